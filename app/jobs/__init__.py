@@ -1,0 +1,1 @@
+"""Background fits as child processes."""

@@ -1,0 +1,1 @@
+"""Runs, turned into files that other programs read."""

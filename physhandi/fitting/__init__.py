@@ -1,0 +1,1 @@
+"""Inverse physics: the stages of the paper."""

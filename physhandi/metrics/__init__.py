@@ -1,0 +1,1 @@
+"""Measures of quality, written apart from the losses."""

@@ -1,0 +1,1 @@
+"""Warp kernels; this package imports nothing but Warp."""
