@@ -1,0 +1,54 @@
+# PhysHanDI: everything a fresh machine needs is set up by these targets.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+PORT ?= 8080
+DATA ?= data
+# Without an NVIDIA GPU install torch's CPU build first (README, "Installing torch"); this variable is passed to pip.
+TORCH ?= torch==2.13.0
+
+.PHONY: install demo test check fmt bench test-gpu browser clean
+
+install: $(STAMP)
+
+$(STAMP): pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt $(TORCH)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
+	touch $@
+
+demo: install
+	$(BIN)/physhandi doctor
+	$(BIN)/physhandi serve --host 127.0.0.1 --port $(PORT) --data-dir $(DATA) --demo
+
+check: install
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+	$(BIN)/pyright
+
+fmt: install
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+test: install browser
+	rm -f .coverage .coverage.*
+	$(BIN)/python -m pytest -n 2 --dist loadfile --cov --cov-report=term
+
+test-gpu: install
+	$(BIN)/python -m pytest -m gpu
+
+bench: install
+	$(BIN)/physhandi benchmark rollout --json
+
+# The browser tests drive Debian's chromium; open3d, where it is used, needs libusb and libGL.
+browser:
+	@command -v chromium >/dev/null || { \
+	  if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+	    apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends \
+	      chromium libegl-mesa0 libgl1-mesa-dri libgl1 libegl1 libusb-1.0-0 >/dev/null; \
+	  else echo "The browser tests need chromium: install it with your package manager." >&2; exit 1; fi; }
+
+clean:
+	rm -rf $(VENV) .coverage .coverage.* .pytest_cache .ruff_cache
