@@ -1,0 +1,215 @@
+"""What the object fit is given of one sequence: nodes, controls and observations."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from physhandi.data.observation import ObjectObservation
+from physhandi.errors import FitError
+from physhandi.fitting.losses import chamfer_loss, track_loss
+
+CARRIERS = 4  # nodes that carry one observed surface point
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectProblem:
+    """One sequence, reduced to what the object fit needs of it."""
+
+    name: str
+    """Name of the sequence."""
+    object_node: Float[ndarray, "node 3"]
+    """Object nodes at frame 0 [m]."""
+    rest_node: Float[ndarray, "node 3"]
+    """The object's rest shape, which gives topology and rest lengths [m]."""
+    control: Float[ndarray, "frame control 3"]
+    """Positions of the control nodes [m]."""
+    frame_rate: float
+    """Frames a second [Hz]."""
+    ground_height: float | None
+    """Height of the ground plane, none if the object hangs free [m]."""
+    gravity: float
+    """Acceleration along −z [m/s²]."""
+    initial_velocity: Float[ndarray, "node 3"]
+    """Velocity of the object nodes at frame 0 [m/s]."""
+    cloud: Float[Tensor, "frame point 3"]
+    """Observed object points, padded [m]."""
+    is_observed: Bool[Tensor, "frame point"]
+    """Which of the padded points are real."""
+    track: Float[Tensor, "frame track 3"]
+    """Observed tracks of the frames to fit [m]."""
+    is_valid: Bool[Tensor, "frame track"]
+    """Where a track can be trusted."""
+    carrier: Int[Tensor, "track carrier"]
+    """The nodes that carry each track."""
+    carrier_weight: Float[Tensor, "track carrier"]
+    """How much each of them counts; rows sum to one."""
+    track_offset: Float[Tensor, "track 3"]
+    """Position of a track less the weighted mean of its carriers, at the first frame it is seen [m]."""
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames to fit, frame 0 included."""
+        return self.cloud.shape[0]
+
+    def predict_tracks(self, node: Float[Tensor, "frame node 3"]) -> Float[Tensor, "frame track 3"]:
+        """Carry the tracked surface points along with the nodes."""
+        carried = (node[:, self.carrier] * self.carrier_weight[..., None]).sum(dim=2)
+        return carried + self.track_offset
+
+    def frame_losses(
+        self,
+        node: Float[Tensor, "frame node 3"],
+        *,
+        first_frame: int = 1,
+        track_weight: float = 1.0,
+        freeze_counts: bool = False,
+    ) -> Float[Tensor, " frame"]:
+        """Compare simulated nodes with the observations, frame by frame [m²].
+
+        Args:
+            node: Simulated nodes of the frames ``first_frame, first_frame + 1, …`` [m].
+            first_frame: Frame of the first row of ``node``.
+            track_weight: Weight of the track term beside the Chamfer term.
+            freeze_counts: Divide by frame 1's counts in every frame, as PhysTwin does.
+
+        Returns:
+            Chamfer plus weighted track loss of each frame.
+        """
+        frames = slice(first_frame, first_frame + node.shape[0])
+        cloud_count = track_count = None
+        if freeze_counts:
+            cloud_count = self.is_observed[1].sum().float().expand(node.shape[0])
+            track_count = self.is_valid[1].sum().float().expand(node.shape[0])
+        chamfer = chamfer_loss(self.cloud[frames], self.is_observed[frames], node, count=cloud_count)
+        track = track_loss(
+            self.track[frames], self.is_valid[frames], self.predict_tracks(node), count=track_count
+        )
+        return chamfer + track_weight * track
+
+
+def _pad_clouds(
+    clouds: tuple[ndarray, ...], frame_count: int, most: int
+) -> tuple[Float[Tensor, "frame point 3"], Bool[Tensor, "frame point"]]:
+    picked = []
+    for cloud in clouds[:frame_count]:
+        keep = np.linspace(0, len(cloud) - 1, min(most, len(cloud))).round().astype(int)
+        picked.append(np.asarray(cloud, np.float32).reshape(-1, 3)[keep])
+    width = max((len(points) for points in picked), default=0)
+    padded = np.zeros((frame_count, width, 3), np.float32)
+    real = np.zeros((frame_count, width), bool)
+    for frame, points in enumerate(picked):
+        padded[frame, : len(points)] = points
+        real[frame, : len(points)] = True
+    return torch.from_numpy(padded), torch.from_numpy(real)
+
+
+def _carriers(
+    observation: ObjectObservation, object_node: Float[ndarray, "node 3"]
+) -> tuple[ndarray, ndarray, ndarray, ndarray]:
+    """Attach each track that is seen at frame 0 to its nearest nodes there."""
+    kept = np.flatnonzero(observation.is_visible[0])
+    start = np.asarray(observation.point[0, kept], np.float32)
+    if observation.node_of_track is not None:
+        carrier = np.asarray(observation.node_of_track)[kept][:, None].astype(np.int64)
+        weight = np.ones((len(kept), 1), np.float32)
+        return kept, carrier, weight, np.zeros((len(kept), 3), np.float32)
+    count = min(CARRIERS, len(object_node))
+    distance, carrier = cKDTree(object_node).query(start, k=count)
+    distance, carrier = np.reshape(distance, (-1, count)), np.reshape(carrier, (-1, count))
+    weight = 1.0 / (distance + 1e-4)
+    weight = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
+    offset = start - (object_node[carrier] * weight[..., None]).sum(axis=1)
+    return kept, carrier.astype(np.int64), weight, offset.astype(np.float32)
+
+
+def build_problem(
+    *,
+    name: str,
+    observation: ObjectObservation,
+    object_node: Float[ndarray, "node 3"],
+    rest_node: Float[ndarray, "node 3"],
+    control: Float[ndarray, "frame control 3"],
+    frame_count: int,
+    frame_rate: float,
+    ground_height: float | None,
+    gravity: float,
+    cloud_points: int = 300,
+) -> ObjectProblem:
+    """Reduce a sequence to the tensors that the object fit reads.
+
+    Args:
+        name: Name of the sequence, for messages.
+        observation: What was seen of the object.
+        object_node: Object nodes at frame 0 [m].
+        rest_node: The same nodes in the rest shape [m].
+        control: Control node positions over all frames [m].
+        frame_count: Frames to fit, counted from 0; later ones are never looked at.
+        frame_rate: Frames a second [Hz].
+        ground_height: Height of the ground, or none [m].
+        gravity: Acceleration along −z [m/s²].
+        cloud_points: Most points of a frame that enter the Chamfer term.
+
+    Returns:
+        The problem, on the CPU.
+
+    Raises:
+        FitError: If there is nothing to compare the simulation with.
+    """
+    clouds = observation.cloud or tuple(np.zeros((0, 3), np.float32) for _ in range(frame_count))
+    cloud, is_observed = _pad_clouds(clouds, frame_count, cloud_points)
+    kept, carrier, weight, offset = _carriers(observation, np.asarray(object_node, np.float32))
+    valid = (observation.is_visible & observation.is_motion_valid)[:frame_count, kept]
+    if not is_observed[1:].any() and not valid[1:].any():
+        raise FitError(
+            f"Sequence '{name}' shows the object in no frame after frame 0 of the {frame_count} to "
+            "fit: there is nothing to compare a simulation with. Check masks, depth and tracks."
+        )
+    velocity = np.zeros_like(object_node, dtype=np.float32)
+    if observation.node_of_track is not None:
+        velocity = _initial_velocity(observation, kept, object_node, frame_rate)
+    return ObjectProblem(
+        name=name,
+        object_node=np.asarray(object_node, np.float32),
+        rest_node=np.asarray(rest_node, np.float32),
+        control=np.asarray(control, np.float32),
+        frame_rate=frame_rate,
+        ground_height=ground_height,
+        gravity=gravity,
+        initial_velocity=velocity,
+        cloud=cloud,
+        is_observed=is_observed,
+        track=torch.from_numpy(np.asarray(observation.point[:frame_count, kept], np.float32)),
+        is_valid=torch.from_numpy(np.asarray(valid)),
+        carrier=torch.from_numpy(carrier),
+        carrier_weight=torch.from_numpy(weight),
+        track_offset=torch.from_numpy(offset),
+    )
+
+
+def _initial_velocity(
+    observation: ObjectObservation,
+    kept: ndarray,
+    object_node: Float[ndarray, "node 3"],
+    frame_rate: float,
+) -> Float[ndarray, "node 3"]:
+    """Spread the identified points' velocity between the first two frames over all nodes.
+
+    Only frames 0 and 1 are read, so a prediction that starts at frame 0 knows its initial state and
+    nothing of what follows.
+    """
+    nodes = np.asarray(observation.node_of_track)[kept]
+    seen = observation.is_visible[:2, kept].all(axis=0)
+    if not seen.any():
+        return np.zeros_like(object_node, dtype=np.float32)
+    moved = (observation.point[1, kept] - observation.point[0, kept])[seen] * frame_rate
+    count = min(2, int(seen.sum()))
+    distance, near = cKDTree(object_node[nodes[seen]]).query(object_node, k=count)
+    distance, near = np.reshape(distance, (-1, count)), np.reshape(near, (-1, count))
+    weight = 1.0 / (distance + 1e-6)
+    weight /= weight.sum(axis=1, keepdims=True)
+    return (moved[near] * weight[..., None]).sum(axis=1).astype(np.float32)

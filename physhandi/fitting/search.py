@@ -1,0 +1,142 @@
+"""The zeroth-order stage: search the few global parameters that no gradient reaches."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from physhandi.errors import FitError
+from physhandi.progress import Progress
+from physhandi.simulation.model import SimulationParameters
+
+STAGE = "zeroth_order"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchVariable:
+    """One searched parameter and the interval in which it is looked for."""
+
+    low: float
+    """Lower end of the interval, in the parameter's unit."""
+    high: float
+    """Upper end of the interval, in the parameter's unit."""
+    scale: str = "linear"
+    """How the interval is walked: ``linear``, ``log`` or ``integer``."""
+
+    def __post_init__(self) -> None:
+        if self.scale not in {"linear", "log", "integer"}:
+            raise ValueError(f"scale is {self.scale!r}; expected linear, log or integer")
+        if not self.low < self.high or (self.scale == "log" and self.low <= 0):
+            raise ValueError(f"interval [{self.low}, {self.high}] is empty or not positive for a log scale")
+
+    def to_unit(self, value: float) -> float:
+        """Map a value to [0, 1]; values outside the interval land on its ends."""
+        if self.scale == "log":
+            unit = math.log(value / self.low) / math.log(self.high / self.low)
+        else:
+            unit = (value - self.low) / (self.high - self.low)
+        return min(max(unit, 0.0), 1.0)
+
+    def from_unit(self, unit: float) -> float | int:
+        """Map a number in [0, 1] to a value of the parameter."""
+        if self.scale == "log":
+            return float(self.low * (self.high / self.low) ** unit)
+        value = self.low + unit * (self.high - self.low)
+        return math.floor(value) if self.scale == "integer" else value
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchConfig:
+    """How the global parameters are searched (CMA-ES)."""
+
+    generations: int = 20
+    """Generations of the evolution strategy; 0 keeps the start values."""
+    population: int | None = None
+    """Candidates a generation; none leaves it to the number of variables."""
+    sigma: float = 1.0 / 6.0
+    """First step, as a part of each interval."""
+    seed: int = 42
+    """Seed of the random numbers."""
+    variables: dict[str, SearchVariable] = field(default_factory=dict)
+    """Interval of each searched parameter, by its name in the simulation parameters."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchResult:
+    """The best global parameters that the search saw."""
+
+    parameters: SimulationParameters
+    """Best parameters; the start itself if nothing was better."""
+    loss_before: float
+    """Loss of the start values [m²]."""
+    loss_after: float
+    """Loss of the best values [m²]."""
+    curve: list[list[float]]
+    """Evaluations so far and best loss, once a generation."""
+
+
+def search_parameters(
+    evaluate: Callable[[SimulationParameters], float],
+    start: SimulationParameters,
+    config: SearchConfig,
+    progress: Progress,
+) -> SearchResult:
+    """Search global parameters with CMA-ES (paper, zeroth-order stage; PhysTwin §4.2).
+
+    Args:
+        evaluate: Loss of a candidate [m²]; infinite where its simulation diverges.
+        start: Parameters to start from; those that are not searched keep their values.
+        config: Intervals and effort.
+        progress: Told once a generation.
+
+    Returns:
+        The best parameters ever seen and how the loss went.
+
+    Raises:
+        FitError: If every candidate diverges.
+    """
+    import cma
+
+    names = list(config.variables)
+    loss_before = evaluate(start)
+    best, best_loss = start, loss_before
+    curve = [[1.0, loss_before]]
+    if not names or config.generations == 0:
+        return SearchResult(parameters=start, loss_before=loss_before, loss_after=loss_before, curve=curve)
+
+    def candidate(unit: Float[ndarray, " variable"]) -> SimulationParameters:
+        values = {n: config.variables[n].from_unit(float(u)) for n, u in zip(names, unit, strict=True)}
+        return replace(start, **values)
+
+    options = {"bounds": [0, 1], "seed": config.seed, "verbose": -9, "verb_log": 0}
+    if config.population is not None:
+        options["popsize"] = config.population
+    first = [config.variables[name].to_unit(getattr(start, name)) for name in names]
+    # Exactly on a bound CMA's transform has no slope, so a start there could never leave it.
+    strategy = cma.CMAEvolutionStrategy(np.clip(first, 0.02, 0.98), config.sigma, options)
+    evaluations = 1
+    for generation in range(config.generations):
+        units = strategy.ask()
+        losses = []
+        for unit in units:
+            progress.check_cancelled()
+            losses.append(evaluate(candidate(unit)))
+        evaluations += len(losses)
+        winner = int(np.argmin(losses))
+        if losses[winner] < best_loss:
+            best, best_loss = candidate(units[winner]), losses[winner]
+        # Rank decides in CMA, so any value above all finite ones stands for "diverged".
+        finite = [loss for loss in losses if math.isfinite(loss)]
+        worst = max(finite, default=1.0)
+        strategy.tell(units, [loss if math.isfinite(loss) else 10.0 * worst for loss in losses])
+        curve.append([float(evaluations), best_loss])
+        progress.report(STAGE, generation + 1, config.generations, best_loss)
+    if not math.isfinite(best_loss):
+        raise FitError(
+            f"All {evaluations} candidates diverged. Lower the upper end of the stiffness interval "
+            "or raise substeps_per_frame in the profile."
+        )
+    return SearchResult(parameters=best, loss_before=loss_before, loss_after=best_loss, curve=curve)
