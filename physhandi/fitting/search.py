@@ -62,6 +62,8 @@ class SearchConfig:
     """Seed of the random numbers."""
     variables: dict[str, SearchVariable] = field(default_factory=dict)
     """Interval of each searched parameter, by its name in the simulation parameters."""
+    tied: dict[str, str] = field(default_factory=dict)
+    """Parameters that always take the value of another one, such as virtual_stiffness: stiffness."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,6 +111,7 @@ def search_parameters(
 
     def candidate(unit: Float[ndarray, " variable"]) -> SimulationParameters:
         values = {n: config.variables[n].from_unit(float(u)) for n, u in zip(names, unit, strict=True)}
+        values |= {name: values[other] for name, other in config.tied.items() if other in values}
         return replace(start, **values)
 
     options = {"bounds": [0, 1], "seed": config.seed, "verbose": -9, "verb_log": 0}

@@ -1,0 +1,279 @@
+"""What each command does; returns plain data and never prints."""
+
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Protocol
+
+from app.jobs.catalog import Catalog
+from app.settings import Settings
+from physhandi import pipeline
+from physhandi.data.run import Run
+from physhandi.data.sequence import Sequence
+from physhandi.errors import RunError, UsageError
+from physhandi.fitting.profile import config_to_dict, load_profile
+from physhandi.progress import Progress
+
+OVERRIDES = (
+    "connection_radius",
+    "max_neighbors",
+    "virtual_connection_radius",
+    "virtual_max_neighbors",
+    "stiffness_scale",
+    "damping",
+    "drag",
+    "restitution",
+    "friction",
+    "substeps_per_frame",
+)
+
+
+class _WithDevice(Protocol):
+    device: str
+
+
+def pick_device(name: str) -> str:
+    """Turn ``auto`` into the fastest Warp device of this machine.
+
+    Raises:
+        UsageError: If the named device does not exist here.
+    """
+    import warp as wp
+
+    wp.config.quiet = True
+    if name == "auto":
+        return "cuda:0" if wp.is_cuda_available() else "cpu"
+    known = [str(device) for device in wp.get_devices()]
+    if name not in known:
+        raise UsageError(f"There is no device '{name}' here. There is: {', '.join(known)}.")
+    return name
+
+
+def find_sequence(name: str, data_dir: Path) -> Sequence:
+    """Open a sequence by folder or by name.
+
+    Raises:
+        UsageError: If there is no such sequence.
+        SequenceError: If it breaks the format.
+    """
+    if (Path(name) / "sequence.yaml").is_file():
+        return Sequence.load(Path(name))
+    catalog = Catalog(Settings(data_dir=data_dir))
+    known = [entry.id for entry in catalog.sequences()]
+    if name not in known:
+        raise UsageError(
+            f"'{name}' is neither a folder with a sequence.yaml nor a known sequence. "
+            f"Known are: {', '.join(known) or 'none'}."
+        )
+    return catalog.sequence(name)
+
+
+def find_run(name: str, data_dir: Path) -> Run:
+    """Open a run by folder or by id.
+
+    Raises:
+        RunError: If there is no such run.
+    """
+    if (Path(name) / "run.yaml").is_file():
+        return Run.open(Path(name))
+    catalog = Catalog(Settings(data_dir=data_dir))
+    known = [entry.id for entry in catalog.runs()]
+    if name not in known:
+        raise RunError(
+            f"'{name}' is neither a run folder nor a known run. Known are: {', '.join(known) or 'none'}."
+        )
+    return catalog.run(name)
+
+
+def reconstruct(command: Any, progress: Progress) -> dict[str, Any]:
+    """Fit sequences into a run folder; an existing unfinished one of the same kind goes on."""
+    if not command.sequences:
+        raise UsageError("Name at least one sequence to reconstruct.")
+    sequences = [find_sequence(name, command.data_dir) for name in command.sequences]
+    config = {"profile": config_to_dict(load_profile(command.profile))}
+    paths = [str(sequence.folder) for sequence in sequences]
+    run = _run_at(command.out, "reconstruction", command.out.name, paths, config)
+    return _execute(run, command, progress)
+
+
+def simulate(command: Any, progress: Progress) -> dict[str, Any]:
+    """Simulate a fitted object again into a run folder of its own."""
+    source = find_run(command.run, command.data_dir)
+    if not source.is_published:
+        raise RunError(f"Run '{source.id}' is {source.state}: only a finished run can be simulated.")
+    changes = {n: v for n in OVERRIDES if (v := getattr(command, n)) is not None}
+    folder = None
+    if command.sequence is not None:
+        folder = str(find_sequence(command.sequence, command.data_dir).folder)
+    config = {"source": str(source.folder.resolve()), "sequence": folder, "parameters": changes}
+    sequences = [folder] if folder is not None else list(source.sequences)[:1]
+    run = _run_at(command.out, "simulation", command.out.name, sequences, config)
+    return _execute(run, command, progress)
+
+
+def _run_at(folder: Path, kind: str, name: str, sequences: list[str], config: dict[str, Any]) -> Run:
+    if not (folder / "run.yaml").is_file():
+        return Run.create(folder, name=name, kind=kind, sequences=sequences, config=config)
+    run = Run.open(folder)
+    if run.kind != kind or run.config != config or list(run.sequences) != sequences:
+        raise UsageError(
+            f"{folder} already holds another run. Choose a new --out, or delete that folder first."
+        )
+    if run.is_published:
+        raise UsageError(f"{folder} already holds this run, finished. Choose a new --out.")
+    return run
+
+
+def _execute(run: Run, command: _WithDevice, progress: Progress) -> dict[str, Any]:
+    pipeline.run_job(run, progress, device=pick_device(command.device))
+    return summary(Run.open(run.folder))
+
+
+def summary(run: Run) -> dict[str, Any]:
+    """What a finished run found: losses of each stage, and metrics."""
+    result: dict[str, Any] = {"run": str(run.folder)}
+    if run.has("losses.json"):
+        losses = run.json("losses.json")
+        result["losses"] = {
+            stage: {key: value[key] for key in ("before", "after")}
+            for stage, value in losses.items()
+            if "before" in value
+        }
+    if run.has("metrics.json"):
+        result["metrics"] = run.json("metrics.json")
+    return result
+
+
+def evaluate_run(command: Any) -> dict[str, Any]:
+    """Measure a run again from its stored motion."""
+    run = find_run(command.run, command.data_dir)
+    return pipeline.evaluate(run)
+
+
+def import_recording(source: Any, progress: Progress) -> list[Path]:
+    """Convert a foreign recording; returns the folders that were written."""
+    if type(source).__name__ == "ImportStereo":
+        from physhandi.data.importers.stereo import import_stereo
+
+        return [import_stereo(source.source, source.out, progress).folder]
+    from physhandi.data.importers.mocap import import_mocap
+
+    return [sequence.folder for sequence in import_mocap(source.source, source.out, progress)]
+
+
+def export(command: Any) -> Path:
+    """Write a run as files of another format; returns what was written."""
+    from physhandi.data.exporters import export_run
+
+    return export_run(
+        find_run(command.run, command.data_dir),
+        command.format,
+        command.out,
+        sequence=command.sequence,
+        frame=command.frame,
+        overwrite=command.overwrite,
+    )
+
+
+def benchmark_rollout(command: Any) -> dict[str, Any]:
+    """Time the simulator against its baseline."""
+    from physhandi.benchmarks.rollout import benchmark_rollout as measure
+
+    return measure(
+        device=pick_device(command.device),
+        node_count=command.nodes,
+        frame_count=command.frames,
+        model_path=command.model,
+    )
+
+
+def serve(command: Any, on_ready: Callable[[str], None]) -> None:
+    """Serve until interrupted."""
+    from app.server import serve as serve_application
+
+    settings = Settings(
+        host=command.host,
+        port=command.port,
+        data_dir=command.data_dir,
+        device=pick_device(command.device),
+    )
+    serve_application(settings, on_ready=on_ready, queue_demo=command.demo)
+
+
+def doctor(data_dir: Path) -> tuple[bool, list[str]]:
+    """Check what the demo needs; returns whether all is well and what was found."""
+    checks = [_check(name, probe) for name, probe in _probes(data_dir)]
+    return all(ok for ok, _ in checks), [line for _, line in checks]
+
+
+def _check(name: str, probe: Callable[[], str]) -> tuple[bool, str]:
+    try:
+        return True, f"ok    {name}: {probe()}"
+    except Exception as error:  # noqa: BLE001  # whatever is wrong here is what doctor is to tell
+        return False, f"FAIL  {name}: {error}"
+
+
+def _probes(data_dir: Path) -> Iterator[tuple[str, Callable[[], str]]]:
+    def python() -> str:
+        return sys.version.split()[0]
+
+    def torch_build() -> str:
+        import torch
+
+        return torch.__version__
+
+    def simulation() -> str:
+        import numpy as np
+
+        from physhandi.simulation.model import SimulationParameters
+        from physhandi.simulation.simulator import Simulator
+        from physhandi.simulation.topology import build_model
+
+        device = pick_device("auto")
+        parameters = SimulationParameters(ground_height=None, drag=0.0, substeps_per_frame=100)
+        model = build_model(np.zeros((1, 3)), np.zeros((0, 3)), parameters)
+        control = np.zeros((2, 0, 3), np.float32)
+        fall = float(Simulator(model, parameters, device=device).rollout(control).position[1, 0, 2])
+        # Symplectic Euler falls g t² / 2 · (1 + 1/substeps) in the first frame.
+        expected = -0.5 * 9.81 / 900 * 1.01
+        if abs(fall - expected) > 1e-5:
+            raise RuntimeError(f"a free fall of one frame gave {fall:.6f} m, expected {expected:.6f} m")
+        return f"Warp on {device}, a falling node lands where it should"
+
+    def bundled() -> str:
+        catalog = Catalog(Settings(data_dir=data_dir))
+        entries = list(catalog.sequences())
+        if not entries:
+            raise RuntimeError("no sequence is bundled; reinstall the package")
+        return ", ".join(entry.id for entry in entries)
+
+    def hand() -> str:
+        from physhandi.hand.model import load_hand_model
+
+        return ", ".join(f"{s} hand {load_hand_model(s).vertex_count} vertices" for s in ("right", "left"))
+
+    def space() -> str:
+        folder = data_dir if data_dir.exists() else Path()
+        free = shutil.disk_usage(folder).free
+        if free < 500e6:
+            raise RuntimeError(f"only {free / 1e6:.0f} MB free; 500 MB are needed")
+        return f"{free / 1e9:.0f} GB free"
+
+    yield "python", python
+    yield "torch", torch_build
+    yield "simulation", simulation
+    yield "hand", hand
+    yield "sequences", bundled
+    yield "disk", space
+
+
+def lines(result: Any, indent: int = 0) -> Iterator[str]:
+    """Lay nested results out for reading."""
+    for key, value in result.items():
+        if isinstance(value, dict):
+            yield f"{'  ' * indent}{key}:"
+            yield from lines(value, indent + 1)
+        else:
+            shown = f"{value:.6g}" if isinstance(value, float) else value
+            yield f"{'  ' * indent}{key}: {shown}"

@@ -1,0 +1,172 @@
+"""What the stages leave in a run's folder, and how later stages read it back.
+
+Everything here is relative to the output folder of one attempt; names are those of
+docs/formats.md.
+"""
+
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import yaml
+from jaxtyping import Float
+from numpy import ndarray
+from safetensors.numpy import load_file
+
+from physhandi.data.observation import ObjectObservation
+from physhandi.data.sequence import Sequence
+from physhandi.hand.model import load_hand_model
+from physhandi.hand.motion import HandMotion
+from physhandi.simulation.model import SimulationParameters, SpringMassModel
+
+
+class OutputFolder(Protocol):
+    """The part of an attempt that stages write through; every write is atomic."""
+
+    @property
+    def out(self) -> Path:
+        """Folder that the artefacts lie in."""
+        ...
+
+    def save_array(self, rel: str, array: ndarray) -> Any:
+        """Write one array."""
+        ...
+
+    def save_tensors(self, rel: str, tensors: dict[str, ndarray]) -> Any:
+        """Write named arrays."""
+        ...
+
+    def save_yaml(self, rel: str, obj: Any) -> Any:
+        """Write plain data."""
+        ...
+
+
+def sequence_folder(name: str) -> str:
+    """Where the artefacts of one sequence lie."""
+    return f"sequences/{name}"
+
+
+def save_sequence_meta(output: OutputFolder, sequence: Sequence) -> None:
+    """Keep what a viewer needs of a sequence, so that a run can be shown without it."""
+    output.save_yaml(
+        f"{sequence_folder(sequence.name)}/meta.yaml",
+        {
+            "name": sequence.name,
+            "folder": str(sequence.folder),
+            "frame_rate": sequence.frame_rate,
+            "frame_count": sequence.frame_count,
+            "metric": sequence.metric,
+            "length_unit": sequence.length_unit,
+            "ground_height": sequence.ground_height,
+            "gravity": sequence.gravity,
+            "hands": list(sequence.hands),
+            "reconstruction_frames": len(sequence.reconstruction_frames),
+        },
+    )
+
+
+def save_observation(output: OutputFolder, name: str, observation: ObjectObservation) -> None:
+    """Store what was seen of the object."""
+    folder = f"{sequence_folder(name)}/observation"
+    output.save_array(f"{folder}/point.npy", observation.point.astype(np.float32))
+    output.save_array(f"{folder}/is_visible.npy", observation.is_visible)
+    output.save_array(f"{folder}/is_motion_valid.npy", observation.is_motion_valid)
+    if observation.node_of_track is not None:
+        output.save_array(f"{folder}/node_of_track.npy", observation.node_of_track.astype(np.int32))
+    if observation.cloud:
+        clouds = [np.asarray(cloud, np.float32).reshape(-1, 3) for cloud in observation.cloud]
+        end = np.cumsum([len(cloud) for cloud in clouds]).astype(np.int64)
+        output.save_array(f"{folder}/cloud.npy", np.concatenate(clouds))
+        output.save_array(f"{folder}/cloud_end.npy", end)
+
+
+def load_observation(out: Path, name: str) -> ObjectObservation:
+    """Read back what `save_observation` stored."""
+    folder = out / sequence_folder(name) / "observation"
+
+    def read(file: str) -> ndarray | None:
+        path = folder / file
+        return np.load(path, allow_pickle=False) if path.exists() else None
+
+    cloud, cloud_end = read("cloud.npy"), read("cloud_end.npy")
+    clouds: tuple[ndarray, ...] = ()
+    if cloud is not None and cloud_end is not None:
+        clouds = tuple(np.split(cloud, cloud_end[:-1]))
+    return ObjectObservation(
+        point=np.load(folder / "point.npy", allow_pickle=False),
+        is_visible=np.load(folder / "is_visible.npy", allow_pickle=False),
+        is_motion_valid=np.load(folder / "is_motion_valid.npy", allow_pickle=False),
+        cloud=clouds,
+        node_of_track=read("node_of_track.npy"),
+    )
+
+
+def save_motions(output: OutputFolder, name: str, motions: tuple[HandMotion, ...]) -> None:
+    """Store the fitted motion of each hand."""
+    for motion in motions:
+        rel = f"{sequence_folder(name)}/hand_{motion.side}.safetensors"
+        output.save_tensors(rel, motion.to_tensors())
+
+
+def load_motions(out: Path, name: str) -> tuple[HandMotion, ...]:
+    """Read the hand motions of one sequence, the right hand first."""
+    folder = out / sequence_folder(name)
+    paths = [folder / f"hand_{side}.safetensors" for side in ("right", "left")]
+    return tuple(HandMotion.from_tensors(load_file(path)) for path in paths if path.exists())
+
+
+def save_object(
+    output: OutputFolder,
+    parameters: SimulationParameters,
+    model: SpringMassModel,
+    rest_node: Float[ndarray, "node 3"],
+) -> None:
+    """Store the object by itself: rest shape, its springs and the global parameters."""
+    count = model.object_spring_count
+    output.save_yaml("object/parameters.yaml", parameters.to_dict())
+    output.save_tensors(
+        "object/material.safetensors",
+        {
+            "rest_node": rest_node.astype(np.float32),
+            "object_spring_nodes": model.spring_nodes[:count].copy(),
+            "object_rest_length": model.rest_length[:count].copy(),
+            "stiffness": model.stiffness[:count].copy(),
+            "damping": model.damping[:count].copy(),
+        },
+    )
+
+
+def load_parameters(out: Path) -> SimulationParameters:
+    """Read the global parameters of a run."""
+    text = (out / "object/parameters.yaml").read_text(encoding="utf-8")
+    return SimulationParameters.from_dict(yaml.safe_load(text))
+
+
+def load_rest_node(out: Path) -> Float[ndarray, "node 3"]:
+    """Read the rest shape of a run's object [m]."""
+    return load_file(out / "object/material.safetensors")["rest_node"]
+
+
+def save_model(output: OutputFolder, name: str, model: SpringMassModel) -> None:
+    """Store the springs of one sequence, object springs and virtual springs."""
+    tensors = {key: np.ascontiguousarray(value) for key, value in model.to_tensors().items()}
+    output.save_tensors(f"{sequence_folder(name)}/model.safetensors", tensors)
+
+
+def load_model(out: Path, name: str) -> SpringMassModel:
+    """Read the springs of one sequence."""
+    return SpringMassModel.from_tensors(load_file(out / sequence_folder(name) / "model.safetensors"))
+
+
+def save_hand_observation(
+    output: OutputFolder, name: str, keypoint: Float[ndarray, "view frame hand 21 3"]
+) -> None:
+    """Store the keypoints that stage 1 compared the hands with [px]."""
+    output.save_array(f"{sequence_folder(name)}/keypoint.npy", keypoint.astype(np.float32))
+
+
+def save_hand_vertices(output: OutputFolder, name: str) -> None:
+    """Store the mesh of every hand in every frame, for viewers and exports."""
+    for motion in load_motions(output.out, name):
+        vertex = motion.vertices(load_hand_model(motion.side)).astype(np.float32)
+        output.save_array(f"{sequence_folder(name)}/hand_{motion.side}_vertex.npy", vertex)

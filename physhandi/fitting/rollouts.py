@@ -1,0 +1,117 @@
+"""From a sequence and a fitted object to simulated motion."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from physhandi.data.observation import ObjectObservation
+from physhandi.data.sequence import Sequence
+from physhandi.errors import FitError, MissingInputError
+from physhandi.fitting import artefacts
+from physhandi.fitting.artefacts import OutputFolder
+from physhandi.fitting.controls import farthest_points, lay_object, visible_vertices
+from physhandi.fitting.profile import PipelineConfig
+from physhandi.hand.control_nodes import control_trajectory
+from physhandi.hand.model import load_hand_model
+from physhandi.hand.motion import HandMotion
+from physhandi.perception.shape import object_nodes
+from physhandi.progress import Progress
+from physhandi.simulation.simulator import Simulator
+
+STAGE = "rollout"
+
+
+def control_trajectory_of(
+    sequence: Sequence, motions: tuple[HandMotion, ...], config: PipelineConfig
+) -> Float[ndarray, "frame control 3"]:
+    """Give the control nodes of a sequence over all frames [m].
+
+    Raises:
+        MissingInputError: If the sequence has neither hands nor point controllers.
+    """
+    if sequence.control is not None:
+        return np.asarray(sequence.control, np.float32)
+    if not motions:
+        raise MissingInputError(
+            f"Sequence '{sequence.name}' has neither hands nor control.npy: nothing moves its object."
+        )
+    models = tuple(load_hand_model(motion.side) for motion in motions)
+    control = control_trajectory(motions, models)
+    if config.control_nodes == "all":
+        return control
+    offset, seen = 0, []
+    for model in models:
+        vertex = control[0, offset : offset + model.vertex_count]
+        seen.append(visible_vertices(sequence, vertex, model.faces) + offset)
+        offset += model.vertex_count
+    candidates = np.concatenate(seen)
+    return control[:, candidates[farthest_points(control[0, candidates], config.control_count)]]
+
+
+def object_nodes_of(
+    sequence: Sequence,
+    observation: ObjectObservation,
+    spacing: float,
+    template: tuple[ndarray, ndarray] | None,
+) -> tuple[Float[ndarray, "node 3"], Float[ndarray, "node 3"]]:
+    """Give the object nodes at frame 0 and their rest shape [m].
+
+    Args:
+        sequence: Where the object is to be placed.
+        observation: What was seen of it there.
+        spacing: Distance between nodes that are sampled from what was seen [m].
+        template: Nodes and rest shape in the first sequence, if the object is known already.
+
+    Raises:
+        FitError: If the sequence identifies another number of nodes than the template has.
+        MissingInputError: If frame 0 shows nothing of the object.
+    """
+    if sequence.object_node is not None:
+        node = np.asarray(sequence.object_node, np.float32)
+        rest = node if sequence.rest_node is None else np.asarray(sequence.rest_node, np.float32)
+        if template is not None and len(template[0]) != len(node):
+            raise FitError(
+                f"Sequence '{sequence.name}' has {len(node)} object nodes (object_node.npy), but the "
+                f"object has {len(template[0])}: it is not the same object, or refined differently."
+            )
+        return node, rest if template is None else template[1]
+    cloud = observation.cloud[0] if observation.cloud else observation.point[0]
+    cloud = cloud[np.isfinite(cloud).all(axis=1)]
+    if len(cloud) < 10:
+        raise MissingInputError(
+            f"Sequence '{sequence.name}' shows only {len(cloud)} object points in frame 0; at least 10 "
+            "are needed to place nodes. Check depth and masks of frame 0, or start later."
+        )
+    if template is not None:
+        return lay_object(template[0], cloud), template[1]
+    node = object_nodes(cloud, spacing, sequence.ground_height).astype(np.float32)
+    return node, node
+
+
+def simulate_sequence(
+    output: OutputFolder, sequence: Sequence, *, device: str, progress: Progress
+) -> Float[ndarray, "frame node 3"]:
+    """Simulate all frames of a sequence with the stored model, and store the motion [m].
+
+    Raises:
+        SimulationDivergedError: If the motion runs away.
+    """
+    model = artefacts.load_model(output.out, sequence.name)
+    parameters = replace(
+        artefacts.load_parameters(output.out),
+        frame_rate=sequence.frame_rate,
+        ground_height=sequence.ground_height,
+        gravity=sequence.gravity,
+    )
+    folder = artefacts.sequence_folder(sequence.name)
+    control = np.load(output.out / folder / "control.npy", allow_pickle=False)
+    positions = []
+    for frame, position, _ in Simulator(model, parameters, device=device).frames(control):
+        progress.check_cancelled()
+        positions.append(position)
+        progress.report(STAGE, frame + 1, len(control))
+    rollout = np.stack(positions).astype(np.float32)
+    output.save_array(f"{folder}/rollout.npy", rollout)
+    return rollout

@@ -1,0 +1,257 @@
+"""The paper on one page: hands, then the object that they move, then how well it went.
+
+Each stage reads what earlier stages stored and stores what it found, so that an interrupted run
+goes on after its last finished stage.
+"""
+
+from collections.abc import Sequence as Many
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from physhandi.data.attempt import Attempt
+from physhandi.data.run import Run
+from physhandi.data.sequence import Sequence
+from physhandi.errors import MissingInputError
+from physhandi.fitting import artefacts
+from physhandi.fitting.hand_reconstruction import reconstruct_hands
+from physhandi.fitting.object_problem import ObjectProblem, build_problem
+from physhandi.fitting.object_reconstruction import optimise_springs, search_object
+from physhandi.fitting.profile import PipelineConfig, config_from_dict
+from physhandi.fitting.rollouts import control_trajectory_of, object_nodes_of, simulate_sequence
+from physhandi.metrics.report import score_run
+from physhandi.perception.lifting import observe_object
+from physhandi.progress import Progress
+from physhandi.simulation.stability import stable_substeps
+from physhandi.simulation.topology import build_model
+
+HANDS, OBSERVATION, SEARCH, SPRINGS, EVALUATION = (
+    "hand_reconstruction",
+    "observation",
+    "zeroth_order",
+    "first_order",
+    "evaluation",
+)
+STAGES = (HANDS, OBSERVATION, SEARCH, SPRINGS, EVALUATION)
+
+
+def reconstruct(
+    sequences: Many[Sequence],
+    config: PipelineConfig,
+    attempt: Attempt,
+    progress: Progress,
+    *,
+    device: str = "cpu",
+) -> None:
+    """Reconstruct hands and one object from one or several sequences (paper, sections 3.2-3.4).
+
+    Args:
+        sequences: Recordings of the same object; the first one defines its nodes.
+        config: Settings of all stages.
+        attempt: Where results go; finished stages in it are not computed again.
+        progress: Told about every iteration.
+        device: Warp device.
+
+    Raises:
+        MissingInputError: If the sequences have neither hands nor an object to fit.
+        FitError: If an optimisation has no usable result.
+        CancelledError: If the user asked to stop.
+    """
+    has_object = all(not sequence.missing("object") for sequence in sequences)
+    if not has_object and not all(sequence.hands for sequence in sequences):
+        raise MissingInputError(_nothing_to_fit(sequences))
+    for sequence in sequences:
+        artefacts.save_sequence_meta(attempt, sequence)
+    _stage_hands(sequences, config, attempt, progress)
+    if has_object:
+        _stage_observation(sequences, config, attempt, progress)
+        _stage_search(sequences, config, attempt, progress, device)
+        _stage_springs(sequences, config, attempt, progress, device)
+    _stage_evaluation(sequences, attempt, progress, device, has_object=has_object)
+
+
+def _stage_hands(
+    sequences: Many[Sequence], config: PipelineConfig, attempt: Attempt, progress: Progress
+) -> None:
+    """Stage 1: a hand mesh for every frame, from keypoints and depth of all views."""
+    if attempt.stage_done(HANDS):
+        return
+    before, after, curve = [], [], []
+    for sequence in sequences:
+        if not sequence.hands:
+            continue
+        fit = reconstruct_hands(sequence, config.hand, progress)
+        artefacts.save_motions(attempt, sequence.name, fit.motions)
+        artefacts.save_hand_observation(attempt, sequence.name, fit.keypoint)
+        before.append(fit.loss_before)
+        after.append(fit.loss_after)
+        curve = curve or fit.curve
+    _finish(attempt, HANDS, before, after, curve)
+
+
+def _stage_observation(
+    sequences: Many[Sequence], config: PipelineConfig, attempt: Attempt, progress: Progress
+) -> None:
+    """From pixels or markers to points of the object, and nodes to simulate."""
+    if attempt.stage_done(OBSERVATION):
+        return
+    template = None
+    for number, sequence in enumerate(sequences):
+        observation = observe_object(sequence, progress)
+        node, rest_node = object_nodes_of(sequence, observation, config.node_spacing, template)
+        template = (node, rest_node) if template is None else template
+        control = control_trajectory_of(
+            sequence, artefacts.load_motions(attempt.out, sequence.name), config
+        )
+        folder = artefacts.sequence_folder(sequence.name)
+        artefacts.save_observation(attempt, sequence.name, observation)
+        attempt.save_array(f"{folder}/object_node.npy", node.astype(np.float32))
+        attempt.save_array(f"{folder}/control.npy", control.astype(np.float32))
+        if number == 0:
+            attempt.save_array("object/rest_node.npy", rest_node.astype(np.float32))
+        progress.report(OBSERVATION, number + 1, len(sequences))
+    _finish(attempt, OBSERVATION, [], [], [])
+
+
+def _problems(
+    sequences: Many[Sequence], config: PipelineConfig, attempt: Attempt
+) -> list[ObjectProblem]:
+    rest_node = np.load(attempt.out / "object/rest_node.npy", allow_pickle=False)
+    problems = []
+    for sequence in sequences:
+        folder = attempt.out / artefacts.sequence_folder(sequence.name)
+        problems.append(
+            build_problem(
+                name=sequence.name,
+                observation=artefacts.load_observation(attempt.out, sequence.name),
+                object_node=np.load(folder / "object_node.npy", allow_pickle=False),
+                rest_node=rest_node,
+                control=np.load(folder / "control.npy", allow_pickle=False),
+                frame_count=len(sequence.reconstruction_frames),
+                frame_rate=sequence.frame_rate,
+                ground_height=sequence.ground_height,
+                gravity=sequence.gravity,
+                cloud_points=config.object_.cloud_points,
+            )
+        )
+    return problems
+
+
+def _stage_search(
+    sequences: Many[Sequence],
+    config: PipelineConfig,
+    attempt: Attempt,
+    progress: Progress,
+    device: str,
+) -> None:
+    """Stage 2, zeroth-order: topology and the other global parameters."""
+    if attempt.stage_done(SEARCH):
+        return
+    problems = _problems(sequences, config, attempt)
+    start = _start_parameters(problems, config)
+    result = search_object(problems, start, config.object_, progress, device=device)
+    attempt.save_yaml("object/parameters.yaml", result.parameters.to_dict())
+    _finish(attempt, SEARCH, [result.loss_before], [result.loss_after], result.curve)
+
+
+def _start_parameters(problems: Many[ObjectProblem], config: PipelineConfig) -> Any:
+    """Choose substeps that keep the stiffest, densest candidate of the search stable."""
+    start = config.simulation
+    if not config.automatic_substeps:
+        return start
+    variables = config.object_.search.variables
+    stiffest = replace(
+        start, **{n: v.from_unit(1.0) for n, v in variables.items() if "stiffness" in n}
+    )
+    problem = problems[0]
+    model = build_model(problem.object_node, problem.control[0], stiffest, problem.rest_node)
+    return replace(start, substeps_per_frame=stable_substeps(model, stiffest))
+
+
+def _stage_springs(
+    sequences: Many[Sequence],
+    config: PipelineConfig,
+    attempt: Attempt,
+    progress: Progress,
+    device: str,
+) -> None:
+    """Stage 2, first-order: a stiffness and a damping for each spring."""
+    if attempt.stage_done(SPRINGS):
+        return
+    problems = _problems(sequences, config, attempt)
+    parameters = artefacts.load_parameters(attempt.out)
+    result = optimise_springs(problems, parameters, config.object_, progress, device=device)
+    for problem in problems:
+        artefacts.save_model(attempt, problem.name, result.models[problem.name])
+    first = problems[0]
+    artefacts.save_object(attempt, parameters, result.models[first.name], first.rest_node)
+    _finish(attempt, SPRINGS, [result.loss_before], [result.loss_after], result.curve)
+
+
+def _stage_evaluation(
+    sequences: Many[Sequence],
+    attempt: Attempt,
+    progress: Progress,
+    device: str,
+    *,
+    has_object: bool,
+) -> None:
+    """Roll out all frames, the held-out ones included, and measure."""
+    if attempt.stage_done(EVALUATION):
+        return
+    metrics = {}
+    for number, sequence in enumerate(sequences):
+        artefacts.save_hand_vertices(attempt, sequence.name)
+        if has_object:
+            simulate_sequence(attempt, sequence, device=device, progress=progress)
+        metrics[sequence.name] = score_run(attempt.out, sequence)
+        progress.report(EVALUATION, number + 1, len(sequences))
+    attempt.save_json("metrics.json", metrics)
+    _finish(attempt, EVALUATION, [], [], [])
+
+
+def _finish(
+    attempt: Attempt,
+    stage: str,
+    before: list[float],
+    after: list[float],
+    curve: list[list[float]],
+) -> None:
+    summary: dict[str, Any] = {"curve": curve}
+    if before:
+        summary |= {"before": float(np.mean(before)), "after": float(np.mean(after))}
+    attempt.finish_stage(stage, summary)
+
+
+def _nothing_to_fit(sequences: Many[Sequence]) -> str:
+    missing = [
+        f"'{sequence.name}' lacks {', '.join(sequence.missing('object'))} for the object"
+        + ("" if sequence.hands else " and has no hands")
+        for sequence in sequences
+    ]
+    return f"There is nothing to fit: {'; '.join(missing)}."
+
+
+def run_job(run: Run, progress: Progress | None = None, *, device: str = "cpu") -> None:
+    """Execute what a run folder asks for, and publish the result.
+
+    Args:
+        run: The run; its configuration says what to do.
+        progress: Also told what the run's own event log is told.
+        device: Warp device.
+
+    Raises:
+        PhysHandiError: If the work failed; the run folder then says why.
+    """
+    from physhandi.fitting.simulate import simulate_job
+
+    with run.begin_attempt() as attempt:
+        watched = attempt.progress(progress)
+        if run.kind == "simulation":
+            simulate_job(run, attempt, watched, device=device)
+        else:
+            sequences = [Sequence.load(Path(path)) for path in run.sequences]
+            reconstruct(sequences, config_from_dict(run.config["profile"]), attempt, watched, device=device)
+        attempt.publish()
