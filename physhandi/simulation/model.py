@@ -1,0 +1,235 @@
+"""What is simulated: the tunable parameters and the springs that join the nodes."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Int32
+from numpy import ndarray
+
+from physhandi.errors import UsageError
+
+# Field -> lowest and highest value; None leaves that side open.
+_BOUNDS: dict[str, tuple[float | None, float | None]] = {
+    "connection_radius": (0.0, None),
+    "max_neighbors": (0, 1000),
+    "virtual_connection_radius": (0.0, None),
+    "virtual_max_neighbors": (0, 1000),
+    "stiffness": (0.0, None),
+    "stiffness_scale": (0.0, None),
+    "virtual_stiffness": (0.0, None),
+    "damping": (0.0, None),
+    "drag": (0.0, None),
+    "restitution": (0.0, 1.0),
+    "friction": (0.0, 2.0),
+    "ground_height": (None, None),
+    "gravity": (None, None),
+    "frame_rate": (1e-3, None),
+    "substeps_per_frame": (1, 1_000_000),
+    "rest_length_floor": (0.0, None),
+    "virtual_rest_length_floor": (0.0, None),
+}
+_INTEGERS = ("max_neighbors", "virtual_max_neighbors", "substeps_per_frame")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulationParameters:
+    """The few numbers that describe an object as a whole; sliders and searches move these."""
+
+    connection_radius: float = 0.02
+    """δ: object nodes nearer than this get a spring [m]."""
+    max_neighbors: int = 29
+    """d_max: most object springs that one node may start, the node itself not counted."""
+    virtual_connection_radius: float = 0.01
+    """Object nodes nearer to a control node than this are held by it [m]."""
+    virtual_max_neighbors: int = 6
+    """Most virtual springs that one control node may start."""
+    stiffness: float = 3e4
+    """Force per unit strain that a new object spring gets [N]."""
+    stiffness_scale: float = 1.0
+    """Multiplies the stiffness of every spring."""
+    virtual_stiffness: float = 3e4
+    """Force per unit strain that a new virtual spring gets [N]."""
+    damping: float = 100.0
+    """Dashpot along each spring [N·s/m]."""
+    drag: float = 3.0
+    """Decay rate of every node's velocity [1/s]."""
+    restitution: float = 0.5
+    """Part of the normal speed that a bounce on the ground gives back."""
+    friction: float = 0.3
+    """Coulomb friction coefficient of the ground."""
+    ground_height: float | None = 0.0
+    """Height of the ground plane [m]; none for no ground."""
+    gravity: float = 9.81
+    """Acceleration along -z [m/s²]."""
+    frame_rate: float = 30.0
+    """Frames in a second [Hz]."""
+    substeps_per_frame: int = 667
+    """Integration steps in one frame; stiffer springs need more."""
+    rest_length_floor: float = 1e-3
+    """Shortest rest length of an object spring [m]; 0 for none."""
+    virtual_rest_length_floor: float = 1e-3
+    """Shortest rest length of a virtual spring [m]; 0 for none."""
+    use_control_velocity: bool = True
+    """Whether the dashpots of virtual springs see the control nodes move."""
+
+    def __post_init__(self) -> None:
+        for name, (low, high) in _BOUNDS.items():
+            value = getattr(self, name)
+            if value is None and name == "ground_height":
+                continue
+            if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+                raise UsageError(f"Simulation parameter {name} is {value!r}; expected a number.")
+            is_inside = (low is None or value >= low) and (high is None or value <= high)
+            if not (math.isfinite(value) and is_inside):
+                raise UsageError(
+                    f"Simulation parameter {name} is {value}; expected a finite value "
+                    f"in [{low if low is not None else '-∞'}, {high if high is not None else '∞'}]."
+                )
+
+    @property
+    def dt(self) -> float:
+        """Length of one substep [s]."""
+        return 1.0 / (self.frame_rate * self.substeps_per_frame)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields as plain values, ready for YAML or JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> "SimulationParameters":
+        """Read parameters from plain values; fields that are left out keep their default.
+
+        Args:
+            values: Field names and values, as `to_dict` returns them.
+
+        Raises:
+            UsageError: If a key is unknown or a value is of the wrong kind or out of bounds.
+        """
+        unknown = sorted(set(values) - {field.name for field in fields(cls)})
+        if unknown:
+            raise UsageError(
+                f"Unknown simulation parameter {', '.join(map(repr, unknown))}. "
+                f"Known are {', '.join(field.name for field in fields(cls))}."
+            )
+        return cls(**{name: _converted(name, value) for name, value in values.items()})
+
+
+def _converted(name: str, value: Any) -> Any:
+    """Return a value in the type of its field."""
+    if value is None and name == "ground_height":
+        return None
+    if name == "use_control_velocity":
+        if not isinstance(value, bool | np.bool_):
+            raise UsageError(f"Simulation parameter {name} is {value!r}; expected true or false.")
+        return bool(value)
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise UsageError(f"Simulation parameter {name} is {value!r}; expected a number.") from None
+    if name not in _INTEGERS:
+        return number
+    if number != math.floor(number):
+        raise UsageError(f"Simulation parameter {name} is {value!r}; expected a whole number.")
+    return int(number)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SpringMassModel:
+    """Nodes, springs and material of one deformable object and what holds it.
+
+    Every object node weighs 1 kg. Nodes are numbered object nodes first, then control
+    nodes: control `c` is node `node_count + c`. Object springs come first, then virtual ones.
+    """
+
+    object_node: Float32[ndarray, "node 3"]
+    """Positions of the object nodes at frame 0 [m]."""
+    initial_velocity: Float32[ndarray, "node 3"]
+    """Velocities of the object nodes at frame 0 [m/s]."""
+    spring_nodes: Int32[ndarray, "spring 2"]
+    """The two nodes that each spring joins."""
+    rest_length: Float32[ndarray, " spring"]
+    """Length at which a spring pulls with no force [m]."""
+    stiffness: Float32[ndarray, " spring"]
+    """Force per unit strain [N]; divide by rest_length for N/m."""
+    damping: Float32[ndarray, " spring"]
+    """Dashpot along the spring [N·s/m]."""
+    object_spring_count: int
+    """How many of the springs join two object nodes; they come first."""
+    control_count: int
+    """Number of control nodes."""
+
+    def __post_init__(self) -> None:
+        spring_count = len(self.spring_nodes)
+        for name in ("rest_length", "stiffness", "damping"):
+            value = getattr(self, name)
+            if value.shape != (spring_count,) or not np.all(np.isfinite(value)):
+                raise ValueError(
+                    f"{name} has shape {value.shape} or values that are not finite; "
+                    f"expected {spring_count} finite values, one a spring."
+                )
+        if spring_count and float(self.rest_length.min()) <= 0.0:
+            raise ValueError("rest_length must be positive; raise the rest length floor.")
+        for name in ("object_node", "initial_velocity"):
+            value = getattr(self, name)
+            if value.shape != (self.node_count, 3) or not np.all(np.isfinite(value)):
+                raise ValueError(
+                    f"{name} has shape {value.shape} or values that are not finite; "
+                    f"expected ({self.node_count}, 3)."
+                )
+        if not 0 <= self.object_spring_count <= spring_count:
+            raise ValueError(
+                f"object_spring_count is {self.object_spring_count}, "
+                f"but there are {spring_count} springs."
+            )
+        self._check_nodes()
+
+    def _check_nodes(self) -> None:
+        """Refuse springs whose ends are not the nodes that their kind joins."""
+        is_control = self.spring_nodes >= self.node_count
+        count = self.node_count + self.control_count
+        if np.any(self.spring_nodes < 0) or np.any(self.spring_nodes >= count):
+            raise ValueError(f"spring_nodes names a node outside 0…{count - 1}.")
+        if np.any(self.spring_nodes[:, 0] == self.spring_nodes[:, 1]):
+            raise ValueError("spring_nodes has a spring that joins a node to itself.")
+        if np.any(is_control[: self.object_spring_count]):
+            raise ValueError("An object spring (one of the first) ends at a control node.")
+        if np.any(is_control[self.object_spring_count :].sum(axis=1) != 1):
+            raise ValueError("A virtual spring must join one object node and one control node.")
+
+    @property
+    def node_count(self) -> int:
+        """Number of object nodes."""
+        return len(self.object_node)
+
+    @property
+    def virtual_spring_count(self) -> int:
+        """Number of springs that join a control node to an object node."""
+        return len(self.spring_nodes) - self.object_spring_count
+
+    def to_tensors(self) -> dict[str, ndarray]:
+        """Return every field as an array, ready for safetensors."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {
+            name: value if isinstance(value, np.ndarray) else np.array([value], dtype=np.int32)
+            for name, value in values.items()
+        }
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, ndarray]) -> "SpringMassModel":
+        """Rebuild a model from the arrays of `to_tensors`.
+
+        Raises:
+            ValueError: If an array is missing, unknown or inconsistent.
+        """
+        names = {field.name for field in fields(cls)}
+        if set(tensors) != names:
+            raise ValueError(
+                f"A spring-mass model needs the arrays {', '.join(sorted(names))}; "
+                f"got {', '.join(sorted(tensors))}."
+            )
+        counts = {name: int(tensors[name][0]) for name in ("object_spring_count", "control_count")}
+        arrays = {name: np.asarray(tensors[name]) for name in names - counts.keys()}
+        return cls(**arrays, **counts)

@@ -1,0 +1,280 @@
+"""Semi-implicit Euler rollouts of a spring-mass model; one graph replay a frame."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import warp as wp
+from jaxtyping import Float, Float32
+from numpy import ndarray
+
+from physhandi.errors import SimulationDivergedError
+from physhandi.simulation.kernels.integration import integrate_nodes
+from physhandi.simulation.kernels.springs import pull_springs
+from physhandi.simulation.kernels.world import World
+from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.stability import explain_divergence
+from physhandi.simulation.topology import half_edges
+
+wp.config.log_level = wp.LOG_WARNING
+
+SPEED_LIMIT = 50.0
+"""A node faster than this has diverged [m/s]."""
+_NO_DIVERGENCE = np.iinfo(np.int32).max
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """The simulated motion of the object nodes; frame 0 is the initial state."""
+
+    position: Float32[ndarray, "frame node 3"]
+    """Positions in the world frame [m]."""
+    velocity: Float32[ndarray, "frame node 3"]
+    """Velocities in the world frame [m/s]."""
+
+
+class Simulator:
+    """Moves the object nodes of one model; holds model and state on a device.
+
+    One frame is captured once as a graph of two kernels a substep. Everything tunable lives
+    in device arrays, so `set_parameters` and `set_material` act without another capture.
+    The same input gives the same bits, run after run.
+    """
+
+    def __init__(
+        self, model: SpringMassModel, parameters: SimulationParameters, device: str = "cpu"
+    ) -> None:
+        """Place a model on a device.
+
+        Args:
+            model: Nodes, springs and material; not modified.
+            parameters: Global parameters; radii and floors have done their work in the model.
+            device: Warp device to run on, for example ``"cuda:0"``.
+        """
+        wp.init()
+        self.model = model
+        self.parameters = parameters
+        self.device = wp.get_device(device)
+        start, entry = half_edges(model.spring_nodes, model.node_count + model.control_count)
+        self.half_edge_start = self.array(start, wp.int32)
+        self.half_edge = self.array(entry, wp.int32)
+        self.spring_nodes = self.array(model.spring_nodes, wp.vec2i)
+        self.rest_length = self.array(model.rest_length, wp.float32)
+        self.stiffness = self.array(model.stiffness, wp.float32)
+        self.damping = self.array(model.damping, wp.float32)
+        self.world = wp.zeros(1, dtype=World, device=self.device)
+        self.position = self.array(model.object_node, wp.vec3)
+        self.velocity = self.array(model.initial_velocity, wp.vec3)
+        self.control_start = wp.zeros(model.control_count, dtype=wp.vec3, device=self.device)
+        self.control_end = wp.zeros(model.control_count, dtype=wp.vec3, device=self.device)
+        self.pull = wp.zeros(len(model.spring_nodes), dtype=wp.vec3, device=self.device)
+        self.first_divergence = self.array(np.array([_NO_DIVERGENCE]), wp.int32)
+        self._no_tape = wp.zeros(0, dtype=wp.vec3, device=self.device)
+        self._graph: wp.Graph | None = None
+        self.set_parameters(parameters)
+
+    def set_parameters(self, parameters: SimulationParameters) -> None:
+        """Change drag, contact, ground, gravity, stiffness scale or control velocity.
+
+        Args:
+            parameters: The new values. Radii, floors, `stiffness` and `damping` belong to
+                the model and are not looked at.
+
+        Raises:
+            ValueError: If the length of a substep differs; build another simulator then.
+        """
+        old = self.parameters
+        if (parameters.frame_rate, parameters.substeps_per_frame) != (
+            old.frame_rate,
+            old.substeps_per_frame,
+        ):
+            raise ValueError(
+                "frame_rate and substeps_per_frame are fixed in a simulator; build a new one."
+            )
+        self.parameters = parameters
+        has_ground = parameters.ground_height is not None
+        values = np.zeros(1, dtype=World.numpy_dtype())
+        values["dt"] = parameters.dt
+        values["velocity_decay"] = np.exp(-parameters.dt * parameters.drag)
+        values["gravity"] = parameters.gravity
+        values["has_ground"] = has_ground
+        values["ground_height"] = parameters.ground_height if has_ground else 0.0
+        values["restitution"] = parameters.restitution
+        values["friction"] = parameters.friction
+        values["stiffness_scale"] = parameters.stiffness_scale
+        values["control_rate"] = parameters.frame_rate if parameters.use_control_velocity else 0.0
+        values["speed_limit"] = SPEED_LIMIT
+        self.world.assign(values)
+
+    def set_material(
+        self,
+        *,
+        stiffness: Float[ndarray, " spring"] | None = None,
+        damping: Float[ndarray, " spring"] | None = None,
+    ) -> None:
+        """Change the stiffness [N] or damping [N·s/m] of every spring."""
+        for name, value in (("stiffness", stiffness), ("damping", damping)):
+            if value is None:
+                continue
+            if np.shape(value) != self.model.rest_length.shape:
+                raise ValueError(
+                    f"{name} has shape {np.shape(value)}; expected one value for each "
+                    f"of the {len(self.model.rest_length)} springs."
+                )
+            getattr(self, name).assign(np.asarray(value, dtype=np.float32))
+            self.model = replace(self.model, **{name: np.asarray(value, dtype=np.float32)})
+
+    def reset(
+        self,
+        position: Float[ndarray, "node 3"] | None = None,
+        velocity: Float[ndarray, "node 3"] | None = None,
+    ) -> None:
+        """Go back to the initial state, or to a given one."""
+        position = self.model.object_node if position is None else position
+        velocity = self.model.initial_velocity if velocity is None else velocity
+        self.position.assign(np.asarray(position, dtype=np.float32))
+        self.velocity.assign(np.asarray(velocity, dtype=np.float32))
+        self.first_divergence.fill_(_NO_DIVERGENCE)
+
+    def step_frame(
+        self,
+        frame: int,
+        control_start: Float[ndarray, "control 3"],
+        control_end: Float[ndarray, "control 3"],
+    ) -> None:
+        """Advance the state by one frame while the control nodes move on straight lines.
+
+        Args:
+            frame: Number of the frame that this reaches; only for the error message.
+            control_start: Where the control nodes are at the start [m].
+            control_end: Where they are at the end [m].
+
+        Raises:
+            SimulationDivergedError: If a node is not finite or faster than `SPEED_LIMIT`.
+        """
+        if self.model.control_count:
+            self.control_start.assign(np.ascontiguousarray(control_start, dtype=np.float32))
+            self.control_end.assign(np.ascontiguousarray(control_end, dtype=np.float32))
+        if self._graph is None:
+            self._graph = self.capture(self._launch_frame)
+        wp.capture_launch(self._graph)
+        self.check_divergence(frame)
+
+    def frames(
+        self, control: Float[ndarray, "frame control 3"]
+    ) -> Iterator[tuple[int, Float32[ndarray, "node 3"], Float32[ndarray, "node 3"]]]:
+        """Simulate frame by frame from the initial state.
+
+        Args:
+            control: Positions of the control nodes in every frame [m]; its length decides how
+                many frames there are, also when there are no control nodes.
+
+        Yields:
+            Frame, positions [m] and velocities [m/s]; frame 0 is the initial state.
+
+        Raises:
+            SimulationDivergedError: If a node is not finite or faster than `SPEED_LIMIT`.
+        """
+        control = self.checked_control(control)
+        self.reset()
+        for frame in range(len(control)):
+            if frame > 0:
+                self.step_frame(frame, control[frame - 1], control[frame])
+            yield frame, self.position.numpy().copy(), self.velocity.numpy().copy()
+
+    def rollout(self, control: Float[ndarray, "frame control 3"]) -> Rollout:
+        """Simulate all frames of a control trajectory; see `frames`."""
+        control = self.checked_control(control)
+        shape = (len(control), self.model.node_count, 3)
+        position = np.empty(shape, dtype=np.float32)
+        velocity = np.empty(shape, dtype=np.float32)
+        for frame, frame_position, frame_velocity in self.frames(control):
+            position[frame] = frame_position
+            velocity[frame] = frame_velocity
+        return Rollout(position, velocity)
+
+    def checked_control(self, control: Float[ndarray, "frame control 3"]) -> ndarray:
+        """Return the control trajectory, or raise `ValueError` if it does not fit the model."""
+        control = np.asarray(control, dtype=np.float32)
+        if control.ndim != 3 or control.shape[1:] != (self.model.control_count, 3):
+            raise ValueError(
+                f"control has shape {control.shape}; expected "
+                f"(frames, {self.model.control_count}, 3)."
+            )
+        bad = np.argwhere(~np.isfinite(control))
+        if len(bad):
+            raise ValueError(f"control is not finite at frame {bad[0][0]}, node {bad[0][1]}.")
+        return control
+
+    def launch_substep(
+        self,
+        substep: int,
+        before: tuple[wp.array, wp.array],
+        after: tuple[wp.array, wp.array],
+        free_velocity: wp.array | None = None,
+    ) -> None:
+        """Launch the kernels of one substep, from one state (position, velocity) to another."""
+        springs = (self.spring_nodes, self.rest_length, self.stiffness, self.damping)
+        wp.launch(
+            pull_springs,
+            dim=len(self.model.spring_nodes),
+            inputs=[
+                (substep + 1) / self.parameters.substeps_per_frame,
+                self.world,
+                *springs,
+                *before,
+                self.control_start,
+                self.control_end,
+            ],
+            outputs=[self.pull],
+            device=self.device,
+        )
+        tape = self._no_tape if free_velocity is None else free_velocity
+        wp.launch(
+            integrate_nodes,
+            dim=self.model.node_count,
+            inputs=[
+                substep,
+                self.world,
+                self.half_edge_start,
+                self.half_edge,
+                *before,
+                self.pull,
+            ],
+            outputs=[tape, *after, self.first_divergence],
+            device=self.device,
+        )
+
+    def capture(self, launches: Any) -> wp.Graph:
+        """Record what a function launches as a graph."""
+        with wp.ScopedCapture(device=self.device, force_module_load=True) as capture:
+            launches()
+        if capture.graph is None:
+            raise RuntimeError(f"Warp captured no graph on {self.device}.")
+        return capture.graph
+
+    def check_divergence(self, frame: int) -> None:
+        """Raise `SimulationDivergedError` if the last frame recorded a divergence."""
+        first = int(self.first_divergence.numpy()[0])
+        if first == _NO_DIVERGENCE:
+            return
+        substep, node = divmod(first, self.model.node_count)
+        model = replace(self.model, stiffness=self.stiffness.numpy(), damping=self.damping.numpy())
+        raise SimulationDivergedError(
+            f"Simulation diverged at frame {frame}, substep {substep}: node {node} is not finite "
+            f"or faster than {SPEED_LIMIT:g} m/s. "
+            + explain_divergence(model, self.parameters, node),
+            frame=frame,
+            substep=substep,
+            node=node,
+        )
+
+    def array(self, value: ndarray, dtype: Any) -> wp.array:
+        """Copy an array to the device."""
+        return wp.array(np.ascontiguousarray(value), dtype=dtype, device=self.device)
+
+    def _launch_frame(self) -> None:
+        state = (self.position, self.velocity)
+        for substep in range(self.parameters.substeps_per_frame):
+            self.launch_substep(substep, state, state)

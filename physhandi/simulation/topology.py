@@ -1,0 +1,208 @@
+"""Which springs exist: connection radius δ and most neighbors d_max, evaluated on frame 0."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float, Int32
+from numpy import ndarray
+from scipy.spatial import cKDTree
+
+from physhandi.simulation.model import SimulationParameters, SpringMassModel
+
+MINIMUM_LENGTH = 1e-4
+"""Object nodes this near to each other are not joined [m]."""
+MINIMUM_VIRTUAL_REST_LENGTH = 1e-6
+"""A control node on top of an object node must not divide by zero [m]."""
+
+SpringList = tuple[Int32[ndarray, "spring 2"], Float[ndarray, " spring"]]
+
+
+def object_springs(
+    node: Float[ndarray, "node 3"], connection_radius: float, max_neighbors: int
+) -> SpringList:
+    """Join object nodes that are near to each other.
+
+    Each node proposes springs to its `max_neighbors` nearest other nodes, as far as they are
+    strictly nearer than `connection_radius`. The springs are the union of all proposals, so
+    a node can have more springs than it proposed. Pairs not farther apart than
+    `MINIMUM_LENGTH` are left out.
+
+    Args:
+        node: Positions of the object nodes at rest [m].
+        connection_radius: δ [m].
+        max_neighbors: d_max; the node itself is not counted.
+
+    Returns:
+        The springs as (lower node, higher node) in ascending order, and their lengths [m].
+    """
+    node_count = len(node)
+    if max_neighbors < 1 or node_count < 2:
+        return _no_springs()
+    neighbor_count = min(max_neighbors + 1, node_count)
+    distance, neighbor = cKDTree(node).query(node, k=neighbor_count)
+    own = np.arange(node_count)[:, None]
+    is_other = neighbor != own
+    # Of duplicated positions the node itself may rank behind its twins, or fall out.
+    is_kept = is_other & (np.cumsum(is_other, axis=1) <= max_neighbors)
+    is_kept &= (distance < connection_radius) & (distance > MINIMUM_LENGTH)
+    first = np.broadcast_to(own, neighbor.shape)[is_kept]
+    second = neighbor[is_kept]
+    pair = np.stack([np.minimum(first, second), np.maximum(first, second)], axis=1)
+    springs = np.unique(pair, axis=0).astype(np.int32)
+    return springs, np.linalg.norm(node[springs[:, 1]] - node[springs[:, 0]], axis=1)
+
+
+def virtual_springs(
+    control: Float[ndarray, "control 3"],
+    node: Float[ndarray, "node 3"],
+    radius: float,
+    max_neighbors: int,
+) -> SpringList:
+    """Join each control node to the object nodes near it.
+
+    Args:
+        control: Positions of the control nodes at frame 0 [m].
+        node: Positions of the object nodes at frame 0 [m].
+        radius: Object nodes strictly nearer than this are joined [m].
+        max_neighbors: Most springs of one control node.
+
+    Returns:
+        The springs as (object node, `len(node)` + control) in ascending order, and their
+        lengths [m].
+    """
+    if max_neighbors < 1 or len(node) == 0 or len(control) == 0:
+        return _no_springs()
+    count = min(max_neighbors, len(node))
+    distance, neighbor = cKDTree(node).query(control, k=count)
+    distance = distance.reshape(len(control), count)
+    neighbor = neighbor.reshape(len(control), count)
+    is_kept = distance < radius
+    control_index = np.broadcast_to(np.arange(len(control))[:, None], neighbor.shape)[is_kept]
+    object_index = neighbor[is_kept]
+    order = np.lexsort((control_index, object_index))
+    springs = np.stack([object_index, len(node) + control_index], axis=1)[order]
+    return springs.astype(np.int32), distance[is_kept][order]
+
+
+def build_model(
+    object_node: Float[ndarray, "node 3"],
+    control_0: Float[ndarray, "control 3"],
+    parameters: SimulationParameters,
+    rest_node: Float[ndarray, "node 3"] | None = None,
+) -> SpringMassModel:
+    """Build the springs of an object and of the control nodes that touch it at frame 0.
+
+    Args:
+        object_node: Positions of the object nodes at frame 0 [m].
+        control_0: Positions of the control nodes at frame 0 [m]; may be empty.
+        parameters: Radii, neighbor limits, rest length floors, stiffness and damping.
+        rest_node: The object's rest shape [m], if it differs from frame 0; it decides the
+            object springs and their rest lengths.
+
+    Returns:
+        The model, at rest. `stiffness_scale` is not applied: the simulator does that.
+    """
+    rest = np.asarray(object_node if rest_node is None else rest_node, dtype=np.float64)
+    if rest.shape != object_node.shape:
+        raise ValueError(f"rest_node has shape {rest.shape}; expected {object_node.shape}.")
+    node = np.asarray(object_node, dtype=np.float64)
+    springs, length = object_springs(rest, parameters.connection_radius, parameters.max_neighbors)
+    virtual, virtual_length = virtual_springs(
+        np.asarray(control_0, dtype=np.float64),
+        node,
+        parameters.virtual_connection_radius,
+        parameters.virtual_max_neighbors,
+    )
+    virtual_floor = max(parameters.virtual_rest_length_floor, MINIMUM_VIRTUAL_REST_LENGTH)
+    rest_length = np.concatenate(
+        [
+            np.maximum(length, parameters.rest_length_floor),
+            np.maximum(virtual_length, virtual_floor),
+        ]
+    )
+    stiffness = np.repeat(
+        [parameters.stiffness, parameters.virtual_stiffness], [len(springs), len(virtual)]
+    )
+    return SpringMassModel(
+        object_node=node.astype(np.float32),
+        initial_velocity=np.zeros(node.shape, dtype=np.float32),
+        spring_nodes=np.concatenate([springs, virtual]),
+        rest_length=rest_length.astype(np.float32),
+        stiffness=stiffness.astype(np.float32),
+        damping=np.full(len(rest_length), parameters.damping, dtype=np.float32),
+        object_spring_count=len(springs),
+        control_count=len(control_0),
+    )
+
+
+def retopologize(
+    model: SpringMassModel,
+    parameters: SimulationParameters,
+    control_0: Float[ndarray, "control 3"],
+    *,
+    fitted: SimulationParameters,
+    rest_node: Float[ndarray, "node 3"] | None = None,
+) -> SpringMassModel:
+    """Rebuild the springs for other radii or neighbor limits, keeping what was fitted.
+
+    A spring that both topologies have keeps the ratio of its stiffness and damping to the
+    global value under which it was fitted; a new spring gets the global value.
+
+    Args:
+        model: The fitted model; not modified.
+        parameters: The new parameters.
+        control_0: Positions of the control nodes at frame 0 [m].
+        fitted: The parameters whose global stiffness and damping the fitted values refer to.
+        rest_node: The object's rest shape [m]; the nodes of frame 0 if left out.
+
+    Returns:
+        The new model, with the initial velocity of the old one.
+    """
+    built = build_model(model.object_node, control_0, parameters, rest_node)
+    key = _spring_keys(built.spring_nodes, model.node_count)
+    fitted_key = _spring_keys(model.spring_nodes, model.node_count)
+    _, index, fitted_index = np.intersect1d(key, fitted_key, return_indices=True)
+    is_object = fitted_index < model.object_spring_count
+    global_stiffness = np.where(is_object, fitted.stiffness, fitted.virtual_stiffness)
+    stiffness = built.stiffness.copy()
+    damping = built.damping.copy()
+    stiffness[index] *= _ratio(model.stiffness[fitted_index], global_stiffness)
+    damping[index] *= _ratio(model.damping[fitted_index], np.full(len(index), fitted.damping))
+    return replace(
+        built, stiffness=stiffness, damping=damping, initial_velocity=model.initial_velocity
+    )
+
+
+def half_edges(
+    spring_nodes: Int32[ndarray, "spring 2"], count: int
+) -> tuple[Int32[ndarray, " row"], Int32[ndarray, " half_edge"]]:
+    """List the springs of every node, so that a node can sum its forces in a fixed order.
+
+    Args:
+        spring_nodes: The two nodes of each spring.
+        count: Number of nodes, control nodes included.
+
+    Returns:
+        Where each node's entries start (`count` + 1 numbers), and the entries: spring `s` is
+        `s` at its first node and `-s - 1` at its second.
+    """
+    spring = np.arange(len(spring_nodes), dtype=np.int32)
+    node = np.concatenate([spring_nodes[:, 1], spring_nodes[:, 0]])
+    entry = np.concatenate([-spring - 1, spring])[np.argsort(node, kind="stable")]
+    start = np.concatenate([[0], np.cumsum(np.bincount(node, minlength=count))])
+    return start.astype(np.int32), entry.astype(np.int32)
+
+
+def _no_springs() -> SpringList:
+    return np.zeros((0, 2), dtype=np.int32), np.zeros(0)
+
+
+def _spring_keys(spring_nodes: ndarray, node_count: int) -> ndarray:
+    """Return one number for each unordered pair of nodes."""
+    pair = np.sort(spring_nodes.astype(np.int64), axis=1)
+    return pair[:, 0] + pair[:, 1] * node_count
+
+
+def _ratio(value: ndarray, reference: ndarray) -> ndarray:
+    """Return value / reference, and 1 where the reference is 0 and says nothing."""
+    return np.divide(value, reference, out=np.ones(len(value)), where=reference > 0.0)
