@@ -1,0 +1,131 @@
+"""Writing files so that a reader sees the old content or the new, never half of it."""
+
+import json
+import math
+import os
+import secrets
+import shutil
+import socket
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path, PurePath
+from typing import Any, BinaryIO, cast
+
+import numpy as np
+import psutil
+import yaml
+
+_HOST = socket.gethostname().replace("-", "_").replace(".", "_")[:32] or "host"
+
+
+def temporary_name(name: str) -> str:
+    """Name a hidden sibling of a file that tells which process is writing it."""
+    return f".{name}.{_HOST}-{os.getpid()}-{secrets.token_hex(4)}.tmp"
+
+
+def is_abandoned(path: Path) -> bool:
+    """Tell whether a temporary file or folder was left by a process of this host that is gone."""
+    parts = path.name.split(".")
+    if len(parts) < 4 or parts[0] or parts[-1] != "tmp":
+        return False
+    fields = parts[-2].split("-")
+    if len(fields) != 3 or fields[0] != _HOST or not fields[1].isdigit():
+        return False
+    return int(fields[1]) != os.getpid() and not psutil.pid_exists(int(fields[1]))
+
+
+def sweep_temporary(paths: Iterator[Path]) -> int:
+    """Remove temporary files and folders whose process is gone; return how many there were."""
+    count = 0
+    for path in list(paths):
+        if is_abandoned(path):
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
+            count += 1
+    return count
+
+
+def sync_folder(folder: Path) -> None:
+    """Make a folder's entries durable (a rename is lost in a power cut otherwise)."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def write_atomically(path: Path, write: Callable[[BinaryIO], Any]) -> None:
+    """Let `write` fill a temporary file, make it durable and move it to `path`."""
+    temporary = path.with_name(temporary_name(path.name))
+    try:
+        with temporary.open("wb") as stream:
+            write(stream)
+            stream.flush()
+            os.fsync(stream.fileno())
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    sync_folder(path.parent)
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Replace a file's content."""
+    write_atomically(path, lambda stream: stream.write(content))
+
+
+def write_array(path: Path, array: np.ndarray) -> None:
+    """Write an array as ``.npy``; arrays of Python objects are refused (ValueError)."""
+    contiguous = np.asarray(array, order="C")
+    write_atomically(path, lambda stream: np.save(stream, contiguous, allow_pickle=False))
+
+
+def plain(value: Any) -> Any:
+    """Turn NumPy values, paths and tuples into what JSON and YAML know; NaN and inf become None."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in cast("Mapping[Any, Any]", value).items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, str | int | bool):
+        return value
+    if isinstance(value, PurePath):
+        return str(value)
+    if isinstance(value, list | tuple | set | frozenset | range):
+        return [plain(item) for item in cast("Iterable[Any]", value)]
+    raise TypeError(f"{type(value).__name__} cannot be stored in JSON or YAML")
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write a value as JSON (`plain` first)."""
+    text = json.dumps(plain(value), indent=1, allow_nan=False)
+    write_bytes(path, text.encode() + b"\n")
+
+
+def write_yaml(path: Path, value: Any) -> None:
+    """Write a value as YAML in the given key order (`plain` first)."""
+    text = yaml.safe_dump(plain(value), sort_keys=False, allow_unicode=True, width=100)
+    write_bytes(path, text.encode())
+
+
+def read_array(path: Path, *, mmap: bool = False) -> np.ndarray:
+    """Read an ``.npy`` file without ever unpickling.
+
+    Args:
+        path: File to read.
+        mmap: Map the file instead of reading it; the array is read-only.
+
+    Raises:
+        ValueError: If the file is not a whole array of plain numbers.
+        FileNotFoundError: If there is no such file.
+    """
+    try:
+        mapped: Any = np.load(path, mmap_mode="r", allow_pickle=False)
+    except EOFError:
+        raise ValueError("the file is empty") from None
+    if isinstance(mapped, np.lib.npyio.NpzFile):
+        mapped.close()
+        raise ValueError("it is an archive, not one array")  # noqa: TRY004 - the content is wrong
+    return mapped if mmap else np.array(mapped)

@@ -1,0 +1,189 @@
+"""One calibrated pinhole camera in OpenCV's conventions."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+_UNDISTORT_ITERATIONS = 30
+_FIELDS = ("K", "T_world_camera", "width", "height", "distortion")
+
+
+def _no_distortion() -> ndarray:
+    return np.zeros(5)
+
+
+@dataclass(frozen=True, eq=False)
+class PinholeCamera:
+    """The calibration of one view: intrinsics, lens distortion and pose.
+
+    Camera axes are OpenCV's: x right, y down, z forward. A pixel's centre has integer coordinates.
+    """
+
+    K: Float[ndarray, "3 3"]
+    """Intrinsic matrix [px]."""
+    T_world_camera: Float[ndarray, "4 4"]
+    """Maps camera coordinates to world coordinates [m]."""
+    width: int
+    """Image width [px]."""
+    height: int
+    """Image height [px]."""
+    distortion: Float[ndarray, " 5"] = field(default_factory=_no_distortion)
+    """Lens coefficients k1, k2, p1, p2, k3 of OpenCV's model."""
+
+    def __post_init__(self) -> None:
+        for name, shape in (("K", (3, 3)), ("T_world_camera", (4, 4)), ("distortion", (5,))):
+            value = np.array(getattr(self, name), dtype=np.float64)
+            if value.shape != shape or not np.isfinite(value).all():
+                raise ValueError(f"{name} must be {shape} finite numbers, not {value.tolist()}")
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"width and height must be positive, not {self.width}x{self.height}")
+        if self.K[0, 0] <= 0 or self.K[1, 1] <= 0 or not np.array_equal(self.K[2], [0, 0, 1]):
+            raise ValueError(
+                f"K must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]], not {self.K.tolist()}"
+            )
+        rotation = self.T_world_camera[:3, :3]
+        is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
+        if not is_rotation or np.linalg.det(rotation) < 0:
+            raise ValueError("T_world_camera must hold a rotation (orthonormal, determinant +1)")
+        if not np.allclose(self.T_world_camera[3], [0, 0, 0, 1]):
+            raise ValueError("T_world_camera must end in the row [0, 0, 0, 1]")
+
+    @property
+    def T_camera_world(self) -> Float[ndarray, "4 4"]:
+        """Maps world coordinates to camera coordinates [m]."""
+        rotation = self.T_world_camera[:3, :3].T
+        inverse = np.eye(4)
+        inverse[:3, :3] = rotation
+        inverse[:3, 3] = -rotation @ self.T_world_camera[:3, 3]
+        return inverse
+
+    def to_camera(self, point: Float[ndarray, "*batch 3"]) -> Float[ndarray, "*batch 3"]:
+        """Express world points in camera coordinates [m]."""
+        transform = self.T_camera_world
+        return point @ transform[:3, :3].T + transform[:3, 3]
+
+    def camera_depth(self, point: Float[ndarray, "*batch 3"]) -> Float[ndarray, "*batch"]:
+        """Measure how far world points lie in front of the camera, along its z axis [m]."""
+        return self.to_camera(point)[..., 2]
+
+    def project(self, point: Float[ndarray, "*batch 3"]) -> Float[ndarray, "*batch 2"]:
+        """Find the pixels where world points are seen, lens distortion included.
+
+        Args:
+            point: Points in the world frame [m].
+
+        Returns:
+            Pixel x and y [px], also outside the image; NaN for points that are not in front.
+        """
+        local = self.to_camera(point)
+        depth = np.where(local[..., 2:] > 0, local[..., 2:], np.nan)
+        ray = self._distort(local[..., :2] / depth)
+        return ray @ self.K[:2, :2].T + self.K[:2, 2]
+
+    def undistort(self, pixel: Float[ndarray, "*batch 2"]) -> Float[ndarray, "*batch 2"]:
+        """Move pixels to where a lens without distortion would have seen them [px]."""
+        return self._ray(pixel) @ self.K[:2, :2].T + self.K[:2, 2]
+
+    def unproject(
+        self, pixel: Float[ndarray, "*batch 2"], depth: Float[ndarray, "*batch"]
+    ) -> Float[ndarray, "*batch 3"]:
+        """Find the world points that pixels see at given depths.
+
+        Args:
+            pixel: Pixel x and y, as the camera recorded them [px].
+            depth: Distance along the camera's z axis [m].
+
+        Returns:
+            Points in the world frame [m].
+        """
+        ray = self._ray(pixel)
+        local = np.concatenate([ray, np.ones_like(ray[..., :1])], axis=-1) * depth[..., None]
+        return local @ self.T_world_camera[:3, :3].T + self.T_world_camera[:3, 3]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Describe the camera in plain lists and numbers, as ``sequence.yaml`` holds it."""
+        return {
+            "K": self.K.tolist(),
+            "T_world_camera": self.T_world_camera.tolist(),
+            "width": self.width,
+            "height": self.height,
+            "distortion": self.distortion.tolist(),
+        }
+
+    @classmethod
+    def from_dict(cls, fields: Mapping[str, Any]) -> "PinholeCamera":
+        """Build a camera from what `to_dict` returned.
+
+        Raises:
+            ValueError: If a field is missing, unknown or makes no sense; names the field.
+        """
+        unknown = sorted(set(fields) - set(_FIELDS))
+        if unknown:
+            raise ValueError(f"unknown field {unknown[0]!r} (known: {', '.join(_FIELDS)})")
+        missing = [name for name in _FIELDS[:4] if name not in fields]
+        if missing:
+            raise ValueError(f"field {missing[0]!r} is missing")
+        arrays: dict[str, ndarray] = {}
+        for name in ("K", "T_world_camera", "distortion"):
+            try:
+                arrays[name] = np.array(fields.get(name, [0.0] * 5), dtype=np.float64)
+            except (TypeError, ValueError):
+                raise ValueError(f"{name} must hold numbers, not {fields[name]!r}") from None
+        for name, shape in (("K", (3, 3)), ("T_world_camera", (4, 4)), ("distortion", (5,))):
+            if arrays[name].shape != shape:
+                raise ValueError(f"{name} must have shape {shape}, not {arrays[name].shape}")
+        for name in ("width", "height"):
+            if type(fields[name]) is not int:
+                raise ValueError(f"{name} must be a whole number, not {fields[name]!r}")
+        return cls(
+            K=arrays["K"],
+            T_world_camera=arrays["T_world_camera"],
+            width=fields["width"],
+            height=fields["height"],
+            distortion=arrays["distortion"],
+        )
+
+    def _ray(self, pixel: ndarray) -> ndarray:
+        """Turn recorded pixels into undistorted ray directions at depth one."""
+        return self._undistort_ray((pixel - self.K[:2, 2]) @ np.linalg.inv(self.K[:2, :2]).T)
+
+    def _distort(self, ray: ndarray) -> ndarray:
+        k1, k2, p1, p2, k3 = self.distortion
+        x, y = ray[..., 0], ray[..., 1]
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        return np.stack(
+            [
+                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+            ],
+            axis=-1,
+        )
+
+    def _undistort_ray(self, target: ndarray) -> ndarray:
+        """Invert `_distort` by Newton's method."""
+        if not self.distortion.any():
+            return target
+        k1, k2, p1, p2, k3 = self.distortion
+        ray = np.array(target, dtype=np.float64)
+        for _ in range(_UNDISTORT_ITERATIONS):
+            error = self._distort(ray) - target
+            if np.nanmax(np.abs(error), initial=0.0) < 1e-12:
+                break
+            x, y = ray[..., 0], ray[..., 1]
+            r2 = x * x + y * y
+            radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+            slope = k1 + r2 * (2 * k2 + 3 * k3 * r2)
+            xx = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
+            xy = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
+            yy = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
+            determinant = xx * yy - xy * xy
+            ray[..., 0] -= (yy * error[..., 0] - xy * error[..., 1]) / determinant
+            ray[..., 1] -= (xx * error[..., 1] - xy * error[..., 0]) / determinant
+        return ray

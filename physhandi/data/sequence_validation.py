@@ -1,0 +1,149 @@
+"""Checks of a sequence's files: cheap ones when it is loaded, thorough ones on request."""
+
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy import ndarray
+
+from physhandi.data.atomic import read_array
+from physhandi.data.sequence_schema import FILE, SequenceMeta
+from physhandi.data.view import View
+from physhandi.errors import SequenceError
+
+_F, _I, _B = "floating-point", "integer", "boolean"
+_KINDS: dict[str, Any] = {_F: np.floating, _I: np.integer, _B: np.bool_}
+_Table = dict[str, tuple[tuple[str | int, ...], str, bool]]
+
+# File: axes ("frame" is the sequence's), kind of number, whether NaN may stand for "not seen".
+ARRAYS: _Table = {
+    "control.npy": (("frame", "control", 3), _F, False),
+    "marker.npy": (("frame", "marker", 3), _F, True),
+    "marker_node.npy": (("marker",), _I, False),
+    "object_node.npy": (("node", 3), _F, False),
+    "rest_node.npy": (("node", 3), _F, False),
+}
+VIEW_ARRAYS: _Table = {
+    "keypoint.npy": (("frame", "hand", 21, 3), _F, True),
+    "track.npy": (("frame", "track", 2), _F, True),
+    "track_visible.npy": (("frame", "track"), _B, False),
+}
+
+
+def check_layout(folder: Path, meta: SequenceMeta, views: tuple[View, ...]) -> None:
+    """Check that the files fit to ``sequence.yaml`` and to each other, without decoding images.
+
+    Raises:
+        SequenceError: At the first thing that is wrong.
+    """
+    axes = {"frame": meta.frame_count, "hand": len(meta.hands)}
+    _check_arrays(folder, folder, meta.name, ARRAYS, axes)
+    for view in views:
+        if not view.folder.is_dir():
+            _fail(meta.name, f"views/{view.name}", f"is missing, but {FILE} lists it")
+        # Each view has its own number of tracks.
+        _check_arrays(folder, view.folder, meta.name, VIEW_ARRAYS, dict(axes))
+        has_track = [(view.folder / f).is_file() for f in ("track.npy", "track_visible.npy")]
+        if has_track[0] != has_track[1]:
+            _fail(meta.name, f"views/{view.name}", "needs both track.npy and track_visible.npy")
+        view.check_presence()
+    _check_markers(folder, meta, axes)
+
+
+def check_values(folder: Path, name: str, views: tuple[View, ...]) -> None:
+    """Read every frame of every part and check sizes, labels and finiteness.
+
+    Raises:
+        SequenceError: At the first thing that is wrong.
+    """
+    for file in ARRAYS:
+        _check_finite(folder, folder / file, name)
+    for view in views:
+        for file in VIEW_ARRAYS:
+            _check_finite(folder, view.folder / file, name)
+        _check_tracks(view, name)
+        readers = (
+            (view.has_color, view.color),
+            (view.has_depth, view.depth),
+            (view.has_mask, view.mask),
+        )
+        for read in [read for is_there, read in readers if is_there]:
+            for frame in range(view.frame_count):
+                read(frame)
+        view.close()
+
+
+def _check_arrays(
+    root: Path, folder: Path, name: str, table: _Table, axis_size: dict[str, int]
+) -> None:
+    for file_name, (axes, kind, _) in table.items():
+        path = folder / file_name
+        if not path.is_file():
+            continue
+        file = path.relative_to(root).as_posix()
+        try:
+            array = read_array(path, mmap=True)
+        except (ValueError, OSError) as error:
+            _fail(name, file, f"is not a readable .npy file: {error}")
+        text = "(" + ", ".join(str(axis) for axis in axes) + ")"
+        if not np.issubdtype(array.dtype, _KINDS[kind]):
+            _fail(name, file, f"holds {array.dtype}; expected {kind} numbers {text}")
+        if array.ndim != len(axes):
+            _fail(name, file, f"has shape {array.shape}; expected axes {text}")
+        for axis, size in zip(axes, array.shape, strict=True):
+            expected = axis_size.setdefault(axis, size) if isinstance(axis, str) else axis
+            if size != expected:
+                _fail(
+                    name,
+                    file,
+                    f"has shape {array.shape} for axes {text}; expected {axis} = {expected}, "
+                    f"as {FILE} or another file says. Re-export it or correct {FILE}",
+                )
+
+
+def _check_markers(folder: Path, meta: SequenceMeta, axes: dict[str, int]) -> None:
+    path = folder / "marker_node.npy"
+    nodes = read_array(path) if path.is_file() else np.zeros(0, int)
+    node_count = axes.get("node", 0)
+    if nodes.size and not 0 <= nodes.min() <= nodes.max() < node_count:
+        _fail(
+            meta.name,
+            "marker_node.npy",
+            f"names nodes {nodes.min()} to {nodes.max()}, but object_node.npy has {node_count}",
+        )
+    marker_count = axes.get("marker", 0)
+    wrong = [marker for marker in meta.controlled_markers if marker >= marker_count]
+    if wrong:
+        reason = f"lists controlled_markers {wrong[0]}, but marker.npy has {marker_count} markers"
+        _fail(meta.name, FILE, reason)
+
+
+def _check_finite(root: Path, path: Path, name: str) -> None:
+    axes, kind, may_be_nan = (ARRAYS | VIEW_ARRAYS)[path.name]
+    if kind != _F or not path.is_file():
+        return
+    array = read_array(path)
+    is_wrong: ndarray = np.isinf(array) if may_be_nan else ~np.isfinite(array)
+    if is_wrong.any():
+        place = tuple(int(index) for index in np.argwhere(is_wrong)[0])
+        at = ", ".join(f"{axis} {index}" for axis, index in zip(axes, place[:-1], strict=False))
+        file = path.relative_to(root).as_posix()
+        _fail(name, file, f"is {array[place]} at {at}. Repair or cut out these frames")
+
+
+def _check_tracks(view: View, name: str) -> None:
+    if view.track is None or view.track_visible is None:
+        return
+    lost = np.argwhere(view.track_visible & np.isnan(view.track).any(-1))
+    if lost.size:
+        frame, track = lost[0]
+        _fail(
+            name,
+            f"views/{view.name}/track.npy",
+            f"is NaN at frame {frame}, track {track}, which track_visible.npy calls visible. "
+            "Mark it as not visible",
+        )
+
+
+def _fail(name: str, file: str, reason: str) -> NoReturn:
+    raise SequenceError(f"Sequence '{name}': {file} {reason}.")

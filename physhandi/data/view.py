@@ -1,0 +1,237 @@
+"""One view of a sequence: its images, keypoints and tracks, frame by frame."""
+
+import threading
+from collections import OrderedDict
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NoReturn
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from numpy import ndarray
+
+from physhandi.data.atomic import read_array
+from physhandi.data.camera import PinholeCamera
+from physhandi.errors import SequenceError
+
+_CACHED_FRAMES = 16
+_MILLIMETRE = np.float32(0.001)
+
+
+class View:
+    """One calibrated RGB-D stream; any part of it may be absent."""
+
+    def __init__(self, folder: Path, sequence: str, camera: PinholeCamera, frame_count: int):
+        self.name = folder.name
+        self.folder = folder
+        self.camera = camera
+        self.frame_count = frame_count
+        self._sequence = sequence
+        self._video: _Video | None = None
+        self._lock = threading.Lock()
+
+    def __repr__(self) -> str:
+        return f"View({str(self.folder)!r})"
+
+    @cached_property
+    def has_color(self) -> bool:
+        """Whether there are color images or a video."""
+        return (self.folder / "color.mp4").is_file() or (self.folder / "color").is_dir()
+
+    @cached_property
+    def has_depth(self) -> bool:
+        """Whether there are depth images."""
+        return (self.folder / "depth").is_dir()
+
+    @cached_property
+    def has_mask(self) -> bool:
+        """Whether there are masks."""
+        return (self.folder / "mask").is_dir()
+
+    @cached_property
+    def keypoint(self) -> Float[ndarray, "frame hand 21 3"] | None:
+        """Pixel x, pixel y and confidence of each hand's keypoints; NaN where not seen."""
+        return self._array("keypoint.npy")
+
+    @cached_property
+    def track(self) -> Float[ndarray, "frame track 2"] | None:
+        """Pixel of each tracked point [px]."""
+        return self._array("track.npy")
+
+    @cached_property
+    def track_visible(self) -> Bool[ndarray, "frame track"] | None:
+        """Whether each track is visible."""
+        return self._array("track_visible.npy")
+
+    def color(self, frame: int) -> UInt8[ndarray, "row column 3"]:
+        """Read the color image of a frame (RGB)."""
+        self._check(frame)
+        if (self.folder / "color.mp4").is_file():
+            with self._lock:
+                self._video = self._video or _Video(self.folder / "color.mp4")
+                image = self._video.read(frame)
+            if image is None:
+                self._fail("color.mp4", frame, "cannot be decoded; re-export the video")
+        else:
+            image = self._image("color", frame, cv2.IMREAD_COLOR)
+        self._check_size("color", frame, image)
+        return np.ascontiguousarray(image[..., ::-1])
+
+    def depth(self, frame: int) -> Float[ndarray, "row column"]:
+        """Read the depth image of a frame [m]; zero where nothing was measured."""
+        image = self._image("depth", frame, cv2.IMREAD_UNCHANGED)
+        if image.dtype != np.uint16 or image.ndim != 2:
+            self._fail("depth", frame, f"is {image.dtype}{image.shape}; expected 16-bit grey, mm")
+        self._check_size("depth", frame, image)
+        return image.astype(np.float32) * _MILLIMETRE
+
+    def mask(self, frame: int) -> UInt8[ndarray, "row column"]:
+        """Read the labels of a frame: 0 background, 1 object, 2 right hand, 3 left hand."""
+        image = self._image("mask", frame, cv2.IMREAD_UNCHANGED)
+        if image.dtype != np.uint8 or image.ndim != 2:
+            self._fail("mask", frame, f"is {image.dtype}{image.shape}; expected 8-bit grey, 0 to 3")
+        self._check_size("mask", frame, image)
+        if image.max() > 3:
+            self._fail("mask", frame, f"has label {image.max()}; only 0 to 3 are known")
+        return np.asarray(image)
+
+    def files(self, kind: str) -> list[Path]:
+        """List the images of ``color``, ``depth`` or ``mask`` in frame order."""
+        folder = self.folder / kind
+        suffixes = {".png", ".jpg"} if kind == "color" else {".png"}
+        return sorted(p for p in folder.iterdir() if p.suffix in suffixes and p.name[0] != ".")
+
+    def check_presence(self) -> None:
+        """Check that each part that is there has all frames, without decoding images."""
+        for kind in ("color", "depth", "mask"):
+            if (self.folder / kind).is_dir():
+                self._check_files(kind)
+        video = self.folder / "color.mp4"
+        if video.is_file():
+            if (self.folder / "color").is_dir():
+                self._fail("color", None, "is there twice: color.mp4 and color/; remove one")
+            count = _frame_count(video)
+            if count != self.frame_count:
+                self._fail(
+                    "color.mp4",
+                    None,
+                    f"has {count} frames, but the sequence has {self.frame_count}; "
+                    "cut the video or correct frame_count in sequence.yaml",
+                )
+
+    def close(self) -> None:
+        """Release the video decoder."""
+        with self._lock:
+            if self._video is not None:
+                self._video.close()
+                self._video = None
+
+    def _check_files(self, kind: str) -> None:
+        names = [path.stem for path in self.files(kind)]
+        expected = [f"{frame:05d}" for frame in range(self.frame_count)]
+        if names == expected:
+            return
+        if len(names) != len(set(names)):
+            self._fail(kind, None, "has a frame twice, as .png and .jpg; remove one of them")
+        missing = sorted(set(expected) - set(names))
+        if missing:
+            self._fail(
+                kind,
+                int(missing[0]),
+                f"is missing ({kind}/{missing[0]}.png); there are {len(names)} images for "
+                f"{self.frame_count} frames. Add it or lower frame_count in sequence.yaml",
+            )
+        extra = sorted(set(names) - set(expected))
+        self._fail(
+            kind,
+            None,
+            f"has {kind}/{extra[0]}, but the sequence has only {self.frame_count} frames "
+            f"(00000 to {expected[-1]}). Remove it or raise frame_count in sequence.yaml",
+        )
+
+    def _array(self, file: str) -> Any:
+        path = self.folder / file
+        if not path.is_file():
+            return None
+        try:
+            return read_array(path)
+        except (ValueError, OSError) as error:
+            self._fail(file, None, f"is not a readable .npy file: {error}")
+
+    def _image(self, kind: str, frame: int, flags: int) -> ndarray:
+        self._check(frame)
+        path = self.folder / kind / f"{frame:05d}.png"
+        if kind == "color" and not path.is_file():
+            path = path.with_suffix(".jpg")
+        if not path.is_file():
+            self._fail(kind, frame, f"is missing ({path.relative_to(self.folder)})")
+        image: ndarray | None = cv2.imread(str(path), flags)
+        if image is None:
+            self._fail(kind, frame, f"cannot be decoded ({path.relative_to(self.folder)})")
+        return image
+
+    def _check(self, frame: int) -> None:
+        if not 0 <= frame < self.frame_count:
+            raise IndexError(f"frame {frame} is outside 0 to {self.frame_count - 1}")
+
+    def _check_size(self, kind: str, frame: int, image: ndarray) -> None:
+        height, width = image.shape[:2]
+        camera = self.camera
+        if (width, height) != (camera.width, camera.height):
+            self._fail(
+                kind,
+                frame,
+                f"is {width}x{height} px, but the view's camera says "
+                f"{camera.width}x{camera.height}. Re-export it or correct sequence.yaml",
+            )
+
+    def _fail(self, part: str, frame: int | None, reason: str) -> NoReturn:
+        at = "" if frame is None else f" of frame {frame}"
+        raise SequenceError(
+            f"Sequence '{self._sequence}': view '{self.name}': {part}{at} {reason}."
+        )
+
+
+class _Video:
+    """Frames of a video by number; neighbours are decoded once."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._capture = cv2.VideoCapture(str(path))
+        self._next = 0
+        self._cache: OrderedDict[int, ndarray] = OrderedDict()
+
+    def read(self, frame: int) -> ndarray | None:
+        """Decode a frame (BGR); None if the video does not have it."""
+        if frame in self._cache:
+            self._cache.move_to_end(frame)
+            return self._cache[frame]
+        if frame < self._next:
+            # Seeking by number is inexact for many encoders, so decode from the start.
+            self._capture.release()
+            self._capture = cv2.VideoCapture(str(self._path))
+            self._next = 0
+        while self._next < frame:
+            if not self._capture.grab():
+                return None
+            self._next += 1
+        found, image = self._capture.read()
+        if not found:
+            return None
+        self._next = frame + 1
+        self._cache[frame] = image
+        if len(self._cache) > _CACHED_FRAMES:
+            self._cache.popitem(last=False)
+        return image
+
+    def close(self) -> None:
+        self._capture.release()
+
+
+def _frame_count(path: Path) -> int:
+    capture = cv2.VideoCapture(str(path))
+    try:
+        return round(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
+    finally:
+        capture.release()
