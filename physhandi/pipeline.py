@@ -21,6 +21,7 @@ from physhandi.fitting.object_problem import ObjectProblem, build_problem
 from physhandi.fitting.object_reconstruction import optimise_springs, search_object
 from physhandi.fitting.profile import PipelineConfig, config_from_dict
 from physhandi.fitting.rollouts import control_trajectory_of, object_nodes_of, simulate_sequence
+from physhandi.fitting.simulate import simulate_again
 from physhandi.metrics.report import score_run
 from physhandi.perception.lifting import observe_object
 from physhandi.progress import Progress
@@ -34,6 +35,7 @@ HANDS, OBSERVATION, SEARCH, SPRINGS, EVALUATION = (
     "first_order",
     "evaluation",
 )
+SIMULATION = "simulation"
 STAGES = (HANDS, OBSERVATION, SEARCH, SPRINGS, EVALUATION)
 
 
@@ -70,6 +72,37 @@ def reconstruct(
         _stage_search(sequences, config, attempt, progress, device)
         _stage_springs(sequences, config, attempt, progress, device)
     _stage_evaluation(sequences, attempt, progress, device, has_object=has_object)
+
+
+def simulate(
+    source: Run,
+    sequence: Sequence,
+    changes: dict[str, float],
+    attempt: Attempt,
+    progress: Progress,
+    *,
+    device: str = "cpu",
+) -> None:
+    """Simulate a fitted object with changed parameters, or in another sequence, and measure it.
+
+    Args:
+        source: Run that the object was fitted in.
+        sequence: Where to simulate it.
+        changes: New values of simulation parameters.
+        attempt: Where results go.
+        progress: Told about every frame.
+        device: Warp device.
+    """
+    if not attempt.stage_done(SIMULATION):
+        simulate_again(source, sequence, changes, attempt, progress, device=device)
+        _finish(attempt, SIMULATION, [], [], [])
+    attempt.save_json("metrics.json", {sequence.name: score_run(attempt.out, sequence)})
+
+
+def evaluate(run: Run) -> dict[str, Any]:
+    """Measure a finished run against its sequences again."""
+    sequences = [Sequence.load(Path(path)) for path in run.sequences]
+    return {sequence.name: score_run(run.out, sequence) for sequence in sequences}
 
 
 def _stage_hands(
@@ -245,13 +278,13 @@ def run_job(run: Run, progress: Progress | None = None, *, device: str = "cpu") 
     Raises:
         PhysHandiError: If the work failed; the run folder then says why.
     """
-    from physhandi.fitting.simulate import simulate_job
-
     with run.begin_attempt() as attempt:
         watched = attempt.progress(progress)
+        sequences = [Sequence.load(Path(path)) for path in run.sequences]
         if run.kind == "simulation":
-            simulate_job(run, attempt, watched, device=device)
+            source = Run.open(Path(run.config["source"]))
+            simulate(source, sequences[0], run.config["parameters"], attempt, watched, device=device)
         else:
-            sequences = [Sequence.load(Path(path)) for path in run.sequences]
-            reconstruct(sequences, config_from_dict(run.config["profile"]), attempt, watched, device=device)
+            config = config_from_dict(run.config["profile"])
+            reconstruct(sequences, config, attempt, watched, device=device)
         attempt.publish()

@@ -169,9 +169,6 @@ def build_problem(
             f"Sequence '{name}' shows the object in no frame after frame 0 of the {frame_count} to "
             "fit: there is nothing to compare a simulation with. Check masks, depth and tracks."
         )
-    velocity = np.zeros_like(object_node, dtype=np.float32)
-    if observation.node_of_track is not None:
-        velocity = _initial_velocity(observation, kept, object_node, frame_rate)
     return ObjectProblem(
         name=name,
         object_node=np.asarray(object_node, np.float32),
@@ -180,7 +177,7 @@ def build_problem(
         frame_rate=frame_rate,
         ground_height=ground_height,
         gravity=gravity,
-        initial_velocity=velocity,
+        initial_velocity=initial_velocity(observation, object_node, frame_rate),
         cloud=cloud,
         is_observed=is_observed,
         track=torch.from_numpy(np.asarray(observation.point[:frame_count, kept], np.float32)),
@@ -191,24 +188,22 @@ def build_problem(
     )
 
 
-def _initial_velocity(
-    observation: ObjectObservation,
-    kept: ndarray,
-    object_node: Float[ndarray, "node 3"],
-    frame_rate: float,
+def initial_velocity(
+    observation: ObjectObservation, object_node: Float[ndarray, "node 3"], frame_rate: float
 ) -> Float[ndarray, "node 3"]:
-    """Spread the identified points' velocity between the first two frames over all nodes.
+    """Estimate how fast the object moves at frame 0 [m/s].
 
-    Only frames 0 and 1 are read, so a prediction that starts at frame 0 knows its initial state and
-    nothing of what follows.
+    Identified points' velocity between the first two frames is spread over all nodes; without
+    identified points the object is taken to be at rest. Only frames 0 and 1 are read, so a prediction
+    that starts at frame 0 knows its initial state and nothing of what follows.
     """
-    nodes = np.asarray(observation.node_of_track)[kept]
-    seen = observation.is_visible[:2, kept].all(axis=0)
-    if not seen.any():
-        return np.zeros_like(object_node, dtype=np.float32)
-    moved = (observation.point[1, kept] - observation.point[0, kept])[seen] * frame_rate
+    seen = observation.is_visible[:2].all(axis=0)
+    if observation.node_of_track is None or not seen.any():
+        return np.zeros(object_node.shape, np.float32)
+    moved = (observation.point[1] - observation.point[0])[seen] * frame_rate
     count = min(2, int(seen.sum()))
-    distance, near = cKDTree(object_node[nodes[seen]]).query(object_node, k=count)
+    source = object_node[np.asarray(observation.node_of_track)[seen]]
+    distance, near = cKDTree(source).query(object_node, k=count)
     distance, near = np.reshape(distance, (-1, count)), np.reshape(near, (-1, count))
     weight = 1.0 / (distance + 1e-6)
     weight /= weight.sum(axis=1, keepdims=True)

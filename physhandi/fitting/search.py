@@ -117,7 +117,7 @@ def search_parameters(
     options = {"bounds": [0, 1], "seed": config.seed, "verbose": -9, "verb_log": 0}
     if config.population is not None:
         options["popsize"] = config.population
-    first = [config.variables[name].to_unit(getattr(start, name)) for name in names]
+    first = np.array([config.variables[name].to_unit(getattr(start, name)) for name in names])
     # Exactly on a bound CMA's transform has no slope, so a start there could never leave it.
     strategy = cma.CMAEvolutionStrategy(np.clip(first, 0.02, 0.98), config.sigma, options)
     evaluations = 1

@@ -1,0 +1,101 @@
+"""Simulate a fitted object again: with other parameters, or moved by the hands of another sequence."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from physhandi.data.run import Run
+from physhandi.data.sequence import Sequence
+from physhandi.errors import RunError
+from physhandi.fitting import artefacts
+from physhandi.fitting.artefacts import OutputFolder
+from physhandi.fitting.hand_reconstruction import reconstruct_hands
+from physhandi.fitting.object_problem import initial_velocity
+from physhandi.fitting.profile import config_from_dict
+from physhandi.fitting.rollouts import control_trajectory_of, object_nodes_of, simulate_sequence
+from physhandi.perception.lifting import observe_object
+from physhandi.progress import Progress
+from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.topology import retopologize
+
+
+def simulate_again(
+    source: Run,
+    sequence: Sequence,
+    changes: dict[str, float],
+    output: OutputFolder,
+    progress: Progress,
+    *,
+    device: str,
+) -> None:
+    """Roll a fitted object out in a sequence and store the motion.
+
+    Springs that the new topology shares with the fitted one keep their fitted stiffness and damping
+    relative to the global values.
+
+    Args:
+        source: A finished run with an object.
+        sequence: One of the run's sequences, or another one of the same object.
+        changes: New values of simulation parameters.
+        output: Where the motion goes.
+        progress: Told about every frame.
+        device: Warp device.
+
+    Raises:
+        RunError: If the run holds no fitted object.
+        UsageError: If a parameter is unknown or out of bounds.
+        SimulationDivergedError: If the motion runs away.
+    """
+    if not (source.out / "object/material.safetensors").is_file():
+        raise RunError(f"Run '{source.id}' holds no fitted object, so there is nothing to simulate.")
+    fitted = artefacts.load_parameters(source.out)
+    parameters = SimulationParameters.from_dict(fitted.to_dict() | changes)
+    first = source.sequence_names[0]
+    is_known = sequence.name in source.sequence_names
+    name = sequence.name if is_known else first
+    model = artefacts.load_model(source.out, name)
+    rest_node = artefacts.load_rest_node(source.out)
+    artefacts.save_sequence_meta(output, sequence)
+    if is_known:
+        control = _copy_known(source, sequence.name, output)
+    else:
+        control, node, velocity = _prepare(source, sequence, output, (model.object_node, rest_node), progress)
+        model = replace(model, object_node=node, initial_velocity=velocity)
+    model = retopologize(model, parameters, control[0], fitted=fitted, rest_node=rest_node)
+    output.save_array(f"{artefacts.sequence_folder(sequence.name)}/control.npy", control)
+    artefacts.save_model(output, sequence.name, model)
+    artefacts.save_object(output, parameters, model, rest_node)
+    simulate_sequence(output, sequence, device=device, progress=progress)
+
+
+def _copy_known(source: Run, name: str, output: OutputFolder) -> np.ndarray:
+    """Take over what the source run already found out about one of its sequences."""
+    artefacts.save_observation(output, name, artefacts.load_observation(source.out, name))
+    artefacts.save_motions(output, name, artefacts.load_motions(source.out, name))
+    artefacts.save_hand_vertices(output, name)
+    return np.load(source.out / artefacts.sequence_folder(name) / "control.npy", allow_pickle=False)
+
+
+def _prepare(
+    source: Run,
+    sequence: Sequence,
+    output: OutputFolder,
+    template: tuple[np.ndarray, np.ndarray],
+    progress: Progress,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Reconstruct the hands of another sequence and lay the known object into it."""
+    while source.kind == "simulation":
+        source = Run.open(Path(source.config["source"]))
+    config = config_from_dict(source.config["profile"])
+    motions = ()
+    if sequence.hands:
+        fit = reconstruct_hands(sequence, config.hand, progress)
+        motions = fit.motions
+        artefacts.save_motions(output, sequence.name, motions)
+        artefacts.save_hand_vertices(output, sequence.name)
+    observation = observe_object(sequence, progress)
+    artefacts.save_observation(output, sequence.name, observation)
+    node, _ = object_nodes_of(sequence, observation, config.node_spacing, template)
+    velocity = initial_velocity(observation, node, sequence.frame_rate)
+    return control_trajectory_of(sequence, motions, config), node, velocity

@@ -1,0 +1,70 @@
+"""Loss terms against hand-computed cases and brute force in float64."""
+
+import numpy as np
+import pytest
+import torch
+
+from physhandi.fitting.losses import acceleration_loss, chamfer_loss, track_loss
+
+
+def test_chamfer_is_one_way_and_squared() -> None:
+    observed = torch.tensor([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [9.0, 9.0, 9.0]]])
+    real = torch.tensor([[True, True, False]])
+    # A node far from every observation costs nothing: (0.2² + 0.3²) / 2.
+    node = torch.tensor([[[0.0, 0.2, 0.0], [1.0, 0.0, 0.3], [5.0, 5.0, 5.0]]])
+    assert chamfer_loss(observed, real, node).tolist() == pytest.approx([0.065])
+
+
+def test_chamfer_gradient_pulls_only_the_nearest_node() -> None:
+    observed = torch.zeros(1, 1, 3)
+    node = torch.tensor([[[0.1, 0.0, 0.0], [0.5, 0.0, 0.0]]], requires_grad=True)
+    chamfer_loss(observed, torch.ones(1, 1, dtype=torch.bool), node).sum().backward()
+    assert node.grad is not None
+    assert node.grad[0, :, 0].tolist() == pytest.approx([0.2, 0.0])
+
+
+def test_frozen_count_replaces_the_number_of_points() -> None:
+    observed = torch.zeros(1, 2, 3)
+    node = torch.tensor([[[0.2, 0.0, 0.0]]])
+    real = torch.ones(1, 2, dtype=torch.bool)
+    assert chamfer_loss(observed, real, node, count=torch.tensor([8.0])).item() == pytest.approx(0.01)
+
+
+def test_track_loss_ignores_what_cannot_be_trusted() -> None:
+    observed = torch.tensor([[[0.3, 0.0, 0.0], [float("nan")] * 3]])
+    predicted = torch.zeros(1, 2, 3)
+    valid = torch.tensor([[True, False]])
+    assert track_loss(observed, valid, predicted).tolist() == pytest.approx([0.09])
+    assert track_loss(observed, torch.zeros_like(valid), predicted).tolist() == [0.0]
+
+
+def test_six_track_losses_are_one_of_phystwin() -> None:
+    difference = torch.tensor([[[0.1, 0.2, -0.1]]])
+    theirs = torch.nn.functional.smooth_l1_loss(difference, torch.zeros_like(difference)).item()
+    ours = track_loss(difference, torch.ones(1, 1, dtype=torch.bool), torch.zeros_like(difference))
+    assert ours.item() / 6 == pytest.approx(theirs)
+    assert theirs == pytest.approx(0.01)
+
+
+def test_acceleration_loss_sees_a_jerk_and_no_steady_push() -> None:
+    steady = torch.arange(5.0)[:, None, None].expand(5, 2, 3)
+    assert acceleration_loss(steady).tolist() == [0.0] * 5
+    kick = steady.clone()
+    kick[3:] += 1.0
+    # The change of velocity grows by 1 and falls back by 1: smooth L1 of 1 is 0.5, twice.
+    assert acceleration_loss(kick).tolist() == pytest.approx([0.0, 0.0, 0.0, 0.5, 0.5])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_chamfer_equals_brute_force(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    observed, node = random.normal(size=(2, 7, 3)), random.normal(size=(2, 5, 3))
+    real = random.random((2, 7)) < 0.7
+    expected = [
+        np.mean([min(np.sum((o - n) ** 2) for n in node[f]) for o in observed[f][real[f]]])
+        for f in range(2)
+    ]
+    loss = chamfer_loss(
+        torch.from_numpy(observed).float(), torch.from_numpy(real), torch.from_numpy(node).float()
+    )
+    assert loss.tolist() == pytest.approx(expected, rel=1e-4)
