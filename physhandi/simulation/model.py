@@ -119,8 +119,10 @@ class SimulationParameters:
 
 def _converted(name: str, value: Any) -> Any:
     """Return a value in the type of its field."""
-    if value is None and name == "ground_height":
-        return None
+    if value is None:
+        if name == "ground_height":
+            return None
+        raise UsageError(f"Simulation parameter {name} is empty; expected a value.")
     if name == "use_control_velocity":
         if not isinstance(value, bool | np.bool_):
             raise UsageError(f"Simulation parameter {name} is {value!r}; expected true or false.")
@@ -231,5 +233,5 @@ class SpringMassModel:
                 f"got {', '.join(sorted(tensors))}."
             )
         counts = {name: int(tensors[name][0]) for name in ("object_spring_count", "control_count")}
-        arrays = {name: np.asarray(tensors[name]) for name in names - counts.keys()}
-        return cls(**arrays, **counts)
+        arrays: dict[str, Any] = {name: np.asarray(tensors[name]) for name in names - counts.keys()}
+        return cls(**(arrays | counts))

@@ -1,5 +1,6 @@
 """Semi-implicit Euler rollouts of a spring-mass model; one graph replay a frame."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -22,6 +23,7 @@ wp.config.log_level = wp.LOG_WARNING
 SPEED_LIMIT = 50.0
 """A node faster than this has diverged [m/s]."""
 _NO_DIVERGENCE = np.iinfo(np.int32).max
+_WORLD: Any = World
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ class Simulator:
         self.rest_length = self.array(model.rest_length, wp.float32)
         self.stiffness = self.array(model.stiffness, wp.float32)
         self.damping = self.array(model.damping, wp.float32)
-        self.world = wp.zeros(1, dtype=World, device=self.device)
+        self.world = wp.zeros(1, dtype=_WORLD, device=self.device)
         self.position = self.array(model.object_node, wp.vec3)
         self.velocity = self.array(model.initial_velocity, wp.vec3)
         self.control_start = wp.zeros(model.control_count, dtype=wp.vec3, device=self.device)
@@ -93,19 +95,23 @@ class Simulator:
                 "frame_rate and substeps_per_frame are fixed in a simulator; build a new one."
             )
         self.parameters = parameters
-        has_ground = parameters.ground_height is not None
-        values = np.zeros(1, dtype=World.numpy_dtype())
-        values["dt"] = parameters.dt
-        values["velocity_decay"] = np.exp(-parameters.dt * parameters.drag)
-        values["gravity"] = parameters.gravity
-        values["has_ground"] = has_ground
-        values["ground_height"] = parameters.ground_height if has_ground else 0.0
-        values["restitution"] = parameters.restitution
-        values["friction"] = parameters.friction
-        values["stiffness_scale"] = parameters.stiffness_scale
-        values["control_rate"] = parameters.frame_rate if parameters.use_control_velocity else 0.0
-        values["speed_limit"] = SPEED_LIMIT
-        self.world.assign(values)
+        height = parameters.ground_height
+        values: dict[str, float] = {
+            "dt": parameters.dt,
+            "velocity_loss": -math.expm1(-parameters.dt * parameters.drag),
+            "gravity": parameters.gravity,
+            "has_ground": height is not None,
+            "ground_height": 0.0 if height is None else height,
+            "restitution": parameters.restitution,
+            "friction": parameters.friction,
+            "stiffness_scale": parameters.stiffness_scale,
+            "control_rate": parameters.frame_rate if parameters.use_control_velocity else 0.0,
+            "speed_limit": SPEED_LIMIT,
+        }
+        world: Any = np.zeros(1, dtype=_WORLD.numpy_dtype())
+        for name, value in values.items():
+            world[name] = value
+        self.world.assign(world)
 
     def set_material(
         self,

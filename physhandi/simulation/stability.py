@@ -5,7 +5,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from scipy.sparse import csr_matrix
+from scipy.sparse import csr_array
 
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
 
@@ -39,7 +39,7 @@ def largest_stable_step(
     damping = model.damping.astype(np.float64)[spring]
     if not np.any(stiffness > 0.0) and not np.any(damping > 0.0):
         return math.inf
-    mode = np.random.default_rng(0).standard_normal(stretch.shape[1])
+    mode = np.random.default_rng(0).standard_normal(3 * model.node_count)
     mode /= np.linalg.norm(mode)
     step = math.inf
     for _ in range(_POWER_ITERATIONS):
@@ -110,7 +110,7 @@ def _critical_step(stiffness: float, damping: float) -> float:
     return 4.0 / (damping + math.sqrt(damping * damping + 4.0 * stiffness))
 
 
-def _stretch_matrix(model: SpringMassModel, control: ndarray | None) -> tuple[csr_matrix, ndarray]:
+def _stretch_matrix(model: SpringMassModel, control: ndarray | None) -> tuple[csr_array, ndarray]:
     """Map node motion to spring stretch; also return which spring each row belongs to."""
     count = model.node_count
     first, second = model.spring_nodes[: model.object_spring_count].T
@@ -137,7 +137,7 @@ def _stretch_matrix(model: SpringMassModel, control: ndarray | None) -> tuple[cs
         [(3 * np.asarray(nodes)[:, None] + np.arange(3)).ravel() for _, nodes, _ in blocks]
     )
     values = np.concatenate([np.ravel(value) for _, _, value in blocks])
-    return csr_matrix((values, (rows, columns)), shape=(len(spring), 3 * count)), spring
+    return csr_array((values, (rows, columns)), shape=(len(spring), 3 * count)), spring
 
 
 def _unit(offset: ndarray) -> ndarray:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Int32
 from numpy import ndarray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
 
@@ -39,7 +39,7 @@ def object_springs(
     if max_neighbors < 1 or node_count < 2:
         return _no_springs()
     neighbor_count = min(max_neighbors + 1, node_count)
-    distance, neighbor = cKDTree(node).query(node, k=neighbor_count)
+    distance, neighbor = (np.asarray(found) for found in KDTree(node).query(node, k=neighbor_count))
     own = np.arange(node_count)[:, None]
     is_other = neighbor != own
     # Of duplicated positions the node itself may rank behind its twins, or fall out.
@@ -73,9 +73,9 @@ def virtual_springs(
     if max_neighbors < 1 or len(node) == 0 or len(control) == 0:
         return _no_springs()
     count = min(max_neighbors, len(node))
-    distance, neighbor = cKDTree(node).query(control, k=count)
-    distance = distance.reshape(len(control), count)
-    neighbor = neighbor.reshape(len(control), count)
+    distance, neighbor = (
+        np.reshape(found, (len(control), count)) for found in KDTree(node).query(control, k=count)
+    )
     is_kept = distance < radius
     control_index = np.broadcast_to(np.arange(len(control))[:, None], neighbor.shape)[is_kept]
     object_index = neighbor[is_kept]

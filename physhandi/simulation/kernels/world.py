@@ -8,7 +8,8 @@ class World:
     """Global parameters of one simulation; one element of an array on the device."""
 
     dt: wp.float32
-    velocity_decay: wp.float32
+    velocity_loss: wp.float32
+    """Part of the velocity that drag takes in one substep, 1 - exp(-dt drag)."""
     gravity: wp.float32
     has_ground: wp.int32
     ground_height: wp.float32
