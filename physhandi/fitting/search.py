@@ -1,6 +1,7 @@
 """The zeroth-order stage: search the few global parameters that no gradient reaches."""
 
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
@@ -100,7 +101,10 @@ def search_parameters(
     Raises:
         FitError: If every candidate diverges.
     """
-    import cma
+    with warnings.catch_warnings():
+        # It only misses matplotlib, whose plots are not used.
+        warnings.filterwarnings("ignore", message="Could not import matplotlib")
+        import cma
 
     names = list(config.variables)
     loss_before = evaluate(start)
@@ -117,7 +121,7 @@ def search_parameters(
     options = {"bounds": [0, 1], "seed": config.seed, "verbose": -9, "verb_log": 0}
     if config.population is not None:
         options["popsize"] = config.population
-    first = np.array([config.variables[name].to_unit(getattr(start, name)) for name in names])
+    first = np.array([config.variables[name].to_unit(float(getattr(start, name))) for name in names])
     # Exactly on a bound CMA's transform has no slope, so a start there could never leave it.
     strategy = cma.CMAEvolutionStrategy(np.clip(first, 0.02, 0.98), config.sigma, options)
     evaluations = 1
