@@ -26,8 +26,8 @@ class ObjectProblem:
     """Object nodes at frame 0 [m]."""
     rest_node: Float[ndarray, "node 3"]
     """The object's rest shape, which gives topology and rest lengths [m]."""
-    control: Float[ndarray, "frame control 3"]
-    """Positions of the control nodes [m]."""
+    control: Float[ndarray, "all_frame control 3"]
+    """Positions of the control nodes, also in frames that are not fitted [m]."""
     frame_rate: float
     """Frames a second [Hz]."""
     ground_height: float | None

@@ -1,0 +1,87 @@
+"""How observations are attached to nodes."""
+
+import numpy as np
+import pytest
+import torch
+
+from physhandi.data.observation import ObjectObservation
+from physhandi.errors import FitError
+from physhandi.fitting.object_problem import ObjectProblem, build_problem, initial_velocity
+
+NODE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0.5, 0.5, 1]], np.float32)
+
+
+def observe(point: np.ndarray, **more: object) -> ObjectObservation:
+    visible = np.isfinite(point).all(axis=2)
+    valid = visible.copy()
+    valid[0] = False
+    return ObjectObservation(
+        point=point.astype(np.float32), is_visible=visible, is_motion_valid=valid, **more
+    )
+
+
+def problem(observation: ObjectObservation, **more: object) -> ObjectProblem:
+    settings = {
+        "name": "made_up",
+        "object_node": NODE,
+        "rest_node": NODE,
+        "control": np.zeros((4, 1, 3), np.float32),
+        "frame_count": 3,
+        "frame_rate": 30.0,
+        "ground_height": 0.0,
+        "gravity": 9.81,
+    }
+    return build_problem(observation=observation, **(settings | more))
+
+
+def test_tracks_stay_on_the_surface_that_carries_them() -> None:
+    track = np.repeat(np.array([[[0.2, 0.1, 0.05], [0.9, 0.8, 0.0]]]), 4, axis=0)
+    moved = problem(observe(track))
+    shift = torch.tensor([0.0, 0.3, -0.2])
+    node = torch.from_numpy(NODE)[None] + shift
+    expected = torch.from_numpy(track[:1].astype(np.float32)) + shift
+    torch.testing.assert_close(moved.predict_tracks(node), expected)
+    losses = moved.frame_losses(node, track_weight=1.0)
+    # Every track is off by |shift|² = 0.13; there is no cloud.
+    assert losses.tolist() == pytest.approx([0.13])
+
+
+def test_identified_tracks_are_their_nodes() -> None:
+    track = np.repeat(NODE[None, [3, 1]], 4, axis=0) + 0.01
+    node_of_track = np.array([3, 1], np.int32)
+    carried = problem(observe(track, node_of_track=node_of_track))
+    node = torch.arange(15.0).reshape(1, 5, 3)
+    assert carried.predict_tracks(node)[0].tolist() == [[9, 10, 11], [3, 4, 5]]
+
+
+def test_frames_to_predict_are_never_looked_at() -> None:
+    track = np.repeat(NODE[None], 4, axis=0).copy()
+    changed = track.copy()
+    changed[3] += 7.0
+    first, second = problem(observe(track)), problem(observe(changed))
+    assert first.frame_count == 3
+    assert torch.equal(first.track, second.track)
+
+
+def test_clouds_are_padded_and_thinned() -> None:
+    track = np.full((4, 1, 3), np.nan)
+    clouds = (np.zeros((0, 3)), np.full((7, 3), 0.5), np.ones((500, 3)), np.ones((9, 3)))
+    padded = problem(observe(track, cloud=clouds), cloud_points=50)
+    assert padded.is_observed.sum(dim=1).tolist() == [0, 7, 50]
+    node = torch.full((2, 1, 3), 1.0)
+    assert padded.frame_losses(node).tolist() == pytest.approx([0.75, 0.0])
+
+
+def test_an_object_that_is_never_seen_is_an_error() -> None:
+    with pytest.raises(FitError, match="made_up.*no frame"):
+        problem(observe(np.full((4, 2, 3), np.nan)))
+
+
+def test_initial_velocity_reads_two_frames_only() -> None:
+    track = np.repeat(NODE[None], 4, axis=0).astype(float)
+    track[1, :, 0] += 0.1
+    track[2:] += 50.0
+    node_of_track = np.arange(5, dtype=np.int32)
+    velocity = initial_velocity(observe(track, node_of_track=node_of_track), NODE, 30.0)
+    np.testing.assert_allclose(velocity, np.tile([3.0, 0.0, 0.0], (5, 1)), atol=1e-4)
+    assert not initial_velocity(observe(track), NODE, 30.0).any()
