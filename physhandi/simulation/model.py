@@ -232,6 +232,7 @@ class SpringMassModel:
                 f"A spring-mass model needs the arrays {', '.join(sorted(names))}; "
                 f"got {', '.join(sorted(tensors))}."
             )
-        counts = {name: int(tensors[name][0]) for name in ("object_spring_count", "control_count")}
-        arrays: dict[str, Any] = {name: np.asarray(tensors[name]) for name in names - counts.keys()}
-        return cls(**(arrays | counts))
+        values: dict[str, Any] = {name: np.asarray(tensors[name]) for name in names}
+        for name in ("object_spring_count", "control_count"):
+            values[name] = int(values[name][0])
+        return cls(**values)

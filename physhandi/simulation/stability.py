@@ -45,7 +45,7 @@ def largest_stable_step(
     for _ in range(_POWER_ITERATIONS):
         strain = stretch @ mode
         squared = strain * strain
-        previous, step = step, _critical_step(squared @ stiffness, squared @ damping)
+        previous, step = step, _critical_step(float(squared @ stiffness), float(squared @ damping))
         if abs(step - previous) <= _POWER_TOLERANCE * step:
             break
         mode = stretch.T @ ((step * stiffness + 2.0 * damping) * strain)
