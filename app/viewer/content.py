@@ -1,0 +1,197 @@
+"""What a session shows: hands, object, observation and cameras of one sequence."""
+
+import logging
+from collections.abc import Sequence as Listing
+from dataclasses import dataclass, field
+from typing import Literal, Protocol
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from app.viewer.observed import DepthCloud, Observed, PointSet
+from app.viewer.skeleton import lift_keypoints
+from app.viewer.take import Take
+from physhandi.data.run import Run
+from physhandi.data.sequence import Sequence
+from physhandi.data.view import View
+from physhandi.errors import MissingInputError, PhysHandiError
+from physhandi.simulation.model import SimulationParameters, SpringMassModel
+
+logger = logging.getLogger(__name__)
+
+
+class Catalog(Protocol):
+    """Finds runs and sequences by their ids."""
+
+    def run(self, run_id: str, /) -> Run:
+        """Open a run."""
+        ...
+
+    def sequence(self, sequence_id: str, /) -> Sequence:
+        """Open a sequence."""
+        ...
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class HandSurface:
+    """The moving surface of one hand."""
+
+    side: Literal["right", "left"]
+    """``"right"`` or ``"left"``."""
+    vertex: Float[ndarray, "frame vertex 3"]
+    """Vertex positions [m]."""
+    face: Int[ndarray, "face 3"] | None
+    """Triangles, or None if they are not known (points are shown)."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Content:
+    """Everything that can be shown of one sequence, with or without a run."""
+
+    title: str
+    """Name of the run or the sequence."""
+    sequence_name: str
+    """Name of the sequence."""
+    frame_count: int
+    """Number of frames."""
+    frame_rate: float
+    """Frames per second [Hz]."""
+    reconstruction_count: int
+    """Number of frames that were fitted; the later ones are predicted."""
+    length_unit: str
+    """Unit of all lengths, ``"m"`` if metric."""
+    ground_height: float | None
+    """Height of the ground [m]; None if there is none."""
+    hands: tuple[HandSurface, ...] = ()
+    """Reconstructed hands."""
+    skeletons: tuple[Float[ndarray, "frame keypoint 3"], ...] = ()
+    """Hand keypoints lifted from the views, if there are no reconstructed hands."""
+    control: Float[ndarray, "frame control 3"] | None = None
+    """Control nodes [m]."""
+    fitted: Take | None = None
+    """The object's fitted rollout."""
+    observed: Observed | None = None
+    """What the cameras or markers saw."""
+    views: Listing[View] = field(default_factory=tuple)
+    """The recording's views."""
+
+    @property
+    def is_metric(self) -> bool:
+        """Whether lengths are metres."""
+        return self.length_unit == "m"
+
+
+def open_run(catalog: Catalog, run_id: str, sequence_name: str | None = None) -> Content:
+    """Collect what a run has found out about one of its sequences.
+
+    Args:
+        catalog: Finds the run, and the recording behind it.
+        run_id: The run.
+        sequence_name: One of the run's sequences; None for the first.
+
+    Raises:
+        MissingInputError: If the run has no result for that sequence yet.
+    """
+    run = catalog.run(run_id)
+    name = sequence_name or run.sequence_names[0]
+    folder = f"sequences/{name}"
+    if not run.has(f"{folder}/meta.yaml"):
+        raise MissingInputError(
+            f"Run '{run.name}' has no result for sequence '{name}' yet ({folder}/meta.yaml is "
+            "missing). Open it when its first stage is finished."
+        )
+    meta = run.yaml(f"{folder}/meta.yaml")
+    sequence = _recording(catalog, name)
+    control = run.array(f"{folder}/control.npy") if run.has(f"{folder}/control.npy") else None
+    return Content(
+        title=run.name,
+        sequence_name=name,
+        frame_count=int(meta["frame_count"]),
+        frame_rate=float(meta["frame_rate"]),
+        reconstruction_count=int(meta.get("reconstruction_frames", meta["frame_count"])),
+        length_unit="m" if meta.get("metric", True) else str(meta.get("length_unit", "units")),
+        ground_height=meta.get("ground_height"),
+        hands=_hands(run, folder),
+        control=control,
+        fitted=load_fitted(run, name),
+        observed=_run_observation(run, folder) or (_observation(sequence) if sequence else None),
+        views=sequence.views if sequence else (),
+    )
+
+
+def open_sequence(catalog: Catalog, sequence_id: str) -> Content:
+    """Collect what a recording shows before anything is fitted to it."""
+    sequence = catalog.sequence(sequence_id)
+    return Content(
+        title=sequence.name,
+        sequence_name=sequence.name,
+        frame_count=sequence.frame_count,
+        frame_rate=sequence.frame_rate,
+        reconstruction_count=len(sequence.reconstruction_frames),
+        length_unit="m" if sequence.metric else sequence.length_unit,
+        ground_height=sequence.ground_height,
+        skeletons=lift_keypoints(sequence.views),
+        control=sequence.control,
+        observed=_observation(sequence),
+        views=sequence.views,
+    )
+
+
+def load_fitted(run: Run, sequence_name: str) -> Take | None:
+    """Load the fitted rollout of a run with its model; None if the run has no object."""
+    folder = f"sequences/{sequence_name}"
+    needed = (f"{folder}/rollout.npy", f"{folder}/control.npy", f"{folder}/model.safetensors")
+    if not all(run.has(name) for name in needed):
+        return None
+    position = run.array(needed[0])
+    return Take(
+        model=SpringMassModel.from_tensors(run.tensors(needed[2])),
+        parameters=SimulationParameters.from_dict(run.yaml("object/parameters.yaml")),
+        control=run.array(needed[1])[: len(position)],
+        position=position,
+        ready=len(position),
+    )
+
+
+def _recording(catalog: Catalog, name: str) -> Sequence | None:
+    try:
+        return catalog.sequence(name)
+    except PhysHandiError as error:
+        logger.info("the recording behind the run is not shown: %s", error)
+        return None
+
+
+def _hands(run: Run, folder: str) -> tuple[HandSurface, ...]:
+    hands: list[HandSurface] = []
+    sides: tuple[Literal["right", "left"], ...] = ("right", "left")
+    for side in sides:
+        if run.has(f"{folder}/hand_{side}_vertex.npy"):
+            vertex = run.array(f"{folder}/hand_{side}_vertex.npy")
+            hands.append(HandSurface(side=side, vertex=vertex, face=_faces(side, vertex.shape[1])))
+    return tuple(hands)
+
+
+def _faces(side: Literal["right", "left"], vertex_count: int) -> Int[ndarray, "face 3"] | None:
+    from physhandi.hand.model import load_hand_model
+
+    model = load_hand_model(side)
+    if model.vertex_count != vertex_count:
+        logger.info("the %s hand has %d vertices; shown as points", side, vertex_count)
+        return None
+    return np.asarray(model.faces, dtype=np.int32)
+
+
+def _run_observation(run: Run, folder: str) -> Observed | None:
+    files = (f"{folder}/observation/point.npy", f"{folder}/observation/is_visible.npy")
+    if not all(run.has(name) for name in files):
+        return None
+    return PointSet(run.array(files[0]), run.array(files[1]))
+
+
+def _observation(sequence: Sequence) -> Observed | None:
+    if sequence.marker is not None:
+        return PointSet(sequence.marker, np.asarray(np.isfinite(sequence.marker).all(axis=-1)))
+    if any(view.has_depth for view in sequence.views):
+        return DepthCloud(sequence.views)
+    return None

@@ -1,0 +1,169 @@
+"""Downloads: picture, geometry, rollout and parameters of what is on the screen."""
+
+import csv
+import io
+import re
+from typing import Any
+
+import cv2
+import numpy as np
+import viser
+import yaml
+
+from app.viewer.content import Content
+from app.viewer.guard import Guard, notify
+from app.viewer.take import Take
+from physhandi.errors import MissingInputError
+
+_GEOMETRY = ("PNG", "PLY")
+_NUMBERS = ("NPZ", "CSV", "YAML")
+_RENDER_SECONDS = 20.0
+_MAX_SIDE = 2_160
+
+
+class Snapshot:
+    """What is on the screen now, for the export panel."""
+
+    def __init__(self, content: Content, frame: int, take: Take | None, take_frame: int) -> None:
+        self.content = content
+        self.frame = frame
+        self.take = take
+        self.take_frame = take_frame
+
+
+class ExportPanel:
+    """Buttons that send files to the client who clicked."""
+
+    def __init__(self, server: viser.ViserServer, guard: Guard, snapshot: Any) -> None:
+        """Add the panel.
+
+        Args:
+            server: Where to.
+            guard: Wraps the callbacks.
+            snapshot: Function without arguments that returns the `Snapshot` of now.
+        """
+        self._snapshot = snapshot
+        with server.gui.add_folder("Export", expand_by_default=False):
+            for label, options, hint in (
+                ("Frame", _GEOMETRY, "Picture of this view, or points of this frame"),
+                ("Rollout", _NUMBERS, "All simulated frames, node means a frame, parameters"),
+            ):
+                buttons = server.gui.add_button_group(label, options, hint=hint)
+                buttons.on_click(guard(self._press))
+
+    def _press(self, event: Any) -> None:
+        snapshot: Snapshot = self._snapshot()
+        kind, client = event.target.value, event.client
+        stem = re.sub(r"[^A-Za-z0-9_-]+", "_", snapshot.content.title)[:60] or "physhandi"
+        make = {"PLY": write_ply, "NPZ": write_npz, "CSV": write_csv, "YAML": write_yaml}
+        content = write_png(client) if kind == "PNG" else make[kind](snapshot)
+        name = f"{stem}_{snapshot.frame:05d}" if kind in _GEOMETRY else stem
+        client.send_file_download(f"{name}.{kind.lower()}", content, save_immediately=True)
+        notify(client, "Saved", f"{name}.{kind.lower()}, {len(content) / 1e3:.0f} kB", color="blue")
+
+
+def write_png(client: viser.ClientHandle) -> bytes:
+    """Render what a client sees."""
+    camera = client.camera
+    scale = min(1.0, _MAX_SIDE / max(camera.image_height, camera.image_width, 1))
+    image = client.get_render(
+        height=max(int(camera.image_height * scale), 1),
+        width=max(int(camera.image_width * scale), 1),
+        transport_format="png",
+        timeout=_RENDER_SECONDS,
+    )
+    order = cv2.COLOR_RGBA2BGRA if image.shape[-1] == 4 else cv2.COLOR_RGB2BGR
+    is_written, content = cv2.imencode(".png", cv2.cvtColor(image, order))
+    if not is_written:
+        raise RuntimeError("the picture could not be encoded")
+    return content.tobytes()
+
+
+def write_ply(snapshot: Snapshot) -> bytes:
+    """Write object nodes, control nodes and hand vertices of the frame as colored points."""
+    content, frame = snapshot.content, snapshot.frame
+    parts: list[tuple[Any, tuple[int, int, int]]] = []
+    if snapshot.take is not None:
+        parts.append((snapshot.take.position[snapshot.take_frame], (47, 111, 222)))
+    if content.control is not None:
+        parts.append((content.control[frame], (214, 39, 40)))
+    if not parts and content.hands:
+        parts = [(hand.vertex[frame], (224, 172, 140)) for hand in content.hands]
+    if not parts and content.observed is not None:
+        parts.append((content.observed.points(frame), (46, 160, 67)))
+    if not parts:
+        raise MissingInputError("This frame shows no geometry to save.")
+    kind = [
+        ("x", "<f4"),
+        ("y", "<f4"),
+        ("z", "<f4"),
+        ("red", "u1"),
+        ("green", "u1"),
+        ("blue", "u1"),
+    ]
+    rows = np.zeros(sum(len(point) for point, _ in parts), dtype=kind)
+    start = 0
+    for point, color in parts:
+        row = rows[start : start + len(point)]
+        for axis, name in enumerate("xyz"):
+            row[name] = np.asarray(point)[:, axis]
+        row["red"], row["green"], row["blue"] = color
+        start += len(point)
+    header = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n"
+        + "".join(f"property float {name}\n" for name in "xyz")
+        + "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
+        + "end_header\n"
+    )
+    return header.encode() + rows.tobytes()
+
+
+def write_npz(snapshot: Snapshot) -> bytes:
+    """Write all frames: rollout, springs and controls, as they are on the screen."""
+    take, content = snapshot.take, snapshot.content
+    arrays: dict[str, Any] = {}
+    if take is not None:
+        arrays = {
+            "position": take.position[: take.ready],
+            "control": take.control[: take.ready],
+            "spring_nodes": take.model.spring_nodes,
+            "rest_length": take.model.rest_length,
+            "stiffness": take.model.stiffness,
+            "object_spring_count": np.int64(take.model.object_spring_count),
+        }
+    elif content.control is not None:
+        arrays["control"] = content.control
+    for hand in content.hands:
+        arrays[f"hand_{hand.side}_vertex"] = hand.vertex
+    if not arrays:
+        raise MissingInputError("There is no rollout to save; this is a recording only.")
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **arrays)
+    return stream.getvalue()
+
+
+def write_csv(snapshot: Snapshot) -> bytes:
+    """Write a table with one row a frame: mean position and force, largest speed."""
+    take = _take(snapshot)
+    stream = io.StringIO()
+    table = csv.writer(stream)
+    table.writerow(
+        ["frame", "time_s", "mean_x", "mean_y", "mean_z", "force_x", "force_y", "force_z"]
+    )
+    for frame in range(take.ready):
+        mean = np.asarray(take.position[frame]).mean(axis=0)
+        force = take.forces(frame).sum(axis=0)
+        seconds = frame / take.parameters.frame_rate
+        table.writerow([frame, f"{seconds:.6g}", *(f"{v:.6g}" for v in (*mean, *force))])
+    return stream.getvalue().encode()
+
+
+def write_yaml(snapshot: Snapshot) -> bytes:
+    """Write the parameters of the rollout that is on the screen."""
+    return yaml.safe_dump(_take(snapshot).parameters.to_dict(), sort_keys=False).encode()
+
+
+def _take(snapshot: Snapshot) -> Take:
+    if snapshot.take is None:
+        raise MissingInputError("There is no simulated object here to save.")
+    return snapshot.take

@@ -1,0 +1,93 @@
+"""Where the camera stands at first, and how large points and arrows are drawn."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from app.viewer.content import Content
+
+_SAMPLED_FRAMES = 12
+_SAMPLED_POINTS = 2_000
+_FOV = float(np.deg2rad(45.0))
+_DIRECTION = np.array([0.55, -1.0, 0.55]) / np.linalg.norm([0.55, -1.0, 0.55])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Framing:
+    """Sizes of the scene, in its own unit of length."""
+
+    center: Float[ndarray, " 3"]
+    """Middle of all that moves."""
+    extent: float
+    """Diagonal of the box around all that moves."""
+    low: float
+    """Height of the lowest point."""
+    spacing: float
+    """Typical distance of neighboring object nodes."""
+
+    @property
+    def fov(self) -> float:
+        """Vertical field of view of the camera [rad]."""
+        return _FOV
+
+    @property
+    def look_at(self) -> Float[ndarray, " 3"]:
+        """Where the camera looks: a little to the right, since the panel covers that side."""
+        right = np.cross([0.0, 0.0, 1.0], _DIRECTION)
+        return self.center + 0.1 * self.extent * right / np.linalg.norm(right)
+
+    @property
+    def camera(self) -> Float[ndarray, " 3"]:
+        """Where the camera stands, so that everything fits into the picture."""
+        distance = 0.55 * self.extent / np.tan(0.5 * _FOV)
+        return self.look_at + _DIRECTION * distance
+
+
+def frame_content(content: Content) -> Framing:
+    """Measure what a content needs of the screen.
+
+    Args:
+        content: What is going to be shown.
+    """
+    parts = [part for part in _parts(content) if len(part)]
+    if not parts:
+        views = [view.camera.T_world_camera[:3, 3] for view in content.views]
+        parts = [np.array(views)] if views else [np.array([[-0.5, -0.5, 0.0], [0.5, 0.5, 1.0]])]
+    point = np.concatenate(parts)
+    low, high = np.quantile(point, [0.002, 0.998], axis=0)
+    extent = max(float(np.linalg.norm(high - low)), 1e-6)
+    return Framing(
+        center=(low + high) / 2,
+        extent=extent,
+        low=float(point[:, 2].min()),
+        spacing=_spacing(content, extent),
+    )
+
+
+def _parts(content: Content) -> list[Float[ndarray, "point 3"]]:
+    """Sample points of everything that moves."""
+    frames = np.unique(np.linspace(0, content.frame_count - 1, _SAMPLED_FRAMES).astype(int))
+    tracks = [hand.vertex for hand in content.hands] + list(content.skeletons)
+    if content.control is not None:
+        tracks.append(content.control)
+    if content.fitted is not None:
+        tracks.append(content.fitted.position)
+    parts = [_thin(np.asarray(track[min(f, len(track) - 1)])) for track in tracks for f in frames]
+    if content.observed is not None:
+        parts += [_thin(content.observed.points(int(frame))) for frame in frames[::4]]
+    return parts
+
+
+def _thin(point: Float[ndarray, "point 3"]) -> Float[ndarray, "point 3"]:
+    point = point[np.isfinite(point).all(axis=-1)]
+    return point[:: max(1, len(point) // _SAMPLED_POINTS)]
+
+
+def _spacing(content: Content, extent: float) -> float:
+    if content.fitted is not None and content.fitted.model.object_spring_count > 0:
+        model = content.fitted.model
+        short = float(np.quantile(model.rest_length[: model.object_spring_count], 0.05))
+        return min(max(short, 0.004 * extent), 0.05 * extent)
+    return 0.012 * extent

@@ -1,0 +1,244 @@
+"""The server's side of the live simulation process: starts it, feeds it and hears its answers."""
+
+import logging
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+
+from app.viewer.wire import Message, WireError, receive, send
+from physhandi.simulation.model import SimulationParameters
+
+logger = logging.getLogger(__name__)
+
+Listener = Callable[[Message], None]
+
+_MAX_CRASHES = 5
+_CRASH_WINDOW = 60.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveRequest:
+    """What to simulate."""
+
+    run: Path
+    """Run folder."""
+    sequence: str
+    """One of the run's sequences."""
+    parameters: SimulationParameters
+    """What to simulate it with."""
+    automatic_substeps: bool = False
+    """Whether to use as few substeps as are stable, instead of the parameters' number."""
+
+
+class LiveSimulation:
+    """Owns the live simulation process; one for all sessions.
+
+    Answers reach a session's listener in the thread of this object: messages ``started``,
+    ``frame``, ``finished``, ``diverged``, ``failed`` of the process, and ``crashed`` when the
+    process is gone. After a crash the process is started again, and a request that was cut off
+    is sent once more.
+    """
+
+    def __init__(self, device: str = "cpu") -> None:
+        """Prepare; the process starts with the first listener.
+
+        Args:
+            device: Warp device that the process simulates on.
+        """
+        self._device = device
+        self._lock = threading.Lock()
+        self._wake = threading.Condition(self._lock)
+        self._listeners: dict[str, Listener] = {}
+        self._pending: dict[str, tuple[Message, bool]] = {}
+        self._numbers = count(1)
+        self._connection: socket.socket | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+        self._crashes: deque[float] = deque(maxlen=_MAX_CRASHES)
+        self._is_closed = False
+        self._thread: threading.Thread | None = None
+        self._write_lock = threading.Lock()
+
+    @property
+    def process_id(self) -> int | None:
+        """Process id of the live simulation process; None if it is not running."""
+        process = self._process
+        return process.pid if process is not None and process.poll() is None else None
+
+    def subscribe(self, session: str, listener: Listener) -> None:
+        """Name the listener of a session, and have the process warm up."""
+        with self._lock:
+            self._listeners[session] = listener
+            if self._thread is None:
+                self._thread = threading.Thread(
+                    target=self._supervise, name="live-simulation", daemon=True
+                )
+                self._thread.start()
+
+    def unsubscribe(self, session: str) -> None:
+        """Forget a session and stop what is simulated for it."""
+        with self._lock:
+            self._listeners.pop(session, None)
+            self._pending.pop(session, None)
+        self._send(Message("close", {"session": session}))
+
+    def request(self, session: str, request: LiveRequest) -> int:
+        """Ask for a rollout; an unfinished earlier request of the session is dropped.
+
+        Args:
+            session: A session with a listener.
+            request: What to simulate.
+
+        Returns:
+            Number of the request, which its answers carry.
+        """
+        number = next(self._numbers)
+        message = Message(
+            "simulate",
+            {
+                "session": session,
+                "request": number,
+                "run": str(request.run),
+                "sequence": request.sequence,
+                "parameters": request.parameters.to_dict(),
+                "automatic_substeps": request.automatic_substeps,
+            },
+        )
+        with self._lock:
+            self._pending[session] = (message, True)
+            if self._connection is None:
+                self._crashes.clear()
+            self._wake.notify_all()
+        self._send(message)
+        return number
+
+    def cancel(self, session: str) -> None:
+        """Stop what is being simulated for a session."""
+        with self._lock:
+            self._pending.pop(session, None)
+        self._send(Message("cancel", {"session": session}))
+
+    def close(self) -> None:
+        """End the process."""
+        with self._lock:
+            self._is_closed = True
+            self._wake.notify_all()
+            connection, process = self._connection, self._process
+        if connection is not None:
+            _shut(connection)
+        if process is not None:
+            try:
+                process.wait(timeout=2)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        if self._thread is not None:
+            self._thread.join(timeout=5)
+
+    def _send(self, message: Message) -> None:
+        """Write a message; a broken connection is the supervisor's business."""
+        with self._write_lock:
+            connection = self._connection
+            if connection is not None:
+                try:
+                    send(connection, message)
+                except OSError:
+                    logger.info("the live simulation process is gone; message not sent")
+
+    def _supervise(self) -> None:
+        # The kernel's death signal is tied to the thread that started the process, so the
+        # process must be started by a thread that lives as long as the server: this one.
+        while not self._is_closed:
+            connection = self._spawn()
+            self._resend()
+            try:
+                while (message := receive(connection)) is not None:
+                    self._deliver(message)
+            except (WireError, OSError) as error:
+                logger.warning("the live simulation process broke off: %s", error)
+            self._bury(connection)
+            self._wait_after_crash()
+
+    def _spawn(self) -> socket.socket:
+        ours, theirs = socket.socketpair()
+        with theirs:
+            command = [sys.executable, "-m", "app.viewer.live_process"]
+            arguments = [str(theirs.fileno()), str(os.getpid()), self._device]
+            self._process = subprocess.Popen(
+                [*command, *arguments], pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL
+            )
+        with self._write_lock:
+            self._connection = ours
+        if self._is_closed:
+            _shut(ours)
+        return ours
+
+    def _resend(self) -> None:
+        with self._lock:
+            messages = [message for message, _ in self._pending.values()]
+        for message in messages:
+            self._send(message)
+
+    def _deliver(self, message: Message) -> None:
+        session = message["session"]
+        with self._lock:
+            listener = self._listeners.get(session)
+            pending = self._pending.get(session)
+            is_current = pending is not None and pending[0]["request"] == message["request"]
+            if is_current and message.kind in {"finished", "diverged", "failed"}:
+                del self._pending[session]
+        if listener is not None:
+            self._tell(listener, message)
+
+    def _bury(self, connection: socket.socket) -> None:
+        with self._write_lock:
+            self._connection = None
+            connection.close()
+        process = self._process
+        if process is None:
+            return
+        if process.poll() is None:
+            process.kill()
+        code = process.wait()
+        if self._is_closed:
+            return
+        logger.error("the live simulation process ended with code %d", code)
+        with self._lock:
+            self._crashes.append(time.monotonic())
+            cut_off = {s: m for s, (m, is_new) in self._pending.items() if is_new}
+            self._pending = {s: (m, False) for s, m in cut_off.items()}
+            listeners = list(self._listeners.items())
+        for session, listener in listeners:
+            about = {"session": session, "code": code, "is_retried": session in cut_off}
+            self._tell(listener, Message("crashed", about))
+
+    def _wait_after_crash(self) -> None:
+        """Do not start the process over and over if it crashes at once; wait for a request."""
+        with self._lock:
+            while (
+                not self._is_closed
+                and len(self._crashes) == _MAX_CRASHES
+                and time.monotonic() - self._crashes[0] < _CRASH_WINDOW
+            ):
+                self._wake.wait(timeout=5)
+
+    @staticmethod
+    def _tell(listener: Listener, message: Message) -> None:
+        try:
+            listener(message)
+        except Exception:
+            logger.exception("a session could not take a %s message", message.kind)
+
+
+def _shut(connection: socket.socket) -> None:
+    try:
+        connection.shutdown(socket.SHUT_RDWR)
+    except OSError:
+        logger.debug("the connection was closed already")

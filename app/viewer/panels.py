@@ -1,0 +1,189 @@
+"""The panel of one session: timeline, layers and view."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import viser
+
+from app.viewer.content import Content
+from app.viewer.framing import Framing
+from app.viewer.guard import Guard, plain
+from app.viewer.playback import Playback
+from app.viewer.scene import BLUE, GREEN, GREY, RED, SKIN, YELLOW, Layers
+
+_OVERVIEW = "Overview"
+_SPEEDS = (0.1, 2.0)
+
+
+class TimelinePanel:
+    """Play, scrub, step, speed and loop, with hot keys."""
+
+    def __init__(self, server: viser.ViserServer, playback: Playback, guard: Guard) -> None:
+        self._playback = playback
+        gui = server.gui
+        self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY, hint="Space")
+        self._frame = gui.add_slider(
+            "Frame", 0, max(playback.frame_count - 1, 1), 1, 0, hint="Arrow keys step by one frame"
+        )
+        step = gui.add_button_group("Step", ("◀ 1", "1 ▶"), hint="Left and right arrow keys")
+        speed = gui.add_slider("Speed", *_SPEEDS, 0.1, 1.0, hint="Sequence seconds per second")
+        loop = gui.add_checkbox("Loop", initial_value=True)
+
+        self._play.on_click(guard(lambda _: self._toggle()))
+        self._frame.on_update(guard.by_user(self._scrub))
+        step.on_click(guard(lambda event: playback.step(1 if event.target.value == "1 ▶" else -1)))
+        speed.on_update(guard.by_user(lambda _: playback.set_speed(speed.value)))
+        loop.on_update(guard.by_user(lambda _: playback.set_loop(on=loop.value)))
+        commands: tuple[tuple[str, Any, Any, Callable[[], None]], ...] = (
+            ("Play or pause", "space", None, self._toggle),
+            ("Next frame", "arrowright", None, lambda: playback.step(1)),
+            ("Previous frame", "arrowleft", None, lambda: playback.step(-1)),
+            ("Ten frames on", "arrowright", "shift", lambda: playback.step(10)),
+            ("Ten frames back", "arrowleft", "shift", lambda: playback.step(-10)),
+        )
+        for label, key, modifier, act in commands:
+            command = gui.add_command(label, hotkey=key, modifier=modifier)
+            command.on_trigger(guard(lambda _, act=act: act()))
+
+    def show(self, frame: int, *, is_playing: bool) -> None:
+        """Follow the clock."""
+        self._frame.value = frame
+        label = "Pause" if is_playing else "Play"
+        if self._play.label != label:
+            self._play.label = label
+            self._play.icon = viser.Icon.PLAYER_PAUSE if is_playing else viser.Icon.PLAYER_PLAY
+
+    def replace(self, frame_count: int) -> None:
+        """Fit the slider to another sequence."""
+        self._frame.value = 0
+        self._frame.max = max(frame_count - 1, 1)
+
+    def _toggle(self) -> None:
+        self._playback.play(on=not self._playback.is_playing)
+
+    def _scrub(self, _: Any) -> None:
+        self._playback.play(on=False)
+        self._playback.seek(self._frame.value)
+
+
+class LayersPanel:
+    """What is shown, and from where."""
+
+    def __init__(
+        self, server: viser.ViserServer, content: Content, guard: Guard, redraw: Callable[[], None]
+    ) -> None:
+        self._server = server
+        self._guard = guard
+        self._redraw = redraw
+        self._layers = Layers()
+        self._switches: dict[str, viser.GuiCheckboxHandle] = {}
+        self._views: dict[str, Any] = {}
+        self._framing: Framing | None = None
+        gui = server.gui
+        with gui.add_folder("Layers", expand_by_default=content.fitted is None):
+            for field, label in (
+                ("hands", "Hands"),
+                ("nodes", "Object nodes"),
+                ("controls", "Control nodes"),
+                ("all_controls", "All control nodes"),
+                ("virtual_springs", "Virtual springs"),
+                ("object_springs", "Object springs"),
+                ("forces", "Force arrows"),
+                ("observed", "Observed points"),
+                ("cameras", "Cameras"),
+                ("ground", "Ground"),
+            ):
+                switch = gui.add_checkbox(label, initial_value=True)
+                switch.on_update(guard.by_user(self._switch(field)))
+                self._switches[field] = switch
+            self._scale = gui.add_slider(
+                "Arrow scale", 0.1, 5.0, 0.1, 1.0, hint="Length of the force arrows"
+            )
+            self._scale.on_update(guard.by_user(self._rescale))
+            self._place: Any = gui.add_dropdown("View from", (_OVERVIEW,))
+            self._place.on_update(guard.by_user(self._look))
+            dark = gui.add_checkbox("Dark", initial_value=False)
+            dark.on_update(guard.by_user(lambda _: set_theme(server, dark=dark.value)))
+
+    def replace(self, content: Content, layers: Layers, framing: Framing) -> None:
+        """Show the switches that a content needs, as its layers stand."""
+        self._layers, self._framing = layers, framing
+        has_object = content.fitted is not None
+        has_control = content.control is not None
+        is_there = {
+            "hands": bool(content.hands or content.skeletons),
+            "nodes": has_object,
+            "controls": has_control,
+            "all_controls": has_object,
+            "virtual_springs": has_object,
+            "object_springs": has_object,
+            "forces": has_object,
+            "observed": content.observed is not None,
+            "cameras": bool(content.views),
+            "ground": content.ground_height is not None,
+        }
+        for field, switch in self._switches.items():
+            switch.visible = is_there[field]
+            switch.value = getattr(layers, field)
+        self._scale.visible = has_object
+        self._views = {plain(view.name): view.camera for view in content.views}
+        self._place.options = (_OVERVIEW, *self._views)
+        self._place.visible = bool(self._views)
+
+    def _switch(self, field: str) -> Callable[[Any], None]:
+        def switch(event: Any) -> None:
+            setattr(self._layers, field, event.target.value)
+            self._redraw()
+
+        return switch
+
+    def _rescale(self, event: Any) -> None:
+        self._layers.force_scale = event.target.value
+        self._redraw()
+
+    def _look(self, event: Any) -> None:
+        framing, eye = self._framing, event.client.camera
+        if framing is None:
+            return
+        camera = self._views.get(self._place.value)
+        with event.client.atomic():
+            if camera is None:
+                eye.up_direction = (0.0, 0.0, 1.0)
+                eye.fov = framing.fov
+                eye.position, eye.look_at = framing.camera, framing.look_at
+                return
+            _, down, ahead, origin = camera.T_world_camera[:3].T
+            distance = max(float((framing.center - origin) @ ahead), 0.1 * framing.extent)
+            eye.fov = float(2 * np.arctan2(camera.height / 2, camera.K[1, 1]))
+            eye.up_direction = -down
+            eye.position, eye.look_at = origin, origin + distance * ahead
+
+
+def set_theme(server: viser.ViserServer, *, dark: bool) -> None:
+    """Dress the page."""
+    server.gui.configure_theme(
+        dark_mode=dark, show_logo=False, show_share_button=False, brand_color=(36, 99, 203)
+    )
+
+
+def add_legend(server: viser.ViserServer, content: Content) -> None:
+    """Tell what the colors mean."""
+    entries: list[tuple[tuple[int, int, int], str]] = []
+    if content.hands or content.skeletons:
+        entries.append((SKIN["right"], "hand"))
+    if content.fitted is not None:
+        entries += [(BLUE, "object"), (RED, "controls, forces"), (YELLOW, "virtual springs")]
+    elif content.control is not None:
+        entries.append((RED, "controls"))
+    if content.observed is not None:
+        entries.append((GREEN, "observed"))
+    if content.views:
+        entries.append((GREY, "cameras"))
+    dots = "".join(
+        '<span style="white-space:nowrap;margin-right:0.8em">'
+        f'<span style="display:inline-block;width:0.7em;height:0.7em;border-radius:50%;'
+        f'background:rgb{color};margin-right:0.35em"></span>{label}</span>'
+        for color, label in entries
+    )
+    server.gui.add_html(f'<div style="font-size:0.8em;padding:0.2em 0.9em 0.5em">{dots}</div>')

@@ -1,0 +1,190 @@
+"""The parameters that sliders move: their ranges, their history and how to say what changed."""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from physhandi.simulation.model import SimulationParameters
+
+_COALESCE = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Knob:
+    """One slider and the parameter that it moves."""
+
+    field: str
+    """Field of `SimulationParameters`."""
+    label: str
+    """Name on the slider, with its unit."""
+    low: float
+    """Smallest slider value."""
+    high: float
+    """Largest slider value."""
+    step: float
+    """Distance of two slider values."""
+    hint: str
+    """What it does."""
+    scale: float = 1.0
+    """Slider value for a parameter of 1."""
+    is_integer: bool = False
+    """Whether only whole numbers make sense."""
+    is_logarithm: bool = False
+    """Whether the slider shows the decimal logarithm."""
+
+    def to_slider(self, parameters: SimulationParameters) -> float:
+        """Find the slider value of a parameter, moved into the slider's range."""
+        value = float(getattr(parameters, self.field)) * self.scale
+        if self.is_logarithm:
+            value = math.log10(max(value, 1e-12))
+        value = min(max(value, self.low), self.high)
+        return round(value) if self.is_integer else round(value, 6)
+
+    def from_slider(self, value: float) -> float:
+        """Find the parameter of a slider value."""
+        if self.is_logarithm:
+            value = 10.0**value
+        return round(value) if self.is_integer else value / self.scale
+
+    def text(self, parameters: SimulationParameters) -> str:
+        """Write the parameter as a person reads it."""
+        value = getattr(parameters, self.field) * self.scale
+        return f"x{value:.3g}" if self.is_logarithm else f"{value:.4g}"
+
+
+def knobs(parameters: SimulationParameters, *, length_unit: str) -> tuple[Knob, ...]:
+    """List the sliders of an object; each range includes the fitted value.
+
+    Args:
+        parameters: The fitted parameters.
+        length_unit: Unit of lengths; ``"m"`` is shown as millimetres.
+    """
+    per_metre, unit, widest = (1e3, "mm", 80.0) if length_unit == "m" else (1.0, length_unit, 0.0)
+
+    def radius(field: str, label: str, hint: str) -> Knob:
+        fitted = getattr(parameters, field) * per_metre
+        high = max(widest, 4 * fitted if not widest else 1.5 * fitted, 1e-6)
+        step = 0.5 if widest else high / 200
+        return Knob(
+            field=field,
+            label=f"{label} [{unit}]",
+            low=step,
+            high=high,
+            step=step,
+            hint=hint,
+            scale=per_metre,
+        )
+
+    def neighbors(field: str, label: str, hint: str) -> Knob:
+        high = max(80, getattr(parameters, field))
+        return Knob(field=field, label=label, low=1, high=high, step=1, hint=hint, is_integer=True)
+
+    def plain(field: str, label: str, high: float, step: float, hint: str) -> Knob:
+        high = max(high, 2 * getattr(parameters, field))
+        return Knob(field=field, label=label, low=0.0, high=high, step=step, hint=hint)
+
+    return (
+        radius("connection_radius", "δ object", "Object nodes nearer than this get a spring."),
+        neighbors("max_neighbors", "d_max object", "Most object springs that one node starts."),
+        radius(
+            "virtual_connection_radius",
+            "δ virtual",
+            "A control node holds the object nodes nearer than this.",
+        ),
+        neighbors(
+            "virtual_max_neighbors", "d_max virtual", "Most virtual springs of one control node."
+        ),
+        Knob(
+            field="stiffness_scale",
+            label="stiffness 10^",
+            low=-2.0,
+            high=1.0,
+            step=0.05,
+            hint="Multiplies the stiffness of every spring: 0 is as fitted, -1 a tenth.",
+            is_logarithm=True,
+        ),
+        plain("damping", "damping [N·s/m]", 300.0, 1.0, "Dashpot along each spring."),
+        plain("drag", "drag [1/s]", 20.0, 0.1, "How fast every motion dies out."),
+        plain("gravity", "gravity [m/s²]", 20.0, 0.1, "Acceleration downwards."),
+    )
+
+
+class History:
+    """The parameters that were tried, with undo and redo."""
+
+    def __init__(
+        self, start: SimulationParameters, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        """Begin with the fitted parameters.
+
+        Args:
+            start: The fitted parameters, to which `reset` returns.
+            clock: Tells the time [s].
+        """
+        self.start = start
+        self._clock = clock
+        self._entries = [start]
+        self._index = 0
+        self._last: tuple[str, float] = ("", -math.inf)
+
+    @property
+    def current(self) -> SimulationParameters:
+        """The parameters in force."""
+        return self._entries[self._index]
+
+    @property
+    def can_undo(self) -> bool:
+        """Whether there is something to take back."""
+        return self._index > 0
+
+    @property
+    def can_redo(self) -> bool:
+        """Whether something was taken back."""
+        return self._index < len(self._entries) - 1
+
+    def set(self, field: str, value: float) -> SimulationParameters:
+        """Change one parameter; changes of the same one in quick succession count as one."""
+        now = self._clock()
+        changed = replace(self.current, **{field: value})
+        is_same_drag = self._last[0] == field and now - self._last[1] < _COALESCE
+        self._last = (field, now)
+        if is_same_drag and self._index > 0:
+            self._entries[self._index :] = [changed]
+        elif changed != self.current:
+            self._entries[self._index + 1 :] = [changed]
+            self._index += 1
+        return self.current
+
+    def undo(self) -> SimulationParameters:
+        """Take the last change back."""
+        return self._go(self._index - 1)
+
+    def redo(self) -> SimulationParameters:
+        """Make the change again that was taken back last."""
+        return self._go(self._index + 1)
+
+    def reset(self) -> SimulationParameters:
+        """Return to the fitted parameters; this can be undone."""
+        self._last = ("", -math.inf)
+        if self.current != self.start:
+            self._entries[self._index + 1 :] = [self.start]
+            self._index += 1
+        return self.current
+
+    def _go(self, index: int) -> SimulationParameters:
+        self._last = ("", -math.inf)
+        self._index = min(max(index, 0), len(self._entries) - 1)
+        return self.current
+
+
+def what_changed(
+    knobs: tuple[Knob, ...], start: SimulationParameters, now: SimulationParameters
+) -> str:
+    """Say which parameters differ from the fitted ones, for example ``δ object 20 → 35 mm``."""
+    parts = [
+        f"{knob.label.replace(' 10^', '')} {knob.text(start)} → {knob.text(now)}"
+        for knob in knobs
+        if getattr(start, knob.field) != getattr(now, knob.field)
+    ]
+    return ", ".join(parts) or "nothing: parameters as fitted"

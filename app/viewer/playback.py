@@ -1,0 +1,162 @@
+"""The clock of one session: which frame is on the screen, and when the next one is due."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+
+logger = logging.getLogger(__name__)
+
+_MAX_RATE = 30.0
+
+
+class Playback:
+    """Plays frames in one thread; everything that draws runs in that thread.
+
+    Setters may be called from any thread; they take effect at the next tick.
+
+    Attributes:
+        frame_count: Frames of the sequence.
+        frame_rate: Frames per second at speed 1 [Hz].
+    """
+
+    def __init__(
+        self, frame_count: int, frame_rate: float, draw: Callable[[int, bool], None]
+    ) -> None:
+        """Prepare a stopped clock.
+
+        Args:
+            frame_count: Frames of the sequence.
+            frame_rate: Frames per second at speed 1 [Hz].
+            draw: Draws a frame; gets its number and whether the clock is running.
+        """
+        self.frame_count = frame_count
+        self.frame_rate = frame_rate
+        self._draw = draw
+        self._condition = threading.Condition()
+        self._position = 0.0
+        self._limit = frame_count
+        self._speed = 1.0
+        self._is_playing = False
+        self._does_loop = True
+        self._needs_drawing = True
+        self._is_closed = False
+        self._thread = threading.Thread(target=self._run, name="viewer-playback", daemon=True)
+
+    @property
+    def frame(self) -> int:
+        """The frame that is due now."""
+        with self._condition:
+            return int(self._position)
+
+    @property
+    def is_playing(self) -> bool:
+        """Whether the clock is running."""
+        with self._condition:
+            return self._is_playing
+
+    @property
+    def speed(self) -> float:
+        """Sequence seconds per second."""
+        with self._condition:
+            return self._speed
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread and wait for it."""
+        with self._condition:
+            self._is_closed = True
+            self._condition.notify_all()
+        if self._thread.is_alive() and threading.current_thread() is not self._thread:
+            self._thread.join(timeout=5)
+
+    def redraw(self) -> None:
+        """Draw the current frame again soon, for example because a layer was switched."""
+        self._change()
+
+    def play(self, *, on: bool = True) -> None:
+        """Start or stop the clock; starting at the end goes back to the beginning."""
+        with self._condition:
+            if on and not self._does_loop and int(self._position) >= self.frame_count - 1:
+                self._position = 0.0
+        self._change(_is_playing=on)
+
+    def seek(self, frame: int) -> None:
+        """Go to a frame; numbers outside the sequence are moved to its ends."""
+        self._change(_position=float(min(max(frame, 0), self.frame_count - 1)))
+
+    def step(self, count: int) -> None:
+        """Stop, and go some frames forward or, if negative, back."""
+        self.play(on=False)
+        self.seek((self.frame + count) % self.frame_count)
+
+    def set_speed(self, speed: float) -> None:
+        """Set how many sequence seconds pass in a second."""
+        self._change(_speed=speed)
+
+    def set_loop(self, *, on: bool) -> None:
+        """Set whether playing starts over at the end."""
+        self._change(_does_loop=on)
+
+    def limit(self, frame_count: int) -> None:
+        """Keep the running clock inside the first frames, while later ones are being computed."""
+        self._change(_limit=min(max(frame_count, 1), self.frame_count))
+
+    def replace(self, frame_count: int, frame_rate: float) -> None:
+        """Start over with another sequence."""
+        with self._condition:
+            self.frame_count, self.frame_rate = frame_count, frame_rate
+        self._change(_position=0.0, _limit=frame_count)
+
+    def _change(self, **values: float | bool) -> None:
+        with self._condition:
+            for name, value in values.items():
+                setattr(self, name, value)
+            self._needs_drawing = True
+            self._condition.notify_all()
+
+    def _run(self) -> None:
+        last = time.monotonic()
+        while True:
+            with self._condition:
+                while not (self._is_closed or self._needs_drawing or self._is_playing):
+                    self._condition.wait()
+                    last = time.monotonic()
+                if self._is_closed:
+                    return
+                now = time.monotonic()
+                is_new = self._advance(now - last)
+                last = now
+                is_due = self._needs_drawing or is_new
+                self._needs_drawing = False
+                frame, is_playing = int(self._position), self._is_playing
+                rate = min(self.frame_rate * self._speed, _MAX_RATE)
+            if is_due:
+                try:
+                    self._draw(frame, is_playing)
+                except Exception:
+                    logger.exception("drawing frame %d failed", frame)
+            with self._condition:
+                if self._is_closed:
+                    return
+                self._condition.wait(max(1.0 / rate - (time.monotonic() - last), 0.001))
+
+    def _advance(self, elapsed: float) -> bool:
+        """Move the clock on; returns whether another frame is due."""
+        if not self._is_playing:
+            return False
+        before = int(self._position)
+        position = self._position + min(elapsed, 0.5) * self._speed * self.frame_rate
+        if self._limit < self.frame_count:
+            position = min(position, self._limit - 1)
+        elif position >= self.frame_count:
+            if self._does_loop:
+                position %= self.frame_count
+            else:
+                position, self._is_playing = float(self.frame_count - 1), False
+                self._needs_drawing = True
+        self._position = position
+        return int(position) != before

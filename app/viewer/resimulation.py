@@ -1,0 +1,185 @@
+"""The rollouts of one session: the fitted one, the one shown and the one being simulated."""
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from app.viewer.live import LiveRequest, LiveSimulation
+from app.viewer.take import Take
+from app.viewer.wire import Message
+from physhandi.simulation.model import SimulationParameters, SpringMassModel
+
+
+@dataclass(frozen=True, kw_only=True)
+class Readout:
+    """What the physics panel says about the rollout."""
+
+    object_spring_count: int
+    """Springs between object nodes."""
+    virtual_spring_count: int
+    """Springs between control nodes and object nodes."""
+    node_count: int
+    """Object nodes."""
+    substeps_per_frame: int
+    """Substeps of a frame."""
+    simulated_count: int
+    """Frames that are ready."""
+    frame_count: int
+    """Frames that are wanted."""
+    frame_duration: float
+    """Mean time that one frame took [s]; NaN if none was simulated."""
+    difference: float
+    """Mean distance from the fitted rollout over the ready frames [m]."""
+    is_busy: bool
+    """Whether frames are being simulated."""
+    error: str | None
+    """Why the simulation ended early, if it did."""
+
+
+class Resimulation:
+    """Turns parameter changes into rollouts; the latest request wins.
+
+    The rollout shown before stays on the screen, frame by frame, until its frame has been
+    simulated anew. If the object diverges, the last good state stays.
+    """
+
+    def __init__(
+        self,
+        session: str,
+        live: LiveSimulation,
+        fitted: Take,
+        *,
+        run: Path,
+        sequence: str,
+        on_change: Callable[[str, int], None],
+    ) -> None:
+        """Listen to the live simulation process.
+
+        Args:
+            session: Id of the session.
+            live: The process.
+            fitted: The fitted rollout.
+            run: Run folder.
+            sequence: The run's sequence.
+            on_change: Called with the kind of each message and the number of ready frames.
+        """
+        self.fitted = fitted
+        self._session = session
+        self._live = live
+        self._run = run
+        self._sequence = sequence
+        self._on_change = on_change
+        self._lock = threading.Lock()
+        self._shown = fitted
+        self._incoming: Take | None = None
+        self._request = 0
+        self._parameters = fitted.parameters
+        self._durations: list[float] = []
+        self._is_busy = False
+        live.subscribe(session, self._hear)
+
+    def request(self, parameters: SimulationParameters, *, automatic_substeps: bool) -> None:
+        """Ask for a rollout with other parameters."""
+        with self._lock:
+            self._parameters = parameters
+            self._is_busy = True
+            self._incoming = None
+            # Answers to earlier requests are refused from here on.
+            self._request = self._live.request(
+                self._session,
+                LiveRequest(
+                    run=self._run,
+                    sequence=self._sequence,
+                    parameters=parameters,
+                    automatic_substeps=automatic_substeps,
+                ),
+            )
+
+    def show_fitted(self) -> None:
+        """Go back to the fitted rollout without simulating it."""
+        with self._lock:
+            self._live.cancel(self._session)
+            self._request = 0
+            self._shown, self._incoming = self.fitted, None
+            self._durations, self._is_busy = [], False
+        self._on_change("finished", self.fitted.ready)
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._live.unsubscribe(self._session)
+
+    def at(self, frame: int) -> tuple[Take, int]:
+        """Find the rollout to show in a frame, and which of its frames."""
+        with self._lock:
+            incoming = self._incoming
+            if incoming is not None and incoming.ready > 0:
+                if frame < incoming.ready:
+                    return incoming, frame
+                if incoming.error is not None:
+                    return incoming, incoming.ready - 1
+            return self._shown, min(frame, self._shown.ready - 1)
+
+    @property
+    def newest(self) -> Take:
+        """The rollout that was asked for last, as far as it is there."""
+        with self._lock:
+            return self._incoming or self._shown
+
+    @property
+    def readout(self) -> Readout:
+        """What there is to say about the newest rollout."""
+        with self._lock:
+            take = self._incoming or self._shown
+            durations = self._durations
+            return Readout(
+                object_spring_count=take.model.object_spring_count,
+                virtual_spring_count=take.model.virtual_spring_count,
+                node_count=take.model.node_count,
+                substeps_per_frame=take.parameters.substeps_per_frame,
+                simulated_count=take.ready,
+                frame_count=take.frame_count,
+                frame_duration=float(np.mean(durations)) if durations else float("nan"),
+                difference=take.mean_distance(self.fitted) if not self._is_busy else float("nan"),
+                is_busy=self._is_busy,
+                error=take.error,
+            )
+
+    def _hear(self, message: Message) -> None:
+        with self._lock:
+            if message.kind != "crashed" and message["request"] != self._request:
+                return
+            self._take_in(message)
+            ready = self._incoming.ready if self._incoming is not None else 0
+            if message.kind == "finished" and self._incoming is not None:
+                self._shown, self._incoming = self._incoming, None
+        self._on_change(message.kind, ready)
+
+    def _take_in(self, message: Message) -> None:
+        if message.kind == "started":
+            model = SpringMassModel.from_tensors(message.arrays)
+            parameters = replace(self._parameters, substeps_per_frame=message["substeps_per_frame"])
+            self._incoming = Take.empty(model, parameters, self.fitted.control)
+            self._durations = []
+        elif message.kind == "frame" and self._incoming is not None:
+            frame = int(message["frame"])
+            self._incoming.position[frame] = message.arrays["position"]
+            if self._incoming.velocity is not None:
+                self._incoming.velocity[frame] = message.arrays["velocity"]
+            self._incoming.ready = frame + 1
+            if frame > 0:
+                self._durations.append(float(message["duration"]))
+        elif message.kind in {"diverged", "failed"}:
+            take = self._incoming
+            if take is None:
+                take = self._incoming = Take.empty(
+                    self.fitted.model, self._parameters, self.fitted.control
+                )
+            take.error = str(message["error"])
+            self._is_busy = False
+        elif message.kind == "finished":
+            self._is_busy = False
+        elif message.kind == "crashed":
+            self._is_busy = self._is_busy and bool(message["is_retried"])

@@ -1,0 +1,305 @@
+"""The nodes of one session's scene and how they follow the frames."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import viser
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from app.viewer.cameras import CameraNodes
+from app.viewer.content import Content
+from app.viewer.framing import Framing
+from app.viewer.skeleton import BONES
+from app.viewer.take import Take
+
+BLUE = (47, 111, 222)
+RED = (214, 39, 40)
+GREEN = (46, 160, 67)
+YELLOW = (245, 190, 20)
+GREY = (120, 130, 145)
+SKIN = {"right": (224, 172, 140), "left": (205, 150, 122)}
+
+PLAYING_SPRINGS = 2_000
+"""Most object springs that are streamed while the clock is running."""
+_ARROWS = 800
+_QUIET_FORCE = 1e-6
+
+
+@dataclass
+class Layers:
+    """Which parts of the scene are shown."""
+
+    hands: bool = True
+    """Hand meshes."""
+    nodes: bool = True
+    """Object nodes."""
+    controls: bool = True
+    """Control nodes that hold the object by a virtual spring."""
+    all_controls: bool = False
+    """Control nodes that hold nothing."""
+    virtual_springs: bool = True
+    """Springs between control nodes and object nodes."""
+    object_springs: bool = False
+    """Springs between object nodes."""
+    forces: bool = True
+    """Sum of the virtual springs' forces on each object node."""
+    observed: bool = False
+    """Observed points."""
+    cameras: bool = True
+    """Camera frustums with the frame's image."""
+    ground: bool = True
+    """Grid on the ground."""
+    force_scale: float = 1.0
+    """Length of the force arrows, relative to the automatic one."""
+
+
+class Scene:
+    """Draws frames into a viser server; used by one thread."""
+
+    def __init__(self, server: viser.ViserServer, content: Content, framing: Framing) -> None:
+        self._server = server
+        self._content = content
+        self._framing = framing
+        self.layers = default_layers(content)
+        self._nodes: dict[str, Any] = {}
+        self._model_shown: Take | None = None
+        self._attached: Int[ndarray, " control"] = np.zeros(0, np.int64)
+        self._force_unit = 0.0
+        self._cameras = CameraNodes(server, content.views, framing)
+        self._aim()
+        self._add_ground()
+
+    def clear(self) -> None:
+        """Remove everything, to make room for another content."""
+        for node in self._nodes.values():
+            node.remove()
+        self._nodes.clear()
+        self._cameras.remove()
+
+    def draw(self, frame: int, take: Take | None, take_frame: int, *, is_playing: bool) -> None:
+        """Bring the scene to a frame.
+
+        Args:
+            frame: Frame of hands, observation and cameras.
+            take: The object's rollout; None without an object.
+            take_frame: Frame of the rollout, which may lag behind while it is being computed.
+            is_playing: Whether the clock is running, so that less may be sent.
+        """
+        with self._server.atomic():
+            self._draw_hands(frame)
+            self._draw_observed(frame)
+            if take is not None and take.ready > 0:
+                self._draw_object(take, take_frame, is_playing)
+            elif self._content.control is not None:
+                self._draw_controls(np.asarray(self._content.control[frame]), None)
+            self._cameras.draw(frame, is_visible=self.layers.cameras, is_playing=is_playing)
+            if "ground" in self._nodes:
+                self._nodes["ground"].visible = self.layers.ground
+
+    def _aim(self) -> None:
+        camera = self._server.initial_camera
+        camera.fov = self._framing.fov
+        camera.near = 0.005 * self._framing.extent
+        camera.far = 200.0 * self._framing.extent
+        camera.look_at = tuple(self._framing.look_at)
+        camera.position = tuple(self._framing.camera)
+
+    def _add_ground(self) -> None:
+        height = self._content.ground_height
+        if height is None:
+            return
+        cell = 10.0 ** np.floor(np.log10(self._framing.extent / 2))
+        center = self._framing.center
+        self._nodes["ground"] = self._server.scene.add_grid(
+            "/ground",
+            width=float(cell * np.ceil(4 * self._framing.extent / cell)),
+            height=float(cell * np.ceil(4 * self._framing.extent / cell)),
+            cell_size=float(cell / 2),
+            section_size=float(cell),
+            cell_color=(214, 219, 226),
+            section_color=(182, 190, 201),
+            cell_thickness=0.6,
+            section_thickness=1.0,
+            shadow_opacity=0.15,
+            fade_distance=8.0 * self._framing.extent,
+            position=(
+                float(np.round(center[0] / cell) * cell),
+                float(np.round(center[1] / cell) * cell),
+                float(height) - 0.001 * self._framing.extent,
+            ),
+        )
+
+    def _draw_hands(self, frame: int) -> None:
+        for hand in self._content.hands:
+            vertex = np.asarray(hand.vertex[min(frame, len(hand.vertex) - 1)], dtype=np.float32)
+            name = f"/hand/{hand.side}"
+            if hand.face is None:
+                size = 0.006 * self._framing.extent
+                self._points(name, vertex, SKIN[hand.side], size, self.layers.hands)
+                continue
+            node = self._nodes.get(name)
+            if node is None:
+                self._nodes[name] = self._server.scene.add_mesh_simple(
+                    name, vertex, hand.face, color=SKIN[hand.side], opacity=0.62, side="double"
+                )
+                node = self._nodes[name]
+            elif self.layers.hands:
+                node.vertices = vertex
+            node.visible = self.layers.hands
+        for index, skeleton in enumerate(self._content.skeletons):
+            bones = skeleton[frame][BONES]
+            bones = bones[np.isfinite(bones).all(axis=(1, 2))]
+            self._segments(f"/hand/skeleton_{index}", bones, SKIN["right"], 4.0, self.layers.hands)
+
+    def _draw_observed(self, frame: int) -> None:
+        observed = self._content.observed
+        if observed is None:
+            return
+        point = observed.points(frame) if self.layers.observed else np.zeros((0, 3), np.float32)
+        size = 0.3 * self._framing.spacing
+        self._points("/observed", point, observed.colors(), size, self.layers.observed)
+
+    def _draw_object(self, take: Take, frame: int, is_playing: bool) -> None:
+        position = np.asarray(take.position[frame], dtype=np.float32)
+        control = np.asarray(take.control[frame], dtype=np.float32)
+        if take is not self._model_shown:
+            springs = take.model.spring_nodes[take.model.object_spring_count :]
+            self._attached = np.unique(springs.max(axis=1) - take.model.node_count)
+            self._model_shown = take
+        size = 0.36 * self._framing.spacing
+        self._points("/object/nodes", position, BLUE, size, self.layers.nodes)
+        self._draw_controls(control, self._attached)
+        point = np.concatenate([position, control])
+        count = take.model.object_spring_count
+        self._segments(
+            "/springs/virtual",
+            _ends(point, take.model.spring_nodes[count:], PLAYING_SPRINGS if is_playing else None),
+            YELLOW,
+            2.0,
+            self.layers.virtual_springs,
+        )
+        self._segments(
+            "/springs/object",
+            _ends(point, take.model.spring_nodes[:count], PLAYING_SPRINGS if is_playing else None)
+            if self.layers.object_springs
+            else np.zeros((0, 2, 3), np.float32),
+            GREY,
+            1.0,
+            self.layers.object_springs,
+        )
+        self._draw_forces(take, frame, position)
+
+    def _draw_controls(
+        self, control: Float[ndarray, "control 3"], attached: Int[ndarray, " attached"] | None
+    ) -> None:
+        spacing = self._framing.spacing
+        held = control if attached is None else control[attached]
+        self._points("/controls/attached", held, RED, 0.3 * spacing, self.layers.controls)
+        is_shown = self.layers.all_controls and attached is not None
+        free = np.delete(control, attached, axis=0) if is_shown and attached is not None else None
+        if free is not None or "/controls/free" in self._nodes:
+            point = np.zeros((0, 3), np.float32) if free is None else free
+            self._points("/controls/free", point, RED, 0.12 * spacing, is_shown)
+
+    def _draw_forces(self, take: Take, frame: int, position: Float[ndarray, "node 3"]) -> None:
+        arrows = np.zeros((0, 2, 3), np.float32)
+        if self.layers.forces:
+            force = take.forces(frame)
+            strength = np.linalg.norm(force, axis=-1)
+            node = np.flatnonzero(strength > _QUIET_FORCE)
+            node = node[np.argsort(-strength[node], kind="stable")[:_ARROWS]]
+            if not self._force_unit and len(node):
+                strong = float(np.quantile(strength[node], 0.9))
+                self._force_unit = 0.07 * self._framing.extent / strong
+            offset = force[node] * (self._force_unit * self.layers.force_scale)
+            length = np.linalg.norm(offset, axis=-1, keepdims=True)
+            most = 0.22 * self._framing.extent
+            offset *= np.minimum(1.0, most / np.maximum(length, 1e-12))
+            arrows = np.stack([position[node], position[node] + offset], axis=1)
+            arrows = arrows[length[:, 0] > 0.004 * self._framing.extent].astype(np.float32)
+        self._arrows(arrows)
+
+    def _arrows(self, arrows: Float[ndarray, "arrow 2 3"]) -> None:
+        node = self._nodes.get("/forces")
+        if node is None and len(arrows):
+            extent = self._framing.extent
+            node = self._nodes["/forces"] = self._server.scene.add_arrows(
+                "/forces",
+                arrows,
+                RED,
+                shaft_radius=0.0011 * extent,
+                head_radius=0.0036 * extent,
+                head_length=0.011 * extent,
+            )
+        elif node is not None and len(arrows):
+            node.points = arrows
+        if node is not None:
+            node.visible = bool(len(arrows))
+
+    def _points(
+        self,
+        name: str,
+        point: Float[ndarray, "point 3"],
+        color: Any,
+        size: float,
+        is_visible: bool,
+    ) -> None:
+        node = self._nodes.get(name)
+        is_visible = is_visible and len(point) > 0
+        if node is None and is_visible:
+            node = self._nodes[name] = self._server.scene.add_point_cloud(
+                name,
+                np.asarray(point, dtype=np.float32),
+                color,
+                point_size=size,
+                point_shape="circle",
+                precision="float32",
+            )
+        elif node is not None and is_visible:
+            node.points = np.asarray(point, dtype=np.float32)
+            if np.ndim(color) == 2:
+                node.colors = color
+        if node is not None:
+            node.visible = is_visible
+
+    def _segments(
+        self,
+        name: str,
+        segment: Float[ndarray, "segment 2 3"],
+        color: tuple[int, int, int],
+        width: float,
+        is_visible: bool,
+    ) -> None:
+        node = self._nodes.get(name)
+        is_visible = is_visible and len(segment) > 0
+        if node is None and is_visible:
+            node = self._nodes[name] = self._server.scene.add_line_segments(
+                name,
+                np.asarray(segment, dtype=np.float32),
+                color,
+                thickness=width,
+                thickness_units="screen",
+            )
+        elif node is not None and is_visible:
+            node.points = np.asarray(segment, dtype=np.float32)
+        if node is not None:
+            node.visible = is_visible
+
+
+def default_layers(content: Content) -> Layers:
+    """Choose what is shown at first: the result if there is one, else the recording."""
+    has_object = content.fitted is not None
+    return Layers(
+        observed=not has_object,
+        cameras=not has_object and bool(content.views),
+    )
+
+
+def _ends(
+    point: Float[ndarray, "point 3"], spring_nodes: Int[ndarray, "spring 2"], most: int | None
+) -> Float[ndarray, "segment 2 3"]:
+    """Look up the end points of springs, thinned out evenly to at most `most`."""
+    every = 1 if most is None else max(1, -(-len(spring_nodes) // most))
+    return point[spring_nodes[::every]]

@@ -1,0 +1,95 @@
+"""One rollout of the object: the fitted one, or one that is being simulated now."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from physhandi.simulation.forces import virtual_forces
+from physhandi.simulation.model import SimulationParameters, SpringMassModel
+
+
+@dataclass(eq=False, kw_only=True)
+class Take:
+    """Object motion under one set of parameters; frames become ready one after the other."""
+
+    model: SpringMassModel
+    """Topology and material."""
+    parameters: SimulationParameters
+    """What the object was simulated with."""
+    control: Float[ndarray, "frame control 3"]
+    """Control node positions [m]."""
+    position: Float[ndarray, "frame node 3"]
+    """Object node positions [m]; meaningless from frame `ready` on."""
+    velocity: Float[ndarray, "frame node 3"] | None = None
+    """Object node velocities [m/s]; None if they are to be differences of positions."""
+    ready: int = 0
+    """Number of frames that have been simulated."""
+    error: str | None = None
+    """Why the simulation ended early, if it did."""
+
+    @classmethod
+    def empty(
+        cls,
+        model: SpringMassModel,
+        parameters: SimulationParameters,
+        control: Float[ndarray, "frame control 3"],
+    ) -> "Take":
+        """Make room for a rollout of which no frame is ready."""
+        shape = (len(control), model.node_count, 3)
+        return cls(
+            model=model,
+            parameters=parameters,
+            control=control,
+            position=np.zeros(shape, np.float32),
+            velocity=np.zeros(shape, np.float32),
+        )
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames when all are ready."""
+        return len(self.position)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether every frame is ready."""
+        return self.ready >= self.frame_count
+
+    def forces(self, frame: int) -> Float[ndarray, "node 3"]:
+        """Compute the sum of the virtual springs' forces on each object node [N]."""
+        rate = self.parameters.frame_rate
+        if self.velocity is not None:
+            velocity = self.velocity[frame]
+        else:
+            velocity = _difference(self.position, frame, rate)
+        control_velocity = _difference(self.control, frame, rate)
+        if not self.parameters.use_control_velocity:
+            control_velocity = np.zeros_like(control_velocity)
+        return virtual_forces(
+            self.model,
+            self.parameters,
+            np.asarray(self.position[frame]),
+            np.asarray(velocity),
+            np.asarray(self.control[frame]),
+            control_velocity,
+        )
+
+    def mean_distance(self, other: "Take") -> float:
+        """Measure how far the ready frames are from another rollout, averaged over nodes [m]."""
+        count = min(self.ready, other.ready)
+        if count == 0 or self.position.shape[1:] != other.position.shape[1:]:
+            return float("nan")
+        offset = np.asarray(self.position[:count]) - np.asarray(other.position[:count])
+        return float(np.linalg.norm(offset, axis=-1).mean())
+
+
+def _difference(
+    point: Float[ndarray, "frame point 3"], frame: int, rate: float
+) -> Float[ndarray, "point 3"]:
+    """Velocity during the frame's substeps: from the frame before to this one [m/s]."""
+    before, after = max(frame - 1, 0), max(frame, 1)
+    after = min(after, len(point) - 1)
+    return ((np.asarray(point[after]) - np.asarray(point[before])) * np.float32(rate)).astype(
+        np.float32
+    )
