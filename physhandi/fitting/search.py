@@ -118,7 +118,8 @@ def search_parameters(
         values |= {name: values[other] for name, other in config.tied.items() if other in values}
         return replace(start, **values)
 
-    options = {"bounds": [0, 1], "seed": config.seed, "verbose": -9, "verb_log": 0}
+    # pycma 4.5 fails when it shortens the step of a single variable, so the step is left alone.
+    options = {"bounds": [0, 1], "maxstd": np.inf, "seed": config.seed, "verbose": -9, "verb_log": 0}
     if config.population is not None:
         options["popsize"] = config.population
     first = np.array([config.variables[name].to_unit(float(getattr(start, name))) for name in names])

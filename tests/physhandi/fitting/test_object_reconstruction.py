@@ -1,0 +1,153 @@
+"""Stage 2 recovers a made-up object, alone and from several sequences."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from physhandi.data.observation import ObjectObservation
+from physhandi.errors import CancelledError, FitError
+from physhandi.fitting.object_problem import ObjectProblem, build_problem
+from physhandi.fitting.object_reconstruction import (
+    FirstOrderConfig,
+    ObjectFitConfig,
+    mean_loss,
+    optimise_springs,
+    search_object,
+)
+from physhandi.fitting.search import SearchConfig, SearchVariable
+from physhandi.progress import NullProgress, Progress
+from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.simulator import Simulator
+from physhandi.simulation.topology import build_model
+
+PARAMETERS = SimulationParameters(
+    connection_radius=0.16,
+    max_neighbors=8,
+    virtual_connection_radius=0.03,
+    virtual_max_neighbors=1,
+    stiffness=300.0,
+    virtual_stiffness=3000.0,
+    damping=5.0,
+    drag=1.0,
+    ground_height=None,
+    substeps_per_frame=40,
+)
+FRAMES = 9
+AXIS = np.arange(4) * 0.1
+NODE = np.stack([*np.meshgrid(AXIS, AXIS, indexing="ij"), np.zeros((4, 4))], axis=-1).reshape(-1, 3)
+
+
+def held_sheet(name: str, lift: float) -> ObjectProblem:
+    """A sheet held at two corners that rise; one half is three times as stiff as the other."""
+    corner = NODE[[0, 3]] + [0.0, 0.0, 0.01]
+    rise = np.linspace(0, 1, FRAMES)[:, None, None] * np.array([0.0, 0.0, lift])
+    control = (corner[None] + rise).astype(np.float32)
+    model = build_model(NODE, control[0], PARAMETERS)
+    middle = NODE[np.minimum(model.spring_nodes, len(NODE) - 1)].mean(axis=1)
+    stiffness = np.where(middle[:, 0] < 0.15, 600.0, 200.0).astype(np.float32)
+    stiffness[model.object_spring_count :] = 3000.0
+    truth = Simulator(replace(model, stiffness=stiffness), PARAMETERS)
+    position = truth.rollout(control).position
+    visible = np.ones(position.shape[:2], bool)
+    valid = visible.copy()
+    valid[0] = False
+    observation = ObjectObservation(point=position, is_visible=visible, is_motion_valid=valid)
+    return build_problem(
+        name=name,
+        observation=observation,
+        object_node=NODE,
+        rest_node=NODE,
+        control=control,
+        frame_count=FRAMES,
+        frame_rate=30.0,
+        ground_height=None,
+        gravity=9.81,
+    )
+
+
+def config(**first_order: object) -> ObjectFitConfig:
+    settings = {"iterations": 30, "learning_rate": 0.1, "is_annealed": False}
+    return ObjectFitConfig(
+        search=SearchConfig(
+            generations=4,
+            population=6,
+            variables={"stiffness": SearchVariable(low=50.0, high=2000.0, scale="log")},
+        ),
+        first_order=FirstOrderConfig(**(settings | first_order)),
+    )
+
+
+def test_springs_of_two_halves_are_told_apart() -> None:
+    problems = [held_sheet("slow", 0.2), held_sheet("fast", 0.5)]
+    result = optimise_springs(problems, PARAMETERS, config(), NullProgress())
+    assert result.loss_after < 0.2 * result.loss_before
+    slow, fast = result.models["slow"], result.models["fast"]
+    count = slow.object_spring_count
+    np.testing.assert_array_equal(slow.stiffness[:count], fast.stiffness[:count])
+    middle = NODE[slow.spring_nodes[:count]].mean(axis=1)
+    near, far = (slow.stiffness[:count][side] for side in (middle[:, 0] < 0.15, middle[:, 0] > 0.15))
+    assert np.median(near) > 1.3 * np.median(far)
+    stored = mean_loss(problems, result.models, PARAMETERS, config(), "cpu")
+    assert stored == pytest.approx(result.loss_after, rel=1e-6)
+
+
+@pytest.mark.parametrize("window", [1, 4])
+def test_short_windows_also_descend(window: int) -> None:
+    problems = [held_sheet("slow", 0.2)]
+    settings = config(window=window, iterations=6, learning_rate=0.05)
+    result = optimise_springs(problems, PARAMETERS, settings, NullProgress())
+    assert result.loss_after < 0.9 * result.loss_before
+
+
+def test_without_learned_damping_it_stays() -> None:
+    problems = [held_sheet("slow", 0.2)]
+    settings = config(learns_damping=False, iterations=4)
+    result = optimise_springs(problems, PARAMETERS, settings, NullProgress())
+    np.testing.assert_allclose(result.models["slow"].damping, PARAMETERS.damping, rtol=1e-5)
+    assert result.loss_after < result.loss_before
+
+
+def test_annealing_ends_on_the_whole_sequence() -> None:
+    problems = [held_sheet("slow", 0.2)]
+    result = optimise_springs(problems, PARAMETERS, config(is_annealed=True), NullProgress())
+    assert result.loss_after < 0.3 * result.loss_before
+
+
+def test_search_improves_a_wrong_start() -> None:
+    problems = [held_sheet("slow", 0.2)]
+    start = replace(PARAMETERS, stiffness=2000.0)
+    result = search_object(problems, start, config(), NullProgress())
+    assert 100.0 < result.parameters.stiffness < 900.0
+    assert result.loss_after < 0.3 * result.loss_before
+
+
+def test_objects_that_differ_are_refused() -> None:
+    first, second = held_sheet("slow", 0.2), held_sheet("fast", 0.2)
+    stretched = replace(second, rest_node=(NODE * [1.0, 2.5, 1.0]).astype(np.float32))
+    with pytest.raises(FitError, match="'fast' connects"):
+        optimise_springs([first, stretched], PARAMETERS, config(), NullProgress())
+
+
+def test_a_start_that_diverges_is_an_error() -> None:
+    stiff = replace(PARAMETERS, stiffness=1e6)
+    with pytest.raises(FitError, match="diverge"):
+        optimise_springs([held_sheet("slow", 0.2)], stiff, config(), NullProgress())
+
+
+def test_cancelling_stops_between_iterations() -> None:
+    class Impatient(Progress):
+        def __init__(self) -> None:
+            self.seen: list[int] = []
+
+        def report(self, stage, iteration, total, loss=None, message="") -> None:
+            self.seen.append(iteration)
+
+        def check_cancelled(self) -> None:
+            if len(self.seen) >= 2:
+                raise CancelledError
+
+    progress = Impatient()
+    with pytest.raises(CancelledError):
+        optimise_springs([held_sheet("slow", 0.2)], PARAMETERS, config(), progress)
+    assert progress.seen == [1, 2]
