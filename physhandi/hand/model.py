@@ -1,0 +1,105 @@
+"""What every articulated hand offers: pose and shape in, vertices and keypoints out."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Literal
+
+from jaxtyping import Float, Int
+from numpy import ndarray
+from torch import Tensor
+
+Side = Literal["right", "left"]
+
+SHAPE_COUNT = 10
+JOINT_COUNT = 15
+KEYPOINT_NAMES = (
+    "wrist",
+    "thumb_cmc",
+    "thumb_mcp",
+    "thumb_ip",
+    "thumb_tip",
+    "index_mcp",
+    "index_pip",
+    "index_dip",
+    "index_tip",
+    "middle_mcp",
+    "middle_pip",
+    "middle_dip",
+    "middle_tip",
+    "ring_mcp",
+    "ring_pip",
+    "ring_dip",
+    "ring_tip",
+    "pinky_mcp",
+    "pinky_pip",
+    "pinky_dip",
+    "pinky_tip",
+)
+"""The 21 keypoints in MediaPipe's order."""
+JOINT_NAMES = tuple(name for name in KEYPOINT_NAMES if name != "wrist" and not name.endswith("tip"))
+"""The 15 joints that articulate, thumb to pinky, each finger from the palm outwards."""
+
+
+@dataclass(frozen=True)
+class HandPose:
+    """A posed hand, differentiable with respect to what posed it."""
+
+    vertex: Float[Tensor, "batch vertex 3"]
+    """Vertices of the surface [length unit of the sequence; m when metric]."""
+    keypoint: Float[Tensor, "batch 21 3"]
+    """Keypoints in MediaPipe's order [as the vertices]."""
+
+
+class HandModel(ABC):
+    """One hand whose shape is constant and whose articulation changes from frame to frame."""
+
+    side: Side
+    """Which hand it is."""
+    faces: Int[ndarray, "face 3"]
+    """Vertices of each triangle, counter-clockwise from outside."""
+    vertex_count: int
+    """Vertices of the surface."""
+    shape_count: int = SHAPE_COUNT
+    """Shape coefficients; all zero is the template, each about one standard deviation per unit."""
+    joint_count: int = JOINT_COUNT
+    """Joints that articulate, in the order of `JOINT_NAMES`."""
+
+    @abstractmethod
+    def __call__(
+        self,
+        shape: Float[Tensor, " 10"],
+        articulation: Float[Tensor, "batch 15 3"],
+        wrist_rotation: Float[Tensor, "batch 3"],
+        wrist_translation: Float[Tensor, "batch 3"],
+        scale: float | Float[Tensor, ""] = 1.0,
+    ) -> HandPose:
+        """Pose the hand: ``scale * (R(wrist_rotation) hand + wrist_translation)``.
+
+        Args:
+            shape: Shape coefficients.
+            articulation: Rotation vector of every joint in its bone's own frame [rad].
+            wrist_rotation: Rotation vector of the whole hand about the wrist [rad].
+            wrist_translation: Position of the wrist [m].
+            scale: Length units of the sequence per metre; 1 when it is metric.
+
+        Returns:
+            Vertices and keypoints in the world frame.
+        """
+
+    @abstractmethod
+    def keypoints(
+        self,
+        shape: Float[Tensor, " 10"],
+        articulation: Float[Tensor, "batch 15 3"],
+        wrist_rotation: Float[Tensor, "batch 3"],
+        wrist_translation: Float[Tensor, "batch 3"],
+        scale: float | Float[Tensor, ""] = 1.0,
+    ) -> Float[Tensor, "batch 21 3"]:
+        """Compute the keypoints alone, as `__call__` does but without the surface."""
+
+
+def load_hand_model(side: Side) -> HandModel:
+    """Load the built-in open hand of one side; repeated calls return the same object."""
+    from physhandi.hand.open_hand import OpenHand
+
+    return OpenHand.load(side)

@@ -1,0 +1,107 @@
+"""A hand's motion: one shape, and the pose of every frame."""
+
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+
+from physhandi.hand.model import HandModel, HandPose, Side
+
+_BATCH = 128
+_SIDES: tuple[Side, Side] = ("right", "left")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HandMotion:
+    """Shape, articulation and wrist pose of one hand over all frames of a sequence."""
+
+    side: Side
+    """Which hand it is."""
+    shape: Float[ndarray, " 10"]
+    """Shape coefficients, constant over the sequence."""
+    articulation: Float[ndarray, "frame 15 3"]
+    """Rotation vector of every joint in its bone's frame [rad]."""
+    wrist_rotation: Float[ndarray, "frame 3"]
+    """Rotation vector of the hand about the wrist [rad]."""
+    wrist_translation: Float[ndarray, "frame 3"]
+    """Position of the wrist in the world frame [m, before `scale`]."""
+    scale: float = 1.0
+    """Length units of the sequence per metre; 1 when it is metric."""
+
+    @property
+    def frame_count(self) -> int:
+        """Frames that the motion covers."""
+        return len(self.articulation)
+
+    def vertices(self, model: HandModel) -> Float[ndarray, "frame vertex 3"]:
+        """Compute the surface in every frame [length unit of the sequence], in float32."""
+        return np.concatenate([pose.vertex.numpy() for pose in self._poses(model)])
+
+    def keypoints(self, model: HandModel) -> Float[ndarray, "frame 21 3"]:
+        """Compute the keypoints in every frame [length unit of the sequence], in float32."""
+        return np.concatenate([pose.keypoint.numpy() for pose in self._poses(model)])
+
+    def _poses(self, model: HandModel) -> list[HandPose]:
+        if model.side != self.side:
+            raise ValueError(
+                f"the motion of a {self.side} hand was given a {model.side} hand model"
+            )
+        arrays = (self.articulation, self.wrist_rotation, self.wrist_translation)
+        shape = torch.from_numpy(self.shape.astype(np.float32))
+        with torch.no_grad():
+            return [
+                model(
+                    shape,
+                    *(
+                        torch.from_numpy(a[start : start + _BATCH].astype(np.float32))
+                        for a in arrays
+                    ),
+                    scale=self.scale,
+                )
+                for start in range(0, self.frame_count, _BATCH)
+            ]
+
+    def to_tensors(self) -> dict[str, ndarray]:
+        """Describe the motion as arrays, as a run's ``hand_<side>.safetensors`` holds it."""
+        return {
+            "side": np.array(_SIDES.index(self.side), dtype=np.int32),
+            "shape": self.shape.astype(np.float32),
+            "articulation": self.articulation.astype(np.float32),
+            "wrist_rotation": self.wrist_rotation.astype(np.float32),
+            "wrist_translation": self.wrist_translation.astype(np.float32),
+            "scale": np.array(self.scale, dtype=np.float64),
+        }
+
+    @classmethod
+    def from_tensors(cls, tensors: dict[str, ndarray]) -> "HandMotion":
+        """Build a motion from what `to_tensors` returned.
+
+        Raises:
+            ValueError: If an array is missing, has the wrong shape or is not finite.
+        """
+        names = ("side", "shape", "articulation", "wrist_rotation", "wrist_translation", "scale")
+        missing = [name for name in names if name not in tensors]
+        if missing:
+            raise ValueError(f"hand motion lacks the array {missing[0]!r}")
+        frame_count = len(np.atleast_1d(tensors["articulation"]))
+        shapes = ((), (10,), (frame_count, 15, 3), (frame_count, 3), (frame_count, 3), ())
+        for name, expected in zip(names, shapes, strict=True):
+            array = tensors[name]
+            if array.shape != expected or not np.isfinite(array).all():
+                raise ValueError(
+                    f"hand motion's {name!r} must be finite numbers of shape {expected}, "
+                    f"not of shape {array.shape}"
+                )
+        if int(tensors["side"]) not in {0, 1}:
+            raise ValueError(f"hand motion's 'side' must be 0 or 1, not {int(tensors['side'])}")
+        return cls(
+            side=cast("Side", _SIDES[int(tensors["side"])]),
+            shape=tensors["shape"],
+            articulation=tensors["articulation"],
+            wrist_rotation=tensors["wrist_rotation"],
+            wrist_translation=tensors["wrist_translation"],
+            scale=float(tensors["scale"]),
+        )

@@ -1,0 +1,240 @@
+"""The open hand: the WebXR generic hand (MIT) with a parent table and ten shape coefficients."""
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+from torch import Tensor
+
+from physhandi.hand.gltf import SkinnedMesh, read_skinned_mesh
+from physhandi.hand.model import JOINT_COUNT, HandModel, HandPose, Side
+from physhandi.hand.rotation import rotation_offset
+
+ASSETS = Path(__file__).parent / "assets"
+
+SHAPE_NAMES = (
+    "size",
+    "palm_length",
+    "palm_width",
+    "thumb_length",
+    "index_length",
+    "middle_length",
+    "ring_length",
+    "pinky_length",
+    "finger_thickness",
+    "thumb_set",
+)
+"""What each shape coefficient scales."""
+SHAPE_RATE = (0.05, 0.06, 0.06, 0.06, 0.06, 0.06, 0.06, 0.06, 0.08, 0.12)
+"""A coefficient b multiplies its length by ``exp(rate * b)``; -3 to 3 is the sensible range."""
+
+_FINGERS = ("thumb", "index-finger", "middle-finger", "ring-finger", "pinky-finger")
+_THUMB_BONES = ("thumb-metacarpal", "thumb-phalanx-proximal", "thumb-phalanx-distal")
+_PHALANGES = ("phalanx-proximal", "phalanx-intermediate", "phalanx-distal")
+_JOINT_NODES = _THUMB_BONES + tuple(
+    f"{finger}-{bone}" for finger in _FINGERS[1:] for bone in _PHALANGES
+)
+_KEYPOINT_NODES = [
+    "wrist",
+    *(
+        node
+        for finger in range(5)
+        for node in (*_JOINT_NODES[3 * finger : 3 * finger + 3], f"{_FINGERS[finger]}-tip")
+    ),
+]
+_PARENT = [0 if joint % 3 == 0 else joint for joint in range(JOINT_COUNT)]
+"""Bone that each joint hangs on."""
+_FINGER_OF_JOINT = [joint // 3 for joint in range(JOINT_COUNT)]
+_BONE_OF_KEYPOINT = [
+    0,
+    *(
+        bone
+        for finger in range(5)
+        for bone in (3 * finger + 1, 3 * finger + 2, *[3 * finger + 3] * 2)
+    ),
+]
+"""Bone 0 is the palm, bone j + 1 the one that joint j moves; a fingertip rides on the last bone."""
+
+
+@dataclass(frozen=True)
+class _Skeleton:
+    """The bones of one shape: how the template's neighbourhood of each bone is deformed."""
+
+    stretch: Float[Tensor, "16 3 3"]
+    """Stretch of each bone, less the identity."""
+    shift: Float[Tensor, "16 3"]
+    """How far each bone's origin lies from the template's [m]."""
+    joint: Float[Tensor, "16 3"]
+    """Origin of each bone [m]."""
+
+
+class OpenHand(HandModel):
+    """Linear blend skinning of a welded, watertight hand of 1,159 vertices.
+
+    The template's frame has its origin in the wrist; fingers point along -y. A joint's rotation
+    vector is expressed in its bone's frame: about x it curls (negative flexes), about y it
+    spreads, about z it twists. The left hand is the mirror image (x to -x) of the right one, so
+    an articulation ``(a, b, c)`` of the right hand mirrors to ``(a, -b, -c)``.
+    """
+
+    def __init__(self, mesh: SkinnedMesh, side: Side) -> None:
+        """Arrange the right hand's mesh by joints and, for a left hand, mirror it.
+
+        Args:
+            mesh: The right hand with WebXR's 25 bones.
+            side: Which hand to build.
+        """
+        bone = {name: index for index, name in enumerate(mesh.bone_names)}
+        origin = mesh.T_mesh_bone[bone["wrist"], :3, 3]
+        joint = [bone[name] for name in _JOINT_NODES]
+        mirror = np.array([-1.0 if side == "left" else 1.0, 1.0, 1.0])
+
+        weight = mesh.weight[:, joint]
+        self.side: Side = side
+        self.faces = mesh.faces if side == "right" else np.ascontiguousarray(mesh.faces[:, ::-1])
+        self.vertex_count = len(mesh.vertex)
+        self.weight = np.concatenate([1.0 - weight.sum(1, keepdims=True), weight], axis=1)
+        self.template = (mesh.vertex - origin) * mirror
+        self.joint_position = (mesh.T_mesh_bone[joint, :3, 3] - origin) * mirror
+        axes = np.stack([_nearest_rotation(T[:3, :3]) for T in mesh.T_mesh_bone[joint]])
+        self.joint_axes = mirror[:, None] * axes * mirror
+        keypoint = [bone[name] for name in _KEYPOINT_NODES]
+        self.keypoint_position = (mesh.T_mesh_bone[keypoint, :3, 3] - origin) * mirror
+        self.keypoint_weight = np.eye(JOINT_COUNT + 1)[_BONE_OF_KEYPOINT]
+        self.palm_axes = _palm_axes(self.joint_position)
+        self._tensors: dict[torch.dtype, dict[str, Tensor]] = {}
+
+    @staticmethod
+    @cache
+    def load(side: Side) -> "OpenHand":
+        """Load the vendored hand of one side."""
+        return OpenHand(read_skinned_mesh(ASSETS / "right.glb"), side)
+
+    def __call__(
+        self,
+        shape: Float[Tensor, " 10"],
+        articulation: Float[Tensor, "batch 15 3"],
+        wrist_rotation: Float[Tensor, "batch 3"],
+        wrist_translation: Float[Tensor, "batch 3"],
+        scale: float | Float[Tensor, ""] = 1.0,
+    ) -> HandPose:
+        """Pose surface and keypoints; see `HandModel`."""
+        skeleton = self._skeleton(shape)
+        bones = self._turn_bones(skeleton, articulation)
+        vertex, keypoint = (self._skin(part, skeleton, *bones) for part in ("vertex", "keypoint"))
+        wrist = (wrist_rotation, wrist_translation, scale)
+        return HandPose(_place(vertex, *wrist), _place(keypoint, *wrist))
+
+    def keypoints(
+        self,
+        shape: Float[Tensor, " 10"],
+        articulation: Float[Tensor, "batch 15 3"],
+        wrist_rotation: Float[Tensor, "batch 3"],
+        wrist_translation: Float[Tensor, "batch 3"],
+        scale: float | Float[Tensor, ""] = 1.0,
+    ) -> Float[Tensor, "batch 21 3"]:
+        """Pose the keypoints alone; see `HandModel`."""
+        skeleton = self._skeleton(shape)
+        keypoint = self._skin("keypoint", skeleton, *self._turn_bones(skeleton, articulation))
+        return _place(keypoint, wrist_rotation, wrist_translation, scale)
+
+    def _skeleton(self, shape: Float[Tensor, " 10"]) -> _Skeleton:
+        fixed = self._constants(shape)
+        ratio = torch.expm1(shape * fixed["rate"])
+        zero = torch.zeros_like(ratio[0])
+        palm = torch.diag_embed(torch.stack([ratio[2], ratio[1], zero]))
+        palm = fixed["palm_axes"] @ palm @ fixed["palm_axes"].T
+        length = ratio[3:8][_FINGER_OF_JOINT]
+        thickness = ratio[8].expand(JOINT_COUNT)
+        finger = torch.diag_embed(torch.stack([thickness, thickness, length], 1))
+        finger = fixed["joint_axes"] @ finger @ fixed["joint_axes"].transpose(-1, -2)
+
+        offset = fixed["offset"].reshape(5, 3, 3)
+        root = offset[:, 0] @ palm + torch.cat([ratio[9:], zero.expand(4)])[:, None] * offset[:, 0]
+        beyond = length.reshape(5, 3, 1)[:, 1:] * offset[:, 1:]
+        shift = torch.cat([root[:, None], beyond], 1).cumsum(1).reshape(-1, 3)
+        shift = torch.cat([torch.zeros_like(shift[:1]), shift])
+
+        grown = 1 + ratio[0]
+        stretch = torch.cat([palm[None], finger]) * grown + ratio[0] * fixed["identity"]
+        shift = shift * grown + ratio[0] * fixed["bone"]
+        return _Skeleton(stretch, shift, fixed["bone"] + shift)
+
+    def _turn_bones(
+        self, skeleton: _Skeleton, articulation: Float[Tensor, "batch 15 3"]
+    ) -> tuple[Tensor, Tensor]:
+        """Compute each bone's rotation, less the identity, and how far its origin moved."""
+        axes = self._constants(articulation)["joint_axes"]
+        turn = axes @ rotation_offset(articulation) @ axes.transpose(-1, -2)
+        turn = turn.reshape(-1, 5, 3, 3, 3)
+        joint = skeleton.joint[1:].reshape(5, 3, 3)
+        rotation, moved = [turn[:, :, 0]], [torch.zeros_like(turn[:, :, 0, 0])]
+        for link in (1, 2):
+            above = rotation[-1]
+            offset = (joint[:, link] - joint[:, link - 1])[..., None]
+            moved.append(moved[-1] + (above @ offset)[..., 0])
+            rotation.append(above + turn[:, :, link] + above @ turn[:, :, link])
+        palm = torch.zeros_like(turn[:, 0, :1])
+        return (
+            torch.cat([palm, torch.stack(rotation, 2).flatten(1, 2)], 1),
+            torch.cat([palm[..., 0], torch.stack(moved, 2).flatten(1, 2)], 1),
+        )
+
+    def _skin(
+        self, part: str, skeleton: _Skeleton, rotation: Tensor, moved: Tensor
+    ) -> Float[Tensor, "batch point 3"]:
+        fixed = self._constants(rotation)
+        weight, point, arm = fixed[f"{part}_weight"], fixed[part], fixed[f"{part}_arm"]
+        change = (skeleton.stretch @ arm[..., None])[..., 0] + skeleton.shift
+        shaped = point + (weight[..., None] * change).sum(1)
+        constant = moved - (rotation @ skeleton.joint[..., None])[..., 0]
+        blended = (weight @ rotation.flatten(2)).unflatten(2, (3, 3))
+        return shaped + (blended @ shaped[:, :, None])[..., 0] + weight @ constant
+
+    def _constants(self, like: Tensor) -> dict[str, Tensor]:
+        if like.dtype not in self._tensors:
+            joint = np.concatenate([np.zeros((1, 3)), self.joint_position])
+            arrays = {
+                "bone": joint,
+                "offset": self.joint_position - joint[_PARENT],
+                "joint_axes": self.joint_axes,
+                "palm_axes": self.palm_axes,
+                "rate": np.array(SHAPE_RATE),
+                "identity": np.eye(3),
+                "vertex": self.template,
+                "vertex_weight": self.weight,
+                "vertex_arm": self.template[:, None] - joint,
+                "keypoint": self.keypoint_position,
+                "keypoint_weight": self.keypoint_weight,
+                "keypoint_arm": self.keypoint_position[:, None] - joint,
+            }
+            self._tensors[like.dtype] = {
+                name: torch.as_tensor(array).to(like) for name, array in arrays.items()
+            }
+        return self._tensors[like.dtype]
+
+
+def _place(
+    point: Tensor, wrist_rotation: Tensor, wrist_translation: Tensor, scale: float | Tensor
+) -> Tensor:
+    turned = point + point @ rotation_offset(wrist_rotation).transpose(-1, -2)
+    return scale * (turned + wrist_translation[:, None])
+
+
+def _nearest_rotation(matrix: Float[ndarray, "3 3"]) -> Float[ndarray, "3 3"]:
+    """Undo the rounding of the file's four decimals."""
+    left, _, right = np.linalg.svd(matrix)
+    return left @ right
+
+
+def _palm_axes(joint: Float[ndarray, "joint 3"]) -> Float[ndarray, "3 3"]:
+    """Find the palm's width, length and normal as columns: wrist to middle knuckle is length."""
+    length = joint[6] / np.linalg.norm(joint[6])
+    width = joint[3] - joint[12]
+    width = width - (width @ length) * length
+    width /= np.linalg.norm(width)
+    return np.stack([width, length, np.cross(width, length)], axis=1)
