@@ -13,6 +13,7 @@ from typing import Any, BinaryIO, cast
 import numpy as np
 import psutil
 import yaml
+from safetensors import numpy as safetensors_numpy
 
 _HOST = socket.gethostname().replace("-", "_").replace(".", "_")[:32] or "host"
 
@@ -55,19 +56,29 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def write_atomically(path: Path, write: Callable[[BinaryIO], Any]) -> None:
-    """Let `write` fill a temporary file, make it durable and move it to `path`."""
+def write_atomically(
+    path: Path, write: Callable[[BinaryIO], Any], *, is_durable: bool = True
+) -> None:
+    """Let `write` fill a temporary file and move it to `path`.
+
+    Args:
+        path: File to replace; its folder must exist.
+        write: Writes the content.
+        is_durable: Whether the content must survive a power cut; costs milliseconds.
+    """
     temporary = path.with_name(temporary_name(path.name))
     try:
         with temporary.open("wb") as stream:
             write(stream)
             stream.flush()
-            os.fsync(stream.fileno())
+            if is_durable:
+                os.fsync(stream.fileno())
         temporary.replace(path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
-    sync_folder(path.parent)
+    if is_durable:
+        sync_folder(path.parent)
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -82,14 +93,12 @@ def write_array(path: Path, array: np.ndarray) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Turn NumPy values, paths and tuples into what JSON and YAML know; NaN and inf become None."""
+    """Turn NumPy values, paths and tuples into lists, numbers and text, as JSON and YAML have."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in cast("Mapping[Any, Any]", value).items()}
     if isinstance(value, np.ndarray | np.generic):
         return plain(value.tolist())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if value is None or isinstance(value, str | int | bool):
+    if value is None or isinstance(value, str | int | float | bool):
         return value
     if isinstance(value, PurePath):
         return str(value)
@@ -98,10 +107,25 @@ def plain(value: Any) -> Any:
     raise TypeError(f"{type(value).__name__} cannot be stored in JSON or YAML")
 
 
-def write_json(path: Path, value: Any) -> None:
-    """Write a value as JSON (`plain` first)."""
-    text = json.dumps(plain(value), indent=1, allow_nan=False)
-    write_bytes(path, text.encode() + b"\n")
+def without_non_finite(value: Any) -> Any:
+    """Replace NaN and infinity, which JSON does not know, by None in `plain` data."""
+    if isinstance(value, dict):
+        return {k: without_non_finite(v) for k, v in cast("dict[str, Any]", value).items()}
+    if isinstance(value, list):
+        return [without_non_finite(item) for item in cast("list[Any]", value)]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def json_line(value: Any) -> str:
+    """Format a value as JSON on one line; NaN and infinity become null."""
+    return json.dumps(without_non_finite(plain(value)), allow_nan=False)
+
+
+def write_json(path: Path, value: Any, *, is_durable: bool = True) -> None:
+    """Write a value as JSON; NaN and infinity become null."""
+    text = json.dumps(without_non_finite(plain(value)), indent=1, allow_nan=False)
+    content = text.encode() + b"\n"
+    write_atomically(path, lambda stream: stream.write(content), is_durable=is_durable)
 
 
 def write_yaml(path: Path, value: Any) -> None:
@@ -129,3 +153,15 @@ def read_array(path: Path, *, mmap: bool = False) -> np.ndarray:
         mapped.close()
         raise ValueError("it is an archive, not one array")  # noqa: TRY004 - the content is wrong
     return mapped if mmap else np.array(mapped)
+
+
+def read_tensors(path: Path) -> dict[str, np.ndarray]:
+    """Read a ``.safetensors`` file."""
+    return safetensors_numpy.load(path.read_bytes())
+
+
+def named_fields(value: Any) -> dict[str, Any] | None:
+    """Give a mapping as one with text keys; None if it is something else."""
+    if not isinstance(value, dict):
+        return None
+    return {str(key): item for key, item in cast("dict[Any, Any]", value).items()}

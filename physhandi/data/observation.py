@@ -16,7 +16,7 @@ class ObjectObservation:
     """Whether a track was seen in a frame."""
     is_motion_valid: Bool[ndarray, "frame track"]
     """Whether the motion from the frame before can be trusted; False in frame 0."""
-    cloud: tuple[Float[ndarray, "point 3"], ...] = ()
+    cloud: tuple[Float[ndarray, "_ 3"], ...] = ()
     """Object points of all views fused, per frame [m]; empty if no view has depth."""
     node_of_track: Int[ndarray, " track"] | None = None
     """Object node that each track observes, where the recording identifies it."""

@@ -163,11 +163,16 @@ class Sequence:
         Args:
             parts: Of ``views hands color depth mask keypoint track control marker marker_node
                 object_node rest_node``. A part of views counts as there if one view has it.
+                ``object`` stands for what an object can be observed by (markers, or depth with
+                masks) and moved by (hands or control).
 
         Returns:
             The parts that are not there, in the order asked for.
         """
-        return [part for part in parts if not self._has(part)]
+        wanted: list[str] = []
+        for part in parts:
+            wanted.extend(self._object_parts() if part == "object" else [part])
+        return [part for part in dict.fromkeys(wanted) if not self._has(part)]
 
     def validate(self) -> None:
         """Read every frame of every part and check its values.
@@ -193,6 +198,10 @@ class Sequence:
     def fingerprint(self) -> str:
         """Compute a SHA-256 over all names and sizes, and the content of YAML and arrays."""
         return self._fingerprint
+
+    def _object_parts(self) -> list[str]:
+        seen = ["marker"] if self._has("marker") else ["depth", "mask"]
+        return [*seen, "hands" if self.hands else "control"]
 
     def _has(self, part: str) -> bool:
         if part in {"views", "hands"}:

@@ -1,0 +1,130 @@
+"""The right to write into a run, held by one process at a time and fenced by a nonce."""
+
+import fcntl
+import os
+import secrets
+import socket
+import time
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from physhandi.data.atomic import write_json
+from physhandi.data.run_files import LEASE, read_mapping
+from physhandi.errors import RunError
+
+REMOTE_TIMEOUT_S = 120.0
+_LOCK = ".lease.lock"
+_CLOCK_TOLERANCE_S = 2.0
+
+
+class Lease:
+    """One process's claim on a run; a later claim makes it void.
+
+    The holder proves itself by the nonce in ``lease.json``. Whoever finds another nonce there has
+    been replaced and must not publish.
+    """
+
+    def __init__(self, folder: Path, nonce: str) -> None:
+        self.folder = folder
+        self.nonce = nonce
+
+    @classmethod
+    def acquire(cls, folder: Path, *, take_over: bool = False) -> "Lease":
+        """Claim a run.
+
+        Args:
+            folder: The run's folder.
+            take_over: Whether to replace a holder that is alive.
+
+        Raises:
+            RunError: If another process that is alive holds the run.
+        """
+        with locked(folder):
+            holder = live_holder(folder)
+            if holder is not None and not take_over:
+                raise RunError(
+                    f"Run '{folder.name}' is being written by process {holder['pid']} on "
+                    f"{holder['host']}. Wait for it or cancel it first."
+                )
+            lease = cls(folder, secrets.token_hex(16))
+            lease._write()
+        return lease
+
+    def is_held(self) -> bool:
+        """Tell whether this claim is still the valid one."""
+        return read_mapping(self.folder / LEASE).get("nonce") == self.nonce
+
+    def check(self) -> None:
+        """Make sure that this claim is still the valid one.
+
+        Raises:
+            RunError: If another process took the run over.
+        """
+        if not self.is_held():
+            raise RunError(
+                f"Run '{self.folder.name}' was taken over by another process, so this one must "
+                "stop without publishing. Look at the later attempt for the result."
+            )
+
+    def heartbeat(self) -> None:
+        """Renew the claim.
+
+        Raises:
+            RunError: If another process took the run over.
+        """
+        with locked(self.folder):
+            self.check()
+            self._write()
+
+    def release(self) -> None:
+        """Give the claim up; the caller holds `locked`."""
+        self.check()
+        (self.folder / LEASE).unlink()
+
+    def _write(self) -> None:
+        claim = {
+            "nonce": self.nonce,
+            "pid": os.getpid(),
+            "process_created": psutil.Process().create_time(),
+            "host": socket.gethostname(),
+            "time": time.time(),
+        }
+        write_json(self.folder / LEASE, claim, is_durable=False)
+
+
+@contextmanager
+def locked(folder: Path) -> Generator[None]:
+    """Hold the run's lock for a moment, so that claims and publications do not mix."""
+    try:
+        descriptor = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+    except FileNotFoundError:
+        raise RunError(f"Run folder {folder} is gone; it was deleted or moved.") from None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def live_holder(folder: Path) -> dict[str, Any] | None:
+    """Give the claim on a run, or None if there is none or its process is gone.
+
+    On this host the process itself decides; on another host a claim that was not renewed for
+    `REMOTE_TIMEOUT_S` seconds is void.
+    """
+    try:
+        claim = read_mapping(folder / LEASE)
+    except RunError:
+        return None  # A damaged claim protects nobody.
+    try:
+        if claim["host"] != socket.gethostname():
+            return claim if time.time() - claim["time"] < REMOTE_TIMEOUT_S else None
+        process = psutil.Process(claim["pid"])
+        is_same = abs(process.create_time() - claim["process_created"]) < _CLOCK_TOLERANCE_S
+        return claim if is_same and process.status() != psutil.STATUS_ZOMBIE else None
+    except (KeyError, TypeError, ValueError, psutil.Error):
+        return None

@@ -1,0 +1,365 @@
+"""Run folders: publication is all or nothing, and damage is named."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from physhandi.data.run import Run, find_runs, new_run_id, read_events
+from physhandi.errors import CancelledError, RunError
+from physhandi.progress import Progress
+
+
+def make_run(folder: Path, **changes: object) -> Run:
+    options = {
+        "name": "My fit",
+        "kind": "reconstruction",
+        "sequences": ["/data/lift"],
+        "config": {"radius": 0.02, "search": {"iterations": 3}},
+    }
+    return Run.create(folder, **(options | changes))
+
+
+def fill(run: Run, value: float = 1.5) -> None:
+    with run.begin_attempt() as attempt:
+        attempt.save_array("sequences/lift/rollout.npy", np.full((4, 2, 3), value, np.float32))
+        attempt.save_tensors("object/material.safetensors", {"stiffness": np.arange(5.0)[::2]})
+        attempt.save_yaml("object/parameters.yaml", {"drag": np.float64(3.0)})
+        attempt.save_json("metrics.json", {"track": np.float32(0.5), "bad": float("nan")})
+        attempt.finish_stage("first_order", {"before": 2.0, "after": 0.5, "curve": [[0, 2.0]]})
+        attempt.publish()
+
+
+def test_everything_written_comes_back(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "fit-1")
+    assert run.state == "queued"
+    assert not run.has("metrics.json")
+    fill(run)
+    again = Run.open(tmp_path / "fit-1")
+    assert (again.id, again.name, again.kind, again.state) == (
+        "fit-1",
+        "My fit",
+        "reconstruction",
+        "succeeded",
+    )
+    assert again.config == {"radius": 0.02, "search": {"iterations": 3}}
+    assert again.sequences == ["/data/lift"]
+    assert again.sequence_names == ["lift"]
+    assert again.is_published
+    assert again.out == tmp_path / "fit-1" / "attempts" / "1" / "out"
+    rollout = again.array("sequences/lift/rollout.npy")
+    assert isinstance(rollout, np.memmap)
+    np.testing.assert_array_equal(rollout, np.full((4, 2, 3), 1.5))
+    np.testing.assert_array_equal(
+        again.tensors("object/material.safetensors")["stiffness"], [0, 2, 4]
+    )
+    assert again.yaml("object/parameters.yaml") == {"drag": 3.0}
+    assert again.json("metrics.json") == {"track": 0.5, "bad": None}
+    assert again.json("losses.json")["first_order"]["after"] == 0.5
+    again.verify()
+
+
+def test_a_flipped_byte_is_named(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "fit")
+    fill(run)
+    path = run.out / "sequences/lift/rollout.npy"
+    content = bytearray(path.read_bytes())
+    content[-3] ^= 1
+    path.write_bytes(bytes(content))
+    with pytest.raises(RunError, match=r"'fit': sequences/lift/rollout.npy has changed"):
+        run.verify()
+    path.write_bytes(bytes(content[:-1]))
+    with pytest.raises(RunError, match=r"rollout.npy has \d+ bytes instead of \d+"):
+        run.verify()
+    with pytest.raises(RunError, match=r"rollout.npy is not a readable array"):
+        run.array("sequences/lift/rollout.npy")
+    path.unlink()
+    with pytest.raises(RunError, match=r"rollout.npy is missing"):
+        run.verify()
+
+
+def test_a_file_that_the_manifest_does_not_know_is_named(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "fit")
+    fill(run)
+    (run.out / "extra.npy").write_bytes(b"x")
+    with pytest.raises(RunError, match=r"extra.npy is not in MANIFEST.json"):
+        run.verify()
+
+
+def test_a_stolen_lease_forbids_publication(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "fit")
+    first = run.begin_attempt()
+    first.save_array("a.npy", np.zeros(3))
+    assert run.state == "running"
+    with pytest.raises(RunError, match="is being written by process"):
+        run.begin_attempt()
+    second = run.begin_attempt(take_over=True)
+    for action in (first.publish, first.heartbeat, first.cancelled, lambda: first.fail("x")):
+        with pytest.raises(RunError, match="was taken over by another process"):
+            action()
+    assert not run.is_published
+    assert run.state == "running"
+    second.save_array("a.npy", np.ones(3))
+    second.publish()
+    np.testing.assert_array_equal(run.array("a.npy"), np.ones(3))
+    with pytest.raises(RunError, match="taken over"):
+        first.publish()
+    assert run.out.parent.name == "2"
+
+
+def test_a_claim_of_a_process_that_is_gone_is_void(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "fit")
+    attempt = run.begin_attempt()
+    path = run.folder / "lease.json"
+    claim = json.loads(path.read_text())
+    path.write_text(json.dumps(claim | {"process_created": claim["process_created"] - 100}))
+    assert run.state == "failed"
+    assert "gone without a word" in (run.error or "")
+    path.write_text(json.dumps(claim | {"host": "elsewhere"}))
+    assert run.state == "running"
+    path.write_text(json.dumps(claim | {"host": "elsewhere", "time": claim["time"] - 1000}))
+    assert run.state == "failed"
+    path.write_text("{torn")
+    assert run.state == "failed"
+    with run.begin_attempt() as second:
+        assert second.number == attempt.number + 1
+        second.publish()
+    assert run.state == "succeeded"
+
+
+def fail_in_the_second_stage(run: Run) -> None:
+    with run.begin_attempt() as attempt:
+        attempt.save_array("hands.npy", np.full(3, 7.0))
+        attempt.finish_stage("hands", {"before": 4.0, "after": 1.0})
+        attempt.save_array("half.npy", np.zeros(9))
+        attempt.checkpoint("search", {"mean": np.array([1.0, 2.0])})
+        raise ZeroDivisionError("no luck")
+
+
+def test_finished_stages_are_taken_over(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "fit")
+    with pytest.raises(ZeroDivisionError):
+        fail_in_the_second_stage(run)
+    assert run.state == "failed"
+    assert run.error == "no luck"
+    with run.begin_attempt() as attempt:
+        assert attempt.stage_done("hands")
+        assert not attempt.stage_done("search")
+        assert attempt.stage_summary("hands")["after"] == 1.0
+        assert sorted(p.name for p in attempt.out.iterdir()) == ["hands.npy", "losses.json"]
+        checkpoint = attempt.load_checkpoint("search")
+        assert checkpoint is not None
+        np.testing.assert_array_equal(checkpoint["mean"], [1.0, 2.0])
+        attempt.save_array("object.npy", np.ones(2))
+        attempt.finish_stage("search")
+        attempt.publish()
+    np.testing.assert_array_equal(run.array("hands.npy"), [7.0, 7.0, 7.0])
+    assert list(run.json("losses.json")) == ["hands", "search"]
+    run.verify()
+
+
+def test_a_stage_whose_files_changed_is_done_again(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "fit")
+    attempt = run.begin_attempt()
+    for stage in ("one", "two", "three"):
+        attempt.save_array(f"{stage}.npy", np.zeros(3))
+        attempt.finish_stage(stage)
+    (attempt.out / "two.npy").write_bytes(b"broken")
+    attempt.fail("power cut")
+    with run.begin_attempt() as again:
+        assert [again.stage_done(s) for s in ("one", "two", "three")] == [True, False, False]
+        assert not (again.out / "two.npy").exists()
+        again.publish()
+
+
+def test_a_later_attempt_leaves_published_files_alone(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "fit")
+    fill(run)
+    old = run.out / "metrics.json"
+    before = old.read_bytes()
+    with run.begin_attempt() as attempt:
+        attempt.save_json("metrics.json", {"track": 0.1})
+    assert run.state == "failed"
+    assert run.error == "The attempt ended without publishing its results."
+    assert old.read_bytes() == before
+    assert run.json("metrics.json")["track"] == 0.5
+    run.verify()
+    with run.begin_attempt() as attempt:
+        attempt.save_json("metrics.json", {"track": 0.1})
+        attempt.publish()
+    assert run.json("metrics.json") == {"track": 0.1}
+    run.verify()
+
+
+def cancel_at_the_second_check(run: Run) -> None:
+    with run.begin_attempt() as attempt:
+        progress = attempt.progress()
+        progress.check_cancelled()
+        run.request_cancel()
+        progress.check_cancelled()
+
+
+def test_cancel_stops_at_the_next_check_and_resume_goes_on(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "fit")
+    with pytest.raises(CancelledError, match="'fit' was cancelled"):
+        cancel_at_the_second_check(run)
+    assert run.state == "cancelled"
+    with run.begin_attempt() as attempt:
+        attempt.progress().check_cancelled()
+        attempt.publish()
+    assert run.state == "succeeded"
+
+
+def test_a_cancel_before_the_first_attempt_is_heard(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "fit")
+    run.request_cancel()
+    assert run.state == "cancelled"
+    with pytest.raises(CancelledError), run.begin_attempt() as attempt:
+        attempt.progress().check_cancelled()
+    run.clear_cancel()
+    assert run.state == "cancelled"
+
+
+class Recorder(Progress):
+    def __init__(self) -> None:
+        self.reports: list[tuple[object, ...]] = []
+
+    def report(
+        self, stage: str, iteration: int, total: int, loss: float | None = None, message: str = ""
+    ) -> None:
+        self.reports.append((stage, iteration, total, loss, message))
+
+
+def test_events_are_numbered_across_attempts(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "fit")
+    recorder = Recorder()
+    attempt = run.begin_attempt()
+    progress = attempt.progress(recorder)
+    for iteration in range(1, 4):
+        progress.report("search", iteration, 3, 1.0 / iteration, "größer " + "\U0001f600" * 9000)
+    progress.report("fit", 1, 100, float("inf"))
+    attempt.fail("stop")
+    assert [report[0] for report in recorder.reports] == ["search"] * 3 + ["fit"]
+    events, offset = read_events(run.folder)
+    assert [event["seq"] for event in events] == [0, 1, 2, 3]
+    assert events[2]["loss"] == pytest.approx(1 / 3)
+    assert events[3]["loss"] is None
+    lines = (run.folder / "events.jsonl").read_bytes().splitlines()
+    assert max(len(line) for line in lines) < 4096
+    with (run.folder / "events.jsonl").open("a") as stream:
+        stream.write('{"seq": 4, "st')
+    assert read_events(run.folder, offset) == ([], offset)
+    with run.begin_attempt() as second:
+        second.progress().report("fit", 2, 100, 0.25)
+        second.publish()
+    events, _ = read_events(run.folder, offset)
+    assert [(event["seq"], event["attempt"], event["loss"]) for event in events] == [(4, 2, 0.25)]
+    assert run.progress["iteration"] == 2
+
+
+def test_the_newest_whole_checkpoint_is_read(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "fit")
+    with run.begin_attempt() as attempt:
+        assert attempt.load_checkpoint("fit") is None
+        for iteration in range(5):
+            attempt.checkpoint("fit", {"iteration": np.array(iteration), "x": np.ones(4)})
+        newest = max(attempt.folder.glob("ckpt/*"), key=lambda p: p.stat().st_mtime_ns)
+        content = bytearray(newest.read_bytes())
+        content[-1] ^= 1
+        newest.write_bytes(bytes(content))
+        found = attempt.load_checkpoint("fit")
+        assert found is not None
+        assert int(found["iteration"]) == 3
+        newest.write_bytes(b"torn")
+        attempt.checkpoint("fit", {"iteration": np.array(9)})
+        found = attempt.load_checkpoint("fit")
+        assert found is not None
+        assert int(found["iteration"]) == 9
+        attempt.publish()
+
+
+@pytest.mark.parametrize("rel", ["../x.npy", "/x.npy", "a/../../x", ".x", "a b", ""])
+def test_files_cannot_leave_the_run(tmp_path: Path, rel: str) -> None:
+    run = make_run(tmp_path / "fit")
+    with run.begin_attempt() as attempt:
+        with pytest.raises(RunError, match="not a file name inside"):
+            attempt.save_json(rel, {})
+        with pytest.raises(RunError, match="not a file name inside"):
+            run.has(rel)
+        attempt.publish()
+
+
+def test_pickled_objects_are_neither_written_nor_read(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "fit")
+    objects = np.array([{"a": 1}], dtype=object)
+    with run.begin_attempt() as attempt:
+        with pytest.raises(RunError, match=r"a\.npy cannot be stored"):
+            attempt.save_array("a.npy", objects)
+        np.save(attempt.out / "a.npy", objects, allow_pickle=True)
+        attempt.publish()
+    with pytest.raises(RunError, match=r"a\.npy is not a readable array"):
+        run.array("a.npy")
+
+
+def test_unusable_folders_are_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="is not a run"):
+        Run.open(tmp_path)
+    with pytest.raises(RunError, match="'a b' cannot name a run"):
+        make_run(tmp_path / "a b")
+    with pytest.raises(RunError, match="Two sequences are named 'lift'"):
+        make_run(tmp_path / "fit", sequences=["/a/lift", "/b/lift"])
+    run = make_run(tmp_path / "fit")
+    with pytest.raises(RunError, match="exists already"):
+        make_run(tmp_path / "fit")
+    with pytest.raises(RunError, match="has no outputs yet"):
+        _ = run.out
+    with pytest.raises(RunError, match="nothing published"):
+        run.verify()
+    fill(run)
+    with pytest.raises(RunError, match=r"has no video\.mp4"):
+        run.json("video.mp4")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["fit"]
+
+
+def test_a_damaged_run_does_not_hide_the_others(tmp_path: Path) -> None:
+    fill(make_run(tmp_path / "good"))
+    for name, text in (("bad1", "kind: ["), ("bad2", "format: physhandi-run/1\nkind: 3")):
+        run = make_run(tmp_path / name)
+        (run.folder / "job.yaml").write_text(text)
+    (tmp_path / "notes").mkdir()
+    entries = {entry.folder.name: entry for entry in find_runs(tmp_path)}
+    assert list(entries) == ["bad1", "bad2", "good"]
+    assert "job.yaml cannot be read as YAML" in (entries["bad1"].error or "")
+    assert "field 'kind' is missing or wrong" in (entries["bad2"].error or "")
+    assert entries["good"].run is not None
+    assert entries["good"].run.state == "succeeded"
+
+
+def test_rename_and_delete(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "fit")
+    run.rename("Better name", label="paper")
+    again = Run.open(run.folder)
+    assert (again.name, again.label, again.created) == ("Better name", "paper", run.created)
+    attempt = run.begin_attempt()
+    with pytest.raises(RunError, match="is running"):
+        run.delete()
+    attempt.publish()
+    run.delete()
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(RunError, match="was deleted or moved"):
+        run.begin_attempt()
+
+
+def test_ids_sort_by_time_and_never_repeat() -> None:
+    ids = [new_run_id() for _ in range(500)]
+    assert len(set(ids)) == 500
+    assert all(len(name) == 26 and name.isalnum() for name in ids)
+    assert ids[0][:9] <= ids[-1][:9]
+
+
+def test_job_yaml_is_plain(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "fit", config={"a": (1, 2), "b": np.float32(0.5), "c": Path("/x")})
+    stored = yaml.safe_load((run.folder / "job.yaml").read_text())
+    assert stored["config"] == {"a": [1, 2], "b": 0.5, "c": "/x"} == Run.open(run.folder).config

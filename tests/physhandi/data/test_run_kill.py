@@ -1,0 +1,92 @@
+"""A worker that is killed in the middle of writing leaves nothing corrupt."""
+
+import json
+import multiprocessing
+import os
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import yaml
+from safetensors.numpy import load_file
+
+from physhandi.data.checkpoint import read_checkpoint
+from physhandi.data.run import Run, read_events
+
+KILLS = 30
+
+
+def write_for_ever(folder: Path) -> None:
+    run = Run.open(folder)
+    attempt = run.begin_attempt()
+    progress = attempt.progress()
+    number = 0
+    while True:
+        number += 1
+        attempt.save_array("array.npy", np.full(50_000, number))
+        attempt.save_tensors("tensors.safetensors", {"x": np.full(20_000, number)})
+        attempt.save_json("data.json", [number] * 2000)
+        attempt.save_yaml("data.yaml", {"number": number})
+        attempt.checkpoint("state", {"x": np.full(20_000, number)})
+        progress.report("write", number, 10**9, float(number))
+        attempt.finish_stage(f"stage{number % 3}", {"number": number})
+
+
+def holder_of(folder: Path) -> int | None:
+    path = folder / "lease.json"
+    return json.loads(path.read_text())["pid"] if path.exists() else None
+
+
+def check_whole(run: Run) -> int:
+    """Read every file in the way a reader does; return how many there were."""
+    count = 0
+    for path in run.folder.rglob("*"):
+        if path.name.startswith(".") or not path.is_file():
+            continue
+        count += 1
+        if path.suffix == ".npy":
+            assert len(set(np.load(path).tolist())) == 1
+        elif path.suffix == ".safetensors":
+            assert len(set(load_file(path)["x"].tolist())) == 1
+        elif path.suffix == ".json":
+            assert json.loads(path.read_text()) is not None
+        elif path.suffix == ".yaml":
+            assert isinstance(yaml.safe_load(path.read_text()), dict)
+    events, _ = read_events(run.folder)
+    assert [event["seq"] for event in events] == list(range(len(events)))
+    return count
+
+
+def test_kills_in_the_middle_of_writing(tmp_path: Path) -> None:
+    run = Run.create(
+        tmp_path / "fit", name="fit", kind="reconstruction", sequences=[], config={"a": 1}
+    )
+    context = multiprocessing.get_context("fork")
+    chance = np.random.default_rng(7)
+    files, leftovers, states = 0, 0, set()
+    for _ in range(KILLS):
+        child = context.Process(target=write_for_ever, args=(run.folder,))
+        child.start()
+        deadline = time.monotonic() + 20
+        while holder_of(run.folder) != child.pid and time.monotonic() < deadline:
+            time.sleep(0.001)
+        time.sleep(chance.uniform(0.0, 0.1))
+        os.kill(child.pid or 0, signal.SIGKILL)
+        child.join()
+        files += check_whole(run)
+        leftovers += len(list(run.folder.rglob(".*.tmp")))
+        states.add(run.state)
+    assert states <= {"failed", "queued"}
+    assert "failed" in states
+    assert files > 5 * KILLS
+    assert leftovers > 0  # Otherwise no kill hit a write, and the test shows nothing.
+    with run.begin_attempt() as attempt:
+        assert list(run.folder.rglob(".*.tmp")) == []
+        state = read_checkpoint(attempt.folder / "ckpt", "state")
+        assert state is not None
+        assert len(set(state["x"].tolist())) == 1
+        attempt.publish()
+    run.verify()
+    assert run.state == "succeeded"
+    assert len(list((run.folder / "attempts").iterdir())) <= 3
