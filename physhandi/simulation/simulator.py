@@ -113,6 +113,13 @@ class Simulator:
             world[name] = value
         self.world.assign(world)
 
+    def override_world(self, **values: float) -> None:
+        """Set fields of the kernels' `World` directly, bounds unchecked, until the next change."""
+        world: Any = self.world.numpy()
+        for name, value in values.items():
+            world[name] = value
+        self.world.assign(world)
+
     def set_material(
         self,
         *,
@@ -162,9 +169,7 @@ class Simulator:
         if self.model.control_count:
             self.control_start.assign(np.ascontiguousarray(control_start, dtype=np.float32))
             self.control_end.assign(np.ascontiguousarray(control_end, dtype=np.float32))
-        if self._graph is None:
-            self._graph = self.capture(self._launch_frame)
-        wp.capture_launch(self._graph)
+        self.replay_frame()
         self.check_divergence(frame)
 
     def frames(
@@ -213,6 +218,18 @@ class Simulator:
             raise ValueError(f"control is not finite at frame {bad[0][0]}, node {bad[0][1]}.")
         return control
 
+    def replay_frame(self) -> None:
+        """Advance the state on the device by one frame, with the controls that are there."""
+        if self._graph is None:
+            self._graph = self.capture(self._launch_frame)
+        wp.capture_launch(self._graph)
+
+    def spring_inputs(self, fraction: float, state: tuple[wp.array, wp.array]) -> list[Any]:
+        """List what a spring kernel reads, a `fraction` of a frame after its start."""
+        material = (self.spring_nodes, self.rest_length, self.stiffness, self.damping)
+        control = (self.control_start, self.control_end)
+        return [fraction, self.world, *material, *state, *control]
+
     def launch_substep(
         self,
         substep: int,
@@ -221,18 +238,11 @@ class Simulator:
         free_velocity: wp.array | None = None,
     ) -> None:
         """Launch the kernels of one substep, from one state (position, velocity) to another."""
-        springs = (self.spring_nodes, self.rest_length, self.stiffness, self.damping)
+        fraction = (substep + 1) / self.parameters.substeps_per_frame
         wp.launch(
             pull_springs,
             dim=len(self.model.spring_nodes),
-            inputs=[
-                (substep + 1) / self.parameters.substeps_per_frame,
-                self.world,
-                *springs,
-                *before,
-                self.control_start,
-                self.control_end,
-            ],
+            inputs=self.spring_inputs(fraction, before),
             outputs=[self.pull],
             device=self.device,
         )
