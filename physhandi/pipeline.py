@@ -5,7 +5,6 @@ goes on after its last finished stage.
 """
 
 from collections.abc import Sequence as Many
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +24,6 @@ from physhandi.fitting.simulate import simulate_again
 from physhandi.metrics.report import score_run
 from physhandi.perception.lifting import observe_object
 from physhandi.progress import Progress
-from physhandi.simulation.stability import stable_substeps
-from physhandi.simulation.topology import build_model
 
 HANDS, OBSERVATION, SEARCH, SPRINGS, EVALUATION = (
     "hand_reconstruction",
@@ -61,7 +58,7 @@ def reconstruct(
         FitError: If an optimisation has no usable result.
         CancelledError: If the user asked to stop.
     """
-    has_object = all(not sequence.missing("object") for sequence in sequences)
+    has_object = not any(_missing_for_object(sequence) for sequence in sequences)
     if not has_object and not all(sequence.hands for sequence in sequences):
         raise MissingInputError(_nothing_to_fit(sequences))
     for sequence in sequences:
@@ -183,24 +180,9 @@ def _stage_search(
     if attempt.stage_done(SEARCH):
         return
     problems = _problems(sequences, config, attempt)
-    start = _start_parameters(problems, config)
-    result = search_object(problems, start, config.object_, progress, device=device)
+    result = search_object(problems, config.simulation, config.object_, progress, device=device)
     attempt.save_yaml("object/parameters.yaml", result.parameters.to_dict())
     _finish(attempt, SEARCH, [result.loss_before], [result.loss_after], result.curve)
-
-
-def _start_parameters(problems: Many[ObjectProblem], config: PipelineConfig) -> Any:
-    """Choose substeps that keep the stiffest, densest candidate of the search stable."""
-    start = config.simulation
-    if not config.automatic_substeps:
-        return start
-    variables = config.object_.search.variables
-    stiffest = replace(
-        start, **{n: v.from_unit(1.0) for n, v in variables.items() if "stiffness" in n}
-    )
-    problem = problems[0]
-    model = build_model(problem.object_node, problem.control[0], stiffest, problem.rest_node)
-    return replace(start, substeps_per_frame=stable_substeps(model, stiffest))
 
 
 def _stage_springs(
@@ -219,7 +201,7 @@ def _stage_springs(
     for problem in problems:
         artefacts.save_model(attempt, problem.name, result.models[problem.name])
     first = problems[0]
-    artefacts.save_object(attempt, parameters, result.models[first.name], first.rest_node)
+    artefacts.save_object(attempt, result.parameters, result.models[first.name], first.rest_node)
     _finish(attempt, SPRINGS, [result.loss_before], [result.loss_after], result.curve)
 
 
@@ -258,13 +240,21 @@ def _finish(
     attempt.finish_stage(stage, summary)
 
 
+def _missing_for_object(sequence: Sequence) -> list[str]:
+    """What a sequence lacks for stage 2: markers, or depth images with masks."""
+    missing = sequence.missing("depth", "mask") if sequence.missing("marker") else []
+    if not sequence.hands and sequence.control is None:
+        missing.append("hands or control")
+    return missing
+
+
 def _nothing_to_fit(sequences: Many[Sequence]) -> str:
-    missing = [
-        f"'{sequence.name}' lacks {', '.join(sequence.missing('object'))} for the object"
-        + ("" if sequence.hands else " and has no hands")
+    told = [
+        f"'{sequence.name}' lacks {', '.join(_missing_for_object(sequence))} for the object"
+        + ("" if sequence.hands else " and shows no hands")
         for sequence in sequences
     ]
-    return f"There is nothing to fit: {'; '.join(missing)}."
+    return f"There is nothing to fit: {'; '.join(told)}."
 
 
 def run_job(run: Run, progress: Progress | None = None, *, device: str = "cpu") -> None:

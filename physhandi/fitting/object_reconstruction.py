@@ -15,9 +15,14 @@ from physhandi.progress import Progress
 from physhandi.simulation import differentiable
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
 from physhandi.simulation.simulator import Simulator
+from physhandi.simulation.stability import stable_substeps
 from physhandi.simulation.topology import build_model
 
 STAGE = "first_order"
+SAFETY = 1.25
+"""Margin of the substeps over the stability limit."""
+STEEPEST = 100.0
+"""Largest sane gradient, in losses per unit of the logarithm of a stiffness."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,6 +57,10 @@ class ObjectFitConfig:
     """Weight of the track term beside the Chamfer term; PhysTwin's is 1/6."""
     freezes_counts: bool = False
     """Divide every frame's loss by the counts of frame 1, as PhysTwin does."""
+    automatic_substeps: bool = False
+    """Give each candidate the substeps that its own stability limit asks for, not a fixed number."""
+    most_substeps: int = 2000
+    """A candidate that needs more substeps a frame than this is not tried."""
     cloud_points: int = 300
     """Most observed points of a frame that enter the Chamfer term."""
 
@@ -62,6 +71,8 @@ class FirstOrderResult:
 
     models: dict[str, SpringMassModel]
     """The fitted model of each sequence; object springs are the same in all."""
+    parameters: SimulationParameters
+    """The global parameters, with the substeps that the fitted springs need."""
     loss_before: float
     """Mean loss of the start [m²]."""
     loss_after: float
@@ -121,6 +132,24 @@ def mean_loss(
     return float(np.mean(losses))
 
 
+def settle_substeps(
+    models: Many[SpringMassModel],
+    parameters: SimulationParameters,
+    config: ObjectFitConfig,
+    *,
+    safety: float = SAFETY,
+) -> SimulationParameters:
+    """Choose the substeps that keep all models stable, if the configuration says so.
+
+    A step near the limit may stay bounded and still be noise: a search without this finds
+    parameters whose simulation no longer has useful gradients.
+    """
+    if not config.automatic_substeps:
+        return parameters
+    needed = max(stable_substeps(model, parameters, safety=safety) for model in models)
+    return replace(parameters, substeps_per_frame=10 * math.ceil(needed / 10))
+
+
 def search_object(
     problems: Many[ObjectProblem],
     start: SimulationParameters,
@@ -147,11 +176,17 @@ def search_object(
 
     def evaluate(parameters: SimulationParameters) -> float:
         models = {p.name: build_problem_model(p, parameters) for p in problems}
-        if any(len(model.spring_nodes) == 0 for model in models.values()):
+        has_springs = all(len(model.spring_nodes) > 0 for model in models.values())
+        if not has_springs or parameters.substeps_per_frame > config.most_substeps:
             return math.inf
         return mean_loss(problems, models, parameters, config, device)
 
-    return search_parameters(evaluate, start, config.search, progress)
+    def settle(parameters: SimulationParameters) -> SimulationParameters:
+        parameters = problem_parameters(parameters, problems[0])
+        models = [build_problem_model(p, parameters) for p in problems]
+        return settle_substeps(models, parameters, config)
+
+    return search_parameters(evaluate, start, config.search, progress, settle)
 
 
 class _SpringLogs:
@@ -235,6 +270,10 @@ def optimise_springs(
     """
     settings = config.first_order
     models = {p.name: build_problem_model(p, parameters) for p in problems}
+    # Springs may stiffen while they are fitted, so the limit is kept farther away.
+    parameters = settle_substeps(
+        list(models.values()), parameters, config, safety=SAFETY * SAFETY
+    )
     logs = _SpringLogs(models, learns_damping=settings.learns_damping)
     loss_before = mean_loss(problems, models, parameters, config, device)
     if not math.isfinite(loss_before):
@@ -259,7 +298,13 @@ def optimise_springs(
             best, best_loss = now, loss
         curve.append([float(iteration + 1), loss])
         progress.report(STAGE, iteration + 1, settings.iterations, loss)
-    return FirstOrderResult(models=best, loss_before=loss_before, loss_after=best_loss, curve=curve)
+    return FirstOrderResult(
+        models=best,
+        parameters=parameters,
+        loss_before=loss_before,
+        loss_after=best_loss,
+        curve=curve,
+    )
 
 
 def _descend(
@@ -279,6 +324,38 @@ def _descend(
     velocity = torch.from_numpy(model.initial_velocity)
     for begin in range(0, horizon - 1, window):
         end = min(begin + window, horizon - 1)
+        node, node_velocity = _gradient(
+            problem,
+            model,
+            logs,
+            optimizer,
+            parameters,
+            config,
+            (begin, end, position, velocity),
+            device,
+        )
+        optimizer.step()
+        position, velocity = node[-1].detach(), node_velocity[-1].detach()
+
+
+def _gradient(
+    problem: ObjectProblem,
+    model: SpringMassModel,
+    logs: _SpringLogs,
+    optimizer: torch.optim.Optimizer,
+    parameters: SimulationParameters,
+    config: ObjectFitConfig,
+    stretch: tuple[int, int, Tensor, Tensor],
+    device: str,
+) -> tuple[Tensor, Tensor]:
+    """Leave the gradient of one window in the parameters; return the simulated motion.
+
+    Motion that is chaotic over the window has gradients that grow without bound and point nowhere;
+    the window is then cut in halves until they are sane.
+    """
+    begin, end, position, velocity = stretch
+    cut: int | None = None
+    while True:
         optimizer.zero_grad()
         log_stiffness, damping = logs.of(problem.name)
         node, node_velocity = differentiable.rollout(
@@ -290,6 +367,7 @@ def _descend(
             initial_position=position,
             initial_velocity=velocity,
             device=device,
+            window=cut,
         )
         frame_losses = problem.frame_losses(
             node[1:],
@@ -299,5 +377,13 @@ def _descend(
         )
         loss = frame_losses.mean() + config.first_order.prior_weight * logs.distance_from_start()
         loss.backward()
-        optimizer.step()
-        position, velocity = node[-1].detach(), node_velocity[-1].detach()
+        gradients = [tensor.grad for tensor in logs.tensors() if tensor.grad is not None]
+        steepest = max(float(gradient.double().norm()) for gradient in gradients)
+        if steepest <= STEEPEST * float(loss.detach()):
+            return node, node_velocity
+        cut = (end - begin if cut is None else cut) // 2
+        if cut == 0:
+            raise FitError(
+                f"The gradient over one frame of sequence '{problem.name}' is out of bounds. Raise "
+                "substeps_per_frame, or lower the upper ends of the stiffness and damping intervals."
+            )

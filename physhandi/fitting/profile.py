@@ -30,8 +30,6 @@ class PipelineConfig:
     """Which hand vertices become control nodes: all, or `control_count` that a camera sees at frame 0."""
     control_count: int = 30
     """How many control nodes are kept of the visible ones."""
-    automatic_substeps: bool = False
-    """Choose substeps from the stability limit of the stiffest candidate instead of a fixed number."""
     hand: HandFitConfig = field(default_factory=HandFitConfig)
     """Stage 1."""
     object_: ObjectFitConfig = field(default_factory=ObjectFitConfig)

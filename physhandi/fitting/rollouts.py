@@ -16,11 +16,12 @@ from physhandi.fitting.profile import PipelineConfig
 from physhandi.hand.control_nodes import control_trajectory
 from physhandi.hand.model import load_hand_model
 from physhandi.hand.motion import HandMotion
-from physhandi.perception.shape import object_nodes
+from physhandi.perception.shape import object_nodes_from_observation
 from physhandi.progress import Progress
 from physhandi.simulation.simulator import Simulator
 
 STAGE = "rollout"
+LEAST_CLOUD = 10
 
 
 def control_trajectory_of(
@@ -77,17 +78,17 @@ def object_nodes_of(
                 f"object has {len(template[0])}: it is not the same object, or refined differently."
             )
         return node, rest if template is None else template[1]
+    if template is None:
+        node = object_nodes_from_observation(observation, spacing, sequence)
+        return node, node
     cloud = observation.cloud[0] if observation.cloud else observation.point[0]
     cloud = cloud[np.isfinite(cloud).all(axis=1)]
-    if len(cloud) < 10:
+    if len(cloud) < LEAST_CLOUD:
         raise MissingInputError(
-            f"Sequence '{sequence.name}' shows only {len(cloud)} object points in frame 0; at least 10 "
-            "are needed to place nodes. Check depth and masks of frame 0, or start later."
+            f"Sequence '{sequence.name}' shows only {len(cloud)} object points in frame 0; at least "
+            f"{LEAST_CLOUD} are needed to find the object there. Check depth and masks of frame 0."
         )
-    if template is not None:
-        return lay_object(template[0], cloud), template[1]
-    node = object_nodes(cloud, spacing, sequence.ground_height).astype(np.float32)
-    return node, node
+    return lay_object(template[0], cloud), template[1]
 
 
 def simulate_sequence(

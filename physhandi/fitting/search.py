@@ -86,6 +86,7 @@ def search_parameters(
     start: SimulationParameters,
     config: SearchConfig,
     progress: Progress,
+    settle: Callable[[SimulationParameters], SimulationParameters] = lambda parameters: parameters,
 ) -> SearchResult:
     """Search global parameters with CMA-ES (paper, zeroth-order stage; PhysTwin §4.2).
 
@@ -94,6 +95,7 @@ def search_parameters(
         start: Parameters to start from; those that are not searched keep their values.
         config: Intervals and effort.
         progress: Told once a generation.
+        settle: Derives what follows from a candidate's values, such as its substeps.
 
     Returns:
         The best parameters ever seen and how the loss went.
@@ -107,6 +109,7 @@ def search_parameters(
         import cma
 
     names = list(config.variables)
+    start = settle(start)
     loss_before = evaluate(start)
     best, best_loss = start, loss_before
     curve = [[1.0, loss_before]]
@@ -116,7 +119,7 @@ def search_parameters(
     def candidate(unit: Float[ndarray, " variable"]) -> SimulationParameters:
         values = {n: config.variables[n].from_unit(float(u)) for n, u in zip(names, unit, strict=True)}
         values |= {name: values[other] for name, other in config.tied.items() if other in values}
-        return replace(start, **values)
+        return settle(replace(start, **values))
 
     # pycma 4.5 fails when it shortens the step of a single variable, so the step is left alone.
     options = {"bounds": [0, 1], "maxstd": np.inf, "seed": config.seed, "verbose": -9, "verb_log": 0}

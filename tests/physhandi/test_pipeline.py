@@ -1,0 +1,181 @@
+"""The pipeline end to end on a small recording: fit, stop, go on, simulate again."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from sheet_sequence import FITTED, FRAMES, NODE, write_sheet
+
+from physhandi import pipeline
+from physhandi.data.run import Run, read_events
+from physhandi.errors import CancelledError, MissingInputError, RunError, UsageError
+from physhandi.fitting.artefacts import load_model, load_parameters
+from physhandi.fitting.profile import PipelineConfig, config_to_dict, load_profile
+from physhandi.progress import Progress
+
+
+def small_config() -> PipelineConfig:
+    config = load_profile("quick")
+    search = replace(config.object_.search, generations=4, population=6)
+    first_order = replace(config.object_.first_order, iterations=8)
+    simulation = replace(config.simulation, connection_radius=0.08, virtual_connection_radius=0.02)
+    object_ = replace(config.object_, search=search, first_order=first_order)
+    return replace(config, object_=object_, simulation=simulation)
+
+
+def new_run(folder: Path, sequences: list[Path], config: PipelineConfig | None = None) -> Run:
+    return Run.create(
+        folder,
+        name="test",
+        kind="reconstruction",
+        sequences=[str(path) for path in sequences],
+        config={"profile": config_to_dict(config or small_config())},
+    )
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("sequences")
+    write_sheet(root / "low", lift=0.12)
+    write_sheet(root / "high", lift=0.2)
+    write_sheet(root / "other", lift=0.16)
+    return root
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory: pytest.TempPathFactory, recordings: Path) -> Run:
+    run = new_run(tmp_path_factory.mktemp("runs") / "fit", [recordings / "low", recordings / "high"])
+    pipeline.run_job(run)
+    return Run.open(run.folder)
+
+
+def test_every_stage_tells_its_loss_and_lowers_it(fitted: Run) -> None:
+    fitted.verify()
+    assert fitted.state == "succeeded"
+    losses = fitted.json("losses.json")
+    assert list(losses) == list(pipeline.STAGES)
+    for stage in (pipeline.SEARCH, pipeline.SPRINGS):
+        assert 0 < losses[stage]["after"] < losses[stage]["before"]
+        assert len(losses[stage]["curve"]) > 2
+
+
+def test_the_fit_beats_standing_still(fitted: Run) -> None:
+    metrics = fitted.json("metrics.json")
+    assert set(metrics) == {"low", "high"}
+    for name in metrics:
+        rollout = fitted.array(f"sequences/{name}/rollout.npy")
+        marker = np.load(Path(fitted.sequences[0]).parent / name / "marker.npy")
+        assert rollout.shape == (FRAMES, len(NODE), 3)
+        future = slice(FITTED, FRAMES)
+        error = np.linalg.norm(rollout - marker, axis=2)[future].mean()
+        static = np.linalg.norm(marker[:1] - marker, axis=2)[future].mean()
+        assert error < 0.4 * static
+        assert static > 0.03
+
+
+def test_both_sequences_share_one_object(fitted: Run) -> None:
+    low, high = (load_model(fitted.out, name) for name in ("low", "high"))
+    count = low.object_spring_count
+    assert count == high.object_spring_count > 50
+    np.testing.assert_array_equal(low.stiffness[:count], high.stiffness[:count])
+    assert np.ptp(np.log(low.stiffness[:count])) > 0.05
+
+
+def test_a_cancelled_run_goes_on_after_its_last_finished_stage(tmp_path: Path, recordings: Path) -> None:
+    class Stopper(Progress):
+        def report(self, stage: str, iteration: int, *rest: Any, **more: Any) -> None:
+            if stage == pipeline.SPRINGS and iteration == 2:
+                run.request_cancel()
+
+    run = new_run(tmp_path / "stopped", [recordings / "low"])
+    with pytest.raises(CancelledError):
+        pipeline.run_job(run, Stopper())
+    assert Run.open(run.folder).state == "cancelled"
+    run.clear_cancel()
+    before = len(read_events(run.folder)[0])
+    pipeline.run_job(run)
+    again = {event["stage"] for event in read_events(run.folder)[0][before:]}
+    assert pipeline.SPRINGS in again
+    assert pipeline.SEARCH not in again
+    assert Run.open(run.folder).state == "succeeded"
+
+
+def simulate(folder: Path, source: Run, sequence: Path, **changes: float) -> Run:
+    run = Run.create(
+        folder,
+        name="again",
+        kind="simulation",
+        sequences=[str(sequence)],
+        config={"source": str(source.folder), "parameters": changes},
+    )
+    pipeline.run_job(run)
+    return Run.open(run.folder)
+
+
+def test_simulating_unchanged_repeats_the_motion(tmp_path: Path, fitted: Run, recordings: Path) -> None:
+    again = simulate(tmp_path / "same", fitted, recordings / "low")
+    np.testing.assert_array_equal(
+        again.array("sequences/low/rollout.npy"), fitted.array("sequences/low/rollout.npy")
+    )
+
+
+def test_another_radius_gives_the_springs_that_scipy_counts(
+    tmp_path: Path, fitted: Run, recordings: Path
+) -> None:
+    again = simulate(tmp_path / "wide", fitted, recordings / "low", connection_radius=0.055, max_neighbors=24)
+    model = load_model(again.out, "low")
+    expected = len(cKDTree(NODE.astype(np.float32)).query_pairs(0.055))
+    assert model.object_spring_count == expected == 40
+    difference = again.array("sequences/low/rollout.npy") - fitted.array("sequences/low/rollout.npy")
+    assert np.abs(difference).max() > 1e-4
+    assert load_parameters(again.out).connection_radius == 0.055
+
+
+def test_the_object_moves_in_a_sequence_it_was_not_fitted_on(
+    tmp_path: Path, fitted: Run, recordings: Path
+) -> None:
+    again = simulate(tmp_path / "unseen", fitted, recordings / "other")
+    rollout = again.array("sequences/other/rollout.npy")
+    marker = np.load(recordings / "other" / "marker.npy")
+    error = np.linalg.norm(rollout - marker, axis=2)[1:].mean()
+    static = np.linalg.norm(marker[:1] - marker, axis=2)[1:].mean()
+    assert error < 0.4 * static
+    assert "other" in again.json("metrics.json")
+
+
+def test_unknown_parameters_are_named(tmp_path: Path, fitted: Run, recordings: Path) -> None:
+    with pytest.raises(UsageError, match="stiffnes"):
+        simulate(tmp_path / "typo", fitted, recordings / "low", stiffnes=2.0)
+    assert Run.open(tmp_path / "typo").state == "failed"
+
+
+def test_evaluating_again_gives_the_stored_metrics(fitted: Run) -> None:
+    assert pipeline.evaluate(fitted) == fitted.json("metrics.json")
+
+
+def test_a_sequence_with_nothing_to_fit_says_what_is_missing(tmp_path: Path, recordings: Path) -> None:
+    bare = write_sheet(tmp_path / "bare")
+    for file in ("marker.npy", "marker_node.npy"):
+        (bare.folder / file).unlink()
+    run = new_run(tmp_path / "nothing", [bare.folder])
+    with pytest.raises(MissingInputError, match="'bare' lacks depth, mask"):
+        pipeline.run_job(run)
+
+
+def test_a_run_without_an_object_cannot_be_simulated(tmp_path: Path, recordings: Path) -> None:
+    empty = new_run(tmp_path / "empty", [recordings / "low"])
+    empty.begin_attempt().publish()
+    with pytest.raises(RunError, match="no fitted object"):
+        simulate(tmp_path / "again", empty, recordings / "low")
+
+
+def test_the_same_input_gives_the_same_bits(tmp_path: Path, recordings: Path) -> None:
+    outs = []
+    for name in ("one", "two"):
+        run = new_run(tmp_path / name, [recordings / "low"])
+        pipeline.run_job(run)
+        outs.append(run.array("sequences/low/rollout.npy").copy())
+    np.testing.assert_array_equal(outs[0], outs[1])

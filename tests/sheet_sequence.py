@@ -1,0 +1,58 @@
+"""A small recording for tests: markers on a simulated sheet that two point controllers lift."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from physhandi.data.sequence import Sequence
+from physhandi.data.sequence_schema import SequenceMeta
+from physhandi.data.sequence_writer import write_sequence
+from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.simulator import Simulator
+from physhandi.simulation.topology import build_model
+
+FRAMES = 10
+FITTED = 7
+AXIS = np.arange(5) * 0.05
+NODE = np.stack([*np.meshgrid(AXIS, AXIS, indexing="ij"), np.full((5, 5), 0.2)], -1).reshape(-1, 3)
+TRUTH = SimulationParameters(
+    connection_radius=0.08,
+    max_neighbors=8,
+    virtual_connection_radius=0.02,
+    virtual_max_neighbors=1,
+    stiffness=400.0,
+    virtual_stiffness=2000.0,
+    damping=4.0,
+    drag=1.0,
+    ground_height=0.0,
+    substeps_per_frame=60,
+)
+
+
+def write_sheet(folder: Path, *, lift: float = 0.15) -> Sequence:
+    """Simulate the sheet and write its markers as a sequence."""
+    corner = NODE[[0, 4]] + [0.0, 0.0, 0.005]
+    rise = np.linspace(0, 1, FRAMES)[:, None, None] * np.array([0.05, 0.0, lift])
+    control = (corner[None] + rise).astype(np.float32)
+    model = build_model(NODE, control[0], TRUTH)
+    softer = np.where(NODE[model.spring_nodes[:, 0], 0] < 0.1, 2.0, 0.7) * model.stiffness
+    model = replace(model, stiffness=softer.astype(np.float32))
+    marker = Simulator(model, TRUTH).rollout(control).position
+    return write_sequence(
+        folder,
+        SequenceMeta(
+            name=folder.name,
+            frame_rate=30.0,
+            frame_count=FRAMES,
+            ground_height=0.0,
+            reconstruction=FITTED,
+        ),
+        {
+            "control.npy": control,
+            "marker.npy": marker,
+            "marker_node.npy": np.arange(len(NODE), dtype=np.int32),
+            "object_node.npy": NODE.astype(np.float32),
+            "rest_node.npy": NODE.astype(np.float32),
+        },
+    )
