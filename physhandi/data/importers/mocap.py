@@ -1,0 +1,200 @@
+"""Motion capture of a rope that grippers swing: markers in, a sequence with point controllers out."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+from scipy.interpolate import CubicSpline
+
+from physhandi.data.atomic import read_array
+from physhandi.data.sequence import Sequence
+from physhandi.data.sequence_schema import SequenceMeta
+from physhandi.data.sequence_writer import write_sequence
+from physhandi.errors import ImportFailedError
+from physhandi.progress import NullProgress, Progress
+
+STAGE = "import"
+_FEWEST_FRAMES = 8
+_FARTHEST = 50.0
+_SAMPLES_PER_SEGMENT = 64
+
+
+def import_mocap(
+    source: Path | str,
+    out: Path | str,
+    progress: Progress | None = None,
+    *,
+    controlled_markers: tuple[int, ...] = (0, 1, 11, 12),
+    recording_rate: float = 100.0,
+    frame_rate: float = 30.0,
+    nodes_per_segment: int = 4,
+    overwrite: bool = False,
+) -> list[Sequence]:
+    """Convert trajectories of a rope's markers, each to a sequence ``out/<name of the file>``.
+
+    A trajectory is a float array "frame marker 3" in metres with z up; the markers are given in
+    their order along the rope.
+
+    Args:
+        source: One ``.npy`` file, or a folder of them.
+        out: Folder that the sequences go to.
+        progress: Told about every trajectory.
+        controlled_markers: Markers that sit on the grippers; they become the controls.
+        recording_rate: Frames per second of the recording [Hz].
+        frame_rate: Frames per second of the sequence [Hz].
+        nodes_per_segment: Object nodes from one marker to the next.
+        overwrite: Whether to replace sequences that are there.
+
+    Returns:
+        The sequences, by name.
+
+    Raises:
+        ImportFailedError: If a file is no such trajectory; names file, frame and marker. Nothing is
+            written then.
+    """
+    watched = progress or NullProgress()
+    paths = _trajectories(Path(source))
+    # All are read before the first is written: a bad one must not leave half of a folder.
+    recordings = {path: _read(path, controlled_markers) for path in paths}
+    sequences: list[Sequence] = []
+    for number, (path, marker) in enumerate(recordings.items()):
+        watched.check_cancelled()
+        resampled = resample(marker, recording_rate, frame_rate).astype(np.float32)
+        node, marker_node = refine(resampled[0].astype(np.float64), nodes_per_segment)
+        meta = SequenceMeta(
+            name=_name(path),
+            description=f"Rope with {marker.shape[1]} motion-capture markers, moved by grippers.",
+            frame_rate=float(frame_rate),
+            frame_count=len(resampled),
+            gravity=9.81,
+            controlled_markers=controlled_markers,
+            provenance={
+                "importer": "mocap",
+                "file": path.name,
+                "recording_rate": float(recording_rate),
+                "recorded_frames": len(marker),
+                "nodes_per_segment": nodes_per_segment,
+            },
+        )
+        arrays = {
+            "control.npy": resampled[:, list(controlled_markers)],
+            "marker.npy": resampled,
+            "marker_node.npy": marker_node.astype(np.int32),
+            "object_node.npy": node.astype(np.float32),
+            "rest_node.npy": straight_chain(marker, nodes_per_segment).astype(np.float32),
+        }
+        sequences.append(write_sequence(Path(out) / meta.name, meta, arrays, overwrite=overwrite))
+        watched.report(STAGE, number + 1, len(paths), message=meta.name)
+    return sequences
+
+
+def resample(
+    marker: Float[ndarray, "sample marker 3"], recording_rate: float, frame_rate: float
+) -> Float[ndarray, "frame marker 3"]:
+    """Interpolate a recording at another frame rate by cubic splines; the first frame stays [m]."""
+    time = np.arange(len(marker)) / recording_rate
+    frame_count = int(np.floor(time[-1] * frame_rate + 1e-9)) + 1
+    return CubicSpline(time, marker, axis=0)(np.arange(frame_count) / frame_rate)
+
+
+def refine(
+    marker: Float[ndarray, "marker 3"], nodes_per_segment: int
+) -> tuple[Float[ndarray, "node 3"], Int[ndarray, " marker"]]:
+    """Lay a chain of nodes through markers, evenly spaced along a smooth curve between two of them.
+
+    Args:
+        marker: Positions of the markers along the rope [m].
+        nodes_per_segment: Nodes from one marker to the next.
+
+    Returns:
+        The nodes [m], and the index of the node at each marker.
+    """
+    chord = np.linalg.norm(np.diff(marker, axis=0), axis=1)
+    knot = np.concatenate([[0.0], np.cumsum(chord)])
+    curve = CubicSpline(knot, marker, axis=0)
+    nodes = [marker[:1]]
+    for start, end, last in zip(knot[:-1], knot[1:], marker[1:], strict=True):
+        dense = np.linspace(start, end, _SAMPLES_PER_SEGMENT * nodes_per_segment + 1)
+        length = np.linalg.norm(np.diff(curve(dense), axis=0), axis=1)
+        arc = np.concatenate([[0.0], np.cumsum(length)])
+        even = np.arange(1, nodes_per_segment) / nodes_per_segment * arc[-1]
+        nodes.extend([curve(np.interp(even, arc, dense)), last[None]])
+    return np.concatenate(nodes), np.arange(len(marker)) * nodes_per_segment
+
+
+def straight_chain(
+    marker: Float[ndarray, "frame marker 3"], nodes_per_segment: int
+) -> Float[ndarray, "node 3"]:
+    """Give the rope without tension: straight along x, with the median length of each segment [m]."""
+    length = np.median(np.linalg.norm(np.diff(marker, axis=1), axis=2), axis=0)
+    step = np.repeat(length / nodes_per_segment, nodes_per_segment)
+    node = np.zeros((len(step) + 1, 3))
+    node[1:, 0] = np.cumsum(step)
+    return node
+
+
+def _trajectories(source: Path) -> list[Path]:
+    if source.is_file():
+        return [source]
+    if not source.is_dir():
+        raise ImportFailedError(f"{source} is neither a file nor a folder.")
+    paths = sorted(path for path in source.glob("*.npy") if path.name[0] != ".")
+    if not paths:
+        raise ImportFailedError(f"{source} holds no .npy file; give a folder of trajectories.")
+    return paths
+
+
+def _read(path: Path, controlled_markers: tuple[int, ...]) -> Float[ndarray, "sample marker 3"]:
+    try:
+        array = read_array(path)
+    except (ValueError, OSError) as error:
+        raise ImportFailedError(f"{path.name} is not a readable .npy file: {error}.") from error
+    if not np.issubdtype(array.dtype, np.floating) or array.ndim != 3 or array.shape[2] != 3:
+        raise ImportFailedError(
+            f"{path.name} holds {array.dtype} {array.shape}; expected floating-point numbers "
+            "(frame, marker, 3) in metres."
+        )
+    if len(array) < _FEWEST_FRAMES:
+        raise ImportFailedError(
+            f"{path.name} has {len(array)} frames; at least {_FEWEST_FRAMES} are needed."
+        )
+    wrong = [marker for marker in controlled_markers if not 0 <= marker < array.shape[1]]
+    if wrong or not controlled_markers or array.shape[1] < 2:
+        raise ImportFailedError(
+            f"{path.name} has {array.shape[1]} markers, but markers {list(controlled_markers)} "
+            "shall be the controls. Name other controls, or give a recording that has them."
+        )
+    marker = array.astype(np.float64)
+    _check_values(path, marker)
+    return marker
+
+
+def _check_values(path: Path, marker: ndarray) -> None:
+    lost = np.argwhere(~np.isfinite(marker).all(axis=2))
+    if lost.size:
+        frame, number = lost[0]
+        raise ImportFailedError(
+            f"{path.name}: frame {frame}, marker {number} is {marker[frame, number].tolist()}. "
+            "Cut the recording where a marker is lost, or fill the gap."
+        )
+    far = np.argwhere(np.abs(marker).max(axis=2) > _FARTHEST)
+    if far.size:
+        frame, number = far[0]
+        raise ImportFailedError(
+            f"{path.name}: frame {frame}, marker {number} is "
+            f"{np.abs(marker[frame, number]).max():.0f} m from the origin. Convert it to metres."
+        )
+    length = np.linalg.norm(np.diff(marker, axis=1), axis=2)
+    short = np.argwhere(length < 1e-6)
+    if short.size:
+        frame, number = short[0]
+        raise ImportFailedError(
+            f"{path.name}: frame {frame}: markers {number} and {number + 1} are at one place. "
+            "Give markers in their order along the rope, each once."
+        )
+
+
+def _name(path: Path) -> str:
+    return re.sub(r"[^A-Za-z0-9_-]", "_", path.stem)[:64] or "trajectory"
