@@ -1,0 +1,35 @@
+"""Fixtures that all tests share."""
+
+from pathlib import Path
+
+import pytest
+import warp as wp
+
+DEVICES = ["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)]
+SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@pytest.fixture(params=DEVICES)
+def device(request):
+    """A Warp device; what this machine does not have is skipped."""
+    if request.param == "cpu":
+        if not wp.is_cpu_available():
+            pytest.skip("this Warp has no CPU device")
+    elif not wp.is_cuda_available():
+        pytest.skip("needs a CUDA device")
+    return request.param
+
+
+@pytest.fixture
+def shared_array():
+    """Load a recorded `.npz` file from beside the repository, or skip the test."""
+    import numpy as np
+
+    def load(name):
+        path = SHARED_DATA / name
+        if not path.is_file():
+            pytest.skip(f"needs the recorded data {name} in ../shared/data")
+        with np.load(path) as data:
+            return dict(data)
+
+    return load
