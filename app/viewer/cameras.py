@@ -25,7 +25,8 @@ class CameraNodes:
     def __init__(self, server: viser.ViserServer, views: Listing[View], framing: Framing) -> None:
         self._server = server
         self._views = list(views)
-        self._scale = 0.22 * framing.extent
+        self._framing = framing
+        self._scale = 0.08 * max(framing.extent, framing.reach)
         self._nodes: list[viser.CameraFrustumHandle] = []
         self._shown: tuple[int, int] | None = None
         self._time = 0.0
@@ -37,12 +38,24 @@ class CameraNodes:
         self._nodes.clear()
         self._shown = None
 
-    def draw(self, frame: int, *, is_visible: bool, is_playing: bool) -> None:
-        """Show the images of a frame; while playing, only every now and then."""
+    def draw(
+        self, frame: int, *, is_visible: bool, looks_from: str | None, is_playing: bool
+    ) -> None:
+        """Show the images of a frame; while playing, only every now and then.
+
+        Args:
+            frame: The frame.
+            is_visible: Whether the frustums are shown.
+            looks_from: View that the user looks from: its image is moved behind the scene, and
+                the other frustums are hidden.
+            is_playing: Whether the clock is running.
+        """
+        is_visible = is_visible or looks_from is not None
         if is_visible and not self._nodes:
             self._nodes = [self._add(view) for view in self._views]
-        for node in self._nodes:
-            node.visible = is_visible
+        for view, node in zip(self._views, self._nodes, strict=False):
+            node.visible = is_visible and looks_from in {None, view.name}
+            node.scale = self._backdrop(view) if view.name == looks_from else self._scale
         width = _WIDTH if is_playing else _PAUSED_WIDTH
         now = time.monotonic()
         is_soon = is_playing and now - self._time < _IMAGE_INTERVAL
@@ -52,6 +65,17 @@ class CameraNodes:
         for view, node in zip(self._views, self._nodes, strict=True):
             if view.has_color:
                 node.image = _shrink(view.color(frame), width)
+
+    def _backdrop(self, view: View) -> float:
+        """Scale of a frustum whose image lies behind everything that is in the view."""
+        camera, framing = view.camera, self._framing
+        distance = float(
+            (framing.center - camera.T_world_camera[:3, 3]) @ camera.T_world_camera[:3, 2]
+        )
+        half_height = 0.5 * camera.height / camera.K[1, 1]
+        half_width = half_height * camera.width / camera.height
+        # Frustums of one scale have one volume, whatever their field of view.
+        return (max(distance, 0.0) + framing.extent) * float(np.cbrt(half_width * half_height / 3))
 
     def _add(self, view: View) -> viser.CameraFrustumHandle:
         camera = view.camera

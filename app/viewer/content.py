@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Sequence as Listing
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal, Protocol
 
 import numpy as np
@@ -15,7 +16,7 @@ from app.viewer.take import Take
 from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
-from physhandi.errors import MissingInputError, PhysHandiError
+from physhandi.errors import MissingInputError, PhysHandiError, UsageError
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
 
 logger = logging.getLogger(__name__)
@@ -95,6 +96,8 @@ def open_run(catalog: Catalog, run_id: str, sequence_name: str | None = None) ->
     """
     run = catalog.run(run_id)
     name = sequence_name or run.sequence_names[0]
+    if name not in run.sequence_names:
+        raise UsageError(f"Run '{run.name}' has no sequence '{name}'.")
     folder = f"sequences/{name}"
     if not run.has(f"{folder}/meta.yaml"):
         raise MissingInputError(
@@ -102,7 +105,7 @@ def open_run(catalog: Catalog, run_id: str, sequence_name: str | None = None) ->
             "missing). Open it when its first stage is finished."
         )
     meta = run.yaml(f"{folder}/meta.yaml")
-    sequence = _recording(catalog, name)
+    sequence = _recording(catalog, run, name)
     control = run.array(f"{folder}/control.npy") if run.has(f"{folder}/control.npy") else None
     return Content(
         title=run.name,
@@ -154,9 +157,11 @@ def load_fitted(run: Run, sequence_name: str) -> Take | None:
     )
 
 
-def _recording(catalog: Catalog, name: str) -> Sequence | None:
+def _recording(catalog: Catalog, run: Run, name: str) -> Sequence | None:
+    """Find the recording where the run found it, else by its name."""
+    folder = Path(run.sequences[run.sequence_names.index(name)])
     try:
-        return catalog.sequence(name)
+        return Sequence.load(folder) if folder.is_dir() else catalog.sequence(name)
     except PhysHandiError as error:
         logger.info("the recording behind the run is not shown: %s", error)
         return None

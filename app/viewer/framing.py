@@ -11,7 +11,10 @@ from app.viewer.content import Content
 _SAMPLED_FRAMES = 12
 _SAMPLED_POINTS = 2_000
 _FOV = float(np.deg2rad(45.0))
-_DIRECTION = np.array([0.55, -1.0, 0.55]) / np.linalg.norm([0.55, -1.0, 0.55])
+_AZIMUTH = float(np.deg2rad(-61.0))
+_ELEVATION = float(np.deg2rad(26.0))
+_MARGIN = 1.1
+_FARTHEST = 2.6
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -26,6 +29,10 @@ class Framing:
     """Height of the lowest point."""
     spacing: float
     """Typical distance of neighboring object nodes."""
+    azimuth: float = _AZIMUTH
+    """Direction from the middle to the camera, about the vertical [rad]."""
+    reach: float = 0.0
+    """Diagonal of what should be in the picture, if that is more than what moves."""
 
     @property
     def fov(self) -> float:
@@ -35,14 +42,16 @@ class Framing:
     @property
     def look_at(self) -> Float[ndarray, " 3"]:
         """Where the camera looks: a little to the right, since the panel covers that side."""
-        right = np.cross([0.0, 0.0, 1.0], _DIRECTION)
-        return self.center + 0.1 * self.extent * right / np.linalg.norm(right)
+        right = np.array([-np.sin(self.azimuth), np.cos(self.azimuth), 0.0])
+        return self.center + 0.1 * max(self.extent, self.reach) * right
 
     @property
     def camera(self) -> Float[ndarray, " 3"]:
         """Where the camera stands, so that everything fits into the picture."""
-        distance = 0.55 * self.extent / np.tan(0.5 * _FOV)
-        return self.look_at + _DIRECTION * distance
+        flat = np.array([np.cos(self.azimuth), np.sin(self.azimuth), 0.0])
+        direction = np.cos(_ELEVATION) * flat + np.array([0.0, 0.0, np.sin(_ELEVATION)])
+        half = 0.5 * _MARGIN * max(self.extent, self.reach)
+        return self.look_at + direction * half / np.tan(0.5 * _FOV)
 
 
 def frame_content(content: Content) -> Framing:
@@ -63,7 +72,22 @@ def frame_content(content: Content) -> Framing:
         extent=extent,
         low=float(point[:, 2].min()),
         spacing=_spacing(content, extent),
+        **_around_cameras(content, (low + high) / 2, extent),
     )
+
+
+def _around_cameras(
+    content: Content, center: Float[ndarray, " 3"], extent: float
+) -> dict[str, float]:
+    """Stand where no recording camera hides the scene, far enough to see them all."""
+    if content.fitted is not None or not content.views:
+        return {}
+    offset = np.array([view.camera.T_world_camera[:3, 3] for view in content.views]) - center
+    taken = np.arctan2(offset[:, 1], offset[:, 0])
+    azimuth = _AZIMUTH + np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
+    gap = np.abs(np.angle(np.exp(1j * (azimuth[:, None] - taken)))).min(axis=1)
+    reach = min(2 * float(np.linalg.norm(offset, axis=1).max()), _FARTHEST * extent)
+    return {"azimuth": float(azimuth[np.argmax(gap)]), "reach": reach}
 
 
 def _parts(content: Content) -> list[Float[ndarray, "point 3"]]:

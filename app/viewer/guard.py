@@ -15,7 +15,7 @@ _UNSAFE = re.compile(r"[^\w .,:()+\-/]")
 
 
 def plain(text: str) -> str:
-    """Strip a name of everything that Markdown or HTML could give a meaning.
+    """Strip a name of everything that HTML could give a meaning.
 
     Args:
         text: A name chosen by a user, such as that of a run.
@@ -23,7 +23,7 @@ def plain(text: str) -> str:
     Returns:
         The name made of letters, digits, blanks and harmless punctuation, at most 80 characters.
     """
-    return _UNSAFE.sub(" ", text).replace("_", r"\_").strip()[:80]
+    return _UNSAFE.sub(" ", text).strip()[:80]
 
 
 def notify(
@@ -31,7 +31,7 @@ def notify(
     title: str,
     body: str,
     *,
-    color: str = "red",
+    color: Any = "red",
     seconds: float | None = 8.0,
 ) -> None:
     """Show a notification to one client, or to all clients of a server.
@@ -47,7 +47,7 @@ def notify(
         return
     clients = [target] if isinstance(target, viser.ClientHandle) else target.get_clients().values()
     for client in clients:
-        client.add_notification(title, body, color=color, auto_close_seconds=seconds)  # pyright: ignore[reportCallIssue, reportArgumentType]
+        client.add_notification(title, body, color=color, auto_close_seconds=seconds)
 
 
 class Guard:

@@ -149,6 +149,7 @@ class LiveSimulator:
         self._mailboxes = Mailboxes()
         self._objects: dict[str, tuple[tuple[str, str], FittedObject]] = {}
         self._active: dict[str, Iterator[None]] = {}
+        self._newest: dict[str, int] = {}
 
     def run(self) -> None:
         """Work until the parent closes the connection."""
@@ -174,11 +175,16 @@ class LiveSimulator:
 
     def _start(self, request: Message) -> None:
         session = request["session"]
+        if request.kind == "simulate":
+            if self._newest.get(session) == request["request"]:
+                return  # The server repeats a request if it is not sure that it arrived.
+            self._newest[session] = request["request"]
         self._active.pop(session, None)
         if request.kind == "simulate":
             self._active[session] = self._answer(request)
         elif request.kind == "close":
             self._objects.pop(session, None)
+            self._newest.pop(session, None)
 
     def _answer(self, request: Message) -> Iterator[None]:
         """Simulate one request; pauses after each frame."""

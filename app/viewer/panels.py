@@ -8,9 +8,11 @@ import viser
 
 from app.viewer.content import Content
 from app.viewer.framing import Framing
-from app.viewer.guard import Guard, plain
+from app.viewer.guard import Guard
+from app.viewer.observed import PointSet
 from app.viewer.playback import Playback
 from app.viewer.scene import BLUE, GREEN, GREY, RED, SKIN, YELLOW, Layers
+from physhandi.data.view import View
 
 _OVERVIEW = "Overview"
 _SPEEDS = (0.1, 2.0)
@@ -78,7 +80,7 @@ class LayersPanel:
         self._redraw = redraw
         self._layers = Layers()
         self._switches: dict[str, viser.GuiCheckboxHandle] = {}
-        self._views: dict[str, Any] = {}
+        self._views: dict[str, View] = {}
         self._framing: Framing | None = None
         gui = server.gui
         with gui.add_folder("Layers", expand_by_default=content.fitted is None):
@@ -127,7 +129,7 @@ class LayersPanel:
             switch.visible = is_there[field]
             switch.value = getattr(layers, field)
         self._scale.visible = has_object
-        self._views = {plain(view.name): view.camera for view in content.views}
+        self._views = {view.name: view for view in content.views}
         self._place.options = (_OVERVIEW, *self._views)
         self._place.visible = bool(self._views)
 
@@ -146,13 +148,16 @@ class LayersPanel:
         framing, eye = self._framing, event.client.camera
         if framing is None:
             return
-        camera = self._views.get(self._place.value)
+        view = self._views.get(self._place.value)
+        self._layers.looks_from = view.name if view is not None else None
+        self._redraw()
         with event.client.atomic():
-            if camera is None:
+            if view is None:
                 eye.up_direction = (0.0, 0.0, 1.0)
                 eye.fov = framing.fov
                 eye.position, eye.look_at = framing.camera, framing.look_at
                 return
+            camera = view.camera
             _, down, ahead, origin = camera.T_world_camera[:3].T
             distance = max(float((framing.center - origin) @ ahead), 0.1 * framing.extent)
             eye.fov = float(2 * np.arctan2(camera.height / 2, camera.K[1, 1]))
@@ -176,7 +181,7 @@ def add_legend(server: viser.ViserServer, content: Content) -> None:
         entries += [(BLUE, "object"), (RED, "controls, forces"), (YELLOW, "virtual springs")]
     elif content.control is not None:
         entries.append((RED, "controls"))
-    if content.observed is not None:
+    if isinstance(content.observed, PointSet):
         entries.append((GREEN, "observed"))
     if content.views:
         entries.append((GREY, "cameras"))

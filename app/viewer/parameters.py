@@ -42,7 +42,8 @@ class Knob:
         return round(value) if self.is_integer else round(value, 6)
 
     def from_slider(self, value: float) -> float:
-        """Find the parameter of a slider value."""
+        """Find the parameter of a slider value; values outside the range are moved into it."""
+        value = min(max(value, self.low), self.high)
         if self.is_logarithm:
             value = 10.0**value
         return round(value) if self.is_integer else value / self.scale

@@ -87,6 +87,7 @@ class Resimulation:
             self._parameters = parameters
             self._is_busy = True
             self._incoming = None
+            self._durations = []
             # Answers to earlier requests are refused from here on.
             self._request = self._live.request(
                 self._session,
@@ -134,12 +135,13 @@ class Resimulation:
         with self._lock:
             take = self._incoming or self._shown
             durations = self._durations
+            is_waiting = self._is_busy and self._incoming is None
             return Readout(
                 object_spring_count=take.model.object_spring_count,
                 virtual_spring_count=take.model.virtual_spring_count,
                 node_count=take.model.node_count,
                 substeps_per_frame=take.parameters.substeps_per_frame,
-                simulated_count=take.ready,
+                simulated_count=0 if is_waiting else take.ready,
                 frame_count=take.frame_count,
                 frame_duration=float(np.mean(durations)) if durations else float("nan"),
                 difference=take.mean_distance(self.fitted) if not self._is_busy else float("nan"),

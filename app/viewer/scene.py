@@ -51,6 +51,8 @@ class Layers:
     """Camera frustums with the frame's image."""
     ground: bool = True
     """Grid on the ground."""
+    looks_from: str | None = None
+    """View whose image is the backdrop."""
     force_scale: float = 1.0
     """Length of the force arrows, relative to the automatic one."""
 
@@ -94,7 +96,12 @@ class Scene:
                 self._draw_object(take, take_frame, is_playing)
             elif self._content.control is not None:
                 self._draw_controls(np.asarray(self._content.control[frame]), None)
-            self._cameras.draw(frame, is_visible=self.layers.cameras, is_playing=is_playing)
+            self._cameras.draw(
+                frame,
+                is_visible=self.layers.cameras,
+                looks_from=self.layers.looks_from,
+                is_playing=is_playing,
+            )
             if "ground" in self._nodes:
                 self._nodes["ground"].visible = self.layers.ground
 
@@ -103,8 +110,8 @@ class Scene:
         camera.fov = self._framing.fov
         camera.near = 0.005 * self._framing.extent
         camera.far = 200.0 * self._framing.extent
-        camera.look_at = tuple(self._framing.look_at)
-        camera.position = tuple(self._framing.camera)
+        camera.look_at = self._framing.look_at
+        camera.position = self._framing.camera
 
     def _add_ground(self) -> None:
         height = self._content.ground_height
@@ -158,7 +165,7 @@ class Scene:
         if observed is None:
             return
         point = observed.points(frame) if self.layers.observed else np.zeros((0, 3), np.float32)
-        size = 0.3 * self._framing.spacing
+        size = 0.4 * self._framing.spacing
         self._points("/observed", point, observed.colors(), size, self.layers.observed)
 
     def _draw_object(self, take: Take, frame: int, is_playing: bool) -> None:

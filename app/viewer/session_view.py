@@ -1,12 +1,11 @@
 """One live session: a viser server with scene, panel and clock."""
 
-import contextlib
-import io
 import threading
 import time
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import rich
 import viser
 import viser._messages as messages
 
@@ -207,13 +206,14 @@ class Session:
             return Snapshot(self._content, frame, take, take_frame)
 
     def _simulate(self, parameters: SimulationParameters, automatic_substeps: bool) -> None:
-        resimulation, content = self._resimulation, self._content
-        if resimulation is None or content.fitted is None:
+        resimulation, content, physics = self._resimulation, self._content, self._physics
+        if resimulation is None or content.fitted is None or physics is None:
             return
         if parameters == content.fitted.parameters and not automatic_substeps:
             resimulation.show_fitted()
         else:
             resimulation.request(parameters, automatic_substeps=automatic_substeps)
+            physics.show(resimulation.readout, at_once=True)
 
     def _hear(self, kind: str, ready: int) -> None:
         """Follow the live simulation; runs in its thread."""
@@ -252,9 +252,9 @@ class Session:
 
 
 def _start_server(label: str) -> viser.ViserServer:
-    with contextlib.redirect_stdout(io.StringIO()):
-        server = viser.ViserServer(host="127.0.0.1", port=0, label=label, verbose=False)
+    rich.get_console().quiet = True  # viser would print its loopback address, which misleads.
+    server = viser.ViserServer(host="127.0.0.1", port=0, label=label, verbose=False)
     # Any client could ask for a public tunnel with this message.
-    infrastructure: Any = server._websock_server  # pyright: ignore[reportPrivateUsage]
+    infrastructure: Any = server._websock_server  # pyright: ignore[reportPrivateUsage]  # no other way
     infrastructure.unregister_handler(messages.ShareUrlRequest)
     return server

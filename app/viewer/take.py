@@ -63,16 +63,13 @@ class Take:
             velocity = self.velocity[frame]
         else:
             velocity = _difference(self.position, frame, rate)
-        control_velocity = _difference(self.control, frame, rate)
-        if not self.parameters.use_control_velocity:
-            control_velocity = np.zeros_like(control_velocity)
         return virtual_forces(
             self.model,
             self.parameters,
             np.asarray(self.position[frame]),
             np.asarray(velocity),
             np.asarray(self.control[frame]),
-            control_velocity,
+            _difference(self.control, frame, rate),
         )
 
     def mean_distance(self, other: "Take") -> float:

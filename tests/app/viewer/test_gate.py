@@ -1,0 +1,112 @@
+import gzip
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import uvicorn
+import viser._messages
+from fastapi import FastAPI
+from viewer_client import PROTOCOL, ViewerClient
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from app.viewer.gate import create_gate
+from app.viewer.session import Sessions
+
+
+@pytest.fixture
+def address(sessions: Sessions) -> Iterator[str]:
+    app = FastAPI()
+    app.include_router(create_gate(sessions))
+    config = uvicorn.Config(
+        app, host="127.0.0.1", port=0, log_level="warning", ws_per_message_deflate=False
+    )
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    while not server.started:
+        time.sleep(0.01)
+    port = server.servers[0].sockets[0].getsockname()[1]
+    yield f"127.0.0.1:{port}"
+    server.should_exit = True
+    thread.join()
+
+
+def fetch(url: str, **headers: str) -> tuple[int, bytes]:
+    request = urllib.request.Request(url, headers=headers)  # noqa: S310
+    opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+    try:
+        with opener.open(request) as response:
+            return response.status, response.read()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.read()
+
+
+def test_the_page_is_viser_s_own_and_nothing_else_is_served(address, sessions) -> None:
+    session = sessions.open("run", "sheet", "me")
+    page = Path(viser.__file__).parent / "client" / "build" / "index.html"
+    base = f"http://{address}/viewer/{session}"
+    assert fetch(f"{base}/") == (200, page.read_bytes())
+    status, packed = fetch(f"{base}/", **{"Accept-Encoding": "gzip"})
+    assert (status, gzip.decompress(packed)) == (200, page.read_bytes())
+    for path in (
+        "/index.html",
+        "/../../../etc/passwd",
+        "/%2e%2e/%2e%2e/etc/passwd",
+        "//etc/passwd",
+    ):
+        assert fetch(base + path)[0] == 404
+
+
+def test_an_unknown_session_is_not_found(address) -> None:
+    assert fetch(f"http://{address}/viewer/AAAAAAAAAAAAAAAAAAAAAAAA/")[0] == 404
+    with pytest.raises(InvalidStatus) as refused:
+        connect(f"ws://{address}/viewer/AAAA", subprotocols=[PROTOCOL], proxy=None)
+    assert refused.value.response.status_code == 404
+
+
+@pytest.mark.parametrize("slash", ["", "/"])
+def test_a_client_gets_the_scene_through_the_gate(address, sessions, slash) -> None:
+    session = sessions.open("run", "sheet", "me")
+    with ViewerClient(f"ws://{address}/viewer/{session}{slash}") as client:
+        assert client.connection.subprotocol == PROTOCOL
+        client.until(lambda: "/object/nodes" in client.nodes and client.texts())
+        assert "/springs/virtual" in client.nodes
+        assert "object springs" in client.texts()
+        client.until(lambda: sessions.list()[0].client_count == 1)
+    end = time.monotonic() + 5
+    while sessions.list()[0].client_count and time.monotonic() < end:
+        time.sleep(0.02)
+    assert sessions.list()[0].client_count == 0
+
+
+@pytest.mark.parametrize("offered", [None, ["chat"]])
+def test_a_client_without_viser_s_protocol_is_refused(address, sessions, offered) -> None:
+    session = sessions.open("run", "sheet", "me")
+    with pytest.raises(InvalidStatus) as refused:
+        connect(f"ws://{address}/viewer/{session}", subprotocols=offered, proxy=None)
+    assert refused.value.response.status_code == 400
+
+
+def test_closing_a_session_hangs_up(address, sessions) -> None:
+    session = sessions.open("run", "sheet", "me")
+    with ViewerClient(f"ws://{address}/viewer/{session}") as client:
+        client.until(lambda: client.nodes)
+        sessions.close(session)
+        with pytest.raises(ConnectionClosed):
+            client.until(lambda: False, seconds=10)
+    assert fetch(f"http://{address}/viewer/{session}/")[0] == 404
+
+
+def test_no_client_can_open_a_public_tunnel(sessions) -> None:
+    session = sessions.get(sessions.open("run", "sheet", "me"))
+    server = session._server
+    assert server.get_host() == "127.0.0.1"
+    handlers = server._websock_server._incoming_handlers
+    assert viser._messages.ShareUrlRequest not in handlers
+    assert viser._messages.GuiUpdateMessage in handlers

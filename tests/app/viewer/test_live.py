@@ -1,0 +1,198 @@
+import os
+import queue
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from viewer_world import FRAMES, PARAMETERS, controls, sheet
+
+from app.viewer.live import LiveRequest, LiveSimulation
+from app.viewer.wire import Message
+from physhandi.data.run import Run
+
+SECONDS = 60.0
+
+
+class Mailbox:
+    """Collects what the process says to one session."""
+
+    def __init__(self) -> None:
+        self.messages: queue.Queue[Message] = queue.Queue()
+
+    def __call__(self, message: Message) -> None:
+        self.messages.put(message)
+
+    def until(self, *kinds: str) -> list[Message]:
+        seen = []
+        while not seen or seen[-1].kind not in kinds:
+            seen.append(self.messages.get(timeout=SECONDS))
+        return seen
+
+
+@pytest.fixture(scope="module")
+def live() -> Iterator[LiveSimulation]:
+    live = LiveSimulation()
+    yield live
+    live.close()
+
+
+@pytest.fixture
+def mailbox(live: LiveSimulation) -> Iterator[Mailbox]:
+    mailbox = Mailbox()
+    live.subscribe("a", mailbox)
+    yield mailbox
+    live.unsubscribe("a")
+
+
+def ask(run: Run, **changes: float) -> LiveRequest:
+    return LiveRequest(run=run.folder, sequence="lift", parameters=replace(PARAMETERS, **changes))
+
+
+def frames(messages: list[Message]) -> np.ndarray:
+    return np.stack([m.arrays["position"] for m in messages if m.kind == "frame"])
+
+
+def recount(radius: float, most: int) -> int:
+    """Count the object springs by looking at every node alone."""
+    node = sheet()
+    tree = cKDTree(node)
+    pairs = set()
+    for index, point in enumerate(node):
+        distance, near = tree.query(point, k=most + 1)
+        for length, other in zip(distance, near, strict=True):
+            if other != index and length < radius:
+                pairs.add((min(index, int(other)), max(index, int(other))))
+    return len(pairs)
+
+
+def test_the_fitted_parameters_give_the_fitted_rollout(live, mailbox, run) -> None:
+    live.request("a", ask(run))
+    messages = mailbox.until("finished")
+    assert [m.kind for m in messages] == ["started", *["frame"] * FRAMES, "finished"]
+    np.testing.assert_array_equal(frames(messages), run.array("sequences/lift/rollout.npy"))
+
+
+def test_a_larger_radius_gives_the_springs_that_an_independent_count_gives(
+    live, mailbox, run
+) -> None:
+    live.request("a", ask(run, connection_radius=0.06, max_neighbors=20))
+    messages = mailbox.until("finished")
+    started = messages[0]
+    assert int(started.arrays["object_spring_count"][0]) == recount(0.06, 20) > recount(0.035, 12)
+    moved = frames(messages) - run.array("sequences/lift/rollout.npy")
+    assert np.abs(moved[0]).max() == 0
+    assert np.abs(moved[-1]).max() > 1e-4
+
+
+def test_the_latest_request_wins(live, mailbox, run) -> None:
+    numbers = [
+        live.request("a", ask(run, drag=float(drag), substeps_per_frame=600)) for drag in range(10)
+    ]
+    seen = []
+    while not seen or seen[-1]["request"] != numbers[-1] or seen[-1].kind != "finished":
+        seen.append(mailbox.messages.get(timeout=SECONDS))
+    finished = [m["request"] for m in seen if m.kind == "finished"]
+    assert finished[-1] == numbers[-1]
+    assert len(finished) < 5
+    assert mailbox.messages.empty()
+
+
+def test_sessions_take_turns(live, mailbox, run) -> None:
+    order: queue.Queue[str] = queue.Queue()
+    other = Mailbox()
+    live.subscribe("a", lambda m: (order.put("a") if m.kind == "frame" else None, mailbox(m)))
+    live.subscribe("b", lambda m: (order.put("b") if m.kind == "frame" else None, other(m)))
+    live.request("a", ask(run, substeps_per_frame=600))
+    live.request("b", ask(run, substeps_per_frame=600))
+    mailbox.until("finished")
+    other.until("finished")
+    live.unsubscribe("b")
+    sequence = [order.get() for _ in range(2 * FRAMES)]
+    changes = sum(x != y for x, y in pairwise(sequence))
+    assert changes >= FRAMES
+
+
+def test_divergence_is_told_with_the_frame_and_the_process_lives_on(live, mailbox, run) -> None:
+    process = live.process_id
+    live.request("a", ask(run, stiffness_scale=1e5))
+    message = mailbox.until("diverged", "finished")[-1]
+    assert message.kind == "diverged"
+    assert message["error"].startswith("Simulation diverged at frame ")
+    assert message["frame"] >= 1
+    live.request("a", ask(run))
+    mailbox.until("finished")
+    assert live.process_id == process
+
+
+def test_automatic_substeps_survive_what_the_fitted_number_does_not(live, mailbox, run) -> None:
+    request = ask(run, stiffness_scale=200.0, damping=0.0)
+    live.request("a", request)
+    assert mailbox.until("diverged", "finished")[-1].kind == "diverged"
+    live.request("a", replace(request, automatic_substeps=True))
+    messages = mailbox.until("diverged", "finished")
+    assert messages[-1].kind == "finished"
+    assert messages[0]["substeps_per_frame"] > PARAMETERS.substeps_per_frame
+
+
+def test_a_request_that_makes_no_sense_is_answered(live, mailbox, run) -> None:
+    live.request("a", replace(ask(run), sequence="nowhere"))
+    assert "nowhere" in mailbox.until("failed")[-1]["error"]
+
+
+def test_a_killed_process_comes_back_and_finishes_the_work(live, mailbox, run) -> None:
+    live.request("a", ask(run, substeps_per_frame=3000))
+    mailbox.until("frame")
+    process = live.process_id
+    assert process is not None
+    os.kill(process, signal.SIGKILL)
+    messages = mailbox.until("finished")
+    crashed = next(m for m in messages if m.kind == "crashed")
+    assert (crashed["code"], crashed["is_retried"]) == (-signal.SIGKILL, True)
+    assert live.process_id not in {None, process}
+
+
+def test_the_process_dies_with_its_parent() -> None:
+    script = (
+        "import os, time\n"
+        "from app.viewer.live import LiveSimulation\n"
+        "live = LiveSimulation()\n"
+        "live.subscribe('a', lambda message: None)\n"
+        "while live.process_id is None: time.sleep(0.01)\n"
+        "os.write(1, str(live.process_id).encode())\n"
+        "os._exit(0)\n"
+    )
+    out = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, check=True, timeout=SECONDS
+    )
+    end = time.monotonic() + 10
+    while time.monotonic() < end and _is_running(int(out.stdout)):
+        time.sleep(0.05)
+    assert not _is_running(int(out.stdout))
+
+
+def test_close_leaves_no_process() -> None:
+    live = LiveSimulation()
+    live.subscribe("a", lambda _: None)
+    while (process := live.process_id) is None:
+        time.sleep(0.01)
+    live.close()
+    assert not _is_running(process)
+
+
+def test_the_controls_move_at_all() -> None:
+    assert np.abs(np.diff(controls((0.0, 0.0, 1.0)), axis=0)).max() > 1e-3
+
+
+def _is_running(process: int) -> bool:
+    try:
+        with open(f"/proc/{process}/stat") as stat:  # noqa: PTH123
+            return stat.read().rsplit(")", 1)[1].split()[0] != "Z"
+    except FileNotFoundError:
+        return False

@@ -1,0 +1,77 @@
+import pytest
+
+from app.viewer.parameters import History, knobs, what_changed
+from physhandi.simulation.model import SimulationParameters
+
+START = SimulationParameters(connection_radius=0.0237, damping=20.0)
+
+
+class Clock:
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_every_slider_shows_the_fitted_value_and_gives_it_back() -> None:
+    for unit in ("m", "squares"):
+        for knob in knobs(START, length_unit=unit):
+            value = knob.to_slider(START)
+            assert knob.low <= value <= knob.high
+            assert knob.from_slider(value) == pytest.approx(getattr(START, knob.field))
+
+
+def test_lengths_are_millimetres_only_if_the_recording_is_metric() -> None:
+    metric, squares = knobs(START, length_unit="m")[0], knobs(START, length_unit="squares")[0]
+    assert (metric.label, metric.to_slider(START)) == ("δ object [mm]", pytest.approx(23.7))
+    assert (squares.label, squares.to_slider(START)) == (
+        "δ object [squares]",
+        pytest.approx(0.0237),
+    )
+
+
+def test_a_wider_fit_widens_its_slider() -> None:
+    wide = SimulationParameters(connection_radius=0.2, max_neighbors=120)
+    by_field = {knob.field: knob for knob in knobs(wide, length_unit="m")}
+    assert by_field["connection_radius"].to_slider(wide) == pytest.approx(200.0)
+    assert by_field["max_neighbors"].to_slider(wide) == 120
+
+
+def test_stiffness_is_moved_by_powers_of_ten() -> None:
+    knob = next(k for k in knobs(START, length_unit="m") if k.field == "stiffness_scale")
+    assert knob.from_slider(-1.0) == pytest.approx(0.1)
+
+
+def test_undo_redo_and_reset() -> None:
+    clock = Clock()
+    history = History(START, clock)
+    history.set("drag", 5.0)
+    clock.now += 10
+    history.set("max_neighbors", 40)
+    assert history.undo().max_neighbors == START.max_neighbors
+    assert history.current.drag == 5.0
+    assert history.redo().max_neighbors == 40
+    assert history.reset() == START
+    assert history.undo().max_neighbors == 40
+    history.undo()
+    clock.now += 10
+    history.set("drag", 9.0)
+    assert not history.can_redo
+
+
+def test_one_drag_of_a_slider_is_one_step_of_the_history() -> None:
+    clock = Clock()
+    history = History(START, clock)
+    for value in (4.0, 5.0, 6.0):
+        history.set("drag", value)
+        clock.now += 0.1
+    assert history.current.drag == 6.0
+    assert history.undo() == START
+    assert not history.can_undo
+
+
+def test_what_changed_is_said_in_the_sliders_units() -> None:
+    now = SimulationParameters(connection_radius=0.035, damping=20.0, stiffness_scale=0.5)
+    text = what_changed(knobs(START, length_unit="m"), START, now)
+    assert text == "δ object [mm] 23.7 → 35, stiffness x1 → x0.5"
+    assert "as fitted" in what_changed(knobs(START, length_unit="m"), START, START)

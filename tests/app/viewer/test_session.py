@@ -1,0 +1,190 @@
+import json
+import time
+
+import numpy as np
+import pytest
+from viewer_client import ViewerClient
+from viewer_world import FRAMES, FakeSettings
+
+from app.viewer.export_panel import write_csv, write_npz, write_ply, write_yaml
+from app.viewer.session import Sessions, TooManySessionsError
+from physhandi.data.run import Run
+from physhandi.errors import MissingInputError, PhysHandiError, RunError, UsageError
+from physhandi.simulation.model import SimulationParameters
+
+
+def watch(sessions: Sessions, kind="run", target="sheet") -> ViewerClient:
+    session = sessions.get(sessions.open(kind, target, "me"))
+    return ViewerClient(f"ws://127.0.0.1:{session.port}")
+
+
+def test_a_slider_re_simulates_and_undo_goes_back(sessions) -> None:
+    with watch(sessions) as client:
+        client.until(lambda: "simulated" in client.texts())
+        first = client.texts()
+        client.set("δ object [mm]", 60.0)
+        client.until(
+            lambda: (
+                f"simulated {FRAMES}/{FRAMES}" in client.texts()
+                and client.texts().split(" · ")[0] != first.split(" · ")[0]
+            )
+        )
+        assert " ms a frame" in client.texts()
+        assert "δ object [mm] 35 → 60" in client.texts()
+        client.set("History", "Undo")
+        client.until(lambda: first.split("<br/>")[0] in client.texts())
+        assert client.gui[client.find("δ object [mm]")]["value"] == 35.0
+
+
+def test_a_diverged_simulation_is_told_and_the_slider_still_works(sessions) -> None:
+    with watch(sessions) as client:
+        client.until(lambda: "simulated" in client.texts())
+        client.set("δ object [mm]", 80.0)
+        client.set("d_max object", 60)
+        client.set("damping [N·s/m]", 300.0)
+        client.until(lambda: "Stopped at frame" in client.texts())
+        client.until(
+            lambda: any(
+                "diverged" in json.dumps(m, default=str)
+                for m in client.messages
+                if "Notification" in m["type"]
+            )
+        )
+        client.set("History", "Reset")
+        client.until(lambda: "Stopped" not in client.texts())
+
+
+def test_a_frame_costs_at_most_100_kilobytes(sessions) -> None:
+    with watch(sessions) as client:
+        client.until(lambda: "/object/nodes" in client.nodes)
+        client.set("Object springs", True)
+        client.until(lambda: "/springs/object" in client.nodes)
+        before, begin = client.bytes_received, time.monotonic()
+        client.until(lambda: time.monotonic() - begin > 1.0)
+        assert 0 < (client.bytes_received - before) / 30 < 100_000
+
+
+def test_playing_starts_when_somebody_looks_and_scrubbing_stops_it(sessions) -> None:
+    with watch(sessions) as client:
+        client.until(lambda: any(p.get("label") == "Pause" for p in client.gui.values()))
+        client.set("Frame", 7)
+        client.until(lambda: any(p.get("label") == "Play" for p in client.gui.values()))
+        session = sessions.get(sessions.list()[0].id)
+        assert session._playback.frame == 7
+
+
+def test_the_other_sequence_of_a_run_can_be_chosen(sessions, run) -> None:
+    with watch(sessions) as client:
+        client.until(lambda: "simulated" in client.texts())
+        client.set("Sequence", "drag")
+        session = sessions.get(sessions.list()[0].id)
+        client.until(lambda: session._content.sequence_name == "drag")
+        client.until(lambda: client.texts().count("object springs") == 1)
+        client.set("stiffness 10^", -1.0)
+        client.until(
+            lambda: "x0.1" in client.texts() and f"simulated {FRAMES}/{FRAMES}" in client.texts()
+        )
+        take, _ = session._resimulation.at(0)
+        control = run.array("sequences/drag/control.npy")
+        np.testing.assert_array_equal(np.asarray(take.control), control)
+
+
+def test_an_error_in_a_callback_is_logged_and_shown(sessions, caplog) -> None:
+    with watch(sessions) as client:
+        client.until(lambda: "simulated" in client.texts())
+        session = sessions.get(sessions.list()[0].id)
+
+        def fail(*_: object) -> None:
+            raise ValueError("the spring snapped")
+
+        session._physics._simulate = fail
+        client.set("drag [1/s]", 9.0)
+        client.until(
+            lambda: any("the spring snapped" in json.dumps(m, default=str) for m in client.messages)
+        )
+        assert "Traceback" in caplog.text
+
+
+def test_a_recording_shows_keypoints_depth_and_cameras(sessions, recording) -> None:
+    with watch(sessions, "sequence", recording.sequence.name) as client:
+        client.until(lambda: "/observed" in client.nodes)
+        client.until(lambda: {"/cameras/view0", "/cameras/view1"} <= set(client.nodes))
+        assert "/hand/skeleton_0" in client.nodes
+        assert "/object/nodes" not in client.nodes
+        assert not any(p.get("label") == "Physics" for p in client.gui.values())
+
+
+def test_downloads_hold_what_is_on_the_screen(sessions, run) -> None:
+    session = sessions.get(sessions.open("run", "sheet", "me"))
+    session._playback.seek(4)
+    snapshot = session._snapshot()
+    ply = write_ply(snapshot)
+    header, _, body = ply.partition(b"end_header\n")
+    assert b"element vertex 111\n" in header
+    row = np.frombuffer(body, dtype="<3f4, 3u1")
+    np.testing.assert_array_equal(row["f0"][:81], run.array("sequences/lift/rollout.npy")[4])
+    np.testing.assert_array_equal(row["f0"][81:], run.array("sequences/lift/control.npy")[4])
+    import io
+
+    with np.load(io.BytesIO(write_npz(snapshot))) as rollout:
+        np.testing.assert_array_equal(rollout["position"], run.array("sequences/lift/rollout.npy"))
+    rows = write_csv(snapshot).decode().splitlines()
+    assert len(rows) == FRAMES + 1
+    import yaml
+
+    parameters = SimulationParameters.from_dict(yaml.safe_load(write_yaml(snapshot)))
+    assert parameters == session._content.fitted.parameters
+
+
+def test_there_are_only_so_many_sessions(catalog) -> None:
+    sessions = Sessions(FakeSettings(live_sessions=2), catalog)
+    try:
+        first = sessions.open("run", "sheet", "me")
+        second = sessions.open("run", "sheet", "you")
+        assert first != second
+        assert len(first) >= 24
+        with pytest.raises(TooManySessionsError, match="2 live sessions are open"):
+            sessions.open("run", "sheet", "me")
+        assert sessions.close(first)
+        assert not sessions.close(first)
+        sessions.open("run", "sheet", "me")
+        assert [info.owner for info in sessions.list()] == ["you", "me"]
+    finally:
+        sessions.shutdown()
+    assert sessions.list() == []
+
+
+def test_what_cannot_be_shown_takes_no_place(catalog, tmp_path) -> None:
+    sessions = Sessions(FakeSettings(live_sessions=1), catalog)
+    try:
+        with pytest.raises(RunError):
+            sessions.open("run", "nothing", "me")
+        with pytest.raises(UsageError):
+            sessions.open("folder", "sheet", "me")
+        empty = Run.create(
+            catalog.root / "runs" / "empty",
+            name="e",
+            kind="reconstruction",
+            sequences=["x"],
+            config={},
+        )
+        with pytest.raises(MissingInputError, match="has no result for sequence 'x' yet"):
+            sessions.open("run", empty.id, "me")
+        sessions.open("run", "sheet", "me")
+        with pytest.raises(PhysHandiError):
+            sessions.open("run", "sheet", "me")
+    finally:
+        sessions.shutdown()
+
+
+def test_a_session_that_nobody_looks_at_is_closed(catalog) -> None:
+    sessions = Sessions(FakeSettings(live_idle_s=0.4), catalog)
+    try:
+        watched = sessions.open("run", "sheet", "me")
+        with ViewerClient(f"ws://127.0.0.1:{sessions.get(watched).port}") as client:
+            client.until(lambda: sessions.list()[0].client_count == 1)
+            sessions.open("run", "sheet", "nobody")
+            client.until(lambda: len(sessions.list()) == 1, seconds=10)
+            assert sessions.list()[0].id == watched
+    finally:
+        sessions.shutdown()
