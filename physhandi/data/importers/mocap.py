@@ -1,4 +1,4 @@
-"""Motion capture of a rope that grippers swing: markers in, a sequence with point controllers out."""
+"""Motion capture of a rope that grippers swing: markers in, point controllers out."""
 
 import re
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicSpline  # pyright: ignore[reportMissingTypeStubs]
 
 from physhandi.data.atomic import read_array
 from physhandi.data.sequence import Sequence
@@ -116,18 +116,20 @@ def refine(
     curve = CubicSpline(knot, marker, axis=0)
     nodes = [marker[:1]]
     for start, end, last in zip(knot[:-1], knot[1:], marker[1:], strict=True):
-        dense = np.linspace(start, end, _SAMPLES_PER_SEGMENT * nodes_per_segment + 1)
+        sample_count = _SAMPLES_PER_SEGMENT * nodes_per_segment + 1
+        dense = np.linspace(float(start), float(end), sample_count)
         length = np.linalg.norm(np.diff(curve(dense), axis=0), axis=1)
         arc = np.concatenate([[0.0], np.cumsum(length)])
         even = np.arange(1, nodes_per_segment) / nodes_per_segment * arc[-1]
-        nodes.extend([curve(np.interp(even, arc, dense)), last[None]])
+        at: ndarray = np.interp(even, arc, dense)
+        nodes.extend([curve(at), last[None]])
     return np.concatenate(nodes), np.arange(len(marker)) * nodes_per_segment
 
 
 def straight_chain(
     marker: Float[ndarray, "frame marker 3"], nodes_per_segment: int
 ) -> Float[ndarray, "node 3"]:
-    """Give the rope without tension: straight along x, with the median length of each segment [m]."""
+    """Give the rope without tension: straight along x, each segment as long as its median [m]."""
     length = np.median(np.linalg.norm(np.diff(marker, axis=1), axis=2), axis=0)
     step = np.repeat(length / nodes_per_segment, nodes_per_segment)
     node = np.zeros((len(step) + 1, 3))
