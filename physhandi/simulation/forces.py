@@ -7,7 +7,7 @@ from numpy import ndarray
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
 
 
-def virtual_forces(
+def virtual_forces(  # noqa: PLR0917  (model, then state in the order of the equations)
     model: SpringMassModel,
     parameters: SimulationParameters,
     position: Float[ndarray, "node 3"],

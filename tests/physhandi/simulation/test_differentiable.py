@@ -1,0 +1,213 @@
+"""Gradients of the float32 adjoint against float64 central differences of the oracle."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from reference.scenes import as_model, cube_scene
+from reference.spring_mass import simulate
+
+from physhandi.simulation import differentiable
+from physhandi.simulation.simulator import Simulator
+
+FIELDS = {
+    "control": "control",
+    "log_stiffness": "stiffness",
+    "damping": "damping",
+    "drag": "drag",
+    "restitution": "restitution",
+    "friction": "friction",
+    "initial_position": "node",
+    "initial_velocity": "velocity",
+}
+"""Argument of `rollout` -> field of the oracle's scene."""
+
+
+def loss_weights(scene, frames=slice(None)):
+    """Weigh every coordinate of every frame differently, frame 0 too."""
+    rng = np.random.default_rng(7)
+    shape = (len(scene.control), len(scene.node), 3)
+    weights = rng.normal(size=shape), 0.05 * rng.normal(size=shape)
+    keep = np.zeros((len(scene.control), 1, 1))
+    keep[frames] = 1.0
+    return weights[0] * keep, weights[1] * keep
+
+
+def oracle_loss(scene, weights, values):
+    changes = {
+        FIELDS[name]: np.exp(value) if name == "log_stiffness" else value
+        for name, value in values.items()
+    }
+    position, velocity = simulate(replace(scene, **changes))
+    return float((weights[0] * position).sum() + (weights[1] * velocity).sum())
+
+
+def arguments(scene):
+    values = {
+        name: np.asarray(getattr(scene, field), dtype=float) for name, field in FIELDS.items()
+    }
+    values["log_stiffness"] = np.log(values["log_stiffness"])
+    return {name: value.astype(np.float32).astype(float) for name, value in values.items()}
+
+
+def gradients(scene, device, weights, window=None):
+    model, parameters = as_model(scene)
+    tensors = {
+        name: torch.tensor(value, requires_grad=True) for name, value in arguments(scene).items()
+    }
+    state = differentiable.rollout(model, parameters, device=device, window=window, **tensors)
+    loss = sum(
+        (torch.tensor(w) * value.double()).sum() for w, value in zip(weights, state, strict=True)
+    )
+    loss.backward()
+    return {name: tensor.grad.numpy() for name, tensor in tensors.items()}
+
+
+def finite_difference(scene, weights, name, index, step=1e-6):
+    loss = []
+    for sign in (1.0, -1.0):
+        values = arguments(scene)
+        values[name][index] += sign * step
+        loss.append(oracle_loss(scene, weights, values))
+    return (loss[0] - loss[1]) / (2.0 * step)
+
+
+SCENES = {
+    "ground": {},
+    "no control velocity": {"moves": False},
+    "slippery": {"friction": 0.05, "restitution": 0.9, "ground": 0.003},
+    "no ground": {"ground": None},
+}
+
+
+@pytest.mark.parametrize("changes", SCENES.values(), ids=SCENES.keys())
+def test_gradients_agree_with_central_differences_of_the_oracle(device, changes):
+    scene = cube_scene(**changes)
+    weights = loss_weights(scene)
+    found = gradients(scene, device, weights)
+    rng = np.random.default_rng(1)
+    for name, gradient in found.items():
+        picks = rng.permutation(gradient.size)[:5]
+        indices = [np.unravel_index(pick, gradient.shape) for pick in picks]
+        expected = np.array([finite_difference(scene, weights, name, index) for index in indices])
+        scale = max(np.abs(gradient).max(), 1e-12)
+        np.testing.assert_allclose(
+            [gradient[index] for index in indices], expected, atol=2e-5 * scale, err_msg=name
+        )
+        is_contact = name in ("restitution", "friction")
+        assert (np.abs(gradient).max() > 1e-4) == (scene.ground is not None or not is_contact), name
+
+
+def test_a_whole_gradient_vector_points_the_right_way(device):
+    scene = cube_scene()
+    weights = loss_weights(scene)
+    found = gradients(scene, device, weights)
+    values = arguments(scene)
+    rng = np.random.default_rng(2)
+    for name in ("control", "log_stiffness", "damping"):
+        direction = rng.normal(size=values[name].shape)
+        loss = [
+            oracle_loss(scene, weights, {**values, name: values[name] + sign * 1e-6 * direction})
+            for sign in (1.0, -1.0)
+        ]
+        expected = (loss[0] - loss[1]) / 2e-6
+        assert float((found[name] * direction).sum()) == pytest.approx(expected, rel=1e-4), name
+
+
+def test_control_velocity_has_its_own_part_in_the_gradient(device):
+    weights = loss_weights(cube_scene())
+    with_velocity = gradients(cube_scene(), device, weights)["control"]
+    without = gradients(cube_scene(moves=False), device, weights)["control"]
+    assert np.abs(with_velocity - without).max() > 0.1
+
+
+def test_a_window_of_one_frame_sees_only_that_frame(device):
+    # Each frame's loss by itself, started from the state that the frame before reached.
+    scene = cube_scene()
+    position, velocity = simulate(scene)
+    whole = gradients(scene, device, loss_weights(scene), window=1)
+    expected = np.zeros_like(whole["log_stiffness"])
+    for frame in (1, 2, 3):
+        piece = replace(
+            scene,
+            node=position[frame - 1],
+            velocity=velocity[frame - 1],
+            control=scene.control[frame - 1 : frame + 1],
+        )
+        weights = tuple(np.stack([0.0 * w[0], w[frame]]) for w in loss_weights(scene))
+        expected += gradients(piece, device, weights)["log_stiffness"]
+    np.testing.assert_allclose(whole["log_stiffness"], expected, atol=1e-5 * np.abs(expected).max())
+    full = gradients(scene, device, loss_weights(scene))["log_stiffness"]
+    assert np.abs(full - whole["log_stiffness"]).max() > 0.1 * np.abs(full).max()
+
+
+def test_a_window_cuts_every_so_many_frames(device):
+    scene = cube_scene()
+    last = loss_weights(scene, frames=3)
+    cut_at_two = gradients(scene, device, last, window=2)
+    assert np.abs(cut_at_two["control"][2:]).max() > 1e-3
+    assert not cut_at_two["control"][:2].any()
+    assert not cut_at_two["initial_position"].any()
+    for window in (3, 4, 100):
+        longer = gradients(scene, device, last, window=window)
+        np.testing.assert_array_equal(longer["control"], gradients(scene, device, last)["control"])
+    assert np.abs(gradients(scene, device, last)["control"][:2]).max() > 1e-3
+
+
+def test_gradients_are_the_same_bits_each_time(device):
+    scene = cube_scene()
+    weights = loss_weights(scene)
+    first, second = gradients(scene, device, weights), gradients(scene, device, weights)
+    for name in first:
+        assert first[name].tobytes() == second[name].tobytes(), name
+
+
+def test_the_forward_pass_is_the_simulator_s(device):
+    scene = cube_scene()
+    model, parameters = as_model(scene)
+    position, velocity = differentiable.rollout(
+        model, parameters, torch.tensor(scene.control), device=device
+    )
+    rollout = Simulator(model, parameters, device=device).rollout(scene.control)
+    np.testing.assert_allclose(position.numpy(), rollout.position, atol=1e-7)
+    np.testing.assert_allclose(velocity.numpy(), rollout.velocity, atol=2e-6)
+
+
+def test_backward_uses_the_material_of_its_own_forward(device):
+    scene = cube_scene()
+    model, parameters = as_model(scene)
+    control = torch.tensor(scene.control)
+
+    def forward(scale):
+        log = torch.tensor(np.log(model.stiffness * scale), requires_grad=True)
+        return log, differentiable.rollout(
+            model, parameters, control, log_stiffness=log, device=device
+        )[0]
+
+    log, position = forward(1.0)
+    position[-1].sum().backward()
+    expected = log.grad.clone()
+    log, position = forward(1.0)
+    forward(3.0)
+    position[-1].sum().backward()
+    np.testing.assert_array_equal(log.grad.numpy(), expected.numpy())
+    assert float(expected.abs().max()) > 1e-4
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"damping": torch.zeros(3)}, r"damping has shape \(3,\); expected \(33,\)"),
+        ({"drag": torch.zeros(1)}, r"drag has shape \(1,\); expected \(\)"),
+        ({"initial_position": torch.zeros(2, 3)}, "initial_position has shape"),
+        ({"window": 0}, "window is 0; expected at least one frame"),
+    ],
+    ids=["damping", "drag", "initial_position", "window"],
+)
+def test_tensors_that_do_not_fit_are_refused(device, change, message):
+    scene = cube_scene()
+    with pytest.raises(ValueError, match=message):
+        differentiable.rollout(
+            *as_model(scene), torch.tensor(scene.control), device=device, **change
+        )

@@ -1,0 +1,87 @@
+"""Parameters and models survive being stored, and refuse nonsense by name."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from reference.scenes import as_model, cube_scene
+from safetensors.numpy import load, save
+
+from physhandi.errors import UsageError
+from physhandi.simulation.model import SimulationParameters, SpringMassModel
+
+
+def test_parameters_survive_a_round_trip():
+    parameters = SimulationParameters(
+        stiffness=123.0, ground_height=None, use_control_velocity=False
+    )
+    assert SimulationParameters.from_dict(parameters.to_dict()) == parameters
+    assert SimulationParameters.from_dict({}) == SimulationParameters()
+
+
+def test_a_substep_is_a_667th_of_a_frame():
+    assert SimulationParameters().dt == pytest.approx(4.9975e-5, rel=1e-4)
+
+
+def test_whole_numbers_and_numpy_values_are_converted():
+    parameters = SimulationParameters.from_dict(
+        {"drag": 3, "max_neighbors": 12.0, "damping": np.float32(0.5)}
+    )
+    assert (type(parameters.drag), type(parameters.max_neighbors)) == (float, int)
+    assert parameters.damping == 0.5
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"stifness": 1.0}, "Unknown simulation parameter 'stifness'. Known are connection_radius"),
+        ({"stiffness": -1.0}, r"stiffness is -1.0; expected a finite value in \[0.0, ∞\]"),
+        ({"friction": 2.1}, "friction is 2.1"),
+        ({"drag": float("nan")}, "drag is nan"),
+        ({"substeps_per_frame": 0}, "substeps_per_frame is 0"),
+        ({"max_neighbors": 2.5}, "max_neighbors is 2.5; expected a whole number"),
+        ({"damping": "much"}, "damping is 'much'; expected a number"),
+        ({"gravity": None}, "gravity is empty"),
+        ({"use_control_velocity": "no"}, "use_control_velocity is 'no'; expected true or false"),
+    ],
+)
+def test_nonsense_is_refused_by_name(values, message):
+    with pytest.raises(UsageError, match=message):
+        SimulationParameters.from_dict(values)
+
+
+def test_a_model_survives_safetensors():
+    model, _ = as_model(cube_scene())
+    again = SpringMassModel.from_tensors(load(save(model.to_tensors())))
+    for name, value in model.to_tensors().items():
+        np.testing.assert_array_equal(value, again.to_tensors()[name])
+    assert (again.node_count, again.control_count, again.virtual_spring_count) == (8, 4, 5)
+
+
+def test_a_model_without_one_of_its_arrays_is_refused():
+    tensors = as_model(cube_scene())[0].to_tensors()
+    del tensors["damping"]
+    with pytest.raises(ValueError, match="needs the arrays control_count, damping"):
+        SpringMassModel.from_tensors(tensors)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda m: {"rest_length": m.rest_length * 0}, "rest_length must be positive"),
+        (lambda m: {"stiffness": m.stiffness * np.float32(np.nan)}, "stiffness has shape"),
+        (lambda m: {"object_node": m.object_node * np.float32(np.inf)}, "object_node has shape"),
+        (lambda m: {"spring_nodes": m.spring_nodes + np.int32(4)}, r"a node outside 0…11"),
+        (lambda m: {"spring_nodes": m.spring_nodes * np.int32(0)}, "joins a node to itself"),
+        (lambda _: {"object_spring_count": 30}, "object spring .* ends at a control node"),
+        (lambda _: {"object_spring_count": 20}, "must join one object node and one control node"),
+        (
+            lambda m: {"object_spring_count": 99},
+            "object_spring_count is 99, but there are 33 springs",
+        ),
+    ],
+)
+def test_an_inconsistent_model_is_refused(change, message):
+    model, _ = as_model(cube_scene())
+    with pytest.raises(ValueError, match=message):
+        replace(model, **change(model))

@@ -1,0 +1,90 @@
+"""Small scenes for the oracle, and the same scenes as models for the simulator."""
+
+from dataclasses import replace
+
+import numpy as np
+from reference.spring_mass import Scene
+
+from physhandi.simulation.model import SimulationParameters, SpringMassModel
+
+
+def cube_scene(**changes):
+    """Throw a soft, well damped cube at the ground while five springs pull it by four controls.
+
+    All numbers are representable in float32, so that oracle and simulator see the same scene.
+    """
+    rng = np.random.default_rng(0)
+    corner = np.array([[x, y, z] for x in (0, 0.03) for y in (0, 0.03) for z in (0, 0.03)])
+    node = corner + rng.normal(0, 0.002, (8, 3))
+    node[:, 2] += 0.004 - node[:, 2].min()
+    control_0 = node[4:] + np.array([0.012, 0.0, 0.012])
+    object_springs = [(i, j) for i in range(8) for j in range(i + 1, 8)]
+    springs = np.array([*object_springs, (4, 8), (9, 5), (6, 10), (7, 11), (5, 8)])
+    ends = np.vstack([node, control_0])[springs]
+    path = np.linspace(0, 1, 4)[:, None, None] ** 2 * np.array([0.02, 0.01, -0.015])
+    scene = Scene(
+        node=node,
+        velocity=rng.normal(0, 0.05, (8, 3)) + np.array([0.3, 0.0, -0.4]),
+        springs=springs,
+        rest=np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) * rng.uniform(0.9, 1.1, len(springs)),
+        stiffness=rng.uniform(20, 40, len(springs)),
+        damping=rng.uniform(1, 3, len(springs)),
+        control=control_0 + path + rng.normal(0, 0.001, (4, 4, 3)),
+        substeps=40,
+    )
+    return in_float32(replace(scene, **changes))
+
+
+def bare_scene(
+    node, velocity=None, springs=(), rest=(), stiffness=(), damping=(), frames=2, **changes
+):
+    """Describe a few nodes without control nodes, drag, gravity or ground, unless given."""
+    node = np.asarray(node, dtype=float)
+    scene = Scene(
+        node=node,
+        velocity=np.zeros_like(node) if velocity is None else np.asarray(velocity, dtype=float),
+        springs=np.asarray(springs, dtype=np.int64).reshape(-1, 2),
+        rest=np.asarray(rest, dtype=float),
+        stiffness=np.asarray(stiffness, dtype=float),
+        damping=np.asarray(damping, dtype=float),
+        control=np.zeros((frames, 0, 3)),
+        drag=0.0,
+        gravity=0.0,
+        ground=None,
+    )
+    return in_float32(replace(scene, **changes))
+
+
+def in_float32(scene):
+    """Round every array to float32, but keep float64."""
+    arrays = ("node", "velocity", "rest", "stiffness", "damping", "control")
+    return replace(
+        scene, **{name: np.float32(getattr(scene, name)).astype(float) for name in arrays}
+    )
+
+
+def as_model(scene):
+    """Return the scene as the simulator's model and parameters."""
+    parameters = SimulationParameters(
+        drag=scene.drag,
+        restitution=scene.restitution,
+        friction=scene.friction,
+        ground_height=scene.ground,
+        gravity=scene.gravity,
+        frame_rate=scene.frame_rate,
+        substeps_per_frame=scene.substeps,
+        use_control_velocity=scene.moves,
+    )
+    is_object = np.all(scene.springs < len(scene.node), axis=1)
+    assert np.all(np.diff(is_object.astype(int)) <= 0), "object springs come first"
+    model = SpringMassModel(
+        object_node=scene.node.astype(np.float32),
+        initial_velocity=scene.velocity.astype(np.float32),
+        spring_nodes=scene.springs.astype(np.int32),
+        rest_length=scene.rest.astype(np.float32),
+        stiffness=scene.stiffness.astype(np.float32),
+        damping=scene.damping.astype(np.float32),
+        object_spring_count=int(is_object.sum()),
+        control_count=scene.control.shape[1],
+    )
+    return model, parameters
