@@ -1,1 +1,4 @@
-"""Runs, turned into files that other programs read."""
+"""Runs as files that other programs read."""
+
+from physhandi.data.exporters.export import FORMATS as FORMATS
+from physhandi.data.exporters.export import export_run as export_run

@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -121,9 +122,12 @@ def refine(
         length = np.linalg.norm(np.diff(curve(dense), axis=0), axis=1)
         arc = np.concatenate([[0.0], np.cumsum(length)])
         even = np.arange(1, nodes_per_segment) / nodes_per_segment * arc[-1]
-        at: ndarray = np.interp(even, arc, dense)
-        nodes.extend([curve(at), last[None]])
+        nodes.extend([curve(_interpolate(even, arc, dense)), last[None]])
     return np.concatenate(nodes), np.arange(len(marker)) * nodes_per_segment
+
+
+def _interpolate(at: ndarray, known: ndarray, value: ndarray) -> Any:
+    return np.interp(at, known, value)
 
 
 def straight_chain(

@@ -1,0 +1,115 @@
+"""One door to all formats: checks what is asked, writes atomically, overwrites only if told."""
+
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from jaxtyping import Int
+from numpy import ndarray
+
+from physhandi.data.atomic import temporary_name
+from physhandi.data.exporters.mesh import write_frame, write_frames
+from physhandi.data.exporters.scene_data import read_scene
+from physhandi.data.exporters.table import (
+    write_npz,
+    write_summary,
+    write_tables,
+    write_trajectories,
+)
+from physhandi.data.run import Run
+from physhandi.errors import UsageError
+
+FORMATS = ("ply", "npz", "csv", "yaml")
+
+
+def export_run(
+    run: Run,
+    format: str,  # noqa: A002 - the command line's name for it
+    out_path: Path | str,
+    *,
+    sequence: str | None = None,
+    frame: int | None = None,
+    overwrite: bool = False,
+    faces: Mapping[str, Int[ndarray, "face 3"]] | None = None,
+) -> Path:
+    """Write a run, or one sequence of it, in another format.
+
+    Args:
+        run: What to export.
+        format: ``ply`` (nodes, hand meshes and virtual springs), ``npz`` (motion and springs),
+            ``csv`` (a file: trajectories; a folder: also parameters and metrics) or ``yaml``
+            (settings, parameters, losses and metrics of the whole run).
+        out_path: File to write. Without the format's suffix, PLY and CSV make a folder.
+        sequence: Which sequence; None takes the first.
+        frame: Only this frame (PLY); None takes all, which needs a folder.
+        overwrite: Whether to replace an export that is there.
+        faces: Triangles of the hands by side, for runs that do not hold them.
+
+    Returns:
+        What was written.
+
+    Raises:
+        UsageError: If format, sequence or frame do not exist, or the path is in use.
+        RunError: If the run does not hold what is asked for.
+    """
+    out = Path(out_path)
+    if format not in FORMATS:
+        raise UsageError(f"'{format}' is not a format; choose one of {', '.join(FORMATS)}.")
+    if frame is not None and format != "ply":
+        raise UsageError(f"A single frame can be exported as ply only, not as {format}.")
+    is_folder = format in {"ply", "csv"} and out.suffix != f".{format}"
+    _check_target(out, format, is_folder=is_folder, overwrite=overwrite)
+    if format == "yaml":
+        return _publish(out, lambda path: write_summary(path, run), is_folder=False)
+    scene = read_scene(run, sequence, faces)
+    if format == "npz":
+        return _publish(out, lambda path: write_npz(path, run, scene), is_folder=False)
+    if format == "csv":
+        if is_folder:
+            return _publish(out, lambda path: write_tables(path, run, scene), is_folder=True)
+        return _publish(out, lambda path: write_trajectories(path, scene), is_folder=False)
+    if frame is not None and not 0 <= frame < scene.frame_count:
+        raise UsageError(
+            f"Sequence '{scene.sequence}' has frames 0 to {scene.frame_count - 1}, not {frame}."
+        )
+    if frame is not None:
+        name = f"frame_{frame:05d}.ply"
+        return _publish(
+            out,
+            lambda path: write_frame(path / name if is_folder else path, scene, frame),
+            is_folder=is_folder,
+        )
+    if not is_folder:
+        raise UsageError(f"{out} is one file; name a folder for all frames, or choose one frame.")
+    return _publish(out, lambda path: write_frames(path, scene), is_folder=True)
+
+
+def _check_target(out: Path, suffix: str, *, is_folder: bool, overwrite: bool) -> None:
+    if not out.exists() or (is_folder and out.is_dir() and not any(out.iterdir())):
+        return
+    if not overwrite:
+        raise UsageError(f"{out} exists already. Choose another path, or allow overwriting.")
+    if out.is_dir() != is_folder:
+        kind = "folder" if out.is_dir() else "file"
+        raise UsageError(f"{out} is a {kind}, which this export cannot replace. Choose another.")
+    if is_folder and any(path.suffix != f".{suffix}" or path.is_dir() for path in out.iterdir()):
+        raise UsageError(f"{out} holds other things than an export, so it is not replaced.")
+
+
+def _publish(out: Path, write: Callable[[Path], None], *, is_folder: bool) -> Path:
+    """Write beside the target and move it there in one step; a failure leaves nothing."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    if not is_folder:
+        write(out)
+        return out
+    temporary = out.with_name(temporary_name(out.name))
+    temporary.mkdir()
+    try:
+        write(temporary)
+        if out.exists():
+            shutil.rmtree(out)
+        temporary.replace(out)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
+    return out

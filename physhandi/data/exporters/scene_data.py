@@ -1,0 +1,107 @@
+"""What exporters take from a run: the motion of one sequence."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from physhandi.data.run import Run
+from physhandi.errors import RunError, UsageError
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class HandSurface:
+    """The moving surface of one hand."""
+
+    vertex: Float[ndarray, "frame vertex 3"]
+    """Vertex positions [m]."""
+    face: Int[ndarray, "face 3"] | None
+    """Triangles; None if the run does not hold them."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SceneData:
+    """Object, controls and hands of one sequence of a run, over all frames."""
+
+    sequence: str
+    """Name of the sequence."""
+    frame_rate: float
+    """Frames per second [Hz]."""
+    length_unit: str
+    """Name of the unit of all lengths."""
+    rollout: Float[ndarray, "frame node 3"]
+    """Object nodes [m]; no nodes if the run has no object."""
+    control: Float[ndarray, "frame control 3"]
+    """Control nodes [m]."""
+    spring_nodes: Int[ndarray, "spring 2"]
+    """Nodes that each spring joins; object nodes first, then control nodes."""
+    object_spring_count: int
+    """Number of leading springs that join two object nodes; the others are virtual springs."""
+    hands: dict[str, HandSurface]
+    """Surface of each hand by its side."""
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames."""
+        return len(self.rollout)
+
+    @property
+    def virtual_springs(self) -> Int[ndarray, "spring 2"]:
+        """Springs between a control node and an object node."""
+        return self.spring_nodes[self.object_spring_count :]
+
+
+def read_scene(
+    run: Run, sequence: str | None, faces: Mapping[str, Int[ndarray, "face 3"]] | None = None
+) -> SceneData:
+    """Collect the motion of one sequence of a run.
+
+    Args:
+        run: The run.
+        sequence: Name of the sequence; None takes the first one.
+        faces: Triangles of the hands by side, for runs that do not hold them.
+
+    Raises:
+        UsageError: If the run has no such sequence.
+        RunError: If the run holds no motion of it.
+    """
+    if sequence is not None and sequence not in run.sequence_names:
+        raise UsageError(
+            f"Run '{run.id}' has no sequence '{sequence}'. It has: {', '.join(run.sequence_names)}."
+        )
+    name = sequence or run.sequence_names[0]
+    folder = f"sequences/{name}"
+    if not run.has(f"{folder}/meta.yaml"):
+        raise RunError(f"Run '{run.id}' has nothing of sequence '{name}'; it is {run.state}.")
+    meta = run.yaml(f"{folder}/meta.yaml")
+    hands: dict[str, HandSurface] = {}
+    for side in ("right", "left"):
+        if run.has(f"{folder}/hand_{side}_vertex.npy"):
+            face = None if faces is None else faces.get(side)
+            if run.has(f"{folder}/hand_{side}_face.npy"):
+                face = run.array(f"{folder}/hand_{side}_face.npy")
+            vertex = run.array(f"{folder}/hand_{side}_vertex.npy")
+            hands[side] = HandSurface(vertex=vertex, face=face)
+    rollout, control = (
+        run.array(f"{folder}/{part}.npy") if run.has(f"{folder}/{part}.npy") else None
+        for part in ("rollout", "control")
+    )
+    if rollout is None and not hands:
+        raise RunError(f"Run '{run.id}' holds neither hands nor an object of sequence '{name}'.")
+    frame_count = len(rollout) if rollout is not None else len(next(iter(hands.values())).vertex)
+    nothing = np.zeros((frame_count, 0, 3), np.float32)
+    model: dict[str, ndarray] = {}
+    if run.has(f"{folder}/model.safetensors"):
+        model = run.tensors(f"{folder}/model.safetensors")
+    return SceneData(
+        sequence=name,
+        frame_rate=float(meta["frame_rate"]),
+        length_unit=str(meta["length_unit"]),
+        rollout=nothing if rollout is None else rollout,
+        control=nothing if control is None else control[:frame_count],
+        spring_nodes=model.get("spring_nodes", np.zeros((0, 2), np.int32)),
+        object_spring_count=int(model["object_spring_count"][0]) if model else 0,
+        hands=hands,
+    )
