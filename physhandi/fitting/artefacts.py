@@ -52,7 +52,6 @@ def save_sequence_meta(output: OutputFolder, sequence: Sequence) -> None:
         f"{sequence_folder(sequence.name)}/meta.yaml",
         {
             "name": sequence.name,
-            "folder": str(sequence.folder),
             "frame_rate": sequence.frame_rate,
             "frame_count": sequence.frame_count,
             "metric": sequence.metric,
