@@ -76,7 +76,7 @@ def test_a_model_without_one_of_its_arrays_is_refused():
         (lambda _: {"object_spring_count": 30}, "object spring .* ends at a control node"),
         (lambda _: {"object_spring_count": 20}, "must join one object node and one control node"),
         (
-            lambda m: {"object_spring_count": 99},
+            lambda _: {"object_spring_count": 99},
             "object_spring_count is 99, but there are 33 springs",
         ),
     ],
