@@ -117,7 +117,7 @@ def _stage_hands(
         artefacts.save_hand_observation(attempt, sequence.name, fit.keypoint)
         before.append(fit.loss_before)
         after.append(fit.loss_after)
-        curve = curve or fit.curve
+        curve = curve or [[float(iteration), loss] for iteration, loss in fit.curve]
     _finish(attempt, HANDS, before, after, curve)
 
 
@@ -273,7 +273,9 @@ def run_job(run: Run, progress: Progress | None = None, *, device: str = "cpu") 
         sequences = [Sequence.load(Path(path)) for path in run.sequences]
         if run.kind == "simulation":
             source = Run.open(Path(run.config["source"]))
-            simulate(source, sequences[0], run.config["parameters"], attempt, watched, device=device)
+            simulate(
+                source, sequences[0], run.config["parameters"], attempt, watched, device=device
+            )
         else:
             config = config_from_dict(run.config["profile"])
             reconstruct(sequences, config, attempt, watched, device=device)

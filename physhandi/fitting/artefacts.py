@@ -5,7 +5,6 @@ docs/formats.md.
 """
 
 from pathlib import Path
-from typing import Any, Protocol
 
 import numpy as np
 import yaml
@@ -13,6 +12,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from safetensors.numpy import load_file
 
+from physhandi.data.attempt import Attempt
 from physhandi.data.observation import ObjectObservation
 from physhandi.data.sequence import Sequence
 from physhandi.hand.model import load_hand_model
@@ -20,33 +20,12 @@ from physhandi.hand.motion import HandMotion
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
 
 
-class OutputFolder(Protocol):
-    """The part of an attempt that stages write through; every write is atomic."""
-
-    @property
-    def out(self) -> Path:
-        """Folder that the artefacts lie in."""
-        ...
-
-    def save_array(self, rel: str, array: ndarray) -> Any:
-        """Write one array."""
-        ...
-
-    def save_tensors(self, rel: str, tensors: dict[str, ndarray]) -> Any:
-        """Write named arrays."""
-        ...
-
-    def save_yaml(self, rel: str, obj: Any) -> Any:
-        """Write plain data."""
-        ...
-
-
 def sequence_folder(name: str) -> str:
     """Where the artefacts of one sequence lie."""
     return f"sequences/{name}"
 
 
-def save_sequence_meta(output: OutputFolder, sequence: Sequence) -> None:
+def save_sequence_meta(output: Attempt, sequence: Sequence) -> None:
     """Keep what a viewer needs of a sequence, so that a run can be shown without it."""
     output.save_yaml(
         f"{sequence_folder(sequence.name)}/meta.yaml",
@@ -64,7 +43,7 @@ def save_sequence_meta(output: OutputFolder, sequence: Sequence) -> None:
     )
 
 
-def save_observation(output: OutputFolder, name: str, observation: ObjectObservation) -> None:
+def save_observation(output: Attempt, name: str, observation: ObjectObservation) -> None:
     """Store what was seen of the object."""
     folder = f"{sequence_folder(name)}/observation"
     output.save_array(f"{folder}/point.npy", observation.point.astype(np.float32))
@@ -100,7 +79,7 @@ def load_observation(out: Path, name: str) -> ObjectObservation:
     )
 
 
-def save_motions(output: OutputFolder, name: str, motions: tuple[HandMotion, ...]) -> None:
+def save_motions(output: Attempt, name: str, motions: tuple[HandMotion, ...]) -> None:
     """Store the fitted motion of each hand."""
     for motion in motions:
         rel = f"{sequence_folder(name)}/hand_{motion.side}.safetensors"
@@ -115,7 +94,7 @@ def load_motions(out: Path, name: str) -> tuple[HandMotion, ...]:
 
 
 def save_object(
-    output: OutputFolder,
+    output: Attempt,
     parameters: SimulationParameters,
     model: SpringMassModel,
     rest_node: Float[ndarray, "node 3"],
@@ -146,7 +125,7 @@ def load_rest_node(out: Path) -> Float[ndarray, "node 3"]:
     return load_file(out / "object/material.safetensors")["rest_node"]
 
 
-def save_model(output: OutputFolder, name: str, model: SpringMassModel) -> None:
+def save_model(output: Attempt, name: str, model: SpringMassModel) -> None:
     """Store the springs of one sequence, object springs and virtual springs."""
     tensors = {key: np.ascontiguousarray(value) for key, value in model.to_tensors().items()}
     output.save_tensors(f"{sequence_folder(name)}/model.safetensors", tensors)
@@ -154,18 +133,22 @@ def save_model(output: OutputFolder, name: str, model: SpringMassModel) -> None:
 
 def load_model(out: Path, name: str) -> SpringMassModel:
     """Read the springs of one sequence."""
-    return SpringMassModel.from_tensors(load_file(out / sequence_folder(name) / "model.safetensors"))
+    return SpringMassModel.from_tensors(
+        load_file(out / sequence_folder(name) / "model.safetensors")
+    )
 
 
 def save_hand_observation(
-    output: OutputFolder, name: str, keypoint: Float[ndarray, "view frame hand 21 3"]
+    output: Attempt, name: str, keypoint: Float[ndarray, "view frame hand 21 3"]
 ) -> None:
     """Store the keypoints that stage 1 compared the hands with [px]."""
     output.save_array(f"{sequence_folder(name)}/keypoint.npy", keypoint.astype(np.float32))
 
 
-def save_hand_vertices(output: OutputFolder, name: str) -> None:
-    """Store the mesh of every hand in every frame, for viewers and exports."""
+def save_hand_vertices(output: Attempt, name: str) -> None:
+    """Store mesh and joints of every hand in every frame, for viewers, exports and metrics."""
     for motion in load_motions(output.out, name):
-        vertex = motion.vertices(load_hand_model(motion.side)).astype(np.float32)
-        output.save_array(f"{sequence_folder(name)}/hand_{motion.side}_vertex.npy", vertex)
+        model = load_hand_model(motion.side)
+        stem = f"{sequence_folder(name)}/hand_{motion.side}"
+        output.save_array(f"{stem}_vertex.npy", motion.vertices(model).astype(np.float32))
+        output.save_array(f"{stem}_keypoint.npy", motion.keypoints(model).astype(np.float32))

@@ -61,9 +61,13 @@ def lay_object(
         node = (template - template.mean(axis=0)) @ heading.T + cloud.mean(axis=0)
         for _ in range(iterations):
             target = cloud[tree.query(node)[1]]
-            rotation, _ = Rotation.align_vectors(target - target.mean(axis=0), node - node.mean(axis=0))
+            rotation, _ = Rotation.align_vectors(
+                target - target.mean(axis=0), node - node.mean(axis=0)
+            )
             node = rotation.apply(node - node.mean(axis=0)) + target.mean(axis=0)
-        error = float(np.mean(tree.query(node)[0] ** 2) + np.mean(cKDTree(node).query(cloud)[0] ** 2))
+        error = float(
+            np.mean(tree.query(node)[0] ** 2) + np.mean(cKDTree(node).query(cloud)[0] ** 2)
+        )
         if error < best_error:
             best, best_error = node, error
     return best.astype(np.float32)

@@ -85,7 +85,9 @@ class ObjectProblem:
         if freeze_counts:
             cloud_count = self.is_observed[1].sum().float().expand(node.shape[0])
             track_count = self.is_valid[1].sum().float().expand(node.shape[0])
-        chamfer = chamfer_loss(self.cloud[frames], self.is_observed[frames], node, count=cloud_count)
+        chamfer = chamfer_loss(
+            self.cloud[frames], self.is_observed[frames], node, count=cloud_count
+        )
         track = track_loss(
             self.track[frames], self.is_valid[frames], self.predict_tracks(node), count=track_count
         )

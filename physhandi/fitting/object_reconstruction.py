@@ -81,7 +81,9 @@ class FirstOrderResult:
     """Iteration and mean loss."""
 
 
-def problem_parameters(parameters: SimulationParameters, problem: ObjectProblem) -> SimulationParameters:
+def problem_parameters(
+    parameters: SimulationParameters, problem: ObjectProblem
+) -> SimulationParameters:
     """Set the frame rate, ground and gravity of one sequence."""
     return replace(
         parameters,
@@ -91,7 +93,9 @@ def problem_parameters(parameters: SimulationParameters, problem: ObjectProblem)
     )
 
 
-def build_problem_model(problem: ObjectProblem, parameters: SimulationParameters) -> SpringMassModel:
+def build_problem_model(
+    problem: ObjectProblem, parameters: SimulationParameters
+) -> SpringMassModel:
     """Connect the object's nodes and attach the control nodes of frame 0."""
     model = build_model(
         problem.object_node,
@@ -206,7 +210,9 @@ class _SpringLogs:
                 )
         self.learns_damping = learns_damping
         self.shared = self._parameter(first, slice(None, self.object_count))
-        self.own = {n: self._parameter(m, slice(self.object_count, None)) for n, m in models.items()}
+        self.own = {
+            n: self._parameter(m, slice(self.object_count, None)) for n, m in models.items()
+        }
         self.start = [tensor.detach().clone() for tensor in self.tensors()]
 
     @staticmethod
@@ -271,9 +277,7 @@ def optimise_springs(
     settings = config.first_order
     models = {p.name: build_problem_model(p, parameters) for p in problems}
     # Springs may stiffen while they are fitted, so the limit is kept farther away.
-    parameters = settle_substeps(
-        list(models.values()), parameters, config, safety=SAFETY * SAFETY
-    )
+    parameters = settle_substeps(list(models.values()), parameters, config, safety=SAFETY * SAFETY)
     logs = _SpringLogs(models, learns_damping=settings.learns_damping)
     loss_before = mean_loss(problems, models, parameters, config, device)
     if not math.isfinite(loss_before):
@@ -288,7 +292,16 @@ def optimise_springs(
         try:
             for problem in problems:
                 horizon = _horizon(iteration, settings, problem.frame_count)
-                _descend(problem, models[problem.name], logs, optimizer, parameters, config, horizon, device)
+                _descend(
+                    problem,
+                    models[problem.name],
+                    logs,
+                    optimizer,
+                    parameters,
+                    config,
+                    horizon,
+                    device,
+                )
         except SimulationDivergedError as error:
             progress.report(STAGE, iteration, settings.iterations, best_loss, f"stopped: {error}")
             break

@@ -50,7 +50,9 @@ def load_profile(name: str) -> PipelineConfig:
         UsageError: If there is no such profile, or it has a wrong field; names the field.
     """
     if name not in profile_names():
-        raise UsageError(f"There is no profile '{name}'. Choose one of: {', '.join(profile_names())}.")
+        raise UsageError(
+            f"There is no profile '{name}'. Choose one of: {', '.join(profile_names())}."
+        )
     path = FOLDER / f"{name}.yaml"
     mapping = yaml.safe_load(path.read_text(encoding="utf-8"))
     return _build(PipelineConfig, {"profile": name, **mapping}, f"profile '{name}'")
@@ -88,9 +90,7 @@ def _build(kind: Any, mapping: Any, where: str) -> Any:
         if key not in known:
             raise UsageError(f"{where} has no field '{key}'. It has: {', '.join(sorted(known))}.")
     hints = typing.get_type_hints(kind)
-    values = {
-        key: _convert(hints[key], value, f"{where}: {key}") for key, value in mapping.items()
-    }
+    values = {key: _convert(hints[key], value, f"{where}: {key}") for key, value in mapping.items()}
     absent = [e.name for e in fields(kind) if e.default is MISSING and e.default_factory is MISSING]
     for name in absent:
         if name not in values:
@@ -115,7 +115,9 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
         return tuple(value)
     if origin is Literal:
         if value not in arguments:
-            raise UsageError(f"{where} is {value!r}; expected one of {', '.join(map(repr, arguments))}.")
+            raise UsageError(
+                f"{where} is {value!r}; expected one of {', '.join(map(repr, arguments))}."
+            )
         return value
     if hint is float and isinstance(value, int | float) and not isinstance(value, bool):
         return float(value)

@@ -6,11 +6,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from physhandi.data.attempt import Attempt
 from physhandi.data.observation import ObjectObservation
 from physhandi.data.sequence import Sequence
 from physhandi.errors import FitError, MissingInputError
 from physhandi.fitting import artefacts
-from physhandi.fitting.artefacts import OutputFolder
 from physhandi.fitting.controls import farthest_points, lay_object, visible_vertices
 from physhandi.fitting.profile import PipelineConfig
 from physhandi.hand.control_nodes import control_trajectory
@@ -92,7 +92,7 @@ def object_nodes_of(
 
 
 def simulate_sequence(
-    output: OutputFolder, sequence: Sequence, *, device: str, progress: Progress
+    output: Attempt, sequence: Sequence, *, device: str, progress: Progress
 ) -> Float[ndarray, "frame node 3"]:
     """Simulate all frames of a sequence with the stored model, and store the motion [m].
 

@@ -31,7 +31,9 @@ class SearchVariable:
         if self.scale not in {"linear", "log", "integer"}:
             raise ValueError(f"scale is {self.scale!r}; expected linear, log or integer")
         if not self.low < self.high or (self.scale == "log" and self.low <= 0):
-            raise ValueError(f"interval [{self.low}, {self.high}] is empty or not positive for a log scale")
+            raise ValueError(
+                f"interval [{self.low}, {self.high}] is empty or not positive for a log scale"
+            )
 
     def to_unit(self, value: float) -> float:
         """Map a value to [0, 1]; values outside the interval land on its ends."""
@@ -114,18 +116,30 @@ def search_parameters(
     best, best_loss = start, loss_before
     curve = [[1.0, loss_before]]
     if not names or config.generations == 0:
-        return SearchResult(parameters=start, loss_before=loss_before, loss_after=loss_before, curve=curve)
+        return SearchResult(
+            parameters=start, loss_before=loss_before, loss_after=loss_before, curve=curve
+        )
 
     def candidate(unit: Float[ndarray, " variable"]) -> SimulationParameters:
-        values = {n: config.variables[n].from_unit(float(u)) for n, u in zip(names, unit, strict=True)}
+        values = {
+            n: config.variables[n].from_unit(float(u)) for n, u in zip(names, unit, strict=True)
+        }
         values |= {name: values[other] for name, other in config.tied.items() if other in values}
         return settle(replace(start, **values))
 
     # pycma 4.5 fails when it shortens the step of a single variable, so the step is left alone.
-    options = {"bounds": [0, 1], "maxstd": np.inf, "seed": config.seed, "verbose": -9, "verb_log": 0}
+    options = {
+        "bounds": [0, 1],
+        "maxstd": np.inf,
+        "seed": config.seed,
+        "verbose": -9,
+        "verb_log": 0,
+    }
     if config.population is not None:
         options["popsize"] = config.population
-    first = np.array([config.variables[name].to_unit(float(getattr(start, name))) for name in names])
+    first = np.array(
+        [config.variables[name].to_unit(float(getattr(start, name))) for name in names]
+    )
     # Exactly on a bound CMA's transform has no slope, so a start there could never leave it.
     strategy = cma.CMAEvolutionStrategy(np.clip(first, 0.02, 0.98), config.sigma, options)
     evaluations = 1

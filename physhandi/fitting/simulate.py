@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
+from physhandi.data.attempt import Attempt
 from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.errors import RunError
 from physhandi.fitting import artefacts
-from physhandi.fitting.artefacts import OutputFolder
 from physhandi.fitting.hand_reconstruction import reconstruct_hands
 from physhandi.fitting.object_problem import initial_velocity
 from physhandi.fitting.profile import config_from_dict
@@ -24,7 +24,7 @@ def simulate_again(
     source: Run,
     sequence: Sequence,
     changes: dict[str, float],
-    output: OutputFolder,
+    output: Attempt,
     progress: Progress,
     *,
     device: str,
@@ -48,7 +48,9 @@ def simulate_again(
         SimulationDivergedError: If the motion runs away.
     """
     if not (source.out / "object/material.safetensors").is_file():
-        raise RunError(f"Run '{source.id}' holds no fitted object, so there is nothing to simulate.")
+        raise RunError(
+            f"Run '{source.id}' holds no fitted object, so there is nothing to simulate."
+        )
     fitted = artefacts.load_parameters(source.out)
     parameters = SimulationParameters.from_dict(fitted.to_dict() | changes)
     first = source.sequence_names[0]
@@ -60,7 +62,9 @@ def simulate_again(
     if is_known:
         control = _copy_known(source, sequence.name, output)
     else:
-        control, node, velocity = _prepare(source, sequence, output, (model.object_node, rest_node), progress)
+        control, node, velocity = _prepare(
+            source, sequence, output, (model.object_node, rest_node), progress
+        )
         model = replace(model, object_node=node, initial_velocity=velocity)
     model = retopologize(model, parameters, control[0], fitted=fitted, rest_node=rest_node)
     output.save_array(f"{artefacts.sequence_folder(sequence.name)}/control.npy", control)
@@ -69,7 +73,7 @@ def simulate_again(
     simulate_sequence(output, sequence, device=device, progress=progress)
 
 
-def _copy_known(source: Run, name: str, output: OutputFolder) -> np.ndarray:
+def _copy_known(source: Run, name: str, output: Attempt) -> np.ndarray:
     """Take over what the source run already found out about one of its sequences."""
     artefacts.save_observation(output, name, artefacts.load_observation(source.out, name))
     artefacts.save_motions(output, name, artefacts.load_motions(source.out, name))
@@ -80,7 +84,7 @@ def _copy_known(source: Run, name: str, output: OutputFolder) -> np.ndarray:
 def _prepare(
     source: Run,
     sequence: Sequence,
-    output: OutputFolder,
+    output: Attempt,
     template: tuple[np.ndarray, np.ndarray],
     progress: Progress,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -14,12 +14,15 @@ from physhandi.data.run import Run, read_events
 from physhandi.errors import CancelledError, MissingInputError, RunError, UsageError
 from physhandi.fitting.artefacts import load_model, load_parameters
 from physhandi.fitting.profile import PipelineConfig, config_to_dict, load_profile
+from physhandi.fitting.search import SearchVariable
 from physhandi.progress import Progress
 
 
 def small_config() -> PipelineConfig:
     config = load_profile("quick")
-    search = replace(config.object_.search, generations=4, population=6)
+    soft = SearchVariable(low=50.0, high=3e4, scale="log")
+    variables = config.object_.search.variables | {"stiffness": soft, "virtual_stiffness": soft}
+    search = replace(config.object_.search, generations=8, population=8, variables=variables)
     first_order = replace(config.object_.first_order, iterations=8)
     simulation = replace(config.simulation, connection_radius=0.08, virtual_connection_radius=0.02)
     object_ = replace(config.object_, search=search, first_order=first_order)
@@ -47,7 +50,9 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory: pytest.TempPathFactory, recordings: Path) -> Run:
-    run = new_run(tmp_path_factory.mktemp("runs") / "fit", [recordings / "low", recordings / "high"])
+    run = new_run(
+        tmp_path_factory.mktemp("runs") / "fit", [recordings / "low", recordings / "high"]
+    )
     pipeline.run_job(run)
     return Run.open(run.folder)
 
@@ -84,7 +89,9 @@ def test_both_sequences_share_one_object(fitted: Run) -> None:
     assert np.ptp(np.log(low.stiffness[:count])) > 0.05
 
 
-def test_a_cancelled_run_goes_on_after_its_last_finished_stage(tmp_path: Path, recordings: Path) -> None:
+def test_a_cancelled_run_goes_on_after_its_last_finished_stage(
+    tmp_path: Path, recordings: Path
+) -> None:
     class Stopper(Progress):
         def report(self, stage: str, iteration: int, *rest: Any, **more: Any) -> None:
             if stage == pipeline.SPRINGS and iteration == 2:
@@ -115,7 +122,9 @@ def simulate(folder: Path, source: Run, sequence: Path, **changes: float) -> Run
     return Run.open(run.folder)
 
 
-def test_simulating_unchanged_repeats_the_motion(tmp_path: Path, fitted: Run, recordings: Path) -> None:
+def test_simulating_unchanged_repeats_the_motion(
+    tmp_path: Path, fitted: Run, recordings: Path
+) -> None:
     again = simulate(tmp_path / "same", fitted, recordings / "low")
     np.testing.assert_array_equal(
         again.array("sequences/low/rollout.npy"), fitted.array("sequences/low/rollout.npy")
@@ -125,11 +134,15 @@ def test_simulating_unchanged_repeats_the_motion(tmp_path: Path, fitted: Run, re
 def test_another_radius_gives_the_springs_that_scipy_counts(
     tmp_path: Path, fitted: Run, recordings: Path
 ) -> None:
-    again = simulate(tmp_path / "wide", fitted, recordings / "low", connection_radius=0.055, max_neighbors=24)
+    again = simulate(
+        tmp_path / "wide", fitted, recordings / "low", connection_radius=0.055, max_neighbors=24
+    )
     model = load_model(again.out, "low")
     expected = len(cKDTree(NODE.astype(np.float32)).query_pairs(0.055))
     assert model.object_spring_count == expected == 40
-    difference = again.array("sequences/low/rollout.npy") - fitted.array("sequences/low/rollout.npy")
+    difference = again.array("sequences/low/rollout.npy") - fitted.array(
+        "sequences/low/rollout.npy"
+    )
     assert np.abs(difference).max() > 1e-4
     assert load_parameters(again.out).connection_radius == 0.055
 
@@ -156,7 +169,9 @@ def test_evaluating_again_gives_the_stored_metrics(fitted: Run) -> None:
     assert pipeline.evaluate(fitted) == fitted.json("metrics.json")
 
 
-def test_a_sequence_with_nothing_to_fit_says_what_is_missing(tmp_path: Path, recordings: Path) -> None:
+def test_a_sequence_with_nothing_to_fit_says_what_is_missing(
+    tmp_path: Path, recordings: Path
+) -> None:
     bare = write_sheet(tmp_path / "bare")
     for file in ("marker.npy", "marker_node.npy"):
         (bare.folder / file).unlink()
