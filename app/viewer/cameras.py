@@ -26,7 +26,7 @@ class CameraNodes:
         self._server = server
         self._views = list(views)
         self._framing = framing
-        self._scale = 0.08 * max(framing.extent, framing.reach)
+        self._scale = framing.frustum
         self._nodes: list[viser.CameraFrustumHandle] = []
         self._shown: tuple[int, int] | None = None
         self._time = 0.0

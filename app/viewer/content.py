@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from app.viewer.observed import DepthCloud, Observed, PointSet
+from app.viewer.observed import CloudSet, DepthCloud, Observed, PointSet
 from app.viewer.skeleton import lift_keypoints
 from app.viewer.take import Take
 from physhandi.data.run import Run
@@ -188,6 +188,9 @@ def _faces(side: Literal["right", "left"], vertex_count: int) -> Int[ndarray, "f
 
 
 def _run_observation(run: Run, folder: str) -> Observed | None:
+    clouds = (f"{folder}/observation/cloud.npy", f"{folder}/observation/cloud_end.npy")
+    if all(run.has(name) for name in clouds):
+        return CloudSet(run.array(clouds[0]), run.array(clouds[1]))
     files = (f"{folder}/observation/point.npy", f"{folder}/observation/is_visible.npy")
     if not all(run.has(name) for name in files):
         return None

@@ -29,8 +29,12 @@ class Framing:
     """Height of the lowest point."""
     spacing: float
     """Typical distance of neighboring object nodes."""
+    frustum: float
+    """Scale of the camera frustums."""
     azimuth: float = _AZIMUTH
     """Direction from the middle to the camera, about the vertical [rad]."""
+    elevation: float = _ELEVATION
+    """Direction from the middle to the camera, above the horizon [rad]."""
     reach: float = 0.0
     """Diagonal of what should be in the picture, if that is more than what moves."""
 
@@ -49,7 +53,8 @@ class Framing:
     def camera(self) -> Float[ndarray, " 3"]:
         """Where the camera stands, so that everything fits into the picture."""
         flat = np.array([np.cos(self.azimuth), np.sin(self.azimuth), 0.0])
-        direction = np.cos(_ELEVATION) * flat + np.array([0.0, 0.0, np.sin(_ELEVATION)])
+        up = np.array([0.0, 0.0, 1.0])
+        direction = np.cos(self.elevation) * flat + np.sin(self.elevation) * up
         half = 0.5 * _MARGIN * max(self.extent, self.reach)
         return self.look_at + direction * half / np.tan(0.5 * _FOV)
 
@@ -61,19 +66,47 @@ def frame_content(content: Content) -> Framing:
         content: What is going to be shown.
     """
     parts = [part for part in _parts(content) if len(part)]
-    if not parts:
-        views = [view.camera.T_world_camera[:3, 3] for view in content.views]
-        parts = [np.array(views)] if views else [np.array([[-0.5, -0.5, 0.0], [0.5, 0.5, 1.0]])]
-    point = np.concatenate(parts)
-    low, high = np.quantile(point, [0.002, 0.998], axis=0)
+    point = np.concatenate(parts) if parts else _seen_place(content)
+    low, high = np.quantile(point, [0.005, 0.995], axis=0)
     extent = max(float(np.linalg.norm(high - low)), 1e-6)
+    around = (
+        _around_cameras(content, (low + high) / 2, extent) if parts else _behind_cameras(content)
+    )
     return Framing(
         center=(low + high) / 2,
         extent=extent,
         low=float(point[:, 2].min()),
         spacing=_spacing(content, extent),
-        **_around_cameras(content, (low + high) / 2, extent),
+        frustum=0.08 * max(around.get("reach", 0.0), extent) if parts else 0.13 * extent,
+        **around,
     )
+
+
+def _seen_place(content: Content) -> Float[ndarray, "point 3"]:
+    """Guess a place around what the cameras look at, when nothing is known in 3-D."""
+    if not content.views:
+        return np.array([[-0.5, -0.5, 0.0], [0.5, 0.5, 1.0]])
+    pose = np.array([view.camera.T_world_camera for view in content.views])
+    ahead, eye = pose[:, :3, 2], pose[:, :3, 3]
+    across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
+    # The point nearest to all optical axes; the small weight decides if they are parallel.
+    weak = 1e-3 * np.eye(3)
+    target = (across @ eye[..., None]).sum(0)[:, 0] + weak @ (eye + ahead).mean(0)
+    center = np.linalg.inv(across.sum(0) + weak) @ target
+    half = float(np.linalg.norm(eye - center, axis=1).mean()) / 4
+    return np.concatenate([[center - half, center + half], eye])
+
+
+def _behind_cameras(content: Content) -> dict[str, float]:
+    """Stand behind the recording cameras, so that their images are seen as they were taken."""
+    if not content.views:
+        return {}
+    back = -np.mean([view.camera.T_world_camera[:3, 2] for view in content.views], axis=0)
+    elevation = float(np.arctan2(back[2], np.hypot(back[0], back[1])))
+    return {
+        "azimuth": float(np.arctan2(back[1], back[0])),
+        "elevation": min(max(elevation, 0.1), 1.3),
+    }
 
 
 def _around_cameras(
@@ -113,5 +146,6 @@ def _spacing(content: Content, extent: float) -> float:
     if content.fitted is not None and content.fitted.model.object_spring_count > 0:
         model = content.fitted.model
         short = float(np.quantile(model.rest_length[: model.object_spring_count], 0.05))
-        return min(max(short, 0.004 * extent), 0.05 * extent)
+        least = min(max(1.0 / model.node_count, 0.006), 0.025)
+        return min(max(short, least * extent), 0.05 * extent)
     return 0.012 * extent

@@ -16,34 +16,20 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
+import warp as wp
 
-from app.viewer.content import load_fitted
-from app.viewer.take import Take
+from app.viewer.fitted_object import FittedObject
 from app.viewer.wire import Message, receive, send
-from physhandi.data.run import Run
-from physhandi.errors import MissingInputError, PhysHandiError, SimulationDivergedError
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
-from physhandi.simulation.simulator import Simulator
+from physhandi.errors import PhysHandiError, SimulationDivergedError
+from physhandi.simulation.model import SimulationParameters
 from physhandi.simulation.stability import stable_substeps
-from physhandi.simulation.topology import retopologize
 
 logger = logging.getLogger(__name__)
 
 _PR_SET_PDEATHSIG = 1
 _MIN_SUBSTEPS = 20
-# Parameters that are built into the model; the others are read by the simulator.
-_TOPOLOGY = (
-    "damping",
-    "connection_radius",
-    "max_neighbors",
-    "virtual_connection_radius",
-    "virtual_max_neighbors",
-    "rest_length_floor",
-    "virtual_rest_length_floor",
-)
 
 
 class Mailboxes:
@@ -82,62 +68,6 @@ class Mailboxes:
         with self._condition:
             self._is_closed = True
             self._condition.notify()
-
-
-class FittedObject:
-    """The fitted object of one sequence of a run, from which sliders start."""
-
-    def __init__(self, folder: str, sequence: str) -> None:
-        run = Run.open(Path(folder))
-        take = load_fitted(run, sequence)
-        if take is None:
-            raise MissingInputError(
-                f"Run '{run.name}' has no fitted object for sequence '{sequence}' to simulate."
-            )
-        self.take: Take = take
-        self.control = np.ascontiguousarray(take.control, dtype=np.float32)
-        self._latest: tuple[tuple[float, ...], SpringMassModel] | None = None
-        self._simulator: Simulator | None = None
-        self._rest_node = None
-        if run.has("object/material.safetensors"):
-            self._rest_node = run.tensors("object/material.safetensors").get("rest_node")
-
-    def model(self, parameters: SimulationParameters) -> SpringMassModel:
-        """Build the springs for other parameters, keeping what was fitted."""
-        key = tuple(getattr(parameters, name) for name in _TOPOLOGY)
-        if self._latest is None or self._latest[0] != key:
-            self._latest = (key, self._build(parameters))
-        return self._latest[1]
-
-    def simulator(
-        self, model: SpringMassModel, parameters: SimulationParameters, device: str
-    ) -> Simulator:
-        """Place a model on the device, or use it again if it is there already."""
-        known = self._simulator
-        lengths = ("frame_rate", "substeps_per_frame")
-        if (
-            known is not None
-            and known.model is model
-            and all(getattr(known.parameters, n) == getattr(parameters, n) for n in lengths)
-        ):
-            known.set_parameters(parameters)
-            return known
-        self._simulator = Simulator(model, parameters, device=device)
-        return self._simulator
-
-    def _build(self, parameters: SimulationParameters) -> SpringMassModel:
-        fitted, model = self.take.parameters, self.take.model
-        if all(getattr(parameters, n) == getattr(fitted, n) for n in _TOPOLOGY if n != "damping"):
-            if parameters.damping == fitted.damping:
-                return model
-            if fitted.damping > 0:
-                damping = model.damping * np.float32(parameters.damping / fitted.damping)
-            else:
-                damping = np.full_like(model.damping, parameters.damping)
-            return replace(model, damping=damping)
-        return retopologize(
-            model, parameters, self.control[0], fitted=fitted, rest_node=self._rest_node
-        )
 
 
 class LiveSimulator:
@@ -258,6 +188,8 @@ def main(arguments: list[str]) -> None:
     """Serve requests from the socket whose descriptor is the first argument."""
     descriptor, parent, device = int(arguments[0]), int(arguments[1]), arguments[2]
     die_with_parent(parent)
+    if device == "auto":
+        device = "cuda:0" if wp.get_cuda_device_count() > 0 else "cpu"
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     logging.basicConfig(level=logging.INFO, format="live simulation: %(levelname)s %(message)s")
     with socket.socket(fileno=descriptor) as connection:

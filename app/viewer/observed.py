@@ -4,7 +4,7 @@ from collections.abc import Sequence as Listing
 from typing import Protocol
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
 from physhandi.data.view import View
@@ -41,6 +41,26 @@ class PointSet:
         point = np.asarray(self._point[frame], dtype=np.float32)
         is_seen = np.asarray(self._is_visible[frame]) & np.isfinite(point).all(axis=-1)
         point = point[is_seen]
+        return point[:: max(1, -(-len(point) // _POINTS))]
+
+    def colors(self) -> UInt8[ndarray, " 3"]:
+        """All points are green."""
+        return _GREEN
+
+
+class CloudSet:
+    """Clouds of all frames, one after the other in one array."""
+
+    def __init__(self, point: Float[ndarray, "point 3"], end: Int[ndarray, " frame"]) -> None:
+        self._point = point
+        self._end = end
+
+    def points(self, frame: int) -> Float[ndarray, "point 3"]:
+        """Find the cloud of a frame, thinned out [m]."""
+        if frame >= len(self._end):
+            return np.zeros((0, 3), np.float32)
+        start = int(self._end[frame - 1]) if frame > 0 else 0
+        point = np.asarray(self._point[start : int(self._end[frame])], dtype=np.float32)
         return point[:: max(1, -(-len(point) // _POINTS))]
 
     def colors(self) -> UInt8[ndarray, " 3"]:

@@ -9,7 +9,7 @@ import viser
 from app.viewer.content import Content
 from app.viewer.framing import Framing
 from app.viewer.guard import Guard
-from app.viewer.observed import PointSet
+from app.viewer.observed import DepthCloud
 from app.viewer.playback import Playback
 from app.viewer.scene import BLUE, GREEN, GREY, RED, SKIN, YELLOW, Layers
 from physhandi.data.view import View
@@ -94,7 +94,7 @@ class LayersPanel:
                 ("forces", "Force arrows"),
                 ("observed", "Observed points"),
                 ("cameras", "Cameras"),
-                ("ground", "Ground"),
+                ("ground", "Grid"),
             ):
                 switch = gui.add_checkbox(label, initial_value=True)
                 switch.on_update(guard.by_user(self._switch(field)))
@@ -123,7 +123,7 @@ class LayersPanel:
             "forces": has_object,
             "observed": content.observed is not None,
             "cameras": bool(content.views),
-            "ground": content.ground_height is not None,
+            "ground": True,
         }
         for field, switch in self._switches.items():
             switch.visible = is_there[field]
@@ -181,7 +181,7 @@ def add_legend(server: viser.ViserServer, content: Content) -> None:
         entries += [(BLUE, "object"), (RED, "controls, forces"), (YELLOW, "virtual springs")]
     elif content.control is not None:
         entries.append((RED, "controls"))
-    if isinstance(content.observed, PointSet):
+    if content.observed is not None and not isinstance(content.observed, DepthCloud):
         entries.append((GREEN, "observed"))
     if content.views:
         entries.append((GREY, "cameras"))

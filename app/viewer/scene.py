@@ -1,7 +1,6 @@
 """The nodes of one session's scene and how they follow the frames."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import viser
@@ -11,6 +10,7 @@ from numpy import ndarray
 from app.viewer.cameras import CameraNodes
 from app.viewer.content import Content
 from app.viewer.framing import Framing
+from app.viewer.nodes import SceneNodes
 from app.viewer.skeleton import BONES
 from app.viewer.take import Take
 
@@ -50,7 +50,7 @@ class Layers:
     cameras: bool = True
     """Camera frustums with the frame's image."""
     ground: bool = True
-    """Grid on the ground."""
+    """Grid on the ground, or below everything if the ground is not known."""
     looks_from: str | None = None
     """View whose image is the backdrop."""
     force_scale: float = 1.0
@@ -65,18 +65,16 @@ class Scene:
         self._content = content
         self._framing = framing
         self.layers = default_layers(content)
-        self._nodes: dict[str, Any] = {}
+        self._nodes = SceneNodes(server)
         self._model_shown: Take | None = None
         self._attached: Int[ndarray, " control"] = np.zeros(0, np.int64)
-        self._force_unit = 0.0
+        self._force_unit = self._choose_force_unit()
         self._cameras = CameraNodes(server, content.views, framing)
         self._aim()
         self._add_ground()
 
     def clear(self) -> None:
         """Remove everything, to make room for another content."""
-        for node in self._nodes.values():
-            node.remove()
         self._nodes.clear()
         self._cameras.remove()
 
@@ -102,8 +100,7 @@ class Scene:
                 looks_from=self.layers.looks_from,
                 is_playing=is_playing,
             )
-            if "ground" in self._nodes:
-                self._nodes["ground"].visible = self.layers.ground
+            self._nodes.show("/ground", is_visible=self.layers.ground)
 
     def _aim(self) -> None:
         camera = self._server.initial_camera
@@ -113,52 +110,43 @@ class Scene:
         camera.look_at = self._framing.look_at
         camera.position = self._framing.camera
 
+    def _choose_force_unit(self) -> float:
+        """Choose how long an arrow of 1 N is, from the fitted rollout."""
+        take = self._content.fitted
+        if take is None:
+            return 0.0
+        frames = np.unique(np.linspace(0, take.ready - 1, 8).astype(int))
+        strength = np.concatenate([np.linalg.norm(take.forces(int(f)), axis=-1) for f in frames])
+        strength = strength[strength > _QUIET_FORCE]
+        strong = float(np.quantile(strength, 0.9)) if len(strength) else 1.0
+        return 0.07 * self._framing.extent / strong
+
     def _add_ground(self) -> None:
-        height = self._content.ground_height
+        height, extent = self._content.ground_height, self._framing.extent
         if height is None:
-            return
-        cell = 10.0 ** np.floor(np.log10(self._framing.extent / 2))
-        center = self._framing.center
-        self._nodes["ground"] = self._server.scene.add_grid(
-            "/ground",
-            width=float(cell * np.ceil(4 * self._framing.extent / cell)),
-            height=float(cell * np.ceil(4 * self._framing.extent / cell)),
-            cell_size=float(cell / 2),
-            section_size=float(cell),
-            cell_color=(214, 219, 226),
-            section_color=(182, 190, 201),
-            cell_thickness=0.6,
-            section_thickness=1.0,
-            shadow_opacity=0.15,
-            fade_distance=8.0 * self._framing.extent,
-            position=(
-                float(np.round(center[0] / cell) * cell),
-                float(np.round(center[1] / cell) * cell),
-                float(height) - 0.001 * self._framing.extent,
-            ),
-        )
+            height = self._framing.low - 0.02 * extent
+        power = 10.0 ** float(np.floor(np.log10(extent / 3)))
+        cell = max(step * power for step in (1, 2, 5) if step * power <= extent / 3)
+        x, y = (round(float(self._framing.center[axis]) / cell) * cell for axis in (0, 1))
+        count = int(np.ceil(4 * extent / cell))
+        self._nodes.ground("/ground", (x, y, float(height) - 0.001 * extent), cell, count)
 
     def _draw_hands(self, frame: int) -> None:
+        is_visible = self.layers.hands
         for hand in self._content.hands:
             vertex = np.asarray(hand.vertex[min(frame, len(hand.vertex) - 1)], dtype=np.float32)
-            name = f"/hand/{hand.side}"
+            name, color = f"/hand/{hand.side}", SKIN[hand.side]
             if hand.face is None:
                 size = 0.006 * self._framing.extent
-                self._points(name, vertex, SKIN[hand.side], size, self.layers.hands)
-                continue
-            node = self._nodes.get(name)
-            if node is None:
-                self._nodes[name] = self._server.scene.add_mesh_simple(
-                    name, vertex, hand.face, color=SKIN[hand.side], opacity=0.62, side="double"
-                )
-                node = self._nodes[name]
-            elif self.layers.hands:
-                node.vertices = vertex
-            node.visible = self.layers.hands
+                self._nodes.points(name, vertex, color, size, is_visible=is_visible)
+            else:
+                self._nodes.mesh(name, vertex, hand.face, color, is_visible=is_visible)
         for index, skeleton in enumerate(self._content.skeletons):
             bones = skeleton[frame][BONES]
             bones = bones[np.isfinite(bones).all(axis=(1, 2))]
-            self._segments(f"/hand/skeleton_{index}", bones, SKIN["right"], 4.0, self.layers.hands)
+            self._nodes.segments(
+                f"/hand/skeleton_{index}", bones, SKIN["right"], 4.0, is_visible=is_visible
+            )
 
     def _draw_observed(self, frame: int) -> None:
         observed = self._content.observed
@@ -166,7 +154,9 @@ class Scene:
             return
         point = observed.points(frame) if self.layers.observed else np.zeros((0, 3), np.float32)
         size = 0.4 * self._framing.spacing
-        self._points("/observed", point, observed.colors(), size, self.layers.observed)
+        self._nodes.points(
+            "/observed", point, observed.colors(), size, is_visible=self.layers.observed
+        )
 
     def _draw_object(self, take: Take, frame: int, is_playing: bool) -> None:
         position = np.asarray(take.position[frame], dtype=np.float32)
@@ -176,25 +166,25 @@ class Scene:
             self._attached = np.unique(springs.max(axis=1) - take.model.node_count)
             self._model_shown = take
         size = 0.36 * self._framing.spacing
-        self._points("/object/nodes", position, BLUE, size, self.layers.nodes)
+        self._nodes.points("/object/nodes", position, BLUE, size, is_visible=self.layers.nodes)
         self._draw_controls(control, self._attached)
         point = np.concatenate([position, control])
         count = take.model.object_spring_count
-        self._segments(
+        self._nodes.segments(
             "/springs/virtual",
             _ends(point, take.model.spring_nodes[count:], PLAYING_SPRINGS if is_playing else None),
             YELLOW,
             2.0,
-            self.layers.virtual_springs,
+            is_visible=self.layers.virtual_springs,
         )
-        self._segments(
+        self._nodes.segments(
             "/springs/object",
             _ends(point, take.model.spring_nodes[:count], PLAYING_SPRINGS if is_playing else None)
             if self.layers.object_springs
             else np.zeros((0, 2, 3), np.float32),
             GREY,
-            1.0,
-            self.layers.object_springs,
+            1.5,
+            is_visible=self.layers.object_springs,
         )
         self._draw_forces(take, frame, position)
 
@@ -203,12 +193,14 @@ class Scene:
     ) -> None:
         spacing = self._framing.spacing
         held = control if attached is None else control[attached]
-        self._points("/controls/attached", held, RED, 0.3 * spacing, self.layers.controls)
+        self._nodes.points(
+            "/controls/attached", held, RED, 0.3 * spacing, is_visible=self.layers.controls
+        )
         is_shown = self.layers.all_controls and attached is not None
         free = np.delete(control, attached, axis=0) if is_shown and attached is not None else None
         if free is not None or "/controls/free" in self._nodes:
             point = np.zeros((0, 3), np.float32) if free is None else free
-            self._points("/controls/free", point, RED, 0.12 * spacing, is_shown)
+            self._nodes.points("/controls/free", point, RED, 0.12 * spacing, is_visible=is_shown)
 
     def _draw_forces(self, take: Take, frame: int, position: Float[ndarray, "node 3"]) -> None:
         arrows = np.zeros((0, 2, 3), np.float32)
@@ -217,82 +209,13 @@ class Scene:
             strength = np.linalg.norm(force, axis=-1)
             node = np.flatnonzero(strength > _QUIET_FORCE)
             node = node[np.argsort(-strength[node], kind="stable")[:_ARROWS]]
-            if not self._force_unit and len(node):
-                strong = float(np.quantile(strength[node], 0.9))
-                self._force_unit = 0.07 * self._framing.extent / strong
             offset = force[node] * (self._force_unit * self.layers.force_scale)
             length = np.linalg.norm(offset, axis=-1, keepdims=True)
             most = 0.22 * self._framing.extent
             offset *= np.minimum(1.0, most / np.maximum(length, 1e-12))
             arrows = np.stack([position[node], position[node] + offset], axis=1)
             arrows = arrows[length[:, 0] > 0.004 * self._framing.extent].astype(np.float32)
-        self._arrows(arrows)
-
-    def _arrows(self, arrows: Float[ndarray, "arrow 2 3"]) -> None:
-        node = self._nodes.get("/forces")
-        if node is None and len(arrows):
-            extent = self._framing.extent
-            node = self._nodes["/forces"] = self._server.scene.add_arrows(
-                "/forces",
-                arrows,
-                RED,
-                shaft_radius=0.0011 * extent,
-                head_radius=0.0036 * extent,
-                head_length=0.011 * extent,
-            )
-        elif node is not None and len(arrows):
-            node.points = arrows
-        if node is not None:
-            node.visible = bool(len(arrows))
-
-    def _points(
-        self,
-        name: str,
-        point: Float[ndarray, "point 3"],
-        color: Any,
-        size: float,
-        is_visible: bool,
-    ) -> None:
-        node = self._nodes.get(name)
-        is_visible = is_visible and len(point) > 0
-        if node is None and is_visible:
-            node = self._nodes[name] = self._server.scene.add_point_cloud(
-                name,
-                np.asarray(point, dtype=np.float32),
-                color,
-                point_size=size,
-                point_shape="circle",
-                precision="float32",
-            )
-        elif node is not None and is_visible:
-            node.points = np.asarray(point, dtype=np.float32)
-            if np.ndim(color) == 2:
-                node.colors = color
-        if node is not None:
-            node.visible = is_visible
-
-    def _segments(
-        self,
-        name: str,
-        segment: Float[ndarray, "segment 2 3"],
-        color: tuple[int, int, int],
-        width: float,
-        is_visible: bool,
-    ) -> None:
-        node = self._nodes.get(name)
-        is_visible = is_visible and len(segment) > 0
-        if node is None and is_visible:
-            node = self._nodes[name] = self._server.scene.add_line_segments(
-                name,
-                np.asarray(segment, dtype=np.float32),
-                color,
-                thickness=width,
-                thickness_units="screen",
-            )
-        elif node is not None and is_visible:
-            node.points = np.asarray(segment, dtype=np.float32)
-        if node is not None:
-            node.visible = is_visible
+        self._nodes.arrows("/forces", arrows, RED, 0.0022 * self._framing.extent)
 
 
 def default_layers(content: Content) -> Layers:
@@ -301,7 +224,13 @@ def default_layers(content: Content) -> Layers:
     return Layers(
         observed=not has_object,
         cameras=not has_object and bool(content.views),
+        object_springs=content.fitted is not None and _is_chain(content.fitted),
     )
+
+
+def _is_chain(take: Take) -> bool:
+    """Tell whether there are so few springs that they show the object's shape."""
+    return take.model.object_spring_count < 3 * take.model.node_count
 
 
 def _ends(

@@ -114,6 +114,28 @@ def test_a_recording_shows_keypoints_depth_and_cameras(sessions, recording) -> N
         assert not any(p.get("label") == "Physics" for p in client.gui.values())
 
 
+def test_a_run_without_an_object_shows_hands_and_cameras(sessions, catalog, recording) -> None:
+    name = recording.sequence.name
+    run = Run.create(
+        catalog.root / "runs" / "hands",
+        name="hands",
+        kind="reconstruction",
+        sequences=[str(recording.sequence.folder)],
+        config={},
+    )
+    vertex = np.random.default_rng(0).normal(0, 0.05, (4, 60, 3)).astype(np.float32)
+    with run.begin_attempt() as attempt:
+        attempt.save_array(f"sequences/{name}/hand_right_vertex.npy", vertex)
+        meta = {"frame_rate": 30.0, "frame_count": 4, "metric": False, "length_unit": "squares"}
+        attempt.save_yaml(f"sequences/{name}/meta.yaml", meta)
+        attempt.publish()
+    with watch(sessions, "run", "hands") as client:
+        client.until(lambda: {"/hand/right", "/cameras/view1"} <= set(client.nodes))
+        assert not any(p.get("label") == "Physics" for p in client.gui.values())
+        client.set("View from", "view0")
+        client.until(lambda: client.nodes["/cameras/view0"]["scale"] > 0.2)
+
+
 def test_downloads_hold_what_is_on_the_screen(sessions, run) -> None:
     session = sessions.get(sessions.open("run", "sheet", "me"))
     session._playback.seek(4)

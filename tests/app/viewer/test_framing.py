@@ -1,0 +1,50 @@
+import numpy as np
+import pytest
+
+from app.viewer.content import Content, open_run, open_sequence
+from app.viewer.framing import frame_content
+from app.viewer.scene import default_layers
+
+
+def in_view(framing, point) -> bool:
+    """Whether a point is inside the vertical field of view of a square picture."""
+    ahead = framing.look_at - framing.camera
+    depth = (point - framing.camera) @ ahead / np.linalg.norm(ahead)
+    distance = np.linalg.norm(point - framing.camera)
+    return depth > 0 and np.arccos(depth / distance) < framing.fov / 2
+
+
+@pytest.mark.parametrize("scale", [0.001, 1.0, 40.0])
+def test_everything_that_moves_is_in_the_picture_at_any_scale(scale: float) -> None:
+    rng = np.random.default_rng(1)
+    control = scale * (rng.uniform(-1, 1, (10, 50, 3)) + np.array([5.0, -3.0, 2.0]))
+    content = Content(
+        title="t",
+        sequence_name="s",
+        frame_count=10,
+        frame_rate=30.0,
+        reconstruction_count=10,
+        length_unit="m",
+        ground_height=None,
+        control=control.astype(np.float32),
+    )
+    framing = frame_content(content)
+    assert framing.extent == pytest.approx(2 * np.sqrt(3) * scale, rel=0.1)
+    np.testing.assert_allclose(framing.center, scale * np.array([5.0, -3.0, 2.0]), atol=0.1 * scale)
+    assert all(in_view(framing, point) for point in control[::3].reshape(-1, 3))
+    assert framing.camera[2] > framing.center[2]
+
+
+def test_the_overview_stands_between_the_recording_cameras(catalog, recording) -> None:
+    framing = frame_content(open_sequence(catalog, recording.sequence.name))
+    for view in recording.sequence.views:
+        eye = view.camera.T_world_camera[:2, 3] - framing.center[:2]
+        away = np.angle(np.exp(1j * (np.arctan2(eye[1], eye[0]) - framing.azimuth)))
+        assert abs(away) > np.deg2rad(60)
+
+
+def test_a_run_hides_the_recording_at_first_and_a_recording_shows_it(catalog, recording) -> None:
+    of_run = default_layers(open_run(catalog, "sheet"))
+    of_recording = default_layers(open_sequence(catalog, recording.sequence.name))
+    assert (of_run.observed, of_run.cameras, of_run.object_springs) == (False, False, True)
+    assert (of_recording.observed, of_recording.cameras) == (True, True)
