@@ -21,7 +21,12 @@ from physhandi.progress import Progress
 def small_config() -> PipelineConfig:
     config = load_profile("quick")
     soft = SearchVariable(low=50.0, high=3e4, scale="log")
-    variables = config.object_.search.variables | {"stiffness": soft, "virtual_stiffness": soft}
+    variables = config.object_.search.variables | {
+        "connection_radius": SearchVariable(low=0.06, high=0.12),
+        "virtual_connection_radius": SearchVariable(low=0.01, high=0.04),
+        "stiffness": soft,
+        "virtual_stiffness": soft,
+    }
     search = replace(config.object_.search, generations=8, population=8, variables=variables)
     first_order = replace(config.object_.first_order, iterations=8)
     simulation = replace(config.simulation, connection_radius=0.08, virtual_connection_radius=0.02)
