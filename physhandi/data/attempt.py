@@ -10,6 +10,7 @@ from safetensors.numpy import save
 
 from physhandi.data.atomic import (
     sweep_temporary,
+    temporary_name,
     write_array,
     write_bytes,
     write_json,
@@ -62,16 +63,11 @@ class Attempt:
         self._stages: list[dict[str, Any]] = []
         self._is_open = True
         sweep_temporary(run_folder.rglob(".*.tmp"))
-        self.out.mkdir(parents=True)
-        self._checkpoints.mkdir()
+        self._prepare(numbers)
         if read_mapping(run_folder / EXIT).get("state") == "cancelled":
             (run_folder / CANCEL).unlink(missing_ok=True)
         (run_folder / EXIT).unlink(missing_ok=True)
-        if numbers:
-            self._stages = take_over(run_folder / ATTEMPTS / str(max(numbers)), self.folder)
-            if self._stages:
-                self._save_losses()
-            prune(run_folder, keep={max(numbers), self.number})
+        prune(run_folder, keep={*numbers[-1:], self.number})
 
     def __enter__(self) -> "Attempt":
         return self
@@ -213,6 +209,17 @@ class Attempt:
         """
         with locked(self.run_folder):
             self._end("cancelled", "Cancelled.")
+
+    def _prepare(self, numbers: list[int]) -> None:
+        """Make the attempt's folder in one step, so that a crash here loses no earlier work."""
+        temporary = self.folder.with_name(temporary_name(self.folder.name))
+        (temporary / OUT).mkdir(parents=True)
+        (temporary / CHECKPOINTS).mkdir()
+        if numbers:
+            self._stages = take_over(self.folder.with_name(str(numbers[-1])), temporary)
+        temporary.replace(self.folder)
+        if self._stages:
+            self._save_losses()
 
     def _end(self, state: str, error: BaseException | str | None) -> None:
         self._lease.check()

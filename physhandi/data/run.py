@@ -37,12 +37,16 @@ RunKind = Literal["reconstruction", "simulation"]
 
 
 class Run(RunOutputs):
-    """One execution of the pipeline, as its folder tells it. Use `Run.create` or `Run.open`."""
+    """One execution of the pipeline, as its folder tells it. Use `Run.create` or `Run.open`.
+
+    Relative paths of sequences in ``job.yaml`` start at the run's folder, so that a run and its
+    sequences can be moved together.
+    """
 
     def __init__(self, folder: Path, job: Mapping[str, Any], about: Mapping[str, Any]) -> None:
         super().__init__(folder)
         self.kind: RunKind = job["kind"]
-        self.sequences: list[str] = list(job["sequences"])
+        self.sequences: list[str] = [str(_absolute(folder / path)) for path in job["sequences"]]
         self.sequence_names: list[str] = list(job["sequence_names"])
         self.config: dict[str, Any] = dict(job["config"])
         self.name: str = about["name"]
@@ -75,7 +79,7 @@ class Run(RunOutputs):
             RunError: If the folder is in use, its name is unsafe, or two sequences share a name.
             SequenceError: If a sequence folder has a damaged ``sequence.yaml``.
         """
-        target = Path(os.path.abspath(folder))  # noqa: PTH100 - links stay as the user wrote them
+        target = _absolute(folder)
         if not SAFE_ID.fullmatch(target.name):
             raise RunError(
                 f"'{target.name}' cannot name a run; use 1-64 letters, digits, '_' or '-'."
@@ -87,7 +91,7 @@ class Run(RunOutputs):
         job = {
             "format": RUN_FORMAT,
             "kind": kind,
-            "sequences": list(sequences),
+            "sequences": [str(_absolute(sequence)) for sequence in sequences],
             "sequence_names": names,
             "config": plain(config),
         }
@@ -116,7 +120,7 @@ class Run(RunOutputs):
         Raises:
             RunError: If the folder is not a run or is damaged; names the file.
         """
-        path = Path(os.path.abspath(folder))  # noqa: PTH100 - links stay as the user wrote them
+        path = _absolute(folder)
         if not (path / RUN).is_file() or not (path / JOB).is_file():
             raise RunError(f"{path} is not a run: it needs {RUN} and {JOB}.")
         job = named_fields(read_yaml(path / JOB)) or {}
@@ -219,3 +223,8 @@ def find_runs(folder: Path | str) -> list[RunEntry]:
 def _sequence_name(folder: Path) -> str:
     """Give a sequence's own name; where the folder cannot be read from here, the folder's."""
     return read_meta(folder).name if (folder / FILE).is_file() else folder.name
+
+
+def _absolute(path: Path | str) -> Path:
+    """Make a path absolute and drop ``..``; links stay as the user wrote them."""
+    return Path(os.path.abspath(path))  # noqa: PTH100 - resolve() would follow links

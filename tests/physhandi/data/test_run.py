@@ -1,7 +1,9 @@
 """Run folders: publication is all or nothing, and damage is named."""
 
 import json
+import multiprocessing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -363,3 +365,54 @@ def test_job_yaml_is_plain(tmp_path: Path) -> None:
     run = make_run(tmp_path / "fit", config={"a": (1, 2), "b": np.float32(0.5), "c": Path("/x")})
     stored = yaml.safe_load((run.folder / "job.yaml").read_text())
     assert stored["config"] == {"a": [1, 2], "b": 0.5, "c": "/x"} == Run.open(run.folder).config
+
+
+def test_relative_sequences_start_at_the_run(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "runs" / "fit")
+    path = run.folder / "job.yaml"
+    job = yaml.safe_load(path.read_text()) | {"sequences": ["../../sequences/lift"]}
+    path.write_text(yaml.safe_dump(job))
+    assert Run.open(run.folder).sequences == [str(tmp_path / "sequences" / "lift")]
+
+
+def test_a_replaced_process_stops_at_its_next_report(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("physhandi.data.run_progress._HEARTBEAT_INTERVAL_S", 0.0)
+    run = make_run(tmp_path / "fit")
+    progress = run.begin_attempt().progress()
+    before = json.loads((run.folder / "lease.json").read_text())["time"]
+    progress.report("fit", 1, 9)
+    assert json.loads((run.folder / "lease.json").read_text())["time"] > before
+    run.begin_attempt(take_over=True)
+    with pytest.raises(RunError, match="taken over"):
+        progress.report("fit", 2, 9)
+
+
+def try_to_begin(folder: Path, start: Any, results: Any) -> None:
+    run = Run.open(folder)
+    start.wait()
+    try:
+        run.begin_attempt()
+    except RunError:
+        results.put("refused")
+    else:
+        results.put("begun")
+    start.wait()  # The holder stays alive until all have tried.
+
+
+def test_only_one_of_several_processes_may_begin(tmp_path: Path) -> None:
+    context = multiprocessing.get_context("fork")
+    for trial in range(5):
+        run = make_run(tmp_path / f"fit{trial}")
+        start, results = context.Barrier(3), context.Queue()
+        children = [
+            context.Process(target=try_to_begin, args=(run.folder, start, results))
+            for _ in range(3)
+        ]
+        for child in children:
+            child.start()
+        assert sorted(results.get(timeout=20) for _ in children) == ["begun", "refused", "refused"]
+        for child in children:
+            child.join()
+        assert run.state == "failed"

@@ -13,6 +13,7 @@ from safetensors.numpy import load_file
 
 from physhandi.data.checkpoint import read_checkpoint
 from physhandi.data.run import Run, read_events
+from physhandi.data.run_files import attempt_numbers
 
 KILLS = 30
 
@@ -21,7 +22,8 @@ def write_for_ever(folder: Path) -> None:
     run = Run.open(folder)
     attempt = run.begin_attempt()
     progress = attempt.progress()
-    number = 0
+    known = attempt.load_checkpoint("state")
+    number = 0 if known is None else int(known["x"][0])
     while True:
         number += 1
         attempt.save_array("array.npy", np.full(50_000, number))
@@ -36,6 +38,14 @@ def write_for_ever(folder: Path) -> None:
 def holder_of(folder: Path) -> int | None:
     path = folder / "lease.json"
     return json.loads(path.read_text())["pid"] if path.exists() else None
+
+
+def latest_checkpoint(run: Run) -> dict[str, np.ndarray] | None:
+    """The checkpoint that a new attempt would go on from."""
+    numbers = attempt_numbers(run.folder)
+    if not numbers:
+        return None
+    return read_checkpoint(run.folder / "attempts" / str(numbers[-1]) / "ckpt", "state")
 
 
 def check_whole(run: Run) -> int:
@@ -64,28 +74,35 @@ def test_kills_in_the_middle_of_writing(tmp_path: Path) -> None:
     )
     context = multiprocessing.get_context("fork")
     chance = np.random.default_rng(7)
-    files, leftovers, states = 0, 0, set()
+    files, leftovers, states, furthest = 0, 0, set(), 0
     for _ in range(KILLS):
         child = context.Process(target=write_for_ever, args=(run.folder,))
         child.start()
         deadline = time.monotonic() + 20
         while holder_of(run.folder) != child.pid and time.monotonic() < deadline:
             time.sleep(0.001)
-        time.sleep(chance.uniform(0.0, 0.1))
+        time.sleep(chance.uniform(0.0, 0.12))
         os.kill(child.pid or 0, signal.SIGKILL)
         child.join()
         files += check_whole(run)
         leftovers += len(list(run.folder.rglob(".*.tmp")))
         states.add(run.state)
+        state = latest_checkpoint(run)
+        if furthest > 0:
+            assert state is not None  # A crash, also one at the very start, loses no earlier work.
+        if state is not None:
+            assert state["x"][0] >= furthest
+            furthest = int(state["x"][0])
     assert states <= {"failed", "queued"}
     assert "failed" in states
     assert files > 5 * KILLS
+    assert furthest > 0
     assert leftovers > 0  # Otherwise no kill hit a write, and the test shows nothing.
     with run.begin_attempt() as attempt:
         assert list(run.folder.rglob(".*.tmp")) == []
         state = read_checkpoint(attempt.folder / "ckpt", "state")
         assert state is not None
-        assert len(set(state["x"].tolist())) == 1
+        assert set(state["x"].tolist()) == {furthest}
         attempt.publish()
     run.verify()
     assert run.state == "succeeded"

@@ -284,3 +284,53 @@ def test_a_damaged_sequence_does_not_hide_the_others(folder: Path, tmp_path: Pat
     assert good.sequence is not None
     assert good.sequence.name == "lift"
     assert find_sequences(tmp_path / "nowhere") == []
+
+
+def test_wrong_images_are_named(folder: Path) -> None:
+    depth = folder / "views/front/depth/00001.png"
+    cv2.imwrite(str(depth), np.zeros((HEIGHT, WIDTH), np.uint8))
+    with pytest.raises(SequenceError, match=r"depth of frame 1 is uint8.*expected 16-bit"):
+        Sequence.load(folder).validate()
+    cv2.imwrite(str(depth), np.zeros((HEIGHT, WIDTH), np.uint16))
+    mask = folder / "views/front/mask/00001.png"
+    cv2.imwrite(str(mask), np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    with pytest.raises(SequenceError, match=r"mask of frame 1 is uint8.*expected 8-bit"):
+        Sequence.load(folder).validate()
+    extra = folder / "views/front/color/00007.png"
+    extra.write_bytes(b"x")
+    with pytest.raises(SequenceError, match=r"color has color/00007, but .* only 5 frames"):
+        Sequence.load(folder)
+    extra.rename(extra.with_name("00002.jpg"))
+    with pytest.raises(SequenceError, match="has a frame twice"):
+        Sequence.load(folder)
+    (folder / "views/front/color/00002.jpg").unlink()
+    (folder / "views/front/color.mp4").write_bytes(b"x")
+    with pytest.raises(SequenceError, match=r"is there twice: color.mp4 and color/"):
+        Sequence.load(folder)
+
+
+def test_tracks_and_views_must_be_whole(folder: Path) -> None:
+    track = np.load(folder / "views/front/track.npy")
+    track[4, 2] = np.nan
+    np.save(folder / "views/front/track.npy", track)
+    with pytest.raises(SequenceError, match=r"track.npy is NaN at frame 4, track 2"):
+        Sequence.load(folder).validate()
+    (folder / "views/front/track_visible.npy").unlink()
+    with pytest.raises(SequenceError, match=r"needs both track.npy and track_visible.npy"):
+        Sequence.load(folder)
+    (folder / "views/front").rename(folder / "views/back")
+    with pytest.raises(SequenceError, match=r"views/front is missing, but sequence.yaml lists it"):
+        Sequence.load(folder)
+
+
+def test_what_an_object_needs_is_listed(tmp_path: Path, folder: Path) -> None:
+    assert Sequence.load(folder).missing("object") == []
+    bare = replace(make_meta("bare"), hands=(), views=(), controlled_markers=())
+    assert write_sequence(tmp_path / "bare", bare).missing("object") == ["depth", "mask", "control"]
+
+
+@pytest.mark.parametrize("text", ["", "- a list", "text", "null", "frame_count: 3"])
+def test_yaml_of_another_kind_is_refused(folder: Path, text: str) -> None:
+    (folder / "sequence.yaml").write_text(text)
+    with pytest.raises(SequenceError, match=r"sequence.yaml"):
+        Sequence.load(folder)
