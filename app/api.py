@@ -111,7 +111,9 @@ def create_api(catalog: Catalog, scheduler: Scheduler, sessions: SessionOpener) 
 
     @router.get("/runs/{run_id}/export")
     def export(
-        run_id: Id, format: Literal["ply", "npz", "csv", "yaml"], sequence: Id | None = None  # noqa: A002  # the query's name
+        run_id: Id,
+        format: Literal["ply", "npz", "csv", "yaml"],
+        sequence: Id | None = None,  # noqa: A002  # the query's name
     ) -> FileResponse:
         return _export(catalog, run_id, format, sequence)
 
@@ -169,7 +171,9 @@ async def _run_changes(
     known, quiet = "", 0.0
     while not await request.is_disconnected():
         items = await asyncio.to_thread(catalog.runs)
-        runs = await asyncio.to_thread(lambda listed: [describe_run(i, scheduler) for i in listed], items)
+        runs = await asyncio.to_thread(
+            lambda listed: [describe_run(i, scheduler) for i in listed], items
+        )
         text = json.dumps(runs, ensure_ascii=False)
         quiet += _POLL_S
         if text != known:

@@ -101,7 +101,9 @@ def simulate(command: Any, progress: Progress) -> dict[str, Any]:
     """Simulate a fitted object again into a run folder of its own."""
     source = find_run(command.run, command.data_dir)
     if not source.is_published:
-        raise RunError(f"Run '{source.id}' is {source.state}: only a finished run can be simulated.")
+        raise RunError(
+            f"Run '{source.id}' is {source.state}: only a finished run can be simulated."
+        )
     changes = {n: v for n in OVERRIDES if (v := getattr(command, n)) is not None}
     folder = None
     if command.sequence is not None:
@@ -112,7 +114,9 @@ def simulate(command: Any, progress: Progress) -> dict[str, Any]:
     return _execute(run, command, progress)
 
 
-def _run_at(folder: Path, kind: str, name: str, sequences: list[str], config: dict[str, Any]) -> Run:
+def _run_at(
+    folder: Path, kind: str, name: str, sequences: list[str], config: dict[str, Any]
+) -> Run:
     if not (folder / "run.yaml").is_file():
         return Run.create(folder, name=name, kind=kind, sequences=sequences, config=config)
     run = Run.open(folder)
@@ -238,7 +242,9 @@ def _probes(data_dir: Path) -> Iterator[tuple[str, Callable[[], str]]]:
         # Symplectic Euler falls g t² / 2 · (1 + 1/substeps) in the first frame.
         expected = -0.5 * 9.81 / 900 * 1.01
         if abs(fall - expected) > 1e-5:
-            raise RuntimeError(f"a free fall of one frame gave {fall:.6f} m, expected {expected:.6f} m")
+            raise RuntimeError(
+                f"a free fall of one frame gave {fall:.6f} m, expected {expected:.6f} m"
+            )
         return f"Warp on {device}, a falling node lands where it should"
 
     def bundled() -> str:
@@ -251,7 +257,9 @@ def _probes(data_dir: Path) -> Iterator[tuple[str, Callable[[], str]]]:
     def hand() -> str:
         from physhandi.hand.model import load_hand_model
 
-        return ", ".join(f"{s} hand {load_hand_model(s).vertex_count} vertices" for s in ("right", "left"))
+        return ", ".join(
+            f"{s} hand {load_hand_model(s).vertex_count} vertices" for s in ("right", "left")
+        )
 
     def space() -> str:
         folder = data_dir if data_dir.exists() else Path()

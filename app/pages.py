@@ -87,8 +87,12 @@ def create_pages(catalog: Catalog, scheduler: Scheduler, pages: Pages) -> APIRou
     def live(request: Request, session_id: Id) -> HTMLResponse:
         session = request.app.state.sessions.get(session_id)
         if session is None:
-            return pages.error(404, "This live scene was closed. Open it again from the start page.")
-        return pages.render("live.html", session=session_id, title=session.target, kind=session.kind)
+            return pages.error(
+                404, "This live scene was closed. Open it again from the start page."
+            )
+        return pages.render(
+            "live.html", session=session_id, title=session.target, kind=session.kind
+        )
 
     return router
 

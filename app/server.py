@@ -74,7 +74,9 @@ def _answer_errors(app: FastAPI, pages: Pages) -> None:
     """Give every error one shape: JSON below /api, a page elsewhere."""
 
     def answer(request: Request, status: int, code: str, message: str) -> Response:
-        if request.url.path.startswith("/api/") or "text/html" not in request.headers.get("accept", ""):
+        if request.url.path.startswith("/api/") or "text/html" not in request.headers.get(
+            "accept", ""
+        ):
             return JSONResponse({"error": {"code": code, "message": message}}, status_code=status)
         return pages.error(status, message)
 
@@ -89,7 +91,9 @@ def _answer_errors(app: FastAPI, pages: Pages) -> None:
 
     @app.exception_handler(HTTPException)
     def on_http(request: Request, error: HTTPException) -> Response:
-        message = "There is nothing at this address." if error.detail == "Not Found" else error.detail
+        message = (
+            "There is nothing at this address." if error.detail == "Not Found" else error.detail
+        )
         return answer(request, error.status_code, "http", str(message))
 
     @app.exception_handler(RequestValidationError)
@@ -104,9 +108,7 @@ def _answer_errors(app: FastAPI, pages: Pages) -> None:
         return answer(request, 500, "defect", "The server made a mistake; its log tells more.")
 
 
-def serve(
-    settings: Settings, on_ready: Callable[[str], None], *, queue_demo: bool = False
-) -> None:
+def serve(settings: Settings, on_ready: Callable[[str], None], *, queue_demo: bool = False) -> None:
     """Serve until interrupted; running fits go on and are found again by the next server.
 
     Args:

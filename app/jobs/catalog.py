@@ -120,7 +120,9 @@ class Catalog:
         found: list[Sequence] = []
         for folder, name in zip(run.sequences, run.sequence_names, strict=True):
             try:
-                found.append(Sequence.load(folder) if Path(folder).is_dir() else self.sequence(name))
+                found.append(
+                    Sequence.load(folder) if Path(folder).is_dir() else self.sequence(name)
+                )
             except PhysHandiError as error:
                 raise SequenceError(
                     f"Run '{run.id}' needs sequence '{name}', which cannot be opened: {error}"

@@ -101,7 +101,9 @@ class Scheduler:
             item = self._own(run_id)
             state = self.view(item).state
             if state not in {"failed", "cancelled"}:
-                raise RunError(f"Run '{run_id}' is {state}; only a failed or cancelled run is resumed.")
+                raise RunError(
+                    f"Run '{run_id}' is {state}; only a failed or cancelled run is resumed."
+                )
             run = Run.open(item.folder)
             run.clear_cancel()
             self._enqueue(run)

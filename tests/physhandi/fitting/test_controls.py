@@ -14,7 +14,9 @@ def test_farthest_points_spread() -> None:
 
 def test_a_turned_object_is_found_again() -> None:
     random = np.random.default_rng(0)
-    template = np.stack([random.uniform(0, 0.3, 300), random.uniform(0, 0.1, 300), np.zeros(300)], axis=1)
+    template = np.stack(
+        [random.uniform(0, 0.3, 300), random.uniform(0, 0.1, 300), np.zeros(300)], axis=1
+    )
     template[:, 2] = 0.05 * (template[:, 0] > 0.2)
     turn = Rotation.from_euler("zyx", [2.0, 0.1, -0.05])
     expected = turn.apply(template) + [0.4, -0.2, 0.1]

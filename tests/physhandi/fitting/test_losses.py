@@ -27,7 +27,9 @@ def test_frozen_count_replaces_the_number_of_points() -> None:
     observed = torch.zeros(1, 2, 3)
     node = torch.tensor([[[0.2, 0.0, 0.0]]])
     real = torch.ones(1, 2, dtype=torch.bool)
-    assert chamfer_loss(observed, real, node, count=torch.tensor([8.0])).item() == pytest.approx(0.01)
+    assert chamfer_loss(observed, real, node, count=torch.tensor([8.0])).item() == pytest.approx(
+        0.01
+    )
 
 
 def test_track_loss_ignores_what_cannot_be_trusted() -> None:

@@ -86,7 +86,9 @@ def test_springs_of_two_halves_are_told_apart() -> None:
     count = slow.object_spring_count
     np.testing.assert_array_equal(slow.stiffness[:count], fast.stiffness[:count])
     middle = NODE[slow.spring_nodes[:count]].mean(axis=1)
-    near, far = (slow.stiffness[:count][side] for side in (middle[:, 0] < 0.15, middle[:, 0] > 0.15))
+    near, far = (
+        slow.stiffness[:count][side] for side in (middle[:, 0] < 0.15, middle[:, 0] > 0.15)
+    )
     assert np.median(near) > 1.3 * np.median(far)
     stored = mean_loss(problems, result.models, PARAMETERS, config(), "cpu")
     assert stored == pytest.approx(result.loss_after, rel=1e-6)

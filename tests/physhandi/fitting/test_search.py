@@ -80,7 +80,9 @@ def test_search_stops_when_told() -> None:
             raise CancelledError
 
     with pytest.raises(CancelledError):
-        search_parameters(bowl, START, SearchConfig(generations=1, variables=VARIABLES), Impatient())
+        search_parameters(
+            bowl, START, SearchConfig(generations=1, variables=VARIABLES), Impatient()
+        )
 
 
 @pytest.mark.parametrize(
@@ -91,7 +93,9 @@ def test_search_stops_when_told() -> None:
         (SearchVariable(low=1.0, high=5.0, scale="integer"), 0.3, 2),
     ],
 )
-def test_intervals_are_walked_as_they_say(variable: SearchVariable, unit: float, value: float) -> None:
+def test_intervals_are_walked_as_they_say(
+    variable: SearchVariable, unit: float, value: float
+) -> None:
     assert variable.from_unit(unit) == pytest.approx(value)
     if variable.scale != "integer":
         assert variable.to_unit(value) == pytest.approx(unit)
