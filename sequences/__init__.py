@@ -1,0 +1,1 @@
+"""The sequences that ship with the project; see README.md."""
