@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from collections.abc import Sequence as Many
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from physhandi.data.atomic import named_fields, plain, temporary_name, write_bytes, write_yaml
 from physhandi.data.attempt import Attempt
@@ -134,6 +134,9 @@ class Run(RunOutputs):
             for field, kind in fields.items():
                 if not isinstance(content.get(field), kind):
                     raise RunError(f"{path / file}: field '{field}' is missing or wrong.")
+        if job["kind"] not in get_args(RunKind):
+            known = " or ".join(get_args(RunKind))
+            raise RunError(f"{path / JOB}: kind is {job['kind']!r}; expected {known}.")
         return cls(path, job, about)
 
     @property

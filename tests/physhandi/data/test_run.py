@@ -416,3 +416,11 @@ def test_only_one_of_several_processes_may_begin(tmp_path: Path) -> None:
         for child in children:
             child.join()
         assert run.state == "failed"
+
+
+def test_an_unknown_kind_of_run_is_refused(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "fit")
+    path = run.folder / "job.yaml"
+    path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | {"kind": "shell"}))
+    with pytest.raises(RunError, match="kind is 'shell'; expected reconstruction or simulation"):
+        Run.open(run.folder)
