@@ -11,6 +11,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from physhandi.hand.gltf import SkinnedMesh, read_skinned_mesh
+from physhandi.hand.keypoint_offset import KEYPOINT_OFFSET
 from physhandi.hand.model import JOINT_COUNT, HandModel, HandPose, Side
 from physhandi.hand.rotation import rotation_offset
 
@@ -49,15 +50,11 @@ _KEYPOINT_NODES = [
 _PARENT = [0 if joint % 3 == 0 else joint for joint in range(JOINT_COUNT)]
 """Bone that each joint hangs on."""
 _FINGER_OF_JOINT = [joint // 3 for joint in range(JOINT_COUNT)]
-_BONE_OF_KEYPOINT = [
-    0,
-    *(
-        bone
-        for finger in range(5)
-        for bone in (3 * finger + 1, 3 * finger + 2, *[3 * finger + 3] * 2)
-    ),
-]
-"""Bone 0 is the palm, bone j + 1 the one that joint j moves; a fingertip rides on the last bone."""
+_BONE_OF_KEYPOINT = [0, *(bone for j in range(1, 16, 3) for bone in (0, j, j + 1, j + 2))]
+"""Bone that carries each keypoint: a joint's rides on the bone before it, a tip's on the last.
+
+Bone 0 is the palm, bone j + 1 the one that joint j moves.
+"""
 
 
 @dataclass(frozen=True)
@@ -103,7 +100,8 @@ class OpenHand(HandModel):
         axes = np.stack([_nearest_rotation(T[:3, :3]) for T in mesh.T_mesh_bone[joint]])
         self.joint_axes = mirror[:, None] * axes * mirror
         keypoint = [bone[name] for name in _KEYPOINT_NODES]
-        self.keypoint_position = (mesh.T_mesh_bone[keypoint, :3, 3] - origin) * mirror
+        node = mesh.T_mesh_bone[keypoint, :3, 3]
+        self.keypoint_position = (node + KEYPOINT_OFFSET - origin) * mirror
         self.keypoint_weight = np.eye(JOINT_COUNT + 1)[_BONE_OF_KEYPOINT]
         self.palm_axes = _palm_axes(self.joint_position)
         self._tensors: dict[torch.dtype, dict[str, Tensor]] = {}
@@ -141,6 +139,10 @@ class OpenHand(HandModel):
         skeleton = self._skeleton(shape)
         keypoint = self._skin("keypoint", skeleton, *self._turn_bones(skeleton, articulation))
         return _place(keypoint, wrist_rotation, wrist_translation, scale)
+
+    def bone_origins(self, shape: Float[Tensor, " 10"]) -> Float[Tensor, "16 3"]:
+        """Compute where the bones begin in the unposed hand: the wrist, then the 15 joints [m]."""
+        return self._skeleton(shape).joint
 
     def _skeleton(self, shape: Float[Tensor, " 10"]) -> _Skeleton:
         fixed = self._constants(shape)

@@ -32,3 +32,14 @@ def rotation_matrix(rotation_vector: Float[Tensor, "*batch 3"]) -> Float[Tensor,
     """Compute the rotation matrix of a rotation vector [rad]."""
     offset = rotation_offset(rotation_vector)
     return offset + torch.eye(3, dtype=offset.dtype, device=offset.device)
+
+
+def quaternion_matrix(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
+    """Compute the rotation matrix of a quaternion (x, y, z, w) of any length but zero."""
+    x, y, z, w = (quaternion / quaternion.norm(dim=-1, keepdim=True)).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
+        2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
+        2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, -1).reshape(*quaternion.shape[:-1], 3, 3)

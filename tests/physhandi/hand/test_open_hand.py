@@ -12,7 +12,7 @@ from physhandi.hand.gltf import read_skinned_mesh
 from physhandi.hand.model import JOINT_NAMES, KEYPOINT_NAMES, HandPose, load_hand_model
 from physhandi.hand.open_hand import ASSETS, SHAPE_NAMES, SHAPE_RATE, OpenHand
 
-WRIST, INDEX, MIDDLE, PINKY = 0, 5, 9, 17
+WRIST = 0
 
 
 def _pose(hand: OpenHand, **changes: Tensor) -> HandPose:
@@ -124,39 +124,34 @@ def test_wrist_turns_and_scale_multiplies_everything(hand: OpenHand) -> None:
     turned = hand.template @ _rotation(rotation, float(np.linalg.norm(rotation))).T
     expected = 2 * (turned + translation)
     np.testing.assert_allclose(pose.vertex[0].numpy(), expected, atol=1e-12)
-    np.testing.assert_allclose(pose.keypoint[0, 0].numpy(), 2 * translation, atol=1e-12)
+    wrist = hand.keypoint_position[0] @ _rotation(rotation, float(np.linalg.norm(rotation))).T
+    np.testing.assert_allclose(pose.keypoint[0, 0].numpy(), 2 * (wrist + translation), atol=1e-12)
 
 
-_FINGER_CHAINS = {
-    "thumb_length": (1, 2, 3, 4),
-    "index_length": (5, 6, 7, 8),
-    "middle_length": (9, 10, 11, 12),
-    "ring_length": (13, 14, 15, 16),
-    "pinky_length": (17, 18, 19, 20),
-}
+_FINGERS = ("thumb_length", "index_length", "middle_length", "ring_length", "pinky_length")
 
 
 # The thumb is set on the palm, so a longer or wider palm carries its root outwards.
 _RIDES_ALONG = {("palm_length", "thumb_set"), ("palm_width", "thumb_set")}
 
 
-def _measure(hand: OpenHand, name: str, pose: HandPose) -> float:
-    keypoint, vertex = pose.keypoint[0].numpy(), pose.vertex[0].numpy()
+def _measure(hand: OpenHand, name: str, shape: Tensor) -> float:
+    bone, vertex = hand.bone_origins(shape).numpy(), _pose(hand, shape=shape).vertex[0].numpy()
+    thumb, index, middle, pinky = 1, 4, 7, 13
     if name == "size":
         return float(np.linalg.norm(vertex[0] - vertex[500]))
     if name == "palm_length":
-        return float(np.linalg.norm(keypoint[MIDDLE] - keypoint[WRIST]))
+        return float(np.linalg.norm(bone[middle]))
     if name == "palm_width":
-        return float((keypoint[INDEX] - keypoint[PINKY]) @ hand.palm_axes[:, 0])
+        return float((bone[index] - bone[pinky]) @ hand.palm_axes[:, 0])
     if name == "thumb_set":
-        return float(np.linalg.norm(keypoint[1] - keypoint[WRIST]))
+        return float(np.linalg.norm(bone[thumb]))
     if name == "finger_thickness":
         joint = JOINT_NAMES.index("middle_dip")
         rigid = vertex[hand.weight[:, joint + 1] > 1 - 1e-9]
-        across = (rigid - keypoint[11]) @ hand.joint_axes[joint][:, 0]
-        return float(np.ptp(across))
-    chain = keypoint[list(_FINGER_CHAINS[name])]
-    return float(np.linalg.norm(np.diff(chain[:3], axis=0), axis=1).sum())
+        return float(np.ptp((rigid - bone[joint + 1]) @ hand.joint_axes[joint][:, 0]))
+    first = 1 + 3 * _FINGERS.index(name)
+    return float(np.linalg.norm(np.diff(bone[first : first + 3], axis=0), axis=1).sum())
 
 
 @pytest.mark.parametrize("name", SHAPE_NAMES)
@@ -166,7 +161,7 @@ def test_shape_coefficient_scales_what_its_name_says(
 ) -> None:
     ratio = np.exp(SHAPE_RATE[SHAPE_NAMES.index(name)] * value)
     assert abs(ratio - 1) > 0.07
-    before, after = _pose(hand), _pose(hand, shape=_shape(name, value))
+    before, after = _shape(name, 0), _shape(name, value)
     measured = _measure(hand, name, after) / _measure(hand, name, before)
     assert measured == pytest.approx(ratio, rel=1e-9)
     for other in set(SHAPE_NAMES[1:]) - {name}:
@@ -187,6 +182,16 @@ def test_extreme_shapes_stay_closed_bodies(name: str, sign: float) -> None:
     assert trimesh.Trimesh(vertex, hand.faces, process=False).volume == pytest.approx(
         343e-6, rel=0.6
     )
+
+
+def test_a_joints_keypoint_stays_when_the_joint_turns_but_a_tips_does_not() -> None:
+    hand = OpenHand.load("right")
+    articulation = torch.zeros(1, 15, 3, dtype=torch.float64)
+    articulation[0, JOINT_NAMES.index("ring_dip"), 0] = -0.8
+    moved = (_pose(hand, articulation=articulation).keypoint - _pose(hand).keypoint).norm(dim=-1)[0]
+    assert moved[:16].max() == 0
+    assert moved[16] > 0.008
+    assert moved[17:].max() == 0
 
 
 def test_left_hand_is_the_mirrored_right_hand() -> None:
