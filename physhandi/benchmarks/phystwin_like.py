@@ -45,12 +45,13 @@ class PhysTwinLike:
         self._place(control_start, control_end)
         self.position = wp.array(self.model.object_node, dtype=wp.vec3, device=self.device)
         self.velocity = wp.array(self.model.initial_velocity, dtype=wp.vec3, device=self.device)
-        scratch = [wp.zeros_like(self.velocity) for _ in range(2)]
+        # A captured graph does not keep its arrays alive.
+        self.scratch = (wp.zeros_like(self.velocity), wp.zeros_like(self.velocity))
 
         def launch() -> None:
             for substep in range(self.parameters.substeps_per_frame):
                 state = (self.position, self.velocity)
-                self._substep(substep, state, (scratch[0], scratch[1]), state)
+                self._substep(substep, state, self.scratch, state)
 
         return self._capture(launch)
 

@@ -249,6 +249,8 @@ class _DifferentiableSimulator:
         self._position_bar, self._velocity_bar = zeros(nodes, wp.vec3), zeros(nodes, wp.vec3)
         self._force_bar = zeros(nodes, wp.vec3)
         self._offset_bar, self._stretch_bar = zeros(springs, wp.vec3), zeros(springs, wp.vec3)
+        self._row_offset_bar = self.simulator.sums.scratch()
+        self._row_stretch_bar = self.simulator.sums.scratch()
         controls = [zeros(model.control_count, wp.vec3) for _ in range(2)]
         materials = [zeros(springs, wp.float32) for _ in range(2)]
         scalars = [zeros(nodes, wp.float32) for _ in range(3)]
@@ -287,17 +289,12 @@ class _DifferentiableSimulator:
                 outputs=[*material_bars, self._offset_bar, self._stretch_bar],
                 device=simulator.device,
             )
+            start, entry, offset_bar = simulator.sums.of(self._offset_bar, self._row_offset_bar)
+            *_, stretch_bar = simulator.sums.of(self._stretch_bar, self._row_stretch_bar)
             wp.launch(
                 gather_nodes,
                 dim=model.node_count + model.control_count,
-                inputs=[
-                    fraction,
-                    simulator.world,
-                    simulator.half_edge_start,
-                    simulator.half_edge,
-                    self._offset_bar,
-                    self._stretch_bar,
-                ],
+                inputs=[fraction, simulator.world, start, entry, offset_bar, stretch_bar],
                 outputs=[*state_bars, *control_bars],
                 device=simulator.device,
             )

@@ -11,17 +11,19 @@ from jaxtyping import Float, Float32
 from numpy import ndarray
 
 from physhandi.errors import SimulationDivergedError
-from physhandi.simulation.kernels.integration import integrate_nodes
+from physhandi.simulation.kernels.integration import integrate_nodes, sum_rows
 from physhandi.simulation.kernels.springs import pull_springs
 from physhandi.simulation.kernels.world import World
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
 from physhandi.simulation.stability import explain_divergence
-from physhandi.simulation.topology import half_edges
+from physhandi.simulation.topology import half_edges, split_rows
 
 wp.config.log_level = wp.LOG_WARNING
 
 SPEED_LIMIT = 50.0
 """A node faster than this has diverged [m/s]."""
+ROW_LENGTH = 8
+"""Most springs that one thread of a GPU sums."""
 _NO_DIVERGENCE = np.iinfo(np.int32).max
 _WORLD: Any = World
 
@@ -34,6 +36,44 @@ class Rollout:
     """Positions in the world frame [m]."""
     velocity: Float32[ndarray, "frame node 3"]
     """Velocities in the world frame [m/s]."""
+
+
+class SpringSums:
+    """How nodes sum over their springs: at once on a CPU, in two levels of short rows on a GPU.
+
+    A thread of a GPU waits for each value that it adds, so long sums are cut into rows that
+    many threads sum. The order of additions is fixed in both cases.
+    """
+
+    def __init__(self, model: SpringMassModel, device: Any) -> None:
+        self._device = device
+        start, entry = half_edges(model.spring_nodes, model.node_count + model.control_count)
+        self._half_edge = wp.array(entry, dtype=wp.int32, device=device)
+        self._row_start: wp.array | None = None
+        if device.is_cuda:
+            row, start = split_rows(start, ROW_LENGTH)
+            self._row_start = wp.array(row, dtype=wp.int32, device=device)
+            entry = np.arange(len(row) - 1, dtype=np.int32)
+        self._start = wp.array(start, dtype=wp.int32, device=device)
+        self._entry = wp.array(entry, dtype=wp.int32, device=device)
+
+    def scratch(self) -> wp.array:
+        """Make room for the rows of one sum."""
+        count = 0 if self._row_start is None else len(self._row_start) - 1
+        return wp.zeros(count, dtype=wp.vec3, device=self._device)
+
+    def of(self, value: wp.array, scratch: wp.array) -> tuple[wp.array, wp.array, wp.array]:
+        """Launch what must come first, and return what `spring_sum` reads: start, entry, value."""
+        if self._row_start is None:
+            return self._start, self._entry, value
+        wp.launch(
+            sum_rows,
+            dim=scratch.shape[0],
+            inputs=[self._row_start, self._half_edge, value],
+            outputs=[scratch],
+            device=self._device,
+        )
+        return self._start, self._entry, scratch
 
 
 class Simulator:
@@ -58,9 +98,8 @@ class Simulator:
         self.model = model
         self.parameters = parameters
         self.device = wp.get_device(device)
-        start, entry = half_edges(model.spring_nodes, model.node_count + model.control_count)
-        self.half_edge_start = self.array(start, wp.int32)
-        self.half_edge = self.array(entry, wp.int32)
+        self.sums = SpringSums(model, self.device)
+        self._row_pull = self.sums.scratch()
         self.spring_nodes = self.array(model.spring_nodes, wp.vec2i)
         self.rest_length = self.array(model.rest_length, wp.float32)
         self.stiffness = self.array(model.stiffness, wp.float32)
@@ -246,18 +285,12 @@ class Simulator:
             outputs=[self.pull],
             device=self.device,
         )
+        start, entry, value = self.sums.of(self.pull, self._row_pull)
         tape = self._no_tape if free_velocity is None else free_velocity
         wp.launch(
             integrate_nodes,
             dim=self.model.node_count,
-            inputs=[
-                substep,
-                self.world,
-                self.half_edge_start,
-                self.half_edge,
-                *before,
-                self.pull,
-            ],
+            inputs=[substep, self.world, start, entry, *before, value],
             outputs=[tape, *after, self.first_divergence],
             device=self.device,
         )

@@ -193,6 +193,26 @@ def half_edges(
     return start.astype(np.int32), entry.astype(np.int32)
 
 
+def split_rows(
+    start: Int32[ndarray, " row"], longest: int
+) -> tuple[Int32[ndarray, " split"], Int32[ndarray, " row"]]:
+    """Cut each node's entries into short rows, so that many threads can sum one node.
+
+    Args:
+        start: Where each node's entries start, as `half_edges` returns it.
+        longest: Most entries in a row.
+
+    Returns:
+        Where each row starts, and which row is the first of each node; both with the end.
+    """
+    degree = np.diff(start)
+    count = -(-degree // longest)
+    first = np.concatenate([[0], np.cumsum(count)])
+    place = np.arange(first[-1]) - np.repeat(first[:-1], count)
+    row = np.repeat(start[:-1], count) + longest * place
+    return np.append(row, start[-1]).astype(np.int32), first.astype(np.int32)
+
+
 def _no_springs() -> SpringList:
     return np.zeros((0, 2), dtype=np.int32), np.zeros(0)
 

@@ -171,8 +171,8 @@ def gather_nodes(
     fraction: float,
     # Model:
     world: wp.array[World],
-    half_edge_start: wp.array[int],
-    half_edge: wp.array[int],
+    entry_start: wp.array[int],
+    entry: wp.array[int],
     # Adjoint in:
     offset_bar: wp.array[wp.vec3],
     stretch_bar: wp.array[wp.vec3],
@@ -185,8 +185,8 @@ def gather_nodes(
     """Add what a node's springs say (one thread per object node, then per control node)."""
     node = wp.tid()
     # The first node of a spring enters offset and stretch with a minus sign.
-    place_bar = -spring_sum(node, half_edge_start, half_edge, offset_bar)
-    speed_bar = -spring_sum(node, half_edge_start, half_edge, stretch_bar)
+    place_bar = -spring_sum(node, entry_start, entry, offset_bar)
+    speed_bar = -spring_sum(node, entry_start, entry, stretch_bar)
     node_count = position_bar_out.shape[0]
     if node < node_count:
         position_bar_out[node] += place_bar

@@ -11,19 +11,34 @@ wp.set_module_options({"enable_backward": False})
 @wp.func
 def spring_sum(
     node: int,
-    half_edge_start: wp.array[int],
-    half_edge: wp.array[int],
+    entry_start: wp.array[int],
+    entry: wp.array[int],
     value: wp.array[wp.vec3],
 ):
-    """Sum what the springs of a node say, with the sign of the end that it is at."""
+    """Sum a node's entries: value `s`, or minus value `s` where the entry is `-s - 1`."""
     total = wp.vec3(0.0, 0.0, 0.0)
-    for entry in range(half_edge_start[node], half_edge_start[node + 1]):
-        spring = half_edge[entry]
-        if spring >= 0:
-            total += value[spring]
+    for place in range(entry_start[node], entry_start[node + 1]):
+        index = entry[place]
+        if index >= 0:
+            total += value[index]
         else:
-            total -= value[-spring - 1]
+            total -= value[-index - 1]
     return total
+
+
+@wp.kernel
+def sum_rows(
+    # Model:
+    row_start: wp.array[int],
+    half_edge: wp.array[int],
+    # State in:
+    value: wp.array[wp.vec3],
+    # State out:
+    sum_out: wp.array[wp.vec3],
+):
+    """Sum a few springs of one node (one thread per row of half-edges)."""
+    row = wp.tid()
+    sum_out[row] = spring_sum(row, row_start, half_edge, value)
 
 
 @wp.kernel
@@ -31,8 +46,8 @@ def integrate_nodes(
     substep: int,
     # Model:
     world: wp.array[World],
-    half_edge_start: wp.array[int],
-    half_edge: wp.array[int],
+    entry_start: wp.array[int],
+    entry: wp.array[int],
     # State in:
     position: wp.array[wp.vec3],
     velocity: wp.array[wp.vec3],
@@ -49,7 +64,7 @@ def integrate_nodes(
     velocity before contact, which the adjoint needs; it may be empty.
     """
     node = wp.tid()
-    force = spring_sum(node, half_edge_start, half_edge, pull)
+    force = spring_sum(node, entry_start, entry, pull)
     acceleration = force - wp.vec3(0.0, 0.0, world[0].gravity)
     kick = world[0].dt * acceleration
     # One rounding only: next to 1, a decay factor in float32 changes the drag by 0.04 %.

@@ -15,6 +15,7 @@ from physhandi.simulation.topology import (
     half_edges,
     object_springs,
     retopologize,
+    split_rows,
     virtual_springs,
 )
 
@@ -155,6 +156,12 @@ def test_half_edges_list_each_spring_at_both_of_its_nodes():
     assert [sorted(entry[a:b].tolist()) for a, b in pairwise(start)] == [
         [0, 1], [-1, 2], [], [-3, -2]
     ]  # fmt: skip
+
+
+def test_long_sums_are_cut_into_rows_that_cover_every_entry_once():
+    row, first = split_rows(np.array([0, 5, 5, 9, 10], dtype=np.int32), 2)
+    assert row.tolist() == [0, 2, 4, 5, 7, 9, 10]
+    assert first.tolist() == [0, 3, 3, 5, 6]
 
 
 def test_a_rest_shape_of_another_size_is_refused():
