@@ -17,10 +17,11 @@ from physhandi.errors import MissingInputError
 from physhandi.fitting import artefacts
 from physhandi.fitting.hand_reconstruction import reconstruct_hands
 from physhandi.fitting.object_problem import ObjectProblem, build_problem
-from physhandi.fitting.object_reconstruction import optimise_springs, search_object
+from physhandi.fitting.object_reconstruction import search_object
 from physhandi.fitting.profile import PipelineConfig, config_from_dict
 from physhandi.fitting.rollouts import control_trajectory_of, object_nodes_of, simulate_sequence
 from physhandi.fitting.simulate import simulate_again
+from physhandi.fitting.spring_optimisation import optimise_springs
 from physhandi.metrics.report import score_run
 from physhandi.perception.lifting import observe_object
 from physhandi.progress import Progress
@@ -96,9 +97,8 @@ def simulate(
     attempt.save_json("metrics.json", {sequence.name: score_run(attempt.out, sequence)})
 
 
-def evaluate(run: Run) -> dict[str, Any]:
+def evaluate(run: Run, sequences: Many[Sequence]) -> dict[str, Any]:
     """Measure a finished run against its sequences again."""
-    sequences = [Sequence.load(Path(path)) for path in run.sequences]
     return {sequence.name: score_run(run.out, sequence) for sequence in sequences}
 
 

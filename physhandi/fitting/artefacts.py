@@ -19,6 +19,9 @@ from physhandi.hand.model import load_hand_model
 from physhandi.hand.motion import HandMotion
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
 
+STORED_CLOUD = 500
+"""Most points of one frame's cloud that a run keeps; evenly picked."""
+
 
 def sequence_folder(name: str) -> str:
     """Where the artefacts of one sequence lie."""
@@ -52,10 +55,15 @@ def save_observation(output: Attempt, name: str, observation: ObjectObservation)
     if observation.node_of_track is not None:
         output.save_array(f"{folder}/node_of_track.npy", observation.node_of_track.astype(np.int32))
     if observation.cloud:
-        clouds = [np.asarray(cloud, np.float32).reshape(-1, 3) for cloud in observation.cloud]
+        clouds = [_thinned(cloud) for cloud in observation.cloud]
         end = np.cumsum([len(cloud) for cloud in clouds]).astype(np.int64)
         output.save_array(f"{folder}/cloud.npy", np.concatenate(clouds))
         output.save_array(f"{folder}/cloud_end.npy", end)
+
+
+def _thinned(cloud: Float[ndarray, "point 3"]) -> Float[ndarray, "kept 3"]:
+    kept = np.linspace(0, len(cloud) - 1, min(STORED_CLOUD, len(cloud))).round().astype(int)
+    return np.asarray(cloud, np.float32).reshape(-1, 3)[kept]
 
 
 def load_observation(out: Path, name: str) -> ObjectObservation:
@@ -151,4 +159,5 @@ def save_hand_vertices(output: Attempt, name: str) -> None:
         model = load_hand_model(motion.side)
         stem = f"{sequence_folder(name)}/hand_{motion.side}"
         output.save_array(f"{stem}_vertex.npy", motion.vertices(model).astype(np.float32))
+        output.save_array(f"{stem}_face.npy", np.asarray(model.faces, np.int32))
         output.save_array(f"{stem}_keypoint.npy", motion.keypoints(model).astype(np.float32))

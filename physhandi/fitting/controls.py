@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from physhandi.data.sequence import Sequence
@@ -54,7 +54,7 @@ def lay_object(
     Returns:
         The nodes in the other sequence [m].
     """
-    tree = cKDTree(cloud)
+    tree = KDTree(cloud)
     best, best_error = template, np.inf
     for turn in np.arange(8) * np.pi / 4:
         heading = Rotation.from_euler("z", turn).as_matrix()
@@ -66,7 +66,7 @@ def lay_object(
             )
             node = rotation.apply(node - node.mean(axis=0)) + target.mean(axis=0)
         error = float(
-            np.mean(tree.query(node)[0] ** 2) + np.mean(cKDTree(node).query(cloud)[0] ** 2)
+            np.mean(tree.query(node)[0] ** 2) + np.mean(KDTree(node).query(cloud)[0] ** 2)
         )
         if error < best_error:
             best, best_error = node, error

@@ -117,7 +117,7 @@ def _guess_from_one_view(
     template: Float[ndarray, "point 3"],
 ) -> tuple[Rotation, Float[ndarray, " 3"]] | None:
     """Solve perspective-n-point in the view that is surest of the palm."""
-    is_seen: ndarray = np.isfinite(keypoint).all(-1)
+    is_seen = np.asarray(np.isfinite(keypoint).all(-1))
     usable = np.where(is_seen.sum(1) >= _MIN_PALM_POINTS, np.nansum(keypoint[..., 2], 1), 0.0)
     view = int(np.argmax(usable))
     if usable[view] <= 0:

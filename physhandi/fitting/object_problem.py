@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from physhandi.data.observation import ObjectObservation
@@ -33,7 +33,7 @@ class ObjectProblem:
     ground_height: float | None
     """Height of the ground plane, none if the object hangs free [m]."""
     gravity: float
-    """Acceleration along −z [m/s²]."""
+    """Acceleration along -z [m/s²]."""
     initial_velocity: Float[ndarray, "node 3"]
     """Velocity of the object nodes at frame 0 [m/s]."""
     cloud: Float[Tensor, "frame point 3"]
@@ -49,7 +49,7 @@ class ObjectProblem:
     carrier_weight: Float[Tensor, "track carrier"]
     """How much each of them counts; rows sum to one."""
     track_offset: Float[Tensor, "track 3"]
-    """Position of a track less the weighted mean of its carriers, at the first frame it is seen [m]."""
+    """Position of a track less the weighted mean of its carriers, at frame 0 [m]."""
 
     @property
     def frame_count(self) -> int:
@@ -121,7 +121,7 @@ def _carriers(
         weight = np.ones((len(kept), 1), np.float32)
         return kept, carrier, weight, np.zeros((len(kept), 3), np.float32)
     count = min(CARRIERS, len(object_node))
-    distance, carrier = cKDTree(object_node).query(start, k=count)
+    distance, carrier = KDTree(object_node).query(start, k=count)
     distance, carrier = np.reshape(distance, (-1, count)), np.reshape(carrier, (-1, count))
     weight = 1.0 / (distance + 1e-4)
     weight = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
@@ -153,7 +153,7 @@ def build_problem(
         frame_count: Frames to fit, counted from 0; later ones are never looked at.
         frame_rate: Frames a second [Hz].
         ground_height: Height of the ground, or none [m].
-        gravity: Acceleration along −z [m/s²].
+        gravity: Acceleration along -z [m/s²].
         cloud_points: Most points of a frame that enter the Chamfer term.
 
     Returns:
@@ -196,8 +196,8 @@ def initial_velocity(
     """Estimate how fast the object moves at frame 0 [m/s].
 
     Identified points' velocity between the first two frames is spread over all nodes; without
-    identified points the object is taken to be at rest. Only frames 0 and 1 are read, so a prediction
-    that starts at frame 0 knows its initial state and nothing of what follows.
+    identified points the object is taken to be at rest. Only frames 0 and 1 are read, so a
+    prediction that starts at frame 0 knows its initial state and nothing of what follows.
     """
     seen = observation.is_visible[:2].all(axis=0)
     if observation.node_of_track is None or not seen.any():
@@ -205,7 +205,7 @@ def initial_velocity(
     moved = (observation.point[1] - observation.point[0])[seen] * frame_rate
     count = min(2, int(seen.sum()))
     source = object_node[np.asarray(observation.node_of_track)[seen]]
-    distance, near = cKDTree(source).query(object_node, k=count)
+    distance, near = KDTree(source).query(object_node, k=count)
     distance, near = np.reshape(distance, (-1, count)), np.reshape(near, (-1, count))
     weight = 1.0 / (distance + 1e-6)
     weight /= weight.sum(axis=1, keepdims=True)

@@ -27,9 +27,9 @@ class PipelineConfig:
     node_spacing: float = 0.01
     """Distance between object nodes sampled from what was seen [m]."""
     control_nodes: Literal["all", "visible"] = "all"
-    """Which hand vertices become control nodes: all, or `control_count` that a camera sees at frame 0."""
+    """Which hand vertices become control nodes: all, or a few that a camera sees at frame 0."""
     control_count: int = 30
-    """How many control nodes are kept of the visible ones."""
+    """How many control nodes are kept of the visible ones, far from each other."""
     hand: HandFitConfig = field(default_factory=HandFitConfig)
     """Stage 1."""
     object_: ObjectFitConfig = field(default_factory=ObjectFitConfig)
@@ -104,23 +104,27 @@ def _build(kind: Any, mapping: Any, where: str) -> Any:
 def _convert(hint: Any, value: Any, where: str) -> Any:
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in {types.UnionType, typing.Union}:
-        if value is None and type(None) in arguments:
-            return None
-        return _convert(next(a for a in arguments if a is not type(None)), value, where)
+        inner = next(a for a in arguments if a is not type(None))
+        return None if value is None else _convert(inner, value, where)
     if is_dataclass(hint):
         return _build(hint, value, where)
     if origin is dict:
         return {key: _convert(arguments[1], item, f"{where}.{key}") for key, item in value.items()}
     if origin is tuple:
         return tuple(value)
-    if origin is Literal:
-        if value not in arguments:
-            raise UsageError(
-                f"{where} is {value!r}; expected one of {', '.join(map(repr, arguments))}."
-            )
+    return _convert_plain(hint, value, where)
+
+
+def _convert_plain(hint: Any, value: Any, where: str) -> Any:
+    if typing.get_origin(hint) is Literal:
+        choices = typing.get_args(hint)
+        if value not in choices:
+            shown = ", ".join(map(repr, choices))
+            raise UsageError(f"{where} is {value!r}; expected one of {shown}.")
         return value
-    if hint is float and isinstance(value, int | float) and not isinstance(value, bool):
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if hint is float and is_number:
         return float(value)
-    if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):
+    if not isinstance(value, hint) or (hint is int and not is_number):
         raise UsageError(f"{where} is {value!r}; expected {hint.__name__}.")
     return value

@@ -36,7 +36,8 @@ def control_trajectory_of(
         return np.asarray(sequence.control, np.float32)
     if not motions:
         raise MissingInputError(
-            f"Sequence '{sequence.name}' has neither hands nor control.npy: nothing moves its object."
+            f"Sequence '{sequence.name}' has neither hands nor control.npy: nothing moves its "
+            "object."
         )
     models = tuple(load_hand_model(motion.side) for motion in motions)
     control = control_trajectory(motions, models)
@@ -74,8 +75,8 @@ def object_nodes_of(
         rest = node if sequence.rest_node is None else np.asarray(sequence.rest_node, np.float32)
         if template is not None and len(template[0]) != len(node):
             raise FitError(
-                f"Sequence '{sequence.name}' has {len(node)} object nodes (object_node.npy), but the "
-                f"object has {len(template[0])}: it is not the same object, or refined differently."
+                f"Sequence '{sequence.name}' has {len(node)} object nodes (object_node.npy), but "
+                f"the object has {len(template[0])}: it is another object, or refined differently."
             )
         return node, rest if template is None else template[1]
     if template is None:
@@ -85,8 +86,8 @@ def object_nodes_of(
     cloud = cloud[np.isfinite(cloud).all(axis=1)]
     if len(cloud) < LEAST_CLOUD:
         raise MissingInputError(
-            f"Sequence '{sequence.name}' shows only {len(cloud)} object points in frame 0; at least "
-            f"{LEAST_CLOUD} are needed to find the object there. Check depth and masks of frame 0."
+            f"Sequence '{sequence.name}' shows only {len(cloud)} object points in frame 0; at "
+            f"least {LEAST_CLOUD} are needed to find the object. Check its depth and masks."
         )
     return lay_object(template[0], cloud), template[1]
 

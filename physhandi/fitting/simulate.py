@@ -1,4 +1,4 @@
-"""Simulate a fitted object again: with other parameters, or moved by the hands of another sequence."""
+"""Simulate a fitted object again: with other parameters, or in another sequence."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -11,6 +11,7 @@ from sheet_sequence import FITTED, FRAMES, NODE, write_sheet
 
 from physhandi import pipeline
 from physhandi.data.run import Run, read_events
+from physhandi.data.sequence import Sequence
 from physhandi.errors import CancelledError, MissingInputError, RunError, UsageError
 from physhandi.fitting.artefacts import load_model, load_parameters
 from physhandi.fitting.profile import PipelineConfig, config_to_dict, load_profile
@@ -171,7 +172,8 @@ def test_unknown_parameters_are_named(tmp_path: Path, fitted: Run, recordings: P
 
 
 def test_evaluating_again_gives_the_stored_metrics(fitted: Run) -> None:
-    assert pipeline.evaluate(fitted) == fitted.json("metrics.json")
+    sequences = [Sequence.load(folder) for folder in fitted.sequences]
+    assert pipeline.evaluate(fitted, sequences) == fitted.json("metrics.json")
 
 
 def test_a_sequence_with_nothing_to_fit_says_what_is_missing(

@@ -19,7 +19,7 @@ def test_a_turned_object_is_found_again() -> None:
     )
     template[:, 2] = 0.05 * (template[:, 0] > 0.2)
     turn = Rotation.from_euler("zyx", [2.0, 0.1, -0.05])
-    expected = turn.apply(template) + [0.4, -0.2, 0.1]
+    expected = turn.apply(template) + np.array([0.4, -0.2, 0.1])
     cloud = expected[random.permutation(300)[:200]] + random.normal(0, 1e-4, (200, 3))
     laid = lay_object(template.astype(np.float32), cloud)
     assert np.linalg.norm(laid - expected, axis=1).mean() < 2e-3

@@ -73,7 +73,7 @@ def test_clouds_are_padded_and_thinned() -> None:
 
 
 def test_an_object_that_is_never_seen_is_an_error() -> None:
-    with pytest.raises(FitError, match="made_up.*no frame"):
+    with pytest.raises(FitError, match=r"made_up.*no frame"):
         problem(observe(np.full((4, 2, 3), np.nan)))
 
 

@@ -12,10 +12,10 @@ from physhandi.fitting.object_reconstruction import (
     FirstOrderConfig,
     ObjectFitConfig,
     mean_loss,
-    optimise_springs,
     search_object,
 )
 from physhandi.fitting.search import SearchConfig, SearchVariable
+from physhandi.fitting.spring_optimisation import optimise_springs
 from physhandi.progress import NullProgress, Progress
 from physhandi.simulation.model import SimulationParameters
 from physhandi.simulation.simulator import Simulator
@@ -142,7 +142,7 @@ def test_cancelling_stops_between_iterations() -> None:
         def __init__(self) -> None:
             self.seen: list[int] = []
 
-        def report(self, stage, iteration, total, loss=None, message="") -> None:
+        def report(self, stage: str, iteration: int, *rest: object, **more: object) -> None:
             self.seen.append(iteration)
 
         def check_cancelled(self) -> None:

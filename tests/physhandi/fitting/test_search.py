@@ -55,7 +55,7 @@ def test_divergent_candidates_do_not_stop_the_search() -> None:
 
 def test_nothing_but_divergence_is_an_error() -> None:
     config = SearchConfig(generations=2, variables=VARIABLES)
-    with pytest.raises(FitError, match="diverged.*stiffness"):
+    with pytest.raises(FitError, match=r"diverged.*stiffness"):
         search_parameters(lambda _: math.inf, START, config, NullProgress())
 
 
