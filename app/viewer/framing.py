@@ -92,7 +92,8 @@ def _seen_place(content: Content) -> Float[ndarray, "point 3"]:
     # The point nearest to all optical axes; the small weight decides if they are parallel.
     weak = 1e-3 * np.eye(3)
     target = (across @ eye[..., None]).sum(0)[:, 0] + weak @ (eye + ahead).mean(0)
-    center = np.linalg.inv(across.sum(0) + weak) @ target
+    weights, axes = np.linalg.eigh(across.sum(0) + weak)
+    center = axes @ ((axes.T @ target) / weights)
     half = float(np.linalg.norm(eye - center, axis=1).mean()) / 4
     return np.concatenate([[center - half, center + half], eye])
 

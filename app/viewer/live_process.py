@@ -190,7 +190,8 @@ def main(arguments: list[str]) -> None:
     die_with_parent(parent)
     if device == "auto":
         device = "cuda:0" if wp.get_cuda_device_count() > 0 else "cpu"
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)  # The server is told too, and closes the socket.
     logging.basicConfig(level=logging.INFO, format="live simulation: %(levelname)s %(message)s")
     with socket.socket(fileno=descriptor) as connection:
         LiveSimulator(connection, device).run()

@@ -7,6 +7,12 @@ import viser
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+_GRID = {
+    False: ((214, 219, 226), (182, 190, 201)),
+    True: ((42, 45, 50), (62, 67, 75)),
+}
+"""Colors of the grid's thin and thick lines on a light and on a dark background."""
+
 
 class SceneNodes:
     """The nodes of one scene by their path; a part without content is hidden, not sent."""
@@ -131,11 +137,18 @@ class SceneNodes:
             height=cell * count,
             cell_size=cell / 2,
             section_size=cell,
-            cell_color=(214, 219, 226),
-            section_color=(182, 190, 201),
+            cell_color=_GRID[False][0],
+            section_color=_GRID[False][1],
             cell_thickness=0.6,
             section_thickness=1.0,
             shadow_opacity=0.15,
             fade_distance=2.0 * cell * count,
             position=center,
         )
+
+    def color_ground(self, name: str, *, is_dark: bool) -> None:
+        """Color the grid for a light or a dark background."""
+        node = self._nodes.get(name)
+        cell, section = _GRID[is_dark]
+        if node is not None and tuple(node.cell_color) != cell:
+            node.cell_color, node.section_color = cell, section

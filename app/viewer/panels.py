@@ -105,12 +105,13 @@ class LayersPanel:
             self._scale.on_update(guard.by_user(self._rescale))
             self._place: Any = gui.add_dropdown("View from", (_OVERVIEW,))
             self._place.on_update(guard.by_user(self._look))
-            dark = gui.add_checkbox("Dark", initial_value=False)
-            dark.on_update(guard.by_user(lambda _: set_theme(server, dark=dark.value)))
+            self._dark = gui.add_checkbox("Dark", initial_value=False)
+            self._dark.on_update(guard.by_user(self._dress))
 
     def replace(self, content: Content, layers: Layers, framing: Framing) -> None:
         """Show the switches that a content needs, as its layers stand."""
         self._layers, self._framing = layers, framing
+        layers.dark, layers.force_scale = self._dark.value, self._scale.value
         has_object = content.fitted is not None
         has_control = content.control is not None
         is_there = {
@@ -139,6 +140,11 @@ class LayersPanel:
             self._redraw()
 
         return switch
+
+    def _dress(self, event: Any) -> None:
+        self._layers.dark = event.target.value
+        set_theme(self._server, dark=self._layers.dark)
+        self._redraw()
 
     def _rescale(self, event: Any) -> None:
         self._layers.force_scale = event.target.value

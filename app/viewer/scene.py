@@ -22,8 +22,12 @@ GREY = (120, 130, 145)
 SKIN = {"right": (224, 172, 140), "left": (205, 150, 122)}
 
 PLAYING_SPRINGS = 2_000
-"""Most object springs that are streamed while the clock is running."""
+"""Most springs that are streamed while the clock is running."""
+FRAME_BYTES = 92_000
+"""What a frame may weigh while the clock is running; springs and arrows give way."""
 _ARROWS = 800
+_PLAYING_ARROWS = 400
+_PLAYING_OBSERVED = 2_000
 _QUIET_FORCE = 1e-6
 
 
@@ -53,6 +57,8 @@ class Layers:
     """Grid on the ground, or below everything if the ground is not known."""
     looks_from: str | None = None
     """View whose image is the backdrop."""
+    dark: bool = False
+    """Dark background."""
     force_scale: float = 1.0
     """Length of the force arrows, relative to the automatic one."""
 
@@ -89,7 +95,7 @@ class Scene:
         """
         with self._server.atomic():
             self._draw_hands(frame)
-            self._draw_observed(frame)
+            self._draw_observed(frame, is_playing)
             if take is not None and take.ready > 0:
                 self._draw_object(take, take_frame, is_playing)
             elif self._content.control is not None:
@@ -101,6 +107,7 @@ class Scene:
                 is_playing=is_playing,
             )
             self._nodes.show("/ground", is_visible=self.layers.ground)
+            self._nodes.color_ground("/ground", is_dark=self.layers.dark)
 
     def _aim(self) -> None:
         camera = self._server.initial_camera
@@ -148,15 +155,17 @@ class Scene:
                 f"/hand/skeleton_{index}", bones, SKIN["right"], 4.0, is_visible=is_visible
             )
 
-    def _draw_observed(self, frame: int) -> None:
+    def _draw_observed(self, frame: int, is_playing: bool) -> None:
         observed = self._content.observed
-        if observed is None:
+        if observed is None or not self.layers.observed:
+            self._nodes.show("/observed", is_visible=False)
             return
-        point = observed.points(frame) if self.layers.observed else np.zeros((0, 3), np.float32)
+        point = observed.points(frame)
+        color = observed.colors()
+        every = max(1, -(-len(point) // _PLAYING_OBSERVED)) if is_playing else 1
+        color = color[::every] if color.ndim == 2 else color
         size = 0.4 * self._framing.spacing
-        self._nodes.points(
-            "/observed", point, observed.colors(), size, is_visible=self.layers.observed
-        )
+        self._nodes.points("/observed", point[::every], color, size, is_visible=True)
 
     def _draw_object(self, take: Take, frame: int, is_playing: bool) -> None:
         position = np.asarray(take.position[frame], dtype=np.float32)
@@ -170,23 +179,41 @@ class Scene:
         self._draw_controls(control, self._attached)
         point = np.concatenate([position, control])
         count = take.model.object_spring_count
+        virtual_most, object_most = self._spring_budget(take) if is_playing else (None, None)
         self._nodes.segments(
             "/springs/virtual",
-            _ends(point, take.model.spring_nodes[count:], PLAYING_SPRINGS if is_playing else None),
+            _ends(point, take.model.spring_nodes[count:], virtual_most),
             YELLOW,
             2.0,
             is_visible=self.layers.virtual_springs,
         )
         self._nodes.segments(
             "/springs/object",
-            _ends(point, take.model.spring_nodes[:count], PLAYING_SPRINGS if is_playing else None)
+            _ends(point, take.model.spring_nodes[:count], object_most)
             if self.layers.object_springs
             else np.zeros((0, 2, 3), np.float32),
             GREY,
             1.5,
             is_visible=self.layers.object_springs,
         )
-        self._draw_forces(take, frame, position)
+        self._draw_forces(take, frame, position, _PLAYING_ARROWS if is_playing else _ARROWS)
+
+    def _spring_budget(self, take: Take) -> tuple[int, int]:
+        """Share what is left of a frame's bytes between virtual and object springs."""
+        layers = self.layers
+        point_count = len(self._attached)
+        point_count += take.model.node_count if layers.nodes else 0
+        point_count += take.model.control_count if layers.all_controls else 0
+        point_count += _PLAYING_OBSERVED if layers.observed else 0
+        if layers.hands:
+            point_count += sum(hand.vertex.shape[1] for hand in self._content.hands)
+        arrow_count = _PLAYING_ARROWS if layers.forces else 0
+        left = (FRAME_BYTES - 12 * point_count) // 24 - arrow_count
+        left = min(max(left, PLAYING_SPRINGS // 10), PLAYING_SPRINGS)
+        virtual = min(take.model.virtual_spring_count, left)
+        if layers.object_springs:
+            virtual = min(virtual, left // 2)
+        return max(virtual, 1), max(left - virtual, 1)
 
     def _draw_controls(
         self, control: Float[ndarray, "control 3"], attached: Int[ndarray, " attached"] | None
@@ -202,17 +229,19 @@ class Scene:
             point = np.zeros((0, 3), np.float32) if free is None else free
             self._nodes.points("/controls/free", point, RED, 0.12 * spacing, is_visible=is_shown)
 
-    def _draw_forces(self, take: Take, frame: int, position: Float[ndarray, "node 3"]) -> None:
+    def _draw_forces(
+        self, take: Take, frame: int, position: Float[ndarray, "node 3"], most: int
+    ) -> None:
         arrows = np.zeros((0, 2, 3), np.float32)
         if self.layers.forces:
             force = take.forces(frame)
             strength = np.linalg.norm(force, axis=-1)
             node = np.flatnonzero(strength > _QUIET_FORCE)
-            node = node[np.argsort(-strength[node], kind="stable")[:_ARROWS]]
+            node = node[np.argsort(-strength[node], kind="stable")[:most]]
             offset = force[node] * (self._force_unit * self.layers.force_scale)
             length = np.linalg.norm(offset, axis=-1, keepdims=True)
-            most = 0.22 * self._framing.extent
-            offset *= np.minimum(1.0, most / np.maximum(length, 1e-12))
+            longest = 0.22 * self._framing.extent
+            offset *= np.minimum(1.0, longest / np.maximum(length, 1e-12))
             arrows = np.stack([position[node], position[node] + offset], axis=1)
             arrows = arrows[length[:, 0] > 0.004 * self._framing.extent].astype(np.float32)
         self._nodes.arrows("/forces", arrows, RED, 0.0022 * self._framing.extent)

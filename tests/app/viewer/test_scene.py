@@ -1,0 +1,74 @@
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import viser
+from viewer_client import ViewerClient
+
+from app.viewer.content import Content, HandSurface
+from app.viewer.framing import frame_content
+from app.viewer.scene import PLAYING_SPRINGS, Scene
+from app.viewer.take import Take
+from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.topology import build_model
+
+FRAMES = 8
+PARAMETERS = SimulationParameters(
+    connection_radius=0.2, max_neighbors=20, virtual_connection_radius=0.1, virtual_max_neighbors=4
+)
+
+
+def large_content() -> Content:
+    rng = np.random.default_rng(5)
+    node = rng.uniform(-0.5, 0.5, (3_000, 3)).astype(np.float32)
+    vertex = rng.uniform(-0.5, 0.5, (2, FRAMES, 1_000, 3)).astype(np.float32)
+    control = np.concatenate(list(vertex), axis=1)
+    model = build_model(node, control[0], PARAMETERS)
+    position = node + np.linspace(0, 0.1, FRAMES, dtype=np.float32)[:, None, None]
+    face = rng.integers(0, 1_000, (2_000, 3)).astype(np.int32)
+    fitted = Take(
+        model=model, parameters=PARAMETERS, control=control, position=position, ready=FRAMES
+    )
+    return Content(
+        title="large",
+        sequence_name="large",
+        frame_count=FRAMES,
+        frame_rate=30.0,
+        reconstruction_count=FRAMES,
+        length_unit="m",
+        ground_height=0.0,
+        hands=(
+            HandSurface(side="right", vertex=vertex[0], face=face),
+            HandSurface(side="left", vertex=vertex[1], face=face),
+        ),
+        control=control,
+        fitted=fitted,
+    )
+
+
+@pytest.fixture
+def server() -> Iterator[viser.ViserServer]:
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    yield server
+    server.stop()
+
+
+def test_a_large_scene_is_thinned_while_it_plays_and_whole_when_it_rests(server) -> None:
+    content = large_content()
+    take = content.fitted
+    assert take is not None
+    assert take.model.object_spring_count > 10 * PLAYING_SPRINGS
+    scene = Scene(server, content, frame_content(content))
+    scene.layers.object_springs = True
+    scene.draw(0, take, 0, is_playing=True)
+    with ViewerClient(f"ws://127.0.0.1:{server.get_port()}") as client:
+        client.until(lambda: "/springs/object" in client.nodes)
+        before = client.bytes_received
+        for frame in range(1, FRAMES):
+            drawn = len(client.messages)
+            scene.draw(frame, take, frame, is_playing=True)
+            client.until(lambda drawn=drawn: len(client.messages) > drawn + 5)
+        each = (client.bytes_received - before) / (FRAMES - 1)
+        assert 60_000 < each < 100_000
+        scene.draw(FRAMES - 1, take, FRAMES - 1, is_playing=False)
+        client.until(lambda: client.bytes_received - before > 1_000_000)
