@@ -61,10 +61,9 @@ def lay_object(
         node = (template - template.mean(axis=0)) @ heading.T + cloud.mean(axis=0)
         for _ in range(iterations):
             target = cloud[tree.query(node)[1]]
-            rotation, _ = Rotation.align_vectors(
-                target - target.mean(axis=0), node - node.mean(axis=0)
-            )
-            node = rotation.apply(node - node.mean(axis=0)) + target.mean(axis=0)
+            centred = node - node.mean(axis=0)
+            rotation = Rotation.align_vectors(target - target.mean(axis=0), centred)[0]
+            node = rotation.apply(centred) + target.mean(axis=0)
         error = float(
             np.mean(tree.query(node)[0] ** 2) + np.mean(KDTree(node).query(cloud)[0] ** 2)
         )

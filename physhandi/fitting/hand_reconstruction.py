@@ -274,11 +274,12 @@ class _HandProblem:
     def _motion(self) -> HandMotion:
         with torch.no_grad():
             shape, rotation, translation, scale = self.hand()
+        turn = Rotation.from_matrix(rotation.numpy()).as_rotvec()
         return HandMotion(
             side=self.model.side,
             shape=shape.numpy().astype(np.float32),
             articulation=self.parameters["articulation"].detach().numpy().copy(),
-            wrist_rotation=Rotation.from_matrix(rotation.numpy()).as_rotvec().astype(np.float32),
+            wrist_rotation=_without_jumps(turn).astype(np.float32),
             wrist_translation=translation.detach().numpy().copy(),
             scale=1.0 if self.metric else float(scale),
         )
@@ -294,3 +295,15 @@ def _parameters(guess: WristGuess, frame_count: int) -> dict[str, Tensor]:
         "translation": torch.tensor(guess.translation, dtype=torch.float32),
         "log_scale": torch.tensor(math.log(guess.scale), dtype=torch.float32),
     }
+
+
+def _without_jumps(vector: Float[ndarray, "frame 3"]) -> Float[ndarray, "frame 3"]:
+    """Describe each rotation by whichever of its two vectors is nearer to the frame before."""
+    vector = vector.copy()
+    for frame in range(1, len(vector)):
+        angle = np.linalg.norm(vector[frame])
+        other = vector[frame] * (1 - 2 * np.pi / max(angle, 1e-9))
+        near, far = (np.linalg.norm(v - vector[frame - 1]) for v in (vector[frame], other))
+        if far < near and angle > 1e-3:
+            vector[frame] = other
+    return vector

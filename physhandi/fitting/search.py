@@ -66,7 +66,7 @@ class SearchConfig:
     variables: dict[str, SearchVariable] = field(default_factory=dict)
     """Interval of each searched parameter, by its name in the simulation parameters."""
     tied: dict[str, str] = field(default_factory=dict)
-    """Parameters that always take the value of another one, such as virtual_stiffness: stiffness."""
+    """Parameters that take the value of another one, such as virtual_stiffness: stiffness."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -56,8 +56,8 @@ class _SpringLogs:
             )
             if model.object_spring_count != self.object_count or not same:
                 raise FitError(
-                    f"Sequence '{name}' connects the object's nodes differently from the first one: "
-                    "sequences fitted together must share one object with the same rest nodes."
+                    f"Sequence '{name}' connects the object's nodes differently from the first "
+                    "one: sequences fitted together must share one object and its rest nodes."
                 )
         self.learns_damping = learns_damping
         self.shared = self._parameter(first, slice(None, self.object_count))
