@@ -12,7 +12,10 @@ import yaml
 
 from app.viewer.content import Content
 from app.viewer.guard import Guard, notify
+from app.viewer.scene import GREEN, RED, SKIN
 from app.viewer.take import Take
+from physhandi.data.exporters.mesh import frame_to_ply, ply_bytes
+from physhandi.data.exporters.scene_data import HandSurface, SceneData
 from physhandi.errors import MissingInputError
 
 _GEOMETRY = ("PNG", "PLY")
@@ -80,42 +83,39 @@ def write_png(client: viser.ClientHandle) -> bytes:
 
 
 def write_ply(snapshot: Snapshot) -> bytes:
-    """Write object nodes, control nodes and hand vertices of the frame as colored points."""
-    content, frame = snapshot.content, snapshot.frame
-    parts: list[tuple[Any, tuple[int, int, int]]] = []
-    if snapshot.take is not None:
-        parts.append((snapshot.take.position[snapshot.take_frame], (47, 111, 222)))
-    if content.control is not None:
-        parts.append((content.control[frame], (214, 39, 40)))
-    if not parts and content.hands:
-        parts = [(hand.vertex[frame], (224, 172, 140)) for hand in content.hands]
-    if not parts and content.observed is not None:
-        parts.append((content.observed.points(frame), (46, 160, 67)))
+    """Write the frame: the object with its controls and hands, or else what is there of them."""
+    content, take = snapshot.content, snapshot.take
+    if take is not None:
+        return frame_to_ply(_scene(content, take), snapshot.take_frame)
+    frame = snapshot.frame
+    parts: list[tuple[Any, tuple[int, int, int]]]
+    parts = [(hand.vertex[frame], SKIN[hand.side]) for hand in content.hands]
+    if not parts and content.control is not None:
+        parts.append((content.control[frame], RED))
+    if content.observed is not None:
+        parts.append((content.observed.points(frame), GREEN))
     if not parts:
         raise MissingInputError("This frame shows no geometry to save.")
-    kind = [
-        ("x", "<f4"),
-        ("y", "<f4"),
-        ("z", "<f4"),
-        ("red", "u1"),
-        ("green", "u1"),
-        ("blue", "u1"),
-    ]
-    rows = np.zeros(sum(len(point) for point, _ in parts), dtype=kind)
-    start = 0
-    for point, color in parts:
-        row = rows[start : start + len(point)]
-        for axis, name in enumerate("xyz"):
-            row[name] = np.asarray(point)[:, axis]
-        row["red"], row["green"], row["blue"] = color
-        start += len(point)
-    header = (
-        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n"
-        + "".join(f"property float {name}\n" for name in "xyz")
-        + "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
-        + "end_header\n"
+    color = [np.tile(np.array(color, np.uint8), (len(point), 1)) for point, color in parts]
+    return ply_bytes(
+        np.concatenate([np.asarray(point, np.float32) for point, _ in parts]),
+        np.concatenate(color),
+        np.zeros((0, 3), np.int32),
+        np.zeros((0, 2), np.int32),
     )
-    return header.encode() + rows.tobytes()
+
+
+def _scene(content: Content, take: Take) -> SceneData:
+    return SceneData(
+        sequence=content.sequence_name,
+        frame_rate=content.frame_rate,
+        length_unit=content.length_unit,
+        rollout=take.position,
+        control=take.control,
+        spring_nodes=take.model.spring_nodes,
+        object_spring_count=take.model.object_spring_count,
+        hands={h.side: HandSurface(vertex=h.vertex, face=h.face) for h in content.hands},
+    )
 
 
 def write_npz(snapshot: Snapshot) -> bytes:
