@@ -95,10 +95,24 @@ class EvaluateRun:
 
 
 @dataclass(frozen=True, kw_only=True)
+class EvaluateHands:
+    """Measure only the hands of a run: reprojection error of every view [px]."""
+
+    run: Positional[str]
+    """Folder or id of a finished run."""
+    json: bool = False
+    """Print JSON instead of a table."""
+    data_dir: DataDir = DATA
+
+
+@dataclass(frozen=True, kw_only=True)
 class Evaluate:
     """Measure results."""
 
-    what: Annotated[EvaluateRun, subcommand("run", prefix_name=False)]
+    what: (
+        Annotated[EvaluateRun, subcommand("run", prefix_name=False)]
+        | Annotated[EvaluateHands, subcommand("hands", prefix_name=False)]
+    )
     """What to measure."""
 
 
@@ -154,7 +168,7 @@ class Export:
 
 @dataclass(frozen=True, kw_only=True)
 class BenchmarkRollout:
-    """Time forward simulation and its gradient against a plain baseline in the same run."""
+    """Time forward simulation against a plain baseline in the same run."""
 
     device: str = "auto"
     """Warp device: auto, cpu or cuda:0."""
@@ -169,10 +183,18 @@ class BenchmarkRollout:
 
 
 @dataclass(frozen=True, kw_only=True)
+class BenchmarkGradient(BenchmarkRollout):
+    """Time forward simulation and its gradient against a plain baseline in the same run."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Benchmark:
     """Measure speed."""
 
-    what: Annotated[BenchmarkRollout, subcommand("rollout", prefix_name=False)]
+    what: (
+        Annotated[BenchmarkRollout, subcommand("rollout", prefix_name=False)]
+        | Annotated[BenchmarkGradient, subcommand("gradient", prefix_name=False)]
+    )
     """What to measure."""
 
 
@@ -241,6 +263,8 @@ def _dispatch(command: Any) -> int:
             result = commands.simulate(command, progress)
             print(file=sys.stderr)
             _show(result, as_json=False)
+        case Evaluate(what=EvaluateHands() as what):
+            _show(commands.evaluate_hands(what), as_json=what.json)
         case Evaluate(what=what):
             _show(commands.evaluate_run(what), as_json=what.json)
         case Import(source=source):
@@ -249,7 +273,9 @@ def _dispatch(command: Any) -> int:
         case Export():
             print(commands.export(command))
         case Benchmark(what=what):
-            _show(commands.benchmark_rollout(what), as_json=what.json)
+            with_gradient = isinstance(what, BenchmarkGradient)
+            result = commands.benchmark_rollout(what, with_gradient=with_gradient)
+            _show(result, as_json=what.json)
         case _:
             healthy, lines = commands.doctor(command.data_dir)
             print("\n".join(lines))

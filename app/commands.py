@@ -105,12 +105,13 @@ def simulate(command: Any, progress: Progress) -> dict[str, Any]:
             f"Run '{source.id}' is {source.state}: only a finished run can be simulated."
         )
     changes = {n: v for n in OVERRIDES if (v := getattr(command, n)) is not None}
-    folder = None
     if command.sequence is not None:
-        folder = str(find_sequence(command.sequence, command.data_dir).folder)
-    config = {"source": str(source.folder.resolve()), "sequence": folder, "parameters": changes}
-    sequences = [folder] if folder is not None else list(source.sequences)[:1]
-    run = _run_at(command.out, "simulation", command.out.name, sequences, config)
+        sequence = find_sequence(command.sequence, command.data_dir)
+    else:
+        sequence = Catalog(Settings(data_dir=command.data_dir)).sequences_of(source)[0]
+    config = {"source": str(source.folder.resolve()), "parameters": changes}
+    paths = [str(sequence.folder)]
+    run = _run_at(command.out, "simulation", command.out.name, paths, config)
     return _execute(run, command, progress)
 
 
@@ -152,7 +153,24 @@ def summary(run: Run) -> dict[str, Any]:
 def evaluate_run(command: Any) -> dict[str, Any]:
     """Measure a run again from its stored motion."""
     run = find_run(command.run, command.data_dir)
-    return pipeline.evaluate(run)
+    catalog = Catalog(Settings(data_dir=command.data_dir))
+    return pipeline.evaluate(run, catalog.sequences_of(run))
+
+
+def evaluate_hands(command: Any) -> dict[str, Any]:
+    """Measure only the hands of a run.
+
+    Raises:
+        RunError: If the run has no hands.
+    """
+    hands = {
+        name: scores["hands"]
+        for name, scores in evaluate_run(command).items()
+        if scores.get("hands")
+    }
+    if not hands:
+        raise RunError(f"Run '{command.run}' has no hands to measure.")
+    return hands
 
 
 def import_recording(source: Any, progress: Progress) -> list[Path]:
@@ -180,7 +198,7 @@ def export(command: Any) -> Path:
     )
 
 
-def benchmark_rollout(command: Any) -> dict[str, Any]:
+def benchmark_rollout(command: Any, *, with_gradient: bool) -> dict[str, Any]:
     """Time the simulator against its baseline."""
     from physhandi.benchmarks.rollout import benchmark_rollout as measure
 
@@ -189,6 +207,7 @@ def benchmark_rollout(command: Any) -> dict[str, Any]:
         node_count=command.nodes,
         frame_count=command.frames,
         model_path=command.model,
+        includes_backward=with_gradient,
     )
 
 
