@@ -13,7 +13,6 @@ from physhandi.errors import MissingInputError
 from physhandi.hand.model import Side
 from physhandi.perception.hand_networks import (
     LandmarkNetwork,
-    Landmarks,
     PalmNetwork,
     Region,
     landmark_region,
@@ -56,47 +55,47 @@ class KeypointDetector:
     def detect(
         self,
         image: UInt8[ndarray, "row column 3"],
-        previous: SequenceOf[DetectedHand] = (),
+        known: SequenceOf[DetectedHand] = (),
         max_hands: int = _MAX_HANDS,
     ) -> list[DetectedHand]:
-        """Find the hands of an RGB image.
+        """Search a whole RGB image for hands.
 
         Args:
             image: The image (RGB).
-            previous: Hands of the frame before; they are looked for where they were, and the
-                whole image is searched only when one of `max_hands` is not found again.
-            max_hands: Most hands to return.
+            known: Hands that have been found in it already.
+            max_hands: Most hands to return, the known ones included.
 
         Returns:
-            The hands, the ones found again first.
+            The known hands, then the others.
         """
-        found: list[Landmarks] = []
+        found = list(known)
+        for region in self._find_palms(image):
+            if len(found) >= max_hands:
+                break
+            first = self._find_landmarks(image, region)
+            if first.presence > _PRESENCE:
+                # The palm's region is coarse; the keypoints in it say where the hand really is.
+                self._add(found, image, landmark_region(first.pixel))
+        return found[:max_hands]
+
+    def follow(
+        self, image: UInt8[ndarray, "row column 3"], previous: SequenceOf[DetectedHand]
+    ) -> list[DetectedHand]:
+        """Look for the hands of the frame before where they were; return those that still are."""
+        found: list[DetectedHand] = []
         for hand in previous:
             self._add(found, image, landmark_region(hand.keypoint))
-        if len(found) < max_hands:
-            for region in self._find_palms(image):
-                self._add(found, image, region, refine=True)
-        return [
-            DetectedHand("right" if one.right > 0.5 else "left", one.pixel, one.presence, one.right)
-            for one in found[:max_hands]
-        ]
+        return found
 
     def _add(
-        self,
-        found: list[Landmarks],
-        image: UInt8[ndarray, "row column 3"],
-        region: Region,
-        *,
-        refine: bool = False,
+        self, found: list[DetectedHand], image: UInt8[ndarray, "row column 3"], region: Region
     ) -> None:
         """Keep what a region shows, if it is a hand that is not known yet."""
         hand = self._find_landmarks(image, region)
-        if refine and hand.presence > _PRESENCE:
-            hand = self._find_landmarks(image, landmark_region(hand.pixel))
-        if hand.presence > _PRESENCE and all(
-            overlap(hand.pixel, other.pixel) < _SAME_HAND for other in found
-        ):
-            found.append(hand)
+        is_new = all(overlap(hand.pixel, other.keypoint) < _SAME_HAND for other in found)
+        if hand.presence > _PRESENCE and is_new:
+            side: Side = "right" if hand.right > 0.5 else "left"
+            found.append(DetectedHand(side, hand.pixel, hand.presence, hand.right))
 
 
 def detect_view(
@@ -117,10 +116,15 @@ def detect_view(
     previous: list[DetectedHand] = []
     for frame in range(view.frame_count):
         progress.check_cancelled()
-        previous = detector.detect(view.color(frame), previous, max_hands=len(hands))
-        for index, hand in _assign(previous, hands):
+        image = view.color(frame)
+        found = detector.follow(image, previous)
+        if len(found) < len(hands):
+            found = detector.detect(image, found)
+        assigned = assign_hands(found, hands)
+        for index, hand in assigned.items():
             result[frame, index, :, :2] = hand.keypoint
             result[frame, index, :, 2] = hand.confidence
+        previous = list(assigned.values())
         progress.report(STAGE, frame + 1, view.frame_count, None, f"View {view.name}")
     return result
 
@@ -158,15 +162,26 @@ def detect_sequence(
     )
 
 
-def _assign(
+def assign_hands(
     found: SequenceOf[DetectedHand], hands: tuple[Side, ...]
-) -> list[tuple[int, DetectedHand]]:
-    """Say which of the wanted hands each found one is; one wanted hand takes whatever is found."""
-    if len(hands) == 1:
-        return [(0, hand) for hand in found[:1]]
+) -> dict[int, DetectedHand]:
+    """Say which of the wanted hands each found one is.
+
+    A single wanted hand is the one that looks most like it, whatever the network calls its side;
+    two wanted hands are told apart by which looks more like a right hand.
+
+    Args:
+        found: Hands of one image.
+        hands: Wanted hands.
+
+    Returns:
+        Found hand by position in `hands`.
+    """
     ordered = sorted(found, key=lambda hand: -hand.right)
+    if not ordered:
+        return {}
+    if len(hands) == 1:
+        return {0: ordered[0] if hands[0] == "right" else ordered[-1]}
     if len(ordered) == 1:
-        return [(hands.index(ordered[0].side), ordered[0])]
-    return [
-        (hands.index(side), hand) for side, hand in zip(("right", "left"), ordered, strict=False)
-    ]
+        return {hands.index(ordered[0].side): ordered[0]}
+    return {hands.index("right"): ordered[0], hands.index("left"): ordered[-1]}
