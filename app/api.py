@@ -4,17 +4,20 @@ import asyncio
 import json
 import shutil
 import tempfile
-from collections.abc import AsyncIterator
+import threading
+from collections import deque
+from collections.abc import AsyncIterator, Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol
 
-from fastapi import APIRouter, Header, Request, Response
+from fastapi import APIRouter, Header, Query, Request, Response
 from fastapi.responses import FileResponse, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.background import BackgroundTask
 
-from app.describe import describe_results, describe_run, describe_sequence
 from app.jobs.catalog import Catalog
+from app.jobs.describe import describe_results, describe_run, describe_sequence, loss_curves
+from app.jobs.feed import Feed
 from app.jobs.scheduler import Scheduler
 from physhandi.data.exporters import export_run
 from physhandi.data.run import read_events
@@ -22,7 +25,10 @@ from physhandi.errors import RunError
 from physhandi.fitting.profile import load_profile, profile_names
 
 Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
-_POLL_S = 0.5
+ExportFormat = Literal["ply", "npz", "csv", "yaml"]
+STREAMS_PER_OWNER = 12
+"""Event streams that one browser may hold; a further one ends the oldest."""
+_POLL_S = 0.4
 _PING_S = 15.0
 
 
@@ -57,19 +63,33 @@ class NewSession(BaseModel):
     id: Id
 
 
-def create_api(catalog: Catalog, scheduler: Scheduler, sessions: SessionOpener) -> APIRouter:
+def create_api(
+    catalog: Catalog, scheduler: Scheduler, feed: Feed, sessions: SessionOpener
+) -> APIRouter:
     """Make the routes.
 
     Args:
         catalog: Finds sequences and runs.
         scheduler: Launches and cancels fits.
+        feed: Tells what changed.
         sessions: Opens live scenes.
     """
     router = APIRouter(prefix="/api/v1")
+    _add_listings(router, catalog, scheduler)
+    _add_jobs(router, catalog, scheduler)
+    _add_sessions(router, sessions)
+    _add_streams(router, catalog, feed)
+    return router
 
+
+def _add_listings(router: APIRouter, catalog: Catalog, scheduler: Scheduler) -> None:
     @router.get("/sequences")
     def list_sequences() -> dict[str, Any]:
         return {"sequences": [describe_sequence(item) for item in catalog.sequences()]}
+
+    @router.get("/sequences/{sequence_id}")
+    def show_sequence(sequence_id: Id) -> dict[str, Any]:
+        return describe_sequence(catalog.sequence_item(sequence_id))
 
     @router.get("/runs")
     def list_runs() -> dict[str, Any]:
@@ -78,17 +98,24 @@ def create_api(catalog: Catalog, scheduler: Scheduler, sessions: SessionOpener) 
     @router.get("/runs/{run_id}")
     def show_run(run_id: Id) -> dict[str, Any]:
         item = catalog.run_item(run_id)
-        return describe_run(item, scheduler) | {"results": describe_results(item)}
+        results = describe_results(item.run) if item.run else {}
+        return describe_run(item, scheduler) | {"results": results}
+
+    @router.get("/runs/{run_id}/losses")
+    def show_losses(run_id: Id) -> dict[str, Any]:
+        return {"losses": loss_curves(catalog.run(run_id))}
 
     @router.get("/profiles")
     def list_profiles() -> dict[str, Any]:
+        names = profile_names()
         return {
             "profiles": [
-                {"name": name, "description": load_profile(name).description}
-                for name in profile_names()
+                {"name": name, "description": load_profile(name).description} for name in names
             ]
         }
 
+
+def _add_jobs(router: APIRouter, catalog: Catalog, scheduler: Scheduler) -> None:
     @router.post("/runs", status_code=201)
     def launch(new: NewRun) -> dict[str, Any]:
         run = scheduler.launch(new.sequences, new.profile, new.name)
@@ -112,14 +139,16 @@ def create_api(catalog: Catalog, scheduler: Scheduler, sessions: SessionOpener) 
     @router.get("/runs/{run_id}/export")
     def export(
         run_id: Id,
-        format: Literal["ply", "npz", "csv", "yaml"],
-        sequence: Id | None = None,  # noqa: A002  # the query's name
+        kind: Annotated[ExportFormat, Query(alias="format")],
+        sequence: Annotated[str | None, Query(max_length=200)] = None,
     ) -> FileResponse:
-        return _export(catalog, run_id, format, sequence)
+        return _export(catalog, run_id, kind, sequence)
 
+
+def _add_sessions(router: APIRouter, sessions: SessionOpener) -> None:
     @router.post("/sessions", status_code=201)
-    def open_session(new: NewSession) -> dict[str, str]:
-        session_id = sessions.open(new.kind, new.id, "browser")
+    def open_session(new: NewSession, request: Request) -> dict[str, str]:
+        session_id = sessions.open(new.kind, new.id, request.state.owner)
         return {"id": session_id, "url": f"/live/{session_id}"}
 
     @router.delete("/sessions/{session_id}", status_code=204)
@@ -127,22 +156,103 @@ def create_api(catalog: Catalog, scheduler: Scheduler, sessions: SessionOpener) 
         sessions.close(session_id)
         return Response(status_code=204)
 
+
+def _add_streams(router: APIRouter, catalog: Catalog, feed: Feed) -> None:
+    streams = _Streams(STREAMS_PER_OWNER)
+
     @router.get("/events")
-    async def stream_runs(request: Request) -> StreamingResponse:
-        return _stream(_run_changes(request, catalog, scheduler))
+    async def follow_runs(
+        request: Request,
+        since: Annotated[str | None, Query(max_length=64)] = None,
+        last_event_id: Annotated[str | None, Header(max_length=64)] = None,
+    ) -> StreamingResponse:
+        last = last_event_id or since or await asyncio.to_thread(feed.cursor)
+
+        def news() -> Iterable[tuple[str, str, object]]:
+            nonlocal last
+            for change in feed.since(last):
+                last = change.id
+                yield change.id, change.event, change.data
+
+        return _stream(request, streams, news)
 
     @router.get("/runs/{run_id}/events")
-    async def stream_log(
+    async def follow_run(
         request: Request, run_id: Id, last_event_id: Annotated[str | None, Header()] = None
     ) -> StreamingResponse:
         folder = (await asyncio.to_thread(catalog.run_item, run_id)).folder
-        seen = int(last_event_id) if (last_event_id or "").isdigit() else -1
-        return _stream(_run_events(request, folder, seen))
+        is_number = (last_event_id or "").isdecimal() and len(last_event_id or "") < 18
+        seen, offset = int(last_event_id or 0) if is_number else -1, 0
 
-    return router
+        def news() -> Iterable[tuple[str, str, object]]:
+            nonlocal offset
+            events, offset = read_events(folder, offset)
+            for event in events:
+                if int(event.get("seq", -1)) > seen:
+                    yield str(event["seq"]), "progress", event
+
+        return _stream(request, streams, news)
 
 
-def _export(catalog: Catalog, run_id: str, kind: Any, sequence: str | None) -> FileResponse:
+class _Streams:
+    """Counts the event streams of each browser and ends the oldest of too many."""
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._lock = threading.Lock()
+        self._open: dict[str, deque[threading.Event]] = {}
+
+    def enter(self, owner: str) -> threading.Event:
+        """Register a stream; the returned event is set when it has to end."""
+        ended = threading.Event()
+        with self._lock:
+            streams = self._open.setdefault(owner, deque())
+            streams.append(ended)
+            if len(streams) > self._limit:
+                streams.popleft().set()
+        return ended
+
+    def leave(self, owner: str, ended: threading.Event) -> None:
+        """Forget a stream that is over."""
+        with self._lock:
+            streams = self._open.get(owner, deque())
+            if ended in streams:
+                streams.remove(ended)
+            if not streams:
+                self._open.pop(owner, None)
+
+
+def _stream(
+    request: Request, streams: _Streams, news: Callable[[], Iterable[tuple[str, str, object]]]
+) -> StreamingResponse:
+    """Send server-sent events: what is new, and a comment now and then if nothing is."""
+    owner: str = request.state.owner
+    stopping: threading.Event = request.app.state.stopping
+
+    async def events() -> AsyncIterator[str]:
+        ended, quiet = streams.enter(owner), 0.0
+        try:
+            yield "retry: 2000\n\n"
+            while not (ended.is_set() or stopping.is_set() or await request.is_disconnected()):
+                quiet += _POLL_S
+                for name, event, data in await asyncio.to_thread(lambda: list(news())):
+                    quiet = 0.0
+                    text = json.dumps(data, ensure_ascii=False)
+                    yield f"id: {name}\nevent: {event}\ndata: {text}\n\n"
+                if quiet >= _PING_S:
+                    quiet = 0.0
+                    yield ": ping\n\n"
+                await asyncio.sleep(_POLL_S)
+        finally:
+            streams.leave(owner, ended)
+
+    headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+    return StreamingResponse(events(), media_type="text/event-stream", headers=headers)
+
+
+def _export(
+    catalog: Catalog, run_id: str, kind: ExportFormat, sequence: str | None
+) -> FileResponse:
     run = catalog.run(run_id)
     if not run.is_published:
         raise RunError(f"Run '{run_id}' is {run.state}: there is nothing to export yet.")
@@ -157,45 +267,3 @@ def _export(catalog: Catalog, run_id: str, kind: Any, sequence: str | None) -> F
         raise
     clean_up = BackgroundTask(shutil.rmtree, folder, ignore_errors=True)
     return FileResponse(path, filename=path.name, background=clean_up)
-
-
-def _stream(events: AsyncIterator[str]) -> StreamingResponse:
-    headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
-    return StreamingResponse(events, media_type="text/event-stream", headers=headers)
-
-
-async def _run_changes(
-    request: Request, catalog: Catalog, scheduler: Scheduler
-) -> AsyncIterator[str]:
-    """Send the list of runs whenever it changes; each event is the whole list."""
-    known, quiet = "", 0.0
-    while not await request.is_disconnected():
-        items = await asyncio.to_thread(catalog.runs)
-        runs = await asyncio.to_thread(
-            lambda listed: [describe_run(i, scheduler) for i in listed], items
-        )
-        text = json.dumps(runs, ensure_ascii=False)
-        quiet += _POLL_S
-        if text != known:
-            known, quiet = text, 0.0
-            yield f"event: runs\ndata: {text}\n\n"
-        elif quiet >= _PING_S:
-            quiet = 0.0
-            yield ": ping\n\n"
-        await asyncio.sleep(_POLL_S)
-
-
-async def _run_events(request: Request, folder: Path, seen: int) -> AsyncIterator[str]:
-    """Send a run's progress reports; a reader that comes back names the last one it saw."""
-    offset, quiet = 0, 0.0
-    while not await request.is_disconnected():
-        events, offset = await asyncio.to_thread(read_events, folder, offset)
-        quiet += _POLL_S
-        for event in events:
-            if int(event["seq"]) > seen:
-                quiet = 0.0
-                yield f"id: {event['seq']}\nevent: progress\ndata: {json.dumps(event)}\n\n"
-        if quiet >= _PING_S:
-            quiet = 0.0
-            yield ": ping\n\n"
-        await asyncio.sleep(_POLL_S)

@@ -1,155 +1,265 @@
-"""Who may talk to the server: token, Host and Origin are checked before anything else."""
+"""Who may come in: one ASGI middleware in front of every http request and websocket."""
 
+import base64
+import hashlib
 import hmac
+import http.cookies
+import logging
 import secrets
+import threading
 import time
 from collections import deque
-from collections.abc import Iterable
-from http.cookies import CookieError, SimpleCookie
-from urllib.parse import parse_qsl, urlencode, urlsplit
+from collections.abc import Callable
+from urllib.parse import parse_qsl, urlencode
 
-from starlette.datastructures import Headers
+from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
-LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
-MOST_WRONG_TOKENS = 20
-"""Wrong tokens that are answered in a minute."""
-POLICY = (
-    "default-src 'self'; img-src 'self' data: blob:; style-src 'self'; script-src 'self'; "
-    "connect-src 'self'; frame-src 'self'; frame-ancestors 'self'; base-uri 'none'; form-action 'self'"
+from app.settings import Settings, is_loopback
+
+logger = logging.getLogger(__name__)
+
+_SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
+_WRONG_TOKENS_PER_MINUTE = 20
+_CLIENTS_REMEMBERED = 1000
+
+PAGE_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
+    "connect-src 'self'; font-src 'self'; frame-src 'self'; form-action 'self'; base-uri 'none'; "
+    "frame-ancestors 'self'"
 )
-VIEWER_POLICY = "frame-ancestors 'self'; base-uri 'none'"
-"""viser's page is one file with scripts inside; it runs in a frame of ours and shows no user's HTML."""
-_SIGN_IN = """<!doctype html><meta charset="utf-8"><title>PhysHanDI</title>
-<h1>Open the address that the server printed</h1>
-<p>This page needs the token in that address. It is valid until the server ends; run
-<code>physhandi serve</code> again for a new one.</p>"""
+# viser's page is one file with inline scripts, workers and WebAssembly.
+VIEWER_POLICY = (
+    "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:; "
+    "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; font-src 'self' data:; "
+    "connect-src 'self' data: blob:; worker-src 'self' blob:; object-src 'none'; base-uri 'self'; "
+    "frame-ancestors 'self'"
+)
+_HEADERS = {
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "SAMEORIGIN",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Permissions-Policy": "camera=(), microphone=(), geolocation=()",
+}
+
+_STYLE = (
+    "body{font:16px/1.6 system-ui,sans-serif;max-width:34rem;margin:18vh auto;padding:0 1.5rem;"
+    "color-scheme:light dark;color:CanvasText;background:Canvas}h1{font-size:1.6rem}"
+    "code{padding:.1em .35em;border:1px solid;border-radius:.3em;opacity:.85}"
+)
+_STYLE_HASH = base64.b64encode(hashlib.sha256(_STYLE.encode()).digest()).decode()
+_LOCKED_PAGE = (
+    "<!doctype html><html lang=en><meta charset=utf-8><title>PhysHanDI is locked</title>"
+    f"<style>{_STYLE}</style><h1>This page needs its token</h1>"
+    "<p>Open the full address that <code>physhandi serve</code> printed in the terminal; it ends "
+    "in <code>?token=…</code>. Your browser then remembers it until the server stops.</p>"
+    "<p>Was the server restarted? Then it has a new token: use the new address.</p></html>"
+)
 
 
-def new_token() -> str:
-    """Make the secret that the printed address carries."""
-    return secrets.token_urlsafe(32)
+class Security:
+    """The server's token and what is derived from it."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        *,
+        port: int | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Draw a token, unless one is set.
+
+        Args:
+            settings: Address, allowed hosts and token.
+            port: Port that was taken when the settings leave it open.
+            clock: Tells the time [s].
+        """
+        given = settings.token.get_secret_value() if settings.token else None
+        self.token = given or secrets.token_urlsafe(32)
+        self.is_open = not settings.auth
+        self._clock = clock
+        self.cookie = f"physhandi_{settings.port if port is None else port}"
+        """Name of the cookie; cookies do not know ports, so it tells servers of one host apart."""
+        self._hosts = {"localhost", "127.0.0.1", "[::1]", settings.host, *settings.allowed_hosts}
+        self._any_host = not is_loopback(settings.host) and settings.host in {"0.0.0.0", "::"}  # noqa: S104
+        self._lock = threading.Lock()
+        self._wrong: dict[str, deque[float]] = {}
+
+    def is_token(self, candidate: str) -> bool:
+        """Compare in constant time."""
+        return hmac.compare_digest(candidate.encode(), self.token.encode())
+
+    def new_pass(self) -> str:
+        """Make a cookie value for one browser; it proves the token without containing it."""
+        visitor = secrets.token_hex(8)
+        return f"{visitor}.{self._sign(visitor)}"
+
+    def owner_of(self, cookie: str) -> str | None:
+        """Name the browser that a cookie was made for; None if it is not one of ours."""
+        visitor, _, signature = cookie.partition(".")
+        is_ours = hmac.compare_digest(signature.encode(), self._sign(visitor).encode())
+        return visitor if is_ours else None
+
+    def is_known_host(self, host: str) -> bool:
+        """Check a Host header against the allow-list, against DNS rebinding."""
+        name = host.lower()
+        name = name.partition("]")[0] + "]" if name.startswith("[") else name.partition(":")[0]
+        if self._any_host and _is_address(name):
+            return True
+        return name in self._hosts
+
+    def count_wrong(self, client: str) -> bool:
+        """Note a wrong token; returns whether this client sent too many within a minute."""
+        now = self._clock()
+        with self._lock:
+            while len(self._wrong) >= _CLIENTS_REMEMBERED and client not in self._wrong:
+                del self._wrong[next(iter(self._wrong))]
+            times = self._wrong.setdefault(client, deque(maxlen=_WRONG_TOKENS_PER_MINUTE + 1))
+            times.append(now)
+            return len(times) > _WRONG_TOKENS_PER_MINUTE and now - times[0] < 60.0
+
+    def _sign(self, visitor: str) -> str:
+        return hmac.new(self.token.encode(), visitor.encode(), "sha256").hexdigest()
+
+
+def _is_address(name: str) -> bool:
+    return name.startswith("[") or name.replace(".", "").isdigit()
 
 
 class Gatekeeper:
-    """ASGI middleware for http and websocket; what it refuses never reaches the application.
+    """ASGI middleware: host, token or cookie, origin; then security headers on every answer."""
 
-    The token comes once in the address (``?token=``) and moves into a cookie, or with every request
-    as ``Authorization: Bearer``. A request from another site is refused by its Origin, a rebound
-    name by its Host.
-    """
-
-    def __init__(
-        self, app: ASGIApp, *, token: str, port: int, hosts: Iterable[str] = LOOPBACK
-    ) -> None:
-        """Wrap an application.
-
-        Args:
-            app: What is protected.
-            token: The secret.
-            port: Port of the server; it is part of the allowed hosts and of the cookie's name.
-            hosts: Names by which the server may be addressed.
-        """
+    def __init__(self, app: ASGIApp, security: Security) -> None:
         self._app = app
-        self._token = token
-        self._cookie = f"physhandi_{port}"
-        self._hosts = {f"{host}:{port}" for host in hosts} | (set(hosts) if port == 80 else set())
-        self._wrong: deque[float] = deque()
+        self._security = security
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer or pass on."""
+        """Pass the request on, or refuse it."""
         if scope["type"] not in {"http", "websocket"}:
             await self._app(scope, receive, send)
             return
+        refusal = self._judge(scope)
+        if refusal is not None:
+            await _refuse(refusal, scope, receive, send)
+            return
+        if scope["type"] == "websocket":
+            await self._app(scope, receive, send)
+            return
+        await self._app(scope, receive, _with_headers(scope, send))
+
+    def _judge(self, scope: Scope) -> Response | None:
         headers = Headers(scope=scope)
-        refusal = self._refusal(scope, headers)
-        if refusal is None:
-            await self._app(scope, receive, _with_headers(scope, send))
-        elif scope["type"] == "websocket":
-            # Closing before accepting makes the server answer the handshake with 403.
-            await receive()
-            await send({"type": "websocket.close", "code": 4403})
-        else:
-            await refusal(scope, receive, _with_headers(scope, send))
+        security = self._security
+        if len(headers.getlist("host")) != 1 or not security.is_known_host(headers["host"]):
+            return _error(400, "unknown_host", "This server does not answer to that host name.")
+        offered = _bearer(headers)
+        owner = self._identify(headers, offered)
+        if owner is None:
+            return self._admit(scope, headers, offered)
+        if offered is None and not self._has_own_origin(scope, headers):
+            return _error(403, "foreign_origin", "The request comes from another site.")
+        scope.setdefault("state", {})["owner"] = owner
+        return _without_token(scope)
 
-    def _refusal(self, scope: Scope, headers: Headers) -> Response | None:
-        host = headers.get("host", "")
-        if host not in self._hosts:
-            return _error(400, "wrong_host", f"This server is not called '{host[:80]}'.")
-        method = "WEBSOCKET" if scope["type"] == "websocket" else scope["method"]
-        bearer = headers.get("authorization", "").removeprefix("Bearer ").strip()
-        if not self._is_same_origin(method, headers, host, has_bearer=bool(bearer)):
-            return _error(403, "wrong_origin", "Requests from other sites are refused.")
-        query = dict(parse_qsl(scope.get("query_string", b"").decode("latin-1")))
-        given = bearer or query.get("token") or self._from_cookie(headers)
-        if not self._is_token(given):
-            return self._unauthorized(headers, is_wrong=bool(given))
-        if method == "GET" and "token" in query:
-            return self._move_token_to_cookie(scope, query)
-        return None
+    def _identify(self, headers: Headers, offered: str | None) -> str | None:
+        if self._security.is_open:
+            return "open"
+        if offered is not None:
+            return "bearer" if self._security.is_token(offered) else None
+        return self._security.owner_of(_cookie(headers, self._security.cookie))
 
-    def _is_same_origin(self, method: str, headers: Headers, host: str, *, has_bearer: bool) -> bool:
-        origin = headers.get("origin")
-        if origin is None:
-            return method in SAFE_METHODS or has_bearer
-        if method in SAFE_METHODS:
+    def _admit(self, scope: Scope, headers: Headers, offered: str | None) -> Response:
+        """Let a browser in that brings the token in the address; refuse everybody else."""
+        token = dict(parse_qsl(scope.get("query_string", b"").decode("latin-1"))).get("token")
+        is_visit = scope["type"] == "http" and scope["method"] in {"GET", "HEAD"}
+        if token is not None and is_visit and self._security.is_token(token):
+            response = _without_token(scope) or Response(status_code=500)
+            response.set_cookie(
+                self._security.cookie,
+                self._security.new_pass(),
+                httponly=True,
+                samesite="strict",
+                path="/",
+                secure=scope.get("scheme") == "https",
+            )
+            return response
+        client = (scope.get("client") or ("unknown", 0))[0]
+        is_guess = token is not None or offered is not None
+        if is_guess and self._security.count_wrong(client):
+            limited = _error(429, "too_many_attempts", "Too many wrong tokens. Wait a minute.")
+            limited.headers["Retry-After"] = "60"
+            return limited
+        if is_visit and "text/html" in headers.get("accept", ""):
+            return _locked_page()
+        refused = _error(401, "unauthorized", "A valid token is needed.")
+        refused.headers["WWW-Authenticate"] = 'Bearer realm="physhandi"'
+        return refused
+
+    def _has_own_origin(self, scope: Scope, headers: Headers) -> bool:
+        if scope["type"] == "http" and scope["method"] in _SAFE_METHODS:
             return True
-        parts = urlsplit(origin)
-        return parts.scheme in {"http", "https"} and origin == f"{parts.scheme}://{host}"
-
-    def _from_cookie(self, headers: Headers) -> str:
-        try:
-            morsel = SimpleCookie(headers.get("cookie", "")).get(self._cookie)
-        except CookieError:
-            return ""
-        return morsel.value if morsel else ""
-
-    def _is_token(self, given: str) -> bool:
-        return hmac.compare_digest(given.encode(), self._token.encode())
-
-    def _unauthorized(self, headers: Headers, *, is_wrong: bool) -> Response:
-        now = time.monotonic()
-        while self._wrong and now - self._wrong[0] > 60:
-            self._wrong.popleft()
-        if is_wrong:
-            self._wrong.append(now)
-            if len(self._wrong) > MOST_WRONG_TOKENS:
-                return _error(429, "too_many_tries", "Too many wrong tokens; wait a minute.")
-        if "text/html" in headers.get("accept", ""):
-            return HTMLResponse(_SIGN_IN, status_code=401)
-        return _error(401, "no_token", "This request needs the token of the printed address.")
-
-    def _move_token_to_cookie(self, scope: Scope, query: dict[str, str]) -> Response:
-        """Redirect to the same page without the token, so that it is in no history and no log."""
-        rest = urlencode({key: value for key, value in query.items() if key != "token"})
-        # A path that begins with two slashes would be another host.
-        path = "/" + str(scope["path"]).lstrip("/\\")
-        response = RedirectResponse(path + (f"?{rest}" if rest else ""), status_code=303)
-        response.set_cookie(self._cookie, self._token, httponly=True, samesite="strict", path="/")
-        return response
+        secure = {"http": "https", "websocket": "wss"}[scope["type"]]
+        scheme = "https" if scope.get("scheme") == secure else "http"
+        return headers.getlist("origin") == [f"{scheme}://{headers['host']}"]
 
 
-def _error(status: int, code: str, message: str) -> JSONResponse:
-    return JSONResponse({"error": {"code": code, "message": message}}, status_code=status)
+def _bearer(headers: Headers) -> str | None:
+    kind, _, value = headers.get("authorization", "").partition(" ")
+    return value.strip() if kind.lower() == "bearer" else None
+
+
+def _cookie(headers: Headers, name: str) -> str:
+    jar: http.cookies.SimpleCookie = http.cookies.SimpleCookie()
+    try:
+        jar.load(headers.get("cookie", ""))
+    except http.cookies.CookieError:
+        return ""
+    return jar[name].value if name in jar else ""
+
+
+def _without_token(scope: Scope) -> Response | None:
+    """Send a browser that is in to the same address without the token."""
+    query = parse_qsl(scope.get("query_string", b"").decode("latin-1"), keep_blank_values=True)
+    if scope["type"] != "http" or not any(key == "token" for key, _ in query):
+        return None
+    rest = urlencode([(key, value) for key, value in query if key != "token"])
+    # A path that begins with two slashes or a backslash would lead to another site.
+    path = "/" + scope["path"].replace("\\", "/").lstrip("/")
+    return RedirectResponse(path + (f"?{rest}" if rest else ""), status_code=303)
+
+
+def _error(status: int, kind: str, message: str) -> Response:
+    return JSONResponse({"error": {"code": kind, "message": message}}, status)
+
+
+def _locked_page() -> Response:
+    policy = f"default-src 'none'; style-src 'sha256-{_STYLE_HASH}'; frame-ancestors 'self'"
+    return HTMLResponse(_LOCKED_PAGE, 401, {"Content-Security-Policy": policy})
+
+
+async def _refuse(response: Response, scope: Scope, receive: Receive, send: Send) -> None:
+    logger.info("refused %s with %d", scope["path"], response.status_code)
+    if scope["type"] == "http":
+        await response(scope, receive, _with_headers(scope, send))
+    elif "websocket.http.response" in scope.get("extensions", {}):
+        await response(scope, receive, send)
+    else:
+        await send({"type": "websocket.close", "code": 1008, "reason": "refused"})
 
 
 def _with_headers(scope: Scope, send: Send) -> Send:
-    policy = VIEWER_POLICY if scope["path"].startswith("/viewer/") else POLICY
+    policy = VIEWER_POLICY if scope["path"].startswith("/viewer/") else PAGE_POLICY
 
-    async def wrapped(message: Message) -> None:
+    async def send_with_headers(message: Message) -> None:
         if message["type"] == "http.response.start":
-            headers = list(message.get("headers", []))
-            present = {name.lower() for name, _ in headers}
-            for name, value in (
-                (b"content-security-policy", policy.encode()),
-                (b"x-content-type-options", b"nosniff"),
-                (b"referrer-policy", b"no-referrer"),
-            ):
-                if name not in present:
-                    headers.append((name, value))
-            message["headers"] = headers
+            headers = MutableHeaders(scope=message)
+            for name, value in _HEADERS.items():
+                headers.setdefault(name, value)
+            headers.setdefault("Content-Security-Policy", policy)
+            headers.setdefault("Cache-Control", "no-store")
         await send(message)
 
-    return wrapped
+    return send_with_headers

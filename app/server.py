@@ -2,8 +2,10 @@
 
 import logging
 import socket
-from collections.abc import AsyncIterator, Callable
+import threading
+from collections.abc import AsyncGenerator, Callable
 from contextlib import asynccontextmanager
+from types import FrameType
 from typing import Any
 
 import uvicorn
@@ -14,93 +16,133 @@ from fastapi.staticfiles import StaticFiles
 from starlette.exceptions import HTTPException
 
 from app.api import create_api
-from app.jobs.catalog import Catalog
-from app.jobs.scheduler import Scheduler
-from app.pages import ASSETS, Pages, create_pages
-from app.security import LOOPBACK, Gatekeeper, new_token
-from app.settings import Settings
+from app.jobs.catalog import Catalog, NotFoundError
+from app.jobs.describe import describe_run
+from app.jobs.feed import Feed
+from app.jobs.scheduler import QueueFullError, Scheduler
+from app.pages import Pages, create_pages
+from app.security import Gatekeeper, Security
+from app.settings import WEB_ASSETS, Settings
 from app.viewer.gate import create_gate
 from app.viewer.session import Sessions, TooManySessionsError
 from physhandi import __version__
-from physhandi.errors import PhysHandiError
+from physhandi.errors import (
+    MissingInputError,
+    PhysHandiError,
+    SequenceError,
+    UsageError,
+)
 
 logger = logging.getLogger(__name__)
 
 DEMO_SEQUENCE = "towel_fold"
 _FRAME_LIMIT = 64 * 2**20
+_BODY_LIMIT = 2**20
+_ANY_ADDRESS = {"0.0.0.0", "::"}  # noqa: S104  # compared, not bound
+_STATUS: tuple[tuple[type[PhysHandiError], int, str], ...] = (
+    (NotFoundError, 404, "not_found"),
+    (TooManySessionsError, 429, "too_many_sessions"),
+    (QueueFullError, 429, "queue_full"),
+    (UsageError, 422, "invalid"),
+    (SequenceError, 422, "unusable_sequence"),
+    (MissingInputError, 422, "missing_input"),
+)
 
 
-def create_app(settings: Settings, *, token: str, port: int) -> FastAPI:
+def create_app(
+    settings: Settings,
+    *,
+    security: Security | None = None,
+    catalog: Catalog | None = None,
+    scheduler: Scheduler | None = None,
+    sessions: Sessions | None = None,
+) -> FastAPI:
     """Build the application.
 
     Args:
         settings: What the server was told.
-        token: Secret that every request must bring.
-        port: Port that the server is addressed by.
+        security: Holds the token; none draws one from the settings.
+        catalog: Finds sequences and runs; none looks where the settings say.
+        scheduler: Works through the queue; none makes one for the catalog.
+        sessions: Live scenes; none makes them for the catalog.
     """
-    catalog = Catalog(settings)
-    scheduler = Scheduler(settings, catalog)
-    sessions = Sessions(settings, catalog)
+    security = security or Security(settings)
+    catalog = catalog or Catalog(settings)
+    scheduler = scheduler or Scheduler(settings, catalog)
+    sessions = sessions or Sessions(settings, catalog)
+    feed = Feed(lambda: [describe_run(item, scheduler) for item in catalog.runs()])
     pages = Pages()
 
     @asynccontextmanager
-    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+    async def lifespan(_: FastAPI) -> AsyncGenerator[None]:
         scheduler.start()
         yield
         scheduler.shutdown()
         sessions.shutdown()
 
     app = FastAPI(
-        title="PhysHanDI", version=__version__, lifespan=lifespan, docs_url=None, redoc_url=None
+        title="PhysHanDI",
+        version=__version__,
+        lifespan=lifespan,
+        openapi_url="/api/v1/openapi.json",
+        docs_url=None,
+        redoc_url=None,
+        max_body_size=_BODY_LIMIT,
     )
+    app.state.stopping = threading.Event()
     app.state.scheduler = scheduler
-    app.state.sessions = sessions
-    app.include_router(create_api(catalog, scheduler, sessions))
-    app.include_router(create_pages(catalog, scheduler, pages))
+    app.state.security = security
+    app.include_router(create_api(catalog, scheduler, feed, sessions))
+    app.include_router(create_pages(catalog, scheduler, feed, sessions, pages))
     app.include_router(create_gate(sessions))
-    app.mount("/assets", StaticFiles(directory=ASSETS), name="assets")
+    app.mount("/assets", StaticFiles(directory=WEB_ASSETS), name="assets")
 
     @app.get("/healthz", include_in_schema=False)
     def healthz() -> dict[str, str]:
         return {"status": "ok", "version": __version__}
 
     _answer_errors(app, pages)
-    hosts = LOOPBACK if settings.host in {"0.0.0.0", "::"} else (*LOOPBACK, settings.host)  # noqa: S104  # compared, not bound
-    app.add_middleware(Gatekeeper, token=token, port=port, hosts=hosts)
+    app.add_middleware(Gatekeeper, security=security)
     return app
 
 
 def _answer_errors(app: FastAPI, pages: Pages) -> None:
     """Give every error one shape: JSON below /api, a page elsewhere."""
 
-    def answer(request: Request, status: int, code: str, message: str) -> Response:
-        if request.url.path.startswith("/api/") or "text/html" not in request.headers.get(
-            "accept", ""
-        ):
-            return JSONResponse({"error": {"code": code, "message": message}}, status_code=status)
+    def answer(
+        request: Request, status: int, code: str, message: str, fields: Any = None
+    ) -> Response:
+        wants_page = "text/html" in request.headers.get("accept", "")
+        if request.url.path.startswith("/api/") or not wants_page:
+            error = {"code": code, "message": message} | ({"fields": fields} if fields else {})
+            return JSONResponse({"error": error}, status_code=status)
         return pages.error(status, message)
 
     @app.exception_handler(PhysHandiError)
     def on_known(request: Request, error: PhysHandiError) -> Response:
-        message = str(error)
-        if message.startswith("There is no "):
-            return answer(request, 404, "not_found", message)
-        if isinstance(error, TooManySessionsError):
-            return answer(request, 429, "too_many_sessions", message)
-        return answer(request, 409, type(error).__name__, message)
+        for kind, status, code in _STATUS:
+            if isinstance(error, kind):
+                return answer(request, status, code, str(error))
+        return answer(request, 409, "conflict", str(error))
 
     @app.exception_handler(HTTPException)
     def on_http(request: Request, error: HTTPException) -> Response:
-        message = (
-            "There is nothing at this address." if error.detail == "Not Found" else error.detail
-        )
-        return answer(request, error.status_code, "http", str(message))
+        known = {404: "There is nothing at this address.", 413: "The request is too large."}
+        is_plain = error.detail in {"Not Found", "Content Too Large", "Request Entity Too Large"}
+        message = known.get(error.status_code, error.detail) if is_plain else error.detail
+        code = {404: "not_found", 405: "wrong_method", 413: "too_large"}.get(error.status_code)
+        return answer(request, error.status_code, code or "http", str(message))
 
     @app.exception_handler(RequestValidationError)
     def on_invalid(request: Request, error: RequestValidationError) -> Response:
-        first: dict[str, Any] = dict(error.errors()[0])
-        where = ".".join(str(part) for part in first.get("loc", ()))
-        return answer(request, 422, "invalid", f"{where}: {first.get('msg', 'is not valid')}")
+        if request.url.path.startswith(("/runs/", "/live/")):
+            return answer(request, 404, "not_found", "There is nothing at this address.")
+        fields = [
+            {"field": ".".join(map(str, entry["loc"])), "message": str(entry["msg"])}
+            for entry in error.errors()
+        ]
+        first = f"{fields[0]['field']}: {fields[0]['message']}"
+        return answer(request, 422, "invalid", first, fields)
 
     @app.exception_handler(Exception)
     def on_defect(request: Request, error: Exception) -> Response:
@@ -117,43 +159,58 @@ def serve(settings: Settings, on_ready: Callable[[str], None], *, queue_demo: bo
         queue_demo: Also launch a quick fit of the bundled sequence.
 
     Raises:
+        RunError: If another server works on the data folder.
         OSError: If the port is taken.
     """
-    listener = socket.socket(socket.AF_INET6 if ":" in settings.host else socket.AF_INET)
+    listener = _listen(settings.host, settings.port)
+    try:
+        port = int(listener.getsockname()[1])
+        security = Security(settings, port=port)
+        app = create_app(settings, security=security)
+        scheduler: Scheduler = app.state.scheduler
+        scheduler.start()
+        if queue_demo:
+            scheduler.launch([DEMO_SEQUENCE], "quick", "Quick fit, running now")
+        config = uvicorn.Config(
+            app,
+            log_level="warning",
+            access_log=False,
+            server_header=False,
+            ws_per_message_deflate=False,
+            ws_max_size=_FRAME_LIMIT,
+            timeout_graceful_shutdown=3,
+        )
+        shown = "127.0.0.1" if settings.host in _ANY_ADDRESS else settings.host
+        shown = f"[{shown}]" if ":" in shown else shown
+        query = "" if security.is_open else f"?token={security.token}"
+        url = f"http://{shown}:{port}/{query}"
+        _Server(config, app.state.stopping, lambda: on_ready(url)).run(sockets=[listener])
+    finally:
+        listener.close()
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    listener = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        listener.bind((settings.host, settings.port))
+        listener.bind((host, port))
     except OSError as error:
         listener.close()
         raise OSError(
-            f"Port {settings.port} of {settings.host} cannot be used ({error.strerror}). "
+            f"Port {port} of {host} cannot be used ({error.strerror}). "
             "Choose another one with --port."
         ) from error
-    settings.sequence_dir.mkdir(parents=True, exist_ok=True)
-    settings.run_dir.mkdir(parents=True, exist_ok=True)
-    port = int(listener.getsockname()[1])
-    token = new_token()
-    app = create_app(settings, token=token, port=port)
-    shown = "127.0.0.1" if settings.host in {"0.0.0.0", "::"} else settings.host  # noqa: S104  # compared, not bound
-    config = uvicorn.Config(
-        app,
-        log_level="warning",
-        access_log=False,
-        ws_per_message_deflate=False,
-        ws_max_size=_FRAME_LIMIT,
-        timeout_graceful_shutdown=3,
-    )
-    server = _Announcing(config, lambda: on_ready(f"http://{shown}:{port}/?token={token}"))
-    if queue_demo:
-        app.state.scheduler.launch([DEMO_SEQUENCE], "quick", "Quick fit, running now")
-    server.run(sockets=[listener])
+    return listener
 
 
-class _Announcing(uvicorn.Server):
-    """Calls back when the first request can be answered."""
+class _Server(uvicorn.Server):
+    """Tells when the first request can be answered, and ends event streams when it stops."""
 
-    def __init__(self, config: uvicorn.Config, announce: Callable[[], None]) -> None:
+    def __init__(
+        self, config: uvicorn.Config, stopping: threading.Event, announce: Callable[[], None]
+    ) -> None:
         super().__init__(config)
+        self._stopping = stopping
         self._announce = announce
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
@@ -161,3 +218,8 @@ class _Announcing(uvicorn.Server):
         await super().startup(sockets)
         if self.started:
             self._announce()
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """End the streams, which would keep the server waiting, and stop."""
+        self._stopping.set()
+        super().handle_exit(sig, frame)

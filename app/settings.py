@@ -1,39 +1,85 @@
-"""Settings of the server: from the command line, or from PHYSHANDI_* variables."""
+"""Settings of the server, from arguments or ``PHYSHANDI_*`` environment variables."""
 
+import ipaddress
 from pathlib import Path
+from typing import Annotated
 
-from pydantic import Field
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic import Field, SecretStr, field_validator, model_validator
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
+
+PACKAGE_ROOT = Path(__file__).resolve().parent.parent
+"""Folder of the packages and, in a checkout and in a wheel alike, of the data beside them."""
+BUNDLED = PACKAGE_ROOT / "sequences"
+WEB_ASSETS = PACKAGE_ROOT / "web_assets"
+
+
+def is_loopback(host: str) -> bool:
+    """Tell whether an address can only be reached from this machine."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return False
 
 
 class Settings(BaseSettings):
-    """What one server is told before it starts."""
+    """What a server may be told; everything has a default that is safe on one machine."""
 
-    model_config = SettingsConfigDict(env_prefix="PHYSHANDI_", frozen=True, extra="forbid")
+    model_config = SettingsConfigDict(env_prefix="PHYSHANDI_", extra="forbid", frozen=True)
 
     data_dir: Path = Path("data")
-    """Folder with `sequences/` and `runs/`."""
+    """Folder with ``sequences/`` and ``runs/``; made when missing."""
     host: str = "127.0.0.1"
     """Address to listen on."""
     port: int = Field(default=8080, ge=0, le=65535)
     """Port to listen on; 0 takes a free one."""
     device: str = "cpu"
     """Warp device of fits and of the live simulation."""
+    auth: bool = True
+    """Whether the token is asked for; only a loopback server may go without."""
+    token: SecretStr | None = Field(default=None, min_length=16)
+    """Token to use instead of a new random one at each start."""
+    allowed_hosts: Annotated[tuple[str, ...], NoDecode] = ()
+    """Further host names that browsers may use, as behind a reverse proxy (comma separated)."""
+    parallel_fits: int = Field(default=1, ge=1, le=64)
+    """Fits that run side by side; others wait."""
+    waiting_fits: int = Field(default=100, ge=1, le=10_000)
+    """Fits that may wait in line."""
+    cancel_grace_s: float = Field(default=8.0, gt=0, le=600)
+    """How long a cancelled fit may take to stop by itself before it is ended [s]."""
     live_sessions: int = Field(default=10, ge=1, le=100)
     """Most live scenes at a time."""
     live_idle_s: float = Field(default=900.0, gt=0)
     """Seconds after which a live scene that nobody looks at is closed."""
-    parallel_fits: int = Field(default=1, ge=1, le=64)
-    """Fits that run side by side; others wait."""
-    cancel_grace_s: float = Field(default=10.0, gt=0)
-    """Seconds that a cancelled fit has to stop by itself before it is killed."""
 
-    @property
-    def sequence_dir(self) -> Path:
-        """Where imported sequences lie."""
-        return self.data_dir / "sequences"
+    @field_validator("data_dir")
+    @classmethod
+    def _absolute(cls, value: Path) -> Path:
+        return value.expanduser().resolve()
+
+    @field_validator("allowed_hosts", mode="before")
+    @classmethod
+    def _split(cls, value: object) -> object:
+        if isinstance(value, str):
+            return tuple(part.strip().lower() for part in value.split(",") if part.strip())
+        return value
+
+    @model_validator(mode="after")
+    def _protect(self) -> "Settings":
+        if not self.auth and not is_loopback(self.host):
+            raise ValueError(
+                f"auth cannot be switched off on {self.host}, which other machines can reach. "
+                "Listen on 127.0.0.1 or keep the token."
+            )
+        return self
 
     @property
     def run_dir(self) -> Path:
         """Where runs are written."""
         return self.data_dir / "runs"
+
+    @property
+    def sequence_dir(self) -> Path:
+        """Where imported sequences are."""
+        return self.data_dir / "sequences"

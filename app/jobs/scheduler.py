@@ -1,21 +1,26 @@
 """The queue of fits: one thread starts them, watches them and ends cancelled ones."""
 
+import fcntl
 import json
 import logging
+import os
 import subprocess
 import threading
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from app.jobs.catalog import Catalog, RunItem
-from app.jobs.local import WORKER, end_processes, processes_of, start_worker
+from app.jobs.local import WORKER, start_supervisor
+from app.jobs.processes import end_processes, marked_processes, processes_of, supervisor_of
+from app.jobs.supervise import note_end
 from app.settings import Settings
 from physhandi.data.atomic import write_json
 from physhandi.data.lease import live_holder
 from physhandi.data.run import Run, new_run_id
+from physhandi.data.run_files import EXIT
 from physhandi.errors import PhysHandiError, RunError, UsageError
 from physhandi.fitting.profile import config_to_dict, load_profile
 
@@ -23,7 +28,16 @@ logger = logging.getLogger(__name__)
 
 QUEUED = "queued.json"
 """File in a run's folder that puts it into the queue; the queue survives a restart."""
-_INTERVAL_S = 0.3
+AT_WORK = frozenset({"starting", "running", "stopping"})
+ENDED = frozenset({"succeeded", "failed", "cancelled"})
+_LOCK = ".server.lock"
+_INTERVAL_S = 0.25
+_SWEEP_INTERVAL_S = 5.0
+_START_TIMEOUT_S = 20.0
+
+
+class QueueFullError(PhysHandiError):
+    """No further fit can be put in line."""
 
 
 @dataclass(frozen=True)
@@ -32,12 +46,14 @@ class JobView:
 
     state: str
     """queued, starting, running, stopping, succeeded, failed or cancelled."""
-    place: int | None
+    place: int | None = None
     """Place in the queue, counted from 1."""
-    reason: str
+    reason: str = ""
     """Why it waits or how it ended."""
-    progress: Mapping[str, Any]
+    progress: Mapping[str, Any] = field(default_factory=dict[str, Any])
     """The latest report of the worker."""
+    is_published: bool = False
+    """Whether there are results to look at."""
 
 
 class Scheduler:
@@ -55,20 +71,36 @@ class Scheduler:
         self._catalog = catalog
         self._worker = worker
         self._lock = threading.RLock()
-        self._children: dict[str, subprocess.Popen[bytes]] = {}
+        self._started: dict[str, tuple[subprocess.Popen[bytes], float]] = {}
         self._stopping: dict[str, threading.Thread] = {}
+        self._ended: dict[str, tuple[int, JobView]] = {}
+        self._line: tuple[str, ...] = ()
+        self._busy: tuple[str, ...] = ()
+        self._claim: int | None = None
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="scheduler", daemon=True)
 
     def start(self) -> None:
-        """Begin to work through the queue."""
-        self._thread.start()
+        """Begin to work through the queue; a second call changes nothing.
+
+        Raises:
+            RunError: If another server works on the same data folder.
+        """
+        if self._claim is None:
+            self._claim = _claim_folder(self._settings.data_dir)
+            self._settings.run_dir.mkdir(exist_ok=True)
+            self._settings.sequence_dir.mkdir(exist_ok=True)
+            self._step()
+            self._thread.start()
 
     def shutdown(self) -> None:
         """Stop watching; running fits go on and are found again by the next server."""
         self._closed.set()
         if self._thread.is_alive():
             self._thread.join(timeout=5)
+        if self._claim is not None:
+            os.close(self._claim)
+            self._claim = None
 
     def launch(self, sequence_ids: list[str], profile: str, name: str = "") -> Run:
         """Make a run of one or several sequences and queue it.
@@ -76,35 +108,39 @@ class Scheduler:
         Raises:
             UsageError: If there is no sequence or no such profile.
             SequenceError: If a sequence is unknown or damaged.
+            QueueFullError: If too many runs wait already.
         """
         if not sequence_ids:
             raise UsageError("Name at least one sequence to fit.")
         config = {"profile": config_to_dict(load_profile(profile))}
         sequences = [self._catalog.sequence(sequence_id) for sequence_id in sequence_ids]
-        run = Run.create(
-            self._settings.run_dir / new_run_id(),
-            name=name.strip() or f"{sequences[0].name} · {profile}",
-            kind="reconstruction",
-            sequences=[str(sequence.folder) for sequence in sequences],
-            config=config,
-        )
-        self._enqueue(run)
+        with self._lock:
+            if len(self._queue()) >= self._settings.waiting_fits:
+                raise QueueFullError(
+                    f"{self._settings.waiting_fits} fits wait already. Cancel some of them first."
+                )
+            run = Run.create(
+                self._settings.run_dir / new_run_id(),
+                name=name.strip() or f"{sequences[0].name} · {profile}",
+                kind="reconstruction",
+                sequences=[str(sequence.folder) for sequence in sequences],
+                config=config,
+            )
+            self._enqueue(run)
         return run
 
     def resume(self, run_id: str) -> None:
-        """Queue a failed or cancelled run again; it goes on after its last finished stage.
+        """Queue a run that did not succeed again; it goes on after its last finished stage.
 
         Raises:
             RunError: If the run is unknown, bundled, finished or at work.
         """
         with self._lock:
-            item = self._own(run_id)
-            state = self.view(item).state
-            if state not in {"failed", "cancelled"}:
+            run, view = self._own(run_id)
+            if view.state not in {"failed", "cancelled"}:
                 raise RunError(
-                    f"Run '{run_id}' is {state}; only a failed or cancelled run is resumed."
+                    f"Run '{run_id}' is {view.state}; only a failed or cancelled run is resumed."
                 )
-            run = Run.open(item.folder)
             run.clear_cancel()
             self._enqueue(run)
 
@@ -115,14 +151,16 @@ class Scheduler:
             RunError: If the run is unknown or not at work.
         """
         with self._lock:
-            item = self._own(run_id)
-            state = self.view(item).state
-            if state not in {"queued", "starting", "running", "stopping"}:
-                raise RunError(f"Run '{run_id}' is {state}; there is nothing to cancel.")
-            Run.open(item.folder).request_cancel()
-            (item.folder / QUEUED).unlink(missing_ok=True)
-            if state in {"starting", "running"} and run_id not in self._stopping:
-                thread = threading.Thread(target=self._end, args=(run_id,), daemon=True)
+            run, view = self._own(run_id)
+            if view.state == "queued":
+                run.request_cancel()
+                (run.folder / QUEUED).unlink(missing_ok=True)
+                note_end(run.folder, "Cancelled.")
+            elif view.state not in AT_WORK:
+                raise RunError(f"Run '{run_id}' is {view.state}; there is nothing to cancel.")
+            elif run_id not in self._stopping:
+                run.request_cancel()
+                thread = threading.Thread(target=self._end, args=(run_id, run.folder), daemon=True)
                 self._stopping[run_id] = thread
                 thread.start()
 
@@ -133,90 +171,166 @@ class Scheduler:
             RunError: If the run is unknown, bundled or at work.
         """
         with self._lock:
-            item = self._own(run_id)
-            if self.view(item).state in {"queued", "starting", "running", "stopping"}:
-                raise RunError(f"Run '{run_id}' is at work. Cancel it before you delete it.")
-            Run.open(item.folder).delete()
+            run, view = self._own(run_id)
+            if view.state not in ENDED:
+                raise RunError(
+                    f"Run '{run_id}' is {view.state}. Cancel it and wait until it has stopped "
+                    "before you delete it."
+                )
+            run.delete()
 
     def view(self, item: RunItem) -> JobView:
         """Tell how far a run is and why it waits."""
         if item.run is None:
-            return JobView("failed", None, str(item.error), {})
-        run = item.run
-        if item.id in self._stopping and self._is_at_work(item):
-            return JobView("stopping", None, "Ending its process.", run.progress)
-        if live_holder(item.folder) is not None:
-            return JobView("running", None, "", run.progress)
-        if item.id in self._children and self._children[item.id].poll() is None:
-            return JobView("starting", None, "Loading the program.", {})
-        if (item.folder / QUEUED).is_file():
-            place = [other.id for other in self._queue()].index(item.id) + 1 if item.run else None
-            slots = self._settings.parallel_fits
-            reason = f"{slots} fit(s) may run at a time; {place} in line." if place else ""
-            return JobView("queued", place, reason, {})
-        state = run.state
-        reason = str(run.error) if state == "failed" else ""
-        return JobView(state, None, reason, run.progress)
+            return JobView("failed", reason=str(item.error))
+        try:
+            stamp = item.folder.stat().st_mtime_ns
+            known = self._ended.get(item.id)
+            if known is not None and known[0] == stamp:
+                return known[1]
+            view = self._look(item.run)
+        except (PhysHandiError, OSError) as error:
+            return JobView("failed", reason=str(error))
+        # Every change of state makes or removes a file of the folder, which changes its time.
+        if view.state in ENDED and time.time_ns() - stamp > 2e9:
+            self._ended[item.id] = (stamp, view)
+        return view
 
-    def _own(self, run_id: str) -> RunItem:
+    def _look(self, run: Run) -> JobView:
+        is_supervised = supervisor_of(run.folder) is not None
+        is_running = live_holder(run.folder) is not None
+        if run.id in self._stopping and (is_supervised or is_running):
+            return JobView("stopping", reason="Ending its processes.", progress=run.progress)
+        if is_running:
+            return JobView("running", progress=run.progress)
+        if (run.folder / QUEUED).is_file():
+            return self._look_in_line(run)
+        started = self._started.get(run.id)
+        is_starting = is_supervised or (started is not None and started[0].poll() is None)
+        if is_starting and not (run.folder / EXIT).is_file():
+            return JobView("starting", reason="Loading the program.")
+        state = run.state
+        if state == "queued":
+            return JobView("failed", reason="It was never started. Resume starts it.")
+        return JobView(
+            state, reason=run.error or "", progress=run.progress, is_published=run.is_published
+        )
+
+    def _look_in_line(self, run: Run) -> JobView:
+        line, busy = self._line, self._busy
+        if run.id not in line:
+            return JobView("queued", reason="It was just put in line.")
+        place = line.index(run.id) + 1
+        slots = self._settings.parallel_fits
+        at_a_time = "one fit runs" if slots == 1 else f"{slots} fits run"
+        if len(busy) < slots and place == 1:
+            return JobView("queued", place, "It starts next.")
+        return JobView("queued", place, f"Waits for a free place: {at_a_time} at a time.")
+
+    def _own(self, run_id: str) -> tuple[Run, JobView]:
         item = self._catalog.run_item(run_id)
         if item.is_bundled:
             raise RunError(f"Run '{run_id}' came with the program and stays as it is.")
-        return item
+        return self._catalog.run(run_id), self.view(item)
 
     def _enqueue(self, run: Run) -> None:
         write_json(run.folder / QUEUED, {"time": time.time()})
+        self._line = (*self._line, run.id)
 
     def _queue(self) -> list[RunItem]:
         waiting: list[tuple[float, str, RunItem]] = []
         for item in self._catalog.runs():
             path = item.folder / QUEUED
-            if item.run is None or item.is_bundled or not path.is_file():
-                continue
-            waiting.append((_queued_at(path), item.id, item))
+            if item.run is not None and not item.is_bundled and path.is_file():
+                waiting.append((_queued_at(path), item.id, item))
         return [item for _, _, item in sorted(waiting, key=lambda entry: entry[:2])]
 
-    def _is_at_work(self, item: RunItem) -> bool:
-        child = self._children.get(item.id)
-        is_alive = child is not None and child.poll() is None
-        return is_alive or live_holder(item.folder) is not None
-
     def _watch(self) -> None:
+        swept = time.monotonic()
         while not self._closed.wait(_INTERVAL_S):
             try:
                 self._step()
-            except (PhysHandiError, OSError):
+                if time.monotonic() - swept > _SWEEP_INTERVAL_S:
+                    swept = time.monotonic()
+                    self._sweep()
+            except Exception:
                 logger.exception("the queue could not go on; it tries again")
 
     def _step(self) -> None:
+        """Forget processes that ended and start as many runs as have room."""
         with self._lock:
-            for run_id, child in list(self._children.items()):
-                if child.poll() is not None:
-                    del self._children[run_id]
+            for run_id, (process, since) in list(self._started.items()):
+                folder = self._settings.run_dir / run_id
+                has_taken_over = supervisor_of(folder) is not None
+                is_late = time.monotonic() - since > _START_TIMEOUT_S
+                if process.poll() is not None or (has_taken_over and is_late):
+                    del self._started[run_id]
             queue = self._queue()
-            if not queue:
-                return
-            busy = sum(1 for item in self._catalog.runs() if self._is_at_work(item))
-            for item in queue[: max(0, self._settings.parallel_fits - busy)]:
-                self._children[item.id] = start_worker(
-                    item.folder, self._settings.device, module=self._worker
-                )
-                (item.folder / QUEUED).unlink(missing_ok=True)
+            views = {item.id: self.view(item) for item in self._catalog.runs()}
+            self._busy = tuple(run_id for run_id, view in views.items() if view.state in AT_WORK)
+            free = max(0, self._settings.parallel_fits - len(self._busy))
+            for item in [item for item in queue if item.id not in self._busy][:free]:
+                self._start(item)
+            self._line = tuple(item.id for item in queue if item.id not in self._started)
 
-    def _end(self, run_id: str) -> None:
+    def _start(self, item: RunItem) -> None:
+        (item.folder / EXIT).unlink(missing_ok=True)
+        process = start_supervisor(item.folder, self._settings.device, worker=self._worker)
+        self._started[item.id] = (process, time.monotonic())
+        self._busy = (*self._busy, item.id)
+        (item.folder / QUEUED).unlink(missing_ok=True)
+        self._line = tuple(run_id for run_id in self._line if run_id != item.id)
+        logger.info("run %s started", item.id)
+
+    def _sweep(self) -> None:
+        """End what is left of runs whose supervisor was killed."""
+        for process, cookie in list(marked_processes()):
+            folder = Path(cookie.rpartition(":")[0])
+            is_ours = folder.parent == self._settings.run_dir and folder.name not in self._started
+            if is_ours and supervisor_of(folder) is None:
+                logger.warning("process %d of run %s lost its supervisor", process.pid, folder.name)
+                end_processes(folder, grace_s=0.0)
+
+    def _end(self, run_id: str, folder: Path) -> None:
         """Wait for the worker to stop by itself, then make sure that nothing of it is left."""
-        end = time.monotonic() + self._settings.cancel_grace_s
-        while time.monotonic() < end and any(True for _ in processes_of(run_id)):
-            self._reap(run_id)
-            time.sleep(0.1)
-        end_processes(run_id, grace_s=2.0)
-        self._reap(run_id)
-        self._stopping.pop(run_id, None)
+        try:
+            self._wait_for_end(folder, self._settings.cancel_grace_s)
+            if any(True for _ in processes_of(folder)):
+                end_processes(folder, grace_s=2.0, spare=supervisor_of(folder))
+                self._wait_for_end(folder, 5.0)  # The supervisor notes the end.
+            end_processes(folder, grace_s=0.0)
+            note_end(folder, "Cancelled.")
+        except Exception:
+            logger.exception("run %s could not be ended", run_id)
+        finally:
+            self._stopping.pop(run_id, None)
 
-    def _reap(self, run_id: str) -> None:
-        child = self._children.get(run_id)
-        if child is not None:
-            child.poll()
+    def _wait_for_end(self, folder: Path, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            if supervisor_of(folder) is None and live_holder(folder) is None:
+                return
+            started = self._started.get(folder.name)
+            if started is not None:
+                started[0].poll()
+            time.sleep(0.05)
+
+
+def _claim_folder(data_dir: Path) -> int:
+    data_dir.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(data_dir / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        holder = os.read(descriptor, 32).decode(errors="replace") or "unknown"
+        os.close(descriptor)
+        raise RunError(
+            f"Another server (process {holder}) works on {data_dir}. "
+            "Stop it, or choose another --data-dir."
+        ) from None
+    os.ftruncate(descriptor, 0)
+    os.write(descriptor, str(os.getpid()).encode())
+    return descriptor
 
 
 def _queued_at(path: Path) -> float:

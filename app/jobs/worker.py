@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from types import FrameType
 
+from app.jobs.processes import die_with_parent
 from physhandi.data.run import Run
 from physhandi.errors import CancelledError, PhysHandiError
 
@@ -46,7 +47,10 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="physhandi-worker", description=__doc__)
     parser.add_argument("--run-dir", type=Path, required=True)
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--parent", type=int, help="process id of the supervisor")
     options = parser.parse_args(argv)
+    if options.parent is not None:
+        die_with_parent(options.parent)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
     signal.signal(signal.SIGTERM, _stop)
     sys.exit(work(options.run_dir, options.device))

@@ -1,0 +1,142 @@
+"""The processes of a run: how they are marked, found again and ended for sure."""
+
+import ctypes
+import fcntl
+import os
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+
+COOKIE = "PHYSHANDI_RUN"
+"""Environment variable that marks a run's processes; children inherit it, wherever they move."""
+_LOCK = ".supervisor.lock"
+_PR_SET_PDEATHSIG = 1
+_PR_SET_CHILD_SUBREAPER = 36
+
+
+def cookie_of(run_folder: Path, nonce: str) -> str:
+    """Make the mark of one start of a run."""
+    return f"{run_folder}:{nonce}"
+
+
+def processes_of(run_folder: Path) -> Iterator[psutil.Process]:
+    """Find every live process of a run, also one that lost its parent or moved away."""
+    for process, cookie in marked_processes():
+        if cookie.rpartition(":")[0] == str(run_folder):
+            yield process
+
+
+def marked_processes() -> Iterator[tuple[psutil.Process, str]]:
+    """Find every live process that belongs to some run, with its mark."""
+    for process in psutil.process_iter():
+        try:
+            cookie = process.environ().get(COOKIE)
+            if cookie and process.status() != psutil.STATUS_ZOMBIE:
+                yield process, cookie
+        except (psutil.Error, OSError):
+            continue  # Gone meanwhile, or of another user: then it is none of ours.
+
+
+def end_processes(run_folder: Path, *, grace_s: float, spare: int | None = None) -> int:
+    """End all processes of a run, politely at first.
+
+    Args:
+        run_folder: The run.
+        grace_s: Seconds between the polite signal and the hard one; 0 is hard at once.
+        spare: A process that is left alone.
+
+    Returns:
+        How many had to be killed.
+    """
+    if grace_s > 0:
+        _signal_all(run_folder, signal.SIGTERM, spare)
+    end = time.monotonic() + grace_s
+    while time.monotonic() < end and any(p.pid != spare for p in processes_of(run_folder)):
+        time.sleep(0.05)
+    killed = 0
+    # A process may start another one while it is being killed, so look until none is left.
+    end = time.monotonic() + 30.0
+    while time.monotonic() < end and (count := _signal_all(run_folder, signal.SIGKILL, spare)):
+        killed += count
+        time.sleep(0.02)
+    return killed
+
+
+def claim_supervision(run_folder: Path) -> int | None:
+    """Become the one supervisor of a run until this process ends.
+
+    Returns:
+        The descriptor that holds the claim, or None if the run has a supervisor already.
+    """
+    descriptor = os.open(run_folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+    end = time.monotonic() + 2.0
+    while not _try_lock(descriptor, fcntl.LOCK_EX):
+        # Whoever asks `supervisor_of` holds the lock for a moment.
+        if time.monotonic() > end:
+            os.close(descriptor)
+            return None
+        time.sleep(0.02)
+    os.ftruncate(descriptor, 0)
+    os.write(descriptor, str(os.getpid()).encode())
+    return descriptor
+
+
+def supervisor_of(run_folder: Path) -> int | None:
+    """Give the process id of a run's live supervisor; None if it has none."""
+    try:
+        descriptor = os.open(run_folder / _LOCK, os.O_RDONLY)
+    except OSError:
+        return None
+    try:
+        if _try_lock(descriptor, fcntl.LOCK_SH):
+            return None
+        # The kernel lets go of the lock when its process ends, however it ends.
+        return int(os.read(descriptor, 32) or b"0")
+    finally:
+        os.close(descriptor)
+
+
+def adopt_orphans() -> None:
+    """Become the parent of all grandchildren that lose theirs (Linux)."""
+    _prctl(_PR_SET_CHILD_SUBREAPER, 1)
+
+
+def die_with_parent(parent: int) -> None:
+    """Make the kernel kill this process when its parent ends (Linux); end it if that has happened.
+
+    Args:
+        parent: Process id that the parent is expected to have.
+    """
+    _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        sys.exit(1)
+
+
+def _try_lock(descriptor: int, kind: int) -> bool:
+    try:
+        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _prctl(option: int, value: int) -> None:
+    if sys.platform == "linux" and ctypes.CDLL(None, use_errno=True).prctl(option, value, 0, 0, 0):
+        raise OSError(ctypes.get_errno(), "prctl failed")
+
+
+def _signal_all(run_folder: Path, number: signal.Signals, spare: int | None) -> int:
+    count = 0
+    for process in processes_of(run_folder):
+        if process.pid in {spare, os.getpid()}:
+            continue
+        try:
+            process.send_signal(number)
+            count += 1
+        except psutil.Error:
+            continue
+    return count
