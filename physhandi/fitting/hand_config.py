@@ -31,7 +31,7 @@ class HandFitConfig:
     """Turn of a joint to be expected from frame to frame [rad]."""
     depth_noise: float = 0.004
     """Error to be expected of a depth measurement on the hand [m]."""
-    depth_weight: float = 20.0
+    depth_weight: float = 100.0
     """Weight of a frame's mean depth error, in units of the expected error, squared."""
     depth_points: int = 128
     """Most observed points of a hand that are used in a frame."""

@@ -139,9 +139,10 @@ def optimise_springs(
     for iteration in range(settings.iterations):
         progress.check_cancelled()
         try:
-            for problem in problems:
-                horizon = _horizon(iteration, settings, problem.frame_count)
-                descent.walk(problem, models[problem.name], horizon)
+            walked = [
+                descent.walk(p, models[p.name], _horizon(iteration, settings, p.frame_count))
+                for p in problems
+            ]
         except SimulationDivergedError as error:
             progress.report(STAGE, iteration, settings.iterations, best_loss, f"stopped: {error}")
             break
@@ -150,7 +151,7 @@ def optimise_springs(
         if loss < best_loss:
             best, best_loss = now, loss
         curve.append([float(iteration + 1), loss])
-        progress.report(STAGE, iteration + 1, settings.iterations, loss)
+        progress.report(STAGE, iteration + 1, settings.iterations, loss, _tell(problems, walked))
     return FirstOrderResult(
         models=best,
         parameters=parameters,
@@ -158,6 +159,17 @@ def optimise_springs(
         loss_after=best_loss,
         curve=curve,
     )
+
+
+def _tell(problems: Many[ObjectProblem], walked: list[bool]) -> str:
+    """Say which sequences gave no usable gradient; there must be one that did."""
+    skipped = [p.name for p, was_walked in zip(problems, walked, strict=True) if not was_walked]
+    if len(skipped) == len(problems):
+        raise FitError(
+            "No sequence has a usable gradient, not even over one frame. Raise substeps_per_frame, "
+            "or lower the upper ends of the stiffness and damping intervals."
+        )
+    return f"too chaotic to learn from: {', '.join(skipped)}" if skipped else ""
 
 
 class _Descent:
@@ -178,15 +190,24 @@ class _Descent:
         self.optimizer = torch.optim.Adam(
             logs.tensors(), lr=settings.learning_rate, betas=(0.9, settings.beta_2)
         )
+        self.reach: dict[str, int] = {}
 
-    def walk(self, problem: ObjectProblem, model: SpringMassModel, horizon: int) -> None:
-        """Walk once through a sequence and update after every window of frames."""
+    def walk(self, problem: ObjectProblem, model: SpringMassModel, horizon: int) -> bool:
+        """Walk once through a sequence and update after every window of frames.
+
+        Returns:
+            Whether the gradient was usable; if not, the rest of the sequence is left out.
+        """
         window = self.config.first_order.window or horizon - 1
         state = torch.from_numpy(model.object_node), torch.from_numpy(model.initial_velocity)
         for begin in range(0, horizon - 1, window):
             end = min(begin + window, horizon - 1)
-            state = self._find_gradient(problem, model, (begin, end), state)
+            found = self._find_gradient(problem, model, (begin, end), state)
+            if found is None:
+                return False
+            state = found
             self.optimizer.step()
+        return True
 
     def _find_gradient(
         self,
@@ -194,15 +215,16 @@ class _Descent:
         model: SpringMassModel,
         frames: tuple[int, int],
         state: tuple[Tensor, Tensor],
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor] | None:
         """Leave the gradient of one window in the parameters; return the state at its end.
 
         Motion that is chaotic over the window has gradients that grow without bound and point
-        nowhere; the window is then cut in halves until they are sane.
+        nowhere. The gradient then reaches back over half as many frames, and again half as many
+        until it is sane; how far it came is tried first the next time.
         """
         begin, end = frames
-        cut: int | None = None
-        while True:
+        reach = min(self.reach.get(problem.name, end - begin), end - begin)
+        while reach >= 1:
             self.optimizer.zero_grad()
             log_stiffness, damping = self.logs.of(problem.name)
             node, velocity = differentiable.rollout(
@@ -214,21 +236,18 @@ class _Descent:
                 initial_position=state[0],
                 initial_velocity=state[1],
                 device=self.device,
-                window=cut,
+                window=reach,
             )
             loss = self._loss(problem, node[1:], begin + 1)
             loss.backward()
             gradients = [t.grad for t in self.logs.tensors() if t.grad is not None]
             steepest = max(float(gradient.double().norm()) for gradient in gradients)
             if steepest <= STEEPEST * float(loss.detach()):
+                if reach < end - begin:
+                    self.reach[problem.name] = reach
                 return node[-1].detach(), velocity[-1].detach()
-            cut = (end - begin if cut is None else cut) // 2
-            if cut == 0:
-                raise FitError(
-                    f"The gradient over one frame of sequence '{problem.name}' is out of bounds. "
-                    "Raise substeps_per_frame, or lower the upper ends of the stiffness and "
-                    "damping intervals."
-                )
+            reach //= 2
+        return None
 
     def _loss(self, problem: ObjectProblem, node: Tensor, first_frame: int) -> Tensor:
         frame_losses = problem.frame_losses(
