@@ -1,0 +1,313 @@
+"""The queue, with real child processes."""
+
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from app.jobs.catalog import Catalog
+from app.jobs.processes import end_processes, processes_of, supervisor_of
+from app.jobs.scheduler import JobView, Scheduler
+from app.settings import Settings
+from physhandi.data.lease import live_holder
+from physhandi.data.run import Run, read_events
+from physhandi.errors import PhysHandiError, RunError, SequenceError, UsageError
+
+TESTS = Path(__file__).parent.parent
+GRACE_S = 1.0
+
+
+def until(claim: Callable[[], object], seconds: float = 15.0) -> None:
+    end = time.monotonic() + seconds
+    while not claim():
+        assert time.monotonic() < end, "waited too long"
+        time.sleep(0.02)
+
+
+class Desk:
+    """A scheduler, and shortcuts to what a test asks it."""
+
+    def __init__(self, data_dir: Path, **settings: int) -> None:
+        self.settings = Settings(data_dir=data_dir, cancel_grace_s=GRACE_S, **settings)
+        self.catalog = Catalog(self.settings)
+        self.scheduler = Scheduler(self.settings, self.catalog, worker="job_worker")
+
+    def launch(self, behaviour: str) -> str:
+        return self.scheduler.launch(["sheet"], "quick", behaviour).id
+
+    def view(self, run_id: str) -> JobView:
+        return self.scheduler.view(self.catalog.run_item(run_id))
+
+    def state(self, run_id: str) -> str:
+        return self.view(run_id).state
+
+    def run(self, run_id: str) -> Run:
+        return self.catalog.run(run_id)
+
+    def until(self, run_id: str, state: str) -> JobView:
+        until(lambda: self.state(run_id) == state)
+        return self.view(run_id)
+
+
+@pytest.fixture
+def desks(data_dir: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Desk]]:
+    monkeypatch.setenv("PYTHONPATH", str(TESTS))
+    made: list[Desk] = []
+
+    def make(**settings: int) -> Desk:
+        desk = Desk(data_dir, **settings)
+        made.append(desk)
+        desk.scheduler.start()
+        return desk
+
+    yield make
+    for desk in made:
+        desk.scheduler.shutdown()
+    for folder in (data_dir / "runs").iterdir():
+        end_processes(folder, grace_s=0.0)
+    for desk in made:
+        for process, _ in desk.scheduler._started.values():
+            process.wait()
+
+
+@pytest.fixture
+def desk(desks: Callable[..., Desk]) -> Desk:
+    return desks()
+
+
+def is_alive(pid: int) -> bool:
+    try:
+        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
+
+
+def pids_of(run: Run) -> list[int]:
+    until((run.folder / "pids").exists)
+    return [int(pid) for pid in (run.folder / "pids").read_text().split()]
+
+
+def test_a_launched_run_is_worked_on_and_published(desk: Desk) -> None:
+    run_id = desk.launch("publish")
+    view = desk.until(run_id, "succeeded")
+    assert view.reason == ""
+    assert view.progress["stage"] == "second"
+    run = desk.run(run_id)
+    run.verify()
+    assert run.json("losses.json")["first"] == {"before": 2.0, "after": 1.0}
+    until(lambda: not list(processes_of(run.folder)))
+
+
+def test_what_cannot_be_launched_leaves_no_run(desk: Desk) -> None:
+    with pytest.raises(SequenceError, match="'nowhere'"):
+        desk.scheduler.launch(["nowhere"], "quick")
+    with pytest.raises(UsageError, match="'fastest'"):
+        desk.scheduler.launch(["sheet"], "fastest")
+    with pytest.raises(UsageError, match="at least one"):
+        desk.scheduler.launch([], "quick")
+    with pytest.raises(PhysHandiError):
+        desk.scheduler.launch(["sheet", "sheet"], "quick")
+    assert [item for item in desk.catalog.runs() if not item.is_bundled] == []
+
+
+def test_runs_wait_in_order_while_the_only_slot_is_taken(desk: Desk) -> None:
+    first = desk.launch("wait 1")
+    desk.until(first, "running")
+    waiting = [desk.launch("wait 2"), desk.launch("wait 3")]
+    until(lambda: [desk.view(run_id).place for run_id in waiting] == [1, 2])
+    assert [desk.state(run_id) for run_id in waiting] == ["queued", "queued"]
+    assert "one fit runs at a time" in desk.view(waiting[1]).reason
+    for _ in range(20):
+        assert desk.state(waiting[0]) == "queued"
+        time.sleep(0.02)
+    (desk.run(first).folder / "go").touch()
+    desk.until(first, "succeeded")
+    desk.until(waiting[0], "running")
+    assert desk.view(waiting[1]).place == 1
+    (desk.run(waiting[1]).folder / "go").touch()
+    (desk.run(waiting[0]).folder / "go").touch()
+    desk.until(waiting[1], "succeeded")
+    ends = [read_events(desk.run(r).folder)[0][-1]["time"] for r in (first, *waiting)]
+    assert ends == sorted(ends)
+
+
+def test_two_slots_run_two_fits_side_by_side(desks: Callable[..., Desk]) -> None:
+    desk = desks(parallel_fits=2)
+    runs = [desk.launch(f"wait {number}") for number in range(3)]
+    until(lambda: [desk.state(r) for r in runs] == ["running", "running", "queued"])
+    desk.scheduler.cancel(runs[0])
+    until(lambda: [desk.state(r) for r in runs] == ["cancelled", "running", "running"])
+
+
+def test_the_line_has_an_end(desks: Callable[..., Desk]) -> None:
+    desk = desks(waiting_fits=1)
+    desk.until(desk.launch("wait"), "running")
+    desk.launch("wait")
+    with pytest.raises(PhysHandiError, match="1 fits wait already"):
+        desk.launch("wait")
+
+
+def test_a_run_that_waits_is_cancelled_without_starting(desk: Desk) -> None:
+    first = desk.launch("wait")
+    desk.until(first, "running")
+    second = desk.launch("wait")
+    desk.scheduler.cancel(second)
+    assert desk.state(second) == "cancelled"
+    (desk.run(first).folder / "go").touch()
+    desk.until(first, "succeeded")
+    time.sleep(0.6)
+    assert desk.state(second) == "cancelled"
+    assert read_events(desk.run(second).folder)[0] == []
+
+
+def test_a_polite_worker_is_cancelled_at_its_next_report_and_resumed_later(desk: Desk) -> None:
+    run_id = desk.launch("wait")
+    run = desk.run(run_id)
+    until(lambda: (run.progress or {}).get("stage") == "second")
+    desk.scheduler.cancel(run_id)
+    desk.until(run_id, "cancelled")
+    until(lambda: not list(processes_of(run.folder)))
+    (run.folder / "go").touch()
+    desk.scheduler.resume(run_id)
+    desk.until(run_id, "succeeded")
+    assert run.json("first.json") == {"attempt": 1}
+    assert (run.folder / "current").read_text().strip() == "2"
+
+
+def test_cancelling_ends_the_whole_tree_however_stubborn(desk: Desk) -> None:
+    run_id = desk.launch("stubborn")
+    run = desk.run(run_id)
+    pids = pids_of(run)
+    assert all(is_alive(pid) for pid in pids)
+    assert os.getsid(pids[1]) == pids[1]
+    start = time.monotonic()
+    desk.scheduler.cancel(run_id)
+    until(lambda: desk.state(run_id) in {"stopping", "cancelled"})
+    desk.until(run_id, "cancelled")
+    assert GRACE_S * 0.9 < time.monotonic() - start < GRACE_S + 6
+    assert not any(is_alive(pid) for pid in pids)
+    assert list(processes_of(run.folder)) == []
+    assert supervisor_of(run.folder) is None
+    follower = desk.launch("publish")
+    desk.until(follower, "succeeded")
+
+
+def test_cancelling_twice_is_harmless(desk: Desk) -> None:
+    run_id = desk.launch("stubborn")
+    pids_of(desk.run(run_id))
+    desk.scheduler.cancel(run_id)
+    desk.scheduler.cancel(run_id)
+    desk.until(run_id, "cancelled")
+    with pytest.raises(RunError, match="nothing to cancel"):
+        desk.scheduler.cancel(run_id)
+
+
+def test_a_killed_worker_fails_with_a_reason_and_takes_its_children_along(desk: Desk) -> None:
+    killed = desk.launch("killed")
+    view = desk.until(killed, "failed")
+    assert "signal 9" in view.reason
+    stubborn = desk.launch("stubborn")
+    worker, child = pids_of(desk.run(stubborn))
+    os.kill(worker, signal.SIGKILL)
+    assert "signal 9" in desk.until(stubborn, "failed").reason
+    until(lambda: not is_alive(child))
+
+
+@pytest.mark.parametrize(
+    ("behaviour", "reason"),
+    [
+        ("fail", "'sheet' lacks a <b>hand</b>."),
+        ("crash", "code 7"),
+        ("silent", "code 5"),
+    ],
+)
+def test_every_way_to_fail_tells_why(desk: Desk, behaviour: str, reason: str) -> None:
+    run_id = desk.launch(behaviour)
+    view = desk.until(run_id, "failed")
+    assert reason in view.reason
+    assert desk.run(run_id).state == "failed"
+    if behaviour == "crash":
+        until(lambda: "the last words" in desk.run(run_id).log_path.read_text())
+
+
+def test_the_worker_dies_with_its_supervisor_and_the_run_can_go_on(desk: Desk) -> None:
+    run_id = desk.launch("wait")
+    run = desk.run(run_id)
+    until(lambda: (run.progress or {}).get("stage") == "second")
+    supervisor = supervisor_of(run.folder)
+    assert supervisor is not None
+    os.kill(supervisor, signal.SIGKILL)
+    desk.until(run_id, "failed")
+    (run.folder / "go").touch()
+    desk.scheduler.resume(run_id)
+    desk.until(run_id, "succeeded")
+
+
+def test_a_restarted_server_finds_running_and_waiting_runs_again(
+    desks: Callable[..., Desk],
+) -> None:
+    before = desks()
+    running, waiting = before.launch("wait 1"), before.launch("publish 2")
+    before.until(running, "running")
+    holder = live_holder(before.run(running).folder)
+    before.scheduler.shutdown()
+
+    after = desks()
+    assert after.state(running) == "running"
+    until(lambda: after.view(waiting).place == 1)
+    time.sleep(0.6)
+    assert [after.state(running), after.state(waiting)] == ["running", "queued"]
+    assert holder is not None
+    now = live_holder(after.run(running).folder)
+    assert now is not None
+    assert now["pid"] == holder["pid"]
+    after.scheduler.cancel(running)
+    after.until(running, "cancelled")
+    after.until(waiting, "succeeded")
+
+
+def test_a_run_that_ended_while_no_server_was_there_is_told_as_it_ended(
+    desks: Callable[..., Desk],
+) -> None:
+    before = desks()
+    run_id = before.launch("wait")
+    before.until(run_id, "running")
+    before.scheduler.shutdown()
+    folder = before.run(run_id).folder
+    (folder / "go").touch()
+    until(lambda: supervisor_of(folder) is None)
+    assert desks().state(run_id) == "succeeded"
+
+
+def test_two_servers_never_share_a_data_folder(desks: Callable[..., Desk]) -> None:
+    desks()
+    with pytest.raises(RunError, match="Another server"):
+        desks()
+
+
+def test_a_run_at_work_is_neither_deleted_nor_resumed(desk: Desk) -> None:
+    run_id = desk.launch("wait")
+    for _ in range(2):
+        with pytest.raises(RunError, match="Cancel it"):
+            desk.scheduler.delete(run_id)
+        with pytest.raises(RunError, match="only a failed or cancelled"):
+            desk.scheduler.resume(run_id)
+        desk.until(run_id, "running")
+    folder = desk.run(run_id).folder
+    desk.scheduler.cancel(run_id)
+    desk.until(run_id, "cancelled")
+    desk.scheduler.delete(run_id)
+    assert not folder.exists()
+    with pytest.raises(RunError, match="no run"):
+        desk.view(run_id)
+
+
+def test_the_worker_never_learns_the_token(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PHYSHANDI_TOKEN", "do-not-tell-anybody")
+    run_id = desk.launch("stubborn")
+    worker, _ = pids_of(desk.run(run_id))
+    assert "PHYSHANDI_TOKEN" not in psutil.Process(worker).environ()

@@ -1,0 +1,83 @@
+"""A worker for tests of the queue: the run's name tells what it does."""
+
+import argparse
+import os
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+from physhandi.data.attempt import Attempt
+from physhandi.data.run import Run
+from physhandi.errors import MissingInputError
+
+STEP_S = 0.02
+
+
+def publish(run: Run, attempt: Attempt) -> None:
+    progress = attempt.progress()
+    if not attempt.stage_done("first"):
+        progress.report("first", 1, 1, 2.0)
+        attempt.save_json("first.json", {"attempt": attempt.number})
+        attempt.finish_stage("first", {"before": 2.0, "after": 1.0})
+    progress.report("second", 1, 1, 0.5)
+    attempt.publish()
+
+
+def wait(run: Run, attempt: Attempt) -> None:
+    """Report until the file `go` is there; a cancel is obeyed at once."""
+    progress = attempt.progress()
+    progress.report("first", 1, 1, 2.0)
+    if not attempt.stage_done("first"):
+        attempt.save_json("first.json", {"attempt": attempt.number})
+        attempt.finish_stage("first", {"before": 2.0, "after": 1.0})
+    iteration = 0
+    while not (run.folder / "go").exists():
+        iteration += 1
+        progress.report("second", min(iteration, 999), 1000, 1.0)
+        progress.check_cancelled()
+        time.sleep(STEP_S)
+    attempt.publish()
+
+
+def stubborn(run: Run, attempt: Attempt) -> None:
+    """Ignore every polite request, and so does a child in a session of its own."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    child = subprocess.Popen(["sleep", "300"], start_new_session=True)
+    attempt.progress().report("first", 1, 1, 2.0)
+    (run.folder / "pids.tmp").write_text(f"{os.getpid()} {child.pid}")
+    (run.folder / "pids.tmp").rename(run.folder / "pids")
+    time.sleep(300)
+
+
+def killed(run: Run, attempt: Attempt) -> None:
+    attempt.progress().report("first", 1, 1, 2.0)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def fail(run: Run, attempt: Attempt) -> None:
+    raise MissingInputError("'sheet' lacks a <b>hand</b>.")
+
+
+def crash(run: Run, attempt: Attempt) -> None:
+    os.write(1, b"the last words\n")
+    os._exit(7)
+
+
+BEHAVIOURS = {f.__name__: f for f in (publish, wait, stubborn, killed, fail, crash)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--run-dir", type=Path, required=True)
+    parser.add_argument("--device", required=True)
+    options, _ = parser.parse_known_args()
+    run = Run.open(options.run_dir)
+    if run.name == "silent":
+        raise SystemExit(5)
+    with run.begin_attempt() as attempt:
+        BEHAVIOURS[run.name.split()[0]](run, attempt)
+
+
+if __name__ == "__main__":
+    main()
