@@ -135,7 +135,7 @@ def create_pages(
             cursor=cursor,
             run=described,
             stages=stage_states(described, results.get("losses", {})),
-            metrics={name: flat(value) for name, value in results.get("metrics", {}).items()},
+            metrics={name: tabulate(v) for name, v in results.get("metrics", {}).items()},
             parameters=flat(results.get("parameters", {})),
             log=log_tail(item.folder / "log.txt"),
         )
@@ -184,6 +184,32 @@ def stage_states(run: Mapping[str, Any], finished: Mapping[str, Any]) -> list[di
             }
         )
     return stages
+
+
+def tabulate(scores: Any) -> dict[str, Any]:
+    """Arrange the scores of a sequence: what has rivals side by side, the rest as notes.
+
+    A part whose entries score the same quantities, such as the rollout beside its baselines,
+    becomes a table with one column each; all scores are errors, so the lowest is the best.
+    """
+    tables: list[dict[str, Any]] = []
+    notes: list[tuple[str, Any]] = []
+    for name, part in (named_fields(scores) or {}).items():
+        fields = named_fields(part) or {}
+        columns = {key: inner for key, v in fields.items() if (inner := named_fields(v))}
+        if len(columns) < 2:
+            notes += flat(part, words(name))
+            continue
+        rows: list[dict[str, Any]] = []
+        for quantity in dict.fromkeys(key for column in columns.values() for key in column):
+            values = [column.get(quantity) for column in columns.values()]
+            known = [value for value in values if isinstance(value, int | float)]
+            if known:
+                rows.append({"name": quantity, "values": values, "best": min(known)})
+        rest = [flat(v, words(key)) for key, v in fields.items() if key not in columns]
+        note = ", ".join(f"{key} {short(v)}" for pairs in rest for key, v in pairs)
+        tables.append({"name": name, "note": note, "columns": list(columns), "rows": rows})
+    return {"tables": tables, "notes": notes}
 
 
 def flat(value: Any, path: str = "") -> list[tuple[str, Any]]:

@@ -195,12 +195,12 @@ function makeChart(place, stage, data) {
   figure.append(caption);
   place.append(figure);
   const axis = { stroke: color("--pico-muted-color"), grid: { stroke: color("--pico-muted-border-color"), width: 1 }, ticks: { show: false } };
-  const isPositive = data[1].every((value) => value > 0);
+  const [low, high] = [Math.min(...data[1]), Math.max(...data[1])];
   const plot = new uPlot({
     width: figure.clientWidth || 320,
     height: 190,
     cursor: { y: false },
-    scales: { x: { time: false }, y: isPositive ? { distr: 3 } : {} },
+    scales: { x: { time: false }, y: low > 0 && high > 5 * low ? { distr: 3 } : {} },
     axes: [{ ...axis, label: "iteration", labelSize: 18, size: 36 },
       { ...axis, size: 62, values: (_, ticks) => ticks.map((tick) => (tick === null ? "" : Number(tick.toPrecision(3)).toString())) }],
     series: [{ label: "iteration" }, { label: "loss", stroke: color("--pico-primary"), width: 2, points: { show: data[0].length < 30, size: 5 } }],
