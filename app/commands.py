@@ -9,7 +9,7 @@ from typing import Any, Protocol
 from app.jobs.catalog import Catalog
 from app.settings import Settings
 from physhandi import pipeline
-from physhandi.data.run import Run
+from physhandi.data.run import Run, RunKind
 from physhandi.data.sequence import Sequence
 from physhandi.errors import RunError, UsageError
 from physhandi.fitting.profile import config_to_dict, load_profile
@@ -41,7 +41,6 @@ def pick_device(name: str) -> str:
     """
     import warp as wp
 
-    wp.config.quiet = True
     if name == "auto":
         return "cuda:0" if wp.is_cuda_available() else "cpu"
     known = [str(device) for device in wp.get_devices()]
@@ -116,7 +115,7 @@ def simulate(command: Any, progress: Progress) -> dict[str, Any]:
 
 
 def _run_at(
-    folder: Path, kind: str, name: str, sequences: list[str], config: dict[str, Any]
+    folder: Path, kind: RunKind, name: str, sequences: list[str], config: dict[str, Any]
 ) -> Run:
     if not (folder / "run.yaml").is_file():
         return Run.create(folder, name=name, kind=kind, sequences=sequences, config=config)
