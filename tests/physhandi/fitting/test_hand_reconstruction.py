@@ -1,0 +1,171 @@
+"""Stage 1 on a made-up hand that is known exactly, and on the real two-camera recording."""
+
+import time
+from pathlib import Path
+
+import hand_scene as scene
+import numpy as np
+import pytest
+import torch
+
+from physhandi.data.importers.stereo import import_stereo
+from physhandi.errors import CancelledError, FitError, MissingInputError
+from physhandi.fitting.hand_reconstruction import HandFit, HandFitConfig, reconstruct_hands
+from physhandi.hand.model import load_hand_model
+from physhandi.hand.motion import HandMotion
+from physhandi.metrics.hands import evaluate_hands, hide_keypoints
+from physhandi.perception.keypoints import detect_sequence
+from physhandi.progress import Progress
+
+RECORDING = Path(__file__).resolve().parents[4] / "shared" / "data" / "stereo_hand"
+QUICK = HandFitConfig(iterations=250)
+
+
+CAMERAS = [scene.looking_at_hand(angle) for angle in (0.0, 1.2, 2.6)]
+
+
+def _vertex_error(fit: HandFit, truth: HandMotion, hand: int = 0) -> np.ndarray:
+    """Distance of every vertex from the true one, mean of each frame [length unit]."""
+    model = load_hand_model(truth.side)
+    found = fit.motions[hand].vertices(model) - truth.vertices(model)
+    return np.linalg.norm(found, axis=-1).mean(axis=1)
+
+
+def test_a_known_hand_is_found_again(tmp_path: Path) -> None:
+    truth = scene.grasping()
+    keypoint = scene.seen_keypoints([truth], CAMERAS)
+    fit = reconstruct_hands(scene.write_scene(tmp_path / "a", [truth], CAMERAS, keypoint), QUICK)
+    assert _vertex_error(fit, truth).max() < 0.003
+    joint = fit.motions[0].keypoints(load_hand_model("right"))
+    (score,) = evaluate_hands(CAMERAS, [joint], keypoint)
+    assert score.fitted.median < 0.5
+    assert score.frame_count == 16
+    assert fit.loss_before > 10 * fit.loss_after
+    assert fit.curve[-1][0] == 250
+    np.testing.assert_allclose(fit.keypoint, keypoint)
+    assert np.abs(np.diff(fit.motions[0].wrist_rotation, axis=0)).max() < 0.3
+
+
+def test_the_same_input_gives_the_same_bits(tmp_path: Path) -> None:
+    truth = scene.grasping(frames=4)
+    keypoint = scene.seen_keypoints([truth], CAMERAS, noise=1.0)
+    sequence = scene.write_scene(tmp_path / "a", [truth], CAMERAS, keypoint)
+    config = HandFitConfig(iterations=30)
+    first, second = (reconstruct_hands(sequence, config).motions[0] for _ in range(2))
+    for name, array in first.to_tensors().items():
+        assert np.array_equal(array, second.to_tensors()[name]), name
+
+
+def test_both_hands_and_the_scale_of_a_sequence_without_metres(tmp_path: Path) -> None:
+    motions = [scene.grasping("right", scale=20.0), scene.grasping("left", scale=20.0)]
+    cameras = []
+    for camera in CAMERAS:
+        pose = camera.T_world_camera.copy()
+        pose[:3, 3] *= 20
+        fields = {**camera.to_dict(), "T_world_camera": pose.tolist()}
+        cameras.append(type(camera).from_dict(fields))
+    keypoint = scene.seen_keypoints(motions, cameras)
+    sequence = scene.write_scene(tmp_path / "a", motions, cameras, keypoint, metric=False)
+    fit = reconstruct_hands(sequence, QUICK)
+    assert [motion.side for motion in fit.motions] == ["right", "left"]
+    for hand, truth in enumerate(motions):
+        # A sequence without metres cannot tell a large hand from a small unit.
+        size, true_size = fit.motions[hand].shape[0], truth.shape[0]
+        product = fit.motions[hand].scale * np.exp(0.05 * size)
+        assert product == pytest.approx(20 * np.exp(0.05 * true_size), rel=0.03)
+        assert _vertex_error(fit, truth, hand).max() < 20 * 0.004
+
+
+def test_frames_that_no_view_saw_are_bridged(tmp_path: Path) -> None:
+    truth = scene.grasping()
+    keypoint = scene.seen_keypoints([truth], CAMERAS)
+    keypoint[:, 6:9] = np.nan
+    keypoint[:2, 12] = np.nan
+    keypoint[:, 15] = np.nan
+    fit = reconstruct_hands(scene.write_scene(tmp_path / "a", [truth], CAMERAS, keypoint), QUICK)
+    error = _vertex_error(fit, truth)
+    assert len(error) == 16
+    assert error[6:9].max() < 0.008
+    assert error[12] < 0.006
+    assert error[15] < 0.02
+    assert np.delete(error, [6, 7, 8, 12, 15]).max() < 0.004
+
+
+def test_a_view_that_errs_is_outvoted(tmp_path: Path) -> None:
+    truth = scene.grasping()
+    keypoint = scene.seen_keypoints([truth], CAMERAS)
+    keypoint[1, 4:7, :, :, 0] += 60
+    keypoint[2, 10, 0, 8:, 1] -= 45
+    fit = reconstruct_hands(scene.write_scene(tmp_path / "a", [truth], CAMERAS, keypoint), QUICK)
+    assert _vertex_error(fit, truth).max() < 0.005
+
+
+def test_depth_corrects_a_hand_that_one_view_cannot_place(tmp_path: Path) -> None:
+    truth = scene.grasping(frames=6)
+    keypoint = scene.seen_keypoints([truth], CAMERAS[:1])
+    sequence = scene.write_scene(tmp_path / "a", [truth], CAMERAS[:1], keypoint, depth=True)
+    config = HandFitConfig(iterations=200, depth_iterations=0)
+    without = _vertex_error(reconstruct_hands(sequence, config), truth)
+    config = HandFitConfig(iterations=200, depth_iterations=120)
+    with_depth = _vertex_error(reconstruct_hands(sequence, config), truth)
+    assert without.mean() > 0.015
+    assert with_depth.mean() < 0.5 * without.mean()
+
+
+def test_what_is_missing_is_said(tmp_path: Path) -> None:
+    truth = scene.grasping(frames=2)
+    keypoint = scene.seen_keypoints([truth], CAMERAS)
+    keypoint[..., 3:, :] = np.nan
+    keypoint[..., :3, :] = np.nan
+    with pytest.raises(FitError, match="right hand cannot be placed"):
+        reconstruct_hands(scene.write_scene(tmp_path / "a", [truth], CAMERAS, keypoint))
+    with pytest.raises(MissingInputError, match=r"'b': .* there are 0 views and 1 hands"):
+        reconstruct_hands(scene.write_scene(tmp_path / "b", [truth], [], None))
+    with pytest.raises(MissingInputError, match=r"'c': view 'view0' has no color"):
+        reconstruct_hands(scene.write_scene(tmp_path / "c", [truth], CAMERAS, None, depth=True))
+    with pytest.raises(ValueError, match="at least 1"):
+        HandFitConfig(iterations=0)
+
+
+def test_the_fit_reports_and_stops_when_asked(tmp_path: Path) -> None:
+    truth = scene.grasping(frames=2)
+    keypoint = scene.seen_keypoints([truth], CAMERAS)
+    sequence = scene.write_scene(tmp_path / "a", [truth], CAMERAS, keypoint)
+    seen: list[tuple] = []
+
+    class Stop(Progress):
+        def report(self, stage, iteration, total, loss=None, message=""):
+            seen.append((stage, iteration, total, message))
+
+        def check_cancelled(self):
+            if len(seen) == 2:
+                raise CancelledError("stop")
+
+    threads = torch.get_num_threads()
+    with pytest.raises(CancelledError):
+        reconstruct_hands(sequence, HandFitConfig(iterations=100), Stop())
+    assert seen == [("hand_reconstruction", i, 100, "Right hand") for i in (10, 20)]
+    assert torch.get_num_threads() == threads
+
+
+@pytest.mark.slow
+def test_the_recorded_hand_is_reconstructed(tmp_path: Path) -> None:
+    if not RECORDING.is_dir():
+        pytest.skip("needs the recording stereo_hand in ../shared/data")
+    sequence = import_stereo(RECORDING, tmp_path / "hand")
+    keypoint = detect_sequence(sequence)
+    hidden = hide_keypoints(keypoint, share=0.1, seed=0)
+    given = np.where(hidden[..., None], np.nan, keypoint).astype(np.float32)
+    started = time.process_time()
+    fit = reconstruct_hands(sequence, keypoint=given)
+    assert time.process_time() - started < 60
+    joint = fit.motions[0].keypoints(load_hand_model("right"))
+    assert joint.shape == (378, 21, 3)
+    assert np.isfinite(joint).all()
+    cameras = [view.camera for view in sequence.views]
+    (score,) = evaluate_hands(cameras, [joint], keypoint, hidden, least_views=2)
+    assert score.frame_count >= 360
+    assert score.fitted.median <= 4
+    assert score.hidden.median <= 6
+    assert score.hidden.keypoint_count > 1400
+    assert max(score.joint_median) < 8
