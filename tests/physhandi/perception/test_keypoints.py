@@ -8,10 +8,14 @@ import numpy as np
 import pytest
 
 from physhandi.data.camera import PinholeCamera
+from physhandi.data.exporters.overlay import hand_overlay
 from physhandi.data.sequence import Sequence, ViewMeta
 from physhandi.data.sequence_schema import SequenceMeta
 from physhandi.data.sequence_writer import SequenceWriter
 from physhandi.errors import CancelledError, MissingInputError
+from physhandi.hand.keypoint_offset import KEYPOINT_OFFSET
+from physhandi.hand.model import load_hand_model
+from physhandi.hand.open_hand import OpenHand
 from physhandi.perception.hand_networks import Region, landmark_region, overlap
 from physhandi.perception.keypoints import (
     DetectedHand,
@@ -188,3 +192,33 @@ def test_detection_stops_when_asked(tmp_path: Path) -> None:
     sequence = _sequence(tmp_path / "stop", [np.zeros((8, 8, 3), np.uint8)], hands=("right",))
     with pytest.raises(CancelledError):
         detect_sequence(sequence, Stop())
+
+
+def test_the_open_hands_keypoints_are_where_the_networks_see_them(
+    detector: KeypointDetector,
+) -> None:
+    hand = load_hand_model("right")
+    assert isinstance(hand, OpenHand)
+    vertex, keypoint = hand.template, hand.keypoint_position
+    ours, joints = [], []
+    for azimuth in (-0.4, 0.0, 0.4, 2.74, 3.14, 3.54):
+        toward = np.array([np.cos(azimuth), 0, np.sin(azimuth)])
+        right = np.cross(-toward, [0, -1, 0])
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([right, np.cross(-toward, right), -toward], axis=1)
+        pose[:3, 3] = keypoint.mean(0) + 0.6 * toward
+        camera = PinholeCamera(
+            K=np.array([[900.0, 0, 240], [0, 900, 240], [0, 0, 1]]),
+            T_world_camera=pose,
+            width=480,
+            height=480,
+        )
+        grey = np.full((480, 480, 3), 120, np.uint8)
+        skin = (225, 172, 140)
+        image = hand_overlay(grey, camera, vertex, hand.faces, color=skin, opacity=1.0)
+        (found,) = detector.detect(cv2.GaussianBlur(image, (5, 5), 1.2))
+        assert found.side == "right"
+        for point, errors in ((keypoint, ours), (keypoint - KEYPOINT_OFFSET, joints)):
+            errors.append(np.linalg.norm(camera.project(point) - found.keypoint, axis=-1))
+    assert np.median(ours) < 4.5, "1.5 px are one millimetre"
+    assert np.median(np.array(ours)[:, 0]) < 0.5 * np.median(np.array(joints)[:, 0])
