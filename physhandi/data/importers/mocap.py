@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
-from scipy.interpolate import CubicSpline  # pyright: ignore[reportMissingTypeStubs]
+from scipy.interpolate import CubicSpline  # pyright: ignore[reportMissingTypeStubs]  # it has none
 
 from physhandi.data.atomic import read_array
 from physhandi.data.sequence import Sequence
