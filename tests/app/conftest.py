@@ -4,12 +4,18 @@ import shutil
 from pathlib import Path
 
 import pytest
+from server_world import World, fit_sheet, make_world
 from sheet_sequence import write_sheet
 
 
 @pytest.fixture(scope="session")
 def sheet_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_sheet(tmp_path_factory.mktemp("sheets") / "sheet").folder
+
+
+@pytest.fixture(scope="session")
+def fitted_folder(tmp_path_factory: pytest.TempPathFactory, sheet_folder: Path) -> Path:
+    return fit_sheet(tmp_path_factory.mktemp("fits") / "fitted", sheet_folder).folder
 
 
 @pytest.fixture
@@ -19,3 +25,10 @@ def data_dir(tmp_path: Path, sheet_folder: Path) -> Path:
     shutil.copytree(sheet_folder, folder / "sequences" / "sheet")
     (folder / "runs").mkdir()
     return folder
+
+
+@pytest.fixture
+def world(data_dir: Path, fitted_folder: Path) -> World:
+    """A server with one sequence and one finished run, whose queue stands still."""
+    shutil.copytree(fitted_folder, data_dir / "runs" / "fitted")
+    return make_world(data_dir)

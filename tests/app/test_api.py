@@ -1,0 +1,191 @@
+"""The REST interface, as a script and a page use it."""
+
+import csv
+import io
+import zipfile
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from server_world import World
+from sheet_sequence import FRAMES, NODE
+from starlette.testclient import TestClient
+
+from physhandi.data.run import Run
+
+
+@pytest.fixture
+def client(world: World) -> TestClient:
+    return world.script()
+
+
+def bundled_run(client: TestClient) -> str:
+    return next(run["id"] for run in client.get("/api/v1/runs").json()["runs"] if run["is_bundled"])
+
+
+def error_of(response: Any) -> dict[str, Any]:
+    assert list(response.json()) == ["error"]
+    return response.json()["error"]
+
+
+def test_sequences_are_listed_with_what_they_have(client: TestClient) -> None:
+    answer = client.get("/api/v1/sequences").json()
+    assert list(answer) == ["sequences"]
+    listed = {sequence["id"]: sequence for sequence in answer["sequences"]}
+    sheet = listed["sheet"]
+    assert (sheet["frame_count"], sheet["frame_rate"], sheet["is_bundled"]) == (FRAMES, 30.0, False)
+    assert sheet["parts"] == ["control", "marker", "object_node"]
+    assert sheet["duration_s"] == pytest.approx(FRAMES / 30)
+    assert listed["towel_fold"]["is_bundled"]
+    assert client.get("/api/v1/sequences/sheet").json() == sheet
+
+
+def test_runs_are_listed_with_how_far_they_are(client: TestClient) -> None:
+    answer = client.get("/api/v1/runs").json()
+    assert list(answer) == ["runs"]
+    run = answer["runs"][0]
+    assert (run["id"], run["name"], run["state"]) == ("fitted", "a sheet", "succeeded")
+    assert (run["sequences"], run["profile"], run["kind"]) == (["sheet"], "quick", "reconstruction")
+    assert run["is_published"]
+    assert run["error"] is None
+    assert answer["runs"][-1]["is_bundled"]
+    shown = client.get("/api/v1/runs/fitted").json()
+    assert shown["results"]["losses"]["first_order"]["after"] > 0
+    assert set(shown["results"]["metrics"]) == {"sheet"}
+    assert shown["results"]["parameters"]["gravity"] == 9.81
+    assert shown | {"results": None} == run | {"results": None}
+
+
+def test_losses_are_curves_of_iteration_and_loss(client: TestClient) -> None:
+    losses = client.get("/api/v1/runs/fitted/losses").json()["losses"]
+    curve = losses["zeroth_order"]["curve"]
+    assert len(curve) > 1
+    assert [point[0] for point in curve] == sorted(point[0] for point in curve)
+    assert losses["zeroth_order"]["before"] > losses["zeroth_order"]["after"] > 0
+
+
+def test_profiles_are_listed(client: TestClient) -> None:
+    profiles = client.get("/api/v1/profiles").json()["profiles"]
+    assert {profile["name"] for profile in profiles} == {"quick", "default", "paper", "phystwin"}
+    assert all(profile["description"] for profile in profiles)
+
+
+@pytest.mark.parametrize(
+    ("method", "path"),
+    [
+        ("GET", "/sequences/nothing"),
+        ("GET", "/runs/nothing"),
+        ("GET", "/runs/nothing/losses"),
+        ("GET", "/runs/nothing/events"),
+        ("GET", "/runs/nothing/export?format=npz"),
+        ("POST", "/runs/nothing/cancel"),
+        ("POST", "/runs/nothing/resume"),
+        ("DELETE", "/runs/nothing"),
+    ],
+)
+def test_what_is_not_there_is_not_found(client: TestClient, method: str, path: str) -> None:
+    response = client.request(method, f"/api/v1{path}")
+    assert response.status_code == 404
+    assert error_of(response)["code"] == "not_found"
+    assert "'nothing'" in error_of(response)["message"]
+
+
+@pytest.mark.parametrize(
+    "run_id", ["..%2f..%2fetc", "%2e%2e", "a.b", "C:x", "a" * 65, "%00", "%5c%5chost%5cs", "a%0ab"]
+)
+def test_an_id_is_never_a_path(client: TestClient, run_id: str) -> None:
+    for method, rest in (("GET", ""), ("DELETE", ""), ("POST", "/cancel"), ("GET", "/events")):
+        response = client.request(method, f"/api/v1/runs/{run_id}{rest}")
+        assert response.status_code in {404, 405, 422}
+        assert error_of(response)["message"]
+
+
+def test_too_many_waiting_fits_are_refused(world: World) -> None:
+    client = world.script()
+    world.settings.__dict__["waiting_fits"] = 1
+    assert client.post("/api/v1/runs", json={"sequences": ["sheet"]}).status_code == 201
+    full = client.post("/api/v1/runs", json={"sequences": ["sheet"]})
+    assert (full.status_code, error_of(full)["code"]) == (429, "queue_full")
+
+
+def test_the_bundled_run_stays_as_it_is(client: TestClient) -> None:
+    run_id = bundled_run(client)
+    for method, rest in (("DELETE", ""), ("POST", "/cancel"), ("POST", "/resume")):
+        response = client.request(method, f"/api/v1/runs/{run_id}{rest}")
+        assert response.status_code == 409
+        assert "came with the program" in error_of(response)["message"]
+    assert client.get(f"/api/v1/runs/{run_id}").json()["state"] == "succeeded"
+
+
+def test_exports_read_back_as_what_the_run_holds(world: World) -> None:
+    client = world.script()
+    rollout = Run.open(world.settings.run_dir / "fitted").array("sequences/sheet/rollout.npy")
+
+    def export(kind: str) -> bytes:
+        response = client.get(f"/api/v1/runs/fitted/export?format={kind}")
+        assert response.status_code == 200
+        suffix = "fitted_ply.zip" if kind == "ply" else f"fitted.{kind}"
+        assert f'filename="{suffix}"' in response.headers["content-disposition"]
+        return response.content
+
+    with np.load(io.BytesIO(export("npz")), allow_pickle=False) as arrays:
+        assert any(
+            array.shape == rollout.shape and np.array_equal(array, rollout)
+            for array in arrays.values()
+        )
+    with zipfile.ZipFile(io.BytesIO(export("ply"))) as archive:
+        assert len(archive.namelist()) >= FRAMES
+        assert archive.read(archive.namelist()[0]).startswith(b"ply\n")
+    rows = list(csv.reader(io.StringIO(export("csv").decode())))
+    assert len(rows) > FRAMES * len(NODE)
+    assert "parameters" in yaml.safe_load(export("yaml"))
+
+
+@pytest.mark.parametrize(
+    "query",
+    ["", "format=pkl", "format=../ply", "format=npz&sequence=nowhere", "format=npz&sequence=../x"],
+)
+def test_what_cannot_be_exported_is_told(client: TestClient, query: str) -> None:
+    response = client.get(f"/api/v1/runs/fitted/export?{query}")
+    assert response.status_code == 422
+    assert error_of(response)["message"]
+
+
+def test_an_unfinished_run_has_nothing_to_export(client: TestClient) -> None:
+    run_id = client.post("/api/v1/runs", json={"sequences": ["sheet"]}).json()["id"]
+    response = client.get(f"/api/v1/runs/{run_id}/export?format=npz")
+    assert response.status_code == 409
+    assert "nothing to export" in error_of(response)["message"]
+
+
+def test_live_scenes_are_opened_and_closed(world: World) -> None:
+    client = world.script()
+    try:
+        opened = client.post("/api/v1/sessions", json={"kind": "run", "id": "fitted"})
+        assert opened.status_code == 201
+        session = opened.json()
+        assert session["url"] == f"/live/{session['id']}"
+        assert f"/viewer/{session['id']}/" in client.get(session["url"]).text
+        assert client.get(f"/viewer/{session['id']}/").status_code == 200
+        for _ in range(2):
+            assert client.delete(f"/api/v1/sessions/{session['id']}").status_code == 204
+        assert client.get(session["url"]).status_code == 404
+        wrong = client.post("/api/v1/sessions", json={"kind": "run", "id": "nothing"})
+        assert wrong.status_code == 404
+        body = {"kind": "file", "id": "fitted"}
+        assert client.post("/api/v1/sessions", json=body).status_code == 422
+    finally:
+        world.sessions.shutdown()
+
+
+def test_too_many_live_scenes_are_refused(world: World) -> None:
+    world.settings.__dict__["live_sessions"] = 1
+    client = world.script()
+    try:
+        body = {"kind": "run", "id": "fitted"}
+        assert client.post("/api/v1/sessions", json=body).status_code == 201
+        full = client.post("/api/v1/sessions", json=body)
+        assert (full.status_code, error_of(full)["code"]) == (429, "too_many_sessions")
+    finally:
+        world.sessions.shutdown()

@@ -1,0 +1,164 @@
+"""The whole application: who gets in, and what it says when something is wrong."""
+
+import logging
+import re
+from collections.abc import Iterator
+
+import pytest
+from fastapi.routing import iter_route_contexts
+from server_world import HOST, ORIGIN, TOKEN, World
+from starlette.routing import Mount
+from starlette.testclient import WebSocketDenialResponse
+
+from app.security import PAGE_POLICY, VIEWER_POLICY
+from app.settings import WEB_ASSETS
+from physhandi.errors import RunError
+
+
+def addresses(world: World) -> Iterator[tuple[str, str]]:
+    """Every method and path that the application knows, with an id where one belongs."""
+    for route in iter_route_contexts(world.app.routes):
+        path = re.sub(r"\{[^}]*\}", "fitted", getattr(route, "path", None) or "")
+        if isinstance(getattr(route, "original_route", route), Mount) or path == "/assets":
+            continue
+        methods = getattr(route, "methods", None)
+        for method in sorted(methods) if methods else ["WEBSOCKET"]:
+            yield method, path
+    for file in WEB_ASSETS.rglob("*"):
+        if file.is_file():
+            yield "GET", f"/assets/{file.relative_to(WEB_ASSETS).as_posix()}"
+    yield "GET", "/nothing/here"
+
+
+def test_nothing_is_told_to_anybody_without_the_token(world: World) -> None:
+    client = world.client(Origin=ORIGIN)
+    known = list(addresses(world))
+    assert {"GET /", "POST /api/v1/runs", "GET /api/v1/openapi.json", "GET /healthz"} <= {
+        " ".join(pair) for pair in known
+    }
+    assert sum(path.startswith("/api/v1/") for _, path in known) >= 14
+    assert sum(method == "WEBSOCKET" for method, _ in known) == 2
+    for method, path in known:
+        if method == "WEBSOCKET":
+            with (
+                pytest.raises(WebSocketDenialResponse) as refused,
+                client.websocket_connect(f"ws://{HOST}{path}", subprotocols=["viser-v1.1.1"]),
+            ):
+                pass
+            assert refused.value.status_code == 401
+            continue
+        response = client.request(method, path)
+        assert response.status_code == 401, f"{method} {path}"
+        assert method == "HEAD" or response.json()["error"]["code"] == "unauthorized"
+
+
+def test_the_printed_address_lets_a_browser_in(world: World) -> None:
+    client = world.client(Accept="text/html")
+    entered = client.get(f"/?token={TOKEN}")
+    assert (entered.status_code, entered.headers["location"]) == (303, "/")
+    assert TOKEN not in entered.headers["set-cookie"]
+    assert client.get("/").status_code == 200
+    assert client.get("/assets/app.js").status_code == 200
+    assert client.get("/healthz").json()["status"] == "ok"
+
+
+def test_the_token_never_reaches_a_log_or_a_page(
+    world: World, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.DEBUG)
+    client = world.client(Accept="text/html")
+    pages = [client.get(f"/x?token={TOKEN}z"), client.get(f"/?token={TOKEN}"), client.get("/")]
+    told = [record.getMessage() for record in caplog.records if record.name.startswith("app")]
+    assert told
+    assert not any(TOKEN in line for line in told)
+    assert not any(TOKEN in page.text for page in pages)
+
+
+def test_another_site_can_neither_launch_nor_cancel(world: World) -> None:
+    client = world.browser()
+    body = {"sequences": ["sheet"], "name": "publish"}
+    for origin in ("http://evil.example", "null", "http://127.0.0.1:9999"):
+        for method, path in addresses(world):
+            if method in {"POST", "DELETE"}:
+                headers = {"Origin": origin}
+                response = client.request(method, path, json=body, headers=headers)
+                assert response.status_code == 403, f"{method} {path}"
+    assert [item.id for item in world.catalog.runs() if not item.is_bundled] == ["fitted"]
+
+
+def test_pages_run_no_foreign_and_no_inline_script(world: World) -> None:
+    client = world.browser()
+    for path in ("/", "/runs/fitted", "/nothing"):
+        response = client.get(path)
+        assert response.headers["content-security-policy"] == PAGE_POLICY
+        assert not re.search(r"<script(?![^>]*\ssrc=)|\son\w+=|javascript:|<style", response.text)
+        assert not re.search(r"(src|href)=\"(https?:)?//", response.text)
+    assert "unsafe" not in PAGE_POLICY
+    scene = client.get("/viewer/nothing/")
+    assert scene.headers["content-security-policy"] == VIEWER_POLICY
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/assets/../app/cli.py",
+        "/assets/%2e%2e/app/cli.py",
+        "/assets/..%2fapp/cli.py",
+        "/assets/..%5capp/cli.py",
+        "/assets//etc/passwd",
+        "/assets/%00",
+        "/assets/templates",
+        "/viewer/x/../../etc/passwd",
+        "/viewer/x/index.html",
+        "/viewer/x/%2e%2e/%2e%2e/etc/passwd",
+        "/runs/..%2f..%2fetc",
+        "/runs/" + "a" * 10_000,
+        "/runs/a.b",
+        "/live/%2e%2e",
+    ],
+)
+def test_no_path_leads_out(world: World, path: str) -> None:
+    response = world.browser().get(path)
+    assert response.status_code == 404
+    assert "root:" not in response.text
+
+
+def test_errors_are_pages_for_browsers_and_json_for_scripts(world: World) -> None:
+    page = world.browser().get("/runs/nothing")
+    assert (page.status_code, page.headers["content-type"]) == (404, "text/html; charset=utf-8")
+    assert "There is no run &#39;nothing&#39;." in page.text
+    for client in (world.script(), world.browser()):
+        answer = client.get("/api/v1/runs/nothing")
+        assert answer.status_code == 404
+        error = {"code": "not_found", "message": "There is no run 'nothing'."}
+        assert answer.json() == {"error": error}
+    assert world.script().get("/nothing").json()["error"]["code"] == "not_found"
+    wrong = world.script().put("/api/v1/runs")
+    assert (wrong.status_code, wrong.json()["error"]["code"]) == (405, "wrong_method")
+
+
+def test_a_defect_is_logged_and_told_without_details(
+    world: World, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def break_down() -> None:
+        raise ZeroDivisionError("secret detail")
+
+    monkeypatch.setattr(world.catalog, "sequences", break_down)
+    client = world.script()
+    client._transport.raise_server_exceptions = False
+    response = client.get("/api/v1/sequences")
+    assert response.status_code == 500
+    assert response.json()["error"]["code"] == "defect"
+    assert "secret detail" not in response.text
+    assert "secret detail" in caplog.text
+
+
+def test_a_large_body_is_refused(world: World) -> None:
+    body = {"sequences": ["sheet"], "name": "x" * 2**20}
+    assert world.script().post("/api/v1/runs", json=body).status_code == 413
+    assert [item.id for item in world.catalog.runs() if not item.is_bundled] == ["fitted"]
+
+
+def test_a_second_server_on_the_same_data_folder_says_so(world: World) -> None:
+    with world.script(), pytest.raises(RunError, match="Another server"):
+        world.scheduler.__class__(world.settings, world.catalog).start()

@@ -1,0 +1,94 @@
+"""A server inside the test's process, and a small finished run for it to show."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from fastapi import FastAPI
+from starlette.testclient import TestClient
+
+from app.jobs.catalog import Catalog
+from app.jobs.scheduler import Scheduler
+from app.security import Security
+from app.server import create_app
+from app.settings import Settings
+from app.viewer.session import Sessions
+from physhandi import pipeline
+from physhandi.data.run import Run
+from physhandi.fitting.profile import PipelineConfig, config_to_dict, load_profile
+from physhandi.fitting.search import SearchVariable
+
+TOKEN = "a-token-that-only-the-tests-know"  # noqa: S105
+HOST = "127.0.0.1:8080"
+ORIGIN = f"http://{HOST}"
+
+
+@dataclass(frozen=True)
+class World:
+    """An application with all its parts."""
+
+    settings: Settings
+    security: Security
+    catalog: Catalog
+    scheduler: Scheduler
+    sessions: Sessions
+    app: FastAPI
+
+    def client(self, **headers: str) -> TestClient:
+        """A client that sends nothing but these headers by itself."""
+        return TestClient(
+            self.app, base_url=ORIGIN, headers=headers, follow_redirects=False, client=("tester", 1)
+        )
+
+    def script(self) -> TestClient:
+        """A client with the token in its header."""
+        return self.client(Authorization=f"Bearer {TOKEN}")
+
+    def browser(self) -> TestClient:
+        """A client with a cookie, as a page of ours."""
+        client = self.client(Accept="text/html", Origin=ORIGIN)
+        client.cookies.set(self.security.cookie, self.security.new_pass())
+        return client
+
+
+def make_world(data_dir: Path, **options: object) -> World:
+    settings = Settings.model_validate(
+        {"data_dir": data_dir, "token": TOKEN, "cancel_grace_s": 1.0} | options
+    )
+    security = Security(settings)
+    catalog = Catalog(settings)
+    scheduler = Scheduler(settings, catalog, worker="job_worker")
+    sessions = Sessions(settings, catalog)
+    app = create_app(
+        settings, security=security, catalog=catalog, scheduler=scheduler, sessions=sessions
+    )
+    return World(settings, security, catalog, scheduler, sessions, app)
+
+
+def tiny_config() -> PipelineConfig:
+    """Settings that fit `sheet_sequence` within a second or two."""
+    config = load_profile("quick")
+    soft = SearchVariable(low=50.0, high=3e4, scale="log")
+    variables = config.object_.search.variables | {
+        "connection_radius": SearchVariable(low=0.06, high=0.12),
+        "virtual_connection_radius": SearchVariable(low=0.01, high=0.04),
+        "stiffness": soft,
+        "virtual_stiffness": soft,
+    }
+    search = replace(config.object_.search, generations=2, population=4, variables=variables)
+    first_order = replace(config.object_.first_order, iterations=2)
+    simulation = replace(config.simulation, connection_radius=0.08, virtual_connection_radius=0.02)
+    object_ = replace(config.object_, search=search, first_order=first_order)
+    return replace(config, object_=object_, simulation=simulation)
+
+
+def fit_sheet(folder: Path, sequence: Path) -> Run:
+    """Make a finished run of a sequence of `sheet_sequence`."""
+    run = Run.create(
+        folder,
+        name="a sheet",
+        kind="reconstruction",
+        sequences=[str(sequence)],
+        config={"profile": config_to_dict(tiny_config())},
+    )
+    pipeline.run_job(run)
+    return Run.open(folder)
