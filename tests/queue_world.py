@@ -1,0 +1,102 @@
+"""An application whose queue works, with the workers of `job_worker` and made-up live scenes."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
+
+from app.jobs.catalog import Catalog
+from app.jobs.processes import end_processes
+from app.jobs.scheduler import Scheduler
+from app.security import Security
+from app.server import create_app
+from app.settings import Settings
+from app.viewer.session import TooManySessionsError
+
+HOSTILE = "<img src=x onerror=alert(1)>\u202e"
+
+
+@dataclass
+class Scene:
+    kind: str
+    target: str
+    title: str
+
+    @property
+    def info(self) -> "Scene":
+        return self
+
+
+@dataclass
+class Scenes:
+    """Stands for the live viewer; it has room for two scenes."""
+
+    opened: dict[str, Scene] = field(default_factory=dict)
+    owners: list[str] = field(default_factory=list)
+
+    def open(self, kind: str, target: str, owner: str) -> str:
+        if len(self.opened) == 2:
+            raise TooManySessionsError("2 live sessions are open.")
+        self.owners.append(owner)
+        name = f"scene{len(self.opened)}"
+        self.opened[name] = Scene(kind, target, HOSTILE)
+        return name
+
+    def get(self, session_id: str) -> Scene | None:
+        return self.opened.get(session_id)
+
+    def close(self, session_id: str) -> bool:
+        return self.opened.pop(session_id, None) is not None
+
+    def shutdown(self) -> None:
+        self.opened.clear()
+
+
+@dataclass
+class QueueWorld:
+    app: FastAPI
+    client: TestClient
+    scenes: Scenes
+    data_dir: Path
+    token: str
+
+    def launch(self, name: str) -> str:
+        body = {"sequences": ["sheet"], "profile": "quick", "name": name}
+        response = self.client.post("/api/v1/runs", json=body)
+        assert response.status_code == 201
+        return response.json()["id"]
+
+    def until(self, run_id: str, state: str, seconds: float = 15.0) -> dict[str, Any]:
+        end = time.monotonic() + seconds
+        while (run := self.client.get(f"/api/v1/runs/{run_id}").json())["state"] != state:
+            assert time.monotonic() < end, run
+            time.sleep(0.03)
+        return run
+
+    def folder(self, run_id: str) -> Path:
+        return self.data_dir / "runs" / run_id
+
+
+@contextmanager
+def queue_world(data_dir: Path, bundled: Path) -> Iterator[QueueWorld]:
+    """Serve a data folder; when it is over, no process of a run is left."""
+    settings = Settings(data_dir=data_dir, cancel_grace_s=1.0)
+    catalog = Catalog(settings, bundled=bundled)
+    scheduler = Scheduler(settings, catalog, worker="job_worker")
+    security = Security(settings)
+    scenes: Any = Scenes()
+    app = create_app(
+        settings, security=security, catalog=catalog, scheduler=scheduler, sessions=scenes
+    )
+    bearer = {"Authorization": f"Bearer {security.token}"}
+    with TestClient(app, "http://127.0.0.1:8080", headers=bearer) as client:
+        yield QueueWorld(app, client, scenes, data_dir, security.token)
+    for folder in (data_dir / "runs").iterdir():
+        end_processes(folder, grace_s=0.0)
+    for process, _ in scheduler._started.values():
+        process.wait()
