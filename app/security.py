@@ -56,7 +56,9 @@ _LOCKED_PAGE = (
     f"<style>{_STYLE}</style><h1>This page needs its token</h1>"
     "<p>Open the full address that <code>physhandi serve</code> printed in the terminal; it ends "
     "in <code>?token=…</code>. Your browser then remembers it until the server stops.</p>"
-    "<p>Was the server restarted? Then it has a new token: use the new address.</p></html>"
+    "<p>Was the server restarted? Then it has a new token: use the new address.</p>"
+    # A browser that came from another site brings its cookie only when it is asked again from here.
+    "<p>Did you just open that address? <a href='/'>Try again</a></p></html>"
 )
 
 

@@ -39,6 +39,7 @@ DEMO_SEQUENCE = "towel_fold"
 _FRAME_LIMIT = 64 * 2**20
 _BODY_LIMIT = 2**20
 _ANY_ADDRESS = {"0.0.0.0", "::"}  # noqa: S104  # compared, not bound
+_NOWHERE = "There is nothing at this address. It may be mistyped, or what was here was deleted."
 _STATUS: tuple[tuple[type[PhysHandiError], int, str], ...] = (
     (NotFoundError, 404, "not_found"),
     (TooManySessionsError, 429, "too_many_sessions"),
@@ -127,7 +128,7 @@ def _answer_errors(app: FastAPI, pages: Pages) -> None:
 
     @app.exception_handler(HTTPException)
     def on_http(request: Request, error: HTTPException) -> Response:
-        known = {404: "There is nothing at this address.", 413: "The request is too large."}
+        known = {404: _NOWHERE, 413: "The request is too large."}
         is_plain = error.detail in {"Not Found", "Content Too Large", "Request Entity Too Large"}
         message = known.get(error.status_code, error.detail) if is_plain else error.detail
         code = {404: "not_found", 405: "wrong_method", 413: "too_large"}.get(error.status_code)
@@ -136,7 +137,7 @@ def _answer_errors(app: FastAPI, pages: Pages) -> None:
     @app.exception_handler(RequestValidationError)
     def on_invalid(request: Request, error: RequestValidationError) -> Response:
         if request.url.path.startswith(("/runs/", "/live/")):
-            return answer(request, 404, "not_found", "There is nothing at this address.")
+            return answer(request, 404, "not_found", _NOWHERE)
         fields = [
             {"field": ".".join(map(str, entry["loc"])), "message": str(entry["msg"])}
             for entry in error.errors()

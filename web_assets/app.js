@@ -233,12 +233,19 @@ addEventListener("resize", () => charts.forEach(({ plot, figure }) => plot.setSi
 
 /* ---- start ---- */
 
+function showLocalTimes() {
+  for (const place of document.querySelectorAll("time")) {
+    place.textContent = new Date(place.dateTime).toLocaleString([], { dateStyle: "medium", timeStyle: "short" });
+  }
+}
+
 document.addEventListener("error", (event) => {
   if (event.target.matches?.("img[data-thumbnail]")) event.target.classList.add("missing");
 }, true);
 
 document.addEventListener("DOMContentLoaded", () => {
   cursor = document.body.dataset.since ?? null;
+  showLocalTimes();
   follow();
   drawLosses();
   const log = document.getElementById("log");
@@ -248,6 +255,7 @@ document.addEventListener("DOMContentLoaded", () => {
 });
 
 document.addEventListener("htmx:afterSettle", () => {
+  showLocalTimes();
   const log = document.getElementById("log");
   if (log) log.scrollTop = log.scrollHeight;
 });
