@@ -3,9 +3,10 @@
 import json
 import logging
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import tyro
 from tyro.conf import Positional, arg, subcommand
@@ -14,21 +15,24 @@ from app import commands
 from physhandi.errors import PhysHandiError, UsageError
 from physhandi.progress import Progress
 
-DataDir = Annotated[Path, arg(help="Folder with `sequences/` and `runs/`; made when missing.")]
-DATA = Path("data")
+Result = TypeVar("Result")
+DataDir = Annotated[
+    Path | None,
+    arg(help="Folder with `sequences/` and `runs/` (PHYSHANDI_DATA_DIR, else `data`)."),
+]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Serve:
     """Serve the application and print the address to open."""
 
-    host: str = "127.0.0.1"
-    """Address to listen on; anything but loopback is reachable by others."""
-    port: int = 8080
-    """Port to listen on; 0 takes a free one."""
-    data_dir: DataDir = DATA
-    device: str = "auto"
-    """Warp device: auto, cpu or cuda:0."""
+    host: str | None = None
+    """Address to listen on; others reach anything but loopback (PHYSHANDI_HOST, else 127.0.0.1)."""
+    port: int | None = None
+    """Port to listen on; 0 takes a free one (PHYSHANDI_PORT, else 8080)."""
+    data_dir: DataDir = None
+    device: str | None = None
+    """Warp device: auto, cpu or cuda:0 (PHYSHANDI_DEVICE, else auto)."""
     demo: bool = False
     """Also queue a quick fit of the bundled sequence."""
 
@@ -45,7 +49,7 @@ class Reconstruct:
     """Settings: quick, default, paper or phystwin."""
     device: str = "auto"
     """Warp device: auto, cpu or cuda:0."""
-    data_dir: DataDir = DATA
+    data_dir: DataDir = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +84,7 @@ class Simulate:
     """Integration steps in one frame."""
     device: str = "auto"
     """Warp device: auto, cpu or cuda:0."""
-    data_dir: DataDir = DATA
+    data_dir: DataDir = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,7 +95,7 @@ class EvaluateRun:
     """Folder or id of a finished run."""
     json: bool = False
     """Print JSON instead of a table."""
-    data_dir: DataDir = DATA
+    data_dir: DataDir = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +106,7 @@ class EvaluateHands:
     """Folder or id of a finished run."""
     json: bool = False
     """Print JSON instead of a table."""
-    data_dir: DataDir = DATA
+    data_dir: DataDir = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,7 +167,7 @@ class Export:
     """Only this frame (ply)."""
     overwrite: bool = False
     """Replace what is there."""
-    data_dir: DataDir = DATA
+    data_dir: DataDir = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,7 +206,7 @@ class Benchmark:
 class Doctor:
     """Check that this machine can run the demo; exit code 0 when it can."""
 
-    data_dir: DataDir = DATA
+    data_dir: DataDir = None
 
 
 Command = (
@@ -241,34 +245,43 @@ class PrintedProgress(Progress):
         line = f"\r{stage:<20} {bar} {iteration}/{total}{shown}  {message}"
         print(f"{line:<100}", end="", file=sys.stderr, flush=True)
 
+    def finish(self) -> None:
+        """End the line, if there is one, so that what follows stands on its own."""
+        if self.stage:
+            print(file=sys.stderr)
+            self.stage = ""
 
-def _show(result: Any, *, as_json: bool) -> None:
+
+def _watched(work: Callable[[Progress], Result]) -> Result:
+    progress = PrintedProgress()
+    try:
+        return work(progress)
+    finally:
+        progress.finish()
+
+
+def _show(result: Any, *, as_json: bool = False) -> None:
     if as_json:
-        print(json.dumps(result, indent=2, ensure_ascii=False))
+        print(json.dumps(commands.as_json_data(result), indent=2, ensure_ascii=False))
         return
     for line in commands.lines(result):
         print(line)
 
 
 def _dispatch(command: Any) -> int:
-    progress = PrintedProgress()
     match command:
         case Serve():
             commands.serve(command, on_ready=lambda url: print(url, flush=True))
         case Reconstruct():
-            result = commands.reconstruct(command, progress)
-            print(file=sys.stderr)
-            _show(result, as_json=False)
+            _show(_watched(lambda progress: commands.reconstruct(command, progress)))
         case Simulate():
-            result = commands.simulate(command, progress)
-            print(file=sys.stderr)
-            _show(result, as_json=False)
+            _show(_watched(lambda progress: commands.simulate(command, progress)))
         case Evaluate(what=EvaluateHands() as what):
             _show(commands.evaluate_hands(what), as_json=what.json)
         case Evaluate(what=what):
             _show(commands.evaluate_run(what), as_json=what.json)
         case Import(source=source):
-            for folder in commands.import_recording(source, progress):
+            for folder in _watched(lambda progress: commands.import_recording(source, progress)):
                 print(folder)
         case Export():
             print(commands.export(command))
@@ -296,6 +309,6 @@ def main(argv: list[str] | None = None) -> None:
         print(f"physhandi: {error}", file=sys.stderr)
         code = 1
     except KeyboardInterrupt:
-        print("\nphyshandi: interrupted", file=sys.stderr)
+        print("physhandi: interrupted", file=sys.stderr)
         code = 130
     sys.exit(code)

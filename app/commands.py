@@ -4,16 +4,20 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
+
+from pydantic import ValidationError
 
 from app.jobs.catalog import Catalog
 from app.settings import Settings
 from physhandi import pipeline
+from physhandi.data.atomic import plain, without_non_finite
 from physhandi.data.run import Run, RunKind
 from physhandi.data.sequence import Sequence
 from physhandi.errors import RunError, UsageError
 from physhandi.fitting.profile import config_to_dict, load_profile
 from physhandi.progress import Progress
+from physhandi.simulation.model import SimulationParameters
 
 OVERRIDES = (
     "connection_radius",
@@ -29,8 +33,23 @@ OVERRIDES = (
 )
 
 
-class _WithDevice(Protocol):
-    device: str
+def read_settings(**given: Any) -> Settings:
+    """Read the settings; where an argument is None, the environment speaks, then the default.
+
+    Raises:
+        UsageError: If a value is out of range; names it.
+    """
+    try:
+        return Settings(**{name: value for name, value in given.items() if value is not None})
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "settings"
+        raise UsageError(f"{where}: {first['msg']}.") from None
+
+
+def open_catalog(data_dir: Path | None) -> Catalog:
+    """Find sequences and runs in a data folder and among the bundled ones."""
+    return Catalog(read_settings(data_dir=data_dir))
 
 
 def pick_device(name: str) -> str:
@@ -49,7 +68,7 @@ def pick_device(name: str) -> str:
     return name
 
 
-def find_sequence(name: str, data_dir: Path) -> Sequence:
+def find_sequence(name: str, data_dir: Path | None) -> Sequence:
     """Open a sequence by folder or by name.
 
     Raises:
@@ -58,7 +77,7 @@ def find_sequence(name: str, data_dir: Path) -> Sequence:
     """
     if (Path(name) / "sequence.yaml").is_file():
         return Sequence.load(Path(name))
-    catalog = Catalog(Settings(data_dir=data_dir))
+    catalog = open_catalog(data_dir)
     known = [entry.id for entry in catalog.sequences()]
     if name not in known:
         raise UsageError(
@@ -68,7 +87,7 @@ def find_sequence(name: str, data_dir: Path) -> Sequence:
     return catalog.sequence(name)
 
 
-def find_run(name: str, data_dir: Path) -> Run:
+def find_run(name: str, data_dir: Path | None) -> Run:
     """Open a run by folder or by id.
 
     Raises:
@@ -76,11 +95,12 @@ def find_run(name: str, data_dir: Path) -> Run:
     """
     if (Path(name) / "run.yaml").is_file():
         return Run.open(Path(name))
-    catalog = Catalog(Settings(data_dir=data_dir))
+    catalog = open_catalog(data_dir)
     known = [entry.id for entry in catalog.runs()]
     if name not in known:
         raise RunError(
-            f"'{name}' is neither a run folder nor a known run. Known are: {', '.join(known) or 'none'}."
+            f"'{name}' is neither a run folder nor a known run. "
+            f"Known are: {', '.join(known) or 'none'}."
         )
     return catalog.run(name)
 
@@ -90,10 +110,10 @@ def reconstruct(command: Any, progress: Progress) -> dict[str, Any]:
     if not command.sequences:
         raise UsageError("Name at least one sequence to reconstruct.")
     sequences = [find_sequence(name, command.data_dir) for name in command.sequences]
+    device = pick_device(command.device)
     config = {"profile": config_to_dict(load_profile(command.profile))}
     paths = [str(sequence.folder) for sequence in sequences]
-    run = _run_at(command.out, "reconstruction", command.out.name, paths, config)
-    return _execute(run, command, progress)
+    return _execute(_run_at(command.out, "reconstruction", paths, config), device, progress)
 
 
 def simulate(command: Any, progress: Progress) -> dict[str, Any]:
@@ -103,21 +123,21 @@ def simulate(command: Any, progress: Progress) -> dict[str, Any]:
         raise RunError(
             f"Run '{source.id}' is {source.state}: only a finished run can be simulated."
         )
+    device = pick_device(command.device)
     changes = {n: v for n in OVERRIDES if (v := getattr(command, n)) is not None}
+    SimulationParameters.from_dict(changes)  # Tells a wrong value before a run is made.
     if command.sequence is not None:
         sequence = find_sequence(command.sequence, command.data_dir)
     else:
-        sequence = Catalog(Settings(data_dir=command.data_dir)).sequences_of(source)[0]
+        sequence = open_catalog(command.data_dir).sequences_of(source)[0]
     config = {"source": str(source.folder.resolve()), "parameters": changes}
     paths = [str(sequence.folder)]
-    run = _run_at(command.out, "simulation", command.out.name, paths, config)
-    return _execute(run, command, progress)
+    return _execute(_run_at(command.out, "simulation", paths, config), device, progress)
 
 
-def _run_at(
-    folder: Path, kind: RunKind, name: str, sequences: list[str], config: dict[str, Any]
-) -> Run:
+def _run_at(folder: Path, kind: RunKind, sequences: list[str], config: dict[str, Any]) -> Run:
     if not (folder / "run.yaml").is_file():
+        name = folder.resolve().name
         return Run.create(folder, name=name, kind=kind, sequences=sequences, config=config)
     run = Run.open(folder)
     if run.kind != kind or run.config != config or list(run.sequences) != sequences:
@@ -129,8 +149,8 @@ def _run_at(
     return run
 
 
-def _execute(run: Run, command: _WithDevice, progress: Progress) -> dict[str, Any]:
-    pipeline.run_job(run, progress, device=pick_device(command.device))
+def _execute(run: Run, device: str, progress: Progress) -> dict[str, Any]:
+    pipeline.run_job(run, progress, device=device)
     return summary(Run.open(run.folder))
 
 
@@ -152,7 +172,7 @@ def summary(run: Run) -> dict[str, Any]:
 def evaluate_run(command: Any) -> dict[str, Any]:
     """Measure a run again from its stored motion."""
     run = find_run(command.run, command.data_dir)
-    catalog = Catalog(Settings(data_dir=command.data_dir))
+    catalog = open_catalog(command.data_dir)
     return pipeline.evaluate(run, catalog.sequences_of(run))
 
 
@@ -214,16 +234,15 @@ def serve(command: Any, on_ready: Callable[[str], None]) -> None:
     """Serve until interrupted."""
     from app.server import serve as serve_application
 
-    settings = Settings(
-        host=command.host,
-        port=command.port,
-        data_dir=command.data_dir,
-        device=pick_device(command.device),
+    settings = read_settings(
+        host=command.host, port=command.port, data_dir=command.data_dir, device=command.device
     )
+    named = settings.device if "device" in settings.model_fields_set else "auto"
+    settings = settings.model_copy(update={"device": pick_device(named)})
     serve_application(settings, on_ready=on_ready, queue_demo=command.demo)
 
 
-def doctor(data_dir: Path) -> tuple[bool, list[str]]:
+def doctor(data_dir: Path | None) -> tuple[bool, list[str]]:
     """Check what the demo needs; returns whether all is well and what was found."""
     checks = [_check(name, probe) for name, probe in _probes(data_dir)]
     return all(ok for ok, _ in checks), [line for _, line in checks]
@@ -236,7 +255,7 @@ def _check(name: str, probe: Callable[[], str]) -> tuple[bool, str]:
         return False, f"FAIL  {name}: {error}"
 
 
-def _probes(data_dir: Path) -> Iterator[tuple[str, Callable[[], str]]]:
+def _probes(data_dir: Path | None) -> Iterator[tuple[str, Callable[[], str]]]:
     def python() -> str:
         return sys.version.split()[0]
 
@@ -266,7 +285,7 @@ def _probes(data_dir: Path) -> Iterator[tuple[str, Callable[[], str]]]:
         return f"Warp on {device}, a falling node lands where it should"
 
     def bundled() -> str:
-        catalog = Catalog(Settings(data_dir=data_dir))
+        catalog = open_catalog(data_dir)
         entries = list(catalog.sequences())
         if not entries:
             raise RuntimeError("no sequence is bundled; reinstall the package")
@@ -280,8 +299,9 @@ def _probes(data_dir: Path) -> Iterator[tuple[str, Callable[[], str]]]:
         )
 
     def space() -> str:
-        folder = data_dir if data_dir.exists() else Path()
-        free = shutil.disk_usage(folder).free
+        folder = read_settings(data_dir=data_dir).data_dir
+        existing = next(place for place in (folder, *folder.parents) if place.exists())
+        free = shutil.disk_usage(existing).free
         if free < 500e6:
             raise RuntimeError(f"only {free / 1e6:.0f} MB free; 500 MB are needed")
         return f"{free / 1e9:.0f} GB free"
@@ -292,6 +312,11 @@ def _probes(data_dir: Path) -> Iterator[tuple[str, Callable[[], str]]]:
     yield "hand", hand
     yield "sequences", bundled
     yield "disk", space
+
+
+def as_json_data(result: Any) -> Any:
+    """Turn results into what JSON knows; NaN and infinity become null."""
+    return without_non_finite(plain(result))
 
 
 def lines(result: Any, indent: int = 0) -> Iterator[str]:

@@ -1,0 +1,280 @@
+"""The command line: what it prints, what it writes and how it exits."""
+
+import json
+import shutil
+import socket
+from pathlib import Path
+
+import numpy as np
+import pytest
+from server_world import tiny_config
+from sheet_sequence import FRAMES, NODE
+
+from app import cli, commands
+from physhandi.data.run import Run
+from physhandi.fitting.artefacts import load_parameters
+from physhandi.fitting.profile import PipelineConfig
+
+
+class Terminal:
+    """Calls the command line in a folder of its own."""
+
+    def __init__(self, data_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        self.data_dir = data_dir
+        self._capsys = capsys
+        self.out = self.error = ""
+
+    def __call__(self, *arguments: object) -> int:
+        self._capsys.readouterr()
+        with pytest.raises(SystemExit) as end:
+            cli.main([str(argument) for argument in arguments])
+        self.out, self.error = self._capsys.readouterr()
+        return int(end.value.code or 0)
+
+    def refused(self, code: int, *arguments: object) -> str:
+        """Call what must fail with one clear line; returns the line."""
+        assert self(*arguments) == code
+        assert "Traceback" not in self.error
+        last = self.error.splitlines()[-1]
+        assert last.startswith("physhandi: "), self.error
+        assert self.out == ""
+        return last
+
+
+@pytest.fixture
+def terminal(
+    data_dir: Path,
+    fitted_folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> Terminal:
+    shutil.copytree(fitted_folder, data_dir / "runs" / "fitted")
+    monkeypatch.chdir(data_dir.parent)
+    return Terminal(data_dir, capsys)
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> PipelineConfig:
+    """Make the quick profile quicker."""
+    config = tiny_config()
+    monkeypatch.setattr(commands, "load_profile", lambda _: config)
+    return config
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["fly"],
+        [],
+        ["export", "fitted", "--format", "pkl", "--out", "x"],
+        ["export", "fitted", "--format", "npz"],
+        ["reconstruct", "sheet"],
+        ["simulate", "fitted", "--out", "x", "--drag", "much"],
+        ["serve", "--port", "many"],
+        ["doctor", "--nonsense"],
+    ],
+)
+def test_bad_usage_exits_with_2_and_says_how_it_goes(
+    terminal: Terminal, arguments: list[str]
+) -> None:
+    assert terminal(*arguments) == 2
+    assert "Traceback" not in terminal.error + terminal.out
+    assert "--help" in terminal.error + terminal.out
+    assert not Path("x").exists()
+
+
+def test_help_names_every_command_and_exits_with_0(terminal: Terminal) -> None:
+    assert terminal("--help") == 0
+    for command in (
+        "serve",
+        "reconstruct",
+        "simulate",
+        "evaluate",
+        "import",
+        "export",
+        "benchmark",
+        "doctor",
+    ):
+        assert command in terminal.out
+    assert terminal("simulate", "--help") == 0
+    assert "--connection-radius" in terminal.out
+    assert "δ of object springs" in terminal.out
+
+
+def test_the_doctor_finds_all_well(terminal: Terminal) -> None:
+    assert terminal("doctor") == 0
+    lines = terminal.out.splitlines()
+    assert [line.split()[0] for line in lines] == ["ok"] * len(lines)
+    assert any("towel_fold" in line and "sheet" in line for line in lines)
+    assert "falling node" in terminal.out
+
+
+def test_the_doctor_names_what_is_wrong(
+    terminal: Terminal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def absent(side: str) -> None:
+        raise FileNotFoundError(f"{side} hand is not there")
+
+    monkeypatch.setattr("physhandi.hand.model.load_hand_model", absent)
+    assert terminal("doctor") == 1
+    assert "FAIL  hand: right hand is not there" in terminal.out
+
+
+def test_a_fit_is_made_told_and_not_made_twice(terminal: Terminal, quick: PipelineConfig) -> None:
+    order = ("reconstruct", "sheet", "--out", "mine", "--profile", "quick", "--device", "cpu")
+    assert terminal(*order) == 0
+    run = Run.open("mine")
+    assert (run.state, run.name, run.sequence_names) == ("succeeded", "mine", ["sheet"])
+    losses = run.json("losses.json")["first_order"]
+    assert f"after: {losses['after']:.6g}" in terminal.out
+    assert "first order" in terminal.error.replace("_", " ")
+    assert "finished" in terminal.refused(2, *order)
+    other = ("reconstruct", "sheet", "sheet", "--out", "mine", "--device", "cpu")
+    assert "another run" in terminal.refused(2, *other)
+    assert Run.open("mine").state == "succeeded"
+
+
+def test_an_interrupted_fit_goes_on(terminal: Terminal, quick: PipelineConfig) -> None:
+    order = ("reconstruct", "sheet", "--out", "mine", "--device", "cpu")
+    original = commands.pipeline.optimise_springs
+
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(commands.pipeline, "optimise_springs", interrupt)
+        assert terminal(*order) == 130
+    assert terminal.error.splitlines()[-1] == "physhandi: interrupted"
+    assert Run.open("mine").state == "cancelled"
+    assert commands.pipeline.optimise_springs is original
+    assert terminal(*order) == 0
+    assert "first_order" in terminal.error
+    assert "zeroth_order" not in terminal.error
+
+
+def test_an_error_stands_on_a_line_of_its_own_below_the_progress(
+    terminal: Terminal, quick: PipelineConfig
+) -> None:
+    folder = terminal.data_dir / "sequences" / "sheet"
+    (folder / "marker.npy").unlink()
+    (folder / "marker_node.npy").unlink()
+    line = terminal.refused(1, "reconstruct", "sheet", "--out", "mine", "--device", "cpu")
+    assert "'sheet' lacks depth, mask" in line
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "reason"),
+    [
+        (["reconstruct", "nowhere", "--out", "x"], 2, "Known are: sheet, towel_fold"),
+        (["reconstruct", "--out", "x"], 2, "at least one sequence"),
+        (["reconstruct", "sheet", "--out", "x", "--profile", "fastest"], 2, "Choose one of"),
+        (["reconstruct", "sheet", "--out", "x", "--device", "abacus"], 2, "no device 'abacus'"),
+        (["reconstruct", "sheet", "--out", "a.b"], 1, "cannot name a run"),
+        (["simulate", "nothing", "--out", "x"], 1, "Known are: fitted"),
+        (["evaluate", "run", "nothing"], 1, "neither a run folder nor a known run"),
+        (["evaluate", "hands", "fitted"], 1, "no hands"),
+        (["export", "nothing", "--format", "npz", "--out", "x.npz"], 1, "known run"),
+        (["export", "fitted", "--format", "npz", "--out", "x.npz", "--sequence", "q"], 2, "'q'"),
+        (["export", "fitted", "--format", "npz", "--out", "x.npz", "--frame", "1"], 2, "ply only"),
+        (["import", "stereo", "nothing", "--out", "x"], 1, "nothing"),
+        (["serve", "--port", "70000"], 2, "port"),
+    ],
+)
+def test_every_mistake_is_one_clear_line(
+    terminal: Terminal, arguments: list[str], code: int, reason: str
+) -> None:
+    assert reason in terminal.refused(code, *arguments)
+    assert not list(Path().glob("x*"))
+
+
+def test_an_unfinished_run_is_neither_simulated_nor_measured_nor_exported(
+    terminal: Terminal,
+) -> None:
+    folder = terminal.data_dir / "runs" / "new"
+    sequence = str(terminal.data_dir / "sequences" / "sheet")
+    Run.create(folder, name="new", kind="reconstruction", sequences=[sequence], config={})
+    assert "is queued" in terminal.refused(1, "simulate", "new", "--out", "x")
+    assert "is queued" in terminal.refused(1, "evaluate", "run", "new")
+    assert "is queued" in terminal.refused(1, "export", "new", "--format", "npz", "--out", "x.npz")
+
+
+def test_a_run_is_simulated_again_with_other_parameters(terminal: Terminal) -> None:
+    order = ("simulate", "fitted", "--out", "softer", "--stiffness-scale", "0.5", "--device", "cpu")
+    assert terminal(*order) == 0
+    run = Run.open("softer")
+    assert (run.kind, run.state) == ("simulation", "succeeded")
+    assert load_parameters(run.out).stiffness_scale == 0.5
+    fitted = Run.open(terminal.data_dir / "runs" / "fitted").array("sequences/sheet/rollout.npy")
+    assert np.abs(run.array("sequences/sheet/rollout.npy") - fitted).max() > 1e-5
+
+
+def test_a_value_out_of_range_is_refused_by_name(terminal: Terminal) -> None:
+    order = ("simulate", "fitted", "--device", "cpu", "--out", "x")
+    for field, value in (
+        ("connection_radius", "nan"),
+        ("connection_radius", "-1"),
+        ("max_neighbors", "1000000000"),
+        ("drag", "1e999"),
+        ("substeps_per_frame", "0"),
+    ):
+        line = terminal.refused(2, *order, "--" + field.replace("_", "-"), value)
+        assert field in line
+    assert not Path("x").exists()
+
+
+def test_measures_are_json_that_any_program_reads(terminal: Terminal) -> None:
+    assert terminal("evaluate", "run", "fitted", "--json") == 0
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is not JSON")
+
+    measured = json.loads(terminal.out, parse_constant=refuse)
+    stored = Run.open(terminal.data_dir / "runs" / "fitted").json("metrics.json")
+    assert measured == stored
+    assert terminal("evaluate", "run", terminal.data_dir / "runs" / "fitted") == 0
+    assert terminal.out.startswith("sheet:\n")
+
+
+def test_exports_are_written_once_and_over_only_on_demand(terminal: Terminal) -> None:
+    order = ("export", "fitted", "--format", "npz", "--out", "motion.npz")
+    assert terminal(*order) == 0
+    assert terminal.out.strip() == "motion.npz"
+    with np.load("motion.npz", allow_pickle=False) as arrays:
+        assert any(array.shape == (FRAMES, len(NODE), 3) for array in arrays.values())
+    assert "exists already" in terminal.refused(2, *order)
+    assert terminal(*order, "--overwrite") == 0
+    assert terminal("export", "fitted", "--format", "ply", "--out", "mesh.ply", "--frame", 3) == 0
+    assert Path("mesh.ply").read_bytes().startswith(b"ply\n")
+
+
+def test_a_taken_port_is_told(terminal: Terminal) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        line = terminal.refused(1, "serve", "--port", port, "--device", "cpu")
+    assert f"Port {port} of 127.0.0.1" in line
+
+
+def test_the_environment_speaks_where_the_arguments_are_silent(
+    terminal: Terminal, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    seen = []
+    monkeypatch.setattr("app.server.serve", lambda settings, **_: seen.append(settings))
+    monkeypatch.setenv("PHYSHANDI_PORT", "8123")
+    monkeypatch.setenv("PHYSHANDI_DATA_DIR", str(tmp_path / "elsewhere"))
+    monkeypatch.setenv("PHYSHANDI_DEVICE", "cpu")
+    terminal("serve")
+    terminal("serve", "--port", "8124", "--data-dir", "here")
+    assert [settings.port for settings in seen] == [8123, 8124]
+    assert [settings.device for settings in seen] == ["cpu", "cpu"]
+    assert seen[0].data_dir == tmp_path / "elsewhere"
+    assert seen[1].data_dir == Path("here").resolve()
+    assert "Known are: towel_fold" in terminal.refused(2, "reconstruct", "sheet", "--out", "x")
+    monkeypatch.setenv("PHYSHANDI_PORT", "many")
+    assert "port" in terminal.refused(2, "serve")
+    monkeypatch.delenv("PHYSHANDI_PORT")
+    monkeypatch.setenv("PHYSHANDI_TOKEN", "short")
+    line = terminal.refused(2, "serve")
+    assert "token" in line
+    assert "short'" not in line
