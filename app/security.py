@@ -3,7 +3,6 @@
 import base64
 import hashlib
 import hmac
-import http.cookies
 import logging
 import secrets
 import threading
@@ -13,6 +12,7 @@ from collections.abc import Callable
 from urllib.parse import parse_qsl, urlencode
 
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import cookie_parser
 from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -85,7 +85,8 @@ class Security:
         self._clock = clock
         self.cookie = f"physhandi_{settings.port if port is None else port}"
         """Name of the cookie; cookies do not know ports, so it tells servers of one host apart."""
-        self._hosts = {"localhost", "127.0.0.1", "[::1]", settings.host, *settings.allowed_hosts}
+        own = f"[{settings.host}]" if ":" in settings.host else settings.host.lower()
+        self._hosts = {"localhost", "127.0.0.1", "[::1]", own, *settings.allowed_hosts}
         self._any_host = not is_loopback(settings.host) and settings.host in {"0.0.0.0", "::"}  # noqa: S104
         self._lock = threading.Lock()
         self._wrong: dict[str, deque[float]] = {}
@@ -214,12 +215,8 @@ def _bearer(headers: Headers) -> str | None:
 
 
 def _cookie(headers: Headers, name: str) -> str:
-    jar: http.cookies.SimpleCookie = http.cookies.SimpleCookie()
-    try:
-        jar.load(headers.get("cookie", ""))
-    except http.cookies.CookieError:
-        return ""
-    return jar[name].value if name in jar else ""
+    # As browsers read them: a strange cookie of another program on this host must not hide ours.
+    return cookie_parser(headers.get("cookie", "")).get(name, "")
 
 
 def _without_token(scope: Scope) -> Response | None:

@@ -100,6 +100,13 @@ def test_two_browsers_are_told_apart_and_a_forged_cookie_is_not_believed(door: D
     assert Security(Settings()).owner_of(f"{visitor}.{signature}") is None
 
 
+@pytest.mark.parametrize("other", ["_xsrf=2|a|b", '{"a":1}', "a b=1", "x[]=1", "k=a,b c", "="])
+def test_cookies_of_other_programs_on_this_host_lock_nobody_out(door: Door, other: str) -> None:
+    own = f"physhandi_8080={door.security.new_pass()}"
+    for cookies in (f"{other}; {own}", f"{own}; {other}"):
+        assert door.client.get("/", headers={"Cookie": cookies}).status_code == 200
+
+
 @pytest.mark.parametrize(
     "path", ["//evil.example/", "/\\evil.example/", "///evil.example", "/%5C/evil.example"]
 )
@@ -230,3 +237,9 @@ def test_on_all_addresses_only_numbers_and_allowed_names_are_known() -> None:
     security = Security(Settings(host=ANY_ADDRESS))
     assert security.is_known_host("192.168.1.7:8080")
     assert not security.is_known_host("rebound.example:8080")
+
+
+def test_the_address_that_is_listened_on_is_known() -> None:
+    assert Security(Settings(host="fd00::7")).is_known_host("[fd00::7]:8080")
+    assert Security(Settings(host="Lab.example")).is_known_host("lab.example:8080")
+    assert not Security(Settings(host="fd00::7")).is_known_host("[fd00::8]:8080")
