@@ -16,7 +16,7 @@ from starlette.exceptions import HTTPException
 from app.jobs.catalog import Catalog
 from app.jobs.describe import describe_results, describe_run, describe_sequence
 from app.jobs.feed import Feed
-from app.jobs.scheduler import AT_WORK, Scheduler
+from app.jobs.scheduler import AT_WORK, ENDED, Scheduler
 from app.settings import WEB_ASSETS
 from physhandi.data.atomic import named_fields
 from physhandi.data.sequence import Sequence
@@ -25,6 +25,7 @@ from physhandi.pipeline import SIMULATION, STAGES
 
 Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
 _LOG_BYTES = 20_000
+_RUNS_SHOWN = 50
 _THUMBNAIL_WIDTH = 640
 _TITLES = {
     400: "The server cannot answer this",
@@ -111,7 +112,7 @@ def create_pages(
     router = APIRouter(include_in_schema=False)
 
     @router.get("/")
-    def home() -> HTMLResponse:
+    def home(*, all: bool = False) -> HTMLResponse:  # noqa: A002  # the query's name
         cursor = feed.cursor()
         runs = [describe_run(item, scheduler) for item in catalog.runs()]
         sequences = [describe_sequence(item) for item in catalog.sequences()]
@@ -119,7 +120,11 @@ def create_pages(
             "home.html",
             cursor=cursor,
             sequences=sequences,
-            runs=runs,
+            runs=runs
+            if all
+            else runs[:_RUNS_SHOWN] + [r for r in runs[_RUNS_SHOWN:] if _is_kept(r)],
+            address="/?all=true" if all else "/",
+            hidden_count=0 if all else sum(not _is_kept(r) for r in runs[_RUNS_SHOWN:]),
             featured=_featured(runs),
             profiles=[(name, load_profile(name).description) for name in ordered_profiles()],
         )
@@ -253,6 +258,11 @@ def log_tail(path: Path) -> str:
         stream.seek(max(0, size - _LOG_BYTES))
         text = stream.read().decode("utf-8", errors="replace")
     return text if size <= _LOG_BYTES else text.partition("\n")[2]
+
+
+def _is_kept(run: Mapping[str, Any]) -> bool:
+    """Tell whether the home page lists a run however old it is."""
+    return run["is_bundled"] or run["state"] not in ENDED
 
 
 def _featured(runs: list[dict[str, Any]]) -> dict[str, Any] | None:

@@ -23,10 +23,16 @@ def cookie_of(run_folder: Path, nonce: str) -> str:
     return f"{run_folder}:{nonce}"
 
 
-def processes_of(run_folder: Path) -> Iterator[psutil.Process]:
-    """Find every live process of a run, also one that lost its parent or moved away."""
+def processes_of(run_folder: Path, nonce: str | None = None) -> Iterator[psutil.Process]:
+    """Find every live process of a run, also one that lost its parent or moved away.
+
+    Args:
+        run_folder: The run.
+        nonce: Only those of this start of the run; None for all.
+    """
     for process, cookie in marked_processes():
-        if cookie.rpartition(":")[0] == str(run_folder):
+        folder, _, start = cookie.rpartition(":")
+        if folder == str(run_folder) and nonce in {None, start}:
             yield process
 
 
@@ -41,26 +47,31 @@ def marked_processes() -> Iterator[tuple[psutil.Process, str]]:
             continue  # Gone meanwhile, or of another user: then it is none of ours.
 
 
-def end_processes(run_folder: Path, *, grace_s: float, spare: int | None = None) -> int:
+def end_processes(
+    run_folder: Path, *, grace_s: float, spare: int | None = None, nonce: str | None = None
+) -> int:
     """End all processes of a run, politely at first.
 
     Args:
         run_folder: The run.
         grace_s: Seconds between the polite signal and the hard one; 0 is hard at once.
         spare: A process that is left alone.
+        nonce: Only processes of this start of the run; None for all.
 
     Returns:
         How many had to be killed.
     """
     if grace_s > 0:
-        _signal_all(run_folder, signal.SIGTERM, spare)
+        _signal_all(run_folder, signal.SIGTERM, spare, nonce)
     end = time.monotonic() + grace_s
-    while time.monotonic() < end and any(p.pid != spare for p in processes_of(run_folder)):
+    while time.monotonic() < end and any(p.pid != spare for p in processes_of(run_folder, nonce)):
         time.sleep(0.05)
     killed = 0
     # A process may start another one while it is being killed, so look until none is left.
     end = time.monotonic() + 30.0
-    while time.monotonic() < end and (count := _signal_all(run_folder, signal.SIGKILL, spare)):
+    while time.monotonic() < end and (
+        count := _signal_all(run_folder, signal.SIGKILL, spare, nonce)
+    ):
         killed += count
         time.sleep(0.02)
     return killed
@@ -129,9 +140,11 @@ def _prctl(option: int, value: int) -> None:
         raise OSError(ctypes.get_errno(), "prctl failed")
 
 
-def _signal_all(run_folder: Path, number: signal.Signals, spare: int | None) -> int:
+def _signal_all(
+    run_folder: Path, number: signal.Signals, spare: int | None, nonce: str | None
+) -> int:
     count = 0
-    for process in processes_of(run_folder):
+    for process in processes_of(run_folder, nonce):
         if process.pid in {spare, os.getpid()}:
             continue
         try:

@@ -32,8 +32,8 @@ AT_WORK = frozenset({"starting", "running", "stopping"})
 ENDED = frozenset({"succeeded", "failed", "cancelled"})
 _LOCK = ".server.lock"
 _INTERVAL_S = 0.25
+_IDLE_INTERVAL_S = 1.0
 _SWEEP_INTERVAL_S = 5.0
-_START_TIMEOUT_S = 20.0
 
 
 class QueueFullError(PhysHandiError):
@@ -71,13 +71,14 @@ class Scheduler:
         self._catalog = catalog
         self._worker = worker
         self._lock = threading.RLock()
-        self._started: dict[str, tuple[subprocess.Popen[bytes], float]] = {}
+        self._started: dict[str, subprocess.Popen[bytes]] = {}
         self._stopping: dict[str, threading.Thread] = {}
         self._ended: dict[str, tuple[int, JobView]] = {}
         self._line: tuple[str, ...] = ()
         self._busy: tuple[str, ...] = ()
         self._claim: int | None = None
         self._closed = threading.Event()
+        self._wake = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="scheduler", daemon=True)
 
     def start(self) -> None:
@@ -96,6 +97,7 @@ class Scheduler:
     def shutdown(self) -> None:
         """Stop watching; running fits go on and are found again by the next server."""
         self._closed.set()
+        self._wake.set()
         if self._thread.is_alive():
             self._thread.join(timeout=5)
         if self._claim is not None:
@@ -115,7 +117,7 @@ class Scheduler:
         config = {"profile": config_to_dict(load_profile(profile))}
         sequences = [self._catalog.sequence(sequence_id) for sequence_id in sequence_ids]
         with self._lock:
-            if len(self._queue()) >= self._settings.waiting_fits:
+            if len(self._queue(self._catalog.runs())) >= self._settings.waiting_fits:
                 raise QueueFullError(
                     f"{self._settings.waiting_fits} fits wait already. Cancel some of them first."
                 )
@@ -199,14 +201,15 @@ class Scheduler:
     def _look(self, run: Run) -> JobView:
         is_supervised = supervisor_of(run.folder) is not None
         is_running = live_holder(run.folder) is not None
-        if run.id in self._stopping and (is_supervised or is_running):
+        if run.id in self._stopping:
+            # Until nothing is left: what is started meanwhile would be ended with the rest.
             return JobView("stopping", reason="Ending its processes.", progress=run.progress)
         if is_running:
             return JobView("running", progress=run.progress)
         if (run.folder / QUEUED).is_file():
             return self._look_in_line(run)
         started = self._started.get(run.id)
-        is_starting = is_supervised or (started is not None and started[0].poll() is None)
+        is_starting = is_supervised or (started is not None and started.poll() is None)
         if is_starting and not (run.folder / EXIT).is_file():
             return JobView("starting", reason="Loading the program.")
         state = run.state
@@ -236,10 +239,11 @@ class Scheduler:
     def _enqueue(self, run: Run) -> None:
         write_json(run.folder / QUEUED, {"time": time.time()})
         self._line = (*self._line, run.id)
+        self._wake.set()
 
-    def _queue(self) -> list[RunItem]:
+    def _queue(self, items: list[RunItem]) -> list[RunItem]:
         waiting: list[tuple[float, str, RunItem]] = []
-        for item in self._catalog.runs():
+        for item in items:
             path = item.folder / QUEUED
             if item.run is not None and not item.is_bundled and path.is_file():
                 waiting.append((_queued_at(path), item.id, item))
@@ -247,7 +251,12 @@ class Scheduler:
 
     def _watch(self) -> None:
         swept = time.monotonic()
-        while not self._closed.wait(_INTERVAL_S):
+        while True:
+            is_idle = not (self._busy or self._line or self._started)
+            self._wake.wait(_IDLE_INTERVAL_S if is_idle else _INTERVAL_S)
+            self._wake.clear()
+            if self._closed.is_set():
+                return
             try:
                 self._step()
                 if time.monotonic() - swept > _SWEEP_INTERVAL_S:
@@ -259,24 +268,23 @@ class Scheduler:
     def _step(self) -> None:
         """Forget processes that ended and start as many runs as have room."""
         with self._lock:
-            for run_id, (process, since) in list(self._started.items()):
-                folder = self._settings.run_dir / run_id
-                has_taken_over = supervisor_of(folder) is not None
-                is_late = time.monotonic() - since > _START_TIMEOUT_S
-                if process.poll() is not None or (has_taken_over and is_late):
+            for run_id, process in list(self._started.items()):
+                if process.poll() is not None:
                     del self._started[run_id]
-            queue = self._queue()
-            views = {item.id: self.view(item) for item in self._catalog.runs()}
+            items = self._catalog.runs()
+            queue = self._queue(items)
+            views = {item.id: self.view(item) for item in items}
             self._busy = tuple(run_id for run_id, view in views.items() if view.state in AT_WORK)
             free = max(0, self._settings.parallel_fits - len(self._busy))
-            for item in [item for item in queue if item.id not in self._busy][:free]:
+            ready = [item for item in queue if supervisor_of(item.folder) is None]
+            for item in ready[:free]:
                 self._start(item)
             self._line = tuple(item.id for item in queue if item.id not in self._started)
 
     def _start(self, item: RunItem) -> None:
         (item.folder / EXIT).unlink(missing_ok=True)
         process = start_supervisor(item.folder, self._settings.device, worker=self._worker)
-        self._started[item.id] = (process, time.monotonic())
+        self._started[item.id] = process
         self._busy = (*self._busy, item.id)
         (item.folder / QUEUED).unlink(missing_ok=True)
         self._line = tuple(run_id for run_id in self._line if run_id != item.id)
@@ -312,7 +320,7 @@ class Scheduler:
                 return
             started = self._started.get(folder.name)
             if started is not None:
-                started[0].poll()
+                started.poll()
             time.sleep(0.05)
 
 

@@ -13,7 +13,7 @@ import threading
 from pathlib import Path
 from typing import BinaryIO
 
-from app.jobs.processes import adopt_orphans, claim_supervision, end_processes
+from app.jobs.processes import COOKIE, adopt_orphans, claim_supervision, end_processes
 from physhandi.data.atomic import write_json
 from physhandi.data.lease import live_holder, locked
 from physhandi.data.run_files import CANCEL, EXIT, LOG, now
@@ -43,7 +43,8 @@ def supervise(run_folder: Path, device: str, worker: str) -> int:
     log = threading.Thread(target=copy_log, args=(process.stdout, run_folder / LOG), daemon=True)
     log.start()
     code = process.wait()
-    end_processes(run_folder, grace_s=0.0, spare=os.getpid())
+    nonce = os.environ.get(COOKIE, "").rpartition(":")[2]
+    end_processes(run_folder, grace_s=0.0, spare=os.getpid(), nonce=nonce)
     log.join(timeout=5)
     if not (run_folder / EXIT).is_file():
         note_end(run_folder, _explain(code))

@@ -70,7 +70,7 @@ def desks(data_dir: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[
     for folder in (data_dir / "runs").iterdir():
         end_processes(folder, grace_s=0.0)
     for desk in made:
-        for process, _ in desk.scheduler._started.values():
+        for process in desk.scheduler._started.values():
             process.wait()
 
 
@@ -194,6 +194,28 @@ def test_cancelling_ends_the_whole_tree_however_stubborn(desk: Desk) -> None:
     assert supervisor_of(run.folder) is None
     follower = desk.launch("publish")
     desk.until(follower, "succeeded")
+
+
+def test_a_fit_is_cancelled_while_its_program_is_loading(desk: Desk) -> None:
+    run_id = desk.launch("wait")
+    until(lambda: desk.state(run_id) != "queued")
+    desk.scheduler.cancel(run_id)
+    desk.until(run_id, "cancelled")
+    run = desk.run(run_id)
+    assert list(processes_of(run.folder)) == []
+    assert supervisor_of(run.folder) is None
+
+
+def test_a_closed_server_starts_nothing_more(desk: Desk) -> None:
+    running = desk.launch("wait")
+    desk.until(running, "running")
+    waiting = desk.launch("publish")
+    desk.scheduler.shutdown()
+    folder = desk.run(running).folder
+    (folder / "go").touch()
+    until(lambda: supervisor_of(folder) is None)
+    time.sleep(0.6)
+    assert (desk.run(waiting).folder / "queued.json").is_file()
 
 
 def test_cancelling_twice_is_harmless(desk: Desk) -> None:

@@ -152,3 +152,17 @@ def test_scenes_are_opened_for_the_browser_that_asks_up_to_the_limit(world: Queu
     assert "was closed" in gone.text
     wrong = world.client.post("/api/v1/sessions", json={"kind": "file", "id": "x"})
     assert wrong.status_code == 422
+
+
+def test_the_home_page_stays_short_however_many_runs_there_are(world: QueueWorld) -> None:
+    first = world.launch("wait first")
+    world.until(first, "running")
+    for number in range(60):
+        folder = world.folder(f"old{number:02d}")
+        folder.mkdir()
+        (folder / "run.yaml").write_text("damaged")
+    page = world.client.get("/").text
+    assert page.count("<tr data-run=") == 50
+    assert first in page
+    assert "Show 11 older runs" in page
+    assert world.client.get("/?all=true").text.count("<tr data-run=") == 61
