@@ -1,12 +1,10 @@
 """Fixtures that all tests share."""
 
-from pathlib import Path
-
 import pytest
 import warp as wp
+from recordings import recording
 
 DEVICES = ["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)]
-SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
 @pytest.fixture(params=DEVICES)
@@ -26,10 +24,7 @@ def shared_array():
     import numpy as np
 
     def load(name):
-        path = SHARED_DATA / name
-        if not path.is_file():
-            pytest.skip(f"needs the recorded data {name} in ../shared/data")
-        with np.load(path) as data:
+        with np.load(recording(name)) as data:
             return dict(data)
 
     return load

@@ -7,6 +7,7 @@ import hand_scene as scene
 import numpy as np
 import pytest
 import torch
+from recordings import recording
 
 from physhandi.data.importers.stereo import import_stereo
 from physhandi.errors import CancelledError, FitError, MissingInputError
@@ -17,7 +18,6 @@ from physhandi.metrics.hands import evaluate_hands, hide_keypoints
 from physhandi.perception.keypoints import detect_sequence
 from physhandi.progress import Progress
 
-RECORDING = Path(__file__).resolve().parents[4] / "shared" / "data" / "stereo_hand"
 QUICK = HandFitConfig(iterations=250)
 
 
@@ -150,9 +150,7 @@ def test_the_fit_reports_and_stops_when_asked(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_recorded_hand_is_reconstructed(tmp_path: Path) -> None:
-    if not RECORDING.is_dir():
-        pytest.skip("needs the recording stereo_hand in ../shared/data")
-    sequence = import_stereo(RECORDING, tmp_path / "hand")
+    sequence = import_stereo(recording("stereo_hand"), tmp_path / "hand")
     keypoint = detect_sequence(sequence)
     hidden = hide_keypoints(keypoint, share=0.1, seed=0)
     given = np.where(hidden[..., None], np.nan, keypoint).astype(np.float32)

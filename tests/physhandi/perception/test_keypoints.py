@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from recordings import recording
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.exporters.overlay import hand_overlay
@@ -25,8 +26,6 @@ from physhandi.perception.keypoints import (
 )
 from physhandi.progress import Progress
 
-PHOTO = Path(__file__).resolve().parents[4] / "shared" / "data" / "hand_photo"
-
 
 @pytest.fixture(scope="module")
 def detector() -> KeypointDetector:
@@ -35,13 +34,13 @@ def detector() -> KeypointDetector:
 
 @pytest.fixture(scope="module")
 def photo() -> np.ndarray:
-    if not PHOTO.is_dir():
-        pytest.skip("needs the photograph hand_photo in ../shared/data")
-    return np.ascontiguousarray(cv2.imread(str(PHOTO / "hands.jpg"))[..., ::-1])
+    return np.ascontiguousarray(cv2.imread(str(recording("hand_photo") / "hands.jpg"))[..., ::-1])
 
 
 def _expected() -> np.ndarray:
-    return np.array(json.loads((PHOTO / "expected.json").read_text())["hands"], dtype=float)
+    return np.array(
+        json.loads((recording("hand_photo") / "expected.json").read_text())["hands"], dtype=float
+    )
 
 
 def _errors(found: list[DetectedHand], expected: np.ndarray) -> list[np.ndarray]:

@@ -5,11 +5,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from recordings import recording as published
 
 from physhandi.data.importers.stereo import import_stereo
 from physhandi.errors import ImportFailedError
-
-RECORDING = Path(__file__).resolve().parents[5] / "shared" / "data" / "stereo_hand"
 
 INTRINSICS = """intrinsic:
 60.0 0.0 32.0
@@ -137,9 +136,7 @@ def test_videos_must_be_there_once_decode_and_agree(recording: Path, tmp_path: P
 
 
 def test_the_published_recording_is_imported(tmp_path: Path) -> None:
-    if not RECORDING.is_dir():
-        pytest.skip("needs the recording stereo_hand in ../shared/data")
-    sequence = import_stereo(RECORDING, tmp_path / "hand")
+    sequence = import_stereo(published("stereo_hand"), tmp_path / "hand")
     assert (sequence.frame_count, sequence.frame_rate) == (378, 30.0)
     assert sequence.views[0].color(100).shape == (720, 720, 3)
     centers = [view.camera.T_world_camera[:3, 3] for view in sequence.views]

@@ -1,0 +1,53 @@
+"""A real rope: fitted on two trajectories, it predicts two that it never saw."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recordings import recording
+
+from physhandi import pipeline
+from physhandi.data.importers.mocap import import_mocap
+from physhandi.data.run import Run
+from physhandi.fitting.profile import config_to_dict, load_profile
+
+
+@pytest.mark.slow
+def test_a_rope_predicts_trajectories_it_was_not_fitted_on(tmp_path: Path) -> None:
+    folder = recording("rope_mocap")
+    for number in (48, 49, 52, 53):
+        import_mocap(folder / f"trajectory_{number:03d}.npy", tmp_path / "sequences")
+    config = load_profile("default")
+    search = replace(config.object_.search, generations=5, population=8)
+    first_order = replace(config.object_.first_order, iterations=0)
+    config = replace(
+        config, object_=replace(config.object_, search=search, first_order=first_order)
+    )
+    run = Run.create(
+        tmp_path / "fit",
+        name="rope",
+        kind="reconstruction",
+        sequences=[str(tmp_path / "sequences" / f"trajectory_{n:03d}") for n in (48, 49)],
+        config={"profile": config_to_dict(config)},
+    )
+    pipeline.run_job(run)
+    errors = []
+    for number in (52, 53):
+        name = f"trajectory_{number:03d}"
+        prediction = Run.create(
+            tmp_path / f"predict_{number}",
+            name="prediction",
+            kind="simulation",
+            sequences=[str(tmp_path / "sequences" / name)],
+            config={"source": str(run.folder), "parameters": {}},
+        )
+        pipeline.run_job(prediction)
+        scores = prediction.json("metrics.json")[name]["reconstruction"]
+        marker = np.load(tmp_path / "sequences" / name / "marker.npy")[:, 2:11]
+        rollout = prediction.array(f"sequences/{name}/rollout.npy")[:, 8:41:4]
+        recount = np.linalg.norm(rollout - marker, axis=2)[1:].mean()
+        assert scores["rollout"]["marker_error"] == pytest.approx(recount, rel=1e-5)
+        assert scores["static"]["marker_error"] > 0.1
+        errors.append(recount)
+    assert np.mean(errors) < 0.06
