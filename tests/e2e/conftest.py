@@ -1,0 +1,118 @@
+"""A real server, a real browser, and a watch over what the browser complains about."""
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import (
+    Browser,
+    BrowserContext,
+    Page,
+    Playwright,
+    expect,
+    sync_playwright,
+)
+
+from app.jobs.processes import end_processes
+
+ROOT = Path(__file__).parents[2]
+START = "from app.cli import main; main()"
+_CHROMIUM = ["--no-sandbox", "--use-angle=gl-egl", "--ignore-gpu-blocklist"]
+_START_SECONDS = 60.0
+_TIMEOUT_MS = 45_000
+_REPORT_VIOLATIONS = (
+    "document.addEventListener('securitypolicyviolation', (event) => console.error("
+    "'policy violated', event.violatedDirective, event.blockedURI));"
+)
+
+
+@dataclass(frozen=True)
+class Served:
+    """A server that runs beside the tests."""
+
+    url: str
+    """The address that it printed, with the token."""
+    data_dir: Path
+    """Where it keeps runs."""
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    folder = tmp_path_factory.mktemp("served")
+    command = [sys.executable, "-c", START, "serve", "--port", "0", "--data-dir", "data"]
+    printed = folder / "printed"
+    with printed.open("w") as out, (folder / "log").open("w") as log:
+        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        server = subprocess.Popen(command, cwd=folder, stdout=out, stderr=log, env=environment)
+    try:
+        end = time.monotonic() + _START_SECONDS
+        while not printed.read_text().endswith("\n"):
+            assert server.poll() is None, (folder / "log").read_text()
+            assert time.monotonic() < end, "the server printed no address"
+            time.sleep(0.1)
+        yield Served(printed.read_text().strip(), folder / "data")
+    finally:
+        for run in (folder / "data" / "runs").glob("*"):
+            end_processes(run, grace_s=0)
+        server.terminate()
+        try:
+            server.wait(20)
+        finally:
+            server.kill()
+            server.wait()
+
+
+@pytest.fixture(scope="module")
+def playwright_driver() -> Iterator[Playwright]:
+    expect.set_options(timeout=_TIMEOUT_MS)
+    with sync_playwright() as driver:
+        yield driver
+
+
+@pytest.fixture(scope="module")
+def browser(playwright_driver: Playwright) -> Iterator[Browser]:
+    executable = shutil.which("chromium") or shutil.which("chromium-browser")
+    if executable is None:
+        reason = "needs Debian's chromium with libegl-mesa0 and libgl1-mesa-dri"
+        (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)
+    browser = playwright_driver.chromium.launch(executable_path=executable, args=_CHROMIUM)
+    yield browser
+    browser.close()
+
+
+@pytest.fixture
+def context(browser: Browser) -> Iterator[BrowserContext]:
+    """A browser without history; its pages may not complain of anything."""
+    complaints: list[str] = []
+    context = browser.new_context(viewport={"width": 1280, "height": 800})
+    context.set_default_timeout(_TIMEOUT_MS)
+    context.add_init_script(_REPORT_VIOLATIONS)
+    context.on("console", lambda m: m.type == "error" and complaints.append(m.text))
+    context.on("weberror", lambda error: complaints.append(str(error.error)))
+    yield context
+    context.close()
+    assert complaints == []
+
+
+@pytest.fixture
+def open_home(context: BrowserContext, served: Served) -> Callable[[], Page]:
+    """Open a tab at the printed address; all tabs belong to the same browser."""
+
+    def open_one() -> Page:
+        page = context.new_page()
+        page.goto(served.url)
+        return page
+
+    return open_one
+
+
+@pytest.fixture
+def home(open_home: Callable[[], Page]) -> Page:
+    """The start page."""
+    return open_home()

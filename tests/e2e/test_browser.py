@@ -1,0 +1,218 @@
+"""The first minutes of a user, in a real browser against a real server."""
+
+import re
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import psutil
+import pytest
+import yaml
+from playwright.sync_api import Page, expect
+from scene_page import ScenePage, object_springs, virtual_springs
+
+from app.jobs.processes import COOKIE
+from physhandi.data.run import Run
+
+pytestmark = pytest.mark.e2e
+BUNDLED = Path(__file__).parents[2] / "sequences"
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """The bundled run, read from its files."""
+
+    id: str
+    name: str
+    parameters: dict
+    rest_node: np.ndarray
+    object_node: np.ndarray
+    control: np.ndarray
+    rollout: np.ndarray
+
+    def object_springs(self, radius: float) -> set[tuple[int, int]]:
+        return object_springs(self.rest_node, radius, self.parameters["max_neighbors"])
+
+    def virtual_springs(self, radius: float) -> set[tuple[int, int]]:
+        most = self.parameters["virtual_max_neighbors"]
+        return virtual_springs(self.control[0], self.object_node, radius, most)
+
+
+@pytest.fixture(scope="module")
+def fitted() -> Fitted:
+    run = Run.open(sorted((BUNDLED / "runs").glob("*/run.yaml"))[0].parent)
+    (name,) = run.sequence_names
+    motion = run.out / "sequences" / name
+    return Fitted(
+        id=run.id,
+        name=run.name,
+        parameters=yaml.safe_load((run.out / "object" / "parameters.yaml").read_text()),
+        rest_node=np.load(run.out / "object" / "rest_node.npy").astype(np.float64),
+        object_node=np.load(motion / "object_node.npy").astype(np.float64),
+        control=np.load(motion / "control.npy").astype(np.float64),
+        rollout=np.load(motion / "rollout.npy"),
+    )
+
+
+@pytest.fixture
+def scene(home: Page) -> ScenePage:
+    """The finished run in the viewer, paused."""
+    scene = ScenePage.opened_from(home)
+    scene.pause()
+    return scene
+
+
+def test_the_printed_address_shows_sequences_and_finished_runs(home, fitted):
+    expect(home.locator("[data-sequence=towel_fold] h3")).to_contain_text("towel_fold")
+    row = home.locator(f"#runs [data-run={fitted.id}]")
+    expect(row).to_contain_text(fitted.name)
+    expect(row).to_contain_text("succeeded")
+    # The token has left the address, so that nobody copies it from there.
+    assert "token" not in home.url
+
+
+def test_a_scene_opens_and_plays(home):
+    scene = ScenePage.opened_from(home)
+
+    frames = {scene.value("Frame")}
+    scene.until(lambda: len(frames.add(scene.value("Frame")) or frames) >= 3, "playing")
+    scene.pause()
+    before = scene.value("Frame")
+    scene.press("1 ▶")
+    scene.until(lambda: scene.value("Frame") == (before + 1) % 60, "a step by one frame")
+
+
+def test_sliders_simulate_again_and_reset_returns(scene, fitted, tmp_path):
+    radius = fitted.parameters["connection_radius"]
+    virtual_radius = fitted.parameters["virtual_connection_radius"]
+    as_fitted = len(fitted.object_springs(radius)), len(fitted.virtual_springs(virtual_radius))
+    assert scene.springs() == as_fitted
+    assert scene.difference() == 0
+
+    wide = fitted.object_springs(0.045)
+    assert len(wide) > 1.2 * as_fitted[0]
+    scene.set("δ object [mm]", 45)
+    scene.until(lambda: scene.springs()[0] == len(wide), "the springs of δ = 45 mm")
+    scene.until(lambda: (scene.difference() or 0) > 0, "another rollout")
+    by_radius = scene.difference()
+    assert scene.springs()[1] == as_fitted[1]
+
+    scene.set("stiffness 10^", -1)
+    scene.until(lambda: scene.difference() not in {None, by_radius}, "a third rollout")
+    assert scene.difference() > 0
+    scene.unfold("Export")
+    with np.load(scene.download("NPZ", tmp_path)) as data:
+        pairs = data["spring_nodes"][: data["object_spring_count"]].tolist()
+        assert set(map(tuple, pairs)) == wide
+        moved = np.linalg.norm(data["position"] - fitted.rollout, axis=-1).mean()
+    assert scene.difference() == pytest.approx(1e3 * moved, rel=0.01)
+
+    scene.press("Undo")
+    scene.until(lambda: scene.difference() == by_radius, "the rollout of δ = 45 mm")
+    assert scene.value("stiffness 10^") == 0
+
+    virtual = fitted.virtual_springs(0.012)
+    assert len(virtual) != as_fitted[1]
+    scene.set("δ virtual [mm]", 12)
+    scene.until(lambda: scene.springs() == (len(wide), len(virtual)), "the virtual springs")
+
+    scene.press("Reset")
+    scene.until(lambda: scene.difference() == 0, "the fitted rollout")
+    assert scene.springs() == as_fitted
+    assert scene.value("δ object [mm]") == pytest.approx(1e3 * radius, abs=1e-3)
+
+
+def test_another_tab_is_left_alone(scene: ScenePage, open_home: Callable[[], Page]):
+    other = ScenePage.opened_from(open_home())
+    other.pause()
+    assert other.page.url != scene.page.url
+    springs, frame, radius = other.springs(), other.value("Frame"), other.value("δ object [mm]")
+
+    scene.set("δ object [mm]", 60)
+    scene.until(lambda: (scene.difference() or 0) > 0, "another rollout")
+
+    assert scene.springs() != springs
+    assert (other.springs(), other.value("Frame"), other.difference()) == (springs, frame, 0)
+    assert other.value("δ object [mm]") == radius
+    # The other tab is not merely frozen: it answers its own user.
+    other.press("1 ▶")
+    other.until(lambda: other.value("Frame") != frame, "a step by one frame")
+
+
+def test_the_viewer_saves_what_it_shows(scene, fitted, tmp_path):
+    scene.set("Frame", 30)
+    scene.until(lambda: scene.value("Frame") == 30, "frame 30")
+    scene.unfold("Export")
+
+    points = ply_vertices(scene.download("PLY", tmp_path))
+    expected = np.concatenate([fitted.rollout[30], fitted.control[30]])
+    np.testing.assert_allclose(points, expected, atol=1e-6)
+
+    image = cv2.imread(str(scene.download("PNG", tmp_path)))
+    assert image.shape[0] > 500
+    # It shows blue object nodes and red control nodes, not an empty canvas.
+    blue, green, red = (image[..., channel].astype(int) for channel in range(3))
+    assert np.count_nonzero((blue > 150) & (blue - red > 60)) > 1000
+    assert np.count_nonzero((red > 120) & (red - blue > 80) & (red - green > 80)) > 100
+
+
+def test_a_run_page_exports_the_rollout(home, fitted, tmp_path):
+    home.locator(f"#runs [data-run={fitted.id}] a").first.click()
+    expect(home.locator("h1")).to_have_text(fitted.name)
+    expect(home.locator("#losses .uplot").first).to_be_visible()
+
+    with home.expect_download() as download:
+        home.locator(".exports").get_by_text("PLY", exact=True).click()
+    download.value.save_as(tmp_path / "frames.zip")
+
+    with zipfile.ZipFile(tmp_path / "frames.zip") as archive:
+        archive.extractall(tmp_path / "frames")
+    frames = sorted((tmp_path / "frames").rglob("*.ply"))
+    assert len(frames) == len(fitted.rollout) == 60
+    for frame in (0, 31, 59):
+        nodes = ply_vertices(frames[frame])[: fitted.rollout.shape[1]]
+        np.testing.assert_allclose(nodes, fitted.rollout[frame], atol=1e-6)
+
+
+def test_a_fit_is_launched_followed_and_cancelled(home, served):
+    home.locator("[data-sequence=towel_fold] [data-new]").click()
+    dialog = home.locator("dialog#new")
+    dialog.get_by_label("quick").check()
+    dialog.get_by_label("Name").fill("A fit <b>from</b> the browser")
+    dialog.get_by_role("button", name="Launch", exact=True).click()
+    expect(dialog).to_be_hidden()
+
+    row = home.locator("#runs tr", has_text="A fit <b>from</b> the browser")
+    expect(row.locator(".state")).to_have_text("running")
+    expect(row.locator("[data-text]")).to_have_text(re.compile(r"\w+ reconstruction · \d+ of \d+"))
+    seen = row.locator("progress").evaluate("bar => bar.value")
+    expect(row.locator("progress")).not_to_have_js_property("value", seen)
+    run_id = row.get_attribute("data-run")
+    assert processes_of(served.data_dir / "runs" / run_id)
+
+    row.get_by_role("button", name="Cancel").click()
+    expect(row.locator(".state")).to_have_text("cancelled")
+
+    assert processes_of(served.data_dir / "runs" / run_id) == []
+    expect(row.get_by_role("button", name="Resume")).to_be_visible()
+
+
+def ply_vertices(path: Path) -> np.ndarray:
+    import trimesh
+
+    return np.asarray(trimesh.load(path, process=False).vertices)
+
+
+def processes_of(run_folder: Path) -> list[psutil.Process]:
+    """Find the processes that carry a run's mark, without the help of the application."""
+    found = []
+    for process in psutil.process_iter():
+        try:
+            if process.environ().get(COOKIE, "").startswith(f"{run_folder}:"):
+                found.append(process)
+        except psutil.Error:
+            continue
+    return found

@@ -1,0 +1,115 @@
+"""The page of a live scene as a user works it, and an independent count of its springs."""
+
+import re
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from playwright.sync_api import Locator, Page
+from scipy.spatial.distance import cdist
+
+_NUMBER = r"([\d.]+(?:e[+-]?\d+)?)"
+
+
+class ScenePage:
+    """A tab with the viewer; it works the panel inside the frame."""
+
+    def __init__(self, page: Page) -> None:
+        self.page = page
+        self.panel = page.frame_locator("#scene")
+
+    @classmethod
+    def opened_from(cls, home: Page) -> "ScenePage":
+        """Press the button of the start page that invites to the finished run."""
+        home.locator("[data-featured]").click()
+        home.wait_for_url("**/live/**")
+        scene = cls(home)
+        scene.until(lambda: scene.has("object springs"), "the panel appears")
+        return scene
+
+    def text(self) -> str:
+        return self.panel.locator("body").inner_text()
+
+    def has(self, text: str) -> bool:
+        return text in self.text()
+
+    def number(self, before: str = "", after: str = "") -> float | None:
+        """Read the number between two texts of the panel, as long as it is there."""
+        found = re.search(re.escape(before) + r"\s*" + _NUMBER + re.escape(after), self.text())
+        return float(found[1]) if found else None
+
+    def field(self, label: str) -> Locator:
+        """The number beside a slider."""
+        row = self.panel.locator("label", has_text=re.compile(f"^{re.escape(label)}$"))
+        row = row.locator("xpath=ancestor::div[contains(@class, 'mantine-Flex-root')][1]")
+        return row.locator("input.mantine-NumberInput-input")
+
+    def value(self, label: str) -> float:
+        return float(self.field(label).input_value())
+
+    def set(self, label: str, value: float) -> None:
+        """Type a value beside a slider."""
+        field = self.field(label)
+        field.fill(f"{value:g}")
+        field.press("Enter")
+
+    def press(self, name: str) -> None:
+        self.panel.get_by_role("button", name=name, exact=True).click()
+
+    def pause(self) -> None:
+        self.press("Pause")
+        self.panel.get_by_role("button", name="Play", exact=True).wait_for()
+
+    def unfold(self, folder: str) -> None:
+        self.panel.get_by_text(folder, exact=True).click()
+
+    def download(self, name: str, path: Path) -> Path:
+        """Press a button of the export panel and keep the file that the browser gets."""
+        with self.page.expect_download() as download:
+            self.press(name)
+        target = path / download.value.suggested_filename
+        download.value.save_as(target)
+        return target
+
+    def difference(self) -> float | None:
+        """How far the rollout is from the fitted one [mm]; None while it is simulated."""
+        return self.number(after=" mm from the fitted rollout")
+
+    def springs(self) -> tuple[float | None, float | None]:
+        """The numbers of object springs and virtual springs that are shown."""
+        return self.number("object springs"), self.number("virtual springs")
+
+    def until(self, condition: Callable[[], bool], what: str, seconds: float = 45.0) -> None:
+        """Wait for something; says what the panel shows if it does not come true."""
+        end = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < end, (
+                f"{what} did not come true; the panel says\n{self.text()}"
+            )
+            self.page.wait_for_timeout(100)
+
+
+def object_springs(node: np.ndarray, radius: float, most: int) -> set[tuple[int, int]]:
+    """Join each node to its `most` nearest others below `radius`, by comparing all pairs."""
+    distance = cdist(node, node)
+    np.fill_diagonal(distance, np.inf)
+    springs = set()
+    for first, row in enumerate(distance):
+        for second in np.argsort(row, kind="stable")[:most]:
+            if 1e-4 < row[second] < radius:
+                springs.add((min(first, int(second)), max(first, int(second))))
+    return springs
+
+
+def virtual_springs(
+    control: np.ndarray, node: np.ndarray, radius: float, most: int
+) -> set[tuple[int, int]]:
+    """Join each control node to its `most` nearest object nodes below `radius`."""
+    distance = cdist(control, node)
+    return {
+        (int(second), len(node) + first)
+        for first, row in enumerate(distance)
+        for second in np.argsort(row, kind="stable")[:most]
+        if row[second] < radius
+    }
