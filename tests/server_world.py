@@ -4,13 +4,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from fastapi import FastAPI
+from pydantic import SecretStr
 from starlette.testclient import TestClient
 
 from app.jobs.catalog import Catalog
 from app.jobs.scheduler import Scheduler
 from app.security import Security
 from app.server import create_app
-from app.settings import Settings
+from app.settings import BUNDLED, Settings
 from app.viewer.session import Sessions
 from physhandi import pipeline
 from physhandi.data.run import Run
@@ -50,12 +51,10 @@ class World:
         return client
 
 
-def make_world(data_dir: Path, **options: object) -> World:
-    settings = Settings.model_validate(
-        {"data_dir": data_dir, "token": TOKEN, "cancel_grace_s": 1.0} | options
-    )
+def make_world(data_dir: Path, *, bundled: Path = BUNDLED) -> World:
+    settings = Settings(data_dir=data_dir, token=SecretStr(TOKEN), cancel_grace_s=1.0)
     security = Security(settings)
-    catalog = Catalog(settings)
+    catalog = Catalog(settings, bundled=bundled)
     scheduler = Scheduler(settings, catalog, worker="job_worker")
     sessions = Sessions(settings, catalog)
     app = create_app(

@@ -2,11 +2,14 @@
 
 import logging
 import re
+import shutil
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
+import yaml
 from fastapi.routing import iter_route_contexts
-from server_world import HOST, ORIGIN, TOKEN, World
+from server_world import HOST, ORIGIN, TOKEN, World, make_world
 from starlette.routing import Mount
 from starlette.testclient import WebSocketDenialResponse
 
@@ -162,3 +165,26 @@ def test_a_large_body_is_refused(world: World) -> None:
 def test_a_second_server_on_the_same_data_folder_says_so(world: World) -> None:
     with world.script(), pytest.raises(RunError, match="Another server"):
         world.scheduler.__class__(world.settings, world.catalog).start()
+
+
+def test_what_a_sequence_says_of_itself_is_text(world: World, data_dir: Path) -> None:
+    hostile = "<img src=x onerror=alert(1)>\u202e"
+    folder = data_dir / "sequences" / "hostile"
+    shutil.copytree(data_dir / "sequences" / "sheet", folder)
+    meta = yaml.safe_load((folder / "sequence.yaml").read_text())
+    meta |= {"name": "hostile", "description": hostile, "label": hostile}
+    (folder / "sequence.yaml").write_text(yaml.safe_dump(meta))
+    (data_dir / "sequences" / "broken").mkdir()
+    (data_dir / "sequences" / "broken" / "sequence.yaml").write_text(f"{hostile}: 1")
+    page = world.browser().get("/").text
+    assert "&lt;img src=x onerror=alert(1)&gt;" in page
+    assert "<img src=x" not in page
+
+
+def test_an_empty_server_tells_how_to_begin(tmp_path: Path) -> None:
+    world = make_world(tmp_path / "data", bundled=tmp_path)
+    page = world.browser().get("/")
+    assert page.status_code == 200
+    assert "No sequences." in page.text
+    assert "physhandi import" in page.text
+    assert "No runs yet." in page.text
