@@ -126,15 +126,15 @@ class HandProblem:
             self._descend(
                 config.iterations, config.learning_rate, lambda i: self.loss(widening(i)), step, 0
             )
-        if self.depth is not None:
-            depth = self.depth
-            self._descend(
-                config.depth_iterations,
-                config.learning_rate / 4,
-                lambda _: self.loss(config.doubt) + self.depth_term(depth),
-                step,
-                config.iterations,
-            )
+            if self.depth is not None:
+                depth = self.depth
+                self._descend(
+                    config.depth_iterations,
+                    config.learning_rate / 4,
+                    lambda _: self.loss(config.doubt) + self.depth_term(depth),
+                    step,
+                    config.iterations,
+                )
         with torch.no_grad():
             after = float(self.loss(config.doubt))
         if not math.isfinite(after):
@@ -191,7 +191,7 @@ class HandProblem:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Keep torch from spreading 21 points over all cores, which costs more than it gains."""
+    """Keep torch from spreading small tensors over all cores, which on a busy machine costs more."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
