@@ -191,7 +191,7 @@ class HandProblem:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Keep torch from spreading small tensors over all cores, which on a busy machine costs more."""
+    """Keep torch from spreading small tensors over busy cores, which costs more than it gains."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

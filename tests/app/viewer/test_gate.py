@@ -75,9 +75,8 @@ def test_a_client_gets_the_scene_through_the_gate(address, sessions, slash) -> N
     session = sessions.open("run", "sheet", "me")
     with ViewerClient(f"ws://{address}/viewer/{session}{slash}") as client:
         assert client.connection.subprotocol == PROTOCOL
-        client.until(lambda: "/object/nodes" in client.nodes and client.texts())
-        assert "/springs/virtual" in client.nodes
-        assert "object springs" in client.texts()
+        client.until(lambda: {"/object/nodes", "/springs/virtual"} <= set(client.nodes))
+        client.until(lambda: "object springs" in client.texts())
         client.until(lambda: sessions.list()[0].client_count == 1)
     end = time.monotonic() + 5
     while sessions.list()[0].client_count and time.monotonic() < end:
