@@ -253,13 +253,13 @@ def default_layers(content: Content) -> Layers:
     return Layers(
         observed=not has_object,
         cameras=not has_object and bool(content.views),
-        object_springs=content.fitted is not None and _is_chain(content.fitted),
+        object_springs=content.fitted is not None and _has_few_springs(content.fitted),
     )
 
 
-def _is_chain(take: Take) -> bool:
-    """Tell whether there are so few springs that they show the object's shape."""
-    return take.model.object_spring_count < 3 * take.model.node_count
+def _has_few_springs(take: Take) -> bool:
+    """Tell whether all springs fit into a playing frame; they make nodes read as cloth or rope."""
+    return take.model.object_spring_count <= PLAYING_SPRINGS
 
 
 def _ends(
