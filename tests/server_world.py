@@ -1,10 +1,11 @@
 """A server inside the test's process, and a small finished run for it to show."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from fastapi import FastAPI
 from pydantic import SecretStr
+from sheet_sequence import sheet_config
 from starlette.testclient import TestClient
 
 from app.jobs.catalog import Catalog
@@ -15,8 +16,7 @@ from app.settings import BUNDLED, Settings
 from app.viewer.session import Sessions
 from physhandi import pipeline
 from physhandi.data.run import Run
-from physhandi.fitting.profile import PipelineConfig, config_to_dict, load_profile
-from physhandi.fitting.search import SearchVariable
+from physhandi.fitting.profile import PipelineConfig, config_to_dict
 
 TOKEN = "a-token-that-only-the-tests-know"  # noqa: S105
 HOST = "127.0.0.1:8080"
@@ -65,19 +65,7 @@ def make_world(data_dir: Path, *, bundled: Path = BUNDLED) -> World:
 
 def tiny_config() -> PipelineConfig:
     """Settings that fit `sheet_sequence` within a second or two."""
-    config = load_profile("quick")
-    soft = SearchVariable(low=50.0, high=3e4, scale="log")
-    variables = config.object_.search.variables | {
-        "connection_radius": SearchVariable(low=0.06, high=0.12),
-        "virtual_connection_radius": SearchVariable(low=0.01, high=0.04),
-        "stiffness": soft,
-        "virtual_stiffness": soft,
-    }
-    search = replace(config.object_.search, generations=2, population=4, variables=variables)
-    first_order = replace(config.object_.first_order, iterations=2)
-    simulation = replace(config.simulation, connection_radius=0.08, virtual_connection_radius=0.02)
-    object_ = replace(config.object_, search=search, first_order=first_order)
-    return replace(config, object_=object_, simulation=simulation)
+    return sheet_config(generations=2, population=4, iterations=2)
 
 
 def fit_sheet(folder: Path, sequence: Path) -> Run:

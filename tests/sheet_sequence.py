@@ -8,6 +8,8 @@ import numpy as np
 from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_schema import SequenceMeta
 from physhandi.data.sequence_writer import write_sequence
+from physhandi.fitting.profile import PipelineConfig, load_profile
+from physhandi.fitting.search import SearchVariable
 from physhandi.simulation.model import SimulationParameters
 from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.topology import build_model
@@ -56,3 +58,25 @@ def write_sheet(folder: Path, *, lift: float = 0.15) -> Sequence:
             "rest_node.npy": NODE.astype(np.float32),
         },
     )
+
+
+def sheet_config(*, generations: int, population: int, iterations: int) -> PipelineConfig:
+    """The quick profile, searched where the sheet has springs and with the given effort."""
+    config = load_profile("quick")
+    soft = SearchVariable(low=50.0, high=3e4, scale="log")
+    variables = config.object_.search.variables | {
+        "connection_radius": SearchVariable(low=0.06, high=0.12),
+        "virtual_connection_radius": SearchVariable(low=0.01, high=0.04),
+        "stiffness": soft,
+        "virtual_stiffness": soft,
+    }
+    search = replace(
+        config.object_.search,
+        generations=generations,
+        population=population,
+        variables=variables,
+    )
+    first_order = replace(config.object_.first_order, iterations=iterations)
+    simulation = replace(config.simulation, connection_radius=0.08, virtual_connection_radius=0.02)
+    object_ = replace(config.object_, search=search, first_order=first_order)
+    return replace(config, object_=object_, simulation=simulation)

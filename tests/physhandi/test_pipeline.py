@@ -1,38 +1,24 @@
 """The pipeline end to end on a small recording: fit, stop, go on, simulate again."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from sheet_sequence import FITTED, FRAMES, NODE, write_sheet
+from sheet_sequence import FITTED, FRAMES, NODE, sheet_config, write_sheet
 
 from physhandi import pipeline
 from physhandi.data.run import Run, read_events
 from physhandi.data.sequence import Sequence
 from physhandi.errors import CancelledError, MissingInputError, RunError, UsageError
 from physhandi.fitting.artefacts import load_model, load_parameters
-from physhandi.fitting.profile import PipelineConfig, config_to_dict, load_profile
-from physhandi.fitting.search import SearchVariable
+from physhandi.fitting.profile import PipelineConfig, config_to_dict
 from physhandi.progress import Progress
 
 
 def small_config() -> PipelineConfig:
-    config = load_profile("quick")
-    soft = SearchVariable(low=50.0, high=3e4, scale="log")
-    variables = config.object_.search.variables | {
-        "connection_radius": SearchVariable(low=0.06, high=0.12),
-        "virtual_connection_radius": SearchVariable(low=0.01, high=0.04),
-        "stiffness": soft,
-        "virtual_stiffness": soft,
-    }
-    search = replace(config.object_.search, generations=8, population=8, variables=variables)
-    first_order = replace(config.object_.first_order, iterations=8)
-    simulation = replace(config.simulation, connection_radius=0.08, virtual_connection_radius=0.02)
-    object_ = replace(config.object_, search=search, first_order=first_order)
-    return replace(config, object_=object_, simulation=simulation)
+    return sheet_config(generations=8, population=8, iterations=8)
 
 
 def new_run(folder: Path, sequences: list[Path], config: PipelineConfig | None = None) -> Run:
