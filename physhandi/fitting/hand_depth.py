@@ -12,8 +12,8 @@ from torch import Tensor
 
 from physhandi.data.sequence import Sequence
 from physhandi.hand.model import Side
+from physhandi.perception.lifting import HAND_LABEL
 
-MASK_LABEL = {"right": 2, "left": 3}
 _CANDIDATES = 8
 _REFRESH = 10
 _DOUBT = 3.0
@@ -52,7 +52,7 @@ def depth_target(sequence: Sequence, side: Side, point_count: int) -> DepthTarge
         point, camera = np.zeros((0, 3)), np.zeros((0, 3))
         for view in views:
             depth = view.depth(frame)
-            is_hand = _inside(view.mask(frame) == MASK_LABEL[side]) & (depth > 0)
+            is_hand = _inside(view.mask(frame) == HAND_LABEL[side]) & (depth > 0)
             row, column = np.nonzero(is_hand)
             pixel = np.stack([column, row], 1).astype(np.float64)
             seen = view.camera.unproject(pixel, depth[row, column].astype(np.float64))
