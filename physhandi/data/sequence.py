@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from physhandi.data.atomic import read_array
@@ -118,6 +118,11 @@ class Sequence:
         return self.meta.controlled_markers
 
     @property
+    def surface_node_count(self) -> int | None:
+        """Number of leading object nodes that lie on the surface; None if that is not known."""
+        return self.meta.surface_node_count
+
+    @property
     def provenance(self) -> Mapping[str, Any]:
         """Where the recording comes from."""
         return self.meta.provenance
@@ -148,6 +153,16 @@ class Sequence:
         return self._array("marker_node.npy", np.int32)
 
     @cached_property
+    def marker_motion_valid(self) -> Bool[ndarray, "frame marker"] | None:
+        """Whether the motion of each marker from the frame before can be trusted."""
+        return self._array("marker_motion_valid.npy", np.bool_)
+
+    @cached_property
+    def validation_track(self) -> Float[ndarray, "frame validation 3"] | None:
+        """Annotated points that no stage may fit, for scoring [m]; NaN where not annotated."""
+        return self._array("validation_track.npy", np.float32)
+
+    @cached_property
     def object_node(self) -> Float[ndarray, "node 3"] | None:
         """Given object nodes of frame 0 [m]."""
         return self._array("object_node.npy", np.float32)
@@ -162,8 +177,8 @@ class Sequence:
 
         Args:
             parts: Of ``views hands color depth mask keypoint track control marker marker_node
-                object_node rest_node``. A part of views counts as there if one view has it.
-                ``object`` stands for what an object can be observed by (markers, or depth with
+                marker_motion_valid validation_track object_node rest_node``. A part
+                of views counts as there if one view has it. ``object`` stands for what an object can be observed by (markers, or depth with
                 masks) and moved by (hands or control).
 
         Returns:

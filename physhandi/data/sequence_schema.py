@@ -58,6 +58,8 @@ class SequenceMeta:
     """Number of leading frames that are fitted; None means all of them."""
     controlled_markers: tuple[int, ...] = ()
     """Markers that are fixed to a control, so that metrics do not score them."""
+    surface_node_count: int | None = None
+    """Number of leading object nodes that lie on the surface; None if that is not known."""
     provenance: Mapping[str, Any] = field(default_factory=dict[str, Any])
     """Where the recording comes from: origin, licence, importer and its settings."""
     label: str = ""
@@ -83,6 +85,7 @@ class SequenceMeta:
             "gravity": self.gravity,
             "hands": list(self.hands),
             "controlled_markers": list(self.controlled_markers),
+            "surface_node_count": self.surface_node_count,
             "split": {"reconstruction": self.reconstruction_count},
             "views": [{"name": v.name, "camera": v.camera.to_dict()} for v in self.views],
             "provenance": dict(self.provenance),
@@ -136,6 +139,7 @@ def parse_meta(content: Any, where: str) -> SequenceMeta:
         views=_views(fields, where),
         reconstruction=reconstruction,
         controlled_markers=_markers(fields),
+        surface_node_count=fields.optional_whole("surface_node_count", least=0),
         provenance=fields.take("provenance", dict, {}),
         label=fields.take("label", str, ""),
     )
@@ -213,6 +217,10 @@ class _Fields:
         if type(value) is not int or value < least:
             self.fail(name, value, f"a whole number from {least} on")
         return value
+
+    def optional_whole(self, name: str, *, least: int) -> int | None:
+        is_given = self._left.get(name) is not None
+        return self.whole(name, least=least) if is_given else self._left.pop(name, None)
 
     def number(self, name: str, *, above: float = -math.inf, default: Any = _MISSING) -> float:
         value = self._any(name, default)

@@ -20,6 +20,8 @@ ARRAYS: _Table = {
     "control.npy": (("frame", "control", 3), _F, False),
     "marker.npy": (("frame", "marker", 3), _F, True),
     "marker_node.npy": (("marker",), _I, False),
+    "marker_motion_valid.npy": (("frame", "marker"), _B, False),
+    "validation_track.npy": (("frame", "validation", 3), _F, True),
     "object_node.npy": (("node", 3), _F, False),
     "rest_node.npy": (("node", 3), _F, False),
 }
@@ -58,6 +60,7 @@ def check_values(folder: Path, name: str, views: tuple[View, ...]) -> None:
     """
     for file in ARRAYS:
         _check_finite(folder, folder / file, name)
+    _check_motion(folder, name)
     for view in views:
         for file in VIEW_ARRAYS:
             _check_finite(folder, view.folder / file, name)
@@ -116,6 +119,9 @@ def _check_markers(folder: Path, meta: SequenceMeta, axes: dict[str, int]) -> No
     if wrong:
         reason = f"lists controlled_markers {wrong[0]}, but marker.npy has {marker_count} markers"
         _fail(meta.name, FILE, reason)
+    if (meta.surface_node_count or 0) > node_count:
+        reason = f"says surface_node_count {meta.surface_node_count}, but object_node.npy has "
+        _fail(meta.name, FILE, f"{reason}{node_count} nodes")
 
 
 def _check_finite(root: Path, path: Path, name: str) -> None:
@@ -129,6 +135,29 @@ def _check_finite(root: Path, path: Path, name: str) -> None:
         at = ", ".join(f"{axis} {index}" for axis, index in zip(axes, place[:-1], strict=False))
         file = path.relative_to(root).as_posix()
         _fail(name, file, f"is {array[place]} at {at}. Repair or cut out these frames")
+
+
+def _check_motion(folder: Path, name: str) -> None:
+    """Check that a trusted motion joins two frames in which its marker was seen."""
+    file = "marker_motion_valid.npy"
+    if not (folder / file).is_file():
+        return
+    if not (folder / "marker.npy").is_file():
+        _fail(name, file, "says which motions of markers to trust, but there is no marker.npy")
+    is_valid = read_array(folder / file)
+    marker = read_array(folder / "marker.npy")
+    is_seen = np.asarray(np.isfinite(marker).all(axis=-1))
+    can_be_valid = np.zeros_like(is_seen)
+    can_be_valid[1:] = is_seen[1:] & is_seen[:-1]
+    wrong = np.argwhere(is_valid & ~can_be_valid)
+    if wrong.size:
+        frame, marker = wrong[0]
+        _fail(
+            name,
+            file,
+            f"trusts the motion of marker {marker} to frame {frame} from the frame before, but "
+            "marker.npy does not have both positions. Entry [t] must mean frame t-1 to t",
+        )
 
 
 def _check_tracks(view: View, name: str) -> None:

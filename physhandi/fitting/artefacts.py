@@ -20,7 +20,7 @@ from physhandi.hand.motion import HandMotion
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
 
 STORED_CLOUD = 500
-"""Most points of one frame's cloud that a run keeps; evenly picked."""
+"""Most points of one frame's cloud that a run keeps, evenly picked, unless they are markers."""
 
 
 def sequence_folder(name: str) -> str:
@@ -55,14 +55,17 @@ def save_observation(output: Attempt, name: str, observation: ObjectObservation)
     if observation.node_of_track is not None:
         output.save_array(f"{folder}/node_of_track.npy", observation.node_of_track.astype(np.int32))
     if observation.cloud:
-        clouds = [_thinned(cloud) for cloud in observation.cloud]
+        # A cloud of identified points is what the losses and metrics are defined on.
+        identified = 0 if observation.node_of_track is None else observation.track_count
+        most = max(STORED_CLOUD, identified)
+        clouds = [_thinned(cloud, most) for cloud in observation.cloud]
         end = np.cumsum([len(cloud) for cloud in clouds]).astype(np.int64)
         output.save_array(f"{folder}/cloud.npy", np.concatenate(clouds))
         output.save_array(f"{folder}/cloud_end.npy", end)
 
 
-def _thinned(cloud: Float[ndarray, "point 3"]) -> Float[ndarray, "kept 3"]:
-    kept = np.linspace(0, len(cloud) - 1, min(STORED_CLOUD, len(cloud))).round().astype(int)
+def _thinned(cloud: Float[ndarray, "point 3"], most: int) -> Float[ndarray, "kept 3"]:
+    kept = np.linspace(0, len(cloud) - 1, min(most, len(cloud))).round().astype(int)
     return np.asarray(cloud, np.float32).reshape(-1, 3)[kept]
 
 

@@ -29,7 +29,8 @@ _SOLID_NEIGHBORS = 5
 def observe_object(sequence: Sequence, progress: Progress | None = None) -> ObjectObservation:
     """Collect what a sequence shows of its object, in the world frame.
 
-    Markers, where the sequence has them, become the tracks and name their nodes. Otherwise the
+    Markers, where the sequence has them, become the tracks and name their nodes; where it also says
+    which of their motions to trust, they are the cloud too, and no depth is read. Otherwise the
     pixel tracks of every view are lifted by depth; those that frame 0 does not show on the object
     are left out.
 
@@ -45,6 +46,8 @@ def observe_object(sequence: Sequence, progress: Progress | None = None) -> Obje
         CancelledError: If the user asked to stop.
     """
     progress = progress or NullProgress()
+    if sequence.marker is not None and sequence.marker_motion_valid is not None:
+        return _from_surface_markers(sequence, progress)
     views = _depth_views(sequence)
     if sequence.marker is None and not views:
         raise MissingInputError(_what_is_missing(sequence, "the object"))
@@ -191,12 +194,27 @@ def _join(paths: list[list[ndarray]], frame_count: int) -> Float[ndarray, "frame
     return point[:, np.isfinite(point[0]).all(axis=-1)]
 
 
+def _from_surface_markers(sequence: Sequence, progress: Progress) -> ObjectObservation:
+    """Take markers that sample the visible surface as tracks, and the seen ones as the cloud.
+
+    The recording has judged their motion already, so its depth is not lifted again: PhysTwin's
+    Chamfer term compares with the visible tracked points alone.
+    """
+    progress.check_cancelled()
+    marker = np.asarray(sequence.marker, dtype=np.float32)
+    cloud = tuple(points[np.isfinite(points).all(axis=-1)] for points in marker)
+    progress.report("observation", sequence.frame_count, sequence.frame_count)
+    return _from_markers(sequence, cloud)
+
+
 def _from_markers(sequence: Sequence, cloud: tuple[ndarray, ...]) -> ObjectObservation:
     """Take identified markers as tracks; identity makes every seen motion valid."""
     marker = np.asarray(sequence.marker, dtype=np.float32)
     is_visible = np.asarray(np.isfinite(marker).all(axis=-1))
     is_motion_valid = np.zeros_like(is_visible)
     is_motion_valid[1:] = is_visible[1:] & is_visible[:-1]
+    if sequence.marker_motion_valid is not None:
+        is_motion_valid &= sequence.marker_motion_valid
     return ObjectObservation(
         point=np.where(is_visible[..., None], marker, np.float32(np.nan)),
         is_visible=is_visible,

@@ -190,6 +190,9 @@ def test_wrong_fields_are_named(folder: Path, fields: dict[str, object], message
         ("control.npy", np.zeros((5, 4, 3), int), "expected floating-point numbers"),
         ("rest_node.npy", np.zeros((8, 3)), "expected node = 9"),
         ("marker_node.npy", np.array([0, 9]), "names nodes 0 to 9"),
+        ("marker_motion_valid.npy", np.zeros((5, 3), bool), "expected marker = 2"),
+        ("marker_motion_valid.npy", np.zeros((5, 2)), "expected boolean numbers"),
+        ("validation_track.npy", np.zeros((4, 2, 3)), "expected frame = 5"),
         ("views/front/track.npy", np.zeros((5, 6, 2)), "expected track = 6"),
         ("views/front/keypoint.npy", np.zeros((5, 2, 21, 3)), "expected hand = 1"),
     ],
@@ -231,6 +234,37 @@ def test_values_are_checked_frame_by_frame(folder: Path) -> None:
     (folder / "views/front/mask/00004.png").write_bytes(b"no image")
     with pytest.raises(SequenceError, match=r"mask of frame 4 cannot be decoded"):
         Sequence.load(folder).validate()
+
+
+def test_trusted_motions_need_both_positions(folder: Path) -> None:
+    # Marker 0 is lost in frame 2, so neither its motion to 2 nor that to 3 was seen.
+    is_valid = np.ones((FRAMES, 2), bool)
+    is_valid[0] = False
+    is_valid[2:4, 0] = False
+    np.save(folder / "marker_motion_valid.npy", is_valid)
+    sequence = Sequence.load(folder)
+    sequence.validate()
+    np.testing.assert_array_equal(sequence.marker_motion_valid, is_valid)
+    for frame in (0, 2, 3):
+        wrong = is_valid.copy()
+        wrong[frame, 0] = True
+        np.save(folder / "marker_motion_valid.npy", wrong)
+        with pytest.raises(SequenceError, match=f"motion of marker 0 to frame {frame}"):
+            Sequence.load(folder).validate()
+    (folder / "marker.npy").unlink()
+    edit(folder, controlled_markers=[])
+    with pytest.raises(SequenceError, match=r"there is no marker\.npy"):
+        Sequence.load(folder).validate()
+
+
+def test_surface_nodes_are_among_the_object_nodes(folder: Path) -> None:
+    assert Sequence.load(folder).surface_node_count is None
+    edit(folder, surface_node_count=9)
+    assert Sequence.load(folder).surface_node_count == 9
+    for count, message in ((10, "but object_node.npy has 9"), (-1, "a whole number from 0 on")):
+        edit(folder, surface_node_count=count)
+        with pytest.raises(SequenceError, match=message):
+            Sequence.load(folder)
 
 
 def test_absent_frames_are_named(folder: Path) -> None:

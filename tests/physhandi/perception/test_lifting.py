@@ -117,6 +117,30 @@ def test_markers_become_identified_tracks(tmp_path: Path):
         hand_points(sequence)
 
 
+def test_judged_markers_are_the_cloud_and_keep_their_judgement(tmp_path: Path):
+    marker = np.arange(3 * 4 * 3, dtype=np.float32).reshape(3, 4, 3)
+    marker[1, 1] = marker[2, 3] = np.nan
+    # Seen in both frames: all but markers 1 (twice) and 3 (frame 2); marker 0 slipped to frame 1.
+    is_valid = np.array([[0, 0, 0, 0], [0, 0, 1, 1], [1, 0, 1, 0]], dtype=bool)
+    sequence = write_sequence(
+        tmp_path / "twin",
+        SequenceMeta(name="twin", frame_rate=30.0, frame_count=3),
+        {
+            "marker.npy": marker,
+            "marker_motion_valid.npy": is_valid,
+            "marker_node.npy": np.arange(4, dtype=np.int32),
+            "object_node.npy": marker[0],
+            "control.npy": np.zeros((3, 1, 3), dtype=np.float32),
+        },
+    )
+    observation = observe_object(sequence)
+    assert observation.is_motion_valid.tolist() == is_valid.tolist()
+    assert [len(cloud) for cloud in observation.cloud] == [4, 3, 3]
+    np.testing.assert_array_equal(observation.cloud[1], marker[1, [0, 2, 3]])
+    with pytest.raises(CancelledError):
+        observe_object(sequence, Counting(stop_at=0))
+
+
 def test_missing_input_names_the_view_and_the_part(tmp_path: Path, plate):
     meta = plate.meta
     color = np.zeros((101, 121, 3), dtype=np.uint8)
