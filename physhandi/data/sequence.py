@@ -178,8 +178,8 @@ class Sequence:
         Args:
             parts: Of ``views hands color depth mask keypoint track control marker marker_node
                 marker_motion_valid validation_track object_node rest_node``. A part
-                of views counts as there if one view has it. ``object`` stands for what an object can be observed by (markers, or depth with
-                masks) and moved by (hands or control).
+                of views counts as there if one view has it. ``object`` stands for what an object
+                can be observed by (markers, or depth with masks) and moved by (hands or control).
 
         Returns:
             The parts that are not there, in the order asked for.
