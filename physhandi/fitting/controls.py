@@ -1,12 +1,14 @@
 """Which hand points pull the object, and how an object is laid into another sequence."""
 
+from collections.abc import Sequence as Listing
+
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from physhandi.data.sequence import Sequence
+from physhandi.data.view import View
 
 
 def farthest_points(point: Float[ndarray, "point 3"], count: int) -> Int[ndarray, " chosen"]:
@@ -20,7 +22,7 @@ def farthest_points(point: Float[ndarray, "point 3"], count: int) -> Int[ndarray
 
 
 def visible_vertices(
-    sequence: Sequence, vertex: Float[ndarray, "vertex 3"], faces: Int[ndarray, "face 3"]
+    views: Listing[View], vertex: Float[ndarray, "vertex 3"], faces: Int[ndarray, "face 3"]
 ) -> Int[ndarray, " visible"]:
     """Find the hand vertices whose surface faces at least one camera.
 
@@ -32,7 +34,7 @@ def visible_vertices(
     for k in range(3):
         np.add.at(normal, faces[:, k], face_normal)
     seen = np.zeros(len(vertex), bool)
-    for view in sequence.views:
+    for view in views:
         eye = view.camera.T_world_camera[:3, 3]
         seen |= ((eye - vertex) * normal).sum(axis=1) > 0
     return np.flatnonzero(seen)

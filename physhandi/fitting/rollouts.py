@@ -46,7 +46,7 @@ def control_trajectory_of(
     offset, seen = 0, []
     for model in models:
         vertex = control[0, offset : offset + model.vertex_count]
-        seen.append(visible_vertices(sequence, vertex, model.faces) + offset)
+        seen.append(visible_vertices(sequence.views, vertex, model.faces) + offset)
         offset += model.vertex_count
     candidates = np.concatenate(seen)
     return control[:, candidates[farthest_points(control[0, candidates], config.control_count)]]

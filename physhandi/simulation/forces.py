@@ -7,18 +7,17 @@ from numpy import ndarray
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
 
 
-def virtual_forces(  # noqa: PLR0917  (model, then state in the order of the equations)
+def virtual_spring_forces(  # noqa: PLR0917  (model, then state in the order of the equations)
     model: SpringMassModel,
     parameters: SimulationParameters,
     position: Float[ndarray, "node 3"],
     velocity: Float[ndarray, "node 3"],
     control: Float[ndarray, "control 3"],
     control_velocity: Float[ndarray, "control 3"] | None = None,
-) -> Float[ndarray, "node 3"]:
-    """Sum the forces that virtual springs put on each object node.
+) -> Float[ndarray, "virtual 3"]:
+    """Compute the force that each virtual spring puts on its object node.
 
-    Follows ``F = [Y (L / r - 1) + c (v_j - v_i)·d] d``; object springs, gravity, drag and
-    contact are not included.
+    Follows ``F = [Y (L / r - 1) + c (v_j - v_i)·d] d``.
 
     Args:
         model: Springs and material.
@@ -30,7 +29,7 @@ def virtual_forces(  # noqa: PLR0917  (model, then state in the order of the equ
             `use_control_velocity` is off.
 
     Returns:
-        Force on each object node in the world frame [N]; zero for a node that nothing holds.
+        Forces in the world frame [N], virtual springs in the model's order.
     """
     virtual = slice(model.object_spring_count, None)
     ends = np.sort(model.spring_nodes[virtual], axis=1)
@@ -44,7 +43,27 @@ def virtual_forces(  # noqa: PLR0917  (model, then state in the order of the equ
     strain = length / model.rest_length[virtual] - 1.0
     tension = parameters.stiffness_scale * model.stiffness[virtual] * strain
     tension = tension + model.damping[virtual] * np.sum(stretch * direction, axis=1)
-    pull = tension[:, None] * direction
+    return tension[:, None] * direction
+
+
+def virtual_forces(  # noqa: PLR0917  (model, then state in the order of the equations)
+    model: SpringMassModel,
+    parameters: SimulationParameters,
+    position: Float[ndarray, "node 3"],
+    velocity: Float[ndarray, "node 3"],
+    control: Float[ndarray, "control 3"],
+    control_velocity: Float[ndarray, "control 3"] | None = None,
+) -> Float[ndarray, "node 3"]:
+    """Sum the forces that virtual springs put on each object node.
+
+    The arguments are those of `virtual_spring_forces`; object springs, gravity, drag and contact
+    are not included.
+
+    Returns:
+        Force on each object node in the world frame [N]; zero for a node that nothing holds.
+    """
+    pull = virtual_spring_forces(model, parameters, position, velocity, control, control_velocity)
+    held = model.spring_nodes[model.object_spring_count :].min(axis=1, initial=model.node_count)
     return np.stack(
         [np.bincount(held, weights=pull[:, axis], minlength=model.node_count) for axis in range(3)],
         axis=1,
