@@ -1,0 +1,353 @@
+"""Foreign pickles: what they hold is read, what they ask for never happens."""
+
+import collections
+import os
+import pickle
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.sparse
+import torch
+from foreign_pickle import Call, Global, New, chumpy_array, chumpy_select, python2_pickle
+
+from physhandi.data.inert import array_from_bytes
+from physhandi.data.untrusted import read_untrusted
+from physhandi.errors import ImportFailedError
+
+ARRAYS = {
+    "double": np.random.default_rng(0).normal(size=(4, 3, 2)),
+    "fortran": np.asfortranarray(np.arange(12.0, dtype=np.float32).reshape(3, 4)),
+    "flags": np.array([[True, False], [False, False]]),
+    "index": np.arange(6, dtype=np.int64)[::2],
+    "empty": np.zeros((0, 3)),
+    "text": np.array(["hand", "b"]),
+    "big_endian": np.arange(5, dtype=">f8"),
+    "zero_dim": np.array(2.5),
+}
+
+
+def _store(folder: Path, content: bytes, name: str = "foreign.pkl") -> Path:
+    path = folder / name
+    path.write_bytes(content)
+    return path
+
+
+@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
+def test_plain_trees_and_arrays_come_back(tmp_path: Path, protocol: int) -> None:
+    tree = {
+        **ARRAYS,
+        "numbers": [1, -2.5, True, None, 10**40, float("inf")],
+        "nested": ({0: {1: {"object": ARRAYS["flags"]}}}, ["ä", "日本"]),
+        "ordered": collections.OrderedDict([("a", 1), ("b", [])]),
+        "set": {3},
+        "numpy": [np.float32(0.25), np.int64(7), np.bool_(True)],
+        "shared": [ARRAYS["double"]] * 3,
+    }
+    read = read_untrusted(_store(tmp_path, pickle.dumps(tree, protocol)))
+    assert list(read) == list(tree)
+    for name, array in ARRAYS.items():
+        assert read[name].dtype == array.dtype.newbyteorder("="), name
+        np.testing.assert_array_equal(read[name], array, strict=name != "big_endian")
+    assert read["numbers"] == tree["numbers"]
+    assert read["nested"][1] == ["ä", "日本"]
+    np.testing.assert_array_equal(read["nested"][0][0][1]["object"], ARRAYS["flags"])
+    assert (read["ordered"], read["set"]) == ({"a": 1, "b": []}, [3])
+    assert read["numpy"] == [0.25, 7, True]
+    assert [type(number) for number in read["numpy"]] == [float, int, bool]
+    np.testing.assert_array_equal(read["shared"][2], ARRAYS["double"])
+
+
+def test_python_2_files_with_chumpy_and_sparse_matrices_are_read(tmp_path: Path) -> None:
+    array = np.random.default_rng(1).normal(size=(5, 3, 4))
+    dense = np.where(np.random.default_rng(2).random((4, 6)) < 0.4, 2.5, 0.0)
+    assert dense.any()
+    tree = {
+        "array": array,
+        "fortran": np.asfortranarray(array[0]),
+        "ch": chumpy_array(array),
+        "select": chumpy_select(array),
+        "columns": scipy.sparse.csc_matrix(dense),
+        "rows": scipy.sparse.csr_matrix(dense),
+        "text": "caf\xe9",
+    }
+    content = python2_pickle(tree)
+    assert b"chumpy.reordering\nSelect" in content
+    read = read_untrusted(_store(tmp_path, content))
+    for name in ("array", "ch", "select"):
+        np.testing.assert_array_equal(read[name], array, strict=True)
+    np.testing.assert_array_equal(read["fortran"], array[0], strict=True)
+    for name in ("columns", "rows"):
+        np.testing.assert_array_equal(read[name], dense, strict=True)
+    assert read["text"] == "caf\xe9"
+
+
+@pytest.mark.parametrize("kind", ["csc_matrix", "csr_matrix", "csc_array", "csr_array"])
+def test_sparse_matrices_of_today_become_dense(tmp_path: Path, kind: str) -> None:
+    dense = np.arange(12.0).reshape(3, 4) * (np.arange(12).reshape(3, 4) % 2)
+    content = pickle.dumps(getattr(scipy.sparse, kind)(dense))
+    np.testing.assert_array_equal(read_untrusted(_store(tmp_path, content)), dense, strict=True)
+
+
+def test_torch_checkpoints_become_arrays(tmp_path: Path) -> None:
+    stiffness = torch.nn.Parameter(torch.linspace(1, 9, 12))
+    optimizer = torch.optim.Adam([stiffness], lr=1e-3, betas=(0.9, 0.99))
+    (stiffness**2).sum().backward()
+    optimizer.step()
+    base = torch.arange(24, dtype=torch.float64).reshape(2, 3, 4)
+    kinds = (torch.float16, torch.bfloat16, torch.int64, torch.int16, torch.uint8, torch.bool)
+    saved = {
+        "epoch": 7,
+        "spring_Y": stiffness,
+        "slice": base[1, 1:, ::2],
+        "transposed": base.permute(2, 0, 1),
+        "expanded": torch.ones(1).expand(5),
+        "scalar": torch.tensor(3.5),
+        "empty": torch.zeros(0, 3),
+        "kinds": [torch.tensor([0, 1, 3]).to(kind) for kind in kinds],
+        "module": torch.nn.Linear(3, 2).state_dict(),
+        "size": base.size(),
+        "optimizer_state_dict": optimizer.state_dict(),
+    }
+    path = tmp_path / "best_7.pth"
+    torch.save(saved, path)
+    read = read_untrusted(path)
+    assert read["epoch"] == 7
+    for name in ("spring_Y", "slice", "transposed", "expanded", "scalar", "empty"):
+        expected = saved[name].detach().numpy()
+        np.testing.assert_array_equal(read[name], expected, strict=True)
+    for array, kind in zip(read["kinds"], kinds, strict=True):
+        np.testing.assert_array_equal(array, torch.tensor([0, 1, 3]).to(kind).float().numpy())
+    np.testing.assert_array_equal(read["module"]["weight"], saved["module"]["weight"].numpy())
+    assert list(read["size"]) == [2, 3, 4]
+    state = read["optimizer_state_dict"]
+    expected = optimizer.state_dict()
+    assert state["param_groups"] == expected["param_groups"]
+    for name, value in expected["state"][0].items():
+        np.testing.assert_array_equal(state["state"][0][name], value.numpy(), strict=True)
+        assert np.any(state["state"][0][name]), name
+
+
+class _Hostile:
+    def __init__(self, *call: Any) -> None:
+        self._call = call
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return self._call[0], self._call[1:]
+
+
+def _canaries(canary: Path) -> dict[str, tuple[bytes, str]]:
+    touch = f"touch {canary}"
+    code = f"__import__('pathlib').Path({str(canary)!r}).touch()"
+    system = Call(Global("os", "system"), (touch,))
+    return {
+        "os.system": (pickle.dumps(_Hostile(os.system, touch)), r"posix\.system"),
+        "protocol 0": (f"cos\nsystem\n(S'{touch}'\ntR.".encode(), r"os\.system"),
+        "inst": (f"(S'{touch}'\nios\nsystem\n.".encode(), r"os\.system"),
+        "eval": (pickle.dumps(_Hostile(eval, code)), r"builtins\.eval"),
+        "exec": (
+            python2_pickle(Call(Global("__builtin__", "exec"), (code,))),
+            r"__builtin__\.exec",
+        ),
+        "getattr": (python2_pickle(Call(Global("builtins", "getattr"), ("a", "b"))), "getattr"),
+        "import": (python2_pickle(Call(Global("builtins", "__import__"), ("os",))), "__import__"),
+        "open": (pickle.dumps(_Hostile(open, str(canary), "w")), r"_?io\.open"),
+        "dotted": (b"\x80\x04\x8c\x05numpy\x8c\x08__init__\x93.", r"numpy\.__init__"),
+        "dotted path": (
+            b"\x80\x04\x8c\x08builtins\x8c\x0edict.__class__\x93.",
+            r"dict\.__class__",
+        ),
+        "numpy loader": (
+            python2_pickle(Call(Global("numpy", "load"), (str(canary),))),
+            r"numpy\.load",
+        ),
+        "inside an array": (pickle.dumps(np.array([_Hostile(os.system, touch)])), "system"),
+        "inside a list": (pickle.dumps([1, {"a": (_Hostile(os.system, touch),)}]), "system"),
+        "as a dtype": (python2_pickle(Call(Global("numpy", "dtype"), (system,))), "system"),
+        "in chumpy": (
+            python2_pickle(New(Global("chumpy.ch", "Ch"), {"x": system})),
+            r"os\.system",
+        ),
+        "chumpy lambda": (python2_pickle(New(Global("chumpy.ch", "ChLambda"), {})), "ChLambda"),
+        "memo": (b"\x80\x02cos\nsystem\nq\x00X" + _text(touch) + b"\x85h\x00\x8cR.", "system"),
+        "extension": (b"\x80\x02\x82\x01.", "extension"),
+        "persistent": (b"\x80\x02X" + _text("storage") + b"Q.", "outside of the file"),
+        "torch without archive": (
+            python2_pickle(Call(Global("torch._utils", "_rebuild_tensor_v2"), ())),
+            "_rebuild_tensor_v2",
+        ),
+        "set on a function": (
+            python2_pickle(Call(Global("_codecs", "encode"), ("a",), {"_function": 1})),
+            "refused",
+        ),
+        "build on a function": (
+            b"\x80\x02c_codecs\nencode\n}X" + _text("_function") + b"Nsb.",
+            "attributes of a function",
+        ),
+        "build on a class": (
+            b"\x80\x02cnumpy\ndtype\nN}X" + _text("_build") + b"Ns\x86b.",
+            "refused",
+        ),
+    }
+
+
+def _text(text: str) -> bytes:
+    return len(text).to_bytes(4, "little") + text.encode()
+
+
+CASES = sorted(_canaries(Path("/x")))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_what_a_hostile_pickle_asks_for_never_happens(tmp_path: Path, case: str) -> None:
+    canary = tmp_path / "canary"
+    content, named = _canaries(canary)[case]
+    path = _store(tmp_path, content)
+    with pytest.raises(ImportFailedError, match=named) as caught:
+        read_untrusted(path)
+    assert str(caught.value).startswith(f"{path}: refused, because ")
+    assert "Nothing of the file was executed" in str(caught.value)
+    assert not canary.exists()
+
+
+def test_the_canaries_would_sing(tmp_path: Path) -> None:
+    canary = tmp_path / "canary"
+    for case in ("os.system", "protocol 0", "inst", "eval", "open", "inside an array"):
+        canary.unlink(missing_ok=True)
+        result = pickle.loads(_canaries(canary)[case][0])  # noqa: S301 - what the reader must not do
+        if case == "open":
+            result.close()
+        assert canary.exists(), case
+
+
+def _tuples(depth: int) -> bytes:
+    return b"\x80\x02)" + b"\x85" * depth + b"."
+
+
+def _doubling(depth: int) -> bytes:
+    """A list of two references to a list of two references to ..., ``2**depth`` in all."""
+    rows = b"".join(
+        b"]q" + bytes([i]) + (b"h" + bytes([i - 1])) * 2 + b"\x86a" for i in range(1, depth)
+    )
+    return b"\x80\x02]q\x00" + rows + b"."
+
+
+BROKEN: dict[str, Callable[[], bytes]] = {
+    "deep tuples": lambda: _tuples(3_000_000),
+    "deep key": lambda: b"\x80\x02})" + b"\x85" * 3_000_000 + b"Ns.",
+    "loop": lambda: b"\x80\x02]q\x00h\x00a.",
+    "chumpy loop": lambda: b"\x80\x02cchumpy.ch\nCh\n)\x81q\x00}X" + _text("x") + b"h\x00sb.",
+    "doubling": lambda: _doubling(60),
+    "memo bomb": lambda: b"\x80\x02Nr\xff\xff\xff\x7f.",
+    "bytearray bomb": lambda: b"\x80\x05\x96" + (1 << 40).to_bytes(8, "little") + b".",
+    "text bomb": lambda: b"\x80\x04\x8d" + (1 << 40).to_bytes(8, "little") + b"a.",
+    "frame bomb": lambda: b"\x80\x04\x95" + (1 << 62).to_bytes(8, "little") + b"N.",
+    "count as bytes": lambda: python2_pickle(Call(Global("__builtin__", "bytearray"), (1 << 40,))),
+    "sparse bomb": lambda: python2_pickle(_sparse((10**7, 10**7), 10**7)),
+    "sparse outside": lambda: python2_pickle(_sparse((3, 2), 2, index=3)),
+    "sparse disorder": lambda: python2_pickle(_sparse((3, 2), 2, end=-1)),
+    "truncated": lambda: pickle.dumps(ARRAYS)[:-40],
+    "empty": lambda: b"",
+    "text": lambda: b"# not a pickle\n",
+    "npz": lambda: b"\x93NUMPY\x01\x00",
+    "object array": lambda: pickle.dumps(np.array([{}, []], dtype=object)),
+    "record array": lambda: pickle.dumps(np.zeros(2, dtype=[("a", "O"), ("b", "f8")])),
+    "short array": lambda: python2_pickle(_array((5,), b"\0" * 8)),
+    "array without content": lambda: python2_pickle(Call(Global("numpy", "ndarray"), ((3,),))),
+    "huge integer": lambda: pickle.dumps(1 << 100_000),
+    "complex": lambda: pickle.dumps(1j, protocol=2),
+}
+
+
+def _array(shape: tuple[int, ...], raw: bytes) -> Call:
+    dtype = Call(Global("numpy", "dtype"), ("f8", 0, 1))
+    array = (Global("numpy", "ndarray"), (0,), "b")
+    state = (1, shape, dtype, False, raw)
+    return Call(Global("numpy.core.multiarray", "_reconstruct"), array, state)
+
+
+def _sparse(shape: tuple[int, int], major: int, index: int = 0, end: int = 1) -> New:
+    indptr = np.zeros(major + 1, np.int32)
+    indptr[-1] = end
+    parts = {"data": np.ones(1), "indices": np.array([index]), "indptr": indptr}
+    return New(Global("scipy.sparse.csc", "csc_matrix"), {"_shape": shape, **parts})
+
+
+@pytest.mark.parametrize("case", sorted(BROKEN))
+def test_broken_and_exploding_files_are_refused(tmp_path: Path, case: str) -> None:
+    path = _store(tmp_path, BROKEN[case]())
+    with pytest.raises(ImportFailedError, match=r"foreign\.pkl: refused, because"):
+        read_untrusted(path, time_limit_s=60.0, memory_limit=3 << 30)
+
+
+def test_memory_and_time_are_limited(tmp_path: Path) -> None:
+    path = _store(tmp_path, pickle.dumps(np.zeros(17_000_000)))
+    with pytest.raises(ImportFailedError, match="more memory than is allowed"):
+        read_untrusted(path, memory_limit=1 << 29)
+    assert read_untrusted(path).shape == (17_000_000,)
+    with pytest.raises(ImportFailedError, match=r"took more than 0\.01 s"):
+        read_untrusted(path, time_limit_s=0.01)
+
+
+def test_missing_files_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ImportFailedError, match=r"nowhere\.pkl is not a file"):
+        read_untrusted(tmp_path / "nowhere.pkl")
+    with pytest.raises(ImportFailedError, match="is not a file"):
+        read_untrusted(tmp_path)
+
+
+def _rewritten(path: Path, change: dict[str, bytes], *, compress: bool = False) -> Path:
+    """Copy a checkpoint with some members replaced."""
+    changed = path.with_name("changed.pth")
+    method = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
+    with zipfile.ZipFile(path) as old, zipfile.ZipFile(changed, "w", method) as new:
+        for name in old.namelist():
+            inner = name.partition("/")[2]
+            new.writestr(name, change.get(inner, old.read(name)))
+    return changed
+
+
+def test_hostile_checkpoints_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "model.pth"
+    torch.save({"spring_Y": torch.arange(5.0)}, path)
+    np.testing.assert_array_equal(read_untrusted(path)["spring_Y"], np.arange(5.0))
+    canary = tmp_path / "canary"
+    hostile = pickle.dumps(_Hostile(os.system, f"touch {canary}"))
+    with zipfile.ZipFile(path) as archive:
+        content = archive.read("model/data.pkl")
+    with pytest.raises(ImportFailedError, match=r"posix\.system"):
+        read_untrusted(_rewritten(path, {"data.pkl": hostile}))
+    assert not canary.exists()
+    assert content.count(b"K\x05") >= 1
+    beyond = content.replace(b"K\x05\x85", b"K\x63\x85")
+    for change, named in (
+        ({"data.pkl": beyond}, "beyond its storage"),
+        ({"data/0": b"\0" * 19}, "cut off"),
+        ({"data/0": b"\0" * 400}, "another size"),
+        ({"data.pkl": b""}, "no whole pickle"),
+    ):
+        with pytest.raises(ImportFailedError, match=named):
+            read_untrusted(_rewritten(path, change))
+    bomb = _rewritten(path, {"data/0": b"\0" * 5_000_000}, compress=True)
+    assert bomb.stat().st_size < 100_000
+    with pytest.raises(ImportFailedError, match="is compressed"):
+        read_untrusted(bomb)
+    with zipfile.ZipFile(tmp_path / "other.zip", "w") as archive:
+        archive.writestr("a/readme.txt", "no checkpoint")
+    with pytest.raises(ImportFailedError, match=r"without a/data\.pkl"):
+        read_untrusted(tmp_path / "other.zip")
+
+
+def test_old_torch_files_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "old.pth"
+    torch.save({"a": torch.ones(2)}, path, _use_new_zipfile_serialization=False)
+    with pytest.raises(ImportFailedError, match=r"before 1\.6"):
+        read_untrusted(path)
+
+
+def test_only_known_types_become_arrays() -> None:
+    with pytest.raises(ImportFailedError, match="unknown type"):
+        array_from_bytes(b"\0" * 8, np.dtype("f8"), (1,), "C")
