@@ -38,6 +38,11 @@ class CameraNodes:
         self._nodes.clear()
         self._shown = None
 
+    def hide(self) -> None:
+        """Hide the frustums."""
+        for node in self._nodes:
+            node.visible = False
+
     def draw(
         self, frame: int, *, is_visible: bool, looks_from: str | None, is_playing: bool
     ) -> None:

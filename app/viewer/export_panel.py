@@ -12,7 +12,7 @@ import yaml
 
 from app.viewer.content import Content
 from app.viewer.guard import Guard, notify
-from app.viewer.scene import GREEN, RED, SKIN
+from app.viewer.layers import GREEN, RED, SKIN
 from app.viewer.take import Take
 from physhandi.data.exporters.mesh import frame_to_ply, ply_bytes
 from physhandi.data.exporters.scene_data import HandSurface, SceneData

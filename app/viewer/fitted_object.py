@@ -1,9 +1,12 @@
 """The fitted object of a run, rebuilt for other parameters."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
 
 from app.viewer.content import load_fitted
 from app.viewer.take import Take
@@ -11,7 +14,11 @@ from physhandi.data.run import Run
 from physhandi.errors import MissingInputError
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
 from physhandi.simulation.simulator import Simulator
-from physhandi.simulation.topology import retopologize
+from physhandi.simulation.topology import (
+    MINIMUM_VIRTUAL_REST_LENGTH,
+    retopologize,
+    virtual_springs,
+)
 
 # Parameters that are built into the model; the others are read by the simulator.
 _TOPOLOGY = (
@@ -36,12 +43,32 @@ class FittedObject:
                 f"Run '{run.name}' has no fitted object for sequence '{sequence}' to simulate."
             )
         self.take: Take = take
-        self.control = np.ascontiguousarray(take.control, dtype=np.float32)
+        self._all_controls = np.ascontiguousarray(take.control, dtype=np.float32)
+        self._control = self._all_controls
+        self._chosen: tuple[int, ...] | None = None
         self._latest: tuple[tuple[float, ...], SpringMassModel] | None = None
         self._simulator: Simulator | None = None
         self._rest_node = None
         if run.has("object/material.safetensors"):
             self._rest_node = run.tensors("object/material.safetensors").get("rest_node")
+
+    def choose_controls(self, chosen: Sequence[int] | None) -> Float[ndarray, "frame control 3"]:
+        """Let only some of the control nodes hold the object from now on.
+
+        The object's own springs then stay as fitted, whatever the parameters say of them.
+
+        Args:
+            chosen: Numbers of control nodes; None for all.
+
+        Returns:
+            Their positions [m].
+        """
+        wanted = None if chosen is None else tuple(chosen)
+        if wanted != self._chosen:
+            self._chosen, self._latest = wanted, None
+            everything = self._all_controls
+            self._control = everything if wanted is None else everything[:, list(wanted)].copy()
+        return self._control
 
     def model(self, parameters: SimulationParameters) -> SpringMassModel:
         """Build the springs for other parameters, keeping what was fitted."""
@@ -68,6 +95,8 @@ class FittedObject:
 
     def _build(self, parameters: SimulationParameters) -> SpringMassModel:
         fitted, model = self.take.parameters, self.take.model
+        if self._chosen is not None:
+            return _hold_anew(model, parameters, self._control[0])
         if all(getattr(parameters, n) == getattr(fitted, n) for n in _TOPOLOGY if n != "damping"):
             if parameters.damping == fitted.damping:
                 return model
@@ -77,5 +106,34 @@ class FittedObject:
                 damping = np.full_like(model.damping, parameters.damping)
             return replace(model, damping=damping)
         return retopologize(
-            model, parameters, self.control[0], fitted=fitted, rest_node=self._rest_node
+            model, parameters, self._control[0], fitted=fitted, rest_node=self._rest_node
         )
+
+
+def _hold_anew(
+    model: SpringMassModel,
+    parameters: SimulationParameters,
+    control_0: Float[ndarray, "control 3"],
+) -> SpringMassModel:
+    """Join an object to other control nodes: its own springs stay, the virtual ones are new."""
+    springs, length = virtual_springs(
+        control_0.astype(np.float64),
+        model.object_node.astype(np.float64),
+        parameters.virtual_connection_radius,
+        parameters.virtual_max_neighbors,
+    )
+    floor = max(parameters.virtual_rest_length_floor, MINIMUM_VIRTUAL_REST_LENGTH)
+    own = slice(0, model.object_spring_count)
+
+    def joined(fitted: ndarray, new: ndarray | float) -> ndarray:
+        extra = np.broadcast_to(np.asarray(new, dtype=np.float32), (len(springs),))
+        return np.concatenate([fitted[own], extra])
+
+    return replace(
+        model,
+        spring_nodes=np.concatenate([model.spring_nodes[own], springs]),
+        rest_length=joined(model.rest_length, np.maximum(length, floor)),
+        stiffness=joined(model.stiffness, parameters.virtual_stiffness),
+        damping=joined(model.damping, parameters.damping),
+        control_count=len(control_0),
+    )

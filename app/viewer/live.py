@@ -36,6 +36,8 @@ class LiveRequest:
     """What to simulate it with."""
     automatic_substeps: bool = False
     """Whether to use as few substeps as are stable, instead of the parameters' number."""
+    controls: tuple[int, ...] | None = None
+    """Which of the run's control nodes may hold the object; None for all."""
 
 
 class LiveSimulation:
@@ -109,6 +111,7 @@ class LiveSimulation:
                 "sequence": request.sequence,
                 "parameters": request.parameters.to_dict(),
                 "automatic_substeps": request.automatic_substeps,
+                "controls": None if request.controls is None else list(request.controls),
             },
         )
         with self._lock:

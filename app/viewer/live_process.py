@@ -135,9 +135,10 @@ class LiveSimulator:
     def _simulate(self, request: Message, about: dict[str, object]) -> Iterator[None]:
         fitted = self._object(request)
         parameters = SimulationParameters.from_dict(request["parameters"])
+        control = fitted.choose_controls(request["controls"])
         model = fitted.model(parameters)
         if request["automatic_substeps"]:
-            substeps = stable_substeps(model, parameters, fitted.control[0])
+            substeps = stable_substeps(model, parameters, control[0])
             parameters = replace(parameters, substeps_per_frame=max(substeps, _MIN_SUBSTEPS))
         send(
             self._connection,
@@ -150,7 +151,7 @@ class LiveSimulator:
         yield
         simulator = fitted.simulator(model, parameters, self._device)
         clock = time.perf_counter()
-        for frame, position, velocity in simulator.frames(fitted.control):
+        for frame, position, velocity in simulator.frames(control):
             now = time.perf_counter()
             send(
                 self._connection,

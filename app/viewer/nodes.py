@@ -30,6 +30,11 @@ class SceneNodes:
             node.remove()
         self._nodes.clear()
 
+    def hide(self) -> None:
+        """Hide all nodes."""
+        for node in self._nodes.values():
+            node.visible = False
+
     def show(self, name: str, *, is_visible: bool) -> None:
         """Show or hide a node, if it is there."""
         if name in self._nodes:
@@ -43,12 +48,13 @@ class SceneNodes:
         color: tuple[int, int, int],
         *,
         is_visible: bool,
+        opacity: float = 0.62,
     ) -> None:
         """Draw a semi-transparent surface."""
         node = self._nodes.get(name)
         if node is None and is_visible:
             self._nodes[name] = self._scene.add_mesh_simple(
-                name, vertex, face, color=color, opacity=0.62, side="double"
+                name, vertex, face, color=color, opacity=opacity, side="double"
             )
         elif node is not None and is_visible:
             node.vertices = vertex
@@ -80,6 +86,62 @@ class SceneNodes:
             if np.ndim(color) == 2:
                 node.colors = color
         self.show(name, is_visible=is_visible)
+
+    def spheres(
+        self,
+        name: str,
+        point: Float[ndarray, "point 3"],
+        color: tuple[int, int, int],
+        size: float,
+        *,
+        is_visible: bool,
+    ) -> None:
+        """Draw points as shaded spheres, as large as `points` draws its disks."""
+        node = self._nodes.get(name)
+        is_visible = is_visible and len(point) > 0
+        if node is not None and is_visible and len(node.batched_positions) != len(point):
+            self._nodes.pop(name).remove()
+            node = None
+        if node is None and is_visible:
+            self._nodes[name] = self._scene.add_batched_meshes_simple(
+                name,
+                *_sphere(0.5 * size),
+                np.tile([1.0, 0.0, 0.0, 0.0], (len(point), 1)),
+                np.asarray(point, dtype=np.float32),
+                batched_colors=color,
+                lod="off",
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+        elif node is not None and is_visible:
+            node.batched_positions = np.asarray(point, dtype=np.float32)
+        self.show(name, is_visible=is_visible)
+
+    def frame(self, name: str, position: Float[ndarray, " 3"]) -> None:
+        """Place a coordinate frame, below which other nodes can be drawn."""
+        node = self._nodes.get(name)
+        if node is None:
+            self._nodes[name] = self._scene.add_frame(name, show_axes=False, position=position)
+            return
+        node.position = position
+        node.visible = True
+
+    def label(
+        self, name: str, text: str, position: Float[ndarray, " 3"], *, anchor: Any, height: float
+    ) -> None:
+        """Write a text that faces the camera, its lines as high as `height` in the scene."""
+        node = self._nodes.get(name)
+        if node is None:
+            self._nodes[name] = self._scene.add_label(
+                name,
+                text,
+                position=position,
+                anchor=anchor,
+                font_size_mode="scene",
+                font_scene_height=height,
+            )
+            return
+        node.text, node.position, node.visible = text, position, True
 
     def segments(
         self,
@@ -152,3 +214,18 @@ class SceneNodes:
         cell, section = _GRID[is_dark]
         if node is not None and tuple(node.cell_color) != cell:
             node.cell_color, node.section_color = cell, section
+
+
+def _sphere(radius: float) -> tuple[Float[ndarray, "vertex 3"], Int[ndarray, "face 3"]]:
+    """Make a small sphere: an octahedron, each face cut into four twice over."""
+    corner = np.concatenate([np.eye(3), -np.eye(3)])
+    upper = [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2]]
+    face = corner[np.array(upper + [[b, a, 5] for a, b, _ in upper])]
+    for _ in range(2):
+        a, b, c = face[:, 0], face[:, 1], face[:, 2]
+        middle = [(a + b) / 2, (b + c) / 2, (c + a) / 2]
+        ab, bc, ca = (m / np.linalg.norm(m, axis=1, keepdims=True) for m in middle)
+        parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+        face = np.concatenate([np.stack(part, axis=1) for part in parts])
+    vertex, index = np.unique(face.reshape(-1, 3).round(9), axis=0, return_inverse=True)
+    return (radius * vertex).astype(np.float32), index.reshape(-1, 3).astype(np.uint32)

@@ -9,9 +9,9 @@ import viser
 from app.viewer.content import Content
 from app.viewer.framing import Framing
 from app.viewer.guard import Guard
+from app.viewer.layers import BLUE, GREEN, GREY, RED, SKIN, YELLOW, Layers
 from app.viewer.observed import DepthCloud
 from app.viewer.playback import Playback
-from app.viewer.scene import BLUE, GREEN, GREY, RED, SKIN, YELLOW, Layers
 from physhandi.data.view import View
 
 _OVERVIEW = "Overview"

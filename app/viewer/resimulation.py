@@ -54,6 +54,7 @@ class Resimulation:
         *,
         run: Path,
         sequence: str,
+        controls: tuple[int, ...] | None = None,
         on_change: Callable[[str, int], None],
     ) -> None:
         """Listen to the live simulation process.
@@ -64,6 +65,7 @@ class Resimulation:
             fitted: The fitted rollout.
             run: Run folder.
             sequence: The run's sequence.
+            controls: Which of the run's control nodes hold the object; None for all.
             on_change: Called with the kind of each message and the number of ready frames.
         """
         self.fitted = fitted
@@ -71,6 +73,7 @@ class Resimulation:
         self._live = live
         self._run = run
         self._sequence = sequence
+        self._controls = controls
         self._on_change = on_change
         self._lock = threading.Lock()
         self._shown = fitted
@@ -96,6 +99,7 @@ class Resimulation:
                     sequence=self._sequence,
                     parameters=parameters,
                     automatic_substeps=automatic_substeps,
+                    controls=self._controls,
                 ),
             )
 

@@ -11,15 +11,15 @@ import viser._messages as messages
 
 from app.viewer.content import Catalog, Content, open_run, open_sequence
 from app.viewer.export_panel import ExportPanel, Snapshot
+from app.viewer.figure_mode import FigureMode
 from app.viewer.framing import frame_content
-from app.viewer.guard import Guard, notify, plain
+from app.viewer.guard import Guard, plain
 from app.viewer.live import LiveSimulation
+from app.viewer.object_session import ObjectSession
 from app.viewer.panels import LayersPanel, TimelinePanel, add_legend, set_theme
-from app.viewer.physics_panel import PhysicsPanel
 from app.viewer.playback import Playback
-from app.viewer.resimulation import Resimulation
 from app.viewer.scene import Scene
-from physhandi.simulation.model import SimulationParameters
+from app.viewer.take import Take
 
 Kind = Literal["run", "sequence"]
 
@@ -77,8 +77,8 @@ class Session:
         self._server = _start_server(plain(self._content.title))
         self._guard = Guard(self._server)
         self._playback = Playback(self._content.frame_count, self._content.frame_rate, self._draw)
-        self._physics: PhysicsPanel | None = None
-        self._resimulation: Resimulation | None = None
+        self._object: ObjectSession | None = None
+        self._is_figure_shown = False
         try:
             self._build()
         except BaseException:
@@ -115,8 +115,9 @@ class Session:
     def close(self) -> None:
         """Stop clock, simulation and server."""
         self._playback.close()
-        if self._resimulation is not None:
-            self._resimulation.close()
+        if self._object is not None:
+            self._object.close()
+        self._figure.close()
         self._server.stop()
         for view in self._content.views:
             view.close()
@@ -134,6 +135,7 @@ class Session:
             choice = server.gui.add_dropdown("Sequence", self._names)
             choice.on_update(guard.by_user(lambda event: self._switch(event.target.value)))
         self._timeline = TimelinePanel(server, self._playback, guard)
+        self._figure = FigureMode(server, guard, self._live, self.id, self._playback.redraw)
         self._physics_place = server.gui.add_folder(None)
         self._layers = LayersPanel(server, self._content, guard, self._playback.redraw)
         ExportPanel(server, guard, self._snapshot)
@@ -146,32 +148,31 @@ class Session:
         framing = frame_content(content)
         self._scene = Scene(self._server, content, framing)
         self._layers.replace(content, self._scene.layers, framing)
-        if content.fitted is None or self.kind != "run":
+        run = self._catalog.run(self.target).folder if self.kind == "run" else None
+        self._figure.offer(content, framing, run)
+        if content.fitted is None or run is None:
             return
-        self._resimulation = Resimulation(
-            self.id,
-            self._live,
-            content.fitted,
-            run=self._catalog.run(self.target).folder,
-            sequence=content.sequence_name,
-            on_change=self._hear,
-        )
         with self._physics_place:
-            self._physics = PhysicsPanel(
-                self._server, content, content.fitted, self._guard, self._simulate
+            self._object = ObjectSession(
+                self._server,
+                self._guard,
+                self._playback,
+                session=self.id,
+                live=self._live,
+                content=content,
+                fitted=content.fitted,
+                run=run,
             )
-        self._physics.show(self._resimulation.readout, at_once=True)
 
     def _switch(self, sequence_name: str) -> None:
         content = self._load(sequence_name)
         with self._lock, self._server.atomic():
             self._playback.play(on=False)
-            if self._resimulation is not None:
-                self._resimulation.close()
-                self._resimulation = None
-            if self._physics is not None:
-                self._physics.remove()
-                self._physics = None
+            if self._object is not None:
+                self._object.remove()
+                self._object = None
+            self._figure.close()
+            self._is_figure_shown = False
             self._scene.clear()
             self._content = content
             self._playback.replace(content.frame_count, content.frame_rate)
@@ -179,76 +180,42 @@ class Session:
             self._fill()
         self._playback.play()
 
-    def _welcome(self, _: Any) -> None:
-        """Start playing when the first client is there."""
+    def _welcome(self, client: viser.ClientHandle) -> None:
+        """Start playing when the first client is there, and follow its camera."""
         self._seen = time.monotonic()
+        self._figure.welcome(client)
+        client.camera.on_update(self._guard(lambda _: self._figure.turn(client)))
         if not self._has_played:
             self._has_played = True
             self._playback.play()
 
     def _draw(self, frame: int, is_playing: bool) -> None:
         with self._lock:
-            take, take_frame = None, frame
-            if self._resimulation is not None:
-                take, take_frame = self._resimulation.at(frame)
-            elif self._content.fitted is not None:
-                take = self._content.fitted
-                take_frame = min(frame, take.ready - 1)
-            self._scene.draw(frame, take, take_frame, is_playing=is_playing)
+            take, take_frame = self._take(frame)
+            is_figure = self._figure.is_on and take is not None
+            if is_figure != self._is_figure_shown:
+                (self._scene if is_figure else self._figure).hide()
+                self._is_figure_shown = is_figure
+            if is_figure and take is not None:
+                self._figure.draw(
+                    take, take_frame, frame, self._scene.layers, is_playing=is_playing
+                )
+            else:
+                self._scene.draw(frame, take, take_frame, is_playing=is_playing)
             self._timeline.show(frame, is_playing=is_playing)
+
+    def _take(self, frame: int) -> tuple[Take | None, int]:
+        """Find the rollout to show in a frame, and which of its frames."""
+        if self._object is not None:
+            return self._object.at(frame)
+        fitted = self._content.fitted
+        return fitted, frame if fitted is None else min(frame, fitted.ready - 1)
 
     def _snapshot(self) -> Snapshot:
         with self._lock:
             frame = self._playback.frame
-            take, take_frame = self._content.fitted, frame
-            if self._resimulation is not None:
-                take, take_frame = self._resimulation.at(frame)
+            take, take_frame = self._take(frame)
             return Snapshot(self._content, frame, take, take_frame)
-
-    def _simulate(self, parameters: SimulationParameters, automatic_substeps: bool) -> None:
-        resimulation, content, physics = self._resimulation, self._content, self._physics
-        if resimulation is None or content.fitted is None or physics is None:
-            return
-        if parameters == content.fitted.parameters and not automatic_substeps:
-            resimulation.show_fitted()
-        else:
-            resimulation.request(parameters, automatic_substeps=automatic_substeps)
-            physics.show(resimulation.readout, at_once=True)
-
-    def _hear(self, kind: str, ready: int) -> None:
-        """Follow the live simulation; runs in its thread."""
-        resimulation, physics = self._resimulation, self._physics
-        if resimulation is None or physics is None:
-            return
-        readout = resimulation.readout
-        physics.show(readout, at_once=kind != "frame")
-        if kind == "frame":
-            self._follow(ready)
-            return
-        self._playback.limit(self._playback.frame_count)
-        if kind == "diverged":
-            title = "Simulation diverged; the last good state is kept"
-            notify(self._server, title, readout.error or "", seconds=12.0)
-        elif kind == "failed":
-            notify(self._server, "Simulation failed", readout.error or "")
-        elif kind == "crashed":
-            self._apologise(is_retried=readout.is_busy)
-
-    def _follow(self, ready: int) -> None:
-        """Let the running clock follow the frames that are ready, from the first one on."""
-        playback = self._playback
-        if playback.is_playing:
-            playback.limit(ready)
-            if ready == 1:
-                playback.seek(0)
-        elif playback.frame == ready - 1:
-            playback.redraw()
-
-    def _apologise(self, *, is_retried: bool) -> None:
-        then = "Simulating again." if is_retried else "Move a slider to simulate again."
-        notify(
-            self._server, "The live simulation stopped and was started anew", then, color="orange"
-        )
 
 
 def _start_server(label: str) -> viser.ViserServer:

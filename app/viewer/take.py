@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from physhandi.simulation.forces import virtual_forces
+from physhandi.simulation.forces import virtual_forces, virtual_spring_forces
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
 
 
@@ -58,14 +58,20 @@ class Take:
 
     def forces(self, frame: int) -> Float[ndarray, "node 3"]:
         """Compute the sum of the virtual springs' forces on each object node [N]."""
+        return virtual_forces(self.model, self.parameters, *self._state(frame))
+
+    def spring_forces(self, frame: int) -> Float[ndarray, "virtual 3"]:
+        """Compute the force of each virtual spring on its object node [N]."""
+        return virtual_spring_forces(self.model, self.parameters, *self._state(frame))
+
+    def _state(self, frame: int) -> tuple[ndarray, ndarray, ndarray, ndarray]:
+        """Collect positions and velocities of object nodes and control nodes."""
         rate = self.parameters.frame_rate
         if self.velocity is not None:
             velocity = self.velocity[frame]
         else:
             velocity = _difference(self.position, frame, rate)
-        return virtual_forces(
-            self.model,
-            self.parameters,
+        return (
             np.asarray(self.position[frame]),
             np.asarray(velocity),
             np.asarray(self.control[frame]),

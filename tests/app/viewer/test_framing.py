@@ -3,7 +3,7 @@ import pytest
 
 from app.viewer.content import Content, open_run, open_sequence
 from app.viewer.framing import frame_content
-from app.viewer.scene import default_layers
+from app.viewer.layers import default_layers
 
 
 def in_view(framing, point) -> bool:

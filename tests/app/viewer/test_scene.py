@@ -7,7 +7,8 @@ from viewer_client import ViewerClient
 
 from app.viewer.content import Content, HandSurface
 from app.viewer.framing import frame_content
-from app.viewer.scene import PLAYING_SPRINGS, Scene
+from app.viewer.layers import PLAYING_SPRINGS
+from app.viewer.scene import Scene
 from app.viewer.take import Take
 from physhandi.simulation.model import SimulationParameters
 from physhandi.simulation.topology import build_model

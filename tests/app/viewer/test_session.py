@@ -73,7 +73,7 @@ def test_the_other_sequence_of_a_run_can_be_chosen(sessions, run) -> None:
         client.until(
             lambda: "x0.1" in client.texts() and f"simulated {FRAMES}/{FRAMES}" in client.texts()
         )
-        take, _ = session._resimulation.at(0)
+        take, _ = session._object.at(0)
         control = run.array("sequences/drag/control.npy")
         np.testing.assert_array_equal(np.asarray(take.control), control)
 
@@ -86,7 +86,7 @@ def test_an_error_in_a_callback_is_logged_and_shown(sessions, caplog) -> None:
         def fail(*_: object) -> None:
             raise ValueError("the spring snapped")
 
-        session._physics._simulate = fail
+        session._object.panel._simulate = fail
         client.set("drag [1/s]", 9.0)
         client.until(
             lambda: any("the spring snapped" in json.dumps(m, default=str) for m in client.messages)

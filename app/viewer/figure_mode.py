@@ -1,0 +1,289 @@
+"""The figure mode of a session: its button and key, the rival's simulation and the camera."""
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import viser
+from jaxtyping import Float
+from numpy import ndarray
+
+from app.viewer.content import Content
+from app.viewer.figure import Eye, Figure, Side
+from app.viewer.framing import Framing
+from app.viewer.guard import Guard, notify
+from app.viewer.layers import Layers
+from app.viewer.live import LiveSimulation
+from app.viewer.resimulation import Resimulation
+from app.viewer.rival import Rival
+from app.viewer.take import Take
+
+_PANEL_PIXELS = 345
+_ON, _OFF = "Back to the scene", "Compare with PhysTwin"
+
+
+@dataclass(frozen=True, eq=False)
+class _Pose:
+    """Where a client's camera stood before the figure."""
+
+    position: Float[ndarray, " 3"]
+    look_at: Float[ndarray, " 3"]
+    up: Float[ndarray, " 3"]
+    fov: float
+
+
+class FigureMode:
+    """Switches between the scene and the figure; the rival is simulated at most once."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        guard: Guard,
+        live: LiveSimulation,
+        session: str,
+        redraw: Callable[[], None],
+    ) -> None:
+        """Add the button, hidden until there is something to compare.
+
+        Args:
+            server: Where to.
+            guard: Wraps the callbacks.
+            live: The process that simulates the rival.
+            session: Id of the session.
+            redraw: Draws the current frame again.
+        """
+        self._server = server
+        self._live = live
+        self._mailbox = f"{session}/figure"
+        self._redraw = redraw
+        self._lock = threading.RLock()
+        self._poses: dict[int, _Pose] = {}
+        self._is_on = False
+        self._content: Content | None = None
+        self._figure: Figure | None = None
+        self._rival: Rival | None = None
+        self._rollout: Resimulation | None = None
+        self._run: Path | None = None
+        self._button = server.gui.add_button(
+            _OFF, icon=viser.Icon.COLUMNS_2, color="gray", hint="F: the paper's figure"
+        )
+        self._button.visible = False
+        self._text = server.gui.add_markdown("")
+        self._text.visible = False
+        self._button.on_click(guard(lambda _: self.toggle()))
+        command = server.gui.add_command("Figure: ours and PhysTwin", hotkey="F")
+        command.on_trigger(guard(lambda _: self.toggle()))
+
+    @property
+    def is_on(self) -> bool:
+        """Whether the figure is shown instead of the scene."""
+        return self._is_on
+
+    def offer(self, content: Content, framing: Framing, run: Path | None) -> None:
+        """Get ready for a content; without an object there is no figure."""
+        with self._lock:
+            self.close()
+            self._content = content
+            self._run = run
+            can = content.fitted is not None and run is not None
+            self._button.visible = can
+            if content.fitted is not None and can:
+                self._figure = Figure(self._server, content, content.fitted, framing)
+
+    def close(self) -> None:
+        """Leave the figure and forget the rival."""
+        with self._lock:
+            if self._is_on:
+                self._leave()
+            if self._rollout is not None:
+                self._rollout.close()
+            if self._figure is not None:
+                self._figure.clear()
+            self._rollout = self._rival = self._figure = None
+
+    def toggle(self) -> None:
+        """Enter the figure or leave it."""
+        with self._lock:
+            if self._is_on:
+                self._leave()
+            elif self._figure is not None:
+                self._enter()
+        self._redraw()
+
+    def hide(self) -> None:
+        """Hide the figure's nodes; runs in the thread that draws."""
+        if self._figure is not None:
+            self._figure.hide()
+
+    def draw(
+        self, ours: Take, ours_frame: int, frame: int, layers: Layers, *, is_playing: bool
+    ) -> None:
+        """Bring both halves to a frame.
+
+        Args:
+            ours: The rollout that the session shows.
+            ours_frame: Its frame.
+            frame: Frame of the hands.
+            layers: What is shown.
+            is_playing: Whether the clock is running.
+        """
+        figure = self._figure
+        if figure is None:
+            return
+        sides = self.sides(ours, ours_frame, frame)
+        figure.draw(sides, frame, layers, is_playing=is_playing)
+
+    def sides(self, ours: Take, ours_frame: int, frame: int) -> dict[str, Side]:
+        """Collect what both halves show in a frame."""
+        left = Side(take=ours, frame=ours_frame, caption=self._caption("ours", ours))
+        rollout = self._rollout
+        if rollout is None or rollout.newest.ready == 0:
+            right = Side(take=None, frame=0, caption="PhysTwin-style · simulating …")
+        else:
+            take = rollout.newest
+            at = min(frame, take.ready - 1)
+            right = Side(take=take, frame=at, caption=self._caption("PhysTwin-style", take))
+        return {"ours": left, "phystwin": right}
+
+    def turn(self, client: viser.ClientHandle) -> None:
+        """Let the halves follow a client's camera."""
+        figure = self._figure
+        if self._is_on and figure is not None:
+            figure.turn(Eye.of(client.camera.wxyz))
+
+    def welcome(self, client: viser.ClientHandle) -> None:
+        """Show the figure whole to a client that comes while it is on."""
+        with self._lock:
+            if self._is_on:
+                self._aim(client)
+
+    def picture(self, client: viser.ClientHandle) -> dict[str, Any]:
+        """Find the camera and size of a picture of the figure, without the part under the panel.
+
+        Returns:
+            Arguments of viser's ``get_render``.
+        """
+        camera = client.camera
+        width, height = max(camera.image_width, 1), max(camera.image_height, 1)
+        hidden = _covered(width)
+        pixel = 2 * np.tan(camera.fov / 2) / height
+        distance = float(np.linalg.norm(camera.look_at - camera.position))
+        aside = -0.5 * hidden * pixel * distance * Eye.of(camera.wxyz).right
+        scale = 1600 / (width - hidden)
+        return {
+            "width": 1600,
+            "height": max(round(height * scale), 1),
+            "wxyz": camera.wxyz,
+            "position": camera.position + aside,
+            "fov": camera.fov,
+        }
+
+    def _caption(self, name: str, take: Take) -> str:
+        parameters, content = take.parameters, self._content
+        is_metric = content is None or content.is_metric
+        radius = parameters.virtual_connection_radius
+        shown = f"{1e3 * radius:.3g} mm" if is_metric else f"{radius:.3g}"
+        return (
+            f"{name} · δ {shown} · d_max {parameters.virtual_max_neighbors} · "
+            f"{take.model.virtual_spring_count} virtual springs"
+        )
+
+    def _enter(self) -> None:
+        content, run = self._content, self._run
+        if content is None or content.fitted is None or run is None:
+            return
+        if self._rollout is None:
+            self._rival = Rival.of(content, content.fitted)
+            chosen = tuple(int(control) for control in self._rival.controls)
+            empty = Take.empty(
+                content.fitted.model,
+                self._rival.parameters,
+                np.asarray(content.fitted.control[:, list(chosen)]),
+            )
+            self._rollout = Resimulation(
+                self._mailbox,
+                self._live,
+                empty,
+                run=run,
+                sequence=content.sequence_name,
+                controls=chosen,
+                on_change=self._hear,
+            )
+            self._rollout.request(self._rival.parameters, automatic_substeps=True)
+        self._is_on = True
+        self._button.label = _ON
+        self._tell()
+        self._text.visible = True
+        for client in self._server.get_clients().values():
+            self._aim(client)
+
+    def _leave(self) -> None:
+        self._is_on = False
+        self._button.label = _OFF
+        self._text.visible = False
+        for client in self._server.get_clients().values():
+            pose = self._poses.pop(client.client_id, None)
+            if pose is None:
+                continue
+            with client.atomic():
+                eye = client.camera
+                eye.up_direction, eye.fov = pose.up, pose.fov
+                eye.position, eye.look_at = pose.position, pose.look_at
+        self._poses.clear()
+
+    def _aim(self, client: viser.ClientHandle) -> None:
+        """Move a camera back along its view until both halves fit beside the panel."""
+        figure, camera = self._figure, client.camera
+        if figure is None:
+            return
+        before = _Pose(camera.position, camera.look_at, camera.up_direction, camera.fov)
+        self._poses.setdefault(client.client_id, before)
+        eye = Eye.of(camera.wxyz)
+        width, height = max(camera.image_width, 1), max(camera.image_height, 1)
+        hidden = _covered(width)
+        wide, high = figure.size(eye)
+        slope = float(np.tan(camera.fov / 2))
+        distance = max(high / 2, wide / 2 * height / (width - hidden)) / slope
+        distance += 0.5 * figure.radius
+        aside = 0.5 * hidden * (2 * slope * distance / height) * eye.right
+        with client.atomic():
+            camera.position = figure.center + aside - distance * eye.ahead
+            camera.look_at = figure.center + aside
+        figure.turn(eye)
+
+    def _hear(self, kind: str, _: int) -> None:
+        """Follow the rival's simulation; runs in the live simulation's thread."""
+        rollout, figure, content = self._rollout, self._figure, self._content
+        if rollout is None or figure is None or content is None or content.fitted is None:
+            return
+        if kind == "finished":
+            figure.measure_forces(content.fitted, rollout.newest)
+        elif kind in {"diverged", "failed"}:
+            title = "The PhysTwin-style simulation stopped; its last good state is kept"
+            notify(self._server, title, rollout.readout.error or "", seconds=12.0)
+        self._tell()
+        if self._is_on:
+            self._redraw()
+
+    def _tell(self) -> None:
+        """Write below the button what the right half is and how far it is simulated."""
+        rollout, rival = self._rollout, self._rival
+        if rollout is None or rival is None:
+            return
+        readout = rollout.readout
+        lines = [
+            f"Right: the same object held by {rival.source}, virtual springs as in the profile "
+            "phystwin.",
+            f"PhysTwin-style: simulated {readout.simulated_count}/{readout.frame_count} frames",
+        ]
+        lines += [rival.note] if rival.note else []
+        lines += [f"**Stopped:** {readout.error.splitlines()[0]}"] if readout.error else []
+        self._text.content = "<br/>".join(lines)
+
+
+def _covered(width: int) -> int:
+    """Guess how many pixels of a picture the panel covers."""
+    return _PANEL_PIXELS if width > 2 * _PANEL_PIXELS else 0

@@ -1,0 +1,194 @@
+"""One object in the scene: its nodes, the springs that join them, what holds it and how hard."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from app.viewer.framing import Framing
+from app.viewer.layers import BLUE, GREY, PLAYING_SPRINGS, RED, YELLOW, Layers
+from app.viewer.nodes import SceneNodes
+from app.viewer.take import Take
+
+QUIET_FORCE = 1e-6
+"""Weaker forces are no forces [N]."""
+_SAMPLED_FRAMES = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class Budget:
+    """How much of an object may be sent in a frame; None for all of it."""
+
+    virtual: int | None = None
+    """Most virtual springs."""
+    springs: int | None = None
+    """Most object springs."""
+    arrows: int = 800
+    """Most force arrows; the weakest are left out."""
+
+
+def share_bytes(left: int, take: Take, layers: Layers, arrows: int) -> Budget:
+    """Divide what a playing frame may still weigh between virtual and object springs.
+
+    Args:
+        left: Bytes that are left when all points are sent.
+        take: The rollout.
+        layers: Tells whether there are object springs and arrows at all.
+        arrows: Most force arrows.
+    """
+    count = left // 24 - (arrows if layers.forces else 0)
+    count = min(max(count, PLAYING_SPRINGS // 10), PLAYING_SPRINGS)
+    virtual = min(take.model.virtual_spring_count, count)
+    if layers.object_springs:
+        virtual = min(virtual, count // 2)
+    return Budget(virtual=max(virtual, 1), springs=max(count - virtual, 1), arrows=arrows)
+
+
+def strengths(take: Take) -> Float[ndarray, " node"]:
+    """Sample how hard the virtual springs pull the nodes that they hold, over the frames [N]."""
+    frames = np.unique(np.linspace(0, take.ready - 1, _SAMPLED_FRAMES).astype(int))
+    strength = np.concatenate([np.linalg.norm(take.forces(int(f)), axis=-1) for f in frames])
+    return strength[strength > QUIET_FORCE]
+
+
+def automatic_force_unit(take: Take | None, framing: Framing) -> float:
+    """Choose how long an arrow of 1 N is, so that the strong ones of a rollout are seen well."""
+    if take is None:
+        return 0.0
+    strength = strengths(take)
+    strong = float(np.quantile(strength, 0.9)) if len(strength) else 1.0
+    return 0.07 * framing.extent / strong
+
+
+class ObjectDrawing:
+    """Draws the frames of rollouts below one path of the scene; used by one thread."""
+
+    def __init__(
+        self, nodes: SceneNodes, framing: Framing, *, root: str = "", is_solid: bool = False
+    ) -> None:
+        """Prepare; nothing is drawn yet.
+
+        Args:
+            nodes: The scene's nodes.
+            framing: Sizes.
+            root: Path below which everything is drawn.
+            is_solid: Whether nodes are shaded spheres instead of disks, which is heavier to show.
+        """
+        self._nodes = nodes
+        self._framing = framing
+        self._root = root
+        self._balls = nodes.spheres if is_solid else nodes.points
+        self._model_shown: Take | None = None
+        self._attached: Int[ndarray, " control"] = np.zeros(0, np.int64)
+
+    def attached(self, take: Take) -> Int[ndarray, " control"]:
+        """Find the control nodes that hold the object by a virtual spring."""
+        if take is not self._model_shown:
+            springs = take.model.spring_nodes[take.model.object_spring_count :]
+            self._attached = np.unique(springs.max(axis=1) - take.model.node_count)
+            self._model_shown = take
+        return self._attached
+
+    def draw(
+        self,
+        take: Take,
+        frame: int,
+        layers: Layers,
+        budget: Budget,
+        *,
+        force_unit: float,
+        longest: float,
+    ) -> None:
+        """Bring the object to a frame.
+
+        Args:
+            take: The rollout.
+            frame: One of its frames.
+            layers: What is shown.
+            budget: How much may be sent.
+            force_unit: Length of an arrow of 1 N.
+            longest: No arrow is longer than this.
+        """
+        root, count = self._root, take.model.object_spring_count
+        position = np.asarray(take.position[frame], dtype=np.float32)
+        control = np.asarray(take.control[frame], dtype=np.float32)
+        size = 0.36 * self._framing.spacing
+        self._balls(f"{root}/object/nodes", position, BLUE, size, is_visible=layers.nodes)
+        self.draw_controls(control, self.attached(take), layers)
+        point = np.concatenate([position, control])
+        springs = take.model.spring_nodes
+        self._nodes.segments(
+            f"{root}/springs/virtual",
+            _ends(point, springs[count:], budget.virtual),
+            YELLOW,
+            2.0,
+            is_visible=layers.virtual_springs,
+        )
+        self._nodes.segments(
+            f"{root}/springs/object",
+            _ends(point, springs[: count if layers.object_springs else 0], budget.springs),
+            GREY,
+            1.5,
+            is_visible=layers.object_springs,
+        )
+        arrows = np.zeros((0, 2, 3), np.float32)
+        if layers.forces:
+            unit = force_unit * layers.force_scale
+            arrows = force_arrows(take, frame, unit, longest, budget.arrows)
+        shortest = 0.004 * self._framing.extent
+        arrows = arrows[np.linalg.norm(arrows[:, 1] - arrows[:, 0], axis=-1) > shortest]
+        self._nodes.arrows(f"{root}/forces", arrows, RED, 0.0022 * self._framing.extent)
+
+    def draw_controls(
+        self,
+        control: Float[ndarray, "control 3"],
+        attached: Int[ndarray, " attached"] | None,
+        layers: Layers,
+    ) -> None:
+        """Draw the control nodes, those that hold the object larger than the others."""
+        spacing, root = self._framing.spacing, self._root
+        held = control if attached is None else control[attached]
+        self._balls(
+            f"{root}/controls/attached", held, RED, 0.3 * spacing, is_visible=layers.controls
+        )
+        is_shown = layers.all_controls and attached is not None
+        free = np.delete(control, attached, axis=0) if is_shown and attached is not None else None
+        if free is not None or f"{root}/controls/free" in self._nodes:
+            point = np.zeros((0, 3), np.float32) if free is None else free
+            name = f"{root}/controls/free"
+            self._nodes.points(name, point, RED, 0.12 * spacing, is_visible=is_shown)
+
+
+def force_arrows(
+    take: Take, frame: int, force_unit: float, longest: float, most: int
+) -> Float[ndarray, "arrow 2 3"]:
+    """Lay out the forces that the hand puts on the object through the virtual springs.
+
+    Args:
+        take: The rollout.
+        frame: One of its frames.
+        force_unit: Length of an arrow of 1 N.
+        longest: No arrow is longer than this.
+        most: The weakest forces beyond this number are left out.
+
+    Returns:
+        Start and end of the arrows, the strongest first.
+    """
+    force = take.forces(frame)
+    strength = np.linalg.norm(force, axis=-1)
+    node = np.flatnonzero(strength > QUIET_FORCE)
+    node = node[np.argsort(-strength[node], kind="stable")[:most]]
+    offset = force[node] * force_unit
+    length = np.linalg.norm(offset, axis=-1, keepdims=True)
+    offset *= np.minimum(1.0, longest / np.maximum(length, 1e-12))
+    start = np.asarray(take.position[frame])[node]
+    return np.stack([start, start + offset], axis=1).astype(np.float32)
+
+
+def _ends(
+    point: Float[ndarray, "point 3"], spring_nodes: Int[ndarray, "spring 2"], most: int | None
+) -> Float[ndarray, "segment 2 3"]:
+    """Look up the end points of springs, thinned out evenly to at most `most`."""
+    every = 1 if most is None else max(1, -(-len(spring_nodes) // most))
+    return point[spring_nodes[::every]]
