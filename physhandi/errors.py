@@ -33,6 +33,10 @@ class CancelledError(PhysHandiError):
     """The user asked for the work to stop."""
 
 
+class SimulationError(PhysHandiError):
+    """The parameters ask for more than the simulator can hold; names the one to change."""
+
+
 class SimulationDivergedError(PhysHandiError):
     """A node left the range of sane motion; names frame, substep and node.
 

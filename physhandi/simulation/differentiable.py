@@ -16,10 +16,11 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from physhandi.simulation.kernels.adjoint import gather_nodes, retract_nodes, retract_springs
+from physhandi.simulation.frame_adjoint import FrameAdjoint
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
 from physhandi.simulation.simulator import Simulator
 
+_SCALARS = ("drag", "restitution", "friction", "self_restitution", "self_friction")
 CACHED_SIMULATORS = 16
 """How many models keep their captured graphs and tape between calls of `rollout`."""
 
@@ -34,6 +35,8 @@ def rollout(
     drag: Float[Tensor, ""] | None = None,
     restitution: Float[Tensor, ""] | None = None,
     friction: Float[Tensor, ""] | None = None,
+    self_restitution: Float[Tensor, ""] | None = None,
+    self_friction: Float[Tensor, ""] | None = None,
     initial_position: Float[Tensor, "node 3"] | None = None,
     initial_velocity: Float[Tensor, "node 3"] | None = None,
     device: str = "cpu",
@@ -55,6 +58,9 @@ def rollout(
         drag: Velocity decay rate [1/s].
         restitution: Of the ground; no gradient outside [0, 1].
         friction: Of the ground; no gradient outside [0, 2].
+        self_restitution: Of two object nodes; no gradient outside [0, 1].
+        self_friction: Of two object nodes; no gradient outside [0, 2]. Neither has one without
+            `parameters.self_collision`. Which nodes collide is not differentiated.
         initial_position: Object nodes at frame 0 [m].
         initial_velocity: Their velocities at frame 0 [m/s].
         device: Warp device to simulate on. Tensors may be elsewhere; results are where
@@ -68,6 +74,7 @@ def rollout(
 
     Raises:
         SimulationDivergedError: If a node is not finite or too fast.
+        SimulationError: If there are too many candidates for self-collision.
         ValueError: If a tensor does not fit the model, or the window is not positive.
     """
     if window is not None and window < 1:
@@ -81,6 +88,8 @@ def rollout(
         (drag, parameters.drag),
         (restitution, parameters.restitution),
         (friction, parameters.friction),
+        (self_restitution, parameters.self_restitution),
+        (self_friction, parameters.self_friction),
         (initial_position, model.object_node),
         (initial_velocity, model.initial_velocity),
     )
@@ -123,14 +132,14 @@ class _Rollout(torch.autograd.Function):
 
 
 class _DifferentiableSimulator:
-    """A simulator with the tape of one frame and the graphs that fill it and walk it back."""
+    """A simulator and the adjoint of one frame, with tensors going in and out."""
 
     def __init__(
         self, model: SpringMassModel, parameters: SimulationParameters, device: str
     ) -> None:
         self.simulator = Simulator(model, parameters, device)
         self.torch_device = torch.device(wp.device_to_torch(self.simulator.device))
-        self._is_captured = False
+        self._adjoint: FrameAdjoint | None = None
 
     @contextmanager
     def stream(self) -> Iterator[None]:
@@ -155,7 +164,7 @@ class _DifferentiableSimulator:
             ("damping", damping, model.rest_length.shape),
             ("initial_position", position, model.object_node.shape),
             ("initial_velocity", velocity, model.object_node.shape),
-            *zip(("drag", "restitution", "friction"), scalars, ((), (), ()), strict=True),
+            *((name, value, ()) for name, value in zip(_SCALARS, scalars, strict=True)),
         ):
             if tuple(value.shape) != tuple(shape):
                 raise ValueError(f"{name} has shape {tuple(value.shape)}; expected {tuple(shape)}.")
@@ -187,117 +196,42 @@ class _DifferentiableSimulator:
         """Return the gradients of all tensors, in their order."""
         control, *material, _, _ = tensors
         self._place_material(material)
-        self._capture()
+        # Made on first use: many simulators never walk back.
+        self._adjoint = adjoint = self._adjoint or FrameAdjoint(self.simulator)
+        bars = adjoint.position_bar, adjoint.velocity_bar
         # Sums over many substeps and frames keep their digits in float64.
-        sums = [torch.zeros_like(value, dtype=torch.float64) for value in tensors[:6]]
-        _copy_in(self._position_bar, outputs[0][-1])
-        _copy_in(self._velocity_bar, outputs[1][-1])
+        sums = [torch.zeros_like(value, dtype=torch.float64) for value in tensors[:-2]]
+        for bar, output in zip(bars, outputs, strict=True):
+            _copy_in(bar, output[-1])
         for frame in range(len(control) - 1, 0, -1):
             self._place_control(control, frame)
-            _copy_in(self._position[0], states[0][frame - 1])
-            _copy_in(self._velocity[0], states[1][frame - 1])
-            for sum_bar in self._sums:
-                sum_bar.zero_()
-            wp.capture_launch(self._fill_graph)
-            wp.capture_launch(self._walk_back_graph)
-            start, end, *rest = (_copy_out(value) for value in self._sums)
+            for place, state in zip(adjoint.start, states, strict=True):
+                _copy_in(place, state[frame - 1])
+            adjoint.carry()
+            start, end, *rest = (_copy_out(value) for value in adjoint.sums)
             sums[0][frame - 1] += start
             sums[0][frame] += end
             for total, value in zip(sums[1:], rest, strict=True):
                 total.add_(value.double().sum() if total.ndim == 0 else value)
-            self._enter_frame(frame - 1, outputs, is_cut=(frame - 1) % window == 0 and frame > 1)
-        initial = [_copy_out(self._position_bar), _copy_out(self._velocity_bar)]
-        return [value.float() for value in sums] + initial
-
-    def _enter_frame(self, frame: int, outputs: tuple[Tensor, ...], *, is_cut: bool) -> None:
-        """Add what the loss says of a frame's state, after forgetting later frames if cut."""
-        for bar, output in zip((self._position_bar, self._velocity_bar), outputs, strict=True):
-            later = torch.zeros_like(output[frame]) if is_cut else _copy_out(bar)
-            _copy_in(bar, later + output[frame])
+            is_cut = (frame - 1) % window == 0 and frame > 1
+            # What the loss says of this frame's state, after forgetting later frames if cut.
+            for bar, output in zip(bars, outputs, strict=True):
+                earlier = output[frame - 1]
+                _copy_in(bar, earlier if is_cut else _copy_out(bar) + earlier)
+        return [value.float() for value in sums] + [_copy_out(bar) for bar in bars]
 
     def _place_material(self, material: list[Tensor]) -> None:
-        log_stiffness, damping, drag, restitution, friction = material
+        log_stiffness, damping, drag, *coefficients = material
         _copy_in(self.simulator.stiffness, log_stiffness.exp())
         _copy_in(self.simulator.damping, damping)
         self.simulator.override_world(
-            velocity_loss=-np.expm1(-self.simulator.parameters.dt * float(drag)),
-            restitution=float(restitution),
-            friction=float(friction),
+            velocity_loss=self.simulator.parameters.velocity_loss(float(drag)),
+            **{n: float(v) for n, v in zip(_SCALARS[1:], coefficients, strict=True)},
         )
 
     def _place_control(self, control: Tensor, frame: int) -> None:
         _copy_in(self.simulator.control_start, control[frame - 1])
         _copy_in(self.simulator.control_end, control[frame])
-
-    def _capture(self) -> None:
-        """Make the tape and the two graphs of the backward pass, once."""
-        if self._is_captured:
-            return
-        model, device = self.simulator.model, self.simulator.device
-        substeps = self.simulator.parameters.substeps_per_frame
-        nodes, springs = model.node_count, len(model.spring_nodes)
-
-        def zeros(count: int, dtype: Any) -> wp.array:
-            return wp.zeros(count, dtype=dtype, device=device)
-
-        def tape(length: int) -> list[Any]:
-            whole = wp.zeros((length, nodes), dtype=wp.vec3, device=device)
-            return [whole[index] for index in range(length)]
-
-        self._position, self._velocity = tape(substeps + 1), tape(substeps + 1)
-        self._free_velocity = tape(substeps)
-        self._position_bar, self._velocity_bar = zeros(nodes, wp.vec3), zeros(nodes, wp.vec3)
-        self._force_bar = zeros(nodes, wp.vec3)
-        self._offset_bar, self._stretch_bar = zeros(springs, wp.vec3), zeros(springs, wp.vec3)
-        self._row_offset_bar = self.simulator.sums.scratch()
-        self._row_stretch_bar = self.simulator.sums.scratch()
-        controls = [zeros(model.control_count, wp.vec3) for _ in range(2)]
-        materials = [zeros(springs, wp.float32) for _ in range(2)]
-        scalars = [zeros(nodes, wp.float32) for _ in range(3)]
-        self._sums = [*controls, *materials, *scalars]
-        self._fill_graph = self.simulator.capture(self._fill)
-        self._walk_back_graph = self.simulator.capture(self._walk_back)
-        self._is_captured = True
-
-    def _fill(self) -> None:
-        for substep, free_velocity in enumerate(self._free_velocity):
-            self.simulator.launch_substep(
-                substep,
-                (self._position[substep], self._velocity[substep]),
-                (self._position[substep + 1], self._velocity[substep + 1]),
-                free_velocity,
-            )
-
-    def _walk_back(self) -> None:
-        simulator, model = self.simulator, self.simulator.model
-        control_bars, material_bars, scalar_bars = self._sums[:2], self._sums[2:4], self._sums[4:]
-        state_bars = [self._position_bar, self._velocity_bar]
-        for substep in reversed(range(len(self._free_velocity))):
-            state = self._position[substep], self._velocity[substep]
-            fraction = (substep + 1) / len(self._free_velocity)
-            wp.launch(
-                retract_nodes,
-                dim=model.node_count,
-                inputs=[simulator.world, state[0], self._free_velocity[substep]],
-                outputs=[*state_bars, *scalar_bars, self._force_bar],
-                device=simulator.device,
-            )
-            wp.launch(
-                retract_springs,
-                dim=len(model.spring_nodes),
-                inputs=[*simulator.spring_inputs(fraction, state), self._force_bar],
-                outputs=[*material_bars, self._offset_bar, self._stretch_bar],
-                device=simulator.device,
-            )
-            start, entry, offset_bar = simulator.sums.of(self._offset_bar, self._row_offset_bar)
-            *_, stretch_bar = simulator.sums.of(self._stretch_bar, self._row_stretch_bar)
-            wp.launch(
-                gather_nodes,
-                dim=model.node_count + model.control_count,
-                inputs=[fraction, simulator.world, start, entry, offset_bar, stretch_bar],
-                outputs=[*state_bars, *control_bars],
-                device=simulator.device,
-            )
 
 
 def _copy_in(target: wp.array, value: Tensor) -> None:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -24,14 +24,29 @@ _BOUNDS: dict[str, tuple[float | None, float | None]] = {
     "drag": (0.0, None),
     "restitution": (0.0, 1.0),
     "friction": (0.0, 2.0),
+    "collision_distance": (0.0, None),
+    "self_restitution": (0.0, 1.0),
+    "self_friction": (0.0, 2.0),
     "ground_height": (None, None),
     "gravity": (None, None),
     "frame_rate": (1e-3, None),
+    "frame_duration": (1e-6, None),
     "substeps_per_frame": (1, 1_000_000),
     "rest_length_floor": (0.0, None),
     "virtual_rest_length_floor": (0.0, None),
 }
 _INTEGERS = ("max_neighbors", "virtual_max_neighbors", "substeps_per_frame")
+_SWITCHES = (
+    "use_control_velocity",
+    "self_collision",
+    "collides_rest_neighbors",
+    "uses_sequence_gravity",
+    "rounds_decay",
+)
+_OPTIONAL = ("ground_height", "frame_duration")
+# float32 exp(-5e-5 drag) on an H200 for drag 0, 1, …, 20, less the nearest float32, in units of
+# 2^-24 (measured). PhysTwin truncates its drag to a whole number.
+_DECAY_UNITS = (0, 1, 1, -1, 0, 0, 0, 0, 1, 1, 1, 1, -1, 0, 0, 0, 0, 1, 1, 1, 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,8 +79,13 @@ class SimulationParameters:
     """Height of the ground plane [m]; none for no ground."""
     gravity: float = 9.81
     """Acceleration along -z [m/s²]."""
+    uses_sequence_gravity: bool = True
+    """Whether `in_world` takes the sequence's gravity; PhysTwin's own is 9.8 everywhere."""
     frame_rate: float = 30.0
     """Frames in a second [Hz]."""
+    frame_duration: float | None = None
+    """Time that the simulation takes a frame to last [s]; none for 1 / frame_rate. PhysTwin's 667
+    substeps of 5e-5 s make 33.35 ms, whatever the rate of the recording."""
     substeps_per_frame: int = 667
     """Integration steps in one frame; stiffer springs need more."""
     rest_length_floor: float = 1e-3
@@ -74,11 +94,23 @@ class SimulationParameters:
     """Shortest rest length of a virtual spring [m]; 0 for none."""
     use_control_velocity: bool = True
     """Whether the dashpots of virtual springs see the control nodes move."""
+    rounds_decay: bool = False
+    """Whether a substep's drag is rounded as in PhysTwin's float32 factor; see `velocity_loss`."""
+    self_collision: bool = False
+    """Whether object nodes bounce off each other."""
+    collision_distance: float = 0.005
+    """Object nodes that approach each other nearer than this collide [m]."""
+    self_restitution: float = 0.7
+    """Part of the approach speed that a collision of two nodes gives back."""
+    self_friction: float = 0.3
+    """Coulomb friction coefficient between two nodes."""
+    collides_rest_neighbors: bool = False
+    """Whether nodes collide that are nearer than `collision_distance` at frame 0 (PhysTwin)."""
 
     def __post_init__(self) -> None:
         for name, (low, high) in _BOUNDS.items():
             value = getattr(self, name)
-            if value is None and name == "ground_height":
+            if value is None and name in _OPTIONAL:
                 continue
             if isinstance(value, bool) or not isinstance(value, int | float | np.number):
                 raise UsageError(f"Simulation parameter {name} is {value!r}; expected a number.")
@@ -90,9 +122,51 @@ class SimulationParameters:
                 )
 
     @property
+    def simulated_frame_rate(self) -> float:
+        """Frames in a second of simulated time [Hz]."""
+        return self.frame_rate if self.frame_duration is None else 1.0 / self.frame_duration
+
+    @property
     def dt(self) -> float:
         """Length of one substep [s]."""
-        return 1.0 / (self.frame_rate * self.substeps_per_frame)
+        return 1.0 / (self.simulated_frame_rate * self.substeps_per_frame)
+
+    def velocity_loss(self, drag: float | None = None) -> float:
+        """Part of the velocity that drag takes in one substep, 1 - exp(-dt drag).
+
+        With `rounds_decay` the factor exp(-dt drag) is the float32 that PhysTwin's GPU computes:
+        next to 1, one unit of it is 0.04 % of a drag of 3/s, which moves a thrown object by
+        0.1 mm in half a second. Where the GPU's rounding was not measured (drag that is no whole
+        number in [0, 20], or another dt than 5e-5 s) the nearest float32 is taken.
+
+        Args:
+            drag: Decay rate [1/s]; that of the parameters if left out.
+        """
+        drag = self.drag if drag is None else drag
+        if not self.rounds_decay:
+            return -math.expm1(-self.dt * drag)
+        decay = float(np.float32(math.exp(-self.dt * drag)))
+        is_measured = drag == int(drag) and 0 <= drag < len(_DECAY_UNITS)
+        if is_measured and math.isclose(self.dt, 5e-5, rel_tol=1e-6):
+            decay += _DECAY_UNITS[int(drag)] * 2.0**-24
+        return 1.0 - decay
+
+    def in_world(
+        self, *, frame_rate: float, ground_height: float | None, gravity: float
+    ) -> "SimulationParameters":
+        """Take over what a sequence says of its world, as far as these parameters let it.
+
+        Args:
+            frame_rate: Frames in a second of the recording [Hz]; `frame_duration` stays.
+            ground_height: Height of its ground plane [m], or none.
+            gravity: Acceleration along -z [m/s²]; ignored without `uses_sequence_gravity`.
+        """
+        return replace(
+            self,
+            frame_rate=frame_rate,
+            ground_height=ground_height,
+            gravity=gravity if self.uses_sequence_gravity else self.gravity,
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields as plain values, ready for YAML or JSON."""
@@ -120,10 +194,10 @@ class SimulationParameters:
 def _converted(name: str, value: Any) -> Any:
     """Return a value in the type of its field."""
     if value is None:
-        if name == "ground_height":
+        if name in _OPTIONAL:
             return None
         raise UsageError(f"Simulation parameter {name} is empty; expected a value.")
-    if name == "use_control_velocity":
+    if name in _SWITCHES:
         if not isinstance(value, bool | np.bool_):
             raise UsageError(f"Simulation parameter {name} is {value!r}; expected true or false.")
         return bool(value)

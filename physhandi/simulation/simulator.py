@@ -1,6 +1,5 @@
 """Semi-implicit Euler rollouts of a spring-mass model; one graph replay a frame."""
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -11,19 +10,19 @@ from jaxtyping import Float, Float32
 from numpy import ndarray
 
 from physhandi.errors import SimulationDivergedError
-from physhandi.simulation.kernels.integration import integrate_nodes, sum_rows
+from physhandi.simulation.kernels.integration import integrate_nodes
 from physhandi.simulation.kernels.springs import pull_springs
 from physhandi.simulation.kernels.world import World
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.recording import Recording
+from physhandi.simulation.self_collision import SelfCollision
+from physhandi.simulation.spring_sums import SpringSums
 from physhandi.simulation.stability import explain_divergence
-from physhandi.simulation.topology import half_edges, split_rows
 
 wp.config.log_level = wp.LOG_WARNING
 
 SPEED_LIMIT = 50.0
 """A node faster than this has diverged [m/s]."""
-ROW_LENGTH = 8
-"""Most springs that one thread of a GPU sums."""
 _NO_DIVERGENCE = np.iinfo(np.int32).max
 _WORLD: Any = World
 
@@ -38,49 +37,12 @@ class Rollout:
     """Velocities in the world frame [m/s]."""
 
 
-class SpringSums:
-    """How nodes sum over their springs: at once on a CPU, in two levels of short rows on a GPU.
-
-    A thread of a GPU waits for each value that it adds, so long sums are cut into rows that
-    many threads sum. The order of additions is fixed in both cases.
-    """
-
-    def __init__(self, model: SpringMassModel, device: Any) -> None:
-        self._device = device
-        start, entry = half_edges(model.spring_nodes, model.node_count + model.control_count)
-        self._half_edge = wp.array(entry, dtype=wp.int32, device=device)
-        self._row_start: wp.array | None = None
-        if device.is_cuda:
-            row, start = split_rows(start, ROW_LENGTH)
-            self._row_start = wp.array(row, dtype=wp.int32, device=device)
-            entry = np.arange(len(row) - 1, dtype=np.int32)
-        self._start = wp.array(start, dtype=wp.int32, device=device)
-        self._entry = wp.array(entry, dtype=wp.int32, device=device)
-
-    def scratch(self) -> wp.array:
-        """Make room for the rows of one sum."""
-        count = 0 if self._row_start is None else len(self._row_start) - 1
-        return wp.zeros(count, dtype=wp.vec3, device=self._device)
-
-    def of(self, value: wp.array, scratch: wp.array) -> tuple[wp.array, wp.array, wp.array]:
-        """Launch what must come first, and return what `spring_sum` reads: start, entry, value."""
-        if self._row_start is None:
-            return self._start, self._entry, value
-        wp.launch(
-            sum_rows,
-            dim=scratch.shape[0],
-            inputs=[self._row_start, self._half_edge, value],
-            outputs=[scratch],
-            device=self._device,
-        )
-        return self._start, self._entry, scratch
-
-
 class Simulator:
     """Moves the object nodes of one model; holds model and state on a device.
 
-    One frame is captured once as a graph of two kernels a substep. Everything tunable lives
-    in device arrays, so `set_parameters` and `set_material` act without another capture.
+    One frame is captured once as a graph of two kernels a substep, and once more of three when
+    self-collision is first switched on. Everything tunable lives in device arrays, so
+    `set_parameters` and `set_material` act without another capture.
     The same input gives the same bits, run after run.
     """
 
@@ -112,11 +74,14 @@ class Simulator:
         self.pull = wp.zeros(len(model.spring_nodes), dtype=wp.vec3, device=self.device)
         self.first_divergence = self.array(np.array([_NO_DIVERGENCE]), wp.int32)
         self._no_tape = wp.zeros(0, dtype=wp.vec3, device=self.device)
-        self._graph: wp.Graph | None = None
+        self._collision: SelfCollision | None = None
+        self._recordings = {
+            collides: Recording(self._launch_frame, self.device) for collides in (False, True)
+        }
         self.set_parameters(parameters)
 
     def set_parameters(self, parameters: SimulationParameters) -> None:
-        """Change drag, contact, ground, gravity, stiffness scale or control velocity.
+        """Change drag, contacts, ground, gravity, stiffness scale or control velocity.
 
         Args:
             parameters: The new values. Radii, floors, `stiffness` and `damping` belong to
@@ -126,25 +91,29 @@ class Simulator:
             ValueError: If the length of a substep differs; build another simulator then.
         """
         old = self.parameters
-        if (parameters.frame_rate, parameters.substeps_per_frame) != (
-            old.frame_rate,
+        if (parameters.simulated_frame_rate, parameters.substeps_per_frame) != (
+            old.simulated_frame_rate,
             old.substeps_per_frame,
         ):
             raise ValueError(
                 "frame_rate and substeps_per_frame are fixed in a simulator; build a new one."
             )
         self.parameters = parameters
-        height = parameters.ground_height
+        height, rate = parameters.ground_height, parameters.simulated_frame_rate
         values: dict[str, float] = {
             "dt": parameters.dt,
-            "velocity_loss": -math.expm1(-parameters.dt * parameters.drag),
+            "velocity_loss": parameters.velocity_loss(),
             "gravity": parameters.gravity,
             "has_ground": height is not None,
             "ground_height": 0.0 if height is None else height,
             "restitution": parameters.restitution,
             "friction": parameters.friction,
             "stiffness_scale": parameters.stiffness_scale,
-            "control_rate": parameters.frame_rate if parameters.use_control_velocity else 0.0,
+            "control_rate": rate if parameters.use_control_velocity else 0.0,
+            "collision_distance": parameters.collision_distance,
+            "self_restitution": parameters.self_restitution,
+            "self_friction": parameters.self_friction,
+            "collides_rest_neighbors": parameters.collides_rest_neighbors,
             "speed_limit": SPEED_LIMIT,
         }
         world: Any = np.zeros(1, dtype=_WORLD.numpy_dtype())
@@ -259,9 +228,31 @@ class Simulator:
 
     def replay_frame(self) -> None:
         """Advance the state on the device by one frame, with the controls that are there."""
-        if self._graph is None:
-            self._graph = self.capture(self._launch_frame)
-        wp.capture_launch(self._graph)
+        version = self.find_candidates(self.position)
+        self._recordings[self.parameters.self_collision].replay(version)
+
+    @property
+    def collision(self) -> SelfCollision | None:
+        """What collisions of object nodes need; none while they are switched off."""
+        if not self.parameters.self_collision:
+            return None
+        if self._collision is None:
+            self._collision = SelfCollision(self.model.object_node, self.world)
+        return self._collision
+
+    def find_candidates(self, position: wp.array) -> int:
+        """Find which nodes may collide in the frame that starts at `position`.
+
+        Returns:
+            A number that changes when launches on the candidates must be recorded again.
+
+        Raises:
+            SimulationError: If there are too many.
+        """
+        collision = self.collision
+        if collision is None:
+            return 0
+        return collision.find(position, self.parameters.collision_distance)
 
     def spring_inputs(self, fraction: float, state: tuple[wp.array, wp.array]) -> list[Any]:
         """List what a spring kernel reads, a `fraction` of a frame after its start."""
@@ -275,8 +266,18 @@ class Simulator:
         before: tuple[wp.array, wp.array],
         after: tuple[wp.array, wp.array],
         free_velocity: wp.array | None = None,
+        contact_velocity: wp.array | None = None,
     ) -> None:
-        """Launch the kernels of one substep, from one state (position, velocity) to another."""
+        """Launch the kernels of one substep, from one state (position, velocity) to another.
+
+        Args:
+            substep: Its number in the frame.
+            before: State at its start.
+            after: Where the state at its end goes; with self-collision, positions of its own.
+            free_velocity: Where the velocity before all contacts goes, for the adjoint.
+            contact_velocity: Where the velocity after self-collision and before the ground
+                goes; only looked at with self-collision.
+        """
         fraction = (substep + 1) / self.parameters.substeps_per_frame
         wp.launch(
             pull_springs,
@@ -286,6 +287,13 @@ class Simulator:
             device=self.device,
         )
         start, entry, value = self.sums.of(self.pull, self._row_pull)
+        collision = self.collision
+        if collision is not None:
+            collision.launch_free(start, entry, before[1], value, free_velocity)
+            tape = self._no_tape if contact_velocity is None else contact_velocity
+            outputs = [tape, *after, self.first_divergence]
+            collision.launch_collide(substep, before[0], free_velocity, outputs)
+            return
         tape = self._no_tape if free_velocity is None else free_velocity
         wp.launch(
             integrate_nodes,
@@ -294,14 +302,6 @@ class Simulator:
             outputs=[tape, *after, self.first_divergence],
             device=self.device,
         )
-
-    def capture(self, launches: Any) -> wp.Graph:
-        """Record what a function launches as a graph."""
-        with wp.ScopedCapture(device=self.device, force_module_load=True) as capture:
-            launches()
-        if capture.graph is None:
-            raise RuntimeError(f"Warp captured no graph on {self.device}.")
-        return capture.graph
 
     def check_divergence(self, frame: int) -> None:
         """Raise `SimulationDivergedError` if the last frame recorded a divergence."""
@@ -324,6 +324,12 @@ class Simulator:
         return wp.array(np.ascontiguousarray(value), dtype=dtype, device=self.device)
 
     def _launch_frame(self) -> None:
-        state = (self.position, self.velocity)
-        for substep in range(self.parameters.substeps_per_frame):
-            self.launch_substep(substep, state, state)
+        # Nodes that collide read each other's position, so the new ones need their own place.
+        collision = self.collision
+        places = (self.position, self.position if collision is None else collision.position)
+        count = self.parameters.substeps_per_frame
+        for substep in range(count):
+            before, after = places[substep % 2], places[(substep + 1) % 2]
+            self.launch_substep(substep, (before, self.velocity), (after, self.velocity))
+        if places[count % 2] is not self.position:
+            wp.copy(self.position, places[count % 2])

@@ -64,12 +64,12 @@ def stable_substeps(
 
     Args:
         model: Springs and material.
-        parameters: For `frame_rate` and `stiffness_scale`.
+        parameters: For `simulated_frame_rate` and `stiffness_scale`.
         control: Where the control nodes are at frame 0 [m]; see `largest_stable_step`.
         safety: Factor on the number of substeps that is just stable.
     """
     step = largest_stable_step(model, parameters, control)
-    return max(1, math.ceil(safety / (parameters.frame_rate * step)))
+    return max(1, math.ceil(safety / (parameters.simulated_frame_rate * step)))
 
 
 def explain_divergence(model: SpringMassModel, parameters: SimulationParameters, node: int) -> str:

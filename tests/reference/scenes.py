@@ -55,6 +55,37 @@ def bare_scene(
     return in_float32(replace(scene, **changes))
 
 
+def crossing_scene(**changes):
+    """Let two springy sheets of nine nodes fly through each other at an angle, above the ground.
+
+    Their nodes come nearer than 12 mm only as they meet; neighbours in a sheet are 20 mm apart.
+    One node of each sheet hangs at a control node.
+    """
+    rng = np.random.default_rng(3)
+    plane = np.array([[0.02 * i, 0.02 * j, 0.0] for i in range(3) for j in range(3)])
+    node = np.vstack([plane, plane + np.array([0.007, 0.004, 0.013])])
+    node += rng.normal(0, 0.0005, node.shape) + np.array([0.0, 0.0, 0.006])
+    across = [(3 * i + j, 3 * k + m) for i in range(3) for j in range(3) for k in range(3)
+              for m in range(3) if (i, j) < (k, m) and abs(i - k) + abs(j - m) == 1]  # fmt: skip
+    springs = np.array([*across, *((a + 9, b + 9) for a, b in across), (0, 18), (17, 19)])
+    control = np.stack([node[[0, 17]] + np.array([0.0, 0.0, 0.01])] * 4)
+    control += np.linspace(0, 0.004, 4)[:, None, None]
+    ends = np.vstack([node, control[0]])[springs]
+    velocity = np.repeat([[0.1, 0.0, 0.25], [-0.2, 0.15, -0.35]], 9, axis=0)
+    scene = Scene(
+        node=node,
+        velocity=velocity + rng.normal(0, 0.02, node.shape),
+        springs=springs,
+        rest=np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1),
+        stiffness=rng.uniform(2, 4, len(springs)),
+        damping=rng.uniform(0.1, 0.3, len(springs)),
+        control=control,
+        substeps=40,
+        distance=0.012,
+    )
+    return in_float32(replace(scene, **changes))
+
+
 def in_float32(scene):
     """Round every array to float32, but keep float64."""
     arrays = ("node", "velocity", "rest", "stiffness", "damping", "control")
@@ -74,6 +105,11 @@ def as_model(scene):
         frame_rate=scene.frame_rate,
         substeps_per_frame=scene.substeps,
         use_control_velocity=scene.moves,
+        self_collision=scene.distance is not None,
+        collision_distance=0.005 if scene.distance is None else scene.distance,
+        self_restitution=scene.self_restitution,
+        self_friction=scene.self_friction,
+        collides_rest_neighbors=scene.blocks_rest,
     )
     is_object = np.all(scene.springs < len(scene.node), axis=1)
     assert np.all(np.diff(is_object.astype(int)) <= 0), "object springs come first"

@@ -22,6 +22,11 @@ class Scene:
     frame_rate: float = 30.0
     substeps: int = 667
     moves: bool = True  # dashpots see the control velocity
+    distance: float | None = None  # of self-collision; none switches it off
+    self_restitution: float = 0.7
+    self_friction: float = 0.3
+    blocks_rest: bool = False  # rest neighbours collide too
+    rest_shape: np.ndarray | None = None  # object nodes at rest; none for `node`
 
 
 def spring_force(scene, x, v):
@@ -54,18 +59,58 @@ def move_on_ground(scene, x, v, dt):
     return x + impact * v + (dt - impact) * bounced, bounced
 
 
-def simulate(scene):
-    """Positions and velocities of the object nodes at every frame."""
+def candidate_table(scene, x):
+    """Which pairs may collide in the frame that starts at x, as a symmetric table."""
+    gaps = [np.linalg.norm(p[:, None] - p[None], axis=2) for p in (x, rest_shape(scene))]
+    may = gaps[0] < scene.distance
+    if not scene.blocks_rest:
+        may &= gaps[1] >= scene.distance
+    np.fill_diagonal(may, False)
+    return may
+
+
+def rest_shape(scene):
+    return scene.node if scene.rest_shape is None else scene.rest_shape
+
+
+def collisions(scene, may, x, v):
+    """Collide all pairs of the table at once: new velocities, and how many pairs collided."""
+    gap, rate = x[None] - x[:, None], v[None] - v[:, None]  # of j seen from i
+    length = np.sqrt((gap**2).sum(2))
+    hits = may & (length < scene.distance) & ((gap * rate).sum(2) < -1e-4)
+    normal = gap / np.where(hits, length, 1.0)[..., None]
+    e, mu = np.clip(scene.self_restitution, 0, 1), np.clip(scene.self_friction, 0, 2)
+    v_normal = (rate * normal).sum(2, keepdims=True) * normal
+    v_tangent = rate - v_normal
+    slide = np.maximum(np.sqrt((v_tangent**2).sum(2, keepdims=True)), 1e-6)
+    speed = np.sqrt((v_normal**2).sum(2, keepdims=True))
+    kept = np.maximum(0.0, 1.0 - mu * (1 + e) * speed / slide)
+    # Both weigh 1 kg, so that 1 / (1/m + 1/m) = 1/2.
+    impulse = -(1 + e) * v_normal / 2 + (kept - 1) * v_tangent / 2
+    total = np.where(hits[..., None], impulse, 0.0).sum(1)
+    return v - total / np.maximum(hits.sum(1), 1)[:, None], int(hits.sum()) // 2
+
+
+def simulate(scene, counts=None):
+    """Positions and velocities of the object nodes at every frame.
+
+    A list given as `counts` gets the number of colliding pairs of every substep.
+    """
     dt = 1.0 / (scene.frame_rate * scene.substeps)
     x, v = scene.node.astype(float), scene.velocity.astype(float)
     weight = np.array([0.0, 0.0, -scene.gravity])
     states = [(x, v)]
     for start, end in zip(scene.control[:-1], scene.control[1:], strict=True):
         rate = (end - start) * scene.frame_rate * scene.moves
+        may = None if scene.distance is None else candidate_table(scene, x)
         for substep in range(scene.substeps):
             held = start + (end - start) * (substep + 1) / scene.substeps
             force = spring_force(scene, np.vstack([x, held]), np.vstack([v, rate]))[: len(x)]
             free = (v + dt * (force + weight)) * np.exp(-dt * scene.drag)
+            if may is not None:
+                free, count = collisions(scene, may, x, free)
+                if counts is not None:
+                    counts.append(count)
             moved = [move_on_ground(scene, a, b, dt) for a, b in zip(x, free, strict=True)]
             x, v = np.array([m[0] for m in moved]), np.array([m[1] for m in moved])
         states.append((x, v))

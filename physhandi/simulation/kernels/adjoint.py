@@ -67,6 +67,12 @@ def retract(world: World, position: wp.vec3, velocity: wp.vec3, after: Motion):
     return before
 
 
+@wp.func
+def before_drag(world: World, free_bar: wp.vec3):
+    """Carry the adjoint of a velocity after drag back to before it."""
+    return free_bar - world.velocity_loss * free_bar
+
+
 @wp.kernel
 def retract_nodes(
     # Model:
@@ -90,7 +96,7 @@ def retract_nodes(
     after.velocity = velocity_bar_out[node]
     before = retract(world[0], position[node], free_velocity[node], after)
     free_bar = before.motion.velocity
-    old_bar = free_bar - world[0].velocity_loss * free_bar
+    old_bar = before_drag(world[0], free_bar)
     position_bar_out[node] = before.motion.position
     velocity_bar_out[node] = old_bar
     force_bar_out[node] = world[0].dt * old_bar

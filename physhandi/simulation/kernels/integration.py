@@ -26,6 +26,21 @@ def spring_sum(
     return total
 
 
+@wp.func
+def free_velocity(world: World, velocity: wp.vec3, force: wp.vec3):
+    """Return a node's velocity after force, gravity and drag, before any contact."""
+    acceleration = force - wp.vec3(0.0, 0.0, world.gravity)
+    kick = world.dt * acceleration
+    # One rounding only: next to 1, a decay factor in float32 changes the drag by 0.04 %.
+    return velocity + (kick - world.velocity_loss * (velocity + kick))
+
+
+@wp.func
+def is_too_fast(world: World, velocity: wp.vec3):
+    """Return whether a node has diverged; written so that NaN is caught too."""
+    return not (wp.length(velocity) <= world.speed_limit)
+
+
 @wp.kernel
 def sum_rows(
     # Model:
@@ -65,15 +80,12 @@ def integrate_nodes(
     """
     node = wp.tid()
     force = spring_sum(node, entry_start, entry, pull)
-    acceleration = force - wp.vec3(0.0, 0.0, world[0].gravity)
-    kick = world[0].dt * acceleration
-    # One rounding only: next to 1, a decay factor in float32 changes the drag by 0.04 %.
-    free = velocity[node] + (kick - world[0].velocity_loss * (velocity[node] + kick))
+    free = free_velocity(world[0], velocity[node], force)
     motion = advance(world[0], position[node], free)
     position_out[node] = motion.position
     velocity_out[node] = motion.velocity
     if free_velocity_out.shape[0] > 0:
         free_velocity_out[node] = free
-    # Written so that NaN is caught too; an integer minimum does not depend on thread order.
-    if not (wp.length(motion.velocity) <= world[0].speed_limit):
+    # An integer minimum does not depend on thread order.
+    if is_too_fast(world[0], motion.velocity):
         wp.atomic_min(first_divergence_out, 0, substep * position.shape[0] + node)

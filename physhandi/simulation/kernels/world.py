@@ -18,4 +18,8 @@ class World:
     stiffness_scale: wp.float32
     control_rate: wp.float32
     """Frames in a second, or 0 if springs see the control nodes at rest."""
+    collision_distance: wp.float32
+    self_restitution: wp.float32
+    self_friction: wp.float32
+    collides_rest_neighbors: wp.int32
     speed_limit: wp.float32

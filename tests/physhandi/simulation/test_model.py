@@ -19,6 +19,15 @@ def test_parameters_survive_a_round_trip():
     assert SimulationParameters.from_dict({}) == SimulationParameters()
 
 
+def test_parameters_stored_before_self_collision_existed_still_load():
+    stored = SimulationParameters(drag=2.0).to_dict()
+    for name in ("self_collision", "collision_distance", "self_restitution", "self_friction"):
+        del stored[name]
+    del stored["collides_rest_neighbors"]
+    assert SimulationParameters.from_dict(stored) == SimulationParameters(drag=2.0)
+    assert not SimulationParameters.from_dict(stored).self_collision
+
+
 def test_a_substep_is_a_667th_of_a_frame():
     assert SimulationParameters().dt == pytest.approx(4.9975e-5, rel=1e-4)
 
@@ -43,6 +52,9 @@ def test_whole_numbers_and_numpy_values_are_converted():
         ({"damping": "much"}, "damping is 'much'; expected a number"),
         ({"gravity": None}, "gravity is empty"),
         ({"use_control_velocity": "no"}, "use_control_velocity is 'no'; expected true or false"),
+        ({"self_collision": 1.0}, "self_collision is 1.0; expected true or false"),
+        ({"self_restitution": 1.1}, r"self_restitution is 1.1; expected .* in \[0.0, 1.0\]"),
+        ({"collision_distance": -0.1}, "collision_distance is -0.1"),
     ],
 )
 def test_nonsense_is_refused_by_name(values, message):

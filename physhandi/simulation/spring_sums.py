@@ -1,0 +1,51 @@
+"""How the nodes of a model sum over their springs."""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from physhandi.simulation.kernels.integration import sum_rows
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.topology import half_edges, split_rows
+
+ROW_LENGTH = 8
+"""Most springs that one thread of a GPU sums."""
+
+
+class SpringSums:
+    """How nodes sum over their springs: at once on a CPU, in two levels of short rows on a GPU.
+
+    A thread of a GPU waits for each value that it adds, so long sums are cut into rows that
+    many threads sum. The order of additions is fixed in both cases.
+    """
+
+    def __init__(self, model: SpringMassModel, device: Any) -> None:
+        self._device = device
+        start, entry = half_edges(model.spring_nodes, model.node_count + model.control_count)
+        self._half_edge = wp.array(entry, dtype=wp.int32, device=device)
+        self._row_start: wp.array | None = None
+        if device.is_cuda:
+            row, start = split_rows(start, ROW_LENGTH)
+            self._row_start = wp.array(row, dtype=wp.int32, device=device)
+            entry = np.arange(len(row) - 1, dtype=np.int32)
+        self._start = wp.array(start, dtype=wp.int32, device=device)
+        self._entry = wp.array(entry, dtype=wp.int32, device=device)
+
+    def scratch(self) -> wp.array:
+        """Make room for the rows of one sum."""
+        count = 0 if self._row_start is None else len(self._row_start) - 1
+        return wp.zeros(count, dtype=wp.vec3, device=self._device)
+
+    def of(self, value: wp.array, scratch: wp.array) -> tuple[wp.array, wp.array, wp.array]:
+        """Launch what must come first, and return what `spring_sum` reads: start, entry, value."""
+        if self._row_start is None:
+            return self._start, self._entry, value
+        wp.launch(
+            sum_rows,
+            dim=scratch.shape[0],
+            inputs=[self._row_start, self._half_edge, value],
+            outputs=[scratch],
+            device=self._device,
+        )
+        return self._start, self._entry, scratch

@@ -1,0 +1,89 @@
+"""Gradients of the differentiable rollout, and central differences of the oracle beside them."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from reference.scenes import as_model
+from reference.spring_mass import rest_shape, simulate
+
+from physhandi.simulation import differentiable
+
+FIELDS = {
+    "control": "control",
+    "log_stiffness": "stiffness",
+    "damping": "damping",
+    "drag": "drag",
+    "restitution": "restitution",
+    "friction": "friction",
+    "self_restitution": "self_restitution",
+    "self_friction": "self_friction",
+    "initial_position": "node",
+    "initial_velocity": "velocity",
+}
+"""Argument of `rollout` -> field of the oracle's scene."""
+
+
+def loss_weights(scene, frames=slice(None)):
+    """Weigh every coordinate of every frame differently, frame 0 too."""
+    rng = np.random.default_rng(7)
+    shape = (len(scene.control), len(scene.node), 3)
+    weights = rng.normal(size=shape), 0.05 * rng.normal(size=shape)
+    keep = np.zeros((len(scene.control), 1, 1))
+    keep[frames] = 1.0
+    return weights[0] * keep, weights[1] * keep
+
+
+def arguments(scene):
+    """Give what `rollout` takes, in float64 but rounded to float32."""
+    values = {
+        name: np.asarray(getattr(scene, field), dtype=float) for name, field in FIELDS.items()
+    }
+    values["log_stiffness"] = np.log(values["log_stiffness"])
+    return {name: value.astype(np.float32).astype(float) for name, value in values.items()}
+
+
+def gradients(scene, device, weights, window=None):
+    """Differentiate the weighted sum of positions and velocities by every argument."""
+    model, parameters = as_model(scene)
+    tensors = {
+        name: torch.tensor(value, requires_grad=True) for name, value in arguments(scene).items()
+    }
+    state = differentiable.rollout(model, parameters, device=device, window=window, **tensors)
+    loss = sum(
+        (torch.tensor(w) * value.double()).sum() for w, value in zip(weights, state, strict=True)
+    )
+    loss.backward()
+    return {name: tensor.grad.numpy() for name, tensor in tensors.items()}
+
+
+def oracle_loss(scene, weights, values, counts=None):
+    """Give the same sum as the oracle has it, and the number of colliding pairs if asked."""
+    changes = {
+        FIELDS[name]: np.exp(value) if name == "log_stiffness" else value
+        for name, value in values.items()
+    }
+    moved = replace(scene, rest_shape=rest_shape(scene), **changes)
+    position, velocity = simulate(moved, counts)
+    return float((weights[0] * position).sum() + (weights[1] * velocity).sum())
+
+
+def finite_difference(scene, weights, name, index, step=1e-6):
+    """Differentiate by one number."""
+    loss = []
+    for sign in (1.0, -1.0):
+        values = arguments(scene)
+        values[name][index] += sign * step
+        loss.append(oracle_loss(scene, weights, values))
+    return (loss[0] - loss[1]) / (2.0 * step)
+
+
+def directional_difference(scene, weights, name, direction, step=1e-6):
+    """Differentiate along a direction; refuse to step over a change of the colliding pairs."""
+    values, loss, counts = arguments(scene), [], []
+    for sign in (1.0, -1.0):
+        counts.append([])
+        moved = {**values, name: values[name] + sign * step * direction}
+        loss.append(oracle_loss(scene, weights, moved, counts[-1]))
+    assert counts[0] == counts[1], "the step changes which nodes collide"
+    return (loss[0] - loss[1]) / (2.0 * step)
