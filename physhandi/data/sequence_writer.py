@@ -78,6 +78,10 @@ class SequenceWriter:
         """Take over a file as it is, for example a video."""
         shutil.copyfile(path, self._path(rel))
 
+    def make_folder(self, rel: str) -> None:
+        """Make a folder, for example ``views/a`` of a camera that recorded nothing."""
+        self._path(rel).mkdir(exist_ok=True)
+
     def finish(self, meta: SequenceMeta) -> Sequence:
         """Write ``sequence.yaml``, check everything and publish the folder.
 
