@@ -163,7 +163,10 @@ def _problems(
                 frame_rate=sequence.frame_rate,
                 ground_height=sequence.ground_height,
                 gravity=sequence.gravity,
+                surface_count=sequence.surface_node_count,
+                chamfer_points=config.object_.chamfer_points,
                 cloud_points=config.object_.cloud_points,
+                starts_at_rest=config.object_.starts_at_rest,
             )
         )
     return problems

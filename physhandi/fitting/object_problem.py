@@ -1,6 +1,7 @@
 """What the object fit is given of one sequence: nodes, controls and observations."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
@@ -50,6 +51,8 @@ class ObjectProblem:
     """How much each of them counts; rows sum to one."""
     track_offset: Float[Tensor, "track 3"]
     """Position of a track less the weighted mean of its carriers, at frame 0 [m]."""
+    surface_count: int | None = None
+    """Chamfer sees only so many of the first nodes, those on the surface; all if not known."""
 
     @property
     def frame_count(self) -> int:
@@ -86,7 +89,10 @@ class ObjectProblem:
             cloud_count = self.is_observed[1].sum().float().expand(node.shape[0])
             track_count = self.is_valid[1].sum().float().expand(node.shape[0])
         chamfer = chamfer_loss(
-            self.cloud[frames], self.is_observed[frames], node, count=cloud_count
+            self.cloud[frames],
+            self.is_observed[frames],
+            node[:, : self.surface_count],
+            count=cloud_count,
         )
         track = track_loss(
             self.track[frames], self.is_valid[frames], self.predict_tracks(node), count=track_count
@@ -95,11 +101,12 @@ class ObjectProblem:
 
 
 def _pad_clouds(
-    clouds: tuple[ndarray, ...], frame_count: int, most: int
+    clouds: tuple[ndarray, ...], frame_count: int, most: int | None
 ) -> tuple[Float[Tensor, "frame point 3"], Bool[Tensor, "frame point"]]:
     picked = []
     for cloud in clouds[:frame_count]:
-        keep = np.linspace(0, len(cloud) - 1, min(most, len(cloud))).round().astype(int)
+        count = len(cloud) if most is None else min(most, len(cloud))
+        keep = np.linspace(0, len(cloud) - 1, count).round().astype(int)
         picked.append(np.asarray(cloud, np.float32).reshape(-1, 3)[keep])
     width = max((len(points) for points in picked), default=0)
     padded = np.zeros((frame_count, width, 3), np.float32)
@@ -113,13 +120,14 @@ def _pad_clouds(
 def _carriers(
     observation: ObjectObservation, object_node: Float[ndarray, "node 3"]
 ) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-    """Attach each track that is seen at frame 0 to its nearest nodes there."""
-    kept = np.flatnonzero(observation.is_visible[0])
-    start = np.asarray(observation.point[0, kept], np.float32)
+    """Attach each track to the node that it is, or to those nearest where frame 0 shows it."""
     if observation.node_of_track is not None:
-        carrier = np.asarray(observation.node_of_track)[kept][:, None].astype(np.int64)
+        kept = np.arange(observation.track_count)
+        carrier = np.asarray(observation.node_of_track)[:, None].astype(np.int64)
         weight = np.ones((len(kept), 1), np.float32)
         return kept, carrier, weight, np.zeros((len(kept), 3), np.float32)
+    kept = np.flatnonzero(observation.is_visible[0])
+    start = np.asarray(observation.point[0, kept], np.float32)
     count = min(CARRIERS, len(object_node))
     distance, carrier = KDTree(object_node).query(start, k=count)
     distance, carrier = np.reshape(distance, (-1, count)), np.reshape(carrier, (-1, count))
@@ -140,7 +148,10 @@ def build_problem(
     frame_rate: float,
     ground_height: float | None,
     gravity: float,
-    cloud_points: int = 300,
+    surface_count: int | None = None,
+    chamfer_points: Literal["cloud", "tracks"] = "cloud",
+    cloud_points: int | None = 300,
+    starts_at_rest: bool = False,
 ) -> ObjectProblem:
     """Reduce a sequence to the tensors that the object fit reads.
 
@@ -154,7 +165,11 @@ def build_problem(
         frame_rate: Frames a second [Hz].
         ground_height: Height of the ground, or none [m].
         gravity: Acceleration along -z [m/s²].
-        cloud_points: Most points of a frame that enter the Chamfer term.
+        surface_count: Number of leading nodes that lie on the surface, if that is known.
+        chamfer_points: Whether the Chamfer term compares with the fused cloud or with the tracks
+            that are visible.
+        cloud_points: Most points of a frame that enter the Chamfer term; none for all.
+        starts_at_rest: Whether the object rests at frame 0, whatever the tracks say.
 
     Returns:
         The problem, on the CPU.
@@ -163,14 +178,21 @@ def build_problem(
         FitError: If there is nothing to compare the simulation with.
     """
     clouds = observation.cloud or tuple(np.zeros((0, 3), np.float32) for _ in range(frame_count))
+    if chamfer_points == "tracks":
+        seen = zip(observation.point, observation.is_visible, strict=True)
+        clouds = tuple(point[is_visible] for point, is_visible in seen)
     cloud, is_observed = _pad_clouds(clouds, frame_count, cloud_points)
     kept, carrier, weight, offset = _carriers(observation, np.asarray(object_node, np.float32))
-    valid = (observation.is_visible & observation.is_motion_valid)[:frame_count, kept]
+    is_there = np.isfinite(observation.point).all(axis=2)
+    valid = (is_there & observation.is_motion_valid)[:frame_count, kept]
     if not is_observed[1:].any() and not valid[1:].any():
         raise FitError(
             f"Sequence '{name}' shows the object in no frame after frame 0 of the {frame_count} to "
             "fit: there is nothing to compare a simulation with. Check masks, depth and tracks."
         )
+    velocity = np.zeros(np.shape(object_node), np.float32)
+    if not starts_at_rest:
+        velocity = initial_velocity(observation, object_node, frame_rate)
     return ObjectProblem(
         name=name,
         object_node=np.asarray(object_node, np.float32),
@@ -179,7 +201,7 @@ def build_problem(
         frame_rate=frame_rate,
         ground_height=ground_height,
         gravity=gravity,
-        initial_velocity=initial_velocity(observation, object_node, frame_rate),
+        initial_velocity=velocity,
         cloud=cloud,
         is_observed=is_observed,
         track=torch.from_numpy(np.asarray(observation.point[:frame_count, kept], np.float32)),
@@ -187,6 +209,7 @@ def build_problem(
         carrier=torch.from_numpy(carrier),
         carrier_weight=torch.from_numpy(weight),
         track_offset=torch.from_numpy(offset),
+        surface_count=surface_count,
     )
 
 

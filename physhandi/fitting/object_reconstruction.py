@@ -2,15 +2,18 @@
 
 import math
 from collections.abc import Sequence as Many
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from physhandi.errors import SimulationDivergedError
+from physhandi.fitting.losses import acceleration_loss
+from physhandi.fitting.object_config import ObjectFitConfig
 from physhandi.fitting.object_problem import ObjectProblem
-from physhandi.fitting.search import SearchConfig, SearchResult, search_parameters
+from physhandi.fitting.search import SearchResult, search_parameters
 from physhandi.progress import Progress
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
 from physhandi.simulation.simulator import Simulator
@@ -21,52 +24,11 @@ SAFETY = 1.25
 """Margin of the substeps over the stability limit."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class FirstOrderConfig:
-    """How per-spring stiffness and damping are optimised (Adam)."""
-
-    iterations: int = 60
-    """Passes over all sequences; 0 skips the stage."""
-    learning_rate: float = 0.02
-    """Step of Adam in log space."""
-    beta_2: float = 0.99
-    """Adam's second moment decay."""
-    window: int | None = None
-    """Frames that a gradient reaches back, with one update a window; none is the whole sequence."""
-    is_annealed: bool = True
-    """Fit the first frames first and lengthen the horizon over the first half of the iterations."""
-    learns_damping: bool = True
-    """Whether each spring gets its own damping (paper) or all keep the searched one (PhysTwin)."""
-    prior_weight: float = 1e-8
-    """Pull of every logarithm towards its searched value [m²]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ObjectFitConfig:
-    """What stage 2 does."""
-
-    search: SearchConfig = field(default_factory=SearchConfig)
-    """Zeroth-order part: global parameters."""
-    first_order: FirstOrderConfig = field(default_factory=FirstOrderConfig)
-    """First-order part: one stiffness and one damping for each spring."""
-    track_weight: float = 1.0
-    """Weight of the track term beside the Chamfer term; PhysTwin's is 1/6."""
-    freezes_counts: bool = False
-    """Divide every frame's loss by the counts of frame 1, as PhysTwin does."""
-    automatic_substeps: bool = False
-    """Give each candidate the substeps that its own stability limit asks for."""
-    most_substeps: int = 2000
-    """A candidate that needs more substeps a frame than this is not tried."""
-    cloud_points: int = 300
-    """Most observed points of a frame that enter the Chamfer term."""
-
-
 def problem_parameters(
     parameters: SimulationParameters, problem: ObjectProblem
 ) -> SimulationParameters:
-    """Set the frame rate, ground and gravity of one sequence."""
-    return replace(
-        parameters,
+    """Set the frame rate, ground and gravity of one sequence, as far as the parameters let it."""
+    return parameters.in_world(
         frame_rate=problem.frame_rate,
         ground_height=problem.ground_height,
         gravity=problem.gravity,
@@ -88,11 +50,11 @@ def build_problem_model(
 
 def simulate_problem(
     problem: ObjectProblem, model: SpringMassModel, parameters: SimulationParameters, device: str
-) -> Tensor:
-    """Roll the model out over the frames to fit; "frame node 3" [m]."""
+) -> tuple[Float[Tensor, "frame node 3"], Float[Tensor, "frame node 3"]]:
+    """Roll the model out over the frames to fit; positions [m] and velocities [m/s]."""
     simulator = Simulator(model, problem_parameters(parameters, problem), device=device)
-    position = simulator.rollout(problem.control[: problem.frame_count]).position
-    return torch.from_numpy(np.ascontiguousarray(position))
+    rollout = simulator.rollout(problem.control[: problem.frame_count])
+    return torch.from_numpy(rollout.position), torch.from_numpy(rollout.velocity)
 
 
 def mean_loss(
@@ -101,17 +63,24 @@ def mean_loss(
     parameters: SimulationParameters,
     config: ObjectFitConfig,
     device: str,
+    *,
+    acceleration_weight: float = 0.0,
 ) -> float:
-    """Simulate every sequence and average its frame losses; infinite if one diverges [m²]."""
+    """Simulate every sequence and average its frame losses; infinite if one diverges [m²].
+
+    The mean is over the frames 1, 2, … to fit (physics.md §4.1); frame 0 is given.
+    """
     losses = []
     for problem in problems:
         try:
-            node = simulate_problem(problem, models[problem.name], parameters, device)
+            node, velocity = simulate_problem(problem, models[problem.name], parameters, device)
         except SimulationDivergedError:
             return math.inf
         frame_losses = problem.frame_losses(
             node[1:], track_weight=config.track_weight, freeze_counts=config.freezes_counts
         )
+        if acceleration_weight > 0.0:
+            frame_losses = frame_losses + acceleration_weight * acceleration_loss(velocity)[1:]
         losses.append(float(frame_losses.mean()))
     return float(np.mean(losses))
 
@@ -163,7 +132,8 @@ def search_object(
         has_springs = all(len(model.spring_nodes) > 0 for model in models.values())
         if not has_springs or parameters.substeps_per_frame > config.most_substeps:
             return math.inf
-        return mean_loss(problems, models, parameters, config, device)
+        weight = config.acceleration_weight
+        return mean_loss(problems, models, parameters, config, device, acceleration_weight=weight)
 
     def settle(parameters: SimulationParameters) -> SimulationParameters:
         parameters = problem_parameters(parameters, problems[0])

@@ -10,7 +10,7 @@ import yaml
 
 from physhandi.errors import UsageError
 from physhandi.fitting.hand_reconstruction import HandFitConfig
-from physhandi.fitting.object_reconstruction import ObjectFitConfig
+from physhandi.fitting.object_config import ObjectFitConfig
 from physhandi.simulation.model import SimulationParameters
 
 FOLDER = Path(__file__).parent / "profiles"

@@ -1,7 +1,5 @@
 """From a sequence and a fitted object to simulated motion."""
 
-from dataclasses import replace
-
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
@@ -101,8 +99,7 @@ def simulate_sequence(
         SimulationDivergedError: If the motion runs away.
     """
     model = artefacts.load_model(output.out, sequence.name)
-    parameters = replace(
-        artefacts.load_parameters(output.out),
+    parameters = artefacts.load_parameters(output.out).in_world(
         frame_rate=sequence.frame_rate,
         ground_height=sequence.ground_height,
         gravity=sequence.gravity,

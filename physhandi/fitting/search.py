@@ -61,6 +61,11 @@ class SearchConfig:
     """Candidates a generation; none leaves it to the number of variables."""
     sigma: float = 1.0 / 6.0
     """First step, as a part of each interval."""
+    longest_step: float | None = None
+    """Most that the step may grow to, as a part of each interval; none for no limit."""
+    keeps_start: bool = True
+    """Whether the start values are returned if nothing better was found; PhysTwin returns the best
+    of the evolution alone."""
     seed: int = 42
     """Seed of the random numbers."""
     variables: dict[str, SearchVariable] = field(default_factory=dict)
@@ -127,10 +132,13 @@ def search_parameters(
         values |= {name: values[other] for name, other in config.tied.items() if other in values}
         return settle(replace(start, **values))
 
-    # pycma 4.5 fails when it shortens the step of a single variable, so the step is left alone.
+    if not config.keeps_start:
+        best_loss = math.inf
+    # pycma 4.5 fails when it shortens the step of a single variable, so there it is left alone.
+    longest = config.longest_step if len(names) > 1 else None
     options = {
         "bounds": [0, 1],
-        "maxstd": np.inf,
+        "maxstd": np.inf if longest is None else longest,
         "seed": config.seed,
         "verbose": -9,
         "verb_log": 0,

@@ -101,5 +101,7 @@ def _prepare(
     observation = observe_object(sequence, progress)
     artefacts.save_observation(output, sequence.name, observation)
     node, _ = object_nodes_of(sequence, observation, config.node_spacing, template)
-    velocity = initial_velocity(observation, node, sequence.frame_rate)
+    velocity = np.zeros_like(node)
+    if not config.object_.starts_at_rest:
+        velocity = initial_velocity(observation, node, sequence.frame_rate)
     return control_trajectory_of(sequence, motions, config), node, velocity
