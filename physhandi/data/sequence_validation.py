@@ -8,6 +8,7 @@ from numpy import ndarray
 
 from physhandi.data.atomic import read_array
 from physhandi.data.sequence_schema import FILE, SequenceMeta
+from physhandi.data.truth import FOLDER as TRUTH
 from physhandi.data.view import View
 from physhandi.errors import SequenceError
 
@@ -31,6 +32,14 @@ VIEW_ARRAYS: _Table = {
     "track_visible.npy": (("frame", "track"), _B, False),
 }
 
+_SIDES = ("right", "left")
+TRUTH_ARRAYS: _Table = {
+    **{f"hand_{side}_keypoint.npy": (("frame", 21, 3), _F, False) for side in _SIDES},
+    **{f"hand_{side}_vertex.npy": (("frame", f"{side} vertex", 3), _F, False) for side in _SIDES},
+    "contact_point.npy": (("point", 3), _F, False),
+    "contact.npy": (("frame", "point"), _B, False),
+}
+
 
 def check_layout(folder: Path, meta: SequenceMeta, views: tuple[View, ...]) -> None:
     """Check that the files fit to ``sequence.yaml`` and to each other, without decoding images.
@@ -40,6 +49,7 @@ def check_layout(folder: Path, meta: SequenceMeta, views: tuple[View, ...]) -> N
     """
     axes = {"frame": meta.frame_count, "hand": len(meta.hands)}
     _check_arrays(folder, folder, meta.name, ARRAYS, axes)
+    _check_arrays(folder, folder / TRUTH, meta.name, TRUTH_ARRAYS, {"frame": meta.frame_count})
     for view in views:
         if not view.folder.is_dir():
             _fail(meta.name, f"views/{view.name}", f"is missing, but {FILE} lists it")
@@ -60,6 +70,8 @@ def check_values(folder: Path, name: str, views: tuple[View, ...]) -> None:
     """
     for file in ARRAYS:
         _check_finite(folder, folder / file, name)
+    for file in TRUTH_ARRAYS:
+        _check_finite(folder, folder / TRUTH / file, name)
     _check_motion(folder, name)
     for view in views:
         for file in VIEW_ARRAYS:
@@ -125,7 +137,7 @@ def _check_markers(folder: Path, meta: SequenceMeta, axes: dict[str, int]) -> No
 
 
 def _check_finite(root: Path, path: Path, name: str) -> None:
-    axes, kind, may_be_nan = (ARRAYS | VIEW_ARRAYS)[path.name]
+    axes, kind, may_be_nan = (ARRAYS | VIEW_ARRAYS | TRUTH_ARRAYS)[path.name]
     if kind != _F or not path.is_file():
         return
     array = read_array(path)

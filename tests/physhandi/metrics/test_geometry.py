@@ -1,21 +1,20 @@
-"""Each measure against a case that was computed by hand."""
+"""Each distance against a case that was computed by hand, and against plain double loops."""
 
 import numpy as np
+import open3d as o3d
 import pytest
-from scipy.spatial.transform import Rotation
+from scipy.spatial.distance import cdist
 
 from physhandi.metrics.geometry import (
     chamfer_one_way,
     chamfer_symmetric,
+    dynamic_nodes,
     dynamic_tracks,
     marker_error,
     nearest_distance,
     nearest_node,
-    reprojection_error,
-    rigid_follow_baseline,
-    rigid_transform,
-    static_baseline,
     track_error,
+    track_error_phystwin,
 )
 
 OBSERVED = np.array([[0.0, 0, 0], [3.0, 4.0, 0]])
@@ -46,11 +45,37 @@ def test_symmetric_chamfer_averages_both_directions() -> None:
     assert chamfer_symmetric(NODES, OBSERVED) == pytest.approx((2.5 + back) / 2)
 
 
+@pytest.mark.parametrize(("norm", "order"), [("l1", "cityblock"), ("l2", "euclidean")])
+def test_chamfer_agrees_with_a_full_distance_matrix(norm, order) -> None:
+    rng = np.random.default_rng(7)
+    observed, nodes = rng.normal(size=(70, 3)), rng.normal(size=(40, 3))
+    matrix = cdist(observed, nodes, order)
+    assert chamfer_one_way(observed, nodes, norm) == pytest.approx(matrix.min(axis=1).mean())
+    assert matrix.min(axis=1).mean() != pytest.approx(matrix.min(axis=0).mean(), rel=0.01)
+
+
+def test_chamfer_agrees_with_open3d() -> None:
+    rng = np.random.default_rng(8)
+    first, second = (
+        o3d.geometry.PointCloud(o3d.utility.Vector3dVector(rng.normal(size=(n, 3))))
+        for n in (60, 35)
+    )
+    there = np.asarray(first.compute_point_cloud_distance(second)).mean()
+    back = np.asarray(second.compute_point_cloud_distance(first)).mean()
+    points = np.asarray(first.points), np.asarray(second.points)
+    assert chamfer_one_way(*points) == pytest.approx(there)
+    assert chamfer_symmetric(*points) == pytest.approx((there + back) / 2)
+    assert abs(there - back) > 0.02
+
+
 def test_empty_sets() -> None:
-    assert np.isnan(chamfer_one_way(np.zeros((0, 3)), NODES))
+    nothing = np.zeros((0, 3))
+    assert np.isnan(chamfer_one_way(nothing, NODES))
+    assert np.isnan(chamfer_symmetric(nothing, NODES))
+    assert np.isnan(chamfer_symmetric(NODES, nothing))
     with pytest.raises(ValueError, match="no target"):
-        chamfer_one_way(OBSERVED, np.zeros((0, 3)))
-    assert nearest_node(np.zeros((0, 3)), NODES).shape == (0,)
+        chamfer_one_way(OBSERVED, nothing)
+    assert nearest_node(nothing, NODES).shape == (0,)
 
 
 def test_a_point_is_dynamic_if_it_moves_in_any_frame() -> None:
@@ -66,16 +91,70 @@ def test_a_point_is_dynamic_if_it_moves_in_any_frame() -> None:
     assert dynamic_tracks(point, is_visible, 0.008).tolist() == [True, True, True, False, False]
 
 
+def test_the_threshold_is_the_papers_on_the_squared_norm() -> None:
+    point = np.zeros((2, 2, 3))
+    point[1] = np.array([[0.00575, 0.00575, 0.00575], [0.0058, 0.0058, 0.0058]])
+    squared = (point[1] ** 2).sum(axis=1)
+    assert squared.tolist() == pytest.approx([0.992e-4, 1.009e-4], rel=1e-3)
+    assert dynamic_tracks(point, np.ones((2, 2), bool)).tolist() == (squared > 1e-4).tolist()
+
+
+def test_nodes_are_dynamic_beside_a_dynamic_track() -> None:
+    track = np.array([[0.0, 0, 0], [1.0, 0, 0], [np.nan] * 3])
+    node = np.array([[0.1, 0, 0], [0.45, 0, 0], [0.55, 0, 0], [5.0, 0, 0]])
+    is_dynamic = np.array([False, True, True])
+    assert dynamic_nodes(node, track, is_dynamic).tolist() == [False, False, True, True]
+    assert not dynamic_nodes(node, track[2:], is_dynamic[2:]).any()
+
+
 def test_track_error_leaves_out_what_is_not_visible() -> None:
-    rollout = np.zeros((3, 4, 3))
     point = np.zeros((3, 2, 3))
     point[1, 0] = [0, 3, 4]
     point[1, 1] = [0, 0, 1]
     point[2, 0] = np.nan
     is_visible = np.array([[True, True], [True, True], [False, False]])
-    error = track_error(point, is_visible, rollout, np.array([1, 3]))
+    error = track_error(point, is_visible, np.zeros((3, 2, 3)))
     assert error[:2].tolist() == [0.0, 3.0]
     assert np.isnan(error[2])
+
+
+def phystwin_by_loops(point: np.ndarray, vertices: np.ndarray) -> list[float]:
+    """PhysTwin's definition, point by point: physics.md, section 5."""
+    errors = []
+    for frame in range(len(point)):
+        distances = []
+        for track in range(point.shape[1]):
+            if np.isnan(point[0, track]).any() or np.isnan(point[frame, track]).any():
+                continue
+            gaps = [float(np.linalg.norm(point[0, track] - node)) for node in vertices[0]]
+            node = gaps.index(min(gaps))
+            distances.append(float(np.linalg.norm(point[frame, track] - vertices[frame, node])))
+        errors.append(sum(distances) / len(distances) if distances else 0.0)
+    return errors
+
+
+def test_phystwins_track_error_agrees_with_plain_loops() -> None:
+    rng = np.random.default_rng(3)
+    rollout = rng.normal(size=(6, 9, 3)).cumsum(axis=0)
+    point = rollout[:, [0, 4, 4, 7]] + rng.normal(scale=0.1, size=(6, 4, 3))
+    point[rng.random((6, 4)) < 0.3] = np.nan
+    point[0, 1], point[4] = np.nan, np.nan  # One track starts late, one frame shows nothing.
+    is_visible = np.isfinite(point).all(axis=2)
+    assert is_visible[1:, 1].any()
+    error = track_error_phystwin(point, is_visible, rollout)
+    assert error.tolist() == pytest.approx(phystwin_by_loops(point, rollout))
+    assert error[4] == 0.0
+    assert error[[1, 2, 3, 5]].min() > 0.01
+    late = track_error_phystwin(point, is_visible, np.concatenate([rollout[:1], rollout[:-1]]))
+    assert late[1:4].mean() > 3 * error[1:4].mean()
+
+
+def test_phystwins_track_error_keeps_the_gap_of_frame_0() -> None:
+    rollout = np.zeros((2, 1, 3))
+    rollout[1, 0, 2] = 0.5
+    point = rollout + np.array([0.03, 0.04, 0.0])
+    visible = np.ones((2, 1), bool)
+    assert track_error_phystwin(point, visible, rollout).tolist() == pytest.approx([0.05, 0.05])
 
 
 def test_marker_error_scores_the_given_markers_against_their_nodes() -> None:
@@ -83,74 +162,3 @@ def test_marker_error_scores_the_given_markers_against_their_nodes() -> None:
     marker = rollout[:, [0, 2, 4]] + np.array([[9.0, 9, 9], [0, 0, 2.0], [0, 6.0, 0]])
     error = marker_error(marker, rollout, np.array([0, 2, 4]), np.array([1, 2]))
     assert error == pytest.approx([4.0, 4.0])
-
-
-def test_rigid_transform_recovers_a_motion() -> None:
-    rng = np.random.default_rng(2)
-    source = rng.normal(size=(20, 3))
-    rotation = Rotation.from_rotvec([0.4, -1.2, 2.0]).as_matrix()
-    target = source @ rotation.T + [1.0, 2.0, 3.0]
-    found, translation = rigid_transform(source, target)
-    assert found == pytest.approx(rotation)
-    assert translation == pytest.approx([1, 2, 3])
-
-
-def test_rigid_transform_never_mirrors() -> None:
-    rng = np.random.default_rng(2)
-    source = rng.normal(size=(20, 3))
-    found, _ = rigid_transform(source, source * [1.0, 1.0, -1.0])
-    expected, _ = Rotation.align_vectors(
-        (source - source.mean(0)) * [1, 1, -1], source - source.mean(0)
-    )
-    assert np.linalg.det(found) == pytest.approx(1.0)
-    assert found == pytest.approx(expected.as_matrix())
-
-
-@pytest.mark.parametrize(
-    ("direction", "expected"),
-    [
-        ([0.0, 1.0, 0.0], [[0, -1, 0], [1, 0, 0], [0, 0, 1]]),
-        ([1.0, 0.0, 0.0], np.eye(3)),
-    ],
-)
-def test_points_on_a_line_turn_as_little_as_possible(
-    direction: list[float], expected: object
-) -> None:
-    step = np.linspace(-1, 2, 4)[:, None]
-    found, _ = rigid_transform(step * [1.0, 0, 0], step * np.array(direction) + [5.0, 0, 0])
-    assert found == pytest.approx(np.array(expected))
-
-
-def test_a_reversed_line_turns_by_half_a_turn() -> None:
-    step = np.linspace(-1, 2, 4)[:, None]
-    found, _ = rigid_transform(step * [0.0, 0, 1], step * [0.0, 0, -1])
-    assert np.linalg.det(found) == pytest.approx(1.0)
-    assert found @ [0, 0, 1] == pytest.approx([0, 0, -1])
-
-
-def test_one_point_only_moves() -> None:
-    found, translation = rigid_transform(np.array([[1.0, 0, 0]]), np.array([[1.0, 2.0, 0]]))
-    assert found == pytest.approx(np.eye(3))
-    assert translation == pytest.approx([0, 2, 0])
-
-
-def test_baselines() -> None:
-    node = np.array([[0.0, 0, 0], [2.0, 0, 0]])
-    still = static_baseline(node, 3)
-    assert still.shape == (3, 2, 3)
-    assert still[2].tolist() == node.tolist()
-    # The controls turn by 90 degrees about z around (1,0,0) and rise by 5.
-    control = np.array([[[1.0, 1, 0], [2.0, 0, 0], [1.0, 0, 1.0]]] * 2)
-    control[1] = [[0.0, 0, 5], [1.0, 1, 5], [1.0, 0, 6.0]]
-    moved = rigid_follow_baseline(node, control)
-    assert moved[0] == pytest.approx(node)
-    assert moved[1] == pytest.approx(np.array([[1.0, -1, 5], [1.0, 1, 5]]))
-
-
-def test_reprojection_error_leaves_out_lost_keypoints() -> None:
-    projected = np.zeros((2, 3, 2))
-    keypoint = np.array([[[3.0, 4.0, 1.0], [np.nan, np.nan, np.nan], [0, 1.0, 0.5]]] * 2)
-    keypoint[1] = np.nan
-    error = reprojection_error(projected, keypoint)
-    assert error[0] == pytest.approx(3.0)
-    assert np.isnan(error[1])

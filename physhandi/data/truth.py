@@ -1,0 +1,56 @@
+"""What really happened in a recording, for scoring only: the optional folder ``truth/``.
+
+No stage of a fit reads it. Simulated recordings can have it, and recordings of a better sensor.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from jaxtyping import Bool, Float
+from numpy import ndarray
+
+from physhandi.data.atomic import read_array
+from physhandi.data.sequence_schema import Side
+
+FOLDER = "truth"
+"""Folder of a sequence that holds the truth."""
+_SIDES: tuple[Side, Side] = ("right", "left")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Truth:
+    """True hands and contact of one sequence; any part may be absent."""
+
+    hand_keypoint: Mapping[Side, Float[ndarray, "frame 21 3"]]
+    """Keypoints of each hand whose truth is known [m]."""
+    hand_vertex: Mapping[Side, Float[ndarray, "frame _ 3"]]
+    """Surface vertices of the same hands, in the order of whatever mesh they come from [m]."""
+    contact_point: Float[ndarray, "point 3"] | None = None
+    """Places on the object in frame 0 whose contact is known [m]."""
+    contact: Bool[ndarray, "frame point"] | None = None
+    """Whether a hand touches that place in a frame."""
+
+
+def read_truth(folder: Path) -> Truth:
+    """Read the truth of the sequence in a folder; what is not there is left out.
+
+    Args:
+        folder: Folder of a sequence that `Sequence.load` accepts, so that shapes are right.
+    """
+
+    def read(file: str) -> Any:
+        path = folder / FOLDER / file
+        return read_array(path) if path.is_file() else None
+
+    def of_hands(part: str) -> dict[Side, Any]:
+        arrays: dict[Side, Any] = {side: read(f"hand_{side}_{part}.npy") for side in _SIDES}
+        return {side: array for side, array in arrays.items() if array is not None}
+
+    return Truth(
+        hand_keypoint=of_hands("keypoint"),
+        hand_vertex=of_hands("vertex"),
+        contact_point=read("contact_point.npy"),
+        contact=read("contact.npy"),
+    )

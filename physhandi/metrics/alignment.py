@@ -1,0 +1,132 @@
+"""Rigid motions between point sets: baselines, carried points and aligned errors."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray
+from scipy.spatial import KDTree  # pyright: ignore[reportMissingTypeStubs]  # it has none
+
+CARRIERS = 8
+"""Nodes whose common rigid motion carries a point."""
+LEAST_CARRIERS = 3
+"""Fewer than this many carriers tell nothing about a rotation, so the point is unknown."""
+REACH = 0.03
+"""An observed point farther away than this in frame 0 carries nothing [m]."""
+_LINE = 1e-9
+"""Share of the largest spread below which points are taken to lie on a line."""
+
+
+def rigid_transform(
+    source: Float[ndarray, "point 3"], target: Float[ndarray, "point 3"]
+) -> tuple[Float[ndarray, "3 3"], Float[ndarray, " 3"]]:
+    """Find the rotation and translation that move `source` best onto `target` (Kabsch).
+
+    Where the points leave a rotation open because they lie on a line, the smallest one is taken.
+
+    Returns:
+        Rotation R and translation t [m] such that ``source @ R.T + t`` is nearest to `target`.
+    """
+    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
+    rotation = best_rotations((target - target_mean).T @ (source - source_mean))
+    return rotation, target_mean - rotation @ source_mean
+
+
+def best_rotations(covariance: Float[ndarray, "*item 3 3"]) -> Float[ndarray, "*item 3 3"]:
+    """Find the rotation R of each ``Σ target sourceᵀ`` that turns source onto target best."""
+    u, singular, vt = np.linalg.svd(covariance)
+    sign = np.where(np.linalg.det(u @ vt) < 0, -1.0, 1.0)
+    u_proper = u.copy()
+    u_proper[..., :, 2] *= sign[..., None]
+    rotation = u_proper @ vt
+    open_ended = singular[..., 1] <= _LINE * np.maximum(singular[..., 0], 1e-300)
+    for index in np.argwhere(open_ended):
+        place = tuple(index)
+        is_point = singular[place][0] < 1e-18
+        rotation[place] = (
+            np.eye(3) if is_point else _smallest_rotation(vt[place][0], u[place][:, 0])
+        )
+    return rotation
+
+
+def similarity_aligned(
+    source: Float[ndarray, "frame point 3"], target: Float[ndarray, "frame point 3"]
+) -> Float[ndarray, "frame point 3"]:
+    """Turn, shift and scale the points of each frame onto the target's (Procrustes) [m]."""
+    source_mean, target_mean = (x.mean(axis=1, keepdims=True) for x in (source, target))
+    moved, wanted = source - source_mean, target - target_mean
+    rotation = best_rotations(np.einsum("fpi,fpj->fij", wanted, moved))
+    turned = moved @ rotation.transpose(0, 2, 1)
+    size = (moved**2).sum(axis=(1, 2))
+    scale = (turned * wanted).sum(axis=(1, 2)) / np.maximum(size, 1e-300)
+    return scale[:, None, None] * turned + target_mean
+
+
+def carried_points(
+    point: Float[ndarray, "point 3"],
+    carrier: Float[ndarray, "frame carrier 3"],
+    is_visible: Bool[ndarray, "frame carrier"] | None = None,
+    *,
+    reach: float = np.inf,
+) -> Float[ndarray, "frame point 3"]:
+    """Move points of frame 0 with the carriers around them.
+
+    Each point follows the rigid motion, since frame 0, of the `CARRIERS` carriers that are nearest
+    to it in frame 0, among those that frame 0 and the frame in question show. With carriers that
+    move rigidly it is exact.
+
+    Args:
+        point: Points in frame 0 [m].
+        carrier: Carriers in every frame [m].
+        is_visible: Which of them are known; all of them if left out.
+        reach: Carriers farther away than this in frame 0 are not asked [m].
+
+    Returns:
+        The points in every frame [m]; NaN where fewer than `LEAST_CARRIERS` carriers are near.
+        With fewer carriers than that in all, whatever there is carries the points.
+    """
+    frame_count, carrier_count = carrier.shape[:2]
+    if is_visible is None:
+        is_visible = np.ones((frame_count, carrier_count), dtype=bool)
+    moved = np.full((frame_count, len(point), 3), np.nan)
+    least = min(LEAST_CARRIERS, carrier_count)
+    for frame in range(frame_count):
+        known = np.flatnonzero(is_visible[0] & is_visible[frame])
+        if not len(point) or len(known) < max(least, 1):
+            continue
+        moved[frame] = _carried(point, carrier[0, known], carrier[frame, known], least, reach)
+    return moved
+
+
+def _carried(
+    point: Float[ndarray, "point 3"],
+    start: Float[ndarray, "carrier 3"],
+    now: Float[ndarray, "carrier 3"],
+    least: int,
+    reach: float,
+) -> Float[ndarray, "point 3"]:
+    tree: Any = KDTree(start)
+    count = min(CARRIERS, len(start))
+    distance, near = tree.query(point, k=count)
+    distance, near = np.reshape(distance, (-1, count)), np.reshape(near, (-1, count))
+    weight = (distance <= reach).astype(np.float64)
+    is_known = weight.sum(axis=1) >= least
+    weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1.0)
+    start_mean, now_mean = (np.einsum("pc,pci->pi", weight, x[near]) for x in (start, now))
+    source, target = start[near] - start_mean[:, None], now[near] - now_mean[:, None]
+    rotation = best_rotations(np.einsum("pc,pci,pcj->pij", weight, target, source))
+    moved = np.einsum("pij,pj->pi", rotation, point - start_mean) + now_mean
+    return np.where(is_known[:, None], moved, np.nan)
+
+
+def _smallest_rotation(source: ndarray, target: ndarray) -> Float[ndarray, "3 3"]:
+    """Turn one unit vector onto another about the axis perpendicular to both."""
+    cosine = float(source @ target)
+    if cosine < -1 + 1e-12:  # Half a turn; any perpendicular axis will do.
+        least = np.eye(3)[np.abs(source).argmin()]
+        perpendicular = np.cross(source, least)
+        perpendicular /= np.linalg.norm(perpendicular)
+        return 2 * np.outer(perpendicular, perpendicular) - np.eye(3)
+    axis = np.cross(source, target)
+    cross = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
+    return np.eye(3) + cross + cross @ cross / (1 + cosine)

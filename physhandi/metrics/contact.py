@@ -1,0 +1,161 @@
+"""Which object nodes a hand touches: predicted by the virtual springs, against labels.
+
+The paper's contact accuracy (appendix, contact consistency) is the share of nodes on which
+prediction and label agree. As most nodes touch nothing, agreement is cheap; precision, recall, F1
+and both shares of touching nodes stand beside it.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+
+from physhandi.data.truth import Truth
+from physhandi.metrics.alignment import REACH, carried_points
+from physhandi.metrics.geometry import nearest_distance, nearest_node
+
+THRESHOLDS = {"5mm": 0.005, "10mm": 0.010}
+"""Nodes nearer to a hand than this count as touched [m]."""
+
+LabelKind = Literal["true", "proximity"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ContactLabels:
+    """What is held to be in contact, for one threshold."""
+
+    is_contact: Bool[ndarray, "frame node"]
+    """Whether a hand touches the node."""
+    is_known: Bool[ndarray, "frame node"]
+    """Where that can be told; other nodes are not scored."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ContactReference:
+    """What contacts are judged by."""
+
+    hand: Float[ndarray, "frame point 3"]
+    """Vertices of all hands [m]."""
+    is_joined: Bool[ndarray, " node"]
+    """Whether a virtual spring ends at the node."""
+    kind: LabelKind
+    """True contact of the sequence, or proximity of what was observed to the fitted hands."""
+    labels: dict[str, ContactLabels]
+    """Labels of each threshold."""
+
+
+def joined_nodes(
+    virtual_spring_nodes: Int[ndarray, "spring 2"], node_count: int
+) -> Bool[ndarray, " node"]:
+    """Tell which object nodes at least one virtual spring holds."""
+    ends = virtual_spring_nodes.reshape(-1)
+    is_joined = np.zeros(node_count, dtype=bool)
+    is_joined[ends[ends < node_count]] = True
+    return is_joined
+
+
+def hand_distance(
+    node: Float[ndarray, "frame node 3"], hand: Float[ndarray, "frame point 3"]
+) -> Float[ndarray, "frame node"]:
+    """Measure how far each node is from the nearest hand point of its frame [m]."""
+    return np.stack(
+        [nearest_distance(nodes, points) for nodes, points in zip(node, hand, strict=True)]
+    )
+
+
+def true_labels(truth: Truth, node: Float[ndarray, "node 3"]) -> ContactLabels | None:
+    """Take a node's label from the nearest true place of frame 0; None if there is no truth."""
+    if truth.contact_point is None or truth.contact is None or not len(truth.contact_point):
+        return None
+    nearest = nearest_node(node.astype(np.float64), truth.contact_point.astype(np.float64))
+    is_contact = truth.contact[:, nearest]
+    return ContactLabels(is_contact=is_contact, is_known=np.ones_like(is_contact))
+
+
+def proximity_labels(
+    node: Float[ndarray, "node 3"],
+    hand: Float[ndarray, "frame point 3"],
+    point: Float[ndarray, "frame track 3"] | None,
+    is_visible: Bool[ndarray, "frame track"] | None,
+) -> dict[str, ContactLabels]:
+    """Call nodes touched that are near a fitted hand, whatever a simulation says of them.
+
+    In frame 0 the nodes lie where they were given. In later frames the observed tracks carry them,
+    so that a simulation is not its own judge; a node without visible tracks around it is unknown.
+
+    Args:
+        node: Nodes in frame 0 [m].
+        hand: Vertices of all hands [m].
+        point: Observed tracks [m]; None leaves later frames unknown.
+        is_visible: Which of them are visible.
+    """
+    moved = np.full((len(hand), *node.shape), np.nan)
+    if point is not None and is_visible is not None and point.shape[1]:
+        moved = carried_points(node, point, is_visible, reach=REACH)
+    moved[0] = node
+    is_known = np.asarray(np.isfinite(moved).all(axis=2))
+    distance = hand_distance(np.where(is_known[..., None], moved, 1e3), hand)
+    return {
+        name: ContactLabels(is_contact=is_known & (distance < threshold), is_known=is_known)
+        for name, threshold in THRESHOLDS.items()
+    }
+
+
+def agreement(
+    is_predicted: Bool[ndarray, "frame node"], labels: ContactLabels
+) -> Float[ndarray, " frame"]:
+    """Give the share of known nodes on which prediction and label agree; NaN where none is."""
+    right = (is_predicted == labels.is_contact) & labels.is_known
+    count = labels.is_known.sum(axis=1)
+    return np.where(count > 0, right.sum(axis=1) / np.maximum(count, 1), np.nan)
+
+
+def contact_scores(
+    is_predicted: Bool[ndarray, "frame node"], labels: ContactLabels, suffix: str
+) -> dict[str, float | None]:
+    """Score predicted contacts over the frames given.
+
+    Args:
+        is_predicted: Predicted contacts.
+        labels: Labels of the same frames.
+        suffix: Name of the threshold, which ends every key.
+
+    Returns:
+        ``accuracy``, the mean over frames of the agreement over nodes; ``precision``, ``recall``
+        and ``f1`` over all nodes and frames together; ``predicted_share`` and ``label_share``, the
+        shares of touching nodes, and ``known_share``, that of labelled ones. None where there is
+        nothing to divide by.
+    """
+    known = labels.is_known
+    hit = int((is_predicted & labels.is_contact & known).sum())
+    predicted = int((is_predicted & known).sum())
+    positive = int((labels.is_contact & known).sum())
+    shares = agreement(is_predicted, labels)
+    scores = {
+        "accuracy": float(np.nanmean(shares)) if np.isfinite(shares).any() else None,
+        "precision": _ratio(hit, predicted),
+        "recall": _ratio(hit, positive),
+        "f1": _ratio(2 * hit, predicted + positive),
+        "predicted_share": _ratio(predicted, int(known.sum())),
+        "label_share": _ratio(positive, int(known.sum())),
+        "known_share": _ratio(int(known.sum()), known.size),
+    }
+    return {f"{name}_{suffix}": value for name, value in scores.items()}
+
+
+def predicted_contacts(
+    reference: ContactReference, node: Float[ndarray, "frame node 3"], threshold: float
+) -> Bool[ndarray, "frame node"]:
+    """Predict contact where a virtual spring ends and the hand is nearer than the threshold.
+
+    In frame 0 the springs alone decide: they are the contacts that the model found there.
+    """
+    is_near = hand_distance(node, reference.hand[: len(node)]) < threshold
+    is_near[0] = True
+    return reference.is_joined & is_near
+
+
+def _ratio(part: int, whole: int) -> float | None:
+    return part / whole if whole else None

@@ -1,0 +1,62 @@
+"""The optional truth of a sequence: read as written, and checked like everything else."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from physhandi.data.sequence import Sequence
+from physhandi.data.sequence_schema import SequenceMeta
+from physhandi.data.sequence_writer import write_sequence
+from physhandi.data.truth import read_truth
+from physhandi.errors import SequenceError
+
+META = SequenceMeta(name="s", frame_rate=30.0, frame_count=3, hands=("right", "left"))
+WHOLE = {
+    "truth/hand_right_keypoint.npy": np.arange(189.0).reshape(3, 21, 3),
+    "truth/hand_right_vertex.npy": np.ones((3, 5, 3)),
+    "truth/hand_left_vertex.npy": np.ones((3, 7, 3)),
+    "truth/contact_point.npy": np.eye(3),
+    "truth/contact.npy": np.eye(3, dtype=bool),
+}
+
+
+def test_truth_is_read_as_it_was_written(tmp_path: Path) -> None:
+    sequence = write_sequence(tmp_path / "s", META, WHOLE)
+    sequence.validate()
+    truth = read_truth(sequence.folder)
+    assert set(truth.hand_keypoint) == {"right"}
+    assert truth.hand_keypoint["right"].tolist() == WHOLE["truth/hand_right_keypoint.npy"].tolist()
+    assert {side: v.shape[1] for side, v in truth.hand_vertex.items()} == {"right": 5, "left": 7}
+    assert truth.contact is not None
+    assert truth.contact.tolist() == np.eye(3).astype(bool).tolist()
+
+
+def test_most_sequences_have_none(tmp_path: Path) -> None:
+    truth = read_truth(write_sequence(tmp_path / "s", META).folder)
+    assert not truth.hand_keypoint
+    assert not truth.hand_vertex
+    assert truth.contact is truth.contact_point is None
+
+
+@pytest.mark.parametrize(
+    ("file", "array", "reason"),
+    [
+        ("hand_right_keypoint", np.zeros((2, 21, 3)), "expected frame = 3"),
+        ("hand_right_keypoint", np.zeros((3, 20, 3)), "expected 21 = 21"),
+        ("contact", np.zeros((3, 4), bool), "expected point = 3"),
+        ("contact", np.zeros((3, 3)), "expected boolean"),
+    ],
+)
+def test_wrong_truth_is_refused(tmp_path: Path, file: str, array: np.ndarray, reason: str) -> None:
+    with pytest.raises(SequenceError, match=rf"truth/{file}\.npy.*{reason}"):
+        write_sequence(tmp_path / "s", META, WHOLE | {f"truth/{file}.npy": array})
+
+
+def test_truth_that_is_not_finite_is_refused(tmp_path: Path) -> None:
+    folder = write_sequence(tmp_path / "s", META, WHOLE).folder
+    broken = np.zeros((3, 21, 3))
+    broken[2, 4] = np.nan
+    np.save(folder / "truth" / "hand_right_keypoint.npy", broken)
+    with pytest.raises(SequenceError, match=r"hand_right_keypoint\.npy is nan at frame 2, 21 4"):
+        Sequence.load(folder).validate()
