@@ -54,6 +54,30 @@ class Knob:
         return f"x{value:.3g}" if self.is_logarithm else f"{value:.4g}"
 
 
+@dataclass(frozen=True, kw_only=True)
+class Switch:
+    """One tick box and the parameter that it switches."""
+
+    field: str
+    """Field of `SimulationParameters`."""
+    label: str
+    """Name beside the box."""
+    hint: str
+    """What it does."""
+
+    def to_slider(self, parameters: SimulationParameters) -> bool:
+        """Find whether the box is ticked."""
+        return bool(getattr(parameters, self.field))
+
+    def from_slider(self, value: float) -> bool:
+        """Find the parameter of a box."""
+        return bool(value)
+
+    def text(self, parameters: SimulationParameters) -> str:
+        """Write the parameter as a person reads it."""
+        return "on" if self.to_slider(parameters) else "off"
+
+
 def knobs(parameters: SimulationParameters, *, length_unit: str) -> tuple[Knob, ...]:
     """List the sliders of an object; each range includes the fitted value.
 
@@ -61,21 +85,9 @@ def knobs(parameters: SimulationParameters, *, length_unit: str) -> tuple[Knob, 
         parameters: The fitted parameters.
         length_unit: Unit of lengths; ``"m"`` is shown as millimetres.
     """
-    per_metre, unit, widest = (1e3, "mm", 80.0) if length_unit == "m" else (1.0, length_unit, 0.0)
 
     def radius(field: str, label: str, hint: str) -> Knob:
-        fitted = getattr(parameters, field) * per_metre
-        high = max(widest, 4 * fitted if not widest else 1.5 * fitted, 1e-6)
-        step = 0.5 if widest else high / 200
-        return Knob(
-            field=field,
-            label=f"{label} [{unit}]",
-            low=step,
-            high=high,
-            step=step,
-            hint=hint,
-            scale=per_metre,
-        )
+        return _length(parameters, field, label, hint, length_unit, widest=80.0, step=0.5)
 
     def neighbors(field: str, label: str, hint: str) -> Knob:
         high = max(80, getattr(parameters, field))
@@ -108,6 +120,76 @@ def knobs(parameters: SimulationParameters, *, length_unit: str) -> tuple[Knob, 
         plain("damping", "damping [N·s/m]", 300.0, 1.0, "Dashpot along each spring."),
         plain("drag", "drag [1/s]", 20.0, 0.1, "How fast every motion dies out."),
         plain("gravity", "gravity [m/s²]", 20.0, 0.1, "Acceleration downwards."),
+    )
+
+
+def self_collision_knobs(
+    parameters: SimulationParameters, *, length_unit: str
+) -> tuple[Knob | Switch, ...]:
+    """List what changes the collisions of object nodes with each other; see `knobs`."""
+    return (
+        Switch(
+            field="self_collision",
+            label="nodes collide",
+            hint="Object nodes bounce off each other, so that layers of cloth stay apart.",
+        ),
+        _length(
+            parameters,
+            "collision_distance",
+            "distance",
+            "Nodes that approach each other nearer than this collide.",
+            length_unit,
+            widest=20.0,
+            step=0.1,
+        ),
+        Knob(
+            field="self_restitution",
+            label="restitution of nodes",
+            low=0.0,
+            high=1.0,
+            step=0.05,
+            hint="Part of the approach speed that a collision gives back.",
+        ),
+        Knob(
+            field="self_friction",
+            label="friction of nodes",
+            low=0.0,
+            high=2.0,
+            step=0.05,
+            hint="How much nodes that touch resist sliding past each other.",
+        ),
+        Switch(
+            field="collides_rest_neighbors",
+            label="also rest neighbors",
+            hint="Also collide nodes nearer than the distance at frame 0, as PhysTwin does.",
+        ),
+    )
+
+
+def _length(
+    parameters: SimulationParameters,
+    field: str,
+    label: str,
+    hint: str,
+    length_unit: str,
+    *,
+    widest: float,
+    step: float,
+) -> Knob:
+    """Make the slider of a length; `widest` and `step` are in millimetres."""
+    is_metric = length_unit == "m"
+    per_metre, unit = (1e3, "mm") if is_metric else (1.0, length_unit)
+    fitted = getattr(parameters, field) * per_metre
+    high = max(widest, 1.5 * fitted) if is_metric else max(4 * fitted, 1e-6)
+    step = step if is_metric else high / 200
+    return Knob(
+        field=field,
+        label=f"{label} [{unit}]",
+        low=step,
+        high=high,
+        step=step,
+        hint=hint,
+        scale=per_metre,
     )
 
 
@@ -180,7 +262,7 @@ class History:
 
 
 def what_changed(
-    knobs: tuple[Knob, ...], start: SimulationParameters, now: SimulationParameters
+    knobs: tuple[Knob | Switch, ...], start: SimulationParameters, now: SimulationParameters
 ) -> str:
     """Say which parameters differ from the fitted ones, for example ``δ object 20 → 35 mm``."""
     parts = [

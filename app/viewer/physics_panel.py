@@ -10,7 +10,14 @@ import viser
 
 from app.viewer.content import Content
 from app.viewer.guard import Guard
-from app.viewer.parameters import History, Knob, knobs, what_changed
+from app.viewer.parameters import (
+    History,
+    Knob,
+    Switch,
+    knobs,
+    self_collision_knobs,
+    what_changed,
+)
 from app.viewer.resimulation import Readout
 from app.viewer.take import Take
 from physhandi.simulation.model import SimulationParameters
@@ -43,7 +50,10 @@ class PhysicsPanel:
         """
         self.history = History(fitted.parameters)
         self._simulate = simulate
-        self._knobs = knobs(fitted.parameters, length_unit=content.length_unit)
+        unit = content.length_unit
+        main_knobs = knobs(fitted.parameters, length_unit=unit)
+        collision_knobs = self_collision_knobs(fitted.parameters, length_unit=unit)
+        self._knobs = (*main_knobs, *collision_knobs)
         self._is_metric = content.is_metric
         self._unit = "mm" if content.is_metric else content.length_unit
         self._sliders: dict[str, Any] = {}
@@ -54,13 +64,13 @@ class PhysicsPanel:
         with self._folder:
             self._status = gui.add_markdown("")
             self._progress = gui.add_progress_bar(100.0, color="blue")
-            for knob in self._knobs[:_FIRST_KNOBS]:
+            for knob in main_knobs[:_FIRST_KNOBS]:
                 self._add_slider(gui, knob, guard)
             buttons = gui.add_button_group("History", (_UNDO, _REDO, _RESET))
             buttons.on_click(guard(self._press))
             self._changes = gui.add_markdown("")
             with gui.add_folder("More physics", expand_by_default=False):
-                for knob in self._knobs[_FIRST_KNOBS:]:
+                for knob in main_knobs[_FIRST_KNOBS:]:
                     self._add_slider(gui, knob, guard)
                 self._substeps = gui.add_dropdown(
                     "substeps",
@@ -68,6 +78,9 @@ class PhysicsPanel:
                     hint="Automatic takes as few substeps as are stable at frame 0",
                 )
                 self._substeps.on_update(guard.by_user(lambda _: self._run()))
+            with gui.add_folder("Self-collision", expand_by_default=False):
+                for knob in collision_knobs:
+                    self._add_slider(gui, knob, guard)
 
     def remove(self) -> None:
         """Take the panel away."""
@@ -109,9 +122,11 @@ class PhysicsPanel:
             lines.append(f"**Stopped at frame {readout.simulated_count}; last good state shown**")
         return "<br/>".join(lines)
 
-    def _add_slider(self, gui: viser.GuiApi, knob: Knob, guard: Guard) -> None:
+    def _add_slider(self, gui: viser.GuiApi, knob: Knob | Switch, guard: Guard) -> None:
         start = knob.to_slider(self.history.start)
-        if knob.is_integer:
+        if isinstance(knob, Switch):
+            slider = gui.add_checkbox(knob.label, bool(start), hint=knob.hint)
+        elif knob.is_integer:
             slider = gui.add_slider(
                 knob.label, int(knob.low), int(knob.high), 1, int(start), hint=knob.hint
             )
@@ -122,7 +137,7 @@ class PhysicsPanel:
         slider.on_update(guard.by_user(lambda _, knob=knob: self._move(knob)))
         self._sliders[knob.field] = slider
 
-    def _move(self, knob: Knob) -> None:
+    def _move(self, knob: Knob | Switch) -> None:
         value = knob.from_slider(self._sliders[knob.field].value)
         before = self.history.current
         if self.history.set(knob.field, value) != before:

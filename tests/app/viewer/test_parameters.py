@@ -1,6 +1,6 @@
 import pytest
 
-from app.viewer.parameters import History, knobs, what_changed
+from app.viewer.parameters import History, knobs, self_collision_knobs, what_changed
 from physhandi.simulation.model import SimulationParameters
 
 START = SimulationParameters(connection_radius=0.0237, damping=20.0)
@@ -15,7 +15,10 @@ class Clock:
 
 def test_every_slider_shows_the_fitted_value_and_gives_it_back() -> None:
     for unit in ("m", "squares"):
-        for knob in knobs(START, length_unit=unit):
+        for knob in (
+            *knobs(START, length_unit=unit),
+            *(k for k in self_collision_knobs(START, length_unit=unit) if hasattr(k, "low")),
+        ):
             value = knob.to_slider(START)
             assert knob.low <= value <= knob.high
             assert knob.from_slider(value) == pytest.approx(getattr(START, knob.field))
@@ -75,3 +78,23 @@ def test_what_changed_is_said_in_the_sliders_units() -> None:
     text = what_changed(knobs(START, length_unit="m"), START, now)
     assert text == "δ object [mm] 23.7 → 35, stiffness x1 → x0.5"
     assert "as fitted" in what_changed(knobs(START, length_unit="m"), START, START)
+
+
+def test_self_collision_is_a_box_and_its_sliders() -> None:
+    on = SimulationParameters(self_collision=True, collision_distance=0.008, self_friction=1.0)
+    controls = {knob.field: knob for knob in self_collision_knobs(on, length_unit="m")}
+    box, distance = controls["self_collision"], controls["collision_distance"]
+    assert (box.to_slider(START), box.to_slider(on)) == (False, True)
+    assert (box.from_slider(True), box.from_slider(False)) == (True, False)
+    assert (distance.label, distance.to_slider(on)) == ("distance [mm]", pytest.approx(8.0))
+    assert distance.from_slider(12.0) == pytest.approx(0.012)
+    history = History(SimulationParameters())
+    assert history.set("self_collision", box.from_slider(True)).self_collision is True
+    text = what_changed(tuple(controls.values()), SimulationParameters(), on)
+    assert text == "nodes collide off → on, distance [mm] 5 → 8, friction of nodes 0.3 → 1"
+
+
+def test_a_wider_collision_distance_widens_its_slider() -> None:
+    wide = SimulationParameters(collision_distance=0.05)
+    distance = self_collision_knobs(wide, length_unit="m")[1]
+    assert distance.to_slider(wide) == pytest.approx(50.0)

@@ -1,4 +1,5 @@
 import json
+import re
 
 import numpy as np
 import pytest
@@ -35,6 +36,30 @@ def test_a_slider_re_simulates_and_undo_goes_back(sessions) -> None:
         assert client.gui[client.find("δ object [mm]")]["value"] == 35.0
 
 
+def far_from_fitted(text: str) -> float:
+    found = re.search(r"([\d.]+) mm from the fitted rollout", text)
+    return float(found[1]) if found else 0.0
+
+
+def test_nodes_of_the_sheet_collide_when_the_box_is_ticked(sessions) -> None:
+    with watch(sessions) as client:
+        client.until(lambda: "simulated" in client.texts())
+        client.set("also rest neighbors", True)
+        client.set("distance [mm]", 20.0)
+        client.set("nodes collide", True)
+        client.until(
+            lambda: (
+                "nodes collide off → on" in client.texts()
+                and "also rest neighbors off → on" in client.texts()
+                and f"simulated {FRAMES}/{FRAMES}" in client.texts()
+                and far_from_fitted(client.texts()) > 3.0
+            )
+        )
+        client.set("History", "Reset")
+        client.until(lambda: "as fitted" in client.texts())
+        assert client.gui[client.find("nodes collide")]["value"] is False
+
+
 def test_a_diverged_simulation_is_told_and_the_slider_still_works(sessions) -> None:
     with watch(sessions) as client:
         client.until(lambda: "simulated" in client.texts())
@@ -65,10 +90,13 @@ def test_playing_starts_when_somebody_looks_and_scrubbing_stops_it(sessions) -> 
 def test_the_other_sequence_of_a_run_can_be_chosen(sessions, run) -> None:
     with watch(sessions) as client:
         client.until(lambda: "simulated" in client.texts())
+        before = client.find("stiffness 10^")
         client.set("Sequence", "drag")
         session = sessions.get(sessions.list()[0].id)
         client.until(lambda: session._content.sequence_name == "drag")
-        client.until(lambda: client.texts().count("object springs") == 1)
+        # The old panel may still be there: wait for the slider of the new one.
+        client.until(lambda: before not in client.gui and "object springs" in client.texts())
+        client.until(lambda: any(p.get("label") == "stiffness 10^" for p in client.gui.values()))
         client.set("stiffness 10^", -1.0)
         client.until(
             lambda: "x0.1" in client.texts() and f"simulated {FRAMES}/{FRAMES}" in client.texts()
