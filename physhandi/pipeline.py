@@ -22,7 +22,7 @@ from physhandi.fitting.profile import PipelineConfig, config_from_dict
 from physhandi.fitting.rollouts import control_trajectory_of, object_nodes_of, simulate_sequence
 from physhandi.fitting.simulate import simulate_again
 from physhandi.fitting.spring_optimisation import optimise_springs
-from physhandi.metrics.report import score_run
+from physhandi.metrics.report import measure_run, score_run
 from physhandi.perception.lifting import observe_object
 from physhandi.progress import Progress
 
@@ -94,12 +94,18 @@ def simulate(
     if not attempt.stage_done(SIMULATION):
         simulate_again(source, sequence, changes, attempt, progress, device=device)
         _finish(attempt, SIMULATION, [], [], [])
-    attempt.save_json("metrics.json", {sequence.name: score_run(attempt.out, sequence)})
+    attempt.save_json("metrics.json", {sequence.name: _measure(sequence, attempt)})
 
 
 def evaluate(run: Run, sequences: Many[Sequence]) -> dict[str, Any]:
     """Measure a finished run against its sequences again."""
-    return {sequence.name: score_run(run.out, sequence) for sequence in sequences}
+    scores = {}
+    for sequence in sequences:
+        points = None
+        if not run.has(f"{artefacts.sequence_folder(sequence.name)}/observation/hand_point.npy"):
+            points = artefacts.lifted_hand_points(sequence)
+        scores[sequence.name] = score_run(run.out, sequence, hand_points=points)
+    return scores
 
 
 def _stage_hands(
@@ -115,6 +121,7 @@ def _stage_hands(
         fit = reconstruct_hands(sequence, config.hand, progress)
         artefacts.save_motions(attempt, sequence.name, fit.motions)
         artefacts.save_hand_observation(attempt, sequence.name, fit.keypoint)
+        artefacts.save_hand_points(attempt, sequence, progress)
         before.append(fit.loss_before)
         after.append(fit.loss_after)
         curve = curve or [[float(iteration), loss] for iteration, loss in fit.curve]
@@ -224,10 +231,18 @@ def _stage_evaluation(
         artefacts.save_hand_vertices(attempt, sequence.name)
         if has_object:
             simulate_sequence(attempt, sequence, device=device, progress=progress)
-        metrics[sequence.name] = score_run(attempt.out, sequence)
+        metrics[sequence.name] = _measure(sequence, attempt)
         progress.report(EVALUATION, number + 1, len(sequences))
     attempt.save_json("metrics.json", metrics)
     _finish(attempt, EVALUATION, [], [], [])
+
+
+def _measure(sequence: Sequence, attempt: Attempt) -> dict[str, Any]:
+    """Score one sequence, and store the error of every frame for charts."""
+    scores, frames = measure_run(attempt.out, sequence)
+    folder = artefacts.sequence_folder(sequence.name)
+    attempt.save_json(f"{folder}/frame_errors.json", frames)
+    return scores
 
 
 def _finish(

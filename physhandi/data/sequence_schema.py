@@ -55,7 +55,7 @@ class SequenceMeta:
     views: tuple[ViewMeta, ...] = ()
     """Calibrated views."""
     reconstruction: int | None = None
-    """Number of leading frames that are fitted; None means all of them."""
+    """Number of leading frames that are fitted; None means the first 70 %."""
     controlled_markers: tuple[int, ...] = ()
     """Markers that are fixed to a control, so that metrics do not score them."""
     surface_node_count: int | None = None
@@ -68,7 +68,9 @@ class SequenceMeta:
     @property
     def reconstruction_count(self) -> int:
         """Number of leading frames that are fitted."""
-        return self.frame_count if self.reconstruction is None else self.reconstruction
+        if self.reconstruction is None:
+            return default_reconstruction_count(self.frame_count)
+        return self.reconstruction
 
     def to_dict(self) -> dict[str, Any]:
         """Describe the sequence as ``sequence.yaml`` does."""
@@ -90,6 +92,11 @@ class SequenceMeta:
             "views": [{"name": v.name, "camera": v.camera.to_dict()} for v in self.views],
             "provenance": dict(self.provenance),
         }
+
+
+def default_reconstruction_count(frame_count: int) -> int:
+    """Hold out the last 30 % of a sequence that does not say how to split it, as PhysTwin does."""
+    return max(1, 7 * frame_count // 10)
 
 
 def read_meta(folder: Path) -> SequenceMeta:
@@ -122,7 +129,8 @@ def parse_meta(content: Any, where: str) -> SequenceMeta:
         fields.fail("format", found, f"{FORMAT!r}; this version reads no other")
     frame_count = fields.whole("frame_count", least=1)
     split = _Fields(fields.take("split", dict, {}), f"{where}: {FILE}: split")
-    reconstruction = split.whole("reconstruction", least=1, default=frame_count)
+    default = default_reconstruction_count(frame_count)
+    reconstruction = split.whole("reconstruction", least=1, default=default)
     split.finish()
     if reconstruction > frame_count:
         fields.fail("split.reconstruction", reconstruction, f"at most frame_count = {frame_count}")

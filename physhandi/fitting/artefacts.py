@@ -8,15 +8,18 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 from safetensors.numpy import load_file
 
 from physhandi.data.attempt import Attempt
 from physhandi.data.observation import ObjectObservation
+from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.hand.model import load_hand_model
 from physhandi.hand.motion import HandMotion
+from physhandi.perception.lifting import hand_points
+from physhandi.progress import Progress
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
 
 STORED_CLOUD = 500
@@ -90,6 +93,35 @@ def load_observation(out: Path, name: str) -> ObjectObservation:
     )
 
 
+def lifted_hand_points(
+    sequence: Sequence, progress: Progress | None = None
+) -> tuple[Float[ndarray, "point 3"], Int[ndarray, "hand frame"]] | None:
+    """Lift what the views measured on the hands, thinned as a run keeps it.
+
+    Returns:
+        The points of the first hand's frames, then those of the next hand [m], and where each
+        frame's points end; None without hands, or if no view has both depth and masks.
+    """
+    if not sequence.hands or not any(view.has_depth and view.has_mask for view in sequence.views):
+        return None
+    points = [
+        [_thinned(cloud, STORED_CLOUD) for cloud in frames]
+        for frames in hand_points(sequence, progress)
+    ]
+    count = np.array([[len(cloud) for cloud in frames] for frames in points], dtype=np.int64)
+    end = np.cumsum(count).reshape(count.shape)
+    return np.concatenate([cloud for frames in points for cloud in frames]), end
+
+
+def save_hand_points(output: Attempt, sequence: Sequence, progress: Progress) -> None:
+    """Store what the views measured on the hands, for scoring; nothing if they measured nothing."""
+    found = lifted_hand_points(sequence, progress)
+    if found is not None:
+        folder = f"{sequence_folder(sequence.name)}/observation"
+        output.save_array(f"{folder}/hand_point.npy", found[0])
+        output.save_array(f"{folder}/hand_point_end.npy", found[1])
+
+
 def save_motions(output: Attempt, name: str, motions: tuple[HandMotion, ...]) -> None:
     """Store the fitted motion of each hand."""
     for motion in motions:
@@ -154,6 +186,14 @@ def save_hand_observation(
 ) -> None:
     """Store the keypoints that stage 1 compared the hands with [px]."""
     output.save_array(f"{sequence_folder(name)}/keypoint.npy", keypoint.astype(np.float32))
+
+
+def copy_hand_observation(source: Run, name: str, output: Attempt) -> None:
+    """Take over what another run keeps of what the views saw of the hands."""
+    folder = sequence_folder(name)
+    for file in ("keypoint.npy", "observation/hand_point.npy", "observation/hand_point_end.npy"):
+        if source.has(f"{folder}/{file}"):
+            output.save_array(f"{folder}/{file}", source.array(f"{folder}/{file}"))
 
 
 def save_hand_vertices(output: Attempt, name: str) -> None:

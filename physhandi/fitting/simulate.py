@@ -61,6 +61,7 @@ def simulate_again(
     artefacts.save_sequence_meta(output, sequence)
     if is_known:
         control = _copy_known(source, sequence.name, output)
+        artefacts.copy_hand_observation(source, sequence.name, output)
     else:
         control, node, velocity = _prepare(
             source, sequence, output, (model.object_node, rest_node), progress
@@ -98,6 +99,8 @@ def _prepare(
         motions = fit.motions
         artefacts.save_motions(output, sequence.name, motions)
         artefacts.save_hand_vertices(output, sequence.name)
+        artefacts.save_hand_observation(output, sequence.name, fit.keypoint)
+        artefacts.save_hand_points(output, sequence, progress)
     observation = observe_object(sequence, progress)
     artefacts.save_observation(output, sequence.name, observation)
     node, _ = object_nodes_of(sequence, observation, config.node_spacing, template)

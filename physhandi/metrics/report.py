@@ -20,7 +20,7 @@ from physhandi.metrics.contact import (
     predicted_contacts,
 )
 from physhandi.metrics.report_curves import CURVES, Curves, error_curves
-from physhandi.metrics.report_hands import score_hands
+from physhandi.metrics.report_hands import StoredPoints, score_hands
 from physhandi.metrics.report_inputs import Reference, read, read_reference, read_topology
 
 AGGREGATION = (
@@ -66,8 +66,15 @@ def score_rollout(
     return _tabulated(motions, curves, substituted, reference, splits)
 
 
-def measure_run(out: Path, sequence: Sequence) -> tuple[dict[str, Any], dict[str, Any]]:
+def measure_run(
+    out: Path, sequence: Sequence, *, hand_points: StoredPoints | None = None
+) -> tuple[dict[str, Any], dict[str, Any]]:
     """Give what `score_run` and `frame_errors` give, measured once.
+
+    Args:
+        out: Output folder of the run.
+        sequence: The sequence.
+        hand_points: As for `score_run`.
 
     Raises:
         RunError: If a file of the run is damaged.
@@ -91,7 +98,7 @@ def measure_run(out: Path, sequence: Sequence) -> tuple[dict[str, Any], dict[str
         topology = read_topology(out, reference.object_node)
         if topology is not None:
             report["topology"] = topology
-    hands, hand_curves = score_hands(folder, sequence)
+    hands, hand_curves = score_hands(folder, sequence, hand_points)
     if hands:
         report["hands"] = hands
     if hand_curves:
@@ -99,12 +106,15 @@ def measure_run(out: Path, sequence: Sequence) -> tuple[dict[str, Any], dict[str
     return report, frames
 
 
-def score_run(out: Path, sequence: Sequence) -> dict[str, Any]:
+def score_run(
+    out: Path, sequence: Sequence, *, hand_points: StoredPoints | None = None
+) -> dict[str, Any]:
     """Measure what a run found for one sequence.
 
     Args:
         out: Output folder of the run.
         sequence: The sequence; gives the split, markers, cameras and the truth.
+        hand_points: What the views measured on the hands, for a run that does not hold it.
 
     Returns:
         The table of `score_rollout` if the sequence has an object, with ``topology`` if one was
@@ -113,7 +123,7 @@ def score_run(out: Path, sequence: Sequence) -> dict[str, Any]:
     Raises:
         RunError: If a file of the run is damaged.
     """
-    return measure_run(out, sequence)[0]
+    return measure_run(out, sequence, hand_points=hand_points)[0]
 
 
 def frame_errors(out: Path, sequence: Sequence) -> dict[str, Any]:

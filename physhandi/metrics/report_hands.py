@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from physhandi.data.sequence import Sequence
@@ -24,14 +24,19 @@ HAND_AGGREGATION = (
 )
 
 Curves = dict[str, Float[ndarray, " frame"]]
+StoredPoints = tuple[Float[ndarray, "point 3"], Int[ndarray, "hand frame"]]
+"""Points of all hands and frames one after the other [m], and where those of each frame end."""
 
 
-def score_hands(folder: Path, sequence: Sequence) -> tuple[dict[str, Any], dict[str, Curves]]:
+def score_hands(
+    folder: Path, sequence: Sequence, given: StoredPoints | None = None
+) -> tuple[dict[str, Any], dict[str, Curves]]:
     """Compare each hand with detected keypoints, measured points and the truth.
 
     Args:
         folder: The run's folder of this sequence.
         sequence: Gives cameras and, if it has it, the truth.
+        given: What the views measured on the hands; None reads it from the run.
 
     Returns:
         For each hand its figures, and the same distances [m] frame by frame. A hand that has a
@@ -43,6 +48,8 @@ def score_hands(folder: Path, sequence: Sequence) -> tuple[dict[str, Any], dict[
     truth = read_truth(sequence.folder)
     detected = read(folder / "keypoint.npy")
     points = read_split(folder / "observation", "hand_point")
+    if given is not None:
+        points = np.split(given[0], given[1].reshape(-1)[:-1])
     scores: dict[str, Any] = {}
     curves: dict[str, Curves] = {}
     for hand, side in enumerate(sequence.hands):

@@ -76,11 +76,14 @@ def observe_object(sequence: Sequence, progress: Progress | None = None) -> Obje
     )
 
 
-def hand_points(sequence: Sequence) -> list[list[Float[ndarray, "point 3"]]]:
+def hand_points(
+    sequence: Sequence, progress: Progress | None = None
+) -> list[list[Float[ndarray, "point 3"]]]:
     """Lift the pixels of every hand.
 
     Args:
         sequence: Recording whose views have depth and masks.
+        progress: May ask to stop.
 
     Returns:
         Fused surface points of each hand of `sequence.hands` in each frame, indexed
@@ -88,12 +91,15 @@ def hand_points(sequence: Sequence) -> list[list[Float[ndarray, "point 3"]]]:
 
     Raises:
         MissingInputError: If no view has depth and masks.
+        CancelledError: If the user asked to stop.
     """
+    progress = progress or NullProgress()
     views = _depth_views(sequence)
     if not views:
         raise MissingInputError(_what_is_missing(sequence, "the hands"))
     points: list[list[ndarray]] = [[] for _ in sequence.hands]
     for frame in range(sequence.frame_count):
+        progress.check_cancelled()
         images = [(view, view.depth(frame), view.mask(frame)) for view in views]
         for hand, side in enumerate(sequence.hands):
             points[hand].append(

@@ -1,5 +1,6 @@
 """The pipeline end to end on a small recording: fit, stop, go on, simulate again."""
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -160,6 +161,35 @@ def test_unknown_parameters_are_named(tmp_path: Path, fitted: Run, recordings: P
 def test_evaluating_again_gives_the_stored_metrics(fitted: Run) -> None:
     sequences = [Sequence.load(folder) for folder in fitted.sequences]
     assert pipeline.evaluate(fitted, sequences) == fitted.json("metrics.json")
+
+
+def test_errors_of_every_frame_are_stored_for_charts(
+    tmp_path: Path, fitted: Run, recordings: Path
+) -> None:
+    again = simulate(tmp_path / "charted", fitted, recordings / "high")
+    for run in (fitted, again):
+        errors = run.json("sequences/high/frame_errors.json")
+        assert errors["frames"] == list(range(FRAMES))
+        marker = np.load(recordings / "high" / "marker.npy")
+        distance = np.linalg.norm(run.array("sequences/high/rollout.npy") - marker, axis=2)
+        assert errors["rollout"]["marker_error"] == pytest.approx(distance.mean(axis=1), abs=2e-7)
+        assert errors["static"]["track_error"][-1] > 2 * errors["rollout"]["track_error"][-1] > 0
+
+
+def test_a_run_that_holds_no_hand_points_is_measured_with_those_of_its_sequence(
+    tmp_path: Path,
+) -> None:
+    sequences = Path(__file__).parents[2] / "sequences"
+    shutil.copytree(sequences / "runs" / "towel_fold_quick", tmp_path / "run")
+    run = Run.open(tmp_path / "run")
+    for path in run.out.rglob("hand_point*.npy"):
+        path.unlink()
+    (scores,) = pipeline.evaluate(run, [Sequence.load(sequences / "towel_fold")]).values()
+    right = scores["hands"]["right"]
+    # A perfect hand has 5.4 mm, too: the points are 8 mm apart and miss the sides nobody sees.
+    assert 0.004 < right["chamfer_symmetric"] < 0.006
+    assert 0.002 < right["chamfer_points_to_mesh"] < 0.004
+    assert scores["contact"]["frame_0"]["accuracy_10mm"] > 0.9
 
 
 def test_a_sequence_with_nothing_to_fit_says_what_is_missing(

@@ -70,6 +70,8 @@ def import_mocap(
             frame_rate=float(frame_rate),
             frame_count=len(resampled),
             gravity=9.81,
+            # Other recordings of the same rope are what a fit is tested on.
+            reconstruction=len(resampled),
             controlled_markers=controlled_markers,
             provenance={
                 "importer": "mocap",

@@ -106,6 +106,20 @@ def test_everything_written_comes_back(folder: Path) -> None:
     assert (sequence.ground_height, sequence.gravity, sequence.hands) == (0.25, 9.81, ("right",))
 
 
+@pytest.mark.parametrize(("frames", "fitted"), [(1, 1), (2, 1), (5, 3), (60, 42), (90, 63)])
+def test_a_split_that_is_not_named_holds_out_the_last_30_percent(
+    tmp_path: Path, frames: int, fitted: int
+) -> None:
+    meta = SequenceMeta(name="s", frame_rate=30.0, frame_count=frames)
+    sequence = write_sequence(tmp_path / "s", meta)
+    assert sequence.reconstruction_frames == range(fitted)
+    assert sequence.future_frames == range(fitted, frames)
+    text = (sequence.folder / "sequence.yaml").read_text().split("\n")
+    kept = [line for line in text if "split" not in line and "reconstruction" not in line]
+    (sequence.folder / "sequence.yaml").write_text("\n".join(kept))
+    assert Sequence.load(sequence.folder).reconstruction_frames == range(fitted)
+
+
 def test_video_frames_can_be_read_in_any_order(tmp_path: Path) -> None:
     video = tmp_path / "clip.mp4"
     writer = cv2.VideoWriter(str(video), cv2.VideoWriter_fourcc(*"mp4v"), 30, (64, 48))
