@@ -77,3 +77,16 @@ def test_a_users_mistake_in_a_file_names_the_profile(
 def test_numbers_without_a_point_are_numbers() -> None:
     config = replace(load_profile("quick"), node_spacing=1.0)
     assert config_from_dict(config_to_dict(config) | {"node_spacing": 1}) == config
+
+
+def test_self_collision_can_be_switched_on_and_searched_in_any_profile() -> None:
+    plain = config_to_dict(load_profile("default"))
+    assert plain["simulation"]["self_collision"] is False
+    plain["simulation"] |= {"self_collision": True, "collision_distance": 0.015}
+    searched = plain["object_"]["search"]["variables"]
+    for name, high in (("collision_distance", 0.05), ("self_restitution", 1.0)):
+        searched[name] = {"low": 0.0, "high": high}
+    config = config_from_dict(plain)
+    assert config.simulation.self_collision
+    assert config.simulation.collision_distance == 0.015
+    assert config.object_.search.variables["collision_distance"].from_unit(0.5) == 0.025
