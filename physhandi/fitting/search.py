@@ -149,7 +149,7 @@ def search_parameters(
         [config.variables[name].to_unit(float(getattr(start, name))) for name in names]
     )
     # Exactly on a bound CMA's transform has no slope, so a start there could never leave it.
-    strategy = cma.CMAEvolutionStrategy(np.clip(first, 0.02, 0.98), config.sigma, options)
+    strategy = cma.CMAEvolutionStrategy(np.clip(first, 0.01, 0.99), config.sigma, options)
     evaluations = 1
     for generation in range(config.generations):
         units = strategy.ask()

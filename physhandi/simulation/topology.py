@@ -100,7 +100,8 @@ def build_model(
             object springs and their rest lengths.
 
     Returns:
-        The model, at rest. `stiffness_scale` is not applied: the simulator does that.
+        The model, at rest. A spring without stiffness is off, its dashpot included (physics.md
+        §3.1). `stiffness_scale` is not applied: the simulator does that.
     """
     rest = np.asarray(object_node if rest_node is None else rest_node, dtype=np.float64)
     if rest.shape != object_node.shape:
@@ -129,7 +130,7 @@ def build_model(
         spring_nodes=np.concatenate([springs, virtual]),
         rest_length=rest_length.astype(np.float32),
         stiffness=stiffness.astype(np.float32),
-        damping=np.full(len(rest_length), parameters.damping, dtype=np.float32),
+        damping=np.where(stiffness > 0.0, parameters.damping, 0.0).astype(np.float32),
         object_spring_count=len(springs),
         control_count=len(control_0),
     )

@@ -85,3 +85,53 @@ def test_initial_velocity_reads_two_frames_only() -> None:
     velocity = initial_velocity(observe(track, node_of_track=node_of_track), NODE, 30.0)
     np.testing.assert_allclose(velocity, np.tile([3.0, 0.0, 0.0], (5, 1)), atol=1e-4)
     assert not initial_velocity(observe(track), NODE, 30.0).any()
+
+
+def test_chamfer_sees_the_surface_alone() -> None:
+    track = np.repeat(np.array([[[0.5, 0.5, 0.9]]]), 4, axis=0)
+    clouds = (track[0],) * 4
+    node = torch.from_numpy(NODE)[None]
+    inside = problem(observe(track, cloud=clouds))
+    # The fifth node is 0.1 above; without it the nearest is 0.5² + 0.5² + 0.9² away.
+    assert inside.frame_losses(node, track_weight=0.0).tolist() == pytest.approx([0.01])
+    outside = problem(observe(track, cloud=clouds), surface_count=4)
+    assert outside.frame_losses(node, track_weight=0.0).tolist() == pytest.approx([1.31])
+
+
+def test_visible_tracks_can_be_what_chamfer_compares_with() -> None:
+    track = np.repeat(NODE[None], 4, axis=0).astype(float)
+    track[1, :2] = np.nan
+    track[2:] += [0.0, 0.0, 0.3]
+    clouds = (np.full((9, 3), 7.0),) * 4
+    node = torch.from_numpy(NODE)[None].repeat(2, 1, 1)
+    seen = problem(observe(track, cloud=clouds), chamfer_points="tracks")
+    assert seen.is_observed.sum(dim=1).tolist() == [5, 3, 5]
+    # The lowest four are 0.3 above their nodes, the fifth 0.3 above its own.
+    assert seen.frame_losses(node, track_weight=0.0).tolist() == pytest.approx([0.0, 0.09])
+    frozen = seen.frame_losses(node, track_weight=0.0, freeze_counts=True)
+    assert frozen.tolist() == pytest.approx([0.0, 0.09 * 5 / 3])
+    few = problem(observe(track), chamfer_points="tracks", cloud_points=2)
+    assert few.is_observed.sum(dim=1).tolist() == [2, 2, 2]
+
+
+def test_all_points_of_a_cloud_can_be_kept() -> None:
+    track = np.full((4, 1, 3), np.nan)
+    clouds = (np.ones((500, 3)),) * 4
+    kept = problem(observe(track, cloud=clouds), cloud_points=None)
+    assert kept.is_observed.sum(dim=1).tolist() == [500] * 3
+
+
+def test_an_object_can_be_taken_to_rest() -> None:
+    track = np.repeat(NODE[None], 4, axis=0) + np.arange(4)[:, None, None] * 0.1
+    observation = observe(track, node_of_track=np.arange(5, dtype=np.int32))
+    np.testing.assert_allclose(problem(observation).initial_velocity, 3.0, atol=1e-4)
+    assert not problem(observation, starts_at_rest=True).initial_velocity.any()
+
+
+def test_a_node_that_is_first_seen_later_counts_from_then_on() -> None:
+    track = np.repeat(NODE[None], 4, axis=0).astype(float)
+    track[0, 1] = np.nan
+    track[2, 1] += [0.0, 0.4, 0.0]
+    seen = problem(observe(track, node_of_track=np.arange(5, dtype=np.int32)))
+    node = torch.from_numpy(NODE)[None].repeat(2, 1, 1)
+    assert seen.frame_losses(node).tolist() == pytest.approx([0.0, 0.16 / 5])

@@ -1,10 +1,13 @@
 """The zeroth-order search finds known optima and survives divergence."""
 
 import math
+import warnings
+from typing import Any
 
 import pytest
 
 from physhandi.errors import CancelledError, FitError
+from physhandi.fitting.profile import load_profile
 from physhandi.fitting.search import SearchConfig, SearchVariable, search_parameters
 from physhandi.progress import NullProgress, Progress
 from physhandi.simulation.model import SimulationParameters
@@ -91,6 +94,7 @@ def test_search_stops_when_told() -> None:
         (SearchVariable(low=1.0, high=100.0, scale="log"), 0.5, 10.0),
         (SearchVariable(low=2.0, high=4.0), 0.25, 2.5),
         (SearchVariable(low=1.0, high=5.0, scale="integer"), 0.3, 2),
+        (SearchVariable(low=9.0, high=49.0, scale="integer"), 0.999, 48),
     ],
 )
 def test_intervals_are_walked_as_they_say(
@@ -106,3 +110,75 @@ def test_an_empty_interval_is_refused() -> None:
         SearchVariable(low=2.0, high=1.0)
     with pytest.raises(ValueError, match="log"):
         SearchVariable(low=0.0, high=1.0, scale="log")
+
+
+@pytest.mark.parametrize(("name", "generations"), [("phystwin", 20), ("paper", 100)])
+def test_cma_is_set_up_as_phystwins(
+    monkeypatch: pytest.MonkeyPatch, name: str, generations: int
+) -> None:
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Could not import matplotlib")
+        import cma
+
+    given: dict[str, Any] = {}
+    strategy = cma.CMAEvolutionStrategy
+
+    def spy(x0: Any, sigma0: float, options: dict[str, Any]) -> Any:
+        given.update(options, x0=[float(x) for x in x0], sigma0=sigma0)
+        return strategy(x0, sigma0, options)
+
+    monkeypatch.setattr(cma, "CMAEvolutionStrategy", spy)
+    profile = load_profile(name)
+    seen: list[SimulationParameters] = []
+
+    def evaluate(parameters: SimulationParameters) -> float:
+        seen.append(parameters)
+        return abs(parameters.drag - 7.0)
+
+    search_parameters(evaluate, profile.simulation, profile.object_.search, NullProgress())
+    # physics.md §4.2; 4 + ⌊3 ln 12⌋ = 11, and the start is looked at once before.
+    x0 = [0.3, 0.25, 0.5, 3 / 7, 4 / 7, 0.5, 0.15, 0.7, 0.15, 0.25, 0.15, 0.5]
+    if name == "paper":
+        x0[3:5] = [1 / 79, 2 / 79]
+    assert given["x0"] == pytest.approx(x0, abs=1e-9)
+    assert given["sigma0"] == pytest.approx(1 / 6)
+    assert (given["popsize"], given["seed"], given["bounds"]) == (11, 42, [0, 1])
+    # pycma's own choice where there are bounds.
+    own = strategy(x0, 1 / 6, {"bounds": [0.0, 1.0], "seed": 42, "verbose": -9, "verb_log": 0})
+    assert own.popsize == 11
+    assert given["maxstd"] == pytest.approx(float(own.opts["maxstd"][0]))
+    assert len(seen) == 1 + 11 * generations
+    stiffness = [parameters.stiffness for parameters in seen[1:]]
+    # Walked linearly from 0 N on: a uniform cloud over a log interval would hardly go above 5e4.
+    assert 0.0 <= min(stiffness) < 1e4
+    assert 9e4 < max(stiffness) <= 1e5
+    assert all(parameters.virtual_stiffness == parameters.stiffness for parameters in seen)
+
+
+def test_the_start_is_returned_only_if_it_may_be() -> None:
+    def jealous(parameters: SimulationParameters) -> float:
+        return 0.0 if parameters == START else 1.0 + parameters.drag
+
+    config = SearchConfig(generations=2, variables=VARIABLES)
+    kept = search_parameters(jealous, START, config, NullProgress())
+    assert (kept.parameters, kept.loss_after) == (START, 0.0)
+    config = SearchConfig(generations=2, variables=VARIABLES, keeps_start=False)
+    best = search_parameters(jealous, START, config, NullProgress())
+    assert best.parameters != START
+    assert best.loss_after == 1.0 + best.parameters.drag > best.loss_before == 0.0
+
+
+def test_a_bounded_step_stays_near_the_start() -> None:
+    seen: list[float] = []
+
+    def downhill(parameters: SimulationParameters) -> float:
+        seen.append(parameters.drag)
+        return parameters.drag
+
+    two = {name: VARIABLES[name] for name in ("drag", "max_neighbors")}
+    config = SearchConfig(
+        generations=1, population=20, sigma=1 / 6, longest_step=1e-3, variables=two
+    )
+    search_parameters(downhill, START, config, NullProgress())
+    # The drag's interval is 20 wide: a step of at most a thousandth of it is 0.02.
+    assert 0.005 < max(abs(drag - START.drag) for drag in seen) < 0.1

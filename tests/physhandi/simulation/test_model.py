@@ -32,6 +32,46 @@ def test_a_substep_is_a_667th_of_a_frame():
     assert SimulationParameters().dt == pytest.approx(4.9975e-5, rel=1e-4)
 
 
+def test_a_frame_can_last_longer_than_the_recording_says():
+    parameters = SimulationParameters(frame_rate=30.0, frame_duration=0.03335)
+    assert parameters.dt == pytest.approx(5e-5, rel=1e-9)
+    assert parameters.simulated_frame_rate == pytest.approx(29.985007, rel=1e-7)
+    again = SimulationParameters.from_dict(parameters.to_dict())
+    assert again == parameters
+    assert SimulationParameters.from_dict({"frame_duration": None}).simulated_frame_rate == 30.0
+
+
+def test_a_world_is_taken_over_as_far_as_the_parameters_let_it():
+    world = {"frame_rate": 60.0, "ground_height": None, "gravity": 1.62}
+    moon = SimulationParameters().in_world(**world)
+    assert (moon.frame_rate, moon.ground_height, moon.gravity) == (60.0, None, 1.62)
+    assert moon.dt == pytest.approx(1.0 / (60.0 * 667))
+    own = SimulationParameters(gravity=9.8, uses_sequence_gravity=False, frame_duration=0.03335)
+    own = own.in_world(**world)
+    assert (own.frame_rate, own.ground_height, own.gravity) == (60.0, None, 9.8)
+    assert own.dt == pytest.approx(5e-5)
+
+
+@pytest.mark.parametrize(
+    ("drag", "decay"),
+    [(0.0, 1.0), (1.0, 0.999950051), (3.0, 0.999849975), (12.0, 0.999400139), (20.0, 0.999000549)],
+)
+def test_whole_drags_decay_as_a_gpu_rounds_them(drag, decay):
+    # What float32 expf(-5e-5 drag) was on an H200; next to 1 a unit of float32 is 6e-8.
+    rounded = SimulationParameters(drag=drag, frame_duration=0.03335, rounds_decay=True)
+    assert 1.0 - rounded.velocity_loss() == np.float64(np.float32(decay))
+    exact = replace(rounded, rounds_decay=False)
+    assert exact.velocity_loss() == pytest.approx(1.0 - np.exp(-5e-5 * drag), rel=1e-9)
+    assert exact.velocity_loss() == pytest.approx(rounded.velocity_loss(), abs=9e-8)
+
+
+def test_other_drags_decay_by_the_nearest_float32():
+    own = SimulationParameters(drag=3.0, frame_duration=0.03335, rounds_decay=True)
+    for drag, of in ((2.5, own), (21.0, own), (3.0, replace(own, substeps_per_frame=500))):
+        decay = 1.0 - of.velocity_loss(drag)
+        assert decay == np.float64(np.float32(np.exp(-of.dt * drag)))
+
+
 def test_whole_numbers_and_numpy_values_are_converted():
     parameters = SimulationParameters.from_dict(
         {"drag": 3, "max_neighbors": 12.0, "damping": np.float32(0.5)}
@@ -55,6 +95,8 @@ def test_whole_numbers_and_numpy_values_are_converted():
         ({"self_collision": 1.0}, "self_collision is 1.0; expected true or false"),
         ({"self_restitution": 1.1}, r"self_restitution is 1.1; expected .* in \[0.0, 1.0\]"),
         ({"collision_distance": -0.1}, "collision_distance is -0.1"),
+        ({"frame_duration": 0.0}, "frame_duration is 0.0"),
+        ({"rounds_decay": 1}, "rounds_decay is 1; expected true or false"),
     ],
 )
 def test_nonsense_is_refused_by_name(values, message):

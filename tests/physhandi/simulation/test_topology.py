@@ -107,6 +107,15 @@ def test_a_model_has_floors_and_global_values():
     np.testing.assert_allclose(bare.rest_length, [5e-4, 0.1, 0.0995, 1e-6, 1e-3], rtol=1e-4)
 
 
+def test_a_spring_without_stiffness_is_off_with_its_dashpot():
+    node = np.array([[0.0, 0, 0], [0, 0, 0.05]])
+    control = np.array([[0.0, 0, 0.01]])
+    parameters = replace(PARAMETERS, stiffness=0.0, virtual_stiffness=20.0, damping=3.0)
+    model = build_model(node, control, replace(parameters, virtual_max_neighbors=1))
+    assert model.stiffness.tolist() == [0, 20]
+    assert model.damping.tolist() == [0, 3]
+
+
 def test_the_rest_shape_decides_object_springs_but_not_virtual_ones():
     rest = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.4, 0, 0]])
     node = rest * 2.0
