@@ -18,6 +18,26 @@ def device(request):
     return request.param
 
 
+@pytest.fixture(scope="session")
+def mano_folder(tmp_path_factory):
+    """Import a made-up MANO of both sides into a folder."""
+    from mano_file import write_mano
+
+    from physhandi.data.importers.mano import import_mano
+
+    folder = tmp_path_factory.mktemp("hands")
+    for side in ("right", "left"):
+        import_mano(write_mano(folder / "source", side), folder)
+    return folder
+
+
+@pytest.fixture
+def mano(mano_folder, monkeypatch):
+    """Let `load_hand_model` find the made-up MANO."""
+    monkeypatch.setenv("PHYSHANDI_HANDS", str(mano_folder))
+    return mano_folder
+
+
 @pytest.fixture
 def shared_array():
     """Load a recorded `.npz` file from beside the repository, or skip the test."""

@@ -173,11 +173,14 @@ def _hands(run: Run, folder: str) -> tuple[HandSurface, ...]:
     for side in sides:
         if run.has(f"{folder}/hand_{side}_vertex.npy"):
             vertex = run.array(f"{folder}/hand_{side}_vertex.npy")
-            hands.append(HandSurface(side=side, vertex=vertex, face=_faces(side, vertex.shape[1])))
+            stored = f"{folder}/hand_{side}_face.npy"
+            face = run.array(stored) if run.has(stored) else _faces(side, vertex.shape[1])
+            hands.append(HandSurface(side=side, vertex=vertex, face=face))
     return tuple(hands)
 
 
 def _faces(side: Literal["right", "left"], vertex_count: int) -> Int[ndarray, "face 3"] | None:
+    """Give the open hand's faces to a run that stored none."""
     from physhandi.hand.model import load_hand_model
 
     model = load_hand_model(side)

@@ -22,6 +22,7 @@ from physhandi.errors import ImportFailedError
 logger = logging.getLogger(__name__)
 
 _WORKER = "physhandi.data.untrusted_worker"
+_PACKAGE_ROOT = Path(__file__).parents[2]
 _ADVICE = (
     "Only numbers, text, containers, NumPy arrays, sparse matrices, chumpy arrays and tensors of "
     "a torch checkpoint are read. Nothing of the file was executed; use the file as its publisher "
@@ -60,12 +61,13 @@ def read_untrusted(path: Path, *, time_limit_s: float = 120.0, memory_limit: int
 def _read_in_child(path: Path, out: Path, time_limit_s: float, memory_limit: int) -> None:
     seconds = max(1, round(time_limit_s))
     limits = [str(seconds), str(memory_limit)]
+    kept = {name: value for name, value in os.environ.items() if name[:10] != "PHYSHANDI_"}
     try:
-        # -P: a file named like a module, lying in the working folder, must not be imported.
         child = subprocess.run(
-            [sys.executable, "-P", "-m", _WORKER, str(path), str(out), *limits],
-            cwd=out,
-            env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
+            [sys.executable, "-m", _WORKER, str(path), str(out), *limits],
+            # `-m` searches the working directory first, so it must be the one of our packages.
+            cwd=_PACKAGE_ROOT,
+            env={**kept, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,

@@ -199,7 +199,7 @@ def copy_hand_observation(source: Run, name: str, output: Attempt) -> None:
 def save_hand_vertices(output: Attempt, name: str) -> None:
     """Store mesh and joints of every hand in every frame, for viewers, exports and metrics."""
     for motion in load_motions(output.out, name):
-        model = load_hand_model(motion.side)
+        model = load_hand_model(motion.side, motion.model)
         stem = f"{sequence_folder(name)}/hand_{motion.side}"
         output.save_array(f"{stem}_vertex.npy", motion.vertices(model).astype(np.float32))
         output.save_array(f"{stem}_face.npy", np.asarray(model.faces, np.int32))

@@ -1,12 +1,15 @@
 """Settings of stage 1."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 
 @dataclass(frozen=True, kw_only=True)
 class HandFitConfig:
     """Settings of stage 1."""
 
+    model: Literal["open", "mano"] = "open"
+    """Hand model to fit: the built-in open hand, or MANO that `physhandi import mano` imported."""
     iterations: int = 500
     """Updates of the fit to keypoints."""
     depth_iterations: int = 150

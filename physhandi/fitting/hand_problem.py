@@ -181,6 +181,7 @@ class HandProblem:
         turn = Rotation.from_matrix(rotation.numpy()).as_rotvec()
         return HandMotion(
             side=self.model.side,
+            model=self.model.kind,
             shape=shape.numpy().astype(np.float32),
             articulation=self.parameters["articulation"].detach().numpy().copy(),
             wrist_rotation=_without_jumps(turn).astype(np.float32),

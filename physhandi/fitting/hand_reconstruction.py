@@ -51,7 +51,8 @@ def reconstruct_hands(
         keypoint: Keypoints to fit to; if None, the views' own, or else what the networks find.
 
     Raises:
-        MissingInputError: If there is no hand, no view, or nothing to find keypoints in.
+        MissingInputError: If there is no hand, no view, nothing to find keypoints in, or no MANO
+            when it is asked for.
         FitError: If a hand is not seen well enough to start from.
     """
     config, progress = config or HandFitConfig(), progress or NullProgress()
@@ -66,7 +67,8 @@ def reconstruct_hands(
         keypoint = detect_sequence(sequence, progress)
     fits = []
     for hand, side in enumerate(sequence.hands):
-        problem = HandProblem(sequence, keypoint[:, :, hand], load_hand_model(side), config)
+        model = load_hand_model(side, config.model)
+        problem = HandProblem(sequence, keypoint[:, :, hand], model, config)
         fits.append(problem.solve(progress))
     losses = zip(*(fit.curve for fit in fits), strict=False)
     curve = [(at[0][0], float(sum(loss for _, loss in at))) for at in losses]

@@ -37,7 +37,7 @@ def control_trajectory_of(
             f"Sequence '{sequence.name}' has neither hands nor control.npy: nothing moves its "
             "object."
         )
-    models = tuple(load_hand_model(motion.side) for motion in motions)
+    models = tuple(load_hand_model(motion.side, motion.model) for motion in motions)
     control = control_trajectory(motions, models)
     if config.control_nodes == "all":
         return control

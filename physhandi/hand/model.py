@@ -9,6 +9,8 @@ from numpy import ndarray
 from torch import Tensor
 
 Side = Literal["right", "left"]
+HandKind = Literal["open", "mano"]
+"""The built-in open hand, or the user's MANO."""
 
 SHAPE_COUNT = 10
 JOINT_COUNT = 15
@@ -53,6 +55,8 @@ class HandPose:
 class HandModel(ABC):
     """One hand whose shape is constant and whose articulation changes from frame to frame."""
 
+    kind: HandKind
+    """Which model it is, as `load_hand_model` names it."""
     side: Side
     """Which hand it is."""
     faces: Int[ndarray, "face 3"]
@@ -87,6 +91,10 @@ class HandModel(ABC):
         """
 
     @abstractmethod
+    def bone_origins(self, shape: Float[Tensor, " 10"]) -> Float[Tensor, "16 3"]:
+        """Compute where the bones begin in the unposed hand: the wrist, then the 15 joints [m]."""
+
+    @abstractmethod
     def keypoints(
         self,
         shape: Float[Tensor, " 10"],
@@ -98,8 +106,17 @@ class HandModel(ABC):
         """Compute the keypoints alone, as `__call__` does but without the surface."""
 
 
-def load_hand_model(side: Side) -> HandModel:
-    """Load the built-in open hand of one side; repeated calls return the same object."""
+def load_hand_model(side: Side, kind: HandKind = "open") -> HandModel:
+    """Load a hand model; repeated calls return the same object.
+
+    Args:
+        side: Which hand.
+        kind: ``open`` for the built-in hand, ``mano`` for the user's imported MANO.
+
+    Raises:
+        MissingInputError: If MANO was not imported; says how to.
+    """
+    from physhandi.hand.mano import ManoHand
     from physhandi.hand.open_hand import OpenHand
 
-    return OpenHand.load(side)
+    return ManoHand.load(side) if kind == "mano" else OpenHand.load(side)

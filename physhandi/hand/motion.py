@@ -8,10 +8,11 @@ import torch
 from jaxtyping import Float
 from numpy import ndarray
 
-from physhandi.hand.model import HandModel, HandPose, Side
+from physhandi.hand.model import HandKind, HandModel, HandPose, Side
 
 _BATCH = 128
 _SIDES: tuple[Side, Side] = ("right", "left")
+_MODELS: tuple[HandKind, HandKind] = ("open", "mano")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -30,6 +31,8 @@ class HandMotion:
     """Position of the wrist in the world frame [m, before `scale`]."""
     scale: float = 1.0
     """Length units of the sequence per metre; 1 when it is metric."""
+    model: HandKind = "open"
+    """Hand model whose shape and articulation these are; `load_hand_model` takes it."""
 
     @property
     def frame_count(self) -> int:
@@ -48,6 +51,10 @@ class HandMotion:
         if model.side != self.side:
             raise ValueError(
                 f"the motion of a {self.side} hand was given a {model.side} hand model"
+            )
+        if model.kind != self.model:
+            raise ValueError(
+                f"the motion of the hand model '{self.model}' was given the model '{model.kind}'"
             )
         arrays = (self.articulation, self.wrist_rotation, self.wrist_translation)
         shape = torch.from_numpy(self.shape.astype(np.float32))
@@ -73,16 +80,20 @@ class HandMotion:
             "wrist_rotation": self.wrist_rotation.astype(np.float32),
             "wrist_translation": self.wrist_translation.astype(np.float32),
             "scale": np.array(self.scale, dtype=np.float64),
+            "model": np.array(_MODELS.index(self.model), dtype=np.int32),
         }
 
     @classmethod
     def from_tensors(cls, tensors: dict[str, ndarray]) -> "HandMotion":
         """Build a motion from what `to_tensors` returned.
 
+        Without ``model``, as runs of version 0.1 stored it, the motion is the open hand's.
+
         Raises:
             ValueError: If an array is missing, has the wrong shape or is not finite.
         """
         names = ("side", "shape", "articulation", "wrist_rotation", "wrist_translation", "scale")
+        model = tensors.get("model", np.array(0))
         missing = [name for name in names if name not in tensors]
         if missing:
             raise ValueError(f"hand motion lacks the array {missing[0]!r}")
@@ -97,7 +108,10 @@ class HandMotion:
                 )
         if int(tensors["side"]) not in {0, 1}:
             raise ValueError(f"hand motion's 'side' must be 0 or 1, not {int(tensors['side'])}")
+        if model.shape != () or int(model) not in {0, 1}:
+            raise ValueError(f"hand motion's 'model' must be 0 or 1, not {model}")
         return cls(
+            model=_MODELS[int(model)],
             side=cast("Side", _SIDES[int(tensors["side"])]),
             shape=tensors["shape"],
             articulation=tensors["articulation"],

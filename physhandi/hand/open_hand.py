@@ -14,6 +14,7 @@ from physhandi.hand.gltf import SkinnedMesh, read_skinned_mesh
 from physhandi.hand.keypoint_offset import KEYPOINT_OFFSET
 from physhandi.hand.model import JOINT_COUNT, HandModel, HandPose, Side
 from physhandi.hand.rotation import rotation_offset
+from physhandi.hand.skinning import blend, place, turn_bones
 
 ASSETS = Path(__file__).parent / "assets"
 
@@ -78,6 +79,8 @@ class OpenHand(HandModel):
     an articulation ``(a, b, c)`` of the right hand mirrors to ``(a, -b, -c)``.
     """
 
+    kind = "open"
+
     def __init__(self, mesh: SkinnedMesh, side: Side) -> None:
         """Arrange the right hand's mesh by joints and, for a left hand, mirror it.
 
@@ -125,7 +128,7 @@ class OpenHand(HandModel):
         bones = self._turn_bones(skeleton, articulation)
         vertex, keypoint = (self._skin(part, skeleton, *bones) for part in ("vertex", "keypoint"))
         wrist = (wrist_rotation, wrist_translation, scale)
-        return HandPose(_place(vertex, *wrist), _place(keypoint, *wrist))
+        return HandPose(place(vertex, *wrist), place(keypoint, *wrist))
 
     def keypoints(
         self,
@@ -138,7 +141,7 @@ class OpenHand(HandModel):
         """Pose the keypoints alone; see `HandModel`."""
         skeleton = self._skeleton(shape)
         keypoint = self._skin("keypoint", skeleton, *self._turn_bones(skeleton, articulation))
-        return _place(keypoint, wrist_rotation, wrist_translation, scale)
+        return place(keypoint, wrist_rotation, wrist_translation, scale)
 
     def bone_origins(self, shape: Float[Tensor, " 10"]) -> Float[Tensor, "16 3"]:
         """Compute where the bones begin in the unposed hand: the wrist, then the 15 joints [m]."""
@@ -172,19 +175,7 @@ class OpenHand(HandModel):
         """Compute each bone's rotation, less the identity, and how far its origin moved."""
         axes = self._constants(articulation)["joint_axes"]
         turn = axes @ rotation_offset(articulation) @ axes.transpose(-1, -2)
-        turn = turn.reshape(-1, 5, 3, 3, 3)
-        joint = skeleton.joint[1:].reshape(5, 3, 3)
-        rotation, moved = [turn[:, :, 0]], [torch.zeros_like(turn[:, :, 0, 0])]
-        for link in (1, 2):
-            above = rotation[-1]
-            offset = (joint[:, link] - joint[:, link - 1])[..., None]
-            moved.append(moved[-1] + (above @ offset)[..., 0])
-            rotation.append(above + turn[:, :, link] + above @ turn[:, :, link])
-        palm = torch.zeros_like(turn[:, 0, :1])
-        return (
-            torch.cat([palm, torch.stack(rotation, 2).flatten(1, 2)], 1),
-            torch.cat([palm[..., 0], torch.stack(moved, 2).flatten(1, 2)], 1),
-        )
+        return turn_bones(turn, skeleton.joint)
 
     def _skin(
         self, part: str, skeleton: _Skeleton, rotation: Tensor, moved: Tensor
@@ -193,9 +184,7 @@ class OpenHand(HandModel):
         weight, point, arm = fixed[f"{part}_weight"], fixed[part], fixed[f"{part}_arm"]
         change = (skeleton.stretch @ arm[..., None])[..., 0] + skeleton.shift
         shaped = point + (weight[..., None] * change).sum(1)
-        constant = moved - (rotation @ skeleton.joint[..., None])[..., 0]
-        blended = (weight @ rotation.flatten(2)).unflatten(2, (3, 3))
-        return shaped + (blended @ shaped[:, :, None])[..., 0] + weight @ constant
+        return blend(shaped, weight, skeleton.joint, rotation, moved)
 
     def _constants(self, like: Tensor) -> dict[str, Tensor]:
         if like.dtype not in self._tensors:
@@ -218,13 +207,6 @@ class OpenHand(HandModel):
                 name: torch.as_tensor(array).to(like) for name, array in arrays.items()
             }
         return self._tensors[like.dtype]
-
-
-def _place(
-    point: Tensor, wrist_rotation: Tensor, wrist_translation: Tensor, scale: float | Tensor
-) -> Tensor:
-    turned = point + point @ rotation_offset(wrist_rotation).transpose(-1, -2)
-    return scale * (turned + wrist_translation[:, None])
 
 
 def _nearest_rotation(matrix: Float[ndarray, "3 3"]) -> Float[ndarray, "3 3"]:

@@ -240,7 +240,7 @@ BROKEN: dict[str, Callable[[], bytes]] = {
     "deep key": lambda: b"\x80\x02})" + b"\x85" * 3_000_000 + b"Ns.",
     "loop": lambda: b"\x80\x02]q\x00h\x00a.",
     "chumpy loop": lambda: b"\x80\x02cchumpy.ch\nCh\n)\x81q\x00}X" + _text("x") + b"h\x00sb.",
-    "doubling": lambda: _doubling(60),
+    "doubling": lambda: _doubling(25),
     "memo bomb": lambda: b"\x80\x02Nr\xff\xff\xff\x7f.",
     "bytearray bomb": lambda: b"\x80\x05\x96" + (1 << 40).to_bytes(8, "little") + b".",
     "text bomb": lambda: b"\x80\x04\x8d" + (1 << 40).to_bytes(8, "little") + b"a.",
