@@ -2,17 +2,15 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
-from numpy import ndarray
+from jaxtyping import Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
 from physhandi.data.sequence import Sequence
 from physhandi.hand.model import Side
-from physhandi.perception.lifting import HAND_LABEL
+from physhandi.perception.lifting import HAND_LABEL, surface_points
 
 _CANDIDATES = 8
 _REFRESH = 10
@@ -51,11 +49,8 @@ def depth_target(sequence: Sequence, side: Side, point_count: int) -> DepthTarge
     for frame in range(sequence.frame_count):
         point, camera = np.zeros((0, 3)), np.zeros((0, 3))
         for view in views:
-            depth = view.depth(frame)
-            is_hand = _inside(view.mask(frame) == HAND_LABEL[side]) & (depth > 0)
-            row, column = np.nonzero(is_hand)
-            pixel = np.stack([column, row], 1).astype(np.float64)
-            seen = view.camera.unproject(pixel, depth[row, column].astype(np.float64))
+            is_hand = view.mask(frame) == HAND_LABEL[side]
+            seen = surface_points(view, view.depth(frame), is_hand)
             point = np.concatenate([point, seen])
             camera = np.concatenate([camera, view.camera.T_world_camera[:3, 3] - seen])
         chosen = np.linspace(0, len(point) - 1, min(point_count, len(point))).round().astype(int)
@@ -75,11 +70,6 @@ def depth_target(sequence: Sequence, side: Side, point_count: int) -> DepthTarge
         towards_camera=torch.tensor(ray, dtype=torch.float32),
         weight=torch.tensor(weight, dtype=torch.float32),
     )
-
-
-def _inside(mask: Bool[ndarray, "row column"]) -> Bool[ndarray, "row column"]:
-    """Drop the border of a mask, where depth mixes with what is behind."""
-    return cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
 
 
 def depth_loss(
