@@ -179,6 +179,11 @@ def build_problem(
     """
     clouds = observation.cloud or tuple(np.zeros((0, 3), np.float32) for _ in range(frame_count))
     if chamfer_points == "tracks":
+        if not observation.is_visible.any():
+            raise FitError(
+                f"Sequence '{name}' has no tracks of the object, but chamfer_points is 'tracks': "
+                "add markers or track.npy, or choose chamfer_points: cloud."
+            )
         seen = zip(observation.point, observation.is_visible, strict=True)
         clouds = tuple(point[is_visible] for point, is_visible in seen)
     cloud, is_observed = _pad_clouds(clouds, frame_count, cloud_points)

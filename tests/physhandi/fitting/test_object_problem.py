@@ -77,6 +77,12 @@ def test_an_object_that_is_never_seen_is_an_error() -> None:
         problem(observe(np.full((4, 2, 3), np.nan)))
 
 
+def test_comparing_with_tracks_needs_tracks() -> None:
+    unseen = observe(np.full((4, 2, 3), np.nan), cloud=(np.ones((9, 3)),) * 4)
+    with pytest.raises(FitError, match=r"made_up.*no tracks.*chamfer_points: cloud"):
+        problem(unseen, chamfer_points="tracks")
+
+
 def test_initial_velocity_reads_two_frames_only() -> None:
     track = np.repeat(NODE[None], 4, axis=0).astype(float)
     track[1, :, 0] += 0.1

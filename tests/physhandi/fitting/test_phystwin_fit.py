@@ -81,8 +81,8 @@ def test_a_fit_as_phystwin_tells_soft_from_stiff(tmp_path: Path) -> None:
     fitted = Run.open(run.folder)
     assert fitted.state == "succeeded"
     losses = fitted.json("losses.json")
-    for stage in (pipeline.SEARCH, pipeline.SPRINGS):
-        assert losses[stage]["after"] < 0.7 * losses[stage]["before"]
+    for stage, most in ((pipeline.SEARCH, 0.7), (pipeline.SPRINGS, 0.2)):
+        assert losses[stage]["after"] < most * losses[stage]["before"]
     parameters, model = load_parameters(fitted.out), load_model(fitted.out, "strip")
     assert parameters.dt == pytest.approx(5e-5)
     assert parameters.gravity == 9.8
@@ -95,4 +95,4 @@ def test_a_fit_as_phystwin_tells_soft_from_stiff(tmp_path: Path) -> None:
     stiffness = model.stiffness[: model.object_spring_count]
     stiff, soft = (ends[..., 0] < MIDDLE).all(axis=1), (ends[..., 0] > MIDDLE).all(axis=1)
     assert stiff.sum() > 5 < soft.sum()
-    assert np.median(stiffness[stiff]) > 1.2 * np.median(stiffness[soft])
+    assert np.median(stiffness[stiff]) > 1.5 * np.median(stiffness[soft])

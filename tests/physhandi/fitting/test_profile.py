@@ -1,6 +1,6 @@
 """Profiles are read strictly and survive a round trip."""
 
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -25,6 +25,90 @@ def test_a_profile_survives_a_round_trip(name: str) -> None:
     assert config.profile == name
     assert len(config.description) > 20
     assert config_from_dict(config_to_dict(config)) == config
+
+
+def shown(value: object) -> str:
+    """A value as the documentation writes it."""
+    if value is None or isinstance(value, bool):
+        return {None: "none", True: "yes", False: "no"}[value]
+    return f"{value:g}" if isinstance(value, int | float) else str(value)
+
+
+def flat(config: object, prefix: str = "") -> dict[str, object]:
+    values: dict[str, object] = {}
+    for entry in fields(config):  # type: ignore[arg-type]
+        value = getattr(config, entry.name)
+        if is_dataclass(value):
+            values |= flat(value, f"{prefix}{entry.name}.")
+        else:
+            values[prefix + entry.name] = value
+    return values
+
+
+def table(first: str) -> dict[str, dict[str, str]]:
+    """Rows of the documentation's table whose first column has this head, by profile."""
+    text = (Path(__file__).parents[3] / "docs/conventions.md").read_text(encoding="utf-8")
+    lines = text[text.index(f"| {first} |") :].split("\n\n")[0].splitlines()
+    cells = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines]
+    names = cells[0][1:5]
+    return {row[0].strip("` "): dict(zip(names, row[1:5], strict=True)) for row in cells[2:]}
+
+
+def test_the_documentation_tells_every_switch_that_differs() -> None:
+    told = table("switch")
+    profiles = {name: flat(load_profile(name)) for name in profile_names()}
+    for switch, values in told.items():
+        actual = {name: shown(profile[switch]) for name, profile in profiles.items()}
+        assert values == actual, switch
+    skipped = ("profile", "description", "object_.search.variables", "object_.search.tied")
+    for switch in profiles["default"]:
+        is_same = len({str(profile[switch]) for profile in profiles.values()}) == 1
+        assert is_same or switch in told or switch.startswith(skipped), switch
+
+
+def test_the_documentation_tells_every_interval() -> None:
+    told = table("variable")
+    for name in profile_names():
+        search = load_profile(name).object_.search
+        assert set(search.variables) <= set(told)
+        for variable, values in told.items():
+            if variable in search.tied:
+                expected = f"tied to `{search.tied[variable]}`"
+            elif variable in search.variables:
+                found = search.variables[variable]
+                expected = f"{found.low:g} … {found.high:g} {found.scale}"
+            else:
+                expected = "none"
+            assert values[name] == expected, (name, variable)
+
+
+@pytest.mark.parametrize(
+    ("name", "start", "floors"),
+    [
+        ("phystwin", (0.02, 29, 0.04, 50), (0.0, 0.0)),
+        ("paper", (0.02, 29, 0.002, 3), (0.0, 1e-3)),
+        ("default", (0.02, 29, 0.01, 6), (1e-3, 1e-3)),
+    ],
+)
+def test_each_profile_is_its_row_of_the_design(
+    name: str, start: tuple[float, ...], floors: tuple[float, ...]
+) -> None:
+    config = load_profile(name)
+    simulation, first_order = config.simulation, config.object_.first_order
+    virtual = (simulation.virtual_connection_radius, simulation.virtual_max_neighbors)
+    assert (simulation.connection_radius, simulation.max_neighbors, *virtual) == start
+    assert (simulation.rest_length_floor, simulation.virtual_rest_length_floor) == floors
+    is_phystwin = name == "phystwin"
+    assert config.control_nodes == ("visible" if is_phystwin else "all")
+    assert simulation.use_control_velocity is not is_phystwin
+    assert first_order.learns_damping is not is_phystwin
+    assert first_order.learns_contact is is_phystwin
+    assert config.object_.freezes_counts is is_phystwin
+    assert first_order.window == (None if name == "default" else 1)
+    if name != "default":
+        assert (first_order.iterations, first_order.learning_rate) == (200, 1e-3)
+        assert (first_order.beta_2, first_order.prior_weight) == (0.99, 0.0)
+        assert config.object_.search.generations == (20 if is_phystwin else 100)
 
 
 def test_profiles_differ_where_the_design_says() -> None:
