@@ -4,7 +4,6 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from phystwin_case import (
@@ -21,6 +20,7 @@ from phystwin_case import (
     pixel_of,
     save_pickle,
     write_case,
+    write_video,
 )
 
 from physhandi.data.importers.phystwin import import_phystwin
@@ -175,34 +175,40 @@ def test_images_alone_make_a_sequence_of_views(copied: Path, tmp_path: Path) -> 
 
 def test_videos_and_cleaned_masks_take_the_place_of_images(copied: Path, tmp_path: Path) -> None:
     for camera in range(3):
-        shutil.rmtree(copied / f"color/{camera}")
+        write_video(copied, camera)
         shutil.rmtree(copied / f"mask/{camera}")
-        writer = cv2.VideoWriter(
-            str(copied / f"color/{camera}.mp4"),
-            cv2.VideoWriter.fourcc(*"mp4v"),
-            30,
-            (WIDTH, HEIGHT),
-        )
-        for frame in range(FRAMES):
-            writer.write(np.full((HEIGHT, WIDTH, 3), 40 * frame, np.uint8))
-        writer.release()
-    masks = {
-        frame: {
+    masks: list[Any] = [
+        {
             camera: {"object": masks_of(frame)["2"], "controller": masks_of(frame)["0"]}
             for camera in range(3)
         }
         for frame in range(FRAMES)
-    }
-    save_pickle(copied / "mask/processed_masks.pkl", masks)
+    ]
+    save_pickle(copied / "mask/processed_masks.pkl", dict(enumerate(masks)))
     sequence = Sequence.load(import_phystwin(copied, tmp_path / "out"))
     for view in sequence.views:
         assert view.color(3).mean() == pytest.approx(120, abs=4)
         expected = np.where(masks[4][0]["controller"], 2, masks[4][0]["object"])
         np.testing.assert_array_equal(view.mask(4), expected)
     del masks[2][1]
-    save_pickle(copied / "mask/processed_masks.pkl", masks)
-    with pytest.raises(ImportFailedError, match=r"processed_masks\.pkl: frame 2, camera 1 is miss"):
-        import_phystwin(copied, tmp_path / "again")
+    for wrong, where in ((masks, "frame 2, camera 1"), (masks[:1], "frame 1, camera 0"), (3, "0")):
+        save_pickle(copied / "mask/processed_masks.pkl", wrong)
+        with pytest.raises(ImportFailedError, match=rf"processed_masks\.pkl: .*{where} is missing"):
+            import_phystwin(copied, tmp_path / "again")
+
+
+def test_each_camera_may_lack_parts(copied: Path, tmp_path: Path) -> None:
+    shutil.rmtree(copied / "depth/1")
+    shutil.rmtree(copied / "mask/1")
+    (copied / "cotracker/1.npz").unlink()
+    for name in ("color", "depth", "mask"):
+        shutil.rmtree(copied / name / "2")
+    (copied / "cotracker/2.npz").unlink()
+    first, second, third = Sequence.load(import_phystwin(copied, tmp_path / "out")).views
+    parts = [(v.has_color, v.has_depth, v.has_mask, v.track is not None) for v in (second, third)]
+    assert parts == [(True, False, False, False), (False, False, False, False)]
+    assert (first.has_color, first.has_depth, first.has_mask) == (True, True, True)
+    np.testing.assert_array_equal(second.color(4), color_of(1, 4))
 
 
 def test_progress_is_told_and_may_stop_it(case: Case, tmp_path: Path) -> None:

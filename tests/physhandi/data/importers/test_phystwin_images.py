@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from phystwin_case import HEIGHT, WIDTH, Case, edit_json, write_case
+from phystwin_case import FRAMES, HEIGHT, WIDTH, Case, edit_json, write_case, write_video
 from phystwin_damage import Damage, array_file, image_file, moved, refuse, tracks
 
 
@@ -16,6 +16,15 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
 
 def _extra_camera(folder: Path) -> None:
     (folder / "depth/3").mkdir()
+
+
+def _blank_video(folder: Path) -> None:
+    """Keep the video's tables and its first pictures, but not the last ones."""
+    path = write_video(folder, 2)
+    content = path.read_bytes()
+    end = content.index(b"moov") - 4
+    start = (content.index(b"mdat") + end) // 2
+    path.write_bytes(content[:start] + bytes(end - start) + content[end:])
 
 
 GREY = np.zeros((HEIGHT, WIDTH), np.uint8)
@@ -85,6 +94,11 @@ WRONG: dict[str, tuple[Damage, str]] = {
         tracks(tracks=np.array([{}], dtype=object)),
         r"cotracker/1\.npz: is not a readable",
     ),
+    "a short video": (
+        lambda f: write_video(f, 1, FRAMES - 1),
+        r"color/1\.mp4: has 4 frames, but the case has 5",
+    ),
+    "a video whose end is lost": (_blank_video, r"makes no valid sequence: .*view 'view2': color"),
     "tracks that are no archive": (
         lambda f: (f / "cotracker/0.npz").write_bytes(b"PK") and None,
         r"cotracker/0\.npz: is not a readable",

@@ -68,6 +68,10 @@ WRONG: dict[str, tuple[Damage, str]] = {
         lambda f: edit_pickle(f / "final_data.pkl", object_visibilities=None),
         FINAL + r"field 'object_visibilities' \(5, 26\) is missing; it has",
     ),
+    "ragged points": (
+        lambda f: edit_pickle(f / "final_data.pkl", object_points=[[[0, 1, 2]], [[0, 1]]]),
+        FINAL + "object_points is ragged",
+    ),
     "fewer flags": (
         final("object_motions_valid", lambda a: a[:, 1:]),
         FINAL + r"object_motions_valid has shape \(5, 25\); expected \(5, 26\)",
