@@ -1,12 +1,9 @@
 """The REST interface below /api/v1: nothing but translation."""
 
 import asyncio
-import json
 import shutil
 import tempfile
-import threading
-from collections import deque
-from collections.abc import AsyncIterator, Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol
 
@@ -15,21 +12,26 @@ from fastapi.responses import FileResponse, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.background import BackgroundTask
 
-from app.jobs.catalog import Catalog
-from app.jobs.describe import describe_results, describe_run, describe_sequence, loss_curves
+from app.jobs.catalog import Catalog, NotFoundError
+from app.jobs.describe import (
+    describe_results,
+    describe_run,
+    describe_sequence,
+    follow_run,
+    frame_errors,
+    loss_curves,
+)
 from app.jobs.feed import Feed
+from app.jobs.log import open_log
 from app.jobs.scheduler import Scheduler
+from app.jobs.streams import News, Streams
+from app.jobs.watch import Watch
 from physhandi.data.exporters import export_run
-from physhandi.data.run import read_events
 from physhandi.errors import RunError
 from physhandi.fitting.profile import load_profile, profile_names
 
 Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
 ExportFormat = Literal["ply", "npz", "csv", "yaml"]
-STREAMS_PER_OWNER = 12
-"""Event streams that one browser may hold; a further one ends the oldest."""
-_POLL_S = 0.4
-_PING_S = 15.0
 
 
 class SessionOpener(Protocol):
@@ -78,7 +80,7 @@ def create_api(
     _add_listings(router, catalog, scheduler)
     _add_jobs(router, catalog, scheduler)
     _add_sessions(router, sessions)
-    _add_streams(router, catalog, feed)
+    _add_streams(router, catalog, scheduler, feed)
     return router
 
 
@@ -99,11 +101,28 @@ def _add_listings(router: APIRouter, catalog: Catalog, scheduler: Scheduler) -> 
     def show_run(run_id: Id) -> dict[str, Any]:
         item = catalog.run_item(run_id)
         results = describe_results(item.run) if item.run else {}
-        return describe_run(item, scheduler) | {"results": results}
+        return follow_run(item, scheduler) | {"results": results}
 
     @router.get("/runs/{run_id}/losses")
     def show_losses(run_id: Id) -> dict[str, Any]:
-        return {"losses": loss_curves(catalog.run(run_id))}
+        losses, number = loss_curves(catalog.run(run_id))
+        return {"losses": losses, "seq": number}
+
+    @router.get("/runs/{run_id}/frame_errors")
+    def show_frame_errors(run_id: Id) -> dict[str, Any]:
+        return {"sequences": frame_errors(catalog.run(run_id))}
+
+    @router.get("/runs/{run_id}/log")
+    def show_log(run_id: Id) -> Response:
+        log = open_log(catalog.run_item(run_id).folder)
+        headers = {"Content-Disposition": f'attachment; filename="{run_id}_log.txt"'}
+        if log is None:
+            raise NotFoundError(f"Run '{run_id}' has no log yet.")
+        content = iter(lambda: log.read(2**16), b"")
+        clean_up = BackgroundTask(log.close)
+        return StreamingResponse(
+            content, media_type="text/plain; charset=utf-8", headers=headers, background=clean_up
+        )
 
     @router.get("/profiles")
     def list_profiles() -> dict[str, Any]:
@@ -157,8 +176,8 @@ def _add_sessions(router: APIRouter, sessions: SessionOpener) -> None:
         return Response(status_code=204)
 
 
-def _add_streams(router: APIRouter, catalog: Catalog, feed: Feed) -> None:
-    streams = _Streams(STREAMS_PER_OWNER)
+def _add_streams(router: APIRouter, catalog: Catalog, scheduler: Scheduler, feed: Feed) -> None:
+    streams = Streams()
 
     @router.get("/events")
     async def follow_runs(
@@ -168,86 +187,24 @@ def _add_streams(router: APIRouter, catalog: Catalog, feed: Feed) -> None:
     ) -> StreamingResponse:
         last = last_event_id or since or await asyncio.to_thread(feed.cursor)
 
-        def news() -> Iterable[tuple[str, str, object]]:
+        def news() -> Iterable[News]:
             nonlocal last
             for change in feed.since(last):
                 last = change.id
                 yield change.id, change.event, change.data
 
-        return _stream(request, streams, news)
+        return streams.answer(request, news)
 
     @router.get("/runs/{run_id}/events")
-    async def follow_run(
-        request: Request, run_id: Id, last_event_id: Annotated[str | None, Header()] = None
+    async def watch_run(
+        request: Request,
+        run_id: Id,
+        since: Annotated[str | None, Query(max_length=64)] = None,
+        last_event_id: Annotated[str | None, Header(max_length=64)] = None,
     ) -> StreamingResponse:
-        folder = (await asyncio.to_thread(catalog.run_item, run_id)).folder
-        is_number = (last_event_id or "").isdecimal() and len(last_event_id or "") < 18
-        seen, offset = int(last_event_id or 0) if is_number else -1, 0
-
-        def news() -> Iterable[tuple[str, str, object]]:
-            nonlocal offset
-            events, offset = read_events(folder, offset)
-            for event in events:
-                if int(event.get("seq", -1)) > seen:
-                    yield str(event["seq"]), "progress", event
-
-        return _stream(request, streams, news)
-
-
-class _Streams:
-    """Counts the event streams of each browser and ends the oldest of too many."""
-
-    def __init__(self, limit: int) -> None:
-        self._limit = limit
-        self._lock = threading.Lock()
-        self._open: dict[str, deque[threading.Event]] = {}
-
-    def enter(self, owner: str) -> threading.Event:
-        """Register a stream; the returned event is set when it has to end."""
-        ended = threading.Event()
-        with self._lock:
-            streams = self._open.setdefault(owner, deque())
-            streams.append(ended)
-            if len(streams) > self._limit:
-                streams.popleft().set()
-        return ended
-
-    def leave(self, owner: str, ended: threading.Event) -> None:
-        """Forget a stream that is over."""
-        with self._lock:
-            streams = self._open.get(owner, deque())
-            if ended in streams:
-                streams.remove(ended)
-            if not streams:
-                self._open.pop(owner, None)
-
-
-def _stream(
-    request: Request, streams: _Streams, news: Callable[[], Iterable[tuple[str, str, object]]]
-) -> StreamingResponse:
-    """Send server-sent events: what is new, and a comment now and then if nothing is."""
-    owner: str = request.state.owner
-    stopping: threading.Event = request.app.state.stopping
-
-    async def events() -> AsyncIterator[str]:
-        ended, quiet = streams.enter(owner), 0.0
-        try:
-            yield "retry: 2000\n\n"
-            while not (ended.is_set() or stopping.is_set() or await request.is_disconnected()):
-                quiet += _POLL_S
-                for name, event, data in await asyncio.to_thread(lambda: list(news())):
-                    quiet = 0.0
-                    text = json.dumps(data, ensure_ascii=False)
-                    yield f"id: {name}\nevent: {event}\ndata: {text}\n\n"
-                if quiet >= _PING_S:
-                    quiet = 0.0
-                    yield ": ping\n\n"
-                await asyncio.sleep(_POLL_S)
-        finally:
-            streams.leave(owner, ended)
-
-    headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
-    return StreamingResponse(events(), media_type="text/event-stream", headers=headers)
+        item = await asyncio.to_thread(catalog.run_item, run_id)
+        watch = Watch(item.folder, lambda: follow_run(item, scheduler), last_event_id or since)
+        return streams.answer(request, watch.news)
 
 
 def _export(

@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import warp as wp
 
 from physhandi.data.attempt import Attempt
+from physhandi.data.environment import ENVIRONMENT, describe_environment
 from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.errors import MissingInputError
@@ -288,6 +290,8 @@ def run_job(run: Run, progress: Progress | None = None, *, device: str = "cpu") 
     """
     with run.begin_attempt() as attempt:
         watched = attempt.progress(progress)
+        environment = describe_environment(device, wp.get_device(device).name)
+        attempt.save_json(ENVIRONMENT, environment)
         sequences = [Sequence.load(Path(path)) for path in run.sequences]
         if run.kind == "simulation":
             source = Run.open(Path(run.config["source"]))

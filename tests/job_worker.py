@@ -1,9 +1,11 @@
 """A worker for tests of the queue: the run's name tells what it does."""
 
 import argparse
+import json
 import os
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -59,12 +61,48 @@ def fail(run: Run, attempt: Attempt) -> None:
     raise MissingInputError("'sheet' lacks a <b>hand</b>.")
 
 
+def defect(run: Run, attempt: Attempt) -> None:
+    attempt.progress().report("zeroth_order", 1, 4, 2.0)
+    {}["a <b>key</b>"]
+
+
+def script(run: Run, attempt: Attempt) -> None:
+    """Do what the lines of the file `script` say, in the order in which they are added."""
+    progress = attempt.progress()
+    done = 0
+    while True:
+        lines = (run.folder / "script").read_text().split("\n")[:-1] if is_there(run) else []
+        for line in lines[done:]:
+            done += 1
+            command, *values = json.loads(line)
+            if command == "report":
+                progress.report(*values)
+            elif command == "log":
+                sys.stdout.write("\n".join([*values, ""]))
+                sys.stdout.flush()
+            elif command == "save":
+                attempt.save_json(*values)
+            elif command == "finish":
+                attempt.finish_stage(*values)
+            elif command == "fail":
+                raise MissingInputError(*values)
+            elif command == "publish":
+                attempt.publish()
+                return
+        time.sleep(STEP_S)
+        progress.check_cancelled()
+
+
+def is_there(run: Run) -> bool:
+    return (run.folder / "script").is_file()
+
+
 def crash(run: Run, attempt: Attempt) -> None:
     os.write(1, b"the last words\n")
     os._exit(7)
 
 
-BEHAVIOURS = {f.__name__: f for f in (publish, wait, stubborn, killed, fail, crash)}
+BEHAVIOURS = {f.__name__: f for f in (publish, wait, stubborn, killed, fail, crash, defect, script)}
 
 
 def main() -> None:

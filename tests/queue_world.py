@@ -1,12 +1,15 @@
 """An application whose queue works, with the workers of `job_worker` and made-up live scenes."""
 
+import json
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
+import uvicorn
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
@@ -78,6 +81,11 @@ class QueueWorld:
             time.sleep(0.03)
         return run
 
+    def tell(self, run_id: str, *commands: list[Any]) -> None:
+        """Give a run named `script` its next commands; see `job_worker.script`."""
+        with (self.folder(run_id) / "script").open("a") as stream:
+            stream.writelines(json.dumps(command) + "\n" for command in commands)
+
     def folder(self, run_id: str) -> Path:
         return self.data_dir / "runs" / run_id
 
@@ -100,3 +108,21 @@ def queue_world(data_dir: Path, bundled: Path) -> Iterator[QueueWorld]:
         end_processes(folder, grace_s=0.0)
     for process in scheduler._started.values():
         process.wait()
+
+
+@contextmanager
+def serving(world: QueueWorld) -> Iterator[int]:
+    """Let browsers in on a port of this machine; when it is over, every stream has ended."""
+    config = uvicorn.Config(
+        world.app, port=0, lifespan="off", log_level="error", timeout_graceful_shutdown=2
+    )
+    server = uvicorn.Server(config)
+    thread = Thread(target=server.run, daemon=True)
+    thread.start()
+    while not server.started:
+        time.sleep(0.01)
+    yield server.servers[0].sockets[0].getsockname()[1]
+    world.app.state.stopping.set()
+    server.should_exit = True
+    thread.join(timeout=5)
+    assert not thread.is_alive()

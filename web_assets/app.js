@@ -53,7 +53,7 @@ async function act(button) {
   await send("POST", `/api/v1/runs/${button.dataset.id}/${button.dataset.act}`);
   toast(button.dataset.act === "cancel" ? "Cancelling …" : "Back in line");
   refresh("runs");
-  refresh("run");
+  dispatchEvent(new Event("run-changed"));
 }
 
 async function remove(button) {
@@ -115,13 +115,17 @@ document.addEventListener("keydown", (event) => {
 
 /* ---- what changes while one looks: one event stream per page, closed while it is hidden ---- */
 
+function duration(seconds) {
+  if (seconds > 0 && seconds < 9.95) return `${seconds.toFixed(1)} s`;
+  const [hours, minutes, rest] = [Math.floor(seconds / 3600), Math.floor((seconds % 3600) / 60), Math.floor(seconds % 60)];
+  if (hours) return `${hours} h ${minutes} min`;
+  return minutes ? `${minutes} min ${rest} s` : `${rest} s`;
+}
+
 function describe(report) {
   const parts = [report.stage.replaceAll("_", " "), `${report.iteration} of ${report.total}`];
   if (Number.isFinite(report.loss)) parts.push(`loss ${report.loss.toPrecision(4)}`);
-  if (Number.isFinite(report.eta_s)) {
-    const seconds = Math.round(report.eta_s);
-    parts.push(`${seconds < 60 ? `${seconds} s` : `${Math.floor(seconds / 60)} min ${seconds % 60} s`} left in this stage`);
-  }
+  if (report.eta_s > 0) parts.push(`${duration(Math.round(report.eta_s))} left in this stage`);
   return parts.join(" · ");
 }
 
@@ -135,39 +139,40 @@ function showProgress(row, run) {
   return true;
 }
 
-function onRun(run) {
-  const page = document.getElementById("run");
-  if (page) {
-    if (page.dataset.run !== run.id) return;
-    const isSame = page.dataset.state === run.state && page.dataset.stage === (run.progress.stage ?? "");
-    if (!isSame || (run.state === "running" && !showProgress(page, run))) refresh("run");
-    if (page.dataset.state !== run.state) refresh("results");
-    drawLosses();
-    if (document.getElementById("log-details").open) refresh("log");
-    return;
-  }
+function onListedRun(run) {
   const row = [...document.querySelectorAll("#runs [data-run]")].find((line) => line.dataset.run === run.id);
   const isMoving = row && row.dataset.state === run.state && run.state === "running";
   if (!isMoving || !showProgress(row, run)) refresh("runs");
 }
 
+/* What a page does on each kind of event; a page with another stream puts its own here. */
+const listeners = {
+  run: onListedRun,
+  gone: () => refresh("runs"),
+  reset: () => refresh("runs"),
+};
+const RETRY_MS = 5000;
 let stream = null;
 let cursor = null;
 
 function follow() {
   if (stream || document.hidden || !cursor) return;
-  stream = new EventSource(`/api/v1/events?since=${encodeURIComponent(cursor)}`);
-  const listen = (name, work) =>
+  const address = document.body.dataset.stream ?? "/api/v1/events";
+  stream = new EventSource(`${address}?since=${encodeURIComponent(cursor)}`);
+  for (const name of Object.keys(listeners)) {
     stream.addEventListener(name, (event) => {
       cursor = event.lastEventId;
-      work(JSON.parse(event.data));
+      listeners[name](JSON.parse(event.data));
     });
-  listen("run", onRun);
-  listen("gone", () => refresh("runs"));
-  listen("reset", () => ["runs", "run", "results"].forEach(refresh));
+  }
   const offline = document.querySelector("[data-offline]");
   stream.addEventListener("open", () => (offline.hidden = true));
-  stream.addEventListener("error", () => (offline.hidden = false));
+  stream.addEventListener("error", () => {
+    offline.hidden = false;
+    if (stream?.readyState !== EventSource.CLOSED) return; // The browser comes back by itself.
+    unfollow();
+    setTimeout(follow, RETRY_MS);
+  });
 }
 
 function unfollow() {
@@ -179,62 +184,10 @@ document.addEventListener("visibilitychange", () => (document.hidden ? unfollow(
 addEventListener("pagehide", unfollow);
 addEventListener("pageshow", follow);
 
-/* ---- loss curves ---- */
-
-const charts = new Map();
-let drawing = false;
-
-function color(name) {
-  return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-}
-
-function makeChart(place, stage, data) {
-  const figure = document.createElement("figure");
-  const caption = document.createElement("figcaption");
-  caption.textContent = stage.replaceAll("_", " ");
-  figure.append(caption);
-  place.append(figure);
-  const axis = { stroke: color("--pico-muted-color"), grid: { stroke: color("--pico-muted-border-color"), width: 1 }, ticks: { show: false } };
-  const [low, high] = [Math.min(...data[1]), Math.max(...data[1])];
-  const plot = new uPlot({
-    width: figure.clientWidth || 320,
-    height: 190,
-    cursor: { y: false },
-    scales: { x: { time: false }, y: low > 0 && high > 5 * low ? { distr: 3 } : {} },
-    axes: [{ ...axis, label: "iteration", labelSize: 18, size: 36 },
-      { ...axis, size: 62, values: (_, ticks) => ticks.map((tick) => (tick === null ? "" : Number(tick.toPrecision(3)).toString())) }],
-    series: [{ label: "iteration" }, { label: "loss", stroke: color("--pico-primary"), width: 2, points: { show: data[0].length < 30, size: 5 } }],
-  }, data, figure);
-  return { plot, figure };
-}
-
-async function drawLosses() {
-  const section = document.getElementById("losses");
-  if (!section || drawing) return;
-  drawing = true;
-  try {
-    const { losses } = await send("GET", section.dataset.losses);
-    for (const [stage, { curve }] of Object.entries(losses)) {
-      if (curve.length < 2) continue;
-      section.hidden = false;
-      const data = [curve.map((point) => point[0]), curve.map((point) => point[1])];
-      const known = charts.get(stage);
-      if (known) known.plot.setData(data);
-      else charts.set(stage, makeChart(section.querySelector(".charts"), stage, data));
-    }
-  } catch (error) {
-    toast(error.message, true);
-  } finally {
-    setTimeout(() => (drawing = false), 1500);
-  }
-}
-
-addEventListener("resize", () => charts.forEach(({ plot, figure }) => plot.setSize({ width: figure.clientWidth, height: 190 })));
-
 /* ---- start ---- */
 
-function showLocalTimes() {
-  for (const place of document.querySelectorAll("time")) {
+function showLocalTimes(root = document) {
+  for (const place of root.querySelectorAll("time")) {
     place.textContent = new Date(place.dateTime).toLocaleString([], { dateStyle: "medium", timeStyle: "short" });
   }
 }
@@ -247,15 +200,8 @@ document.addEventListener("DOMContentLoaded", () => {
   cursor = document.body.dataset.since ?? null;
   showLocalTimes();
   follow();
-  drawLosses();
-  const log = document.getElementById("log");
-  if (log) log.scrollTop = log.scrollHeight;
   const scene = document.getElementById("scene");
   scene?.addEventListener("load", () => scene.contentWindow.focus());
 });
 
-document.addEventListener("htmx:afterSettle", () => {
-  showLocalTimes();
-  const log = document.getElementById("log");
-  if (log) log.scrollTop = log.scrollHeight;
-});
+document.addEventListener("htmx:afterSettle", () => showLocalTimes());

@@ -1,14 +1,21 @@
 """What the API and the pages say about sequences and runs, as plain data."""
 
+import hashlib
+import json
+from dataclasses import asdict
 from typing import Any, cast
 
 from app.jobs.catalog import RunItem, SequenceItem
+from app.jobs.failures import explain
 from app.jobs.scheduler import Scheduler
+from app.jobs.stages import stages_of
 from physhandi.data.atomic import named_fields
+from physhandi.data.environment import ENVIRONMENT
 from physhandi.data.run import Run, read_events
 from physhandi.errors import PhysHandiError
 
 PARTS = ("color", "depth", "mask", "keypoint", "track", "control", "marker", "object_node")
+_RESULTS = ("losses.json", "metrics.json", "object/parameters.yaml", ENVIRONMENT)
 CURVE_LIMIT = 2000
 """Most points of a curve that are sent to a browser."""
 
@@ -73,13 +80,42 @@ def describe_run(item: RunItem, scheduler: Scheduler) -> dict[str, Any]:
     }
 
 
+def follow_run(item: RunItem, scheduler: Scheduler) -> dict[str, Any]:
+    """Describe one run as its own page shows it.
+
+    Returns:
+        `describe_run`, with ``stages`` (see `StageView`), ``failure`` (``message advice`` of a
+        failed run, else none) and ``revision``, which differs whenever anything but the progress
+        within a stage does.
+    """
+    described = describe_run(item, scheduler)
+    run, state = item.run, described["state"]
+    results: list[tuple[str, int]] = []
+    stages: list[dict[str, Any]] = []
+    try:
+        if run is not None:
+            stages = stages_of(run, state)
+            results = [
+                (rel, (run.out / rel).stat().st_mtime_ns) for rel in _RESULTS if run.has(rel)
+            ]
+    except (PhysHandiError, OSError) as error:
+        described |= {"state": "failed", "reason": str(error)}
+    failure = asdict(explain(run, described["reason"])) if state == "failed" else None
+    shown = [described | {"progress": None}, results, failure]
+    shown += [stage | {"seconds": None} for stage in stages]
+    revision = hashlib.sha256(json.dumps(shown, default=str).encode()).hexdigest()[:16]
+    return described | {"stages": stages, "failure": failure, "revision": revision}
+
+
 def describe_results(run: Run) -> dict[str, dict[str, Any]]:
-    """Collect what a run has found so far: losses, metrics and parameters, each by name."""
+    """Collect what a run has found so far: losses, metrics, parameters and environment."""
     results: dict[str, dict[str, Any]] = {}
     try:
         for name in ("losses", "metrics"):
             if run.has(f"{name}.json"):
                 results[name] = named_fields(run.json(f"{name}.json")) or {}
+        if run.has(ENVIRONMENT):
+            results["environment"] = named_fields(run.json(ENVIRONMENT)) or {}
         if run.has("object/parameters.yaml"):
             results["parameters"] = named_fields(run.yaml("object/parameters.yaml")) or {}
     except PhysHandiError as error:
@@ -87,16 +123,39 @@ def describe_results(run: Run) -> dict[str, dict[str, Any]]:
     return results
 
 
-def loss_curves(run: Run) -> dict[str, dict[str, Any]]:
+def frame_errors(run: Run) -> dict[str, dict[str, Any]]:
+    """Give the errors of every frame, for each sequence that they were measured in.
+
+    Returns:
+        For each sequence what its ``frame_errors.json`` holds (``unit frames`` and by method
+        ``track_error chamfer_l2``) and ``future_start``, the first frame that was not fitted.
+    """
+    metrics = describe_results(run).get("metrics", {})
+    found: dict[str, dict[str, Any]] = {}
+    for name in run.sequence_names:
+        rel = f"sequences/{name}/frame_errors.json"
+        if not run.has(rel):
+            continue
+        content = named_fields(run.json(rel)) or {}
+        scores = named_fields(metrics.get(name)) or {}
+        future = (named_fields(scores.get("future")) or {}).get("frames")
+        found[name] = content | {"future_start": future[0] if isinstance(future, list) else None}
+    return found
+
+
+def loss_curves(run: Run) -> tuple[dict[str, dict[str, Any]], int]:
     """Give the loss of each stage over its iterations, of a running stage as far as it is.
 
     Returns:
         For each stage its ``before`` and ``after``, null while it runs, and the ``curve`` of
-        ``[iteration, loss]``, thinned to `CURVE_LIMIT` points so that every peak stays.
+        ``[iteration, loss]``, thinned to `CURVE_LIMIT` points so that every peak stays; then the
+        number of the last event that it holds, -1 if there is none.
     """
     curves: dict[str, list[list[float]]] = {}
     events, _ = read_events(run.folder)
+    latest = -1
     for event in events:
+        latest = int(event.get("seq", latest))
         loss, iteration = event.get("loss"), event.get("iteration")
         if not isinstance(loss, int | float) or not isinstance(iteration, int):
             continue
@@ -114,7 +173,7 @@ def loss_curves(run: Run) -> dict[str, dict[str, Any]]:
             "after": summary.get("after"),
             "curve": thin(curve, CURVE_LIMIT),
         }
-    return result
+    return result, latest
 
 
 def thin(curve: list[list[float]], limit: int) -> list[list[float]]:

@@ -4,14 +4,41 @@ import argparse
 import logging
 import signal
 import sys
+import time
 from pathlib import Path
 from types import FrameType
 
 from app.jobs.processes import die_with_parent
 from physhandi.data.run import Run
 from physhandi.errors import CancelledError, PhysHandiError
+from physhandi.progress import Progress
 
 logger = logging.getLogger(__name__)
+_LOG_INTERVAL_S = 5.0
+
+
+class LoggedProgress(Progress):
+    """Logs when a stage begins, and now and then how far it is."""
+
+    def __init__(self) -> None:
+        self._stage = ""
+        self._time = 0.0
+
+    def report(
+        self,
+        stage: str,
+        iteration: int,
+        total: int,
+        loss: float | None = None,
+        message: str = "",
+    ) -> None:
+        """Log a report, unless the last one was just now; see `Progress.report`."""
+        if stage == self._stage and time.monotonic() - self._time < _LOG_INTERVAL_S:
+            return
+        self._stage, self._time = stage, time.monotonic()
+        told = f"{stage}: {iteration} of {total}"
+        told += "" if loss is None else f", loss {loss:.4g}"
+        logger.info("%s", f"{told} ({message})" if message else told)
 
 
 def work(run_folder: Path, device: str) -> int:
@@ -24,15 +51,16 @@ def work(run_folder: Path, device: str) -> int:
     try:
         from physhandi import pipeline
 
-        pipeline.run_job(run, device=device)
+        pipeline.run_job(run, LoggedProgress(), device=device)
     except CancelledError as error:
         logger.info("%s", error)
         return 0
     except PhysHandiError as error:
         logger.error("%s", error)  # noqa: TRY400  # the message is for the user; no traceback
         return 1
-    except Exception:
-        logger.exception("run %s stopped by a defect of the program", run.id)
+    except Exception as error:
+        defect = f"{type(error).__name__}: {error}"
+        logger.exception("run %s stopped by a defect of the program (%s)", run.id, defect)
         return 1
     logger.info("run %s is finished", run.id)
     return 0

@@ -1,5 +1,6 @@
 """One try at filling a run: its files, finished stages and publication."""
 
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
@@ -62,6 +63,7 @@ class Attempt:
         self._records: dict[str, tuple[tuple[int, int, int], dict[str, Any]]] = {}
         self._stages: list[dict[str, Any]] = []
         self._is_open = True
+        self._stage_clock = time.monotonic()
         sweep_temporary(run_folder.rglob(".*.tmp"))
         self._prepare(numbers)
         if read_mapping(run_folder / EXIT).get("state") == "cancelled":
@@ -146,9 +148,11 @@ class Attempt:
     def finish_stage(self, name: str, summary: Mapping[str, Any] | None = None) -> None:
         """Declare a stage finished with all files that were written until now.
 
-        Summaries of all stages are collected in ``losses.json``.
+        Summaries of all stages are collected in ``losses.json``. A stage's time runs from the end
+        of the one before, or from the beginning of the attempt.
         """
         self._lease.check()
+        seconds = time.monotonic() - self._stage_clock
         known: dict[str, Any] = {}
         for stage in self._stages:
             known |= stage["files"]
@@ -159,8 +163,15 @@ class Attempt:
         }
         self._stages = [stage for stage in self._stages if stage["name"] != name]
         self._stages.append(
-            {"name": name, "time": now(), "summary": dict(summary or {}), "files": files}
+            {
+                "name": name,
+                "time": now(),
+                "seconds": round(seconds, 3),
+                "summary": dict(summary or {}),
+                "files": files,
+            }
         )
+        self._stage_clock = time.monotonic()
         write_json(self.folder / STAGES, self._stages)
         self._save_losses()
 

@@ -1,12 +1,12 @@
 """The reading side of a run folder: its state and its published outputs."""
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 from numpy import ndarray
 from safetensors import SafetensorError
 
-from physhandi.data.atomic import read_array, read_tensors
+from physhandi.data.atomic import named_fields, read_array, read_tensors
 from physhandi.data.lease import live_holder
 from physhandi.data.run_files import (
     ATTEMPTS,
@@ -15,6 +15,7 @@ from physhandi.data.run_files import (
     EXIT,
     MANIFEST,
     OUT,
+    STAGES,
     artefacts,
     attempt_numbers,
     find_damage,
@@ -64,6 +65,30 @@ class RunOutputs:
     def is_published(self) -> bool:
         """Whether there are published results."""
         return self._published() is not None
+
+    @property
+    def attempt(self) -> int | None:
+        """Number of the latest attempt; none if no attempt was begun yet."""
+        return max(attempt_numbers(self.folder), default=None)
+
+    def stages(self) -> list[dict[str, Any]]:
+        """Give the finished stages of the latest attempt, in the order in which they ended.
+
+        Returns:
+            For each stage ``name``, ``time`` of its end, ``seconds`` that it took (where they were
+            measured), ``summary`` (what `Attempt.finish_stage` was told) and ``files``.
+
+        Raises:
+            RunError: If their list is damaged.
+        """
+        path = self.folder / ATTEMPTS / str(self.attempt) / STAGES
+        content: Any = read_json(path) if path.is_file() else []
+        if not isinstance(content, list):
+            raise RunError(f"{path} must list stages; it is damaged.")
+        stages = [named_fields(entry) or {} for entry in cast("list[Any]", content)]
+        if any("name" not in stage for stage in stages):
+            raise RunError(f"{path} must name its stages; it is damaged.")
+        return stages
 
     @property
     def out(self) -> Path:

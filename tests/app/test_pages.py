@@ -4,7 +4,7 @@ import json
 import re
 
 from app.jobs.describe import thin
-from app.pages import duration, stage_states, tabulate
+from app.pages.render import duration, short, words
 from app.settings import WEB_ASSETS
 
 
@@ -32,37 +32,6 @@ def test_no_page_loads_anything_from_elsewhere() -> None:
         )
 
 
-def test_stages_are_done_at_work_or_to_come() -> None:
-    run = {"kind": "reconstruction", "state": "running", "progress": {"stage": "zeroth_order"}}
-    finished = {"hand_reconstruction": {"before": 2.0, "after": 1.0}, "observation": {}}
-    stages = stage_states(run, finished)
-    assert [stage["state"] for stage in stages] == ["done", "done", "at-work", "to-come", "to-come"]
-    assert stages[0]["after"] == 1.0
-    hands_only = stage_states(run | {"state": "succeeded"}, {"hand_reconstruction": {}})
-    assert [stage["name"] for stage in hands_only] == ["hand_reconstruction"]
-
-
-def test_rivals_stand_side_by_side_and_the_lowest_error_is_the_best() -> None:
-    scores = {
-        "unit": "m",
-        "future": {
-            "frames": [7, 10],
-            "rollout": {"chamfer": 0.01, "track_error": None},
-            "static": {"chamfer": 0.03, "track_error": 0.2},
-        },
-        "hands": {"right": {"mean": 3.0}},
-    }
-    shown = tabulate(scores)
-    assert shown["notes"] == [("unit", "m"), ("hands · right · mean", 3.0)]
-    (table,) = shown["tables"]
-    assert table["columns"] == ["rollout", "static"]
-    assert table["rows"] == [
-        {"name": "chamfer", "values": [0.01, 0.03], "best": 0.01},
-        {"name": "track_error", "values": [None, 0.2], "best": 0.2},
-    ]
-    assert tabulate("damaged") == {"tables": [], "notes": []}
-
-
 def test_a_thinned_curve_keeps_its_peaks() -> None:
     curve = [[float(i), float(i % 10)] for i in range(10_000)]
     curve[7001][1] = -500.0
@@ -76,4 +45,12 @@ def test_a_thinned_curve_keeps_its_peaks() -> None:
 
 
 def test_times_are_told_in_minutes_from_one_on() -> None:
-    assert [duration(s) for s in (None, 0.4, 59.9, 61)] == ["", "0 s", "59 s", "1 min 1 s"]
+    told = [duration(s) for s in (None, 0, 0.44, 9.94, 9.96, 59.9, 61, 3599, 7322.0)]
+    expected = ["", "0 s", "0.4 s", "9.9 s", "9 s", "59 s", "1 min 1 s", "59 min 59 s", "2 h 2 min"]
+    assert told == expected
+
+
+def test_numbers_keep_four_digits_and_names_become_words() -> None:
+    shown = [short(v) for v in (None, 7, "x", 2230.745, 0.0316404, 1e4, 9.47015e-5, 0.0, 2.5e9)]
+    assert shown == ["none", "7", "x", "2231", "0.03164", "10000", "9.470e-05", "0", "2.5e+09"]
+    assert words("chamfer_dynamic_l1") == "chamfer dynamic L1"

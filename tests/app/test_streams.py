@@ -2,16 +2,13 @@
 
 import json
 import re
-import time
 from collections.abc import Callable, Iterator
 from http.client import HTTPConnection, HTTPResponse
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 import pytest
-import uvicorn
-from queue_world import QueueWorld, queue_world
+from queue_world import QueueWorld, queue_world, serving
 
 
 class Stream:
@@ -53,19 +50,8 @@ def world(data_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> It
 
 @pytest.fixture
 def port(world: QueueWorld) -> Iterator[int]:
-    config = uvicorn.Config(
-        world.app, port=0, lifespan="off", log_level="error", timeout_graceful_shutdown=2
-    )
-    server = uvicorn.Server(config)
-    thread = Thread(target=server.run, daemon=True)
-    thread.start()
-    while not server.started:
-        time.sleep(0.01)
-    yield server.servers[0].sockets[0].getsockname()[1]
-    world.app.state.stopping.set()
-    server.should_exit = True
-    thread.join(timeout=5)
-    assert not thread.is_alive()
+    with serving(world) as port:
+        yield port
 
 
 def test_a_page_follows_a_run_through_one_stream_without_gap_or_repetition(
@@ -93,10 +79,48 @@ def test_a_runs_own_stream_goes_on_after_the_last_event_seen(world: QueueWorld, 
     run_id = world.launch("publish")
     world.until(run_id, "succeeded")
     path = f"/api/v1/runs/{run_id}/events"
-    events = Stream(port, world.token, path).events(lambda event: event["id"] == "1")
-    assert [event["data"]["stage"] for event in events] == ["first", "second"]
-    later = Stream(port, world.token, path, **{"Last-Event-ID": "0"})
-    assert [event["id"] for event in later.events(lambda _: True)] == ["1"]
+    events = Stream(port, world.token, path).events(lambda event: event["event"] == "run")
+    reports = [event for event in events if event["event"] == "progress"]
+    assert [event["data"]["stage"] for event in reports] == ["first", "second"]
+    assert [event["data"]["seq"] for event in reports] == [0, 1]
+    assert [stage["name"] for stage in events[-1]["data"]["stages"]] == ["first"]
+    for since in ({"Last-Event-ID": reports[0]["id"]}, {"Last-Event-ID": "0"}):
+        later = Stream(port, world.token, path, **since).events(lambda e: e["event"] == "run")
+        assert [event["data"]["seq"] for event in later if event["event"] == "progress"] == [1]
+    shown = Stream(port, world.token, f"{path}?since={events[-1]['id']}")
+    assert [event["event"] for event in shown.events(lambda e: e["event"] == "run")] == ["run"]
+
+
+def test_a_runs_stream_tells_its_stages_its_log_and_its_end(world: QueueWorld, port: int) -> None:
+    run_id = world.launch("script")
+    world.until(run_id, "running")
+    stream = Stream(port, world.token, f"/api/v1/runs/{run_id}/events")
+    world.tell(
+        run_id,
+        ["log", "one", "two"],
+        ["report", "hand_reconstruction", 5, 10, 3.0],
+        ["finish", "hand_reconstruction", {"before": 4.0, "after": 2.0}],
+        ["report", "observation", 1, 2],
+        ["fail", "'sheet' lacks <b>markers</b>."],
+    )
+    events = stream.events(lambda e: e["event"] == "run" and e["data"]["state"] == "failed")
+    log = "".join(event["data"]["text"] for event in events if event["event"] == "log")
+    assert "one\ntwo\n" in log
+    assert "Traceback" not in log
+    last = events[-1]["data"]
+    states = {stage["name"]: stage["state"] for stage in last["stages"]}
+    assert states["hand_reconstruction"] == "done"
+    assert states["observation"] == "failed"
+    assert set(states.values()) == {"done", "failed", "to-come"}
+    assert last["failure"]["message"] == "'sheet' lacks <b>markers</b>."
+    assert last["failure"]["advice"]
+    again = Stream(
+        port, world.token, f"/api/v1/runs/{run_id}/events", **{"Last-Event-ID": events[-1]["id"]}
+    )
+    assert world.client.delete(f"/api/v1/runs/{run_id}").status_code == 204
+    rest = [event["event"] for event in again.events(lambda e: e["event"] == "gone")]
+    assert rest[-1] == "gone"
+    assert set(rest) <= {"run", "gone"}
 
 
 def test_of_too_many_streams_the_oldest_ends(world: QueueWorld, port: int) -> None:

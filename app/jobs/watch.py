@@ -1,0 +1,86 @@
+"""What one browser is told about one run: its state, its progress and its log."""
+
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from app.jobs.log import read_log
+from app.jobs.scheduler import ENDED
+from app.jobs.streams import News
+from physhandi.data.run import read_events
+from physhandi.errors import PhysHandiError
+
+_CURSOR = re.compile(r"(-?\d{1,15})(?:-(\d{1,15}))?")
+
+
+class Watch:
+    """Follows a run from where a reader left it.
+
+    Its events are ``run`` (see `follow_run`; first of all, then on every change), ``progress``
+    (one report of the worker), ``log`` (``text is_whole``, see `LogPart`) and ``gone``. Each is
+    named ``<number of the last report>-<position in the log>``, so that a reader that comes back
+    with the last name goes on without gap or repetition.
+    """
+
+    def __init__(
+        self, folder: Path, look: Callable[[], dict[str, Any]], cursor: str | None
+    ) -> None:
+        """Prepare.
+
+        Args:
+            folder: Folder of the run.
+            look: Describes the run as it is now.
+            cursor: Name of the last event that the reader saw. Without one, or with one that is
+                none, reports come from the first on, and the log from `TAIL_BYTES` before its end.
+        """
+        found = _CURSOR.fullmatch(cursor or "")
+        self._folder = folder
+        self._look = look
+        self._seen = int(found[1]) if found else -1
+        self._log = int(found[2]) if found and found[2] else None
+        self._offset = 0
+        self._known: dict[str, Any] | None = None
+        self._is_gone = False
+
+    def news(self) -> Iterator[News]:
+        """Give what is new since the last call."""
+        if self._is_gone:
+            return
+        if not self._folder.is_dir():
+            self._is_gone = True
+            yield self._name, "gone", {"id": self._folder.name}
+            return
+        # Looked at first: whatever was written before it ended is then read below.
+        run = self._described()
+        yield from self._reports()
+        yield from self._lines(is_ended=run["state"] in ENDED)
+        if run != self._known:
+            self._known = run
+            yield self._name, "run", run
+
+    @property
+    def _name(self) -> str:
+        return f"{self._seen}" if self._log is None else f"{self._seen}-{self._log}"
+
+    def _described(self) -> dict[str, Any]:
+        try:
+            return self._look()
+        except (PhysHandiError, OSError):
+            # It is being deleted; the next look finds it gone.
+            return self._known or {"state": ""}
+
+    def _reports(self) -> Iterator[News]:
+        events, self._offset = read_events(self._folder, self._offset)
+        for event in events:
+            number = int(event.get("seq", -1))
+            if number > self._seen:
+                self._seen = number
+                yield self._name, "progress", event
+
+    def _lines(self, *, is_ended: bool) -> Iterator[News]:
+        part = read_log(self._folder, self._log, is_ended=is_ended)
+        is_new = part.end != self._log and part.text != ""
+        self._log = part.end
+        if is_new:
+            yield self._name, "log", {"text": part.text, "is_whole": part.is_whole}

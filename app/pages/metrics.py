@@ -1,0 +1,131 @@
+"""Scores as tables: units that people read, what is best, and what each rival is."""
+
+from typing import Any, cast
+
+from app.pages.render import short, words
+from physhandi.data.atomic import named_fields
+
+METHODS = {
+    "rollout": "The fitted object, simulated from frame 0 on with the motion of the hand.",
+    "static": "Baseline: the object stays as it is in frame 0.",
+    "rigid_follow": "Baseline: the object of frame 0 moves rigidly with the control nodes.",
+}
+"""What the columns of a comparison are."""
+_HIGHER = {"accuracy", "iou", "precision", "recall", "f1", "psnr", "ssim"}
+_SHARES = {"accuracy", "iou", "precision", "recall", "f1"}
+_LENGTHS = {"chamfer", "error", "mpjpe", "distance", "spacing", "resolution"}
+_COUNTS = {"frames", "count", "scored", "seed"}
+_ABOUT = (
+    ("chamfer_dynamic", "Only over observed points that move more than 10 mm from frame 0."),
+    ("chamfer_symmetric", "Mean of both ways between observed points and nodes."),
+    ("chamfer_l1", "From each observed point to its nearest node, in the L1 norm as in PhysTwin."),
+    ("chamfer_l2", "From each observed point to its nearest node, the straight distance."),
+    ("track_error", "From each tracked point to where the object has moved it."),
+    ("marker_error", "From each marker to its node."),
+    ("reprojection", "Joints of the hand against the detected keypoints, in the images."),
+    (
+        "radius_deviation",
+        "Connection radius over resolution, against the recommended 3: |(δ/Δx)/3 - 1|.",
+    ),
+    ("mpjpe", "Mean distance of the hand's joints to the true ones."),
+    ("iou", "Nodes in contact in both over nodes in contact in either."),
+    ("accuracy", "Share of nodes whose contact is told rightly."),
+)
+
+
+def tabulate(scores: Any) -> dict[str, Any]:
+    """Arrange the scores of a sequence as tables; single facts become notes.
+
+    Returns:
+        ``tables``, each with ``name note columns rows``: a column has ``name about``, a row
+        ``name about unit is_higher_better`` and ``cells`` of ``text is_best``. Only rivals that
+        include the rollout are compared. Then ``notes``, pairs of a name and a text.
+    """
+    tables: list[dict[str, Any]] = []
+    notes: list[tuple[str, str]] = []
+    fields = named_fields(scores) or {}
+    unit = str(fields.get("unit", "m"))
+    for name, part in fields.items():
+        inside = named_fields(part)
+        if inside is None:
+            if name != "unit":
+                notes.append((words(name), _fact(name, part)))
+            continue
+        columns = {
+            key: inner for key, v in inside.items() if (inner := named_fields(v)) is not None
+        }
+        facts = {key: v for key, v in inside.items() if key not in columns and key != "unit"}
+        if not columns:
+            columns, facts = {"value": facts}, {}
+        note = ", ".join(f"{words(key)} {_fact(key, v)}" for key, v in facts.items())
+        rows = _rows(columns, str(inside.get("unit", unit)))
+        heads = [{"name": key, "about": METHODS.get(key, "")} for key in columns]
+        tables.append({"name": name, "note": note, "columns": heads, "rows": rows})
+    return {"tables": tables, "notes": notes}
+
+
+def scaled(value: Any, unit: str) -> tuple[Any, str]:
+    """Turn metres into millimetres and shares into percent; leave the rest."""
+    factor, shown = {"m": (1000.0, "mm"), "share": (100.0, "%")}.get(unit, (1.0, unit))
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return (value * factor if is_number and factor != 1.0 else value), shown
+
+
+def _rows(columns: dict[str, dict[str, Any]], unit: str) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = []
+    for quantity in dict.fromkeys(key for column in columns.values() for key in column):
+        values = [column.get(quantity) for column in columns.values()]
+        if quantity == "unit" or all(value is None for value in values):
+            continue
+        parts = set(quantity.split("_"))
+        local = next((str(c["unit"]) for c in columns.values() if "unit" in c), unit)
+        kind = _unit_of(parts, local)
+        is_higher = bool(parts & _HIGHER)
+        known = [v for v in values if isinstance(v, int | float)]
+        is_contest = "rollout" in columns and len(known) > 1 and not parts & _COUNTS
+        best = (max if is_higher else min)(known) if is_contest else None
+        rows.append(
+            {
+                "name": quantity,
+                "about": next((text for start, text in _ABOUT if start in quantity), ""),
+                "unit": scaled(None, kind)[1],
+                "is_higher_better": is_higher,
+                "cells": [
+                    {
+                        "text": "none" if value is None else _figure(scaled(value, kind)[0]),
+                        "is_best": best is not None and value == best,
+                    }
+                    for value in values
+                ],
+            }
+        )
+    return rows
+
+
+def _figure(value: Any) -> str:
+    """Show four digits, the last ones too if they are zero, so that columns compare."""
+    is_plain = isinstance(value, float) and 1e-3 <= abs(value) < 1e3
+    return f"{value:#.4g}" if is_plain else short(value)
+
+
+def _unit_of(parts: set[str], unit: str) -> str:
+    """Tell what a quantity is measured in by the words of its name; empty for a mere number."""
+    if parts & _COUNTS:
+        return ""
+    if parts & _SHARES:
+        return "share"
+    if "reprojection" in parts:
+        return "px"
+    return unit if parts & _LENGTHS else ""
+
+
+def _fact(name: str, value: Any) -> str:
+    if name == "frames" and isinstance(value, list):
+        first, end = cast("list[int]", value)
+        return f"{first} to {end - 1}"
+    fields = named_fields(value)
+    if fields is not None:
+        return ", ".join(f"{words(key)} {_fact(key, inner)}" for key, inner in fields.items())
+    kind = _unit_of(set(name.split("_")), "m")
+    shown, unit = scaled(value, kind)
+    return f"{short(shown)} {unit}".strip()

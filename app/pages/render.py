@@ -1,0 +1,73 @@
+"""Filling templates, and how numbers, names and times are written on pages."""
+
+import re
+from typing import Any
+
+from fastapi.responses import HTMLResponse
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
+
+from app.jobs.log import level_of
+from app.settings import WEB_ASSETS
+
+_TITLES = {
+    400: "The server cannot answer this",
+    404: "Nothing is here",
+    409: "That does not work now",
+    422: "That is not possible",
+    429: "Too much at once",
+    500: "Something went wrong",
+}
+
+
+class Pages:
+    """Renders templates; everything a user wrote is escaped."""
+
+    def __init__(self) -> None:
+        environment: Any = Environment(
+            loader=FileSystemLoader(WEB_ASSETS / "templates"),
+            autoescape=select_autoescape(default=True),
+            undefined=StrictUndefined,
+            trim_blocks=True,
+            lstrip_blocks=True,
+        )
+        environment.filters.update(short=short, words=words, duration=duration, level=level_of)
+        self._environment: Environment = environment
+
+    def render(self, name: str, *, status: int = 200, **values: Any) -> HTMLResponse:
+        """Fill a template."""
+        return HTMLResponse(self._environment.get_template(name).render(values), status_code=status)
+
+    def error(self, status: int, message: str) -> HTMLResponse:
+        """Show an error in the frame of the application."""
+        title = _TITLES.get(status, "That did not work")
+        return self.render("error.html", status=status, code=status, title=title, message=message)
+
+
+def short(value: Any) -> str:
+    """Show a number with about four digits, anything else as it is."""
+    if value is None:
+        return "none"
+    if not isinstance(value, float):
+        return str(value)
+    size = abs(value)
+    if 1e3 <= size < 1e7:
+        return f"{value:.0f}"
+    return f"{value:.3e}" if 0 < size < 1e-3 else f"{value:.4g}"
+
+
+def words(value: Any) -> str:
+    """Show a name of the program as words."""
+    return re.sub(r"\bl([12])\b", r"L\1", str(value).replace("_", " "))
+
+
+def duration(seconds: Any) -> str:
+    """Show a time that is left or was taken."""
+    if seconds is None:
+        return ""
+    if 0 < seconds < 9.95:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(int(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours:
+        return f"{hours} h {minutes} min"
+    return f"{minutes} min {rest} s" if minutes else f"{rest} s"

@@ -1,0 +1,179 @@
+"""The pages: home, one run, one live scene."""
+
+from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Any, Protocol
+
+import cv2
+from fastapi import APIRouter, Response
+from fastapi.responses import HTMLResponse
+from pydantic import Field
+from starlette.exceptions import HTTPException
+
+from app.jobs.catalog import Catalog, RunItem
+from app.jobs.describe import describe_results, describe_run, describe_sequence, follow_run
+from app.jobs.feed import Feed
+from app.jobs.log import read_log
+from app.jobs.scheduler import ENDED, Scheduler
+from app.pages.metrics import METHODS, tabulate
+from app.pages.parameters import parameter_rows
+from app.pages.render import Pages
+from physhandi.data.sequence import Sequence
+from physhandi.fitting.profile import load_profile, profile_names
+
+Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
+_RUNS_SHOWN = 50
+_THUMBNAIL_WIDTH = 640
+
+
+class ShownScene(Protocol):
+    """What a page says about a live scene."""
+
+    @property
+    def kind(self) -> str:
+        """``run`` or ``sequence``."""
+        ...
+
+    @property
+    def target(self) -> str:
+        """Id of the run or the sequence."""
+        ...
+
+    @property
+    def title(self) -> str:
+        """Its name."""
+        ...
+
+
+class Scene(Protocol):
+    """A live scene of the viewer."""
+
+    @property
+    def info(self) -> ShownScene:
+        """What is to be said about it."""
+        ...
+
+
+class Scenes(Protocol):
+    """The part of the live viewer that the pages need."""
+
+    def get(self, session_id: str) -> Scene | None:
+        """Find a live scene."""
+        ...
+
+
+def create_pages(
+    catalog: Catalog, scheduler: Scheduler, feed: Feed, scenes: Scenes, pages: Pages
+) -> APIRouter:
+    """Make the routes of the pages.
+
+    Args:
+        catalog: Finds sequences and runs.
+        scheduler: Tells how far runs are.
+        feed: Names the state that a page shows.
+        scenes: Finds live scenes.
+        pages: Renders.
+    """
+    router = APIRouter(include_in_schema=False)
+
+    @router.get("/")
+    def home(*, all: bool = False) -> HTMLResponse:  # noqa: A002  # the query's name
+        cursor = feed.cursor()
+        runs = [describe_run(item, scheduler) for item in catalog.runs()]
+        sequences = [describe_sequence(item) for item in catalog.sequences()]
+        return pages.render(
+            "home.html",
+            cursor=cursor,
+            sequences=sequences,
+            runs=runs
+            if all
+            else runs[:_RUNS_SHOWN] + [r for r in runs[_RUNS_SHOWN:] if _is_kept(r)],
+            address="/?all=true" if all else "/",
+            hidden_count=0 if all else sum(not _is_kept(r) for r in runs[_RUNS_SHOWN:]),
+            featured=_featured(runs),
+            profiles=[(name, load_profile(name).description) for name in ordered_profiles()],
+        )
+
+    @router.get("/runs/{run_id}")
+    def run(run_id: Id) -> HTMLResponse:
+        item = catalog.run_item(run_id)
+        described = follow_run(item, scheduler)
+        log = read_log(item.folder, is_ended=described["state"] in ENDED)
+        return pages.render(
+            "run.html", log=log, is_listed=item.run is not None, **run_values(item, described)
+        )
+
+    @router.get("/runs/{run_id}/parts")
+    def parts(run_id: Id) -> HTMLResponse:
+        """Give the parts of a run's page that change when a stage or the run ends."""
+        item = catalog.run_item(run_id)
+        return pages.render("parts.html", **run_values(item, follow_run(item, scheduler)))
+
+    @router.get("/live/{session_id}")
+    def live(session_id: Id) -> HTMLResponse:
+        scene = scenes.get(session_id)
+        if scene is None:
+            return pages.error(404, "This live scene was closed. Open it again from the home page.")
+        return pages.render("live.html", session=session_id, scene=scene.info)
+
+    @router.get("/sequences/{sequence_id}/thumbnail")
+    def thumbnail(sequence_id: Id) -> Response:
+        item = catalog.sequence_item(sequence_id)
+        image = _thumbnail(item.folder, (item.folder / "sequence.yaml").stat().st_mtime_ns)
+        if image is None:
+            raise HTTPException(404, "This sequence has no colour video.")
+        headers = {"Cache-Control": "private, max-age=600"}
+        return Response(image, media_type="image/jpeg", headers=headers)
+
+    return router
+
+
+def ordered_profiles() -> list[str]:
+    """Give the profiles, the quickest first."""
+    return sorted(profile_names(), key=lambda name: (name != "quick", name != "default", name))
+
+
+def run_values(item: RunItem, described: dict[str, Any]) -> dict[str, Any]:
+    """Collect what the page of a run shows of its state and its results.
+
+    Args:
+        item: The run.
+        described: What `follow_run` says of it.
+    """
+    results = describe_results(item.run) if item.run else {}
+    found = results.get("parameters", {})
+    return {
+        "run": described,
+        "metrics": {name: tabulate(v) for name, v in results.get("metrics", {}).items()},
+        "parameters": parameter_rows(item.run, found) if item.run else [],
+        "environment": results.get("environment", {}),
+        "problem": results.get("problem", {}).get("message"),
+        "methods": METHODS,
+    }
+
+
+def _is_kept(run: Mapping[str, Any]) -> bool:
+    """Tell whether the home page lists a run however old it is."""
+    return run["is_bundled"] or run["state"] not in ENDED
+
+
+def _featured(runs: list[dict[str, Any]]) -> dict[str, Any] | None:
+    """Choose the finished run that the home page offers first: a bundled one, else the newest."""
+    finished = [run for run in runs if run["is_published"] and run["kind"] == "reconstruction"]
+    return min(finished, key=lambda run: not run["is_bundled"], default=None)
+
+
+@lru_cache(maxsize=256)
+def _thumbnail(folder: Path, _stamp: int) -> bytes | None:
+    sequence = Sequence.load(folder)
+    for view in sequence.views:
+        if view.has_color:
+            image = view.color(min(sequence.frame_count - 1, sequence.frame_count // 2))
+            view.close()
+            height = round(image.shape[0] * _THUMBNAIL_WIDTH / image.shape[1])
+            size = (_THUMBNAIL_WIDTH, height)
+            small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+            done, content = cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 82])
+            return content.tobytes() if done else None
+    return None

@@ -1,0 +1,72 @@
+"""What a result was computed with: device, versions and the state of the source."""
+
+import os
+import platform
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from physhandi.data.run_files import now
+
+ENVIRONMENT = "environment.json"
+_PACKAGES = ("physhandi", "warp-lang", "torch", "numpy", "scipy")
+_SOURCE = Path(__file__).resolve().parents[2]
+
+
+def describe_environment(device: str, device_name: str = "") -> dict[str, Any]:
+    """Describe the program and the machine that this process runs on.
+
+    Args:
+        device: Warp device, for example ``"cuda:0"``.
+        device_name: What the device calls itself; a processor is asked here.
+
+    Returns:
+        ``started`` (the time now), ``device``, ``device_name``, ``cpu_count``, ``system``,
+        ``python``, ``packages`` (name and version of those installed) and ``commit`` of the
+        checkout; none outside of one.
+    """
+    packages: dict[str, str] = {}
+    for name in _PACKAGES:
+        try:
+            packages[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return {
+        "started": now(),
+        "device": device,
+        "device_name": processor_name() if device == "cpu" else device_name,
+        "cpu_count": os.cpu_count(),
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        "packages": packages,
+        "commit": commit_of(_SOURCE),
+    }
+
+
+def processor_name() -> str:
+    """Give what the processor calls itself; empty if it does not tell."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor()
+    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(names, platform.processor())
+
+
+def commit_of(checkout: Path) -> str | None:
+    """Read which commit a git checkout stands at, without git; None if it is no checkout."""
+    folder = checkout / ".git"
+    try:
+        head = (folder / "HEAD").read_text(encoding="ascii").strip()
+        if not head.startswith("ref: "):
+            return head
+        reference = head.removeprefix("ref: ")
+        if (folder / reference).is_file():
+            return (folder / reference).read_text(encoding="ascii").strip()
+        for line in (folder / "packed-refs").read_text(encoding="ascii").splitlines():
+            commit, _, name = line.partition(" ")
+            if name == reference:
+                return commit
+    except (OSError, ValueError):
+        return None
+    return None

@@ -1,0 +1,103 @@
+"""Where a run is on its way, and why it stopped."""
+
+from pathlib import Path
+
+import pytest
+from run_world import make_run
+
+from app.jobs.failures import explain
+from app.jobs.stages import stage_views, stages_of
+from physhandi.data.atomic import write_json
+from physhandi.data.run import Run
+from physhandi.pipeline import STAGES
+
+NAMES = ["hands", "observation", "search", "springs", "evaluation"]
+DONE = [{"name": "hands", "seconds": 3.5, "summary": {"before": 2.0, "after": 1.0}}]
+
+
+def states(state: str, latest: str | None, finished: list[dict] = DONE) -> dict[str, str]:
+    return {view.name: view.state for view in stage_views(NAMES, finished, state, latest)}
+
+
+def test_a_running_stage_stands_between_what_is_done_and_what_is_to_come() -> None:
+    views = stage_views(NAMES, DONE, "running", "observation")
+    assert [view.state for view in views] == ["done", "at-work", "to-come", "to-come", "to-come"]
+    assert (views[0].seconds, views[0].before, views[0].after) == (3.5, 2.0, 1.0)
+    assert views[1].seconds is None
+
+
+@pytest.mark.parametrize(
+    ("state", "mark"),
+    [("failed", "failed"), ("cancelled", "stopped"), ("running", "at-work"), ("queued", "to-come")],
+)
+@pytest.mark.parametrize("latest", ["observation", "hands", None])
+def test_the_stage_that_was_reached_is_marked_even_if_it_never_reported(
+    state: str, mark: str, latest: str | None
+) -> None:
+    shown = states(state, latest)
+    assert shown["observation"] == mark
+    assert shown["hands"] == "done"
+    assert shown["search"] == "to-come"
+
+
+def test_a_stage_that_was_passed_over_is_left_out() -> None:
+    late = [*DONE, {"name": "evaluation", "summary": {}}]
+    assert states("succeeded", "evaluation", late) == {"hands": "done", "evaluation": "done"}
+    search = [*DONE, {"name": "search", "summary": {}}]
+    assert "observation" not in states("running", "springs", search)
+    assert states("failed", "springs", search)["springs"] == "failed"
+    assert states("succeeded", "extra", []) == {}
+
+
+def test_a_run_that_was_not_begun_has_all_stages_to_come(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run")
+    shown = stages_of(run, "queued")
+    assert [(stage["name"], stage["state"]) for stage in shown] == [
+        (name, "to-come") for name in STAGES
+    ]
+    assert [stage["name"] for stage in stages_of(make_run(tmp_path / "b", kind="simulation"), "")]
+
+
+def test_the_time_of_a_stage_is_measured_and_an_older_attempts_report_is_forgotten(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = make_run(tmp_path / "run")
+    times = iter([100.0, 107.25, 107.5, 110.0])
+    with run.begin_attempt() as attempt:
+        monkeypatch.setattr(attempt, "_stage_clock", next(times))
+        monkeypatch.setattr("physhandi.data.attempt.time.monotonic", lambda: next(times))
+        attempt.finish_stage(STAGES[0], {})
+        monkeypatch.undo()
+        attempt.progress().report(STAGES[3], 1, 2)
+    assert run.stages()[0]["seconds"] == 7.25
+    assert {s["name"]: s["state"] for s in stages_of(run, "failed")}[STAGES[3]] == "failed"
+    with run.begin_attempt():
+        shown = {s["name"]: s["state"] for s in stages_of(run, "running")}
+        assert (shown[STAGES[0]], shown[STAGES[1]]) == ("done", "at-work")
+        assert shown[STAGES[3]] == "to-come"
+
+
+@pytest.mark.parametrize(
+    ("kind", "error", "message", "advice"),
+    [
+        ("MissingInputError", "'x' lacks depth.", "'x' lacks depth.", "import it again"),
+        ("SimulationDivergedError", "Node 3 is fast.", "Node 3 is fast.", "softer springs"),
+        ("KeyError", "'node'", "mistake of its own (KeyError: 'node')", "not of your recording"),
+        ("MemoryError", "", "not enough memory", "fewer nodes"),
+        ("PermissionError", "no", "no", "data folder"),
+        ("", "The worker was killed.", "The worker was killed.", "Resume"),
+        ("ImportFailedError", "bad", "bad", "Resume"),
+    ],
+)
+def test_a_failure_is_told_in_words_with_what_to_do(
+    tmp_path: Path, kind: str, error: str, message: str, advice: str
+) -> None:
+    run = make_run(tmp_path / "run")
+    write_json(run.folder / "exit.json", {"state": "failed", "error": error, "error_type": kind})
+    failure = explain(Run.open(run.folder), error)
+    assert message in failure.message
+    assert advice in failure.advice
+
+
+def test_a_damaged_run_says_which_file_to_repair() -> None:
+    assert explain(None, "run.yaml cannot be read.").message == "run.yaml cannot be read."

@@ -1,0 +1,120 @@
+"""Scores and parameters as a run's page lists them."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from run_world import make_run
+
+from app.pages.metrics import tabulate
+from app.pages.parameters import field_notes, parameter_rows
+from physhandi.data.run import Run
+from physhandi.simulation.model import SimulationParameters
+
+
+def cells(row: dict[str, Any]) -> list[tuple[str, bool]]:
+    return [(cell["text"], cell["is_best"]) for cell in row["cells"]]
+
+
+def test_lengths_are_millimetres_and_the_lowest_error_is_the_best() -> None:
+    shown = tabulate(
+        {
+            "unit": "m",
+            "substituted_frames": 0,
+            "future": {
+                "frames": [7, 10],
+                "rollout": {"chamfer_l2": 0.01, "track_error": None, "marker_error": None},
+                "static": {"chamfer_l2": 0.0355, "track_error": 0.2, "marker_error": None},
+            },
+        }
+    )
+    assert shown["notes"] == [("substituted frames", "0")]
+    (table,) = shown["tables"]
+    assert (table["name"], table["note"]) == ("future", "frames 7 to 9")
+    assert [column["name"] for column in table["columns"]] == ["rollout", "static"]
+    assert all(column["about"] for column in table["columns"])
+    chamfer, track = table["rows"]
+    assert (chamfer["name"], chamfer["unit"]) == ("chamfer_l2", "mm")
+    assert cells(chamfer) == [("10.00", True), ("35.50", False)]
+    assert cells(track) == [("none", False), ("200.0", False)]
+
+
+def test_of_shares_the_highest_is_the_best_and_they_are_percent() -> None:
+    scores = {
+        "contact": {
+            "rollout": {"accuracy_5mm": 0.5, "f1": 0.25, "contact_count": 3, "psnr": 20.0},
+            "static": {"accuracy_5mm": 0.75, "f1": 0.25, "contact_count": 9, "psnr": 30.0},
+        }
+    }
+    accuracy, f1, count, psnr = tabulate(scores)["tables"][0]["rows"]
+    assert (accuracy["unit"], accuracy["is_higher_better"]) == ("%", True)
+    assert cells(accuracy) == [("50.00", False), ("75.00", True)]
+    assert cells(f1) == [("25.00", True), ("25.00", True)]
+    assert cells(count) == [("3", False), ("9", False)]
+    assert (psnr["unit"], cells(psnr)) == ("", [("20.00", False), ("30.00", True)])
+
+
+def test_hands_are_no_rivals_and_pixels_stay_pixels() -> None:
+    scores = {
+        "unit": "m",
+        "hands": {
+            "left": {"reprojection_mean": 2.5, "unit": "px", "mpjpe": 0.004},
+            "right": {"reprojection_mean": 3.5, "unit": "px", "mpjpe": None},
+        },
+    }
+    (table,) = tabulate(scores)["tables"]
+    reprojection = table["rows"][0]
+    assert (reprojection["unit"], cells(reprojection)) == (
+        "px",
+        [("2.500", False), ("3.500", False)],
+    )
+    assert not any(cell["is_best"] for row in table["rows"] for cell in row["cells"])
+
+
+def test_a_sequence_without_metric_scale_keeps_its_own_unit() -> None:
+    scores = {"unit": "unit", "future": {"rollout": {"track_error": 0.5}, "static": {}}}
+    (row,) = tabulate(scores)["tables"][0]["rows"]
+    assert (row["unit"], cells(row)) == ("unit", [("0.5000", False), ("none", False)])
+
+
+@pytest.mark.parametrize("scores", ["damaged", None, [1], {}])
+def test_damaged_scores_make_no_table(scores: object) -> None:
+    assert tabulate(scores) == {"tables": [], "notes": []}
+
+
+def test_every_parameter_is_explained_where_it_is_declared() -> None:
+    notes = field_notes()
+    assert set(notes) == set(SimulationParameters().to_dict())
+    assert all(about for about, _ in notes.values())
+    assert notes["connection_radius"][1] == "m"
+    assert notes["drag"][1] == "1/s"
+    assert notes["gravity"][1] == "m/s²"
+    assert notes["friction"][1] == ""
+
+
+def test_what_the_fit_changed_stands_beside_its_start(tmp_path: Path) -> None:
+    start = SimulationParameters().to_dict()
+    run = make_run(tmp_path / "run", config={"profile": {"simulation": start}})
+    found = start | {"connection_radius": 0.03164, "max_neighbors": 20, "new": 1.0}
+    rows = {row["name"]: row for row in parameter_rows(run, found)}
+    radius = rows["connection_radius"]
+    assert (radius["start"], radius["value"], radius["unit"]) == ("20", "31.64", "mm")
+    assert [name for name, row in rows.items() if row["is_changed"]] == [
+        "connection_radius",
+        "max_neighbors",
+    ]
+    assert rows["use_control_velocity"]["value"] == "yes"
+    assert rows["new"]["start"] == ""
+
+
+def test_a_new_simulation_is_compared_with_the_run_that_it_repeats(tmp_path: Path) -> None:
+    source = make_run(tmp_path / "source")
+    with source.begin_attempt() as attempt:
+        attempt.save_yaml("object/parameters.yaml", {"drag": 3.0, "friction": 0.3})
+        attempt.publish()
+    changes = {"source": str(source.folder), "parameters": {"drag": 5.0}}
+    run = make_run(tmp_path / "run", kind="simulation", config=changes)
+    rows = parameter_rows(Run.open(run.folder), {"drag": 5.0, "friction": 0.3})
+    assert [(row["start"], row["is_changed"]) for row in rows] == [("3", True), ("0.3", False)]
+    source.delete()
+    assert [row["start"] for row in parameter_rows(run, {"drag": 5.0})] == [""]

@@ -1,0 +1,219 @@
+"use strict";
+
+/* The page of one run: its parts change in place, its curves and its log grow by events. */
+
+const page = {
+  run: document.getElementById("run").dataset.run,
+  losses: document.getElementById("losses"),
+  frames: document.getElementById("frames"),
+  charts: new Map(),
+  waiting: new Map(),
+  report: { seq: -1 },
+  log: null,
+};
+
+/* ---- parts that the server renders: only what differs is touched ---- */
+
+const KEPT = { DETAILS: ["open"] };
+
+function morph(old, fresh) {
+  if (old.isEqualNode(fresh)) return;
+  if (old.nodeType !== fresh.nodeType || old.nodeName !== fresh.nodeName) {
+    old.replaceWith(fresh.cloneNode(true));
+    return;
+  }
+  if (old.nodeType !== Node.ELEMENT_NODE) {
+    if (old.nodeValue !== fresh.nodeValue) old.nodeValue = fresh.nodeValue;
+    return;
+  }
+  const kept = KEPT[old.nodeName] ?? [];
+  for (const { name } of [...old.attributes]) if (!fresh.hasAttribute(name) && !kept.includes(name)) old.removeAttribute(name);
+  for (const { name, value } of fresh.attributes) if (old.getAttribute(name) !== value && !kept.includes(name)) old.setAttribute(name, value);
+  const [before, after] = [[...old.childNodes], [...fresh.childNodes]];
+  after.forEach((child, i) => (before[i] ? morph(before[i], child) : old.append(child.cloneNode(true))));
+  before.slice(after.length).forEach((child) => child.remove());
+}
+
+let isRefreshing = false;
+let isStale = false;
+
+async function refreshParts() {
+  isStale = true;
+  if (isRefreshing) return;
+  isRefreshing = true;
+  try {
+    while (isStale) {
+      isStale = false;
+      const response = await fetch(`/runs/${page.run}/parts`, { headers: { Accept: "text/html" } });
+      if (!response.ok) throw new Error(`The server answered ${response.status}.`);
+      const fresh = new DOMParser().parseFromString(await response.text(), "text/html");
+      showLocalTimes(fresh);
+      for (const part of fresh.querySelectorAll("[data-part]")) morph(document.getElementById(part.id), part);
+      startClock();
+      await Promise.all([loadLosses(), loadFrames()]);
+    }
+  } catch {
+    setTimeout(refreshParts, 2000);
+  } finally {
+    isRefreshing = false;
+  }
+}
+
+/* ---- the time that the stage at work has taken ---- */
+
+let clock = { start: 0, at: 0 };
+
+function startClock() {
+  const place = document.querySelector("[data-elapsed]");
+  if (place) clock = { start: Number(place.dataset.elapsed), at: performance.now() };
+}
+
+setInterval(() => {
+  const place = document.querySelector("[data-elapsed]");
+  if (place) place.textContent = duration(clock.start + (performance.now() - clock.at) / 1000);
+}, 1000);
+
+/* ---- curves ---- */
+
+function drawLoss(stage, points) {
+  if (!points.length) return;
+  page.losses.hidden = false;
+  let chart = page.charts.get(stage);
+  if (!chart) {
+    chart = new Chart(page.losses.querySelector(".charts"), {
+      title: stage.replaceAll("_", " "), xLabel: "iteration", canLog: true,
+      series: [{ label: "loss", color: "--pico-primary" }],
+    });
+    chart.figure.dataset.chart = stage;
+    page.charts.set(stage, chart);
+  }
+  return chart;
+}
+
+async function loadLosses() {
+  if (!page.losses.dataset.url) return -1;
+  const { losses, seq } = await send("GET", page.losses.dataset.url);
+  for (const [stage, { curve }] of Object.entries(losses)) {
+    drawLoss(stage, curve)?.setData([curve.map((point) => point[0]), curve.map((point) => point[1])]);
+  }
+  for (const [stage, points] of page.waiting) page.waiting.set(stage, points.filter((point) => point.seq > seq));
+  return seq;
+}
+
+/** Reports come at once, the run's own summary of them with the time left a little later. */
+function showReport(report) {
+  if (report.seq >= page.report.seq) page.report = { ...report, eta_s: report.stage === page.report.stage ? (report.eta_s ?? page.report.eta_s) : report.eta_s };
+  if (page.report.total) showProgress(document.getElementById("run"), { progress: page.report });
+}
+
+/** Points of one frame are drawn together, however many there are. */
+function onProgress(event) {
+  showReport(event);
+  if (!Number.isFinite(event.loss)) return;
+  const points = page.waiting.get(event.stage) ?? [];
+  points.push({ seq: event.seq, at: [event.iteration, event.loss] });
+  if (!page.waiting.size) requestAnimationFrame(drawWaiting);
+  page.waiting.set(event.stage, points);
+}
+
+function drawWaiting() {
+  for (const [stage, points] of page.waiting) {
+    const known = points.map((point) => point.at);
+    drawLoss(stage, known)?.append(known);
+  }
+  page.waiting.clear();
+}
+
+/* ---- errors of every frame ---- */
+
+const METHODS = [
+  { key: "rollout", label: "rollout", color: "--pico-primary" },
+  { key: "static", label: "static", color: "--wait", dash: [6, 4] },
+  { key: "rigid_follow", label: "rigid follow", color: "--spring-line", dash: [2, 3] },
+];
+const QUANTITIES = [["track_error", "Track error"], ["chamfer_l2", "Chamfer distance"]];
+let frameErrors = {};
+
+async function loadFrames() {
+  if (!page.frames.dataset.url) return;
+  const { sequences } = await send("GET", page.frames.dataset.url);
+  if (JSON.stringify(sequences) === JSON.stringify(frameErrors)) return;
+  frameErrors = sequences;
+  const names = Object.keys(sequences);
+  page.frames.hidden = names.length === 0;
+  if (!names.length) return;
+  const select = page.frames.querySelector("select");
+  const chosen = names.includes(select.value) ? select.value : names[0];
+  select.replaceChildren(...names.map((name) => new Option(name, name, false, name === chosen)));
+  page.frames.querySelector("[data-choice]").hidden = names.length < 2;
+  drawFrames(chosen);
+}
+
+function drawFrames(name) {
+  const errors = frameErrors[name];
+  const [factor, unit] = errors.unit === "m" ? [1000, "mm"] : [1, errors.unit];
+  const place = page.frames.querySelector(".charts");
+  place.replaceChildren();
+  page.frames.querySelector(".held").hidden = true;
+  for (const [quantity, title] of QUANTITIES) {
+    const lines = METHODS.filter(({ key }) => errors[key]?.[quantity]?.some(Number.isFinite));
+    if (!lines.length) continue;
+    const columns = lines.map(({ key }) => errors[key][quantity].map((value) => (Number.isFinite(value) ? value * factor : null)));
+    const chart = new Chart(place, {
+      title, xLabel: "frame", unit, series: lines, band: errors.future_start, sync: "frames", canLog: true, height: 230,
+      onPick: (index) => holdFrame(title, errors.frames[index], lines.map(({ label }, n) => `${label} ${number(columns[n][index])} ${unit}`)),
+    });
+    chart.isLog = false;
+    chart.figure.dataset.chart = quantity;
+    chart.setData([errors.frames, ...columns]);
+  }
+}
+
+function holdFrame(title, frame, values) {
+  const held = page.frames.querySelector(".held");
+  held.hidden = false;
+  held.textContent = `Frame ${frame} · ${title.toLowerCase()}: ${values.join(" · ")}`;
+}
+
+/* ---- start ---- */
+
+function onRun(run) {
+  const head = document.getElementById("run");
+  if (run.revision !== head.dataset.revision) {
+    refreshParts();
+    return;
+  }
+  showReport(run.progress);
+  const stage = run.stages.find(({ state }) => state === "at-work");
+  if (Number.isFinite(stage?.seconds)) clock = { start: stage.seconds, at: performance.now() };
+}
+
+function onGone() {
+  unfollow();
+  cursor = null;
+  toast("This run was deleted.", true);
+  setTimeout(() => (location.href = "/"), 2500);
+}
+
+async function begin() {
+  page.log = new Log(document.getElementById("log-details"));
+  startClock();
+  page.frames.querySelector("select").addEventListener("change", (event) => drawFrames(event.target.value));
+  listeners.run = onRun;
+  listeners.progress = onProgress;
+  listeners.log = (part) => page.log.add(part);
+  listeners.gone = onGone;
+  let seq = -1;
+  try {
+    seq = await loadLosses();
+    await loadFrames();
+  } catch (error) {
+    toast(error.message, true);
+  }
+  // From what this page shows on, so that nothing is missed or comes twice.
+  cursor = `${seq}-${page.log.end}`;
+  follow();
+}
+
+addEventListener("run-changed", refreshParts);
+document.addEventListener("DOMContentLoaded", begin);
