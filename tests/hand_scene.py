@@ -8,7 +8,7 @@ from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence import Sequence, ViewMeta
 from physhandi.data.sequence_schema import SequenceMeta
 from physhandi.data.sequence_writer import SequenceWriter
-from physhandi.hand.model import Side, load_hand_model
+from physhandi.hand.model import HandKind, Side, load_hand_model
 from physhandi.hand.motion import HandMotion
 
 SIZE = 240
@@ -29,7 +29,9 @@ def looking_at_hand(azimuth: float, distance: float = 0.6) -> PinholeCamera:
     return PinholeCamera(K=K, T_world_camera=pose, width=SIZE, height=SIZE, distortion=distortion)
 
 
-def grasping(side: Side = "right", frames: int = 16, scale: float = 1.0) -> HandMotion:
+def grasping(
+    side: Side = "right", frames: int = 16, scale: float = 1.0, model: HandKind = "open"
+) -> HandMotion:
     """A hand with a shape of its own that closes while it turns and moves."""
     time = np.linspace(0, 1, frames)
     articulation = np.zeros((frames, 15, 3))
@@ -45,6 +47,7 @@ def grasping(side: Side = "right", frames: int = 16, scale: float = 1.0) -> Hand
         wrist_rotation=rotation,
         wrist_translation=translation,
         scale=scale,
+        model=model,
     )
 
 
@@ -53,7 +56,7 @@ def seen_keypoints(
 ) -> np.ndarray:
     """What a detector with normal noise [px] reports of the hands, in "view frame hand 21 3"."""
     random = np.random.default_rng(0)
-    joint = [m.keypoints(load_hand_model(m.side)).astype(np.float64) for m in motions]
+    joint = [m.keypoints(load_hand_model(m.side, m.model)).astype(np.float64) for m in motions]
     pixel = np.stack([np.stack([c.project(j) for j in joint], axis=1) for c in cameras])
     pixel = pixel + noise * random.standard_normal(pixel.shape)
     return np.concatenate([pixel, np.full_like(pixel[..., :1], 0.9)], -1).astype(np.float32)
@@ -101,7 +104,7 @@ def write_scene(
             if keypoint is not None:
                 writer.save_array(f"views/{name}/keypoint.npy", keypoint[view])
             for frame in range(motions[0].frame_count if depth else 0):
-                hand = load_hand_model(motions[0].side)
+                hand = load_hand_model(motions[0].side, motions[0].model)
                 vertex = motions[0].vertices(hand)[frame]
                 image, mask = depth_image(camera, vertex, hand.faces)
                 writer.save_image(f"views/{name}/depth/{frame:05d}.png", image)

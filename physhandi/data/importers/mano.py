@@ -97,7 +97,7 @@ def _checked(path: Path, tree: Any) -> dict[str, ndarray]:
 
 
 def _array(path: Path, name: str, value: Any, shape: tuple[int, ...]) -> ndarray:
-    array: Any = value if isinstance(value, ndarray) else None
+    array = cast("Any", value) if isinstance(value, ndarray) else None
     if array is None or array.shape != shape or array.dtype.kind not in "iuf":
         found = "no array" if array is None else f"{array.dtype} of shape {array.shape}"
         raise ImportFailedError(

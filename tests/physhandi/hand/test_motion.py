@@ -1,5 +1,8 @@
 """Hand motion: what it stores comes back, and its vertices drive the object."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -39,6 +42,20 @@ def test_storage_with_a_fault_is_refused() -> None:
         HandMotion.from_tensors({**stored, "shape": np.zeros(9, np.float32)})
     with pytest.raises(ValueError, match="'side' must be 0 or 1, not 3"):
         HandMotion.from_tensors({**stored, "side": np.array(3)})
+
+
+def test_the_hand_model_is_stored_and_old_motions_are_the_open_hands(mano: Path) -> None:
+    motion = replace(_motion("left", 3), model="mano")
+    stored = motion.to_tensors()
+    loaded = HandMotion.from_tensors(stored)
+    assert loaded.model == "mano"
+    assert loaded.vertices(load_hand_model("left", "mano")).shape == (3, 778, 3)
+    with pytest.raises(ValueError, match="'mano' was given the model 'open'"):
+        loaded.vertices(load_hand_model("left"))
+    del stored["model"]
+    assert HandMotion.from_tensors(stored).model == "open"
+    with pytest.raises(ValueError, match="'model' must be 0 or 1, not 2"):
+        HandMotion.from_tensors({**stored, "model": np.array(2)})
 
 
 def test_wrist_keypoint_keeps_its_distance_from_the_wrist() -> None:

@@ -1,0 +1,93 @@
+"""MANO through the stages: fitted, stored, simulated with, and opened again."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import hand_scene as scene
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from physhandi import pipeline
+from physhandi.data.run import Run
+from physhandi.data.sequence import Sequence
+from physhandi.errors import MissingInputError, UsageError
+from physhandi.fitting.artefacts import load_motions
+from physhandi.fitting.hand_config import HandFitConfig
+from physhandi.fitting.hand_reconstruction import reconstruct_hands
+from physhandi.fitting.profile import config_from_dict, config_to_dict, load_profile
+from physhandi.hand.model import Side, load_hand_model
+
+BUNDLED = Path(__file__).parents[3] / "sequences"
+CAMERAS = [scene.looking_at_hand(angle) for angle in (0.0, 1.2, 2.6)]
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_a_known_mano_hand_is_found_again(tmp_path: Path, mano: Path, side: Side) -> None:
+    truth = scene.grasping(side, model="mano")
+    keypoint = scene.seen_keypoints([truth], CAMERAS)
+    sequence = scene.write_scene(tmp_path / "a", [truth], CAMERAS, keypoint)
+    fit = reconstruct_hands(sequence, HandFitConfig(model="mano", iterations=250))
+    hand = load_hand_model(side, "mano")
+    found, expected = fit.motions[0].vertices(hand), truth.vertices(hand)
+    assert fit.motions[0].model == "mano"
+    assert found.shape == (16, 778, 3)
+    assert np.linalg.norm(found - expected, axis=-1).mean(axis=1).max() < 0.003
+    assert np.linalg.norm(expected[15] - expected[0], axis=-1).max() > 0.05
+    assert fit.loss_before > 10 * fit.loss_after
+
+
+def test_without_mano_the_fit_says_how_to_bring_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PHYSHANDI_HANDS", str(tmp_path))
+    truth = scene.grasping(frames=2)
+    keypoint = scene.seen_keypoints([truth], CAMERAS)
+    sequence = scene.write_scene(tmp_path / "a", [truth], CAMERAS, keypoint)
+    with pytest.raises(MissingInputError, match="physhandi import mano"):
+        reconstruct_hands(sequence, HandFitConfig(model="mano"))
+    with pytest.raises(UsageError, match=r"hand: model is 'smpl'; expected one of 'open', 'mano'"):
+        config_from_dict({"hand": {"model": "smpl"}})
+
+
+@pytest.mark.slow
+def test_a_whole_run_uses_mano(tmp_path: Path, mano: Path) -> None:
+    stored = Run.open(BUNDLED / "runs" / "towel_fold_quick")
+    folder = tmp_path / "towel_fold"
+    shutil.copytree(BUNDLED / "towel_fold", folder)
+    keypoint = stored.array("sequences/towel_fold/keypoint.npy")
+    for view, seen in zip(Sequence.load(folder).views, keypoint, strict=True):
+        np.save(view.folder / "keypoint.npy", seen)
+    config = load_profile("quick")
+    search = replace(config.object_.search, generations=1, population=4)
+    first_order = replace(config.object_.first_order, iterations=1)
+    config = replace(
+        config,
+        hand=replace(config.hand, model="mano", iterations=60, depth_iterations=0),
+        object_=replace(config.object_, search=search, first_order=first_order),
+    )
+    run = Run.create(
+        tmp_path / "run",
+        name="with MANO",
+        kind="reconstruction",
+        sequences=[str(folder)],
+        config={"profile": config_to_dict(config)},
+    )
+    pipeline.run_job(run)
+
+    run = Run.open(run.folder)
+    assert run.state == "succeeded"
+    (motion,) = load_motions(run.out, "towel_fold")
+    assert motion.model == "mano"
+    base = "sequences/towel_fold"
+    vertex = run.array(f"{base}/hand_right_vertex.npy")
+    assert vertex.shape[1:] == (778, 3)
+    np.testing.assert_array_equal(vertex, motion.vertices(load_hand_model("right", "mano")))
+    np.testing.assert_array_equal(run.array(f"{base}/control.npy"), vertex)
+    assert run.array(f"{base}/hand_right_face.npy").shape == (1538, 3)
+    assert np.isfinite(run.array(f"{base}/rollout.npy")).all()
+    # The made-up MANO is cut out of the open hand, so it must lie on what the open hand fitted.
+    known = stored.array(f"{base}/hand_right_vertex.npy")
+    for frame in (0, len(known) // 2, len(known) - 1):
+        assert cKDTree(vertex[frame]).query(known[frame])[0].mean() < 0.006
