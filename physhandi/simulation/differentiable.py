@@ -16,6 +16,7 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
+from physhandi.simulation.dataflow import DataflowAdjoint
 from physhandi.simulation.frame_adjoint import FrameAdjoint
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
 from physhandi.simulation.simulator import Simulator
@@ -139,7 +140,7 @@ class _DifferentiableSimulator:
     ) -> None:
         self.simulator = Simulator(model, parameters, device)
         self.torch_device = torch.device(wp.device_to_torch(self.simulator.device))
-        self._adjoint: FrameAdjoint | None = None
+        self._adjoint: FrameAdjoint | DataflowAdjoint | None = None
 
     @contextmanager
     def stream(self) -> Iterator[None]:
@@ -197,7 +198,11 @@ class _DifferentiableSimulator:
         control, *material, _, _ = tensors
         self._place_material(material)
         # Made on first use: many simulators never walk back.
-        self._adjoint = adjoint = self._adjoint or FrameAdjoint(self.simulator)
+        if self._adjoint is None:
+            simulator = self.simulator
+            fast = DataflowAdjoint.of(simulator, simulator.dataflow)
+            self._adjoint = fast or FrameAdjoint(simulator)
+        adjoint = self._adjoint
         bars = adjoint.position_bar, adjoint.velocity_bar
         # Sums over many substeps and frames keep their digits in float64.
         sums = [torch.zeros_like(value, dtype=torch.float64) for value in tensors[:-2]]

@@ -10,6 +10,7 @@ from jaxtyping import Float, Float32
 from numpy import ndarray
 
 from physhandi.errors import SimulationDivergedError
+from physhandi.simulation.dataflow import Dataflow
 from physhandi.simulation.kernels.integration import integrate_nodes
 from physhandi.simulation.kernels.springs import pull_springs
 from physhandi.simulation.kernels.world import World
@@ -74,6 +75,8 @@ class Simulator:
         self.pull = wp.zeros(len(model.spring_nodes), dtype=wp.vec3, device=self.device)
         self.first_divergence = self.array(np.array([_NO_DIVERGENCE]), wp.int32)
         self._no_tape = wp.zeros(0, dtype=wp.vec3, device=self.device)
+        self.dataflow = Dataflow.of(self)
+        """The fast way through a frame, for models and devices that it suits."""
         self._collision: SelfCollision | None = None
         self._recordings = {
             collides: Recording(self._launch_frame, self.device) for collides in (False, True)
@@ -228,8 +231,22 @@ class Simulator:
 
     def replay_frame(self) -> None:
         """Advance the state on the device by one frame, with the controls that are there."""
+        if self.dataflow is not None and self.collision is None:
+            state = self.position, self.velocity
+            self.dataflow.advance(state, state)
+            return
         version = self.find_candidates(self.position)
         self._recordings[self.parameters.self_collision].replay(version)
+
+    @property
+    def material(self) -> tuple[wp.array, wp.array, wp.array]:
+        """Rest length, stiffness and damping of every spring."""
+        return self.rest_length, self.stiffness, self.damping
+
+    @property
+    def controls(self) -> tuple[wp.array, wp.array]:
+        """Where the control nodes are at the start and the end of the frame."""
+        return self.control_start, self.control_end
 
     @property
     def collision(self) -> SelfCollision | None:
@@ -256,9 +273,7 @@ class Simulator:
 
     def spring_inputs(self, fraction: float, state: tuple[wp.array, wp.array]) -> list[Any]:
         """List what a spring kernel reads, a `fraction` of a frame after its start."""
-        material = (self.spring_nodes, self.rest_length, self.stiffness, self.damping)
-        control = (self.control_start, self.control_end)
-        return [fraction, self.world, *material, *state, *control]
+        return [fraction, self.world, self.spring_nodes, *self.material, *state, *self.controls]
 
     def launch_substep(
         self,

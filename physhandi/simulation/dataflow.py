@@ -1,0 +1,251 @@
+"""Frames and their adjoints in one launch each on CUDA, for models whose blocks fit."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Protocol
+
+import numpy as np
+import warp as wp
+from numpy import ndarray
+
+from physhandi.simulation.kernels.dataflow import FORWARD_LOCALS, make_frame_kernel
+from physhandi.simulation.kernels.dataflow_adjoint import (
+    ADJOINT_LOCALS,
+    make_adjoint_kernel,
+    sum_controls,
+)
+from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.partition import Partition, partition_model
+
+LEAST_OWN = 4
+"""Fewer nodes in a block cost more waiting than they save work."""
+MOST_LANES = 576
+"""A block's nodes get as many threads each as keep them below this sum."""
+MOST_KEPT = 6
+"""Most half-edges that a thread keeps in registers."""
+BLOCK_SIZES = (256, 384, 576, 768)
+"""Threads of a block; few sizes, because each is compiled on its own."""
+_LAST_TAG = 2**31 - 2**20
+
+frame_kernel = lru_cache(maxsize=None)(make_frame_kernel)
+adjoint_kernel = lru_cache(maxsize=None)(make_adjoint_kernel)
+
+
+class Stage(Protocol):
+    """What a frame needs of a simulator."""
+
+    model: SpringMassModel
+    parameters: SimulationParameters
+    device: Any
+    world: wp.array
+    first_divergence: wp.array
+
+    @property
+    def material(self) -> tuple[wp.array, wp.array, wp.array]:
+        """Rest length, stiffness and damping of every spring."""
+        ...
+
+    @property
+    def controls(self) -> tuple[wp.array, wp.array]:
+        """Where the control nodes are at the start and the end of the frame."""
+        ...
+
+    def array(self, value: ndarray, dtype: Any) -> wp.array:
+        """Copy an array to the device."""
+        ...
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How many threads do what."""
+
+    lanes: int
+    """Threads that sum one node's springs."""
+    kept: int
+    """Half-edges that each of them keeps in registers."""
+    threads: int
+    """Threads of a block."""
+
+    @classmethod
+    def of(cls, partition: Partition) -> "Layout":
+        """Choose by measurement (docs/benchmarks): many lanes, but few idle threads."""
+        wide = (n for n in (32, 16) if partition.most_own * n <= MOST_LANES)
+        lanes = next((n for n in wide if n < 2 * partition.most_entries), 8)
+        kept = max(1, min(MOST_KEPT, -(-partition.most_entries // lanes)))
+        needed = partition.most_own * lanes
+        return cls(lanes, kept, next((n for n in BLOCK_SIZES if n >= needed), BLOCK_SIZES[-1]))
+
+
+class Dataflow:
+    """The arrays of one model that blocks of nodes work on."""
+
+    def __init__(self, simulator: Stage, partition: Partition) -> None:
+        """Place a partition on the device.
+
+        Args:
+            simulator: Whose state, controls, material and world are read and written.
+            partition: Of its model.
+        """
+        self._simulator = simulator
+        self.partition = partition
+        self.layout = Layout.of(partition)
+        names = ("own_start", "local_start", "local_node", "model_node", "entry_start")
+        self._map = [simulator.array(getattr(partition, name), wp.int32) for name in names]
+        self._map.append(simulator.array(partition.entry, wp.vec2i))
+        count = simulator.model.node_count
+        self._relay = wp.zeros(4 * count, dtype=wp.vec4, device=simulator.device)
+        self._no_tape = wp.zeros((0, 0), dtype=wp.vec4, device=simulator.device)
+        self._tag = 1
+
+    @staticmethod
+    def of(simulator: Stage) -> "Dataflow | None":
+        """Make one for a simulator; none on a CPU, or if the model's blocks do not fit."""
+        model, device = simulator.model, simulator.device
+        if not device.is_cuda or model.node_count == 0:
+            return None
+        blocks = max(1, min(int(device.sm_count), model.node_count // LEAST_OWN))
+        partition = partition_model(model, blocks)
+        return Dataflow(simulator, partition) if partition.most_locals <= FORWARD_LOCALS else None
+
+    def next_tags(self, count: int) -> int:
+        """Reserve tags that no value in the relay bears."""
+        if self._tag > _LAST_TAG:
+            self._relay.zero_()
+            self._tag = 1
+        self._tag += count
+        return self._tag - count
+
+    def advance(
+        self,
+        before: tuple[wp.array, wp.array],
+        after: tuple[wp.array, wp.array],
+        tape: wp.array | None = None,
+    ) -> None:
+        """Launch one frame, from one state (position, velocity) to another.
+
+        Args:
+            before: State at its start.
+            after: Where the state at its end goes; may be the same arrays.
+            tape: Where each substep's position, velocity and velocity before contact go.
+        """
+        simulator = self._simulator
+        substeps = simulator.parameters.substeps_per_frame
+        self._launch(
+            frame_kernel(self.layout.lanes, self.layout.kept),
+            [self.layout.threads, substeps, self.next_tags(substeps + 1), simulator.world],
+            [*self._map, *simulator.material],
+            [*simulator.controls, *before],
+            [
+                self._relay,
+                self._no_tape if tape is None else tape,
+                *after,
+                simulator.first_divergence,
+            ],
+        )
+
+    def walk_back(
+        self, tape: wp.array, is_first: wp.array, state_bars: list[wp.array], bars: list[wp.array]
+    ) -> None:
+        """Launch the adjoint of one frame.
+
+        Args:
+            tape: What `advance` recorded of it.
+            is_first: Which half-edges speak for their springs.
+            state_bars: Adjoints of position and velocity, from the frame's end to its start.
+            bars: Where the other adjoints go, in the kernel's order.
+        """
+        simulator = self._simulator
+        substeps = simulator.parameters.substeps_per_frame
+        self._launch(
+            adjoint_kernel(self.layout.lanes, self.layout.kept),
+            [self.layout.threads, substeps, self.next_tags(substeps), simulator.world],
+            [*self._map, is_first, simulator.model.object_spring_count],
+            [*simulator.material, *simulator.controls, tape],
+            [*state_bars, self._relay, *bars],
+        )
+
+    def _launch(self, kernel: Any, *arguments: list[Any]) -> None:
+        *inputs, outputs = arguments
+        wp.launch(
+            kernel,
+            dim=self.partition.block_count * self.layout.threads,
+            inputs=[value for part in inputs for value in part],
+            outputs=outputs,
+            block_dim=self.layout.threads,
+            device=self._simulator.device,
+        )
+
+
+class DataflowAdjoint:
+    """Simulates a frame again and carries derivatives back; as `FrameAdjoint`, in two launches."""
+
+    def __init__(self, simulator: Stage, dataflow: Dataflow) -> None:
+        """Make the tape.
+
+        Args:
+            simulator: Whose frames; its controls, material and world are read.
+            dataflow: The simulator's.
+        """
+        self._dataflow = dataflow
+        model, device = simulator.model, simulator.device
+        nodes, springs = model.node_count, len(model.spring_nodes)
+        held = springs - model.object_spring_count
+
+        def zeros(count: int, dtype: Any) -> wp.array:
+            return wp.zeros(count, dtype=dtype, device=device)
+
+        substeps = simulator.parameters.substeps_per_frame
+        self._tape = wp.zeros((substeps, 3 * nodes), dtype=wp.vec4, device=device)
+        self.start = zeros(nodes, wp.vec3), zeros(nodes, wp.vec3)
+        self._end = zeros(nodes, wp.vec3), zeros(nodes, wp.vec3)
+        self.position_bar, self.velocity_bar = zeros(nodes, wp.vec3), zeros(nodes, wp.vec3)
+        self._control_bars = [zeros(model.control_count, wp.vec3) for _ in range(2)]
+        self._held_bars = [zeros(held, wp.vec3) for _ in range(2)]
+        self._material_bars = [zeros(springs, wp.float32) for _ in range(2)]
+        self._scalar_bars = [zeros(nodes, wp.float32) for _ in range(3)]
+        self._self_bars = [zeros(0, wp.float32) for _ in range(2)]
+        self._is_first = simulator.array(dataflow.partition.is_first, wp.int32)
+        control = model.spring_nodes[model.object_spring_count :].max(axis=1, initial=0) - nodes
+        by_control = np.argsort(control, kind="stable")
+        start = np.searchsorted(control[by_control], np.arange(model.control_count + 1))
+        self._held = [
+            simulator.array(start.astype(np.int32), wp.int32),
+            simulator.array(by_control.astype(np.int32), wp.int32),
+        ]
+
+    @staticmethod
+    def of(simulator: Stage, dataflow: Dataflow | None) -> "DataflowAdjoint | None":
+        """Make one for a simulator; none if its model's blocks do not fit."""
+        if dataflow is None or simulator.parameters.self_collision:
+            return None
+        partition, layout = dataflow.partition, dataflow.layout
+        fits = (
+            partition.most_locals <= ADJOINT_LOCALS
+            and partition.most_own * layout.lanes <= layout.threads
+            and partition.most_entries <= layout.lanes * layout.kept
+        )
+        return DataflowAdjoint(simulator, dataflow) if fits else None
+
+    @property
+    def sums(self) -> list[wp.array]:
+        """Derivatives that the last frame gave; see `FrameAdjoint.sums`."""
+        return [*self._control_bars, *self._material_bars, *self._scalar_bars, *self._self_bars]
+
+    def carry(self) -> None:
+        """Carry `position_bar` and `velocity_bar` from the frame's end to its start."""
+        self._dataflow.advance(self.start, self._end, self._tape)
+        for value in self._held_bars:
+            value.zero_()
+        self._dataflow.walk_back(
+            self._tape,
+            self._is_first,
+            [self.position_bar, self.velocity_bar],
+            [*self._material_bars, *self._scalar_bars, *self._held_bars],
+        )
+        wp.launch(
+            sum_controls,
+            dim=len(self._control_bars[0]),
+            inputs=[*self._held, *self._held_bars],
+            outputs=self._control_bars,
+            device=self._control_bars[0].device,
+        )

@@ -1,0 +1,132 @@
+"""What CUDA offers within and between thread blocks and Warp does not; nothing of it on a CPU."""
+
+import warp as wp
+
+SHARED_SLOTS = 2816
+"""Vectors of four floats in a block's 48 KiB of static shared memory, less what Warp takes."""
+
+_BARRIER = """
+#if defined(__CUDA_ARCH__)
+    __syncthreads();
+#endif
+"""
+
+_SHARED = """
+#if defined(__CUDA_ARCH__)
+    __shared__ float4 slots[2816];
+    if (is_write) {
+        slots[slot] = make_float4(value[0], value[1], value[2], value[3]);
+        return value;
+    }
+    const float4 found = slots[slot];
+    return wp::vec4(found.x, found.y, found.z, found.w);
+#else
+    return value;
+#endif
+"""
+
+# A 16-byte access is one transaction: whoever sees the tag sees the three floats before it too,
+# so blocks can wait for each other's values without a barrier or a fence.
+_PUBLISH = """
+#if defined(__CUDA_ARCH__)
+    unsigned long long low = (unsigned long long)__float_as_uint(value[0])
+        | ((unsigned long long)__float_as_uint(value[1]) << 32);
+    unsigned long long high = (unsigned long long)__float_as_uint(value[2])
+        | ((unsigned long long)(unsigned int)tag << 32);
+    asm volatile("{ .reg .b128 t; mov.b128 t, {%1, %2}; st.relaxed.gpu.global.b128 [%0], t; }"
+        :: "l"((float4*)relay.data + index), "l"(low), "l"(high) : "memory");
+#endif
+"""
+
+_AWAIT = """
+#if defined(__CUDA_ARCH__)
+    unsigned long long low, high;
+    do {
+        asm volatile("{ .reg .b128 t; ld.relaxed.gpu.global.b128 t, [%2]; mov.b128 {%0, %1}, t; }"
+            : "=l"(low), "=l"(high) : "l"((const float4*)relay.data + index) : "memory");
+    } while ((unsigned int)(high >> 32) != (unsigned int)tag);
+    return wp::vec3(__uint_as_float((unsigned int)low), __uint_as_float((unsigned int)(low >> 32)),
+        __uint_as_float((unsigned int)high));
+#else
+    return wp::vec3();
+#endif
+"""
+
+_LANE_SUM = """
+#if defined(__CUDA_ARCH__)
+    #pragma unroll
+    for (int offset = 16; offset > 0; offset /= 2) {
+        if (offset < lanes) {
+            value[0] += __shfl_xor_sync(0xffffffffu, value[0], offset);
+            value[1] += __shfl_xor_sync(0xffffffffu, value[1], offset);
+            value[2] += __shfl_xor_sync(0xffffffffu, value[2], offset);
+        }
+    }
+#endif
+    return value;
+"""
+
+# Newton's step makes the length as exact as a rounded square root at a third of its latency.
+_INVERSE_LENGTH = """
+#if defined(__CUDA_ARCH__)
+    return rsqrtf(fmaxf(squared, 1.0e-12f));
+#else
+    return 0.0f;
+#endif
+"""
+_REFINED_LENGTH = """
+#if defined(__CUDA_ARCH__)
+    const float length = squared * inverse;
+    return fmaf(0.5f * inverse, fmaf(-length, length, squared), length);
+#else
+    return 0.0f;
+#endif
+"""
+
+
+@wp.func_native(snippet=_BARRIER)
+def block_barrier():
+    """Wait for all threads of the block."""
+
+
+@wp.func_native(snippet=_SHARED)
+def shared(slot: int, value: wp.vec4, is_write: bool) -> wp.vec4:
+    """Write a slot of the block's shared memory, or read it."""
+
+
+@wp.func
+def shared_read(slot: int):
+    """Read a vector from the block's shared memory."""
+    found = shared(slot, wp.vec4(0.0, 0.0, 0.0, 0.0), False)
+    return wp.vec3(found[0], found[1], found[2])
+
+
+@wp.func
+def shared_write(slot: int, value: wp.vec3):
+    """Write a vector to the block's shared memory."""
+    shared(slot, wp.vec4(value[0], value[1], value[2], 0.0), True)
+
+
+@wp.func_native(snippet=_PUBLISH)
+def publish(relay: wp.array[wp.vec4], index: int, value: wp.vec3, tag: int):
+    """Let other blocks see a value, under a tag that was never used for this index before."""
+
+
+@wp.func_native(snippet=_AWAIT)
+def wait_for(relay: wp.array[wp.vec4], index: int, tag: int) -> wp.vec3:
+    """Wait until a value is there under a tag; all blocks of the launch must be resident."""
+
+
+@wp.func_native(snippet=_LANE_SUM)
+def lane_sum(value: wp.vec3, lanes: int) -> wp.vec3:
+    """Sum over 1, 2, 4, 8, 16 or 32 neighbouring threads; all threads of a warp must call it."""
+
+
+@wp.func_native(snippet=_INVERSE_LENGTH)
+def inverse_length(squared: float) -> float:
+    """Return one over the length of a vector, whose squared length is given."""
+
+
+@wp.func_native(snippet=_REFINED_LENGTH)
+def refined_length(squared: float, inverse: float) -> float:
+    """Return a vector's length from its square and a first guess of its inverse."""

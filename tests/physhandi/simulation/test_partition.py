@@ -1,0 +1,67 @@
+"""Blocks of nodes, against a plain loop over all springs."""
+
+from collections import Counter
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.partition import bisect_nodes, partition_model
+from physhandi.simulation.topology import build_model
+
+
+@pytest.fixture(scope="module")
+def model():
+    rng = np.random.default_rng(0)
+    node, control = rng.uniform(0, 0.1, (300, 3)), rng.uniform(0, 0.1, (12, 3))
+    parameters = SimulationParameters(virtual_connection_radius=0.03)
+    return build_model(node.astype(np.float32), control.astype(np.float32), parameters)
+
+
+@pytest.mark.parametrize("blocks", [1, 7, 300, 1000])
+def test_every_spring_is_found_at_both_of_its_object_nodes(model, blocks):
+    partition = partition_model(model, blocks)
+    assert partition.block_count == min(blocks, 300)
+    number = np.arange(312)
+    number[partition.model_node] = np.arange(300)
+    wanted = Counter(
+        (number[a], number[b], spring)
+        for spring, ends in enumerate(model.spring_nodes)
+        for a, b in (ends, ends[::-1])
+        if a < 300
+    )
+    found = Counter()
+    for block in range(partition.block_count):
+        first, last = partition.own_start[block : block + 2]
+        local = partition.local_node[slice(*partition.local_start[block : block + 2])]
+        assert np.array_equal(local[: last - first], np.arange(first, last))
+        for node in range(first, last):
+            for place, spring in partition.entry[slice(*partition.entry_start[node : node + 2])]:
+                found[node, local[place], spring] += 1
+    assert found == wanted
+    assert len(wanted) == 2 * model.object_spring_count + model.virtual_spring_count
+    assert model.virtual_spring_count > 0
+
+
+def test_one_half_edge_speaks_for_each_spring(model):
+    partition = partition_model(model, 5)
+    spoken = partition.entry[partition.is_first == 1, 1]
+    assert np.array_equal(np.sort(spoken), np.arange(len(model.spring_nodes)))
+
+
+def test_blocks_are_equal_and_compact():
+    grid = np.stack(np.meshgrid(*[np.arange(8.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    order, start = bisect_nodes(grid[np.random.default_rng(1).permutation(512)], 8)
+    assert np.array_equal(np.sort(order), np.arange(512))
+    assert np.array_equal(np.diff(start), np.full(8, 64))
+    shuffled = grid[np.random.default_rng(1).permutation(512)]
+    extents = [np.ptp(shuffled[order[a:b]], axis=0).max() for a, b in pairwise(start)]
+    assert extents == [3.0] * 8
+
+
+def test_a_model_without_springs_has_blocks_without_a_halo():
+    parameters = SimulationParameters(connection_radius=0.001)
+    model = build_model(np.eye(3, dtype=np.float32), np.zeros((0, 3), np.float32), parameters)
+    partition = partition_model(model, 2)
+    assert (partition.most_entries, partition.most_locals) == (0, partition.most_own)
