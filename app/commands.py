@@ -1,13 +1,12 @@
 """What each command does; returns plain data and never prints."""
 
-import shutil
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
+from app.arguments import ImportMano, ImportMocap, ImportPhystwin, ImportStereo
 from app.jobs.catalog import Catalog
 from app.settings import Settings
 from physhandi import pipeline
@@ -192,15 +191,48 @@ def evaluate_hands(command: Any) -> dict[str, Any]:
     return hands
 
 
-def import_recording(source: Any, progress: Progress) -> list[Path]:
-    """Convert a foreign recording; returns the folders that were written."""
-    if type(source).__name__ == "ImportStereo":
-        from physhandi.data.importers.stereo import import_stereo
+def import_foreign(source: Any, progress: Progress) -> list[Path]:
+    """Convert what other programs wrote; returns the folders and files that were written."""
+    match source:
+        case ImportStereo():
+            from physhandi.data.importers.stereo import import_stereo
 
-        return [import_stereo(source.source, source.out, progress).folder]
-    from physhandi.data.importers.mocap import import_mocap
+            return [import_stereo(source.source, source.out, progress).folder]
+        case ImportMocap():
+            from physhandi.data.importers.mocap import import_mocap
 
-    return [sequence.folder for sequence in import_mocap(source.source, source.out, progress)]
+            return [one.folder for one in import_mocap(source.source, source.out, progress)]
+        case ImportMano():
+            from physhandi.data.importers.mano import import_mano
+            from physhandi.hand.mano import hands_folder
+
+            out = source.out or hands_folder()
+            return [import_mano(path, out) for path in source.sources]
+        case _:
+            return _import_phystwin(source, progress)
+
+
+def _import_phystwin(source: ImportPhystwin, progress: Progress) -> list[Path]:
+    from physhandi.data.importers.phystwin import import_phystwin
+    from physhandi.fitting.phystwin_run import import_phystwin_run
+
+    wants_run = source.optimal_params is not None
+    if not wants_run and (source.checkpoint is not None or source.run is not None):
+        raise UsageError(
+            "--checkpoint and --run need --optimal-params: a checkpoint holds no topology, which "
+            "is built again from optimal_params.pkl."
+        )
+    folder = import_phystwin(source.source, source.out, progress)
+    if source.optimal_params is None:
+        return [folder]
+    run = import_phystwin_run(
+        Sequence.load(folder),
+        source.optimal_params,
+        source.checkpoint,
+        source.run or folder.with_name(f"{folder.name}_phystwin"),
+        device=pick_device(source.device),
+    )
+    return [folder, run.folder]
 
 
 def export(command: Any) -> Path:
@@ -240,78 +272,6 @@ def serve(command: Any, on_ready: Callable[[str], None]) -> None:
     named = settings.device if "device" in settings.model_fields_set else "auto"
     settings = settings.model_copy(update={"device": pick_device(named)})
     serve_application(settings, on_ready=on_ready, queue_demo=command.demo)
-
-
-def doctor(data_dir: Path | None) -> tuple[bool, list[str]]:
-    """Check what the demo needs; returns whether all is well and what was found."""
-    checks = [_check(name, probe) for name, probe in _probes(data_dir)]
-    return all(ok for ok, _ in checks), [line for _, line in checks]
-
-
-def _check(name: str, probe: Callable[[], str]) -> tuple[bool, str]:
-    try:
-        return True, f"ok    {name}: {probe()}"
-    except Exception as error:  # noqa: BLE001  # whatever is wrong here is what doctor is to tell
-        return False, f"FAIL  {name}: {error}"
-
-
-def _probes(data_dir: Path | None) -> Iterator[tuple[str, Callable[[], str]]]:
-    def python() -> str:
-        return sys.version.split()[0]
-
-    def torch_build() -> str:
-        import torch
-
-        return torch.__version__
-
-    def simulation() -> str:
-        import numpy as np
-
-        from physhandi.simulation.model import SimulationParameters
-        from physhandi.simulation.simulator import Simulator
-        from physhandi.simulation.topology import build_model
-
-        device = pick_device("auto")
-        parameters = SimulationParameters(ground_height=None, drag=0.0, substeps_per_frame=100)
-        model = build_model(np.zeros((1, 3)), np.zeros((0, 3)), parameters)
-        control = np.zeros((2, 0, 3), np.float32)
-        fall = float(Simulator(model, parameters, device=device).rollout(control).position[1, 0, 2])
-        # Symplectic Euler falls g t² / 2 · (1 + 1/substeps) in the first frame.
-        expected = -0.5 * 9.81 / 900 * 1.01
-        if abs(fall - expected) > 1e-5:
-            raise RuntimeError(
-                f"a free fall of one frame gave {fall:.6f} m, expected {expected:.6f} m"
-            )
-        return f"Warp on {device}, a falling node lands where it should"
-
-    def bundled() -> str:
-        catalog = open_catalog(data_dir)
-        entries = list(catalog.sequences())
-        if not entries:
-            raise RuntimeError("no sequence is bundled; reinstall the package")
-        return ", ".join(entry.id for entry in entries)
-
-    def hand() -> str:
-        from physhandi.hand.model import load_hand_model
-
-        return ", ".join(
-            f"{s} hand {load_hand_model(s).vertex_count} vertices" for s in ("right", "left")
-        )
-
-    def space() -> str:
-        folder = read_settings(data_dir=data_dir).data_dir
-        existing = next(place for place in (folder, *folder.parents) if place.exists())
-        free = shutil.disk_usage(existing).free
-        if free < 500e6:
-            raise RuntimeError(f"only {free / 1e6:.0f} MB free; 500 MB are needed")
-        return f"{free / 1e9:.0f} GB free"
-
-    yield "python", python
-    yield "torch", torch_build
-    yield "simulation", simulation
-    yield "hand", hand
-    yield "sequences", bundled
-    yield "disk", space
 
 
 def as_json_data(result: Any) -> Any:

@@ -1,0 +1,241 @@
+"""What can be said on the command line: one dataclass a command, the source of its help text."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg, subcommand
+
+DataDir = Annotated[
+    Path | None,
+    arg(help="Folder with `sequences/` and `runs/` (PHYSHANDI_DATA_DIR, else `data`)."),
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Serve:
+    """Serve the application and print the address to open."""
+
+    host: str | None = None
+    """Address to listen on; others reach anything but loopback (PHYSHANDI_HOST, else 127.0.0.1)."""
+    port: int | None = None
+    """Port to listen on; 0 takes a free one (PHYSHANDI_PORT, else 8080)."""
+    data_dir: DataDir = None
+    device: str | None = None
+    """Warp device: auto, cpu or cuda:0 (PHYSHANDI_DEVICE, else auto)."""
+    demo: bool = False
+    """Also queue a quick fit of the bundled sequence."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reconstruct:
+    """Fit hands and object of one or several sequences of the same object."""
+
+    sequences: Positional[tuple[str, ...]]
+    """Folders or names of sequences."""
+    out: Path
+    """Run folder to fill; an interrupted run goes on after its last finished stage."""
+    profile: str = "default"
+    """Settings: quick, default, paper or phystwin."""
+    device: str = "auto"
+    """Warp device: auto, cpu or cuda:0."""
+    data_dir: DataDir = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulate:
+    """Simulate a fitted object again, with other parameters or in another sequence."""
+
+    run: Positional[str]
+    """Folder or id of a finished run."""
+    out: Path
+    """Run folder to fill."""
+    sequence: str | None = None
+    """Another sequence of the same object; none takes the run's first one."""
+    connection_radius: float | None = None
+    """δ of object springs [m]."""
+    max_neighbors: int | None = None
+    """d_max of object springs."""
+    virtual_connection_radius: float | None = None
+    """δ of virtual springs [m]."""
+    virtual_max_neighbors: int | None = None
+    """d_max of virtual springs."""
+    stiffness_scale: float | None = None
+    """Multiplies every stiffness."""
+    damping: float | None = None
+    """Dashpot of new springs; fitted ones keep their ratio to the global value [N·s/m]."""
+    drag: float | None = None
+    """Decay rate of velocity [1/s]."""
+    restitution: float | None = None
+    """Ground restitution."""
+    friction: float | None = None
+    """Ground friction."""
+    substeps_per_frame: int | None = None
+    """Integration steps in one frame."""
+    device: str = "auto"
+    """Warp device: auto, cpu or cuda:0."""
+    data_dir: DataDir = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateRun:
+    """Measure a run against its sequences."""
+
+    run: Positional[str]
+    """Folder or id of a finished run."""
+    json: bool = False
+    """Print JSON instead of a table."""
+    data_dir: DataDir = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateHands:
+    """Measure only the hands of a run: reprojection error of every view [px]."""
+
+    run: Positional[str]
+    """Folder or id of a finished run."""
+    json: bool = False
+    """Print JSON instead of a table."""
+    data_dir: DataDir = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluate:
+    """Measure results."""
+
+    what: (
+        Annotated[EvaluateRun, subcommand("run", prefix_name=False)]
+        | Annotated[EvaluateHands, subcommand("hands", prefix_name=False)]
+    )
+    """What to measure."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportStereo:
+    """Two calibrated videos of a hand (cam0_test.mp4, c0.dat, rot_trans_c0.dat, …)."""
+
+    source: Positional[Path]
+    """Folder of the recording."""
+    out: Path
+    """Sequence folder to write."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportMocap:
+    """Motion capture of a rope held by two grippers (one .npy per trajectory)."""
+
+    source: Positional[Path]
+    """A trajectory, or a folder of them."""
+    out: Path
+    """Folder to write one sequence per trajectory into."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportPhystwin:
+    """A case of the PhysTwin data set, and what PhysTwin made of it."""
+
+    source: Positional[Path]
+    """Case folder (calibrate.pkl, metadata.json, final_data.pkl, color/, depth/, mask/, …)."""
+    out: Path
+    """Sequence folder to write."""
+    optimal_params: Path | None = None
+    """optimal_params.pkl of PhysTwin's search; makes a run of it."""
+    checkpoint: Path | None = None
+    """best_*.pth of PhysTwin's training, with per-spring stiffness; needs --optimal-params."""
+    run: Path | None = None
+    """Run folder to write; none takes the sequence folder's name with _phystwin after it."""
+    device: str = "auto"
+    """Warp device that rolls the imported run out: auto, cpu or cuda:0."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportMano:
+    """MANO hand models that you have downloaded under their own licence."""
+
+    sources: Positional[tuple[Path, ...]]
+    """MANO_LEFT.pkl, MANO_RIGHT.pkl or both."""
+    out: Path | None = None
+    """Folder of hand models (PHYSHANDI_HANDS, else ~/.local/share/physhandi/hands)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Import:
+    """Turn a recording, a result or a hand model of another format into ours."""
+
+    source: (
+        Annotated[ImportStereo, subcommand("stereo", prefix_name=False)]
+        | Annotated[ImportMocap, subcommand("mocap", prefix_name=False)]
+        | Annotated[ImportPhystwin, subcommand("phystwin", prefix_name=False)]
+        | Annotated[ImportMano, subcommand("mano", prefix_name=False)]
+    )
+    """What to import."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export:
+    """Write a run as files that other programs read."""
+
+    run: Positional[str]
+    """Folder or id of a finished run."""
+    format: Literal["ply", "npz", "csv", "yaml"]
+    """ply: meshes and points per frame; npz and csv: trajectories; yaml: parameters and metrics."""
+    out: Path
+    """File or folder to write."""
+    sequence: str | None = None
+    """Which sequence of the run; none takes the first one."""
+    frame: int | None = None
+    """Only this frame (ply)."""
+    overwrite: bool = False
+    """Replace what is there."""
+    data_dir: DataDir = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchmarkRollout:
+    """Time forward simulation against a plain baseline in the same run."""
+
+    device: str = "auto"
+    """Warp device: auto, cpu or cuda:0."""
+    nodes: int = 400
+    """Object nodes of the made-up object."""
+    frames: int = 3
+    """Frames to time."""
+    model: Path | None = None
+    """A PhysTwin-format .npz topology to time instead."""
+    json: bool = False
+    """Print JSON instead of lines."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchmarkGradient(BenchmarkRollout):
+    """Time forward simulation and its gradient against a plain baseline in the same run."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Benchmark:
+    """Measure speed."""
+
+    what: (
+        Annotated[BenchmarkRollout, subcommand("rollout", prefix_name=False)]
+        | Annotated[BenchmarkGradient, subcommand("gradient", prefix_name=False)]
+    )
+    """What to measure."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Doctor:
+    """Check that this machine can run the demo; exit code 0 when it can."""
+
+    data_dir: DataDir = None
+
+
+Command = (
+    Annotated[Serve, subcommand("serve")]
+    | Annotated[Reconstruct, subcommand("reconstruct")]
+    | Annotated[Simulate, subcommand("simulate")]
+    | Annotated[Evaluate, subcommand("evaluate")]
+    | Annotated[Import, subcommand("import")]
+    | Annotated[Export, subcommand("export")]
+    | Annotated[Benchmark, subcommand("benchmark")]
+    | Annotated[Doctor, subcommand("doctor")]
+)
