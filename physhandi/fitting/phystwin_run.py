@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import warp as wp
 from jaxtyping import Float
 from numpy import ndarray
 
 from physhandi.data.attempt import Attempt
+from physhandi.data.environment import ENVIRONMENT, describe_environment
 from physhandi.data.importers.phystwin_experiment import (
     Checkpoint,
     Optimum,
@@ -182,6 +184,8 @@ def _fill(
 ) -> None:
     """Store what a fit would have stored, and simulate all frames."""
     folder = artefacts.sequence_folder(sequence.name)
+    environment = describe_environment(device, wp.get_device(device).name)
+    attempt.save_json(ENVIRONMENT, environment)
     artefacts.save_sequence_meta(attempt, sequence)
     artefacts.save_observation(attempt, sequence.name, observe_object(sequence, progress))
     attempt.save_array(f"{folder}/object_node.npy", model.object_node)

@@ -71,6 +71,7 @@ def test_the_run_says_what_it_is(run: Run, experiment: Experiment) -> None:
         "PhysTwin: single_lift_sloth",
     )
     assert run.config["profile"]["profile"] == "phystwin"
+    assert run.json("environment.json")["device"] == "cpu"
     report = run.json(REPORT)
     assert report["springs"] == {
         "object": experiment.object_count,
