@@ -111,6 +111,7 @@ def generate_bundled(
     progress: Progress | None = None,
     recipe: Recipe | None = None,
     overwrite: bool = False,
+    tells_truth: bool = False,
 ) -> Sequence:
     """Simulate, film and write the bundled sequence; the same seed gives the same content.
 
@@ -120,6 +121,7 @@ def generate_bundled(
         progress: Told after every frame of every view; may ask to stop.
         recipe: Size of the sequence; the bundled one by default.
         overwrite: Whether to replace a sequence that is there.
+        tells_truth: Whether to write the true hand and contact beside it, for scoring.
 
     Returns:
         The finished, validated sequence.
@@ -141,6 +143,8 @@ def generate_bundled(
             shot = _Shot(writer, f"views/{name}", camera, random)
             pictures = _film(shot, scenes, progress)
             _annotate(shot, truth, pictures, recipe.track_count)
+        if tells_truth:
+            _save_truth(writer, truth)
         return writer.finish(
             SequenceMeta(
                 name=writer.folder.name,
@@ -162,6 +166,18 @@ def generate_bundled(
                 },
             )
         )
+
+
+def _save_truth(writer: SequenceWriter, truth: Truth) -> None:
+    """Write the hand, and where its vertices hold the sheet by virtual springs all the time."""
+    model, frame_count = truth.model, truth.motion.frame_count
+    held = np.zeros(model.node_count, dtype=bool)
+    held[model.spring_nodes[model.object_spring_count :, 0]] = True
+    keypoint = truth.motion.keypoints(load_hand_model("right"))
+    writer.save_array("truth/hand_right_keypoint.npy", keypoint.astype(np.float32))
+    writer.save_array("truth/hand_right_vertex.npy", truth.control.astype(np.float32))
+    writer.save_array("truth/contact_point.npy", truth.sheet.node.astype(np.float32))
+    writer.save_array("truth/contact.npy", np.tile(held, (frame_count, 1)))
 
 
 @dataclass(frozen=True)

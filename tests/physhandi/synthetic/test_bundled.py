@@ -8,6 +8,7 @@ import yaml
 from scipy.spatial import cKDTree
 
 from physhandi.data.sequence import Sequence
+from physhandi.data.truth import read_truth
 from physhandi.errors import CancelledError, SequenceError
 from physhandi.perception.lifting import hand_points, observe_object
 from physhandi.perception.shape import object_nodes_from_observation
@@ -86,6 +87,25 @@ def test_the_folder_keeps_the_makers_numbers_to_itself(which, request):
     assert kinds == {"keypoint.npy", "track.npy", "track_visible.npy"}
     assert sequence.object_node is None
     assert sequence.control is None
+
+
+def test_the_truth_is_told_on_request(small, truth, tmp_path):
+    told = generate_bundled(tmp_path / "small", seed=5, recipe=SMALL, tells_truth=True)
+    extra = {name for name in contents(told.folder) if name not in contents(small.folder)}
+    assert {name.split("/")[0] for name in extra} == {"truth"}
+    known = read_truth(told.folder)
+    np.testing.assert_array_equal(known.hand_vertex["right"], truth.control.astype(np.float32))
+    view = told.views[0]
+    pixel = view.camera.project(known.hand_keypoint["right"].astype(np.float64))
+    assert np.nanmedian(np.linalg.norm(view.keypoint[:, 0, :, :2] - pixel, axis=-1)) < 3.0
+    assert np.median(np.linalg.norm(pixel[-1] - pixel[0], axis=-1)) > 10.0
+    assert known.contact is not None
+    assert known.contact_point is not None
+    assert known.contact.shape == (8, len(truth.sheet.node))
+    distance = cKDTree(truth.control[0]).query(known.contact_point)[0]
+    # The generator joins up to four nodes nearer than 9 mm to each of the hand's vertices.
+    assert distance[known.contact[0]].max() < 0.009
+    assert known.contact[0].sum() > 0.8 * (distance < 0.006).sum() > 5
 
 
 def test_what_is_lifted_lies_on_what_was_simulated(small, truth):
