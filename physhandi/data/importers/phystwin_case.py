@@ -70,7 +70,12 @@ def read_case(folder: Path) -> Case:
     files = {n: folder / n for n in ("final_data.pkl", "metadata.json", "gt_track_3d.pkl")}
     motion = read_motion(files["final_data.pkl"]) if files["final_data.pkl"].is_file() else None
     metadata = read_metadata(files["metadata.json"]) if files["metadata.json"].is_file() else None
-    if metadata is None and (motion is None or any((folder / name).exists() for name in _IMAGES)):
+    if metadata is None and motion is None:
+        raise ImportFailedError(
+            f"{folder} is no PhysTwin case: it has neither final_data.pkl nor metadata.json. Give "
+            "one folder of data/different_types/."
+        )
+    if metadata is None and any((folder / name).exists() for name in _IMAGES):
         fail(files["metadata.json"], "is missing; images cannot be placed without its intrinsics")
     needs_poses = metadata is not None or (folder / "calibrate.pkl").is_file()
     poses = read_poses(folder / "calibrate.pkl") if needs_poses else np.zeros((0, 4, 4))
