@@ -240,5 +240,5 @@ def test_a_file_in_place_of_a_case_is_refused(case: Case, tmp_path: Path) -> Non
     with pytest.raises(ImportFailedError, match="is not a folder"):
         import_phystwin(case.folder / "final_data.pkl", tmp_path / "out")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(ImportFailedError, match="neither final_data.pkl nor metadata.json"):
+    with pytest.raises(ImportFailedError, match=r"neither final_data\.pkl nor metadata\.json"):
         import_phystwin(tmp_path / "empty", tmp_path / "out")
