@@ -1,7 +1,5 @@
 """How far fitted hands are from measured points, and from the true hand where it is known."""
 
-from typing import Any
-
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
@@ -93,19 +91,22 @@ def vertex_errors(
     return errors
 
 
-def held_where_missing(motion: Float[ndarray, "frame point 3"]) -> tuple[Any, int]:
+def held_where_missing(
+    motion: Float[ndarray, "frame point 3"],
+) -> tuple[Float[ndarray, "frame point 3"] | None, int]:
     """Let a hand stand still where its fit is not finite, as the static baseline does.
 
     Returns:
         The motion, each missing frame filled with the last finite one before it (at the start, with
-        the first one), and the number of filled frames. Without any finite frame nothing is filled.
+        the first one), and the number of missing frames; None if no frame is finite.
     """
     is_known = np.isfinite(motion).all(axis=(1, 2))
-    if not is_known.any() or is_known.all():
-        return motion, int((~is_known).sum())
+    missing = int((~is_known).sum())
+    if not is_known.any():
+        return None, missing
     last = np.maximum.accumulate(np.where(is_known, np.arange(len(motion)), -1))
     last[last < 0] = int(is_known.argmax())
-    return motion[last], int((~is_known).sum())
+    return motion[last], missing
 
 
 def _from_wrist(

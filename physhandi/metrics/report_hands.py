@@ -59,11 +59,10 @@ def score_hands(
         score: dict[str, Any] = {}
         if joint is not None and detected is not None:
             score |= _reprojection(sequence, joint, detected[:, :, hand : hand + 1])
-        missing = sequence.frame_count
-        if joint is not None:
-            joint, missing = held_where_missing(joint)
-        if vertex is not None:
-            vertex, _ = held_where_missing(vertex)
+        joint, missing = (
+            (None, sequence.frame_count) if joint is None else held_where_missing(joint)
+        )
+        vertex = None if vertex is None else held_where_missing(vertex)[0]
         errors = _truth_errors(joint, vertex, true_joint, true_vertex)
         if vertex is not None and points is not None:
             of_hand = points[hand * sequence.frame_count : (hand + 1) * sequence.frame_count]

@@ -20,6 +20,7 @@ from physhandi.metrics.contact import (
     proximity_labels,
     true_labels,
 )
+from physhandi.metrics.hand_shape import held_where_missing
 from physhandi.metrics.topology import radius_deviation, resolution
 
 
@@ -153,7 +154,8 @@ def _contact(
 ) -> ContactReference | None:
     """Prepare the judgement of contacts; None without hands or without springs to judge."""
     vertices = [read(folder / f"hand_{side}_vertex.npy") for side in sequence.hands]
-    known = [vertex for vertex in vertices if vertex is not None]
+    whole = [held_where_missing(vertex)[0] for vertex in vertices if vertex is not None]
+    known = [vertex for vertex in whole if vertex is not None]
     path = folder / "model.safetensors"
     if not known or not path.is_file():
         return None

@@ -156,6 +156,13 @@ def test_a_hand_that_was_not_fitted_is_listed_without_figures(tmp_path: Path, fo
     right = score_run(tmp_path / "out", sequence)["hands"]["right"]
     assert right["substituted_frames"] == FRAMES
     assert right["mpjpe"] is None
+    lost = np.full_like(truth, np.nan)
+    np.save(folder / "hand_right_keypoint.npy", lost)
+    np.save(folder / "hand_right_vertex.npy", lost)
+    save_model(folder, [[0, 2]])
+    report = score_run(tmp_path / "out", sequence)
+    assert report["hands"]["right"] == right
+    assert "contact" not in report
     gap = truth.copy()
     gap[1] = np.nan
     gap[2:] += [0.0, 0.0, 0.05]
