@@ -142,6 +142,10 @@ class ImportPhystwin:
     """optimal_params.pkl of PhysTwin's search; makes a run of it."""
     checkpoint: Path | None = None
     """best_*.pth of PhysTwin's training, with per-spring stiffness; needs --optimal-params."""
+    inference: Path | None = None
+    """inference.pkl, PhysTwin's own rollout; the report says how far ours is from it."""
+    keep_decimals: bool = False
+    """Keep the decimals of dashpot and drag, which PhysTwin drops after its search."""
     run: Path | None = None
     """Run folder to write; none takes the sequence folder's name with _phystwin after it."""
     device: str = "auto"

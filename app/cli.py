@@ -88,8 +88,7 @@ def _dispatch(command: Any) -> int:
         case Evaluate(what=what):
             _show(commands.evaluate_run(what), as_json=what.json)
         case Import(source=source):
-            for path in _watched(lambda progress: commands.import_foreign(source, progress)):
-                print(path)
+            _show(_watched(lambda progress: commands.import_foreign(source, progress)))
         case Export():
             print(commands.export(command))
         case Benchmark(what=what):

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from pydantic import ValidationError
 
@@ -191,48 +191,52 @@ def evaluate_hands(command: Any) -> dict[str, Any]:
     return hands
 
 
-def import_foreign(source: Any, progress: Progress) -> list[Path]:
-    """Convert what other programs wrote; returns the folders and files that were written."""
+def import_foreign(source: Any, progress: Progress) -> dict[str, Any]:
+    """Convert what other programs wrote; returns what was written, and what was noticed."""
     match source:
         case ImportStereo():
             from physhandi.data.importers.stereo import import_stereo
 
-            return [import_stereo(source.source, source.out, progress).folder]
+            return {"sequence": str(import_stereo(source.source, source.out, progress).folder)}
         case ImportMocap():
             from physhandi.data.importers.mocap import import_mocap
 
-            return [one.folder for one in import_mocap(source.source, source.out, progress)]
+            sequences = import_mocap(source.source, source.out, progress)
+            return {"sequences": [str(sequence.folder) for sequence in sequences]}
         case ImportMano():
             from physhandi.data.importers.mano import import_mano
             from physhandi.hand.mano import hands_folder
 
             out = source.out or hands_folder()
-            return [import_mano(path, out) for path in source.sources]
+            return {"hands": [str(import_mano(path, out)) for path in source.sources]}
         case _:
             return _import_phystwin(source, progress)
 
 
-def _import_phystwin(source: ImportPhystwin, progress: Progress) -> list[Path]:
+def _import_phystwin(source: ImportPhystwin, progress: Progress) -> dict[str, Any]:
     from physhandi.data.importers.phystwin import import_phystwin
     from physhandi.fitting.phystwin_run import import_phystwin_run
 
     wants_run = source.optimal_params is not None
-    if not wants_run and (source.checkpoint is not None or source.run is not None):
+    if not wants_run and (source.checkpoint or source.inference or source.run):
         raise UsageError(
-            "--checkpoint and --run need --optimal-params: a checkpoint holds no topology, which "
-            "is built again from optimal_params.pkl."
+            "--checkpoint, --inference and --run need --optimal-params: a checkpoint holds no "
+            "topology, which is built again from optimal_params.pkl."
         )
     folder = import_phystwin(source.source, source.out, progress)
     if source.optimal_params is None:
-        return [folder]
+        return {"sequence": str(folder)}
     run = import_phystwin_run(
         Sequence.load(folder),
         source.optimal_params,
         source.checkpoint,
         source.run or folder.with_name(f"{folder.name}_phystwin"),
         device=pick_device(source.device),
+        inference=source.inference,
+        truncates_damping=False if source.keep_decimals else None,
+        progress=progress,
     )
-    return [folder, run.folder]
+    return {"sequence": str(folder), "run": str(run.folder), **run.json("import.json")}
 
 
 def export(command: Any) -> Path:
@@ -285,6 +289,10 @@ def lines(result: Any, indent: int = 0) -> Iterator[str]:
         if isinstance(value, dict):
             yield f"{'  ' * indent}{key}:"
             yield from lines(value, indent + 1)
+        elif isinstance(value, list):
+            yield f"{'  ' * indent}{key}:"
+            items = cast("list[object]", value)
+            yield from (f"{'  ' * (indent + 1)}{item}" for item in items)
         else:
             shown = f"{value:.6g}" if isinstance(value, float) else value
             yield f"{'  ' * indent}{key}: {shown}"

@@ -1,0 +1,73 @@
+"""The commands that turn other programs' files into ours."""
+
+import numpy as np
+import pytest
+from mano_file import write_mano
+from phystwin_case import write_case
+from phystwin_experiment import write_experiment
+
+from app import cli
+from physhandi.data.run import Run
+from physhandi.data.sequence import Sequence
+from physhandi.hand.model import load_hand_model
+
+
+def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    with pytest.raises(SystemExit) as end:
+        cli.main([str(argument) for argument in arguments])
+    return int(end.value.code or 0), *capsys.readouterr()
+
+
+def test_a_phystwin_case_and_what_it_was_fitted_to_are_imported(tmp_path, capsys):
+    case = write_case(tmp_path / "case")
+    experiment = write_experiment(case, tmp_path / "experiment")
+    code, out, error = call(
+        capsys,
+        *("import", "phystwin", case.folder, "--out", tmp_path / "block", "--device", "cpu"),
+        *("--optimal-params", experiment.optimum, "--checkpoint", experiment.checkpoint),
+        *("--inference", experiment.inference),
+    )
+    assert code == 0, error
+    sequence = Sequence.load(tmp_path / "block")
+    assert sequence.object_node is not None
+    assert np.ptp(sequence.object_node, axis=0).min() > 0
+    run = Run.open(tmp_path / "block_phystwin")
+    assert run.is_published
+    moved = run.array("sequences/block/rollout.npy")
+    assert np.abs(moved[-1] - moved[0]).max() > 0.01
+    report = run.json("import.json")
+    assert f"run: {run.folder}" in out
+    for name in report:
+        assert name in out
+
+
+def test_a_case_alone_becomes_a_sequence_and_no_run(tmp_path, capsys):
+    case = write_case(tmp_path / "case")
+    code, out, _ = call(capsys, "import", "phystwin", case.folder, "--out", tmp_path / "block")
+    assert (code, out) == (0, f"sequence: {tmp_path / 'block'}\n")
+    assert [path.name for path in tmp_path.iterdir() if path.name != "case"] == ["block"]
+
+
+def test_a_checkpoint_without_the_search_result_is_refused_before_anything_is_written(
+    tmp_path, capsys
+):
+    case = write_case(tmp_path / "case")
+    code, out, error = call(
+        capsys,
+        *("import", "phystwin", case.folder, "--out", tmp_path / "block"),
+        *("--checkpoint", tmp_path / "best.pth"),
+    )
+    assert code == 2
+    assert "--optimal-params" in error
+    assert out == ""
+    assert not (tmp_path / "block").exists()
+
+
+def test_mano_is_imported_where_fits_look_for_it(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("PHYSHANDI_HANDS", str(tmp_path / "hands"))
+    source = write_mano(tmp_path)
+    code, out, error = call(capsys, "import", "mano", source)
+    assert code == 0, error
+    assert "mano_right.npz" in out
+    assert load_hand_model("right", "mano").vertex_count == 778
+    assert [path.name for path in (tmp_path / "hands").iterdir()] == ["mano_right.npz"]
