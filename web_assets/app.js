@@ -184,6 +184,28 @@ document.addEventListener("visibilitychange", () => (document.hidden ? unfollow(
 addEventListener("pagehide", unfollow);
 addEventListener("pageshow", follow);
 
+/* ---- what a word means: shown beside it while it is pointed at or in focus ---- */
+
+function explain(place) {
+  const tip = document.getElementById("tip") ?? document.body.appendChild(Object.assign(document.createElement("div"), { id: "tip", role: "tooltip" }));
+  tip.hidden = !place;
+  document.querySelector("[aria-describedby=tip]")?.removeAttribute("aria-describedby");
+  if (!place) return;
+  tip.textContent = place.dataset.about;
+  place.setAttribute("aria-describedby", "tip");
+  const box = place.getBoundingClientRect();
+  const above = box.top - tip.offsetHeight - 6;
+  tip.style.left = `${Math.max(8, Math.min(box.left, innerWidth - tip.offsetWidth - 8))}px`;
+  tip.style.top = `${above > 8 ? above : box.bottom + 6}px`;
+}
+
+for (const [begin, end] of [["mouseover", "mouseout"], ["focusin", "focusout"]]) {
+  document.addEventListener(begin, (event) => event.target.dataset?.about && explain(event.target));
+  document.addEventListener(end, (event) => event.target.dataset?.about && explain(null));
+}
+addEventListener("scroll", () => explain(null), { capture: true, passive: true });
+addEventListener("keydown", (event) => event.key === "Escape" && explain(null));
+
 /* ---- start ---- */
 
 function showLocalTimes(root = document) {

@@ -21,6 +21,13 @@ const number = (value) => {
   return size >= 1000 && size < 1e7 ? value.toFixed(0) : Number(value.toPrecision(4)).toString();
 };
 
+/** Write the ticks of an axis, all of them with an exponent if one of them needs it. */
+function tickTexts(ticks) {
+  const rounded = ticks.map((tick) => (tick === null ? null : Number(tick.toPrecision(3))));
+  const isSmall = rounded.some((tick) => tick && (Math.abs(tick) < 1e-3 || Math.abs(tick) >= 1e6));
+  return rounded.map((tick) => (tick === null ? "" : tick && isSmall ? tick.toExponential() : tick.toString()));
+}
+
 /**
  * A chart whose data can grow.
  * options: title, xLabel, unit, series [{label, color (CSS variable), dash}], band (first x of the
@@ -110,7 +117,7 @@ class Chart {
       scales: { x: { time: false }, y: isLog ? { distr: 3 } : {} },
       axes: [
         { ...axis, ...label, label: options.xLabel, size: 30, values: (_, ticks) => ticks.map((tick) => (Number.isInteger(tick) ? tick : "")) },
-        { ...axis, size: 58, values: (_, ticks) => ticks.map((tick) => (tick === null ? "" : Number(tick.toPrecision(3)).toString())) },
+        { ...axis, size: 58, values: (_, ticks) => tickTexts(ticks) },
       ],
       series: [{}, ...options.series.map((line) => ({
         label: line.label, stroke: color(line.color), width: 2, dash: line.dash, spanGaps: false,

@@ -9,7 +9,9 @@ from physhandi.data.run_files import EXIT, read_mapping
 
 _ADVICE = {
     "MissingInputError": "Choose a recording that has this part, or import it again with it.",
-    "SequenceError": "Repair the named file of the sequence, or import the recording again.",
+    "SequenceError": (
+        "Repair the named file of the sequence and resume, or import the recording again."
+    ),
     "UsageError": "Launch a new fit with a value that the message allows.",
     "FitError": (
         "Look at the recording first: is the hand or object seen in most frames? "

@@ -12,24 +12,32 @@ METHODS = {
 }
 """What the columns of a comparison are."""
 _HIGHER = {"accuracy", "iou", "precision", "recall", "f1", "psnr", "ssim"}
-_SHARES = {"accuracy", "iou", "precision", "recall", "f1"}
-_LENGTHS = {"chamfer", "error", "mpjpe", "distance", "spacing", "resolution"}
-_COUNTS = {"frames", "count", "scored", "seed"}
+_SHARES = {"accuracy", "iou", "precision", "recall", "f1", "share"}
+_LENGTHS = {"chamfer", "error", "mpjpe", "mpvpe", "distance", "spacing", "resolution", "radius"}
+_COUNTS = {"frames", "count", "scored", "seed", "keypoints"}
 _ABOUT = (
     ("chamfer_dynamic", "Only over observed points that move more than 10 mm from frame 0."),
-    ("chamfer_symmetric", "Mean of both ways between observed points and nodes."),
-    ("chamfer_l1", "From each observed point to its nearest node, in the L1 norm as in PhysTwin."),
+    ("chamfer_symmetric", "Mean of both ways between observed points and the object or hand."),
+    ("chamfer_phystwin", "From observed points to the nearest node, as PhysTwin evaluates it."),
+    ("chamfer_l1", "From each observed point to its nearest node, in the L1 norm."),
     ("chamfer_l2", "From each observed point to its nearest node, the straight distance."),
+    ("chamfer_points_to_mesh", "From each observed point of the hand to the fitted hand."),
+    ("chamfer_mesh_to_points", "From each vertex of the fitted hand to the observed points."),
+    ("track_error_phystwin", "Track error as PhysTwin evaluates it: to the nearest node."),
     ("track_error", "From each tracked point to where the object has moved it."),
     ("marker_error", "From each marker to its node."),
     ("reprojection", "Joints of the hand against the detected keypoints, in the images."),
-    (
-        "radius_deviation",
-        "Connection radius over resolution, against the recommended 3: |(δ/Δx)/3 - 1|.",
-    ),
+    ("rrd", "How far connection radius over resolution is from 3: |(δ/Δx)/3 - 1|."),
+    ("resolution", "Δx: mean distance of the nodes to their four nearest neighbours."),
     ("mpjpe", "Mean distance of the hand's joints to the true ones."),
+    ("accuracy", "Share of nodes whose contact is told rightly, at this distance to the hand."),
+    ("precision", "Of the nodes told to be in contact, the share that is."),
+    ("recall", "Of the nodes in contact, the share that is told to be."),
+    ("f1", "Harmonic mean of precision and recall of contact."),
+    ("predicted_share", "Share of nodes that are told to be in contact."),
+    ("label_share", "Share of nodes that are in contact by the labels."),
+    ("known_share", "Share of nodes whose contact could be labelled."),
     ("iou", "Nodes in contact in both over nodes in contact in either."),
-    ("accuracy", "Share of nodes whose contact is told rightly."),
 )
 
 
@@ -57,8 +65,14 @@ def tabulate(scores: Any) -> dict[str, Any]:
         facts = {key: v for key, v in inside.items() if key not in columns and key != "unit"}
         if not columns:
             columns, facts = {"value": facts}, {}
-        note = ", ".join(f"{words(key)} {_fact(key, v)}" for key, v in facts.items())
         rows = _rows(columns, str(inside.get("unit", unit)))
+        facts |= {
+            key: value
+            for column in columns.values()
+            for key, value in column.items()
+            if key != "unit" and not isinstance(value, int | float | None)
+        }
+        note = ", ".join(f"{words(key)} {_fact(key, v)}" for key, v in facts.items())
         heads = [{"name": key, "about": METHODS.get(key, "")} for key in columns]
         tables.append({"name": name, "note": note, "columns": heads, "rows": rows})
     return {"tables": tables, "notes": notes}
@@ -75,13 +89,13 @@ def _rows(columns: dict[str, dict[str, Any]], unit: str) -> list[dict[str, Any]]
     rows: list[dict[str, Any]] = []
     for quantity in dict.fromkeys(key for column in columns.values() for key in column):
         values = [column.get(quantity) for column in columns.values()]
-        if quantity == "unit" or all(value is None for value in values):
+        known = [value for value in values if isinstance(value, int | float)]
+        if not known:
             continue
         parts = set(quantity.split("_"))
         local = next((str(c["unit"]) for c in columns.values() if "unit" in c), unit)
         kind = _unit_of(parts, local)
         is_higher = bool(parts & _HIGHER)
-        known = [v for v in values if isinstance(v, int | float)]
         is_contest = "rollout" in columns and len(known) > 1 and not parts & _COUNTS
         best = (max if is_higher else min)(known) if is_contest else None
         rows.append(
@@ -92,7 +106,7 @@ def _rows(columns: dict[str, dict[str, Any]], unit: str) -> list[dict[str, Any]]
                 "is_higher_better": is_higher,
                 "cells": [
                     {
-                        "text": "none" if value is None else _figure(scaled(value, kind)[0]),
+                        "text": _figure(scaled(value, kind)[0]),
                         "is_best": best is not None and value == best,
                     }
                     for value in values
@@ -104,6 +118,8 @@ def _rows(columns: dict[str, dict[str, Any]], unit: str) -> list[dict[str, Any]]
 
 def _figure(value: Any) -> str:
     """Show four digits, the last ones too if they are zero, so that columns compare."""
+    if not isinstance(value, int | float):
+        return "–"  # noqa: RUF001  # a dash, as tables have it
     is_plain = isinstance(value, float) and 1e-3 <= abs(value) < 1e3
     return f"{value:#.4g}" if is_plain else short(value)
 

@@ -1,6 +1,5 @@
 """Filling templates, and how numbers, names and times are written on pages."""
 
-import re
 from typing import Any
 
 from fastapi.responses import HTMLResponse
@@ -9,6 +8,17 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoes
 from app.jobs.log import level_of
 from app.settings import WEB_ASSETS
 
+_SPELLINGS = {
+    "l1": "L1",
+    "l2": "L2",
+    "f1": "F1",
+    "iou": "IoU",
+    "rrd": "RRD",
+    "mpjpe": "MPJPE",
+    "phystwin": "PhysTwin",
+    "5mm": "5 mm",
+    "10mm": "10 mm",
+}
 _TITLES = {
     400: "The server cannot answer this",
     404: "Nothing is here",
@@ -56,8 +66,8 @@ def short(value: Any) -> str:
 
 
 def words(value: Any) -> str:
-    """Show a name of the program as words."""
-    return re.sub(r"\bl([12])\b", r"L\1", str(value).replace("_", " "))
+    """Show a name of the program as words, short forms as they are usually written."""
+    return " ".join(_SPELLINGS.get(part, part) for part in str(value).replace("_", " ").split(" "))
 
 
 def duration(seconds: Any) -> str:

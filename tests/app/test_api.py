@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from server_world import World
-from sheet_sequence import FRAMES, NODE
+from sheet_sequence import FITTED, FRAMES, NODE
 from starlette.testclient import TestClient
 
 from physhandi.data.run import Run
@@ -64,6 +64,47 @@ def test_losses_are_curves_of_iteration_and_loss(client: TestClient) -> None:
     assert len(curve) > 1
     assert [point[0] for point in curve] == sorted(point[0] for point in curve)
     assert losses["zeroth_order"]["before"] > losses["zeroth_order"]["after"] > 0
+
+
+def test_errors_of_every_frame_come_with_where_the_future_begins(client: TestClient) -> None:
+    sequences = client.get("/api/v1/runs/fitted/frame_errors").json()["sequences"]
+    assert list(sequences) == ["sheet"]
+    errors = sequences["sheet"]
+    assert errors["frames"] == list(range(FRAMES))
+    assert errors["future_start"] == FITTED
+    assert len(errors["rollout"]["track_error"]) == FRAMES
+    scores = client.get("/api/v1/runs/fitted").json()["results"]["metrics"]["sheet"]
+    future = errors["static"]["track_error"][FITTED:]
+    assert np.mean(future) == pytest.approx(scores["future"]["static"]["track_error"], rel=1e-3)
+    assert np.mean(future) > 1e-3
+
+
+def test_an_older_run_has_no_errors_of_frames(world: World) -> None:
+    for path in (world.settings.run_dir / "fitted").rglob("frame_errors.json"):
+        path.unlink()
+    assert world.script().get("/api/v1/runs/fitted/frame_errors").json() == {"sequences": {}}
+
+
+def test_a_log_is_downloaded_whole_and_never_through_a_link(world: World) -> None:
+    client = world.script()
+    missing = client.get("/api/v1/runs/fitted/log")
+    assert missing.status_code == 404
+    assert "no log" in error_of(missing)["message"]
+    log = world.settings.run_dir / "fitted" / "log.txt"
+    log.write_text("line\n" * 30_000)
+    answer = client.get("/api/v1/runs/fitted/log")
+    assert answer.text == "line\n" * 30_000
+    assert answer.headers["content-type"] == "text/plain; charset=utf-8"
+    assert 'filename="fitted_log.txt"' in answer.headers["content-disposition"]
+    log.rename(log.with_name("secret"))
+    log.symlink_to(log.with_name("secret"))
+    assert client.get("/api/v1/runs/fitted/log").status_code == 404
+
+
+def test_what_a_fit_was_computed_with_is_told(client: TestClient) -> None:
+    told = client.get("/api/v1/runs/fitted").json()["results"]["environment"]
+    assert told["device"] == "cpu"
+    assert told["packages"]["numpy"] == np.__version__
 
 
 def test_profiles_are_listed(client: TestClient) -> None:

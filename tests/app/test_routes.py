@@ -91,6 +91,39 @@ def test_unknown_ids_are_not_found(world: QueueWorld) -> None:
     assert world.client.get("/sequences/sheet/thumbnail").status_code == 404
 
 
+def test_a_page_shows_results_with_units_and_its_parts_alone(world: QueueWorld) -> None:
+    run_id = world.launch("script")
+    scores = {"rollout": {"track_error": 0.0125}, "static": {"track_error": 0.5}}
+    world.tell(
+        run_id,
+        ["save", "metrics.json", {"sheet": {"unit": "m", "future": scores}}],
+        ["save", "object/parameters.yaml", {"drag": 4.5, "friction": 0.3}],
+        ["save", "environment.json", {"device": "cuda:7", "device_name": "A <b>card</b>"}],
+        ["publish"],
+    )
+    world.until(run_id, "succeeded")
+    whole = world.client.get(f"/runs/{run_id}").text
+    parts = world.client.get(f"/runs/{run_id}/parts").text
+    for page in (whole, parts):
+        assert 'class="best">12.50' in page
+        assert '<tr class="changed"><th scope="row"><span' in page
+        assert "cuda:7 · A &lt;b&gt;card&lt;/b&gt;" in page
+    assert "<html" in whole
+    assert "<html" not in parts
+    assert world.client.get("/runs/nothing/parts").status_code == 404
+
+
+def test_a_failure_is_told_on_top_without_the_insides_of_the_program(world: QueueWorld) -> None:
+    run_id = world.launch("defect")
+    world.until(run_id, "failed")
+    assert "Traceback" in (world.folder(run_id) / "log.txt").read_text()
+    page = world.client.get(f"/runs/{run_id}").text
+    assert "The fit failed in <em>zeroth order</em>" in page
+    assert "KeyError: &#39;a &lt;b&gt;key&lt;/b&gt;&#39;" in page
+    assert "Traceback" not in page
+    assert "job_worker.py" not in page
+
+
 def test_a_log_that_is_a_link_is_not_followed(world: QueueWorld) -> None:
     run_id = world.launch("crash")
     world.until(run_id, "failed")

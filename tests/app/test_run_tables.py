@@ -11,6 +11,8 @@ from app.pages.parameters import field_notes, parameter_rows
 from physhandi.data.run import Run
 from physhandi.simulation.model import SimulationParameters
 
+DASH = "\N{EN DASH}"
+
 
 def cells(row: dict[str, Any]) -> list[tuple[str, bool]]:
     return [(cell["text"], cell["is_best"]) for cell in row["cells"]]
@@ -36,7 +38,7 @@ def test_lengths_are_millimetres_and_the_lowest_error_is_the_best() -> None:
     chamfer, track = table["rows"]
     assert (chamfer["name"], chamfer["unit"]) == ("chamfer_l2", "mm")
     assert cells(chamfer) == [("10.00", True), ("35.50", False)]
-    assert cells(track) == [("none", False), ("200.0", False)]
+    assert cells(track) == [(DASH, False), ("200.0", False)]
 
 
 def test_of_shares_the_highest_is_the_best_and_they_are_percent() -> None:
@@ -71,10 +73,28 @@ def test_hands_are_no_rivals_and_pixels_stay_pixels() -> None:
     assert not any(cell["is_best"] for row in table["rows"] for cell in row["cells"])
 
 
+def test_words_and_single_facts_stand_beside_the_numbers() -> None:
+    scores = {
+        "topology": {"connection_radius": 0.02, "rrd_object": 0.5},
+        "hands": {"right": {"aggregation": "over all", "scored_frames": 60, "known_share": 0.5}},
+    }
+    topology, hands = tabulate(scores)["tables"]
+    assert [column["name"] for column in topology["columns"]] == ["value"]
+    assert [(row["unit"], cells(row)) for row in topology["rows"]] == [
+        ("mm", [("20.00", False)]),
+        ("", [("0.5000", False)]),
+    ]
+    assert hands["note"] == "aggregation over all"
+    assert [(row["unit"], cells(row)) for row in hands["rows"]] == [
+        ("", [("60", False)]),
+        ("%", [("50.00", False)]),
+    ]
+
+
 def test_a_sequence_without_metric_scale_keeps_its_own_unit() -> None:
     scores = {"unit": "unit", "future": {"rollout": {"track_error": 0.5}, "static": {}}}
     (row,) = tabulate(scores)["tables"][0]["rows"]
-    assert (row["unit"], cells(row)) == ("unit", [("0.5000", False), ("none", False)])
+    assert (row["unit"], cells(row)) == ("unit", [("0.5000", False), (DASH, False)])
 
 
 @pytest.mark.parametrize("scores", ["damaged", None, [1], {}])

@@ -11,7 +11,10 @@ from sheet_sequence import write_sheet
 
 pytestmark = pytest.mark.e2e
 TESTS = Path(__file__).parents[1]
-SHEET = "sequences/sheet"
+X_RANGE = """() => {
+  const { min, max } = page.charts.get("first_order").plot.scales.x;
+  return [min, max];
+}"""
 BLUE_PIXELS = """(canvas) => {
   const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
   let count = 0;
@@ -25,7 +28,8 @@ BLUE_PIXELS = """(canvas) => {
 def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[QueueWorld]:
     monkeypatch.setenv("PYTHONPATH", str(TESTS))
     (tmp_path / "bundled").mkdir()
-    write_sheet(tmp_path / "data" / "sequences" / "sheet")
+    for name in ("sheet", "other"):
+        write_sheet(tmp_path / "data" / "sequences" / name)
     with queue_world(tmp_path / "data", tmp_path / "bundled") as world:
         yield world
 
@@ -82,6 +86,34 @@ def test_curves_log_and_stages_grow_without_a_reload(world, open_run):
     expect(stage).to_contain_text(" s")
     expect(page.locator("[data-stage=observation] .mark")).to_have_text("at work")
     assert page.evaluate("window.isTheSamePage")
+
+
+def test_a_zoomed_chart_stays_zoomed_while_it_grows(world, open_run):
+    run_id = world.launch("script")
+    world.until(run_id, "running")
+    world.tell(run_id, *reports("first_order", range(1, 41), lambda i: 100.0 / i))
+    page = open_run(run_id)
+    chart = page.locator("[data-chart=first_order]")
+    log = chart.get_by_role("button", name="Logarithmic scale")
+    expect(log).to_have_attribute("aria-pressed", "true")
+    log.click()
+    expect(log).to_have_attribute("aria-pressed", "false")
+    box = chart.locator(".u-over").bounding_box()
+    middle = box["y"] + box["height"] / 2
+    page.mouse.move(box["x"] + 0.25 * box["width"], middle)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 0.5 * box["width"], middle, steps=4)
+    page.mouse.up()
+    zoomed = page.evaluate(X_RANGE)
+    assert zoomed == pytest.approx([10.75, 20.5], abs=0.5)
+
+    world.tell(run_id, *reports("first_order", range(41, 61), lambda i: 100.0 / i))
+    expect(page.locator("[data-text]")).to_contain_text("60 of 100")
+    page.wait_for_function("page.charts.get('first_order').plot.data[0].length === 60")
+    assert page.evaluate(X_RANGE) == zoomed
+    expect(log).to_have_attribute("aria-pressed", "false")
+    chart.get_by_role("button", name="show all").click()
+    assert page.evaluate(X_RANGE) == [1, 60]
 
 
 def test_a_marked_text_stays_marked_and_a_lost_stream_is_taken_up_without_gap(world, open_run):
@@ -145,7 +177,8 @@ def test_a_failure_is_told_in_words_without_a_traceback(world, open_run):
 
 
 def test_results_appear_when_the_run_ends(world, open_run):
-    run_id = world.launch("script")
+    order = {"sequences": ["sheet", "other"], "profile": "quick", "name": "script"}
+    run_id = world.client.post("/api/v1/runs", json=order).json()["id"]
     world.until(run_id, "running")
     page = open_run(run_id)
     expect(page.locator("#frames")).to_be_hidden()
@@ -160,7 +193,8 @@ def test_results_appear_when_the_run_ends(world, open_run):
     world.tell(
         run_id,
         ["save", "metrics.json", {"sheet": metrics, "other": metrics}],
-        ["save", f"{SHEET}/frame_errors.json", frame_errors(0.001)],
+        ["save", "sequences/sheet/frame_errors.json", frame_errors(0.001)],
+        ["save", "sequences/other/frame_errors.json", frame_errors(0.002)],
         ["finish", "evaluation", {}],
         ["publish"],
     )
@@ -180,6 +214,11 @@ def test_results_appear_when_the_run_ends(world, open_run):
     expect(page.locator("[data-chart=track_error] .readout")).to_contain_text("rollout 8 mm")
     page.keyboard.press("Enter")
     expect(page.locator("#frames .held")).to_contain_text("Frame 8 · track error: rollout 8 mm")
+    page.locator("#frames select").select_option("other")
+    expect(page.locator("#frames .held")).to_be_hidden()
+    readout = page.locator("[data-chart=track_error] .readout")
+    expect(readout).to_contain_text("frame 9")
+    expect(readout).to_contain_text("rollout 18 mm")
 
 
 def frame_errors(step: float) -> dict:
