@@ -18,6 +18,7 @@ from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.hand.model import load_hand_model
 from physhandi.hand.motion import HandMotion
+from physhandi.hand.skin import hand_skin
 from physhandi.perception.lifting import hand_points
 from physhandi.progress import Progress
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
@@ -197,10 +198,23 @@ def copy_hand_observation(source: Run, name: str, output: Attempt) -> None:
 
 
 def save_hand_vertices(output: Attempt, name: str) -> None:
-    """Store mesh and joints of every hand in every frame, for viewers, exports and metrics."""
+    """Store mesh, joints and skin of every hand, for viewers, exports and metrics."""
     for motion in load_motions(output.out, name):
         model = load_hand_model(motion.side, motion.model)
         stem = f"{sequence_folder(name)}/hand_{motion.side}"
         output.save_array(f"{stem}_vertex.npy", motion.vertices(model).astype(np.float32))
         output.save_array(f"{stem}_face.npy", np.asarray(model.faces, np.int32))
         output.save_array(f"{stem}_keypoint.npy", motion.keypoints(model).astype(np.float32))
+        output.save_tensors(f"{stem}_skin.safetensors", hand_skin(model, motion).to_tensors())
+
+
+def copy_hand_vertices(source: Run, name: str, output: Attempt) -> None:
+    """Take over what `save_hand_vertices` stored in another run, which needs no hand model."""
+    for motion in load_motions(output.out, name):
+        stem = f"{sequence_folder(name)}/hand_{motion.side}"
+        for part in ("vertex", "face", "keypoint"):
+            if source.has(f"{stem}_{part}.npy"):
+                output.save_array(f"{stem}_{part}.npy", source.array(f"{stem}_{part}.npy"))
+        if source.has(f"{stem}_skin.safetensors"):
+            tensors = source.tensors(f"{stem}_skin.safetensors")
+            output.save_tensors(f"{stem}_skin.safetensors", tensors)

@@ -78,7 +78,7 @@ def _copy_known(source: Run, name: str, output: Attempt) -> np.ndarray:
     """Take over what the source run already found out about one of its sequences."""
     artefacts.save_observation(output, name, artefacts.load_observation(source.out, name))
     artefacts.save_motions(output, name, artefacts.load_motions(source.out, name))
-    artefacts.save_hand_vertices(output, name)
+    artefacts.copy_hand_vertices(source, name, output)
     return np.load(source.out / artefacts.sequence_folder(name) / "control.npy", allow_pickle=False)
 
 

@@ -63,6 +63,16 @@ class HandModel(ABC):
     """Vertices of each triangle, counter-clockwise from outside."""
     vertex_count: int
     """Vertices of the surface."""
+    template: Float[ndarray, "vertex 3"]
+    """The unposed surface of shape zero, relative to the wrist [m]."""
+    weight: Float[ndarray, "vertex 16"]
+    """Share of each bone in a vertex: the palm, then the bones that `JOINT_NAMES` move."""
+    joint_position: Float[ndarray, "15 3"]
+    """The unposed joints of shape zero, relative to the wrist [m]."""
+    joint_axes: Float[ndarray, "15 3 3"]
+    """Axes, as columns, in which each joint's rotation vector is expressed."""
+    keypoint_position: Float[ndarray, "21 3"]
+    """The unposed keypoints of shape zero, relative to the wrist [m]."""
     shape_count: int = SHAPE_COUNT
     """Shape coefficients; all zero is the template, each about one standard deviation per unit."""
     joint_count: int = JOINT_COUNT

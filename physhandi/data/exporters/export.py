@@ -8,6 +8,7 @@ from jaxtyping import Int
 from numpy import ndarray
 
 from physhandi.data.atomic import temporary_name
+from physhandi.data.exporters.gltf import write_gltf
 from physhandi.data.exporters.mesh import write_frame, write_frames
 from physhandi.data.exporters.scene_data import read_scene
 from physhandi.data.exporters.table import (
@@ -19,7 +20,7 @@ from physhandi.data.exporters.table import (
 from physhandi.data.run import Run
 from physhandi.errors import UsageError
 
-FORMATS = ("ply", "npz", "csv", "yaml")
+FORMATS = ("ply", "npz", "csv", "yaml", "gltf")
 
 
 def export_run(
@@ -38,7 +39,8 @@ def export_run(
         run: What to export.
         format: ``ply`` (nodes, hand meshes and virtual springs), ``npz`` (motion and springs),
             ``csv`` (a file: trajectories; a folder: also parameters and metrics) or ``yaml``
-            (settings, parameters, losses and metrics of the whole run).
+            (settings, parameters, losses and metrics of the whole run), or ``gltf`` (one ``.glb``
+            file: skinned hands, object nodes and springs, moving).
         out_path: File to write. Without the format's suffix, PLY and CSV make a folder.
         sequence: Which sequence; None takes the first.
         frame: Only this frame (PLY); None takes all, which needs a folder.
@@ -62,12 +64,15 @@ def export_run(
     if format == "yaml":
         return _publish(out, lambda path: write_summary(path, run), is_folder=False)
     scene = read_scene(run, sequence, faces)
-    if format == "npz":
-        return _publish(out, lambda path: write_npz(path, run, scene), is_folder=False)
-    if format == "csv":
-        if is_folder:
-            return _publish(out, lambda path: write_tables(path, run, scene), is_folder=True)
-        return _publish(out, lambda path: write_trajectories(path, scene), is_folder=False)
+    whole: dict[str, Callable[[Path], None]] = {
+        "npz": lambda path: write_npz(path, run, scene),
+        "gltf": lambda path: write_gltf(path, run, scene),
+        "csv": lambda path: (
+            write_tables(path, run, scene) if is_folder else write_trajectories(path, scene)
+        ),
+    }
+    if format in whole:
+        return _publish(out, whole[format], is_folder=is_folder)
     if frame is not None and not 0 <= frame < scene.frame_count:
         raise UsageError(
             f"Sequence '{scene.sequence}' has frames 0 to {scene.frame_count - 1}, not {frame}."
