@@ -1,16 +1,20 @@
 """A small run: a sheet held by 30 control points, in two sequences of 20 frames."""
 
+from collections.abc import Sequence as Listing
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy import ndarray
 
+from app.viewer.content import Content, HandSurface
+from app.viewer.take import Take
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_schema import SequenceMeta, ViewMeta
 from physhandi.data.sequence_writer import SequenceWriter
+from physhandi.data.view import View
 from physhandi.simulation.model import SimulationParameters
 from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.topology import build_model
@@ -97,6 +101,34 @@ def make_run(folder: Path) -> Run:
             )
         attempt.publish()
     return Run.open(folder)
+
+
+def content_of(
+    hands: dict[str, tuple[ndarray, ndarray]], control: ndarray, views: Listing[View] = ()
+) -> Content:
+    """A resting sheet with these hands, each with its vertices and faces, and control nodes."""
+    model = build_model(sheet(), control[0], PARAMETERS)
+    position = np.repeat(sheet()[None], len(control), axis=0)
+    fitted = Take(
+        model=model, parameters=PARAMETERS, control=control, position=position, ready=len(control)
+    )
+    surfaces = tuple(
+        HandSurface(side=side, vertex=np.repeat(vertex[None], len(control), axis=0), face=face)
+        for side, (vertex, face) in hands.items()
+    )
+    return Content(
+        title="t",
+        sequence_name="lift",
+        frame_count=len(control),
+        frame_rate=30.0,
+        reconstruction_count=len(control),
+        length_unit="m",
+        ground_height=0.0,
+        hands=surfaces,
+        control=control,
+        fitted=fitted,
+        views=views,
+    )
 
 
 def look_at(eye: tuple[float, float, float]) -> PinholeCamera:

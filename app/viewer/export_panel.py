@@ -3,6 +3,8 @@
 import csv
 import io
 import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -11,6 +13,8 @@ import viser
 import yaml
 
 from app.viewer.content import Content
+from app.viewer.figure import Side
+from app.viewer.figure_export import write_figure_csv, write_figure_npz
 from app.viewer.guard import Guard, notify
 from app.viewer.layers import GREEN, RED, SKIN
 from app.viewer.take import Take
@@ -20,18 +24,27 @@ from physhandi.errors import MissingInputError
 
 _GEOMETRY = ("PNG", "PLY")
 _NUMBERS = ("NPZ", "CSV", "YAML")
+_OF_FIGURE = ("PNG", "NPZ", "CSV")
 _RENDER_SECONDS = 20.0
 _MAX_SIDE = 2_160
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Snapshot:
     """What is on the screen now, for the export panel."""
 
-    def __init__(self, content: Content, frame: int, take: Take | None, take_frame: int) -> None:
-        self.content = content
-        self.frame = frame
-        self.take = take
-        self.take_frame = take_frame
+    content: Content
+    """What is shown."""
+    frame: int
+    """The frame."""
+    take: Take | None
+    """The object's rollout."""
+    take_frame: int
+    """Frame of the rollout."""
+    sides: Mapping[str, Side] | None = None
+    """Both halves of the figure, if the figure is shown."""
+    picture: Callable[[viser.ClientHandle], dict[str, Any]] | None = None
+    """Finds the camera of the figure's picture, if the figure is shown."""
 
 
 class ExportPanel:
@@ -59,22 +72,39 @@ class ExportPanel:
         kind, client = event.target.value, event.client
         stem = re.sub(r"[^A-Za-z0-9_-]+", "_", snapshot.content.title)[:60] or "physhandi"
         make = {"PLY": write_ply, "NPZ": write_npz, "CSV": write_csv, "YAML": write_yaml}
-        content = write_png(client) if kind == "PNG" else make[kind](snapshot)
-        name = f"{stem}_{snapshot.frame:05d}" if kind in _GEOMETRY else stem
+        sides = snapshot.sides
+        is_of_frame = kind in _GEOMETRY
+        if kind == "PNG":
+            content = write_png(client, snapshot.picture)
+        elif sides is not None and kind in {"NPZ", "CSV"}:
+            content = write_figure_npz(sides) if kind == "NPZ" else write_figure_csv(sides)
+            is_of_frame = kind == "CSV"
+        else:
+            content = make[kind](snapshot)
+        stem = stem if sides is None or kind not in _OF_FIGURE else f"{stem}_figure"
+        name = f"{stem}_{snapshot.frame:05d}" if is_of_frame else stem
         client.send_file_download(f"{name}.{kind.lower()}", content, save_immediately=True)
         notify(client, "Saved", f"{name}.{kind.lower()}, {len(content) / 1e3:.0f} kB", color="blue")
 
 
-def write_png(client: viser.ClientHandle) -> bytes:
-    """Render what a client sees."""
+def write_png(
+    client: viser.ClientHandle,
+    picture: Callable[[viser.ClientHandle], dict[str, Any]] | None = None,
+) -> bytes:
+    """Render what a client sees.
+
+    Args:
+        client: Who looks.
+        picture: Finds another camera and size than the client's.
+    """
     camera = client.camera
     scale = min(1.0, _MAX_SIDE / max(camera.image_height, camera.image_width, 1))
-    image = client.get_render(
-        height=max(int(camera.image_height * scale), 1),
-        width=max(int(camera.image_width * scale), 1),
-        transport_format="png",
-        timeout=_RENDER_SECONDS,
-    )
+    view: dict[str, Any] = {
+        "height": max(int(camera.image_height * scale), 1),
+        "width": max(int(camera.image_width * scale), 1),
+    }
+    view = view if picture is None else picture(client)
+    image = client.get_render(**view, transport_format="png", timeout=_RENDER_SECONDS)
     order = cv2.COLOR_RGBA2BGRA if image.shape[-1] == 4 else cv2.COLOR_RGB2BGR
     is_written, content = cv2.imencode(".png", cv2.cvtColor(image, order))
     if not is_written:

@@ -1,18 +1,19 @@
 """The paper's comparison of topologies: our result and PhysTwin's way, side by side."""
 
+import threading
 from dataclasses import dataclass, replace
 
 import numpy as np
 import viser
-import viser.transforms
 from jaxtyping import Float
 from numpy import ndarray
 
 from app.viewer.content import Content
+from app.viewer.figure_camera import Eye
 from app.viewer.framing import Framing
-from app.viewer.layers import BLUE, RED, SKIN, YELLOW, Layers
+from app.viewer.layers import SKIN, YELLOW, Layers
 from app.viewer.nodes import SceneNodes
-from app.viewer.object_drawing import ObjectDrawing, share_bytes, strengths
+from app.viewer.object_drawing import ObjectDrawing, Style, share_bytes, strengths
 from app.viewer.take import Take
 
 ARROWS = 300
@@ -22,30 +23,22 @@ FIGURE_BYTES = 92_000
 SIDES = ("ours", "phystwin")
 _SAMPLED_FRAMES = 10
 _SAMPLED_POINTS = 300
-_GAP = 1.04
+_GAP = 1.08
+_NARROWEST = 13.0
+_ABOVE, _BELOW = 4.0, 2.6
 _LONGEST = 0.3
 _LINE = 0.034
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Eye:
-    """From where a client looks."""
-
-    right: Float[ndarray, " 3"]
-    """To the right of the picture."""
-    up: Float[ndarray, " 3"]
-    """To the top of the picture."""
-
-    @classmethod
-    def of(cls, wxyz: Float[ndarray, " 4"]) -> "Eye":
-        """Read a camera's orientation; its y axis points down."""
-        R_world_camera = viser.transforms.SO3(np.asarray(wxyz, dtype=np.float64)).as_matrix()
-        return cls(right=R_world_camera[:, 0], up=-R_world_camera[:, 1])
-
-    @property
-    def ahead(self) -> Float[ndarray, " 3"]:
-        """Into the picture."""
-        return np.cross(self.up, self.right)
+_STYLE = Style(
+    is_solid=True,
+    node=(18, 66, 170),
+    control=(170, 14, 16),
+    spring=(190, 198, 209),
+    node_size=0.42,
+    control_size=0.36,
+    spring_width=1.0,
+    arrow=(165, 10, 12),
+    arrow_width=0.0032,
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -61,7 +54,10 @@ class Side:
 
 
 class Figure:
-    """Draws both halves around the middle of the scene, along the client's right hand."""
+    """Draws both halves around the middle of the scene, along the client's right hand.
+
+    The thread of the clock draws; a camera may turn the figure from another one.
+    """
 
     def __init__(
         self, server: viser.ViserServer, content: Content, fitted: Take, framing: Framing
@@ -72,7 +68,7 @@ class Figure:
         self._framing = framing
         self._nodes = SceneNodes(server)
         self._drawings = {
-            side: ObjectDrawing(self._nodes, framing, root=f"/figure/{side}", is_solid=True)
+            side: ObjectDrawing(self._nodes, framing, root=f"/figure/{side}", style=_STYLE)
             for side in SIDES
         }
         frames = np.unique(np.linspace(0, fitted.ready - 1, _SAMPLED_FRAMES).astype(int))
@@ -81,13 +77,11 @@ class Figure:
         parts = [part[:: max(1, len(part) // _SAMPLED_POINTS)] for part in parts]
         point = np.concatenate(parts).astype(np.float64)
         low, high = np.quantile(point, [0.002, 0.998], axis=0)
-        self.center: Float[ndarray, " 3"] = (low + high) / 2
-        """Middle of what one half shows, before it is moved aside."""
-        self._point = np.clip(point, low, high) - self.center
-        self.radius = float(np.linalg.norm(self._point[:, :2], axis=1).max())
-        """Half the width of one half, from wherever one looks."""
+        self._point = np.clip(point, low, high)
         self._eye = Eye(right=np.array([1.0, 0.0, 0.0]), up=np.array([0.0, 0.0, 1.0]))
         self._captions = dict.fromkeys(SIDES, "")
+        self._placed: tuple[tuple[float, ...], tuple[str, ...]] | None = None
+        self._lock = threading.RLock()
         self.force_unit = 0.0
         """Length of an arrow of 1 N, before the arrow scale of the panel."""
         self._force_scale = 1.0
@@ -105,32 +99,51 @@ class Figure:
         if unit <= 0:
             return 0.0
         wanted = 0.16 * self._framing.extent / unit
-        power = 10.0 ** np.floor(np.log10(wanted))
-        return float(max(step * power for step in (1, 2, 5) if step * power <= wanted))
+        power = 10.0 ** np.floor(np.log10(wanted * 1.000001))
+        return float(max(step * power for step in (1, 2, 5) if step * power <= wanted * 1.000001))
 
-    def half_height(self, eye: Eye) -> float:
-        """Half the height of one half, as it is seen."""
-        return float(np.abs(self._point @ eye.up).max())
+    def box(self, eye: Eye) -> tuple[Float[ndarray, " 3"], float, float]:
+        """Measure the whole figure with captions and legend, as it is seen.
 
-    def size(self, eye: Eye) -> tuple[float, float]:
-        """Width and height of the whole figure with captions and legend."""
-        line = _LINE * self._framing.extent
-        return 4 * _GAP * self.radius, 2 * self.half_height(eye) + 9 * line
+        Returns:
+            Middle, width and height.
+        """
+        middle, wide, high = self._half(eye)
+        line = self._line
+        middle = middle + 0.5 * (_ABOVE - _BELOW) * line * eye.up
+        return middle, 2 * _GAP * max(wide, _NARROWEST * line), high + (_ABOVE + _BELOW) * line
+
+    @property
+    def _line(self) -> float:
+        return _LINE * self._framing.extent
+
+    def _half(self, eye: Eye) -> tuple[Float[ndarray, " 3"], float, float]:
+        """Measure one half before it is moved aside: middle, width and height."""
+        middle, extents = np.zeros(3), list[float]()
+        for axis in (eye.right, eye.up, eye.ahead):
+            along = self._point @ axis
+            middle += 0.5 * (along.min() + along.max()) * axis
+            extents.append(float(np.ptp(along)))
+        return middle, extents[0], extents[1]
 
     def hide(self) -> None:
         """Hide the figure until it is drawn again."""
-        with self._server.atomic():
+        with self._lock, self._server.atomic():
+            self._placed = None
             self._nodes.hide()
 
     def clear(self) -> None:
         """Remove the figure."""
-        self._nodes.clear()
+        with self._lock:
+            self._placed = None
+            self._nodes.clear()
 
     def turn(self, eye: Eye) -> None:
         """Keep the halves left and right, captions above and legend below, as the camera turns."""
-        self._eye = eye
-        with self._server.atomic():
-            self._place()
+        with self._lock, self._server.atomic():
+            self._eye = eye
+            if self._placed is not None:
+                self._place()
 
     def draw(self, sides: dict[str, Side], frame: int, layers: Layers, *, is_playing: bool) -> None:
         """Bring both halves to a frame.
@@ -142,8 +155,8 @@ class Figure:
             is_playing: Whether the clock is running, so that less may be sent.
         """
         left = FIGURE_BYTES // 2 - (12 * self._hand_size() if layers.hands else 0)
-        self._force_scale = layers.force_scale
-        with self._server.atomic():
+        with self._lock, self._server.atomic():
+            self._force_scale = layers.force_scale
             self._captions = {name: side.caption for name, side in sides.items()}
             self._place()
             for name, side in sides.items():
@@ -175,57 +188,59 @@ class Figure:
                 vertex = np.asarray(hand.vertex[min(frame, len(hand.vertex) - 1)], np.float32)
                 name, color = f"{root}/hand/{hand.side}", SKIN[hand.side]
                 is_visible = layers.hands
-                self._nodes.mesh(
-                    name, vertex, hand.face, color, is_visible=is_visible, opacity=0.35
-                )
+                self._nodes.mesh(name, vertex, hand.face, color, is_visible=is_visible, opacity=0.3)
 
     def _place(self) -> None:
         """Put the halves, their captions and the legend where the camera sees them."""
-        eye, nodes, line = self._eye, self._nodes, _LINE * self._framing.extent
-        height = self.half_height(eye)
+        eye, nodes, line = self._eye, self._nodes, self._line
+        looks = (*eye.right, *eye.up, self.force_unit * self._force_scale)
+        placed = (looks, tuple(self._captions.values()))
+        if placed == self._placed:
+            return
+        self._placed = placed
+        middle, wide, high = self._half(eye)
+        wide = max(wide, _NARROWEST * line)
         for sign, name in zip((-1.0, 1.0), SIDES, strict=True):
-            aside = sign * _GAP * self.radius * eye.right
+            aside = 0.5 * sign * _GAP * wide * eye.right
             nodes.frame(f"/figure/{name}", aside)
-            above = self.center + aside + (height + 2.2 * line) * eye.up
-            nodes.label(
-                f"/figure/caption_{name}",
-                self._captions[name],
-                above,
-                anchor="center-center",
-                height=line,
-            )
-        self._place_legend(self.center - (height + 2.2 * line) * eye.up, line)
+            title, _, detail = self._captions[name].partition("\n")
+            for part, text, size, lines in (
+                ("title", title, 1.2, 2.9),
+                ("detail", detail, 0.9, 1.5),
+            ):
+                nodes.label(
+                    f"/figure/{part}_{name}",
+                    text,
+                    middle + aside + (0.5 * high + lines * line) * eye.up,
+                    anchor="center-center",
+                    height=size * line,
+                )
+        self._place_legend(middle - (0.5 * high + 1.6 * line) * eye.up, line)
 
     def _place_legend(self, middle: Float[ndarray, " 3"], line: float) -> None:
         """Tell below the halves what the colors mean and how strong a force an arrow is."""
         eye, nodes, root = self._eye, self._nodes, "/figure/legend"
         force = self.scale_force
+        texts = ("object nodes", "control nodes", "virtual springs", f"force, {force:g} N")
         length = force * self.force_unit * self._force_scale
-        entries = ["object nodes", "control nodes", "virtual springs", f"force, {force:g} N"]
-        widths = [1.0 * line, 1.0 * line, 2.0 * line, length]
-        texts = [0.52 * line * len(text) for text in entries]
-        total = sum(widths) + sum(texts) + 1.6 * line * 3 + 0.7 * line * 4
-        x = -total / 2
-        for index, (text, width) in enumerate(zip(entries, widths, strict=True)):
-            start = middle + x * eye.right
-            end = start + width * eye.right
+        widths = (0.7 * line, 0.7 * line, 1.8 * line, length)
+        letters = [0.36 * len(text) * line for text in texts]
+        spans = [w + 0.5 * line + letter for w, letter in zip(widths, letters, strict=True)]
+        x = -0.5 * (sum(spans) + 3 * line)
+        for index, (text, width, span) in enumerate(zip(texts, widths, spans, strict=True)):
+            start, end = (middle + at * eye.right for at in (x, x + width))
             if index < 2:
+                color = (_STYLE.node, _STYLE.control)[index]
                 ball = ((start + end) / 2)[None]
-                color = (BLUE, RED)[index]
-                nodes.spheres(f"{root}/ball_{index}", ball, color, 0.7 * line, is_visible=True)
+                nodes.spheres(f"{root}/ball_{index}", ball, color, width, is_visible=True)
             elif index == 2:
-                nodes.segments(
-                    f"{root}/spring", np.stack([start, end])[None], YELLOW, 3.0, is_visible=True
-                )
+                segment = np.stack([start, end])[None]
+                nodes.segments(f"{root}/spring", segment, YELLOW, 3.0, is_visible=True)
             elif force > 0:
                 arrow = np.stack([start, end])[None].astype(np.float32)
-                nodes.arrows(f"{root}/force", arrow, RED, 0.0022 * self._framing.extent)
-            x += width + 0.7 * line
-            nodes.label(
-                f"{root}/text_{index}",
-                text,
-                middle + x * eye.right,
-                anchor="center-left",
-                height=0.8 * line,
-            )
-            x += texts[index] + 1.6 * line
+                thick = _STYLE.arrow_width * self._framing.extent
+                nodes.arrows(f"{root}/force", arrow, _STYLE.arrow, thick)
+            place = middle + (x + width + 0.5 * line) * eye.right
+            name = f"{root}/text_{index}"
+            nodes.label(name, text, place, anchor="center-left", height=0.75 * line)
+            x += span + line

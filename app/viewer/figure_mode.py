@@ -2,17 +2,15 @@
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import viser
-from jaxtyping import Float
-from numpy import ndarray
 
 from app.viewer.content import Content
-from app.viewer.figure import Eye, Figure, Side
+from app.viewer.figure import Figure, Side
+from app.viewer.figure_camera import Eye, FigureCameras, picture_of_figure
 from app.viewer.framing import Framing
 from app.viewer.guard import Guard, notify
 from app.viewer.layers import Layers
@@ -20,19 +18,9 @@ from app.viewer.live import LiveSimulation
 from app.viewer.resimulation import Resimulation
 from app.viewer.rival import Rival
 from app.viewer.take import Take
+from physhandi.errors import MissingInputError
 
-_PANEL_PIXELS = 345
 _ON, _OFF = "Back to the scene", "Compare with PhysTwin"
-
-
-@dataclass(frozen=True, eq=False)
-class _Pose:
-    """Where a client's camera stood before the figure."""
-
-    position: Float[ndarray, " 3"]
-    look_at: Float[ndarray, " 3"]
-    up: Float[ndarray, " 3"]
-    fov: float
 
 
 class FigureMode:
@@ -60,7 +48,7 @@ class FigureMode:
         self._mailbox = f"{session}/figure"
         self._redraw = redraw
         self._lock = threading.RLock()
-        self._poses: dict[int, _Pose] = {}
+        self._cameras = FigureCameras()
         self._is_on = False
         self._content: Content | None = None
         self._figure: Figure | None = None
@@ -141,7 +129,7 @@ class FigureMode:
         left = Side(take=ours, frame=ours_frame, caption=self._caption("ours", ours))
         rollout = self._rollout
         if rollout is None or rollout.newest.ready == 0:
-            right = Side(take=None, frame=0, caption="PhysTwin-style · simulating …")
+            right = Side(take=None, frame=0, caption="PhysTwin-style\nsimulating …")
         else:
             take = rollout.newest
             at = min(frame, take.ready - 1)
@@ -161,25 +149,11 @@ class FigureMode:
                 self._aim(client)
 
     def picture(self, client: viser.ClientHandle) -> dict[str, Any]:
-        """Find the camera and size of a picture of the figure, without the part under the panel.
-
-        Returns:
-            Arguments of viser's ``get_render``.
-        """
-        camera = client.camera
-        width, height = max(camera.image_width, 1), max(camera.image_height, 1)
-        hidden = _covered(width)
-        pixel = 2 * np.tan(camera.fov / 2) / height
-        distance = float(np.linalg.norm(camera.look_at - camera.position))
-        aside = -0.5 * hidden * pixel * distance * Eye.of(camera.wxyz).right
-        scale = 1600 / (width - hidden)
-        return {
-            "width": 1600,
-            "height": max(round(height * scale), 1),
-            "wxyz": camera.wxyz,
-            "position": camera.position + aside,
-            "fov": camera.fov,
-        }
+        """Find camera and size of a picture of the figure, as arguments of ``get_render``."""
+        figure = self._figure
+        if figure is None:
+            raise MissingInputError("There is no figure to save; this run has no fitted object.")
+        return picture_of_figure(client, figure.box(Eye.of(client.camera.wxyz)))
 
     def _caption(self, name: str, take: Take) -> str:
         parameters, content = take.parameters, self._content
@@ -187,7 +161,7 @@ class FigureMode:
         radius = parameters.virtual_connection_radius
         shown = f"{1e3 * radius:.3g} mm" if is_metric else f"{radius:.3g}"
         return (
-            f"{name} · δ {shown} · d_max {parameters.virtual_max_neighbors} · "
+            f"{name}\nδ {shown} · d_max {parameters.virtual_max_neighbors} · "
             f"{take.model.virtual_spring_count} virtual springs"
         )
 
@@ -224,35 +198,15 @@ class FigureMode:
         self._is_on = False
         self._button.label = _OFF
         self._text.visible = False
-        for client in self._server.get_clients().values():
-            pose = self._poses.pop(client.client_id, None)
-            if pose is None:
-                continue
-            with client.atomic():
-                eye = client.camera
-                eye.up_direction, eye.fov = pose.up, pose.fov
-                eye.position, eye.look_at = pose.position, pose.look_at
-        self._poses.clear()
+        self._cameras.restore(self._server)
 
     def _aim(self, client: viser.ClientHandle) -> None:
-        """Move a camera back along its view until both halves fit beside the panel."""
-        figure, camera = self._figure, client.camera
-        if figure is None:
-            return
-        before = _Pose(camera.position, camera.look_at, camera.up_direction, camera.fov)
-        self._poses.setdefault(client.client_id, before)
-        eye = Eye.of(camera.wxyz)
-        width, height = max(camera.image_width, 1), max(camera.image_height, 1)
-        hidden = _covered(width)
-        wide, high = figure.size(eye)
-        slope = float(np.tan(camera.fov / 2))
-        distance = max(high / 2, wide / 2 * height / (width - hidden)) / slope
-        distance += 0.5 * figure.radius
-        aside = 0.5 * hidden * (2 * slope * distance / height) * eye.right
-        with client.atomic():
-            camera.position = figure.center + aside - distance * eye.ahead
-            camera.look_at = figure.center + aside
-        figure.turn(eye)
+        """Show the whole figure to a client."""
+        figure = self._figure
+        if figure is not None:
+            eye = Eye.of(client.camera.wxyz)
+            self._cameras.aim(client, figure.box(eye))
+            figure.turn(eye)
 
     def _hear(self, kind: str, _: int) -> None:
         """Follow the rival's simulation; runs in the live simulation's thread."""
@@ -282,8 +236,3 @@ class FigureMode:
         lines += [rival.note] if rival.note else []
         lines += [f"**Stopped:** {readout.error.splitlines()[0]}"] if readout.error else []
         self._text.content = "<br/>".join(lines)
-
-
-def _covered(width: int) -> int:
-    """Guess how many pixels of a picture the panel covers."""
-    return _PANEL_PIXELS if width > 2 * _PANEL_PIXELS else 0

@@ -25,8 +25,8 @@ class SceneNodes:
         return name in self._nodes
 
     def clear(self) -> None:
-        """Remove all nodes."""
-        for node in self._nodes.values():
+        """Remove all nodes, those below others first."""
+        for node in reversed(self._nodes.values()):
             node.remove()
         self._nodes.clear()
 
@@ -183,7 +183,7 @@ class SceneNodes:
                 color,
                 shaft_radius=0.5 * width,
                 head_radius=1.6 * width,
-                head_length=5.0 * width,
+                head_length=4.0 * width,
             )
         elif node is not None and len(arrow):
             node.points = arrow

@@ -11,6 +11,8 @@ from app.viewer.layers import BLUE, GREY, PLAYING_SPRINGS, RED, YELLOW, Layers
 from app.viewer.nodes import SceneNodes
 from app.viewer.take import Take
 
+Color = tuple[int, int, int]
+
 QUIET_FORCE = 1e-6
 """Weaker forces are no forces [N]."""
 _SAMPLED_FRAMES = 8
@@ -61,11 +63,37 @@ def automatic_force_unit(take: Take | None, framing: Framing) -> float:
     return 0.07 * framing.extent / strong
 
 
+@dataclass(frozen=True, kw_only=True)
+class Style:
+    """How an object is drawn; sizes of nodes are parts of their spacing."""
+
+    is_solid: bool = False
+    """Whether nodes are shaded spheres instead of disks, which is heavier to show."""
+    node: Color = BLUE
+    """Color of object nodes."""
+    control: Color = RED
+    """Color of control nodes."""
+    spring: Color = GREY
+    """Color of object springs."""
+    arrow: Color = RED
+    """Color of force arrows."""
+    node_size: float = 0.36
+    """Diameter of object nodes."""
+    control_size: float = 0.3
+    """Diameter of control nodes that hold the object."""
+    spring_width: float = 1.5
+    """Width of object springs in pixels."""
+    virtual_width: float = 2.0
+    """Width of virtual springs in pixels."""
+    arrow_width: float = 0.0022
+    """Width of force arrows as a part of the scene's extent."""
+
+
 class ObjectDrawing:
     """Draws the frames of rollouts below one path of the scene; used by one thread."""
 
     def __init__(
-        self, nodes: SceneNodes, framing: Framing, *, root: str = "", is_solid: bool = False
+        self, nodes: SceneNodes, framing: Framing, *, root: str = "", style: Style | None = None
     ) -> None:
         """Prepare; nothing is drawn yet.
 
@@ -73,12 +101,13 @@ class ObjectDrawing:
             nodes: The scene's nodes.
             framing: Sizes.
             root: Path below which everything is drawn.
-            is_solid: Whether nodes are shaded spheres instead of disks, which is heavier to show.
+            style: Colors and sizes.
         """
         self._nodes = nodes
         self._framing = framing
         self._root = root
-        self._balls = nodes.spheres if is_solid else nodes.points
+        self._style = style or Style()
+        self._balls = nodes.spheres if self._style.is_solid else nodes.points
         self._model_shown: Take | None = None
         self._attached: Int[ndarray, " control"] = np.zeros(0, np.int64)
 
@@ -113,8 +142,9 @@ class ObjectDrawing:
         root, count = self._root, take.model.object_spring_count
         position = np.asarray(take.position[frame], dtype=np.float32)
         control = np.asarray(take.control[frame], dtype=np.float32)
-        size = 0.36 * self._framing.spacing
-        self._balls(f"{root}/object/nodes", position, BLUE, size, is_visible=layers.nodes)
+        style = self._style
+        size = style.node_size * self._framing.spacing
+        self._balls(f"{root}/object/nodes", position, style.node, size, is_visible=layers.nodes)
         self.draw_controls(control, self.attached(take), layers)
         point = np.concatenate([position, control])
         springs = take.model.spring_nodes
@@ -122,14 +152,14 @@ class ObjectDrawing:
             f"{root}/springs/virtual",
             _ends(point, springs[count:], budget.virtual),
             YELLOW,
-            2.0,
+            style.virtual_width,
             is_visible=layers.virtual_springs,
         )
         self._nodes.segments(
             f"{root}/springs/object",
             _ends(point, springs[: count if layers.object_springs else 0], budget.springs),
-            GREY,
-            1.5,
+            style.spring,
+            style.spring_width,
             is_visible=layers.object_springs,
         )
         arrows = np.zeros((0, 2, 3), np.float32)
@@ -138,7 +168,8 @@ class ObjectDrawing:
             arrows = force_arrows(take, frame, unit, longest, budget.arrows)
         shortest = 0.004 * self._framing.extent
         arrows = arrows[np.linalg.norm(arrows[:, 1] - arrows[:, 0], axis=-1) > shortest]
-        self._nodes.arrows(f"{root}/forces", arrows, RED, 0.0022 * self._framing.extent)
+        width = style.arrow_width * self._framing.extent
+        self._nodes.arrows(f"{root}/forces", arrows, style.arrow, width)
 
     def draw_controls(
         self,
@@ -147,17 +178,17 @@ class ObjectDrawing:
         layers: Layers,
     ) -> None:
         """Draw the control nodes, those that hold the object larger than the others."""
-        spacing, root = self._framing.spacing, self._root
+        spacing, root, style = self._framing.spacing, self._root, self._style
         held = control if attached is None else control[attached]
-        self._balls(
-            f"{root}/controls/attached", held, RED, 0.3 * spacing, is_visible=layers.controls
-        )
+        size = style.control_size * spacing
+        name = f"{root}/controls/attached"
+        self._balls(name, held, style.control, size, is_visible=layers.controls)
         is_shown = layers.all_controls and attached is not None
         free = np.delete(control, attached, axis=0) if is_shown and attached is not None else None
         if free is not None or f"{root}/controls/free" in self._nodes:
             point = np.zeros((0, 3), np.float32) if free is None else free
             name = f"{root}/controls/free"
-            self._nodes.points(name, point, RED, 0.12 * spacing, is_visible=is_shown)
+            self._nodes.points(name, point, style.control, 0.12 * spacing, is_visible=is_shown)
 
 
 def force_arrows(

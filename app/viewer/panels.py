@@ -33,7 +33,7 @@ class TimelinePanel:
         loop = gui.add_checkbox("Loop", initial_value=True)
 
         self._play.on_click(guard(lambda _: self._toggle()))
-        self._frame.on_update(guard.by_user(self._scrub))
+        self._frame.on_update(self._scrub)
         step.on_click(guard(lambda event: playback.step(1 if event.target.value == "1 ▶" else -1)))
         speed.on_update(guard.by_user(lambda _: playback.set_speed(speed.value)))
         loop.on_update(guard.by_user(lambda _: playback.set_loop(on=loop.value)))
@@ -64,9 +64,13 @@ class TimelinePanel:
     def _toggle(self) -> None:
         self._playback.play(on=not self._playback.is_playing)
 
-    def _scrub(self, _: Any) -> None:
-        self._playback.play(on=False)
-        self._playback.seek(self._frame.value)
+    async def _scrub(self, event: Any) -> None:
+        # At once, in viser's own thread: in another one, the running clock could have moved the
+        # slider on before it is read.
+        frame = event.target.value
+        if event.client is not None:
+            self._playback.play(on=False)
+            self._playback.seek(frame)
 
 
 class LayersPanel:

@@ -215,7 +215,17 @@ class Session:
         with self._lock:
             frame = self._playback.frame
             take, take_frame = self._take(frame)
-            return Snapshot(self._content, frame, take, take_frame)
+            is_figure = self._figure.is_on and take is not None
+            sides = self._figure.sides(take, take_frame, frame) if is_figure and take else None
+            picture = self._figure.picture if is_figure else None
+            return Snapshot(
+                content=self._content,
+                frame=frame,
+                take=take,
+                take_frame=take_frame,
+                sides=sides,
+                picture=picture,
+            )
 
 
 def _start_server(label: str) -> viser.ViserServer:

@@ -2,6 +2,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import viser
+from viewer_client import ViewerClient
 from viewer_world import FakeSettings, FolderCatalog, Recording, make_run, make_sequence
 
 from app.viewer.session import Sessions
@@ -35,3 +37,13 @@ def sessions(catalog: FolderCatalog) -> Iterator[Sessions]:
     sessions = Sessions(FakeSettings(), catalog)
     yield sessions
     sessions.shutdown()
+
+
+@pytest.fixture
+def server_client() -> Iterator[tuple[viser.ViserServer, ViewerClient]]:
+    """A bare viser server with one client, which has told it its camera."""
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    with ViewerClient(f"ws://127.0.0.1:{server.get_port()}") as client:
+        client.until(lambda: len(server.get_clients()) == 1)
+        yield server, client
+    server.stop()

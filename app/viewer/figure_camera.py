@@ -1,0 +1,130 @@
+"""Where the cameras stand while the figure is shown, and how they come back."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import viser
+import viser.transforms
+from jaxtyping import Float
+from numpy import ndarray
+
+PICTURE_WIDTH = 1_600
+"""Width of an exported picture of the figure in pixels."""
+_PANEL_PIXELS = 345
+_FOV = float(np.deg2rad(14.0))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Eye:
+    """From where a client looks."""
+
+    right: Float[ndarray, " 3"]
+    """To the right of the picture."""
+    up: Float[ndarray, " 3"]
+    """To the top of the picture."""
+
+    @classmethod
+    def of(cls, wxyz: Float[ndarray, " 4"]) -> "Eye":
+        """Read a camera's orientation; its y axis points down."""
+        R_world_camera = viser.transforms.SO3(np.asarray(wxyz, dtype=np.float64)).as_matrix()
+        return cls(right=R_world_camera[:, 0], up=-R_world_camera[:, 1])
+
+    @property
+    def ahead(self) -> Float[ndarray, " 3"]:
+        """Into the picture."""
+        return np.cross(self.up, self.right)
+
+
+Box = tuple[Float[ndarray, " 3"], float, float]
+"""Middle, width and height of something as it is seen."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Pose:
+    position: Float[ndarray, " 3"]
+    look_at: Float[ndarray, " 3"]
+    up: Float[ndarray, " 3"]
+    fov: float
+
+
+class FigureCameras:
+    """Moves the clients' cameras to the figure and back."""
+
+    def __init__(self) -> None:
+        self._poses: dict[int, _Pose] = {}
+
+    def aim(
+        self,
+        client: viser.ClientHandle,
+        box: Box,
+    ) -> None:
+        """Move a camera back along its view until the figure fits beside the panel.
+
+        The lens becomes a long one, so that both halves are seen from nearly the same side.
+
+        Args:
+            client: Whose camera.
+            box: The figure.
+        """
+        camera = client.camera
+        before = _Pose(camera.position, camera.look_at, camera.up_direction, camera.fov)
+        self._poses.setdefault(client.client_id, before)
+        eye = Eye.of(camera.wxyz)
+        width, height = max(camera.image_width, 1), max(camera.image_height, 1)
+        hidden = _covered(width)
+        slope = float(np.tan(_FOV / 2))
+        center, wide, high = box
+        distance = max(high / 2, wide / 2 * height / (width - hidden)) / slope
+        aside = 0.5 * hidden * (2 * slope * distance / height) * eye.right
+        with client.atomic():
+            camera.fov = _FOV
+            camera.position = center + aside - distance * eye.ahead
+            camera.look_at = center + aside
+
+    def restore(self, server: viser.ViserServer) -> None:
+        """Let all cameras stand again where they stood before."""
+        for client in server.get_clients().values():
+            pose = self._poses.get(client.client_id)
+            if pose is None:
+                continue
+            with client.atomic():
+                eye = client.camera
+                eye.up_direction, eye.fov = pose.up, pose.fov
+                eye.position, eye.look_at = pose.position, pose.look_at
+        self._poses.clear()
+
+
+def picture_of_figure(client: viser.ClientHandle, box: Box) -> dict[str, Any]:
+    """Find camera and size of a picture of the figure as a client sees it beside the panel.
+
+    What is empty above and below is cut off evenly, so that the middle stays.
+
+    Args:
+        client: Who looks.
+        box: The figure.
+
+    Returns:
+        Arguments of viser's ``get_render``.
+    """
+    camera = client.camera
+    width, height = max(camera.image_width, 1), max(camera.image_height, 1)
+    hidden = _covered(width)
+    pixel = 2 * np.tan(camera.fov / 2) / height
+    distance = float(np.linalg.norm(camera.look_at - camera.position))
+    eye = Eye.of(camera.wxyz)
+    aside = 0.5 * hidden * pixel * distance * eye.right
+    reach = abs(float((box[0] - camera.look_at) @ eye.up)) + 0.5 * box[2]
+    kept = min(2 * reach / (pixel * distance), height)
+    return {
+        "width": PICTURE_WIDTH,
+        "height": max(round(kept * PICTURE_WIDTH / (width - hidden)), 1),
+        "wxyz": camera.wxyz,
+        "position": camera.position - aside,
+        "fov": 2 * float(np.arctan(np.tan(camera.fov / 2) * kept / height)),
+    }
+
+
+def _covered(width: int) -> int:
+    """Guess how many pixels of a picture the panel covers."""
+    return _PANEL_PIXELS if width > 2 * _PANEL_PIXELS else 0

@@ -1,0 +1,259 @@
+import csv
+import io
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy import ndarray
+from viewer_client import ViewerClient
+from viewer_world import FRAMES, PARAMETERS, content_of, controls, sheet
+
+from app.viewer.figure import ARROWS, Figure, Side
+from app.viewer.figure_camera import Eye, picture_of_figure
+from app.viewer.figure_export import write_figure_csv, write_figure_npz
+from app.viewer.fitted_object import FittedObject
+from app.viewer.framing import frame_content
+from app.viewer.layers import Layers
+from app.viewer.session import Sessions
+from app.viewer.take import Take
+from physhandi.data.run import Run
+from physhandi.simulation.simulator import Simulator
+from physhandi.simulation.topology import build_model
+
+FRAME = 12
+SIDES = ("ours", "phystwin")
+TURNED = (0.5**0.5, 0.0, 0.0, 0.5**0.5)
+"""A camera whose right hand is the world's y axis."""
+
+
+def watch(sessions: Sessions) -> ViewerClient:
+    session = sessions.get(sessions.open("run", "sheet", "me"))
+    assert session is not None
+    return ViewerClient(f"ws://127.0.0.1:{session.port}")
+
+
+def enter(client: ViewerClient) -> None:
+    client.until(lambda: "object springs" in client.texts())
+    client.set("Frame", FRAME)
+    client.until(lambda: any(p.get("label") == "Play" for p in client.gui.values()))
+    client.set("Compare with PhysTwin", True)
+    done = f"PhysTwin-style: simulated {FRAMES}/{FRAMES} frames"
+    client.until(lambda: done in client.texts() and "/figure/phystwin/forces" in client.nodes)
+    # The arrow scale is chosen anew when both rollouts are known.
+    client.until(lambda: legend_force(client) > 0)
+
+
+def legend_force(client: ViewerClient) -> float:
+    return float(client.nodes["/figure/legend/text_3"]["text"].removeprefix("force, ")[:-2])
+
+
+def arrows(client: ViewerClient, name: str) -> ndarray:
+    return client.nodes[name]["points"].reshape(-1, 2, 3)
+
+
+def rolled_out(run: Run) -> Take:
+    """Simulate PhysTwin's way without the live process."""
+    control = run.array("sequences/lift/control.npy")
+    values = replace(
+        PARAMETERS,
+        virtual_connection_radius=0.04,
+        virtual_max_neighbors=50,
+        virtual_stiffness=PARAMETERS.stiffness,
+        virtual_rest_length_floor=1e-4,
+        use_control_velocity=False,
+    )
+    model = build_model(sheet(), control[0], values)
+    motion = Simulator(model, values).rollout(control)
+    return Take(
+        model=model,
+        parameters=values,
+        control=control,
+        position=motion.position,
+        velocity=motion.velocity,
+        ready=FRAMES,
+    )
+
+
+def test_both_sides_are_shown_in_one_scale_and_the_scene_comes_back(sessions, run) -> None:
+    with watch(sessions) as client:
+        enter(client)
+        session = sessions.get(sessions.list()[0].id)
+        session._playback.redraw()
+        rival = session._figure._rollout.newest
+        ours = run.array("sequences/lift/rollout.npy")[FRAME]
+        np.testing.assert_array_equal(
+            client.array("/figure/ours/object/nodes", "batched_positions"), ours
+        )
+        nodes = client.array("/figure/phystwin/object/nodes", "batched_positions")
+        np.testing.assert_array_equal(nodes, rival.position[FRAME])
+        assert np.abs(nodes - ours).max() > 1e-3
+        assert client.nodes["/figure/title_ours"]["text"] == "ours"
+        detail = client.nodes["/figure/detail_phystwin"]["text"]
+        assert detail == f"δ 40 mm · d_max 50 · {recount(run, 0.04, 50)} virtual springs"
+        detail = client.nodes["/figure/detail_ours"]["text"]
+        assert detail == f"δ 20 mm · d_max 3 · {recount(run, 0.02, 3)} virtual springs"
+        assert "both sides use them" in client.texts()
+        # One length means one force on both sides, and in the legend.
+        lengths, forces = [], []
+        for side, take in (("ours", session._content.fitted), ("phystwin", rival)):
+            arrow = arrows(client, f"/figure/{side}/forces")
+            strength = np.sort(np.linalg.norm(take.forces(FRAME), axis=1))[::-1]
+            lengths.append(np.linalg.norm(arrow[:, 1] - arrow[:, 0], axis=1))
+            forces.append(strength[: len(arrow)])
+            assert len(arrow) > 10
+        unit = np.concatenate(lengths) / np.concatenate(forces)
+        np.testing.assert_allclose(unit, unit[0], rtol=1e-3)
+        (scale,) = arrows(client, "/figure/legend/force")
+        length = float(np.linalg.norm(scale[1] - scale[0]))
+        assert length / legend_force(client) == pytest.approx(unit[0], rel=1e-3)
+        assert not client.visible["/object/nodes"]
+        assert client.camera["fov"] < 0.3
+        client.tell_camera()
+        client.set("Back to the scene", True)
+        client.until(lambda: client.visible["/object/nodes"] and client.camera["fov"] > 0.5)
+        hidden = [n for n in client.visible if n.startswith("/figure/") and client.visible[n]]
+        implied = {"/figure/ours/object", "/figure/ours/springs", "/figure/ours/controls"}
+        implied |= {name.replace("ours", "phystwin") for name in implied} | {"/figure/legend"}
+        assert set(hidden) <= implied
+        assert client.camera["position"] == pytest.approx([1, 1, 1])
+        assert client.camera["look_at"] == pytest.approx([0, 0, 0])
+        assert client.camera["fov"] == pytest.approx(0.8)
+
+
+def recount(run: Run, radius: float, most: int) -> int:
+    """Count the virtual springs by looking at every control node alone."""
+    control = run.array("sequences/lift/control.npy")[0]
+    distance = np.linalg.norm(control[:, None] - sheet()[None], axis=2)
+    return int(np.minimum((distance < radius).sum(axis=1), most).sum())
+
+
+def test_the_halves_stay_left_and_right_as_the_camera_turns(sessions) -> None:
+    with watch(sessions) as client:
+        enter(client)
+        # The camera looks along z with the world's x to its right.
+        left, right = (np.array(client.positions[f"/figure/{side}"]) for side in SIDES)
+        assert right[0] > 0.05
+        np.testing.assert_allclose(left, -right, atol=1e-6)
+        np.testing.assert_allclose(right[1:], 0, atol=1e-6)
+        client.tell_camera(wxyz=TURNED)
+        client.until(lambda: client.positions["/figure/phystwin"][1] > 0.05)
+        x, _, z = client.positions["/figure/phystwin"]
+        assert (x, z) == pytest.approx((0, 0), abs=1e-6)
+        high = np.array(client.positions["/figure/title_ours"])
+        low = np.array(client.positions["/figure/legend/text_0"])
+        assert (high - low) @ Eye.of(np.array(TURNED)).up > 0.05
+
+
+def test_the_live_process_holds_the_object_in_phystwins_way(run) -> None:
+    expected = rolled_out(run)
+    fitted = FittedObject(str(run.folder), "lift")
+    control = fitted.choose_controls(range(30))
+    model = fitted.model(expected.parameters)
+    assert model.object_spring_count == fitted.take.model.object_spring_count
+    np.testing.assert_array_equal(model.spring_nodes, expected.model.spring_nodes)
+    np.testing.assert_allclose(model.rest_length, expected.model.rest_length, rtol=1e-6)
+    np.testing.assert_array_equal(model.stiffness, expected.model.stiffness)
+    motion = Simulator(model, expected.parameters).rollout(control)
+    np.testing.assert_allclose(motion.position, expected.position, atol=1e-5)
+    some = fitted.choose_controls([3, 17])
+    np.testing.assert_array_equal(some, fitted.take.control[:, [3, 17]])
+    held = fitted.model(expected.parameters).spring_nodes[model.object_spring_count :, 1]
+    assert set(held.tolist()) == {81, 82}
+    assert fitted.choose_controls(None).shape[1] == 30
+    assert fitted.model(PARAMETERS) is fitted.take.model
+
+
+def test_the_downloads_hold_positions_springs_and_forces_of_both_sides(run) -> None:
+    content = content_of({}, run.array("sequences/lift/control.npy"))
+    ours, rival = replace_rollout(content.fitted, run), rolled_out(run)
+    sides = {
+        "ours": Side(take=ours, frame=FRAME, caption=""),
+        "phystwin": Side(take=rival, frame=FRAME, caption=""),
+    }
+    with np.load(io.BytesIO(write_figure_npz(sides))) as saved:
+        for name, take in (("ours", ours), ("phystwin", rival)):
+            np.testing.assert_array_equal(saved[f"{name}_position"], take.position)
+            np.testing.assert_array_equal(saved[f"{name}_control"], take.control)
+            np.testing.assert_array_equal(saved[f"{name}_spring_nodes"], take.model.spring_nodes)
+            np.testing.assert_array_equal(saved[f"{name}_force"][FRAME], take.forces(FRAME))
+            assert saved[f"{name}_frame"] == FRAME
+        forces = {name: saved[f"{name}_force"][FRAME] for name in SIDES}
+    rows = list(csv.DictReader(io.StringIO(write_figure_csv(sides).decode())))
+    for name, take in (("ours", ours), ("phystwin", rival)):
+        own = [row for row in rows if row["side"] == name]
+        kinds = [row["kind"] for row in own]
+        assert kinds.count("node") == 81
+        assert kinds.count("virtual_spring") == take.model.virtual_spring_count > 20
+        # The springs' forces, summed over each node, are the node's force.
+        total = np.zeros((81, 3))
+        for row in own:
+            force = [float(row[f"force_{axis}_N"]) for axis in "xyz"]
+            if row["kind"] == "virtual_spring":
+                total[int(row["node"])] += force
+                place = [float(row[f"{axis}_m"]) for axis in "xyz"]
+                control = take.control[FRAME, int(row["control"])]
+                np.testing.assert_allclose(place, control, atol=1e-6)
+                stretched = np.linalg.norm(control - take.position[FRAME, int(row["node"])])
+                assert float(row["length_m"]) == pytest.approx(stretched, rel=1e-5)
+        np.testing.assert_allclose(total, forces[name], atol=1e-3)
+        assert np.abs(total).max() > 1.0
+
+
+def replace_rollout(take: Take | None, run: Run) -> Take:
+    assert take is not None
+    take.position = run.array("sequences/lift/rollout.npy")
+    return take
+
+
+def test_no_side_streams_more_than_300_arrows_or_too_many_bytes(server_client) -> None:
+    rng = np.random.default_rng(5)
+    node = rng.uniform(-0.1, 0.1, (2_000, 3)).astype(np.float32)
+    control = np.repeat(rng.uniform(-0.1, 0.1, (1, 900, 3)).astype(np.float32), 3, axis=0)
+    control += np.linspace(0, 0.02, 3, dtype=np.float32)[:, None, None]
+    content = content_of({}, control)
+    model = build_model(node, control[0], PARAMETERS)
+    assert model.object_spring_count > 4_000
+    position = node + np.linspace(0, 0.01, 3, dtype=np.float32)[:, None, None]
+    take = Take(model=model, parameters=PARAMETERS, control=control, position=position, ready=3)
+    assert (np.linalg.norm(take.forces(2), axis=1) > 1e-6).sum() > 2 * ARROWS
+    server, client = server_client
+    figure = Figure(server, content, take, frame_content(content))
+    sides = {name: Side(take=take, frame=1, caption=name) for name in SIDES}
+    layers = Layers(object_springs=True)
+    figure.draw(sides, 1, layers, is_playing=True)
+    client.until(lambda: "/figure/phystwin/forces" in client.nodes)
+    before = client.bytes_received
+    figure.draw({k: replace(s, frame=2) for k, s in sides.items()}, 2, layers, is_playing=True)
+    client.until(lambda: len(arrows(client, "/figure/phystwin/forces")) > 0)
+    client.until(lambda: client.bytes_received - before > 60_000)
+    for side in SIDES:
+        assert 100 < len(arrows(client, f"/figure/{side}/forces")) <= ARROWS == 300
+    assert client.bytes_received - before < 100_000
+
+
+def test_a_picture_is_centered_on_what_is_seen_beside_the_panel(server_client) -> None:
+    server, _ = server_client
+    (seen,) = (c for c in server.get_clients().values())
+    camera = seen.camera
+    box = (np.zeros(3), 0.4, 0.1)
+    view = picture_of_figure(seen, box)
+    # 640 pixels are too few for the panel to be taken into account: all of the width is kept.
+    assert (view["width"], view["position"].tolist()) == (1600, camera.position.tolist())
+    camera_high = 2 * np.tan(0.4) * np.sqrt(3)
+    eye = Eye.of(camera.wxyz)
+    reach = abs(camera.look_at @ eye.up) + 0.05
+    assert view["height"] == pytest.approx(1600 * 480 / 640 * 2 * reach / camera_high, abs=1)
+    kept = np.tan(view["fov"] / 2) / np.tan(0.4)
+    assert kept == pytest.approx(view["height"] / 1200, abs=1e-3)
+
+
+def test_every_number_of_the_legend_is_round(server_client) -> None:
+    server, _ = server_client
+    content = content_of({}, controls((0.0, 0.0, 1.0)))
+    figure = Figure(server, content, content.fitted, frame_content(content))
+    extent = frame_content(content).extent
+    for exponent, step in itertools.product(range(-3, 4), (1.0, 1.7, 3.3, 9.9)):
+        figure.force_unit = 0.16 * extent / (step * 10.0**exponent)
+        shown = figure.scale_force / 10.0**exponent
+        assert shown == pytest.approx(max(s for s in (1, 2, 5) if s <= step))
