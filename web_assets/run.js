@@ -7,7 +7,9 @@ const page = {
   losses: document.getElementById("losses"),
   frames: document.getElementById("frames"),
   charts: new Map(),
-  waiting: new Map(),
+  loaded: -1, // number of the last report that the curves were loaded with
+  live: [], // points that came since
+  drawn: 0, // how many of them the charts show
   report: { seq: -1 },
   log: null,
 };
@@ -96,7 +98,11 @@ async function loadLosses() {
   for (const [stage, { curve }] of Object.entries(losses)) {
     drawLoss(stage, curve)?.setData([curve.map((point) => point[0]), curve.map((point) => point[1])]);
   }
-  for (const [stage, points] of page.waiting) page.waiting.set(stage, points.filter((point) => point.seq > seq));
+  // The stream may be ahead of this answer or behind it: what it does not hold is drawn again.
+  page.loaded = Math.max(page.loaded, seq);
+  page.live = page.live.filter((point) => point.seq > page.loaded);
+  page.drawn = 0;
+  drawLive();
   return seq;
 }
 
@@ -106,22 +112,18 @@ function showReport(report) {
   if (page.report.total) showProgress(document.getElementById("run"), { progress: page.report });
 }
 
-/** Points of one frame are drawn together, however many there are. */
 function onProgress(event) {
   showReport(event);
-  if (!Number.isFinite(event.loss)) return;
-  const points = page.waiting.get(event.stage) ?? [];
-  points.push({ seq: event.seq, at: [event.iteration, event.loss] });
-  if (!page.waiting.size) requestAnimationFrame(drawWaiting);
-  page.waiting.set(event.stage, points);
+  if (!Number.isFinite(event.loss) || event.seq <= page.loaded) return;
+  // Points of one frame are drawn together, however many there are.
+  if (page.drawn === page.live.length) requestAnimationFrame(drawLive);
+  page.live.push({ stage: event.stage, seq: event.seq, at: [event.iteration, event.loss] });
 }
 
-function drawWaiting() {
-  for (const [stage, points] of page.waiting) {
-    const known = points.map((point) => point.at);
-    drawLoss(stage, known)?.append(known);
-  }
-  page.waiting.clear();
+function drawLive() {
+  const stages = Map.groupBy(page.live.slice(page.drawn), (point) => point.stage);
+  page.drawn = page.live.length;
+  for (const [stage, points] of stages) drawLoss(stage, points).append(points.map((point) => point.at));
 }
 
 /* ---- errors of every frame ---- */

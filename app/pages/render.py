@@ -62,7 +62,7 @@ def short(value: Any) -> str:
     size = abs(value)
     if 1e3 <= size < 1e7:
         return f"{value:.0f}"
-    return f"{value:.3e}" if 0 < size < 1e-3 else f"{value:.4g}"
+    return f"{value:.3e}".replace("e-0", "e-") if 0 < size < 1e-3 else f"{value:.4g}"
 
 
 def words(value: Any) -> str:

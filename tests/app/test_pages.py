@@ -52,5 +52,5 @@ def test_times_are_told_in_minutes_from_one_on() -> None:
 
 def test_numbers_keep_four_digits_and_names_become_words() -> None:
     shown = [short(v) for v in (None, 7, "x", 2230.745, 0.0316404, 1e4, 9.47015e-5, 0.0, 2.5e9)]
-    assert shown == ["none", "7", "x", "2231", "0.03164", "10000", "9.470e-05", "0", "2.5e+09"]
+    assert shown == ["none", "7", "x", "2231", "0.03164", "10000", "9.470e-5", "0", "2.5e+09"]
     assert words("chamfer_dynamic_l1") == "chamfer dynamic L1"

@@ -54,9 +54,11 @@ def reports(stage: str, iterations: range, loss: Callable[[int], float]) -> list
     return [["report", stage, i, 100, loss(i)] for i in iterations]
 
 
-def points(page: Page, stage: str) -> list[list[float]]:
-    """The points that a chart draws, as uPlot holds them."""
-    return page.evaluate("stage => page.charts.get(stage)?.plot.data ?? []", stage)
+def points(page: Page, stage: str, count: int) -> list[list[float]]:
+    """The points that a chart draws, as uPlot holds them, once there are that many."""
+    data = "page.charts.get(stage)?.plot.data"
+    page.wait_for_function(f"([stage, n]) => {data}?.[0].length === n", arg=[stage, count])
+    return page.evaluate(f"stage => {data}", stage)
 
 
 def test_curves_log_and_stages_grow_without_a_reload(world, open_run):
@@ -69,13 +71,13 @@ def test_curves_log_and_stages_grow_without_a_reload(world, open_run):
     world.tell(run_id, *reports("hand_reconstruction", range(5, 6), lambda i: 100.0 / i))
     expect(page.locator("[data-text]")).to_contain_text("hand reconstruction · 5 of 100 · loss 20")
     expect(page.locator("#losses .uplot")).to_have_count(1)
-    assert points(page, "hand_reconstruction") == [[1, 2, 3, 4, 5], [100, 50, 100 / 3, 25, 20]]
+    assert points(page, "hand_reconstruction", 5) == [[1, 2, 3, 4, 5], [100, 50, 100 / 3, 25, 20]]
 
     world.tell(run_id, *reports("hand_reconstruction", range(6, 41), lambda i: 100.0 / i))
     world.tell(run_id, ["log", "a line <i>from</i> the worker"])
     expect(page.locator("[data-text]")).to_contain_text("40 of 100 · loss 2.5")
     expect(page.locator("#log")).to_contain_text("a line <i>from</i> the worker")
-    iterations, losses = points(page, "hand_reconstruction")
+    iterations, losses = points(page, "hand_reconstruction", 40)
     assert iterations == list(range(1, 41))
     assert losses == pytest.approx([100 / i for i in iterations])
 
@@ -109,7 +111,7 @@ def test_a_zoomed_chart_stays_zoomed_while_it_grows(world, open_run):
 
     world.tell(run_id, *reports("first_order", range(41, 61), lambda i: 100.0 / i))
     expect(page.locator("[data-text]")).to_contain_text("60 of 100")
-    page.wait_for_function("page.charts.get('first_order').plot.data[0].length === 60")
+    assert points(page, "first_order", 60)[0] == list(range(1, 61))
     assert page.evaluate(X_RANGE) == zoomed
     expect(log).to_have_attribute("aria-pressed", "false")
     chart.get_by_role("button", name="show all").click()
@@ -132,7 +134,7 @@ def test_a_marked_text_stays_marked_and_a_lost_stream_is_taken_up_without_gap(wo
     world.tell(run_id, *reports("zeroth_order", range(4, 7), float), ["log", "afterwards"])
     expect(page.locator("#log .line", has_text="afterwards")).to_have_count(1)
     expect(page.locator("#log .line", has_text="while away")).to_have_count(1)
-    assert points(page, "zeroth_order") == [[1, 2, 3, 4, 5, 6]] * 2
+    assert points(page, "zeroth_order", 6) == [[1, 2, 3, 4, 5, 6]] * 2
     assert page.evaluate("getSelection().toString()") == "script"
 
 
