@@ -5,13 +5,14 @@ Run as ``python -m physhandi.data.untrusted_worker FILE OUT SECONDS BYTES``. It 
 """
 
 import encodings.cp437 as zip_text
+import io
 import json
 import pickle
 import resource
 import sys
 import zipfile
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import Any, cast
 
 import numpy as np
 from numpy import ndarray
@@ -25,7 +26,7 @@ REFUSED = 3
 TEXT_OF_ARCHIVES = zip_text.getregentry()
 """Loaded here, since names in an archive need it when nothing may be loaded any more."""
 ZIP_MAGIC = b"PK\x03\x04"
-_MOST_VALUES = 2_000_000
+_MOST_VALUES = 500_000
 _DEEPEST = 64
 _WIDEST_INTEGER = 1024
 _CALLS = ("os", "subprocess", "socket", "exec", "compile", "import", "open", "ctypes", "shutil")
@@ -34,7 +35,7 @@ _CALLS = ("os", "subprocess", "socket", "exec", "compile", "import", "open", "ct
 class InertUnpickler(pickle.Unpickler):
     """Builds a pickle's tree from stand-ins; any name without one is refused."""
 
-    def __init__(self, stream: IO[bytes], archive: zipfile.ZipFile | None = None) -> None:
+    def __init__(self, stream: io.BufferedIOBase, archive: zipfile.ZipFile | None = None) -> None:
         super().__init__(stream, encoding="latin1")
         self._archive = archive
         self._storages: dict[str, Storage] = {}
@@ -152,7 +153,7 @@ class Tree:
         return self._index[id(value)]
 
 
-def load(stream: IO[bytes]) -> Any:
+def load(stream: io.BufferedIOBase) -> Any:
     """Build the tree of a pickle or a torch checkpoint from stand-ins.
 
     Raises:
@@ -166,10 +167,27 @@ def load(stream: IO[bytes]) -> Any:
             raise ImportFailedError("more follows its first pickle, as in torch files before 1.6")
         return tree
     with zipfile.ZipFile(stream) as archive:
-        member(archive, "data.pkl")
-        folder = archive.namelist()[0].split("/")[0]
-        with archive.open(f"{folder}/data.pkl") as content:
-            return InertUnpickler(content, archive).load()
+        content = io.BytesIO(member(archive, "data.pkl"))
+        return InertUnpickler(content, archive).load()
+
+
+def convert(stream: io.BufferedIOBase, most_bytes: int) -> tuple[Any, list[ndarray]]:
+    """Read a file into what JSON has, and its arrays, which may take a quarter of the bytes.
+
+    Raises:
+        ImportFailedError: If the file is refused or broken.
+    """
+    tree = Tree(most_bytes // 4)
+    try:
+        return tree.encode(load(stream)), tree.arrays
+    except ImportFailedError:
+        raise
+    except (MemoryError, OverflowError):
+        raise ImportFailedError("it needs more memory than is allowed") from None
+    except RecursionError:
+        raise ImportFailedError("it is nested too deeply") from None
+    except Exception as error:  # noqa: BLE001 - a broken pickle can raise nearly anything
+        raise ImportFailedError(f"it is no whole pickle ({error})"[:200]) from None
 
 
 def read(source: Path, out: Path, most_bytes: int) -> None:
@@ -178,27 +196,18 @@ def read(source: Path, out: Path, most_bytes: int) -> None:
     Raises:
         ImportFailedError: If the file is refused or broken.
     """
-    tree = Tree(most_bytes // 4)
     with source.open("rb") as stream:
-        watched = _forbid_calls()
+        watched = forbid_calls()
         try:
-            encoded = tree.encode(load(stream))
-        except ImportFailedError:
-            raise
-        except (MemoryError, OverflowError):
-            raise ImportFailedError("it needs more memory than is allowed") from None
-        except RecursionError:
-            raise ImportFailedError("it is nested too deeply") from None
-        except Exception as error:  # noqa: BLE001 - a broken pickle can raise nearly anything
-            raise ImportFailedError(f"it is no whole pickle ({error})"[:200]) from None
+            tree, found = convert(stream, most_bytes)
         finally:
             watched.clear()
-    arrays = {str(number): array for number, array in enumerate(tree.arrays)}
-    np.savez(out / "array.npz", allow_pickle=False, **cast("Any", arrays))
-    (out / "tree.json").write_text(json.dumps(encoded), encoding="ascii")
+    arrays: Any = {str(number): array for number, array in enumerate(found)}
+    np.savez(out / "array.npz", allow_pickle=False, **arrays)
+    (out / "tree.json").write_text(json.dumps(tree), encoding="ascii")
 
 
-def _forbid_calls() -> list[bool]:
+def forbid_calls() -> list[bool]:
     """Refuse files, sockets and programs while the returned list holds something.
 
     The last line of defence: stand-ins have no way to any of these.
