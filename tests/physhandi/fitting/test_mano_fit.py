@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from physhandi import pipeline
+from physhandi.data.exporters import export_run
 from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.errors import MissingInputError, UsageError
@@ -52,7 +53,9 @@ def test_without_mano_the_fit_says_how_to_bring_it(
 
 
 @pytest.mark.slow
-def test_a_whole_run_uses_mano(tmp_path: Path, mano: Path) -> None:
+def test_a_whole_run_uses_mano_and_outlives_it(
+    tmp_path: Path, mano: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     stored = Run.open(BUNDLED / "runs" / "towel_fold_quick")
     folder = tmp_path / "towel_fold"
     shutil.copytree(BUNDLED / "towel_fold", folder)
@@ -91,3 +94,20 @@ def test_a_whole_run_uses_mano(tmp_path: Path, mano: Path) -> None:
     known = stored.array(f"{base}/hand_right_vertex.npy")
     for frame in (0, len(known) // 2, len(known) - 1):
         assert cKDTree(vertex[frame]).query(known[frame])[0].mean() < 0.006
+
+    monkeypatch.setenv("PHYSHANDI_HANDS", str(tmp_path / "nowhere"))
+    again = Run.create(
+        tmp_path / "again",
+        name="without MANO",
+        kind="simulation",
+        sequences=[str(folder)],
+        config={"source": str(run.folder), "parameters": {}},
+    )
+    pipeline.run_job(again)
+    again = Run.open(again.folder)
+    rollout = [one.array(f"{base}/rollout.npy") for one in (run, again)]
+    np.testing.assert_array_equal(rollout[1], rollout[0])
+    for part in ("vertex", "face", "keypoint"):
+        file = f"{base}/hand_right_{part}.npy"
+        np.testing.assert_array_equal(again.array(file), run.array(file))
+    assert export_run(again, "gltf", tmp_path / "again.glb").stat().st_size > 100_000
