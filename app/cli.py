@@ -22,7 +22,7 @@ from app.arguments import (
     Serve,
     Simulate,
 )
-from physhandi.errors import PhysHandiError, UsageError
+from physhandi.errors import PhysHandiError, UsageError, describe
 from physhandi.progress import Progress
 
 Result = TypeVar("Result")
@@ -112,7 +112,7 @@ def main(argv: list[str] | None = None) -> None:
         print(f"physhandi: {error}", file=sys.stderr)
         code = 2
     except (PhysHandiError, OSError) as error:
-        print(f"physhandi: {error}", file=sys.stderr)
+        print(f"physhandi: {describe(error)}", file=sys.stderr)
         code = 1
     except KeyboardInterrupt:
         print("physhandi: interrupted", file=sys.stderr)

@@ -1,5 +1,6 @@
 """What each command does; returns plain data and never prints."""
 
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, cast
@@ -15,6 +16,7 @@ from physhandi.data.run import Run, RunKind
 from physhandi.data.sequence import Sequence
 from physhandi.errors import RunError, UsageError
 from physhandi.fitting.profile import config_to_dict, load_profile
+from physhandi.fitting.simulate import changed_parameters
 from physhandi.progress import Progress
 from physhandi.simulation.model import SimulationParameters
 
@@ -109,6 +111,8 @@ def reconstruct(command: Any, progress: Progress) -> dict[str, Any]:
     if not command.sequences:
         raise UsageError("Name at least one sequence to reconstruct.")
     sequences = [find_sequence(name, command.data_dir) for name in command.sequences]
+    for sequence in sequences:
+        sequence.validate(reads_color=False)  # Tells wrong data before a run is made.
     device = pick_device(command.device)
     config = {"profile": config_to_dict(load_profile(command.profile))}
     paths = [str(sequence.folder) for sequence in sequences]
@@ -124,14 +128,17 @@ def simulate(command: Any, progress: Progress) -> dict[str, Any]:
         )
     device = pick_device(command.device)
     changes = {n: v for n in OVERRIDES if (v := getattr(command, n)) is not None}
-    SimulationParameters.from_dict(changes)  # Tells a wrong value before a run is made.
+    changed_parameters(SimulationParameters(), changes)  # Tells a wrong value before a run is made.
     if command.sequence is not None:
         sequence = find_sequence(command.sequence, command.data_dir)
     else:
         sequence = open_catalog(command.data_dir).sequences_of(source)[0]
     config = {"source": str(source.folder.resolve()), "parameters": changes}
     paths = [str(sequence.folder)]
-    return _execute(_run_at(command.out, "simulation", paths, config), device, progress)
+    run = _run_at(command.out, "simulation", paths, config)
+    result = _execute(run, device, progress)
+    chosen = Run.open(run.folder).yaml("object/parameters.yaml")
+    return {"substeps_per_frame": chosen["substeps_per_frame"], **result}
 
 
 def _run_at(folder: Path, kind: RunKind, sequences: list[str], config: dict[str, Any]) -> Run:
@@ -226,16 +233,20 @@ def _import_phystwin(source: ImportPhystwin, progress: Progress) -> dict[str, An
     folder = import_phystwin(source.source, source.out, progress)
     if source.optimal_params is None:
         return {"sequence": str(folder)}
-    run = import_phystwin_run(
-        Sequence.load(folder),
-        source.optimal_params,
-        source.checkpoint,
-        source.run or folder.with_name(f"{folder.name}_phystwin"),
-        device=pick_device(source.device),
-        inference=source.inference,
-        truncates_damping=False if source.keep_decimals else None,
-        progress=progress,
-    )
+    try:
+        run = import_phystwin_run(
+            Sequence.load(folder),
+            source.optimal_params,
+            source.checkpoint,
+            source.run or folder.with_name(f"{folder.name}_phystwin"),
+            device=pick_device(source.device),
+            inference=source.inference,
+            truncates_damping=False if source.keep_decimals else None,
+            progress=progress,
+        )
+    except BaseException:
+        shutil.rmtree(folder)  # All or nothing, so that the same command can be given again.
+        raise
     return {"sequence": str(folder), "run": str(run.folder), **run.json("import.json")}
 
 

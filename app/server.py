@@ -1,5 +1,6 @@
 """The application: built by a factory from explicit arguments, served by uvicorn."""
 
+import errno
 import logging
 import socket
 import threading
@@ -31,6 +32,7 @@ from physhandi.errors import (
     PhysHandiError,
     SequenceError,
     UsageError,
+    describe,
 )
 
 logger = logging.getLogger(__name__)
@@ -120,11 +122,12 @@ def _answer_errors(app: FastAPI, pages: Pages) -> None:
         return pages.error(status, message)
 
     @app.exception_handler(PhysHandiError)
-    def on_known(request: Request, error: PhysHandiError) -> Response:
-        for kind, status, code in _STATUS:
-            if isinstance(error, kind):
-                return answer(request, status, code, str(error))
-        return answer(request, 409, "conflict", str(error))
+    @app.exception_handler(OSError)
+    def on_known(request: Request, error: PhysHandiError | OSError) -> Response:
+        status, code = _status_of(error)
+        if status >= 500:
+            logger.error("a request failed: %s: %s", request.url.path, describe(error))
+        return answer(request, status, code, describe(error))
 
     @app.exception_handler(HTTPException)
     def on_http(request: Request, error: HTTPException) -> Response:
@@ -149,6 +152,14 @@ def _answer_errors(app: FastAPI, pages: Pages) -> None:
     def on_defect(request: Request, error: Exception) -> Response:
         logger.error("a request failed: %s", request.url.path, exc_info=error)
         return answer(request, 500, "defect", "The server made a mistake; its log tells more.")
+
+
+def _status_of(error: PhysHandiError | OSError) -> tuple[int, str]:
+    if isinstance(error, OSError):
+        is_full = error.errno in {errno.ENOSPC, errno.EDQUOT}
+        return (507 if is_full else 500), "storage"
+    found = [(status, code) for kind, status, code in _STATUS if isinstance(error, kind)]
+    return found[0] if found else (409, "conflict")
 
 
 def serve(settings: Settings, on_ready: Callable[[str], None], *, queue_demo: bool = False) -> None:

@@ -56,7 +56,10 @@ class Settings(BaseSettings):
     @field_validator("data_dir")
     @classmethod
     def _absolute(cls, value: Path) -> Path:
-        return value.expanduser().resolve()
+        folder = value.expanduser().resolve()
+        if folder.exists() and not folder.is_dir():
+            raise ValueError(f"{folder} is a file; name a folder, which is made when missing")
+        return folder
 
     @field_validator("allowed_hosts", mode="before")
     @classmethod

@@ -1,5 +1,31 @@
 """Every error that PhysHanDI raises on purpose; its first line is what the user reads."""
 
+import errno
+import os
+
+_REMEDIES = {
+    errno.ENOSPC: "Free some space on this disk, or choose another folder",
+    errno.EDQUOT: "Free some of your quota on this disk, or choose another folder",
+    errno.EACCES: "Choose a place that you may use, or change its permissions",
+    errno.EPERM: "Choose a place that you may use, or change its permissions",
+    errno.EROFS: "Choose a place that can be written to",
+    errno.ENOTDIR: "There is a file where a folder is needed; choose another place",
+    errno.EEXIST: "There is a file where a folder is needed; choose another place",
+    errno.EISDIR: "There is a folder where a file is needed; choose another place",
+    errno.ENOENT: "Check the path",
+}
+
+
+def describe(error: BaseException) -> str:
+    """Put an error into words for the user; the operating system's get their file and a remedy."""
+    if not isinstance(error, OSError) or error.errno is None:
+        return str(error) or type(error).__name__
+    reason = error.strerror or os.strerror(error.errno)
+    has_name = isinstance(error.filename, str | bytes | os.PathLike)
+    where = f"{os.fsdecode(error.filename)}: " if has_name else ""
+    remedy = _REMEDIES.get(error.errno)
+    return f"{where}{reason}." + (f" {remedy}." if remedy else "")
+
 
 class PhysHandiError(Exception):
     """Base of all errors whose message is written for the user."""

@@ -293,6 +293,8 @@ def run_job(run: Run, progress: Progress | None = None, *, device: str = "cpu") 
         environment = describe_environment(device, wp.get_device(device).name)
         attempt.save_json(ENVIRONMENT, environment)
         sequences = [Sequence.load(Path(path)) for path in run.sequences]
+        for sequence in sequences:
+            sequence.validate(reads_color=False)
         if run.kind == "simulation":
             source = Run.open(Path(run.config["source"]))
             simulate(

@@ -10,7 +10,7 @@ from types import FrameType
 
 from app.jobs.processes import die_with_parent
 from physhandi.data.run import Run
-from physhandi.errors import CancelledError, PhysHandiError
+from physhandi.errors import CancelledError, PhysHandiError, describe
 from physhandi.progress import Progress
 
 logger = logging.getLogger(__name__)
@@ -55,8 +55,9 @@ def work(run_folder: Path, device: str) -> int:
     except CancelledError as error:
         logger.info("%s", error)
         return 0
-    except PhysHandiError as error:
-        logger.error("%s", error)  # noqa: TRY400  # the message is for the user; no traceback
+    except (PhysHandiError, OSError) as error:
+        # The message is for the user; no traceback.
+        logger.error("%s", describe(error))  # noqa: TRY400
         return 1
     except Exception as error:
         defect = f"{type(error).__name__}: {error}"

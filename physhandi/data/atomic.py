@@ -74,8 +74,10 @@ def write_atomically(
             if is_durable:
                 os.fsync(stream.fileno())
         temporary.replace(path)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError):  # A full disk is told without a name; name what is written.
+            error.filename, error.filename2 = str(path), None
         raise
     if is_durable:
         sync_folder(path.parent)

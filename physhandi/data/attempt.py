@@ -38,7 +38,7 @@ from physhandi.data.run_files import (
     read_mapping,
 )
 from physhandi.data.run_progress import RunProgress
-from physhandi.errors import CancelledError, RunError
+from physhandi.errors import CancelledError, RunError, describe
 from physhandi.progress import Progress
 
 _LOSSES = "losses.json"
@@ -237,7 +237,8 @@ class Attempt:
         content: dict[str, Any] = {"state": state, "attempt": self.number, "time": now()}
         if error is not None:
             kind = type(error).__name__ if isinstance(error, BaseException) else ""
-            content |= {"error": str(error) or kind, "error_type": kind}
+            told = describe(error) if isinstance(error, BaseException) else error
+            content |= {"error": told, "error_type": kind}
         write_json(self.run_folder / EXIT, content)
         self._lease.release()
         self._is_open = False

@@ -123,7 +123,7 @@ class PinholeCamera:
         Raises:
             ValueError: If a field is missing, unknown or makes no sense; names the field.
         """
-        unknown = sorted(set(fields) - set(_FIELDS))
+        unknown = sorted(set(fields) - set(_FIELDS), key=str)
         if unknown:
             raise ValueError(f"unknown field {unknown[0]!r} (known: {', '.join(_FIELDS)})")
         missing = [name for name in _FIELDS[:4] if name not in fields]
@@ -133,7 +133,7 @@ class PinholeCamera:
         for name in ("K", "T_world_camera", "distortion"):
             try:
                 arrays[name] = np.array(fields.get(name, [0.0] * 5), dtype=np.float64)
-            except (TypeError, ValueError):
+            except (TypeError, ValueError, OverflowError):
                 raise ValueError(f"{name} must hold numbers, not {fields[name]!r}") from None
         for name, shape in (("K", (3, 3)), ("T_world_camera", (4, 4)), ("distortion", (5,))):
             if arrays[name].shape != shape:

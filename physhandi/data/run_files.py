@@ -11,9 +11,8 @@ from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import yaml
-
 from physhandi.data.atomic import named_fields
+from physhandi.data.plain_yaml import parse_yaml
 from physhandi.errors import RunError
 
 RUN_FORMAT = "physhandi-run/1"
@@ -123,12 +122,11 @@ def read_yaml(path: Path) -> Any:
         RunError: If it is missing or damaged.
     """
     try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
+        return parse_yaml(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise RunError(f"{path} is missing.") from None
-    except (yaml.YAMLError, ValueError, RecursionError, OSError) as error:
-        reason = " ".join(str(error).split())
-        raise RunError(f"{path} cannot be read as YAML: {reason}") from error
+    except (ValueError, OSError) as error:
+        raise RunError(f"{path} cannot be read as YAML: {error}.") from error
 
 
 def read_events(run_folder: Path, offset: int = 0) -> tuple[list[dict[str, Any]], int]:

@@ -189,13 +189,16 @@ class Sequence:
             wanted.extend(self._object_parts() if part == "object" else [part])
         return [part for part in dict.fromkeys(wanted) if not self._has(part)]
 
-    def validate(self) -> None:
+    def validate(self, *, reads_color: bool = True) -> None:
         """Read every frame of every part and check its values.
+
+        Args:
+            reads_color: Whether color images are decoded too, which takes longest.
 
         Raises:
             SequenceError: At the first thing that is wrong; names file, frame and remedy.
         """
-        check_values(self.folder, self.name, self.views)
+        check_values(self.folder, self.meta, self.views, reads_color=reads_color)
 
     @cached_property
     def _fingerprint(self) -> str:

@@ -2,20 +2,21 @@
 
 import math
 import re
+import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, cast
 
-import yaml
-
 from physhandi.data.camera import PinholeCamera
+from physhandi.data.plain_yaml import parse_yaml
 from physhandi.errors import SequenceError
 
 FORMAT = "physhandi-sequence/1"
 FILE = "sequence.yaml"
 SAFE_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _SIZE_LIMIT = 4_000_000
+_MOST_FRAMES = 1_000_000
 
 Side = Literal["right", "left"]
 
@@ -110,14 +111,13 @@ def read_meta(folder: Path) -> SequenceMeta:
     try:
         if path.stat().st_size > _SIZE_LIMIT:
             raise SequenceError(f"{where}: {FILE} is larger than {_SIZE_LIMIT} bytes.")
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = parse_yaml(path.read_text(encoding="utf-8"))
     except (FileNotFoundError, NotADirectoryError):
         raise SequenceError(
             f"{where}: {FILE} is missing in {folder}. Give the folder that an importer wrote."
         ) from None
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, OSError) as error:
-        reason = " ".join(str(error).split())
-        raise SequenceError(f"{where}: {FILE} cannot be read as YAML: {reason}") from error
+    except (ValueError, OSError) as error:
+        raise SequenceError(f"{where}: {FILE} cannot be read as YAML: {error}.") from error
     return parse_meta(content, where)
 
 
@@ -127,7 +127,7 @@ def parse_meta(content: Any, where: str) -> SequenceMeta:
     found = fields.take("format", str)
     if found != FORMAT:
         fields.fail("format", found, f"{FORMAT!r}; this version reads no other")
-    frame_count = fields.whole("frame_count", least=1)
+    frame_count = fields.whole("frame_count", least=1, most=_MOST_FRAMES)
     split = _Fields(fields.take("split", dict, {}), f"{where}: {FILE}: split")
     default = default_reconstruction_count(frame_count)
     reconstruction = split.whole("reconstruction", least=1, default=default)
@@ -158,7 +158,7 @@ def parse_meta(content: Any, where: str) -> SequenceMeta:
 def _hands(fields: "_Fields") -> tuple[Side, ...]:
     sides: list[Side] = []
     for side in fields.take("hands", list, []):
-        if side not in {"right", "left"} or side in sides:
+        if side not in ("right", "left") or side in sides:
             fields.fail("hands", side, "each of 'right' and 'left' at most once")
         sides.append(side)
     return tuple(sides)
@@ -189,10 +189,13 @@ def _views(fields: "_Fields", where: str) -> tuple[ViewMeta, ...]:
 
 
 _MISSING = object()
+_LARGEST = 10**300
+"""Larger whole numbers have no float."""
 
 
 def _short(value: Any) -> str:
-    text = repr(value)
+    # YAML's aliases can make a few lines stand for more text than there is memory.
+    text = reprlib.repr(value)
     return text if len(text) <= 80 else text[:77] + "..."
 
 
@@ -220,10 +223,14 @@ class _Fields:
             raise SequenceError(f"{self._where}: field '{name}' is missing; add it.")
         return self._left.pop(name, default)
 
-    def whole(self, name: str, *, least: int, default: Any = _MISSING) -> int:
+    def whole(
+        self, name: str, *, least: int, most: int | None = None, default: Any = _MISSING
+    ) -> int:
         value = self._any(name, default)
         if type(value) is not int or value < least:
             self.fail(name, value, f"a whole number from {least} on")
+        if most is not None and value > most:
+            self.fail(name, value, f"at most {most}")
         return value
 
     def optional_whole(self, name: str, *, least: int) -> int | None:
@@ -232,7 +239,8 @@ class _Fields:
 
     def number(self, name: str, *, above: float = -math.inf, default: Any = _MISSING) -> float:
         value = self._any(name, default)
-        if type(value) not in (int, float) or not math.isfinite(value) or not value > above:
+        is_number = type(value) is float or (type(value) is int and abs(value) < _LARGEST)
+        if not is_number or not math.isfinite(value) or not value > above:
             limit = "" if above == -math.inf else f" above {above:g}"
             self.fail(name, value, f"a finite number{limit}")
         return float(value)

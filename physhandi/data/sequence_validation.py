@@ -7,6 +7,7 @@ import numpy as np
 from numpy import ndarray
 
 from physhandi.data.atomic import read_array
+from physhandi.data.length_unit import FARTHEST, doubt_depth, doubt_extent, doubt_position
 from physhandi.data.sequence_schema import FILE, SequenceMeta
 from physhandi.data.truth import FOLDER as TRUTH
 from physhandi.data.view import View
@@ -33,6 +34,8 @@ VIEW_ARRAYS: _Table = {
 }
 
 _SIDES = ("right", "left")
+# Axes that must not be empty: without a node or a control there is nothing to simulate.
+_NEEDED = {"control", "marker", "node"}
 TRUTH_ARRAYS: _Table = {
     **{f"hand_{side}_keypoint.npy": (("frame", 21, 3), _F, False) for side in _SIDES},
     **{f"hand_{side}_vertex.npy": (("frame", f"{side} vertex", 3), _F, False) for side in _SIDES},
@@ -62,30 +65,61 @@ def check_layout(folder: Path, meta: SequenceMeta, views: tuple[View, ...]) -> N
     _check_markers(folder, meta, axes)
 
 
-def check_values(folder: Path, name: str, views: tuple[View, ...]) -> None:
-    """Read every frame of every part and check sizes, labels and finiteness.
+def check_values(
+    folder: Path, meta: SequenceMeta, views: tuple[View, ...], *, reads_color: bool = True
+) -> None:
+    """Read every frame of every part and check sizes, labels, finiteness and the unit of lengths.
+
+    Args:
+        folder: Folder of the sequence.
+        meta: Its description.
+        views: Its views.
+        reads_color: Whether color images are decoded too, which takes longest.
 
     Raises:
         SequenceError: At the first thing that is wrong.
     """
+    name = meta.name
     for file in ARRAYS:
         _check_finite(folder, folder / file, name)
     for file in TRUTH_ARRAYS:
         _check_finite(folder, folder / TRUTH / file, name)
     _check_motion(folder, name)
+    if meta.metric:
+        _check_unit(folder, meta)
     for view in views:
         for file in VIEW_ARRAYS:
             _check_finite(folder, view.folder / file, name)
         _check_tracks(view, name)
-        readers = (
-            (view.has_color, view.color),
-            (view.has_depth, view.depth),
-            (view.has_mask, view.mask),
-        )
+        readers = ((view.has_color and reads_color, view.color), (view.has_mask, view.mask))
         for read in [read for is_there, read in readers if is_there]:
             for frame in range(view.frame_count):
                 read(frame)
         view.close()
+        if view.has_depth:
+            depth = [view.depth(frame).max(initial=0.0) for frame in range(view.frame_count)]
+            doubt = doubt_depth(round(1e3 * float(max(depth))))
+            if doubt is not None and meta.metric:
+                _fail(name, f"views/{view.name}/depth", doubt)
+
+
+def _check_unit(folder: Path, meta: SequenceMeta) -> None:
+    """Refuse lengths that look like millimetres, or like thousandths of metres."""
+    for view in meta.views:
+        doubt = doubt_position(view.camera.T_world_camera[:3, 3])
+        if doubt is not None:
+            _fail(meta.name, f"{FILE}: T_world_camera of view '{view.name}'", doubt[1])
+    for file, (axes, kind, _) in ARRAYS.items():
+        if kind != _F or not (folder / file).is_file():
+            continue
+        position = read_array(folder / file)
+        doubt = doubt_position(position, FARTHEST)
+        if doubt is not None:
+            at = ", ".join(f"{axis} {index}" for axis, index in zip(axes, doubt[0], strict=False))
+            _fail(meta.name, f"{file}: {at}", doubt[1])
+        small = doubt_extent(position) if file in {"object_node.npy", "rest_node.npy"} else None
+        if small is not None:
+            _fail(meta.name, file, small)
 
 
 def _check_arrays(
@@ -103,10 +137,14 @@ def _check_arrays(
         text = "(" + ", ".join(str(axis) for axis in axes) + ")"
         if not np.issubdtype(array.dtype, _KINDS[kind]):
             _fail(name, file, f"holds {array.dtype}; expected {kind} numbers {text}")
-        if array.ndim != len(axes):
-            _fail(name, file, f"has shape {array.shape}; expected axes {text}")
+        pairs = zip(axes, array.shape, strict=False)
+        fixed = [isinstance(axis, str) or size == axis for axis, size in pairs]
+        if array.ndim != len(axes) or not all(fixed):
+            _fail(name, file, f"has shape {array.shape}; expected axes {text}. Re-export it")
         for axis, size in zip(axes, array.shape, strict=True):
-            expected = axis_size.setdefault(axis, size) if isinstance(axis, str) else axis
+            if size == 0 and axis in _NEEDED:
+                _fail(name, file, f"has shape {array.shape}: no {axis} at all. Remove or fill it")
+            expected = axis_size.setdefault(axis, size) if isinstance(axis, str) else size
             if size != expected:
                 _fail(
                     name,
@@ -117,6 +155,9 @@ def _check_arrays(
 
 
 def _check_markers(folder: Path, meta: SequenceMeta, axes: dict[str, int]) -> None:
+    for file in ("rest_node.npy", "marker_node.npy"):
+        if (folder / file).is_file() and not (folder / "object_node.npy").is_file():
+            _fail(meta.name, file, "is about nodes, but object_node.npy is missing. Add it")
     path = folder / "marker_node.npy"
     nodes = read_array(path) if path.is_file() else np.zeros(0, int)
     node_count = axes.get("node", 0)

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from physhandi.data.sequence import Sequence
-from physhandi.errors import MissingInputError
+from physhandi.errors import FitError, MissingInputError
 from physhandi.fitting.hand_config import HandFitConfig as HandFitConfig
 from physhandi.fitting.hand_problem import HandProblem
 from physhandi.hand.model import load_hand_model
@@ -68,8 +68,11 @@ def reconstruct_hands(
     fits = []
     for hand, side in enumerate(sequence.hands):
         model = load_hand_model(side, config.model)
-        problem = HandProblem(sequence, keypoint[:, :, hand], model, config)
-        fits.append(problem.solve(progress))
+        try:
+            problem = HandProblem(sequence, keypoint[:, :, hand], model, config)
+            fits.append(problem.solve(progress))
+        except FitError as error:
+            raise FitError(f"Sequence '{sequence.name}': {error}") from error
     losses = zip(*(fit.curve for fit in fits), strict=False)
     curve = [(at[0][0], float(sum(loss for _, loss in at))) for at in losses]
     return HandFit(

@@ -177,6 +177,12 @@ def build_problem(
     Raises:
         FitError: If there is nothing to compare the simulation with.
     """
+    if frame_count < 2:
+        raise FitError(
+            f"Sequence '{name}' has {frame_count} frame to fit of {observation.frame_count}, but "
+            "motion needs at least 2. Raise split.reconstruction in sequence.yaml, or give a "
+            "longer recording."
+        )
     clouds = observation.cloud or tuple(np.zeros((0, 3), np.float32) for _ in range(frame_count))
     if chamfer_points == "tracks":
         if not observation.is_visible.any():
@@ -193,7 +199,8 @@ def build_problem(
     if not is_observed[1:].any() and not valid[1:].any():
         raise FitError(
             f"Sequence '{name}' shows the object in no frame after frame 0 of the {frame_count} to "
-            "fit: there is nothing to compare a simulation with. Check masks, depth and tracks."
+            "fit: there is nothing to compare a simulation with. Check its markers, "
+            "or masks, depth and tracks."
         )
     velocity = np.zeros(np.shape(object_node), np.float32)
     if not starts_at_rest:

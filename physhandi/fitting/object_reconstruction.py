@@ -13,6 +13,7 @@ from physhandi.errors import SimulationDivergedError
 from physhandi.fitting.losses import acceleration_loss
 from physhandi.fitting.object_config import ObjectFitConfig
 from physhandi.fitting.object_problem import ObjectProblem
+from physhandi.fitting.reach import check_problem
 from physhandi.fitting.search import SearchResult, search_parameters
 from physhandi.progress import Progress
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
@@ -124,8 +125,10 @@ def search_object(
         The best global parameters.
 
     Raises:
-        FitError: If every candidate diverges.
+        FitError: If no spring can form, or every candidate diverges.
     """
+    for problem in problems:
+        check_problem(problem, start, config.search)
 
     def evaluate(parameters: SimulationParameters) -> float:
         models = {p.name: build_problem_model(p, parameters) for p in problems}

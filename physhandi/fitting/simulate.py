@@ -13,6 +13,7 @@ from physhandi.fitting import artefacts
 from physhandi.fitting.hand_reconstruction import reconstruct_hands
 from physhandi.fitting.object_problem import initial_velocity
 from physhandi.fitting.profile import config_from_dict
+from physhandi.fitting.reach import check_springs
 from physhandi.fitting.rollouts import control_trajectory_of, object_nodes_of, simulate_sequence
 from physhandi.perception.lifting import observe_object
 from physhandi.progress import Progress
@@ -44,7 +45,7 @@ def simulate_again(
 
     Raises:
         RunError: If the run holds no fitted object.
-        UsageError: If a parameter is unknown or out of bounds.
+        UsageError: If a parameter is unknown or out of bounds, or leaves no spring.
         SimulationDivergedError: If the motion runs away.
     """
     if not (source.out / "object/material.safetensors").is_file():
@@ -68,6 +69,7 @@ def simulate_again(
         )
         model = replace(model, object_node=node, initial_velocity=velocity)
     model = retopologize(model, parameters, control[0], fitted=fitted, rest_node=rest_node)
+    check_springs(sequence.name, model, parameters, control[0], rest_node)
     output.save_array(f"{artefacts.sequence_folder(sequence.name)}/control.npy", control)
     artefacts.save_model(output, sequence.name, model)
     artefacts.save_object(output, parameters, model, rest_node)

@@ -52,8 +52,9 @@ def object_nodes_from_observation(
         MissingInputError: If the first frame shows no object points.
     """
     if not observation.cloud or len(observation.cloud[0]) == 0:
+        where = "" if sequence is None else f"Sequence '{sequence.name}': "
         raise MissingInputError(
-            "The first frame shows no points of the object, so its shape is unknown. "
+            f"{where}The first frame shows no points of the object, so its shape is unknown. "
             "Add depth and masks of frame 0, or object_node.npy."
         )
     cloud = observation.cloud[0].astype(np.float64)

@@ -10,6 +10,7 @@ from numpy import ndarray
 from scipy.interpolate import CubicSpline  # pyright: ignore[reportMissingTypeStubs]  # it has none
 
 from physhandi.data.atomic import read_array
+from physhandi.data.length_unit import doubt_extent, doubt_position
 from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_schema import SequenceMeta
 from physhandi.data.sequence_writer import write_sequence
@@ -18,7 +19,6 @@ from physhandi.progress import NullProgress, Progress
 
 STAGE = "import"
 _FEWEST_FRAMES = 8
-_FARTHEST = 50.0
 _SAMPLES_PER_SEGMENT = 64
 
 
@@ -187,13 +187,13 @@ def _check_values(path: Path, marker: ndarray) -> None:
             f"{path.name}: frame {frame}, marker {number} is {marker[frame, number].tolist()}. "
             "Cut the recording where a marker is lost, or fill the gap."
         )
-    far = np.argwhere(np.abs(marker).max(axis=2) > _FARTHEST)
-    if far.size:
-        frame, number = far[0]
-        raise ImportFailedError(
-            f"{path.name}: frame {frame}, marker {number} is "
-            f"{np.abs(marker[frame, number]).max():.0f} m from the origin. Convert it to metres."
-        )
+    doubt = doubt_position(marker)
+    if doubt is not None:
+        (frame, number), reason = doubt
+        raise ImportFailedError(f"{path.name}: frame {frame}, marker {number} {reason}.")
+    reason = doubt_extent(marker[0])
+    if reason is not None:
+        raise ImportFailedError(f"{path.name}: frame 0 {reason}.")
     length = np.linalg.norm(np.diff(marker, axis=1), axis=2)
     short = np.argwhere(length < 1e-6)
     if short.size:

@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
+from physhandi.data.length_unit import FARTHEST as FARTHEST
 from physhandi.errors import ImportFailedError
 
-FARTHEST = 20.0
-"""A point farther from the origin than this was not given in metres [m]."""
+_UNIT = "That looks like millimetres. Convert it to metres"
 _LARGEST_JSON = 64_000_000
 
 
@@ -100,7 +100,7 @@ def check_points(
     for is_wrong, remedy in (
         (~np.isfinite(point).all(axis=-1), "Repair it, or mark it as not visible"),
         (~point.any(axis=-1), "That stands for 'not visible', but it is not marked so"),
-        (np.abs(np.nan_to_num(point)).max(axis=-1, initial=0.0) > FARTHEST, "Convert it to metres"),
+        (np.abs(np.nan_to_num(point)).max(axis=-1, initial=0.0) > FARTHEST, _UNIT),
     ):
         place = np.argwhere(is_wrong if is_visible is None else is_wrong & is_visible)
         if place.size:

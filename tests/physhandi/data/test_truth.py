@@ -43,7 +43,7 @@ def test_most_sequences_have_none(tmp_path: Path) -> None:
     ("file", "array", "reason"),
     [
         ("hand_right_keypoint", np.zeros((2, 21, 3)), "expected frame = 3"),
-        ("hand_right_keypoint", np.zeros((3, 20, 3)), "expected 21 = 21"),
+        ("hand_right_keypoint", np.zeros((3, 20, 3)), "expected axes"),
         ("contact", np.zeros((3, 4), bool), "expected point = 3"),
         ("contact", np.zeros((3, 3)), "expected boolean"),
     ],

@@ -1,0 +1,59 @@
+"""Tells lengths that were given in another unit than metres: they are off by a thousand."""
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+FARTHEST = 20.0
+"""A point or camera farther from the origin than this was not given in metres [m]."""
+SMALLEST = 2e-3
+"""An object smaller than this was not given in metres [m]."""
+
+
+def doubt_position(
+    position: Float[ndarray, "*axis 3"], farthest: float = FARTHEST
+) -> tuple[tuple[int, ...], str] | None:
+    """Find the first position that is too far from the origin to be in metres.
+
+    Args:
+        position: Positions; those that are not finite are not looked at [m].
+        farthest: Largest coordinate that is believed [m].
+
+    Returns:
+        Where in the array it is, and what is wrong with it; None if all is well.
+    """
+    size = np.where(np.isfinite(position), np.abs(position), 0.0).max(axis=-1, initial=0.0)
+    if not (size > farthest).any():
+        return None
+    place = tuple(int(index) for index in np.argwhere(size > farthest)[0])
+    return place, (
+        f"is {size[place]:.4g} m from the origin, which looks like millimetres; divide by 1000, "
+        "metres are expected"
+    )
+
+
+def doubt_extent(point: Float[ndarray, "point 3"], smallest: float = SMALLEST) -> str | None:
+    """Tell what is wrong with an object that is too small to be in metres; None if all is well.
+
+    Args:
+        point: Points of the object; those that are not finite are not looked at [m].
+        smallest: Least extent that is believed [m].
+    """
+    seen = point[np.isfinite(point).all(axis=-1)]
+    extent = float(np.ptp(seen, axis=0).max()) if len(seen) > 1 else 0.0
+    if extent == 0.0 or extent >= smallest:
+        return None
+    return (
+        f"shows an object of only {extent * 1e3:.2g} mm, whose unit looks 1000 times too large; "
+        "multiply by 1000, metres are expected"
+    )
+
+
+def doubt_depth(largest: int) -> str | None:
+    """Tell what is wrong with depth images whose largest value [mm] is too small; else None."""
+    if largest == 0 or largest >= 20:
+        return None
+    return (
+        f"is {largest} mm at most in all frames, which looks like metres; multiply by 1000, "
+        "millimetres are expected"
+    )
