@@ -11,6 +11,7 @@ from fastapi import APIRouter, Header, Query, Request, Response
 from fastapi.responses import FileResponse, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.background import BackgroundTask
+from starlette.exceptions import HTTPException
 
 from app.jobs.catalog import Catalog, NotFoundError
 from app.jobs.describe import (
@@ -34,6 +35,14 @@ Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
 ExportFormat = Literal["ply", "npz", "csv", "yaml"]
 
 
+class OpenScene(Protocol):
+    """A live scene that is open."""
+
+    def prefer_dark(self, *, on: bool) -> None:
+        """Follow the browser's color scheme."""
+        ...
+
+
 class SessionOpener(Protocol):
     """The part of the live viewer that the API needs."""
 
@@ -43,6 +52,10 @@ class SessionOpener(Protocol):
 
     def close(self, session_id: str) -> bool:
         """Close a live scene."""
+        ...
+
+    def find(self, session_id: str, owner: str) -> OpenScene | None:
+        """Find a live scene of an owner."""
         ...
 
 
@@ -63,6 +76,14 @@ class NewSession(BaseModel):
 
     kind: Literal["run", "sequence"]
     id: Id
+
+
+class SessionWishes(BaseModel):
+    """What a browser asks of a live scene."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    dark: bool
 
 
 def create_api(
@@ -170,9 +191,26 @@ def _add_sessions(router: APIRouter, sessions: SessionOpener) -> None:
         session_id = sessions.open(new.kind, new.id, request.state.owner)
         return {"id": session_id, "url": f"/live/{session_id}"}
 
+    def find(session_id: str, request: Request) -> OpenScene:
+        scene = sessions.find(session_id, request.state.owner)
+        if scene is None:
+            raise HTTPException(404, "This live scene was closed, or it is not yours.")
+        return scene
+
+    @router.get("/sessions/{session_id}")
+    def show_session(session_id: Id, request: Request) -> dict[str, str]:
+        find(session_id, request)
+        return {"id": session_id, "url": f"/live/{session_id}"}
+
+    @router.patch("/sessions/{session_id}", status_code=204)
+    def change_session(session_id: Id, wishes: SessionWishes, request: Request) -> Response:
+        find(session_id, request).prefer_dark(on=wishes.dark)
+        return Response(status_code=204)
+
     @router.delete("/sessions/{session_id}", status_code=204)
-    def close_session(session_id: Id) -> Response:
-        sessions.close(session_id)
+    def close_session(session_id: Id, request: Request) -> Response:
+        if sessions.find(session_id, request.state.owner) is not None:
+            sessions.close(session_id)
         return Response(status_code=204)
 
 

@@ -50,8 +50,11 @@ class Scenes:
         self.opened[name] = Scene(kind, target, HOSTILE)
         return name
 
-    def get(self, session_id: str) -> Scene | None:
+    def find(self, session_id: str, owner: str) -> Scene | None:
         return self.opened.get(session_id)
+
+    def farewell(self, session_id: str, owner: str) -> None:
+        return None
 
     def close(self, session_id: str) -> bool:
         return self.opened.pop(session_id, None) is not None

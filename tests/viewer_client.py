@@ -52,7 +52,8 @@ class ViewerClient:
         self.send("GuiUpdateMessage", uuid=self.find(label), updates={"value": value})
 
     def find(self, label: str) -> str:
-        return next(uuid for uuid, props in self.gui.items() if props.get("label") == label)
+        labels = ((uuid, props.get("label")) for uuid, props in self.gui.items())
+        return next((uuid for uuid, known in labels if known == label), "")
 
     def texts(self) -> str:
         """All Markdown of the panel."""

@@ -222,8 +222,6 @@ document.addEventListener("DOMContentLoaded", () => {
   cursor = document.body.dataset.since ?? null;
   showLocalTimes();
   follow();
-  const scene = document.getElementById("scene");
-  scene?.addEventListener("load", () => scene.contentWindow.focus());
 });
 
 document.addEventListener("htmx:afterSettle", () => showLocalTimes());

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, Protocol
 
 import cv2
-from fastapi import APIRouter, Response
+from fastapi import APIRouter, Request, Response
 from fastapi.responses import HTMLResponse
 from pydantic import Field
 from starlette.exceptions import HTTPException
@@ -55,11 +55,24 @@ class Scene(Protocol):
         ...
 
 
+class ClosedScene(ShownScene, Protocol):
+    """What is remembered of a live scene that was closed."""
+
+    @property
+    def reason(self) -> str:
+        """Why it was closed, as a sentence."""
+        ...
+
+
 class Scenes(Protocol):
     """The part of the live viewer that the pages need."""
 
-    def get(self, session_id: str) -> Scene | None:
-        """Find a live scene."""
+    def find(self, session_id: str, owner: str) -> Scene | None:
+        """Find a live scene of an owner."""
+        ...
+
+    def farewell(self, session_id: str, owner: str) -> ClosedScene | None:
+        """Remember a live scene of an owner that was closed."""
         ...
 
 
@@ -111,11 +124,18 @@ def create_pages(
         return pages.render("parts.html", **run_values(item, follow_run(item, scheduler)))
 
     @router.get("/live/{session_id}")
-    def live(session_id: Id) -> HTMLResponse:
-        scene = scenes.get(session_id)
-        if scene is None:
-            return pages.error(404, "This live scene was closed. Open it again from the home page.")
-        return pages.render("live.html", session=session_id, scene=scene.info)
+    def live(session_id: Id, request: Request) -> HTMLResponse:
+        scene = scenes.find(session_id, request.state.owner)
+        if scene is not None:
+            return pages.render("live.html", session=session_id, scene=scene.info)
+        closed = scenes.farewell(session_id, request.state.owner)
+        if closed is not None:
+            return pages.render("closed.html", status=404, scene=closed)
+        return pages.error(
+            404,
+            "This live scene was closed, or it belongs to another browser. "
+            "Open your own from the home page.",
+        )
 
     @router.get("/sequences/{sequence_id}/thumbnail")
     def thumbnail(sequence_id: Id) -> Response:

@@ -9,6 +9,8 @@ import viser.transforms
 from jaxtyping import Float
 from numpy import ndarray
 
+from app.viewer.session_state import Pose
+
 PICTURE_WIDTH = 1_600
 """Width of an exported picture of the figure in pixels."""
 _PANEL_PIXELS = 345
@@ -40,19 +42,11 @@ Box = tuple[Float[ndarray, " 3"], float, float]
 """Middle, width and height of something as it is seen."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Pose:
-    position: Float[ndarray, " 3"]
-    look_at: Float[ndarray, " 3"]
-    up: Float[ndarray, " 3"]
-    fov: float
-
-
 class FigureCameras:
     """Moves the clients' cameras to the figure and back."""
 
     def __init__(self) -> None:
-        self._poses: dict[int, _Pose] = {}
+        self._poses: dict[int, Pose] = {}
 
     def aim(
         self,
@@ -68,8 +62,7 @@ class FigureCameras:
             box: The figure.
         """
         camera = client.camera
-        before = _Pose(camera.position, camera.look_at, camera.up_direction, camera.fov)
-        self._poses.setdefault(client.client_id, before)
+        self._poses.setdefault(client.client_id, Pose.of(camera))
         eye = Eye.of(camera.wxyz)
         width, height = max(camera.image_width, 1), max(camera.image_height, 1)
         hidden = _covered(width)
@@ -81,6 +74,10 @@ class FigureCameras:
             camera.fov = _FOV
             camera.position = center + aside - distance * eye.ahead
             camera.look_at = center + aside
+
+    def before(self, client: viser.ClientHandle) -> Pose:
+        """Find where a camera stands, or stood before it was moved to the figure."""
+        return self._poses.get(client.client_id) or Pose.of(client.camera)
 
     def restore(self, server: viser.ViserServer) -> None:
         """Let all cameras stand again where they stood before."""

@@ -17,6 +17,7 @@ from app.viewer.layers import Layers
 from app.viewer.live import LiveSimulation
 from app.viewer.resimulation import Resimulation
 from app.viewer.rival import Rival
+from app.viewer.session_state import Pose
 from app.viewer.take import Take
 from physhandi.errors import MissingInputError
 
@@ -135,6 +136,11 @@ class FigureMode:
             at = min(frame, take.ready - 1)
             right = Side(take=take, frame=at, caption=self._caption("PhysTwin-style", take))
         return {"ours": left, "phystwin": right}
+
+    def pose(self) -> Pose | None:
+        """Where the first client's camera stands in the scene; None without clients."""
+        clients = list(self._server.get_clients().values())
+        return self._cameras.before(clients[0]) if clients else None
 
     def turn(self, client: viser.ClientHandle) -> None:
         """Let the halves follow a client's camera."""

@@ -3,6 +3,7 @@
 import asyncio
 import gzip
 import logging
+from collections import Counter
 from collections.abc import Coroutine
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import viser
 import websockets
 from fastapi import APIRouter, HTTPException, Request, Response, WebSocket
+from starlette.responses import RedirectResponse
 from starlette.websockets import WebSocketDisconnect, WebSocketState
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Subprotocol
@@ -20,6 +22,12 @@ logger = logging.getLogger(__name__)
 
 _PAGE = Path(viser.__file__).parent / "client" / "build" / "index.html"
 _PROTOCOL = "viser-v"
+_GONE = (
+    "This live scene does not exist, was closed, or belongs to another browser. "
+    "Open your own from the home page."
+)
+_LEAVING_S = 1.2
+"""How long the page that a tab has left may take to hang up."""
 
 
 def create_gate(sessions: Sessions) -> APIRouter:
@@ -27,19 +35,27 @@ def create_gate(sessions: Sessions) -> APIRouter:
 
     ``GET /viewer/{session}/`` answers with viser's one page and nothing else; no path is passed
     on. ``/viewer/{session}`` with or without the slash is the websocket, passed on unchanged.
-    Who may come in is decided before the gate.
+    Who may come in is decided before the gate; that a session is one's own, here. Each tab has a
+    session of its own: a page that is opened while another tab watches the session is sent on to a
+    copy, which begins with the same state. A tab that is reloaded has hung up before.
 
     Args:
         sessions: The sessions that exist.
     """
+    watching: Counter[str] = Counter()
     router = APIRouter(include_in_schema=False)
     page = _PAGE.read_bytes()
     packed = gzip.compress(page, mtime=0)
 
     @router.get("/viewer/{session}/")
-    def show_page(session: str, request: Request) -> Response:
-        if sessions.get(session) is None:
-            raise HTTPException(404, "This live session does not exist or was closed.")
+    async def show_page(session: str, request: Request) -> Response:
+        found = sessions.find(session, request.state.owner)
+        if found is None:
+            raise HTTPException(404, _GONE)
+        if await _is_taken(watching, session):
+            copied = await asyncio.to_thread(sessions.copy, found)
+            headers = {"Cache-Control": "no-store"}
+            return RedirectResponse(f"/viewer/{copied}/", 303, headers=headers)
         is_packed = "gzip" in request.headers.get("accept-encoding", "")
         headers = {"Cache-Control": "no-cache", "Vary": "Accept-Encoding"}
         if is_packed:
@@ -49,9 +65,9 @@ def create_gate(sessions: Sessions) -> APIRouter:
     @router.websocket("/viewer/{session}")
     @router.websocket("/viewer/{session}/")
     async def pass_on(websocket: WebSocket, session: str) -> None:
-        found = sessions.get(session)
+        found = sessions.find(session, websocket.state.owner)
         if found is None:
-            await _refuse(websocket, 404, "This live session does not exist or was closed.")
+            await _refuse(websocket, 404, _GONE)
             return
         offered = [p for p in websocket.scope["subprotocols"] if p.startswith(_PROTOCOL)]
         if not offered:
@@ -71,9 +87,25 @@ def create_gate(sessions: Sessions) -> APIRouter:
             return
         async with upstream:
             await websocket.accept(subprotocol=upstream.subprotocol)
-            await _exchange(websocket, upstream)
+            watching[session] += 1
+            try:
+                await _exchange(websocket, upstream)
+            finally:
+                watching[session] -= 1
+                if watching[session] <= 0:
+                    del watching[session]
 
     return router
+
+
+async def _is_taken(watching: Counter[str], session: str) -> bool:
+    """Tell whether another tab watches a session, and goes on watching it."""
+    end = asyncio.get_running_loop().time() + _LEAVING_S
+    while watching[session] > 0:
+        if asyncio.get_running_loop().time() > end:
+            return True
+        await asyncio.sleep(0.03)
+    return False
 
 
 async def _refuse(websocket: WebSocket, status: int, reason: str) -> None:

@@ -1,6 +1,7 @@
 """Which parts of a scene are shown, and in which colors."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 from app.viewer.content import Content
 from app.viewer.take import Take
@@ -11,6 +12,10 @@ GREEN = (46, 160, 67)
 YELLOW = (245, 190, 20)
 GREY = (120, 130, 145)
 SKIN = {"right": (224, 172, 140), "left": (205, 150, 122)}
+
+Theme = Literal["as the browser", "light", "dark"]
+"""Which background a user can choose."""
+THEMES: tuple[Theme, ...] = ("as the browser", "light", "dark")
 
 PLAYING_SPRINGS = 2_000
 """Most springs that are streamed while the clock is running."""

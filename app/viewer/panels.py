@@ -1,6 +1,7 @@
 """The panel of one session: timeline, layers and view."""
 
 from collections.abc import Callable
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,17 @@ import viser
 from app.viewer.content import Content
 from app.viewer.framing import Framing
 from app.viewer.guard import Guard
-from app.viewer.layers import BLUE, GREEN, GREY, RED, SKIN, YELLOW, Layers
+from app.viewer.layers import (
+    BLUE,
+    GREEN,
+    GREY,
+    RED,
+    SKIN,
+    THEMES,
+    YELLOW,
+    Layers,
+    Theme,
+)
 from app.viewer.observed import DepthCloud
 from app.viewer.playback import Playback
 from physhandi.data.view import View
@@ -31,6 +42,7 @@ class TimelinePanel:
         step = gui.add_button_group("Step", ("◀ 1", "1 ▶"), hint="Left and right arrow keys")
         speed = gui.add_slider("Speed", *_SPEEDS, 0.1, 1.0, hint="Sequence seconds per second")
         loop = gui.add_checkbox("Loop", initial_value=True)
+        self._speed, self._loop = speed, loop
 
         self._play.on_click(guard(lambda _: self._toggle()))
         self._frame.on_update(self._scrub)
@@ -60,6 +72,12 @@ class TimelinePanel:
         """Fit the slider to another sequence."""
         self._frame.value = 0
         self._frame.max = max(frame_count - 1, 1)
+
+    def restore(self, speed: float, *, does_loop: bool) -> None:
+        """Run the clock as it ran in another session."""
+        self._speed.value, self._loop.value = speed, does_loop
+        self._playback.set_speed(speed)
+        self._playback.set_loop(on=does_loop)
 
     def _toggle(self) -> None:
         self._playback.play(on=not self._playback.is_playing)
@@ -109,13 +127,14 @@ class LayersPanel:
             self._scale.on_update(guard.by_user(self._rescale))
             self._place: Any = gui.add_dropdown("View from", (_OVERVIEW,))
             self._place.on_update(guard.by_user(self._look))
-            self._dark = gui.add_checkbox("Dark", initial_value=False)
-            self._dark.on_update(guard.by_user(self._dress))
+            self._theme = gui.add_dropdown("Background", THEMES)
+            self._theme.on_update(guard.by_user(lambda _: self._dress()))
+        self._prefers_dark = False
 
     def replace(self, content: Content, layers: Layers, framing: Framing) -> None:
         """Show the switches that a content needs, as its layers stand."""
         self._layers, self._framing = layers, framing
-        layers.dark, layers.force_scale = self._dark.value, self._scale.value
+        layers.dark, layers.force_scale = self._is_dark, self._scale.value
         has_object = content.fitted is not None
         has_control = content.control is not None
         is_there = {
@@ -138,6 +157,32 @@ class LayersPanel:
         self._place.options = (_OVERVIEW, *self._views)
         self._place.visible = bool(self._views)
 
+    @property
+    def theme(self) -> tuple[Theme, bool]:
+        """The background that was chosen, and whether the browser asks for a dark one."""
+        return self._theme.value, self._prefers_dark
+
+    @property
+    def _is_dark(self) -> bool:
+        return self._prefers_dark if self._theme.value == THEMES[0] else self._theme.value == "dark"
+
+    def prefer_dark(self, *, on: bool) -> None:
+        """Follow the browser, unless a background was chosen."""
+        if on != self._prefers_dark:
+            self._prefers_dark = on
+            self._dress()
+
+    def restore(self, layers: Layers, theme: Theme, *, prefers_dark: bool) -> None:
+        """Show what another session shows of the same content."""
+        self._theme.value, self._prefers_dark = theme, prefers_dark
+        self._scale.value = layers.force_scale
+        for field in fields(layers):
+            setattr(self._layers, field.name, getattr(layers, field.name))
+        for field, switch in self._switches.items():
+            switch.value = getattr(layers, field)
+        self._place.value = layers.looks_from or _OVERVIEW
+        self._dress()
+
     def _switch(self, field: str) -> Callable[[Any], None]:
         def switch(event: Any) -> None:
             setattr(self._layers, field, event.target.value)
@@ -145,8 +190,8 @@ class LayersPanel:
 
         return switch
 
-    def _dress(self, event: Any) -> None:
-        self._layers.dark = event.target.value
+    def _dress(self) -> None:
+        self._layers.dark = self._is_dark
         set_theme(self._server, dark=self._layers.dark)
         self._redraw()
 

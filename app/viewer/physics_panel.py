@@ -10,8 +10,8 @@ import viser
 
 from app.viewer.content import Content
 from app.viewer.guard import Guard
+from app.viewer.history import History
 from app.viewer.parameters import (
-    History,
     Knob,
     Switch,
     knobs,
@@ -81,6 +81,20 @@ class PhysicsPanel:
             with gui.add_folder("Self-collision", expand_by_default=False):
                 for knob in collision_knobs:
                     self._add_slider(gui, knob, guard)
+
+    @property
+    def is_automatic(self) -> bool:
+        """Whether the number of substeps is chosen automatically."""
+        return self._substeps.value == _AUTOMATIC
+
+    def restore(self, parameters: SimulationParameters, *, is_automatic: bool) -> None:
+        """Simulate what another session of the same object simulates."""
+        self._substeps.value = _AUTOMATIC if is_automatic else _AS_FITTED
+        self.history.replace(parameters)
+        for knob in self._knobs:
+            self._sliders[knob.field].value = knob.to_slider(parameters)
+        if is_automatic or parameters != self.history.start:
+            self._run()
 
     def remove(self) -> None:
         """Take the panel away."""

@@ -61,6 +61,12 @@ class Playback:
         with self._condition:
             return self._speed
 
+    @property
+    def does_loop(self) -> bool:
+        """Whether playing starts over at the end."""
+        with self._condition:
+            return self._does_loop
+
     def start(self) -> None:
         """Start the thread."""
         self._thread.start()

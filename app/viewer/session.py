@@ -1,19 +1,23 @@
-"""The live sessions of a server: opening, listing, closing and forgetting them."""
+"""The live sessions of a server: opening, copying, closing and forgetting them."""
 
 import logging
 import secrets
 import threading
+from collections import OrderedDict
+from dataclasses import dataclass
 from typing import Protocol
 
 from app.viewer.content import Catalog
 from app.viewer.live import LiveSimulation
-from app.viewer.session_view import Kind, SessionInfo
+from app.viewer.session_state import Kind, SessionInfo, SessionState
 from app.viewer.session_view import Session as Session
 from physhandi.errors import PhysHandiError, UsageError
 
 logger = logging.getLogger(__name__)
 
 _REAP_INTERVAL = 20.0
+_MAKES_ROOM_AFTER = 30.0
+_REMEMBERED = 200
 
 
 class TooManySessionsError(PhysHandiError):
@@ -39,8 +43,27 @@ class ViewerSettings(Protocol):
         ...
 
 
+@dataclass(frozen=True, kw_only=True)
+class Farewell:
+    """What is remembered of a session that was closed."""
+
+    kind: Kind
+    """Whether it showed a run or a sequence."""
+    target: str
+    """Id of the run or the sequence."""
+    title: str
+    """Name of what it showed."""
+    owner: str
+    """Whose session it was."""
+    reason: str
+    """Why it was closed, as a sentence."""
+
+
 class Sessions:
-    """All live sessions of the server and the process that simulates for them."""
+    """All live sessions of the server and the process that simulates for them.
+
+    A session belongs to the browser that opened it; nobody else finds it.
+    """
 
     def __init__(
         self,
@@ -57,18 +80,22 @@ class Sessions:
         self._catalog = catalog
         self._lock = threading.Lock()
         self._sessions: dict[str, Session] = {}
+        self._farewells: OrderedDict[str, Farewell] = OrderedDict()
         self._opening = 0
         self.live = LiveSimulation(settings.device)
         self._closed = threading.Event()
         self._reaper: threading.Thread | None = None
 
-    def open(self, kind: Kind, target: str, owner: str) -> str:
+    def open(
+        self, kind: Kind, target: str, owner: str, *, state: SessionState | None = None
+    ) -> str:
         """Open a live session.
 
         Args:
             kind: What `target` is the id of.
             target: Id of a run or a sequence.
             owner: Who asks.
+            state: What to begin with; None for what suits the content.
 
         Returns:
             The session's id, for ``/viewer/<id>/``.
@@ -79,7 +106,7 @@ class Sessions:
         """
         if kind not in {"run", "sequence"}:
             raise UsageError(f"A session shows a run or a sequence, not {kind!r}.")
-        self._reserve()
+        self._reserve(owner)
         try:
             session_id = secrets.token_urlsafe(18)
             session = Session(
@@ -89,6 +116,7 @@ class Sessions:
                 owner=owner,
                 catalog=self._catalog,
                 live=self.live,
+                state=state,
             )
             with self._lock:
                 self._sessions[session_id] = session
@@ -98,10 +126,29 @@ class Sessions:
         logger.info("session opened for %s %s by %s", kind, target, owner)
         return session_id
 
+    def copy(self, session: Session) -> str:
+        """Open another session of the same owner that begins where a session stands.
+
+        Raises:
+            TooManySessionsError: If as many sessions as allowed are open.
+        """
+        return self.open(session.kind, session.target, session.owner, state=session.state)
+
     def get(self, session_id: str) -> Session | None:
         """Find a session; None if there is none of that id."""
         with self._lock:
             return self._sessions.get(session_id)
+
+    def find(self, session_id: str, owner: str) -> Session | None:
+        """Find a session of an owner; None if there is none, or if it is somebody else's."""
+        session = self.get(session_id)
+        return session if session is not None and session.owner == owner else None
+
+    def farewell(self, session_id: str, owner: str) -> Farewell | None:
+        """Remember a session of an owner that was closed; None if there was none."""
+        with self._lock:
+            farewell = self._farewells.get(session_id)
+        return farewell if farewell is not None and farewell.owner == owner else None
 
     def list(self) -> list[SessionInfo]:
         """Describe all sessions, the oldest first."""
@@ -109,10 +156,25 @@ class Sessions:
             sessions = list(self._sessions.values())
         return [session.info for session in sessions]
 
-    def close(self, session_id: str) -> bool:
-        """Close a session; returns whether there was one."""
+    def close(self, session_id: str, reason: str = "It was closed.") -> bool:
+        """Close a session; returns whether there was one.
+
+        Args:
+            session_id: Its id.
+            reason: Why, as a sentence for the one who comes back to it.
+        """
         with self._lock:
             session = self._sessions.pop(session_id, None)
+            if session is not None:
+                self._farewells[session_id] = Farewell(
+                    kind=session.kind,
+                    target=session.target,
+                    title=session.info.title,
+                    owner=session.owner,
+                    reason=reason,
+                )
+                while len(self._farewells) > _REMEMBERED:
+                    self._farewells.popitem(last=False)
         if session is not None:
             session.close()
         return session is not None
@@ -126,12 +188,16 @@ class Sessions:
 
     def reap(self) -> int:
         """Close the sessions that nobody has looked at for too long; returns how many."""
-        idle = [info.id for info in self.list() if info.idle >= self._settings.live_idle_s]
-        return sum(self.close(session_id) for session_id in idle)
+        most = self._settings.live_idle_s
+        time = f"{most / 60:.3g} minutes" if most >= 60 else f"{most:.3g} seconds"
+        reason = f"Nobody looked at it for {time}."
+        idle = [info.id for info in self.list() if info.idle >= most]
+        return sum(self.close(session_id, reason) for session_id in idle)
 
-    def _reserve(self) -> None:
+    def _reserve(self, owner: str) -> None:
+        self._make_room(owner)
         with self._lock:
-            if len(self._sessions) + self._opening >= self._settings.live_sessions:
+            if self._is_full():
                 raise TooManySessionsError(
                     f"{len(self._sessions)} live sessions are open, the most this server allows. "
                     "Close one of them, or watch the replay, which needs no session."
@@ -142,6 +208,19 @@ class Sessions:
                     target=self._reap_now_and_then, name="viewer-reaper", daemon=True
                 )
                 self._reaper.start()
+
+    def _is_full(self) -> bool:
+        return len(self._sessions) + self._opening >= self._settings.live_sessions
+
+    def _make_room(self, owner: str) -> None:
+        """If all places are taken, close a session that its owner, who asks, has left."""
+        with self._lock:
+            if not self._is_full():
+                return
+        left = [s for s in self.list() if s.owner == owner and s.idle >= _MAKES_ROOM_AFTER]
+        if left:
+            oldest = max(left, key=lambda info: info.idle)
+            self.close(oldest.id, "It made room for another scene that you opened.")
 
     def _reap_now_and_then(self) -> None:
         while not self._closed.wait(min(_REAP_INTERVAL, self._settings.live_idle_s)):

@@ -2,12 +2,9 @@
 
 import threading
 import time
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import replace
 
-import rich
 import viser
-import viser._messages as messages
 
 from app.viewer.content import Catalog, Content, open_run, open_sequence
 from app.viewer.export_panel import ExportPanel, Snapshot
@@ -19,31 +16,11 @@ from app.viewer.object_session import ObjectSession
 from app.viewer.panels import LayersPanel, TimelinePanel, add_legend, set_theme
 from app.viewer.playback import Playback
 from app.viewer.scene import Scene
+from app.viewer.session_state import Kind as Kind
+from app.viewer.session_state import SessionInfo as SessionInfo
+from app.viewer.session_state import SessionState
 from app.viewer.take import Take
-
-Kind = Literal["run", "sequence"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class SessionInfo:
-    """What a listing says about a session."""
-
-    id: str
-    """Unguessable id, part of its address."""
-    kind: Kind
-    """Whether a run or a sequence is shown."""
-    target: str
-    """Id of the run or the sequence."""
-    owner: str
-    """Who opened it."""
-    title: str
-    """Name of what is shown."""
-    client_count: int
-    """Browsers that look at it."""
-    created: float
-    """When it was opened [s since 1970]."""
-    idle: float
-    """How long nobody has looked at it [s]."""
+from app.viewer.viser_server import start_viser
 
 
 class Session:
@@ -58,8 +35,19 @@ class Session:
         owner: str,
         catalog: Catalog,
         live: LiveSimulation,
+        state: SessionState | None = None,
     ) -> None:
-        """Open a run or a sequence; raises the catalog's errors before a server is started."""
+        """Open a run or a sequence; raises the catalog's errors before a server is started.
+
+        Args:
+            session_id: Unguessable id.
+            kind: What `target` is the id of.
+            target: Id of a run or a sequence.
+            owner: Whose session it is.
+            catalog: Finds runs and sequences.
+            live: The process that simulates.
+            state: What to begin with, as `state` of another session told it.
+        """
         self.id = session_id
         self.kind: Kind = kind
         self.target = target
@@ -72,15 +60,17 @@ class Session:
         self._names: tuple[str, ...] = ()
         if kind == "run":
             self._names = tuple(catalog.run(target).sequence_names)
-        self._content = self._load(None)
+        self._content = self._load(state.sequence_name if state is not None else None)
         self._lock = threading.RLock()
-        self._server = _start_server(plain(self._content.title))
+        self._server = start_viser(plain(self._content.title))
         self._guard = Guard(self._server)
         self._playback = Playback(self._content.frame_count, self._content.frame_rate, self._draw)
         self._object: ObjectSession | None = None
         self._is_figure_shown = False
         try:
             self._build()
+            if state is not None:
+                self._restore(state)
         except BaseException:
             self._server.stop()
             raise
@@ -112,6 +102,31 @@ class Session:
             self._seen = time.monotonic()
         return time.monotonic() - self._seen
 
+    @property
+    def state(self) -> SessionState:
+        """What the user has set up, for a copy of this session."""
+        with self._lock:
+            panel = self._object.panel if self._object is not None else None
+            theme, prefers_dark = self._layers.theme
+            return SessionState(
+                sequence_name=self._content.sequence_name,
+                frame=self._playback.frame,
+                is_playing=self._playback.is_playing,
+                speed=self._playback.speed,
+                does_loop=self._playback.does_loop,
+                layers=replace(self._scene.layers),
+                theme=theme,
+                prefers_dark=prefers_dark,
+                parameters=panel.history.current if panel is not None else None,
+                automatic_substeps=panel is not None and panel.is_automatic,
+                is_figure=self._figure.is_on,
+                pose=self._figure.pose(),
+            )
+
+    def prefer_dark(self, *, on: bool) -> None:
+        """Follow the browser's color scheme, unless the user has chosen a background."""
+        self._layers.prefer_dark(on=on)
+
     def close(self) -> None:
         """Stop clock, simulation and server."""
         self._playback.close()
@@ -132,7 +147,8 @@ class Session:
         set_theme(server, dark=False)
         add_legend(server, self._content)
         if len(self._names) > 1:
-            choice = server.gui.add_dropdown("Sequence", self._names)
+            now = self._content.sequence_name
+            choice = server.gui.add_dropdown("Sequence", self._names, initial_value=now)
             choice.on_update(guard.by_user(lambda event: self._switch(event.target.value)))
         self._timeline = TimelinePanel(server, self._playback, guard)
         self._figure = FigureMode(server, guard, self._live, self.id, self._playback.redraw)
@@ -163,6 +179,22 @@ class Session:
                 fitted=content.fitted,
                 run=run,
             )
+
+    def _restore(self, state: SessionState) -> None:
+        """Go on where another session stands."""
+        self._has_played = True
+        self._timeline.restore(state.speed, does_loop=state.does_loop)
+        self._layers.restore(state.layers, state.theme, prefers_dark=state.prefers_dark)
+        if self._object is not None and self._object.panel is not None and state.parameters:
+            self._object.panel.restore(state.parameters, is_automatic=state.automatic_substeps)
+        if state.pose is not None:
+            camera, pose = self._server.initial_camera, state.pose
+            camera.fov, camera.up = pose.fov, pose.up
+            camera.position, camera.look_at = pose.position, pose.look_at
+        if state.is_figure:
+            self._figure.toggle()
+        self._playback.seek(state.frame)
+        self._playback.play(on=state.is_playing)
 
     def _switch(self, sequence_name: str) -> None:
         content = self._load(sequence_name)
@@ -226,12 +258,3 @@ class Session:
                 sides=sides,
                 picture=picture,
             )
-
-
-def _start_server(label: str) -> viser.ViserServer:
-    rich.get_console().quiet = True  # viser would print its loopback address, which misleads.
-    server = viser.ViserServer(host="127.0.0.1", port=0, label=label, verbose=False)
-    # Any client could ask for a public tunnel with this message.
-    infrastructure: Any = server._websock_server  # pyright: ignore[reportPrivateUsage]  # no other way
-    infrastructure.unregister_handler(messages.ShareUrlRequest)
-    return server

@@ -221,6 +221,34 @@ def test_live_scenes_are_opened_and_closed(world: World) -> None:
         world.sessions.shutdown()
 
 
+def test_a_live_scene_belongs_to_the_browser_that_opened_it(world: World) -> None:
+    mine, theirs = world.browser(), world.browser()
+    try:
+        opened = mine.post("/api/v1/sessions", json={"kind": "run", "id": "fitted"})
+        page = opened.json()["url"]
+        name = page.removeprefix("/live/")
+        addresses = (page, f"/viewer/{name}/", f"/api/v1/sessions/{name}")
+        assert [mine.get(address).status_code for address in addresses] == [200, 200, 200]
+        assert [theirs.get(address).status_code for address in addresses] == [404, 404, 404]
+        assert "belongs to another browser" in theirs.get(page).text
+        wish = {"dark": True}
+        assert theirs.patch(f"/api/v1/sessions/{name}", json=wish).status_code == 404
+        assert not world.sessions.get(name).state.prefers_dark
+        assert mine.patch(f"/api/v1/sessions/{name}", json=wish).status_code == 204
+        assert world.sessions.get(name).state.prefers_dark
+        theirs.delete(f"/api/v1/sessions/{name}")
+        assert mine.get(page).status_code == 200
+
+        world.sessions.close(name, "Nobody looked at it for 15 minutes.")
+        closed = mine.get(page)
+        assert closed.status_code == 404
+        assert "Nobody looked at it for 15 minutes." in closed.text
+        assert 'data-open="run" data-id="fitted"' in closed.text
+        assert "15 minutes" not in theirs.get(page).text
+    finally:
+        world.sessions.shutdown()
+
+
 def test_too_many_live_scenes_are_refused(world: World) -> None:
     world.settings.__dict__["live_sessions"] = 1
     client = world.script()

@@ -6,11 +6,13 @@ import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 import uvicorn
 import viser._messages
 from fastapi import FastAPI
 from viewer_client import PROTOCOL, ViewerClient
+from viewer_world import FRAMES
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
@@ -22,8 +24,14 @@ from app.viewer.session import Sessions
 def address(sessions: Sessions) -> Iterator[str]:
     app = FastAPI()
     app.include_router(create_gate(sessions))
+
+    async def named(scope, receive, send) -> None:
+        """Take the owner from a header, as the gatekeeper takes it from a cookie."""
+        owner = dict(scope.get("headers", [])).get(b"x-owner", b"me").decode()
+        await app(scope | {"state": {"owner": owner}}, receive, send)
+
     config = uvicorn.Config(
-        app, host="127.0.0.1", port=0, log_level="warning", ws_per_message_deflate=False
+        named, host="127.0.0.1", port=0, log_level="warning", ws_per_message_deflate=False
     )
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run)
@@ -37,6 +45,7 @@ def address(sessions: Sessions) -> Iterator[str]:
 
 
 def fetch(url: str, **headers: str) -> tuple[int, bytes]:
+    headers = {name.replace("_", "-"): value for name, value in headers.items()}
     request = urllib.request.Request(url, headers=headers)  # noqa: S310
     opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     try:
@@ -100,6 +109,76 @@ def test_closing_a_session_hangs_up(address, sessions) -> None:
         with pytest.raises(ConnectionClosed):
             client.until(lambda: False, seconds=10)
     assert fetch(f"http://{address}/viewer/{session}/")[0] == 404
+
+
+def test_another_browser_finds_nothing(address, sessions) -> None:
+    session = sessions.open("run", "sheet", "me")
+    url = f"http://{address}/viewer/{session}/"
+    assert fetch(url)[0] == 200
+    status, body = fetch(url, X_Owner="somebody")
+    assert status == 404
+    assert b"belongs to another browser" in body
+    address = f"ws://{address}/viewer/{session}"
+    for owner, allowed in (("somebody", False), ("me", True)):
+        headers = {"X-Owner": owner}
+        if allowed:
+            with ViewerClient(address, additional_headers=headers) as client:
+                client.until(lambda: "/object/nodes" in client.nodes)
+        else:
+            with pytest.raises(InvalidStatus) as refused:
+                ViewerClient(address, additional_headers=headers)
+            assert refused.value.response.status_code == 404
+
+
+def test_a_tab_that_is_reloaded_keeps_its_session(address, sessions) -> None:
+    session = sessions.open("run", "sheet", "me")
+    with ViewerClient(f"ws://{address}/viewer/{session}") as client:
+        client.until(lambda: client.nodes)
+    assert fetch(f"http://{address}/viewer/{session}/")[0] == 200
+    assert [info.id for info in sessions.list()] == [session]
+
+
+def test_a_second_tab_gets_a_copy_with_the_same_state(address, sessions) -> None:
+    session = sessions.open("run", "sheet", "me")
+    with ViewerClient(f"ws://{address}/viewer/{session}") as client:
+        client.until(lambda: "object springs" in client.texts())
+        slider = client.find("stiffness 10^")
+        client.set("Sequence", "drag")
+        client.until(lambda: sessions.get(session)._content.sequence_name == "drag")
+        client.until(lambda: client.find("stiffness 10^") not in {slider, ""})
+        client.until(lambda: sessions.get(session)._playback.is_playing)
+        client.set("Frame", 7)
+        client.set("Speed", 0.5)
+        client.set("Virtual springs", False)
+        client.set("Background", "dark")
+        client.set("stiffness 10^", -1.0)
+        client.tell_camera(position=(0.3, 0.2, 0.1), look_at=(0.0, 0.1, 0.0))
+        client.until(lambda: f"simulated {FRAMES}/{FRAMES}" in client.texts())
+        client.until(lambda: "x0.1" in client.texts())
+        status, _ = fetch(f"http://{address}/viewer/{session}/")
+        assert status == 200  # After the redirect.
+        own, copied = (sessions.get(info.id) for info in sessions.list())
+        assert (own.id, copied.owner) == (session, "me")
+        state = copied.state
+        assert (state.sequence_name, state.frame, state.is_playing) == ("drag", 7, False)
+        assert (state.speed, state.theme) == (0.5, "dark")
+        assert state.parameters.stiffness_scale == pytest.approx(0.1)
+        assert not state.layers.virtual_springs
+        assert state.layers.dark
+        with ViewerClient(f"ws://{address}/viewer/{copied.id}") as second:
+            second.until(lambda: f"simulated {FRAMES}/{FRAMES}" in second.texts())
+            second.until(lambda: " from the fitted rollout" in second.texts())
+            second.until(lambda: {"/object/nodes", "/forces"} <= set(second.nodes))
+            wanted = [m for m in second.messages if m["type"] == "SetCameraPositionMessage"]
+            assert wanted[-1]["position"] == pytest.approx((0.3, 0.2, 0.1))
+            labels = {p.get("label"): p["value"] for p in reversed(second.gui.values())}
+            assert labels["Sequence"] == "drag"
+            assert (labels["Frame"], labels["Speed"], labels["stiffness 10^"]) == (7, 0.5, -1.0)
+            assert (labels["Virtual springs"], labels["Background"]) == (False, "dark")
+            assert "/springs/virtual" not in second.nodes
+            other = second.array("/object/nodes", "points")
+            client.until(lambda: np.array_equal(client.array("/object/nodes", "points"), other))
+            assert np.abs(other - own._content.fitted.position[7]).max() > 1e-4
 
 
 def test_no_client_can_open_a_public_tunnel(sessions) -> None:

@@ -1,6 +1,7 @@
 import pytest
 
-from app.viewer.parameters import History, knobs, self_collision_knobs, what_changed
+from app.viewer.history import History
+from app.viewer.parameters import knobs, self_collision_knobs, what_changed
 from physhandi.simulation.model import SimulationParameters
 
 START = SimulationParameters(connection_radius=0.0237, damping=20.0)

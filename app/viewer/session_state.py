@@ -1,0 +1,89 @@
+"""What there is to say about a session, and what a user has set up in it."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import viser
+from jaxtyping import Float
+from numpy import ndarray
+
+from app.viewer.layers import Layers, Theme
+from physhandi.simulation.model import SimulationParameters
+
+Kind = Literal["run", "sequence"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SessionInfo:
+    """What a listing says about a session."""
+
+    id: str
+    """Unguessable id, part of its address."""
+    kind: Kind
+    """Whether a run or a sequence is shown."""
+    target: str
+    """Id of the run or the sequence."""
+    owner: str
+    """Who opened it."""
+    title: str
+    """Name of what is shown."""
+    client_count: int
+    """Browsers that look at it."""
+    created: float
+    """When it was opened [s since 1970]."""
+    idle: float
+    """How long nobody has looked at it [s]."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pose:
+    """Where a camera stands and what it looks at."""
+
+    position: Float[ndarray, " 3"]
+    """Of the camera."""
+    look_at: Float[ndarray, " 3"]
+    """Point in the middle of the picture, about which the camera turns."""
+    up: Float[ndarray, " 3"]
+    """Direction that is upwards in the picture."""
+    fov: float
+    """Vertical field of view [rad]."""
+
+    @classmethod
+    def of(cls, camera: viser.CameraHandle) -> "Pose":
+        """Read a client's camera."""
+        return cls(
+            position=camera.position.copy(),
+            look_at=camera.look_at.copy(),
+            up=camera.up_direction.copy(),
+            fov=camera.fov,
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SessionState:
+    """Everything that a copy of a session begins with."""
+
+    sequence_name: str
+    """Sequence of the run."""
+    frame: int
+    """Frame that is due."""
+    is_playing: bool
+    """Whether the clock is running."""
+    speed: float
+    """Sequence seconds per second."""
+    does_loop: bool
+    """Whether playing starts over at the end."""
+    layers: Layers
+    """What is shown."""
+    theme: Theme
+    """Which background was chosen."""
+    prefers_dark: bool
+    """Whether the browser asks for a dark one."""
+    parameters: SimulationParameters | None
+    """What the object was simulated with last; None without an object."""
+    automatic_substeps: bool
+    """Whether the number of substeps is chosen automatically."""
+    is_figure: bool
+    """Whether the figure is shown instead of the scene."""
+    pose: Pose | None
+    """Camera of the first client; None if nobody looked."""
