@@ -70,8 +70,8 @@ class Simulate:
     """Ground restitution."""
     friction: float | None = None
     """Ground friction."""
-    substeps_per_frame: int | None = None
-    """Integration steps in one frame."""
+    substeps_per_frame: int | Literal["auto"] | None = None
+    """Integration steps in one frame; auto takes as few as are stable, and prints how many."""
     device: str = "auto"
     """Warp device: auto, cpu or cuda:0."""
     data_dir: DataDir = None

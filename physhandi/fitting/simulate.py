@@ -1,7 +1,9 @@
 """Simulate a fitted object again: with other parameters, or in another sequence."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,13 +20,17 @@ from physhandi.fitting.rollouts import control_trajectory_of, object_nodes_of, s
 from physhandi.perception.lifting import observe_object
 from physhandi.progress import Progress
 from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.stability import with_stable_substeps
 from physhandi.simulation.topology import retopologize
+
+AUTOMATIC = "auto"
+"""Instead of a number of substeps: as few as are stable and fine enough."""
 
 
 def simulate_again(
     source: Run,
     sequence: Sequence,
-    changes: dict[str, float],
+    changes: Mapping[str, Any],
     output: Attempt,
     progress: Progress,
     *,
@@ -38,7 +44,8 @@ def simulate_again(
     Args:
         source: A finished run with an object.
         sequence: One of the run's sequences, or another one of the same object.
-        changes: New values of simulation parameters.
+        changes: New values of simulation parameters; `substeps_per_frame` may be `AUTOMATIC`, and
+            the number that was chosen is stored with the other parameters.
         output: Where the motion goes.
         progress: Told about every frame.
         device: Warp device.
@@ -53,7 +60,7 @@ def simulate_again(
             f"Run '{source.id}' holds no fitted object, so there is nothing to simulate."
         )
     fitted = artefacts.load_parameters(source.out)
-    parameters = SimulationParameters.from_dict(fitted.to_dict() | changes)
+    parameters, is_automatic = changed_parameters(fitted, changes)
     first = source.sequence_names[0]
     is_known = sequence.name in source.sequence_names
     name = sequence.name if is_known else first
@@ -69,11 +76,37 @@ def simulate_again(
         )
         model = replace(model, object_node=node, initial_velocity=velocity)
     model = retopologize(model, parameters, control[0], fitted=fitted, rest_node=rest_node)
+    if is_automatic:
+        in_world = parameters.in_world(
+            frame_rate=sequence.frame_rate,
+            ground_height=sequence.ground_height,
+            gravity=sequence.gravity,
+        )
+        substeps = with_stable_substeps(in_world, model, control[0]).substeps_per_frame
+        parameters = replace(parameters, substeps_per_frame=substeps)
     check_springs(sequence.name, model, parameters, control[0], rest_node)
     output.save_array(f"{artefacts.sequence_folder(sequence.name)}/control.npy", control)
     artefacts.save_model(output, sequence.name, model)
     artefacts.save_object(output, parameters, model, rest_node)
     simulate_sequence(output, sequence, device=device, progress=progress)
+
+
+def changed_parameters(
+    fitted: SimulationParameters, changes: Mapping[str, Any]
+) -> tuple[SimulationParameters, bool]:
+    """Apply changes to fitted parameters.
+
+    Returns:
+        The new parameters, and whether their substeps are yet to be chosen automatically.
+
+    Raises:
+        UsageError: If a parameter is unknown or out of bounds.
+    """
+    given = dict(changes)
+    is_automatic = given.get("substeps_per_frame") == AUTOMATIC
+    if is_automatic:
+        del given["substeps_per_frame"]
+    return SimulationParameters.from_dict(fitted.to_dict() | given), is_automatic
 
 
 def _copy_known(source: Run, name: str, output: Attempt) -> np.ndarray:

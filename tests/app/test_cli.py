@@ -12,8 +12,9 @@ from sheet_sequence import FRAMES, NODE
 
 from app import cli, commands
 from physhandi.data.run import Run
-from physhandi.fitting.artefacts import load_parameters
+from physhandi.fitting.artefacts import load_model, load_parameters
 from physhandi.fitting.profile import PipelineConfig
+from physhandi.simulation.stability import LONGEST_STEP, SAFETY, largest_stable_step
 
 
 class Terminal:
@@ -70,6 +71,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> PipelineConfig:
         ["export", "fitted", "--format", "npz"],
         ["reconstruct", "sheet"],
         ["simulate", "fitted", "--out", "x", "--drag", "much"],
+        ["simulate", "fitted", "--out", "x", "--substeps-per-frame", "few"],
         ["serve", "--port", "many"],
         ["doctor", "--nonsense"],
     ],
@@ -206,6 +208,23 @@ def test_a_run_is_simulated_again_with_other_parameters(terminal: Terminal) -> N
     assert load_parameters(run.out).stiffness_scale == 0.5
     fitted = Run.open(terminal.data_dir / "runs" / "fitted").array("sequences/sheet/rollout.npy")
     assert np.abs(run.array("sequences/sheet/rollout.npy") - fitted).max() > 1e-5
+
+
+def test_substeps_are_chosen_for_the_springs_told_and_stored(terminal: Terminal) -> None:
+    order = ("simulate", "fitted", "--device", "cpu", "--substeps-per-frame", "auto")
+    chosen = []
+    for out, scale in (("soft", "1"), ("stiff", "400")):
+        assert terminal(*order, "--out", out, "--stiffness-scale", scale) == 0
+        run = Run.open(out)
+        parameters = load_parameters(run.out)
+        model = load_model(run.out, "sheet")
+        control = run.array("sequences/sheet/control.npy")[0]
+        needed = SAFETY / largest_stable_step(model, parameters, control) / parameters.frame_rate
+        coarsest = 1.0 / LONGEST_STEP / parameters.frame_rate
+        assert parameters.substeps_per_frame == pytest.approx(max(needed, coarsest), abs=1)
+        assert f"substeps_per_frame: {parameters.substeps_per_frame}\n" in terminal.out
+        chosen.append(parameters.substeps_per_frame)
+    assert chosen[1] > chosen[0]
 
 
 def test_a_value_out_of_range_is_refused_by_name(terminal: Terminal) -> None:
