@@ -21,22 +21,28 @@ from physhandi.fitting.hand_reconstruction import reconstruct_hands
 from physhandi.fitting.object_problem import ObjectProblem, build_problem
 from physhandi.fitting.object_reconstruction import search_object
 from physhandi.fitting.profile import PipelineConfig, config_from_dict
-from physhandi.fitting.rollouts import control_trajectory_of, object_nodes_of, simulate_sequence
+from physhandi.fitting.rollouts import (
+    control_trajectory_of,
+    object_nodes_of,
+    refine_sequence,
+    simulate_sequence,
+)
 from physhandi.fitting.simulate import simulate_again
 from physhandi.fitting.spring_optimisation import optimise_springs
 from physhandi.metrics.report import measure_run, score_run
 from physhandi.perception.lifting import observe_object
 from physhandi.progress import Progress
 
-HANDS, OBSERVATION, SEARCH, SPRINGS, EVALUATION = (
+HANDS, OBSERVATION, SEARCH, SPRINGS, REFINEMENT, EVALUATION = (
     "hand_reconstruction",
     "observation",
     "zeroth_order",
     "first_order",
+    "hand_refinement",
     "evaluation",
 )
 SIMULATION = "simulation"
-STAGES = (HANDS, OBSERVATION, SEARCH, SPRINGS, EVALUATION)
+STAGES = (HANDS, OBSERVATION, SEARCH, SPRINGS, REFINEMENT, EVALUATION)
 
 
 def reconstruct(
@@ -71,6 +77,7 @@ def reconstruct(
         _stage_observation(sequences, config, attempt, progress)
         _stage_search(sequences, config, attempt, progress, device)
         _stage_springs(sequences, config, attempt, progress, device)
+        _stage_refinement(sequences, config, attempt, progress, device)
     _stage_evaluation(sequences, attempt, progress, device, has_object=has_object)
 
 
@@ -215,6 +222,28 @@ def _stage_springs(
     first = problems[0]
     artefacts.save_object(attempt, result.parameters, result.models[first.name], first.rest_node)
     _finish(attempt, SPRINGS, [result.loss_before], [result.loss_after], result.curve)
+
+
+def _stage_refinement(
+    sequences: Many[Sequence],
+    config: PipelineConfig,
+    attempt: Attempt,
+    progress: Progress,
+    device: str,
+) -> None:
+    """Stage 3: hands whose object moves as it was seen to; point controllers are as they are."""
+    if attempt.stage_done(REFINEMENT):
+        return
+    held = [sequence for sequence in sequences if sequence.hands and sequence.control is None]
+    before, after, curve = [], [], []
+    if config.refinement.iterations and held:
+        problems = _problems(held, config, attempt)
+        for sequence, problem in zip(held, problems, strict=True):
+            result = refine_sequence(attempt, sequence, problem, config, progress, device=device)
+            before.append(result.loss_before)
+            after.append(result.loss_after)
+            curve = curve or result.curve
+    _finish(attempt, REFINEMENT, before, after, curve)
 
 
 def _stage_evaluation(

@@ -45,6 +45,10 @@ class FittedObject:
         self.take: Take = take
         self._all_controls = np.ascontiguousarray(take.control, dtype=np.float32)
         self._control = self._all_controls
+        # Springs begin where the hands were when they were laid; refinement may have moved these.
+        moved = f"sequences/{sequence}/attachment.npy"
+        self._all_attached = run.array(moved) if run.has(moved) else self._all_controls[0]
+        self._attached = self._all_attached
         self._chosen: tuple[int, ...] | None = None
         self._latest: tuple[tuple[float, ...], SpringMassModel] | None = None
         self._simulator: Simulator | None = None
@@ -68,6 +72,8 @@ class FittedObject:
             self._chosen, self._latest = wanted, None
             everything = self._all_controls
             self._control = everything if wanted is None else everything[:, list(wanted)].copy()
+            attached = self._all_attached
+            self._attached = attached if wanted is None else attached[list(wanted)].copy()
         return self._control
 
     def model(self, parameters: SimulationParameters) -> SpringMassModel:
@@ -96,7 +102,7 @@ class FittedObject:
     def _build(self, parameters: SimulationParameters) -> SpringMassModel:
         fitted, model = self.take.parameters, self.take.model
         if self._chosen is not None:
-            return _hold_anew(model, parameters, self._control[0])
+            return _hold_anew(model, parameters, self._attached)
         if all(getattr(parameters, n) == getattr(fitted, n) for n in _TOPOLOGY if n != "damping"):
             if parameters.damping == fitted.damping:
                 return model
@@ -106,7 +112,7 @@ class FittedObject:
                 damping = np.full_like(model.damping, parameters.damping)
             return replace(model, damping=damping)
         return retopologize(
-            model, parameters, self._control[0], fitted=fitted, rest_node=self._rest_node
+            model, parameters, self._attached, fitted=fitted, rest_node=self._rest_node
         )
 
 

@@ -130,6 +130,32 @@ def save_motions(output: Attempt, name: str, motions: tuple[HandMotion, ...]) ->
         output.save_tensors(rel, motion.to_tensors())
 
 
+def save_refinement(
+    output: Attempt,
+    name: str,
+    before: tuple[HandMotion, ...],
+    attachment: Float[ndarray, "control 3"],
+    after: tuple[HandMotion, ...],
+) -> None:
+    """Store refined hands, the hands as they were, and where these held the object at frame 0."""
+    folder = sequence_folder(name)
+    for motion in before:
+        output.save_tensors(f"{folder}/hand_{motion.side}_initial.safetensors", motion.to_tensors())
+    output.save_array(f"{folder}/attachment.npy", attachment.astype(np.float32))
+    save_motions(output, name, after)
+
+
+def load_attachment(out: Path, name: str) -> Float[ndarray, "control 3"]:
+    """Read where the control nodes of a sequence were when its virtual springs were laid [m].
+
+    That is frame 0 of the control nodes, unless refinement has moved the hands since.
+    """
+    folder = out / sequence_folder(name)
+    if (folder / "attachment.npy").exists():
+        return np.load(folder / "attachment.npy", allow_pickle=False)
+    return np.load(folder / "control.npy", mmap_mode="r", allow_pickle=False)[0].copy()
+
+
 def load_motions(out: Path, name: str) -> tuple[HandMotion, ...]:
     """Read the hand motions of one sequence, the right hand first."""
     folder = out / sequence_folder(name)

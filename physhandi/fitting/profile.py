@@ -10,6 +10,7 @@ import yaml
 
 from physhandi.errors import UsageError
 from physhandi.fitting.hand_reconstruction import HandFitConfig
+from physhandi.fitting.hand_refinement import RefinementConfig
 from physhandi.fitting.object_config import ObjectFitConfig
 from physhandi.simulation.model import SimulationParameters
 
@@ -34,6 +35,8 @@ class PipelineConfig:
     """Stage 1."""
     object_: ObjectFitConfig = field(default_factory=ObjectFitConfig)
     """Stage 2."""
+    refinement: RefinementConfig = field(default_factory=RefinementConfig)
+    """Stage 3."""
     simulation: SimulationParameters = field(default_factory=SimulationParameters)
     """Values that the search starts from, and all that are not searched."""
 

@@ -1,7 +1,7 @@
 """From a sequence and a fitted object to simulated motion."""
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from physhandi.data.attempt import Attempt
@@ -10,9 +10,12 @@ from physhandi.data.sequence import Sequence
 from physhandi.errors import FitError, MissingInputError
 from physhandi.fitting import artefacts
 from physhandi.fitting.controls import farthest_points, lay_object, visible_vertices
+from physhandi.fitting.hand_losses import keypoint_target
+from physhandi.fitting.hand_refinement import RefinedHands, RefinementProblem, refine_hands
+from physhandi.fitting.object_problem import ObjectProblem
 from physhandi.fitting.profile import PipelineConfig
 from physhandi.hand.control_nodes import control_trajectory
-from physhandi.hand.model import load_hand_model
+from physhandi.hand.model import HandModel, load_hand_model
 from physhandi.hand.motion import HandMotion
 from physhandi.perception.shape import object_nodes_from_observation
 from physhandi.progress import Progress
@@ -37,17 +40,79 @@ def control_trajectory_of(
             f"Sequence '{sequence.name}' has neither hands nor control.npy: nothing moves its "
             "object."
         )
-    models = tuple(load_hand_model(motion.side, motion.model) for motion in motions)
-    control = control_trajectory(motions, models)
+    models = _hand_models(motions)
+    vertex = control_trajectory(motions, models)
+    chosen = _chosen_vertices(sequence, vertex[0], models, config)
+    return vertex if chosen is None else vertex[:, chosen]
+
+
+def refine_sequence(
+    output: Attempt,
+    sequence: Sequence,
+    problem: ObjectProblem,
+    config: PipelineConfig,
+    progress: Progress,
+    *,
+    device: str,
+) -> RefinedHands:
+    """Correct the stored hands of a sequence so that its stored object moves as it was seen to.
+
+    The hands as they were are kept as ``hand_<side>_initial``, and where their control nodes were
+    when the springs were laid as ``attachment``: a topology built anew must begin there.
+    """
+    motions = artefacts.load_motions(output.out, sequence.name)
+    models = _hand_models(motions)
+    vertex = control_trajectory(motions, models)
+    folder = artefacts.sequence_folder(sequence.name)
+    keypoint = np.load(output.out / folder / "keypoint.npy", allow_pickle=False)
+    cameras = [view.camera for view in sequence.views]
+    seen = keypoint[:, : problem.frame_count]
+    refined = refine_hands(
+        RefinementProblem(
+            object_=problem,
+            model=artefacts.load_model(output.out, sequence.name),
+            parameters=artefacts.load_parameters(output.out),
+            motions=motions,
+            hand_models=models,
+            chosen=_chosen_vertices(sequence, vertex[0], models, config),
+            targets=tuple(
+                keypoint_target(
+                    cameras,
+                    seen[:, :, sequence.hands.index(motion.side)],
+                    config.hand.keypoint_noise,
+                )
+                for motion in motions
+            ),
+        ),
+        config.refinement,
+        progress,
+        device=device,
+    )
+    artefacts.save_refinement(output, sequence.name, motions, problem.control[0], refined.motions)
+    output.save_array(f"{folder}/control.npy", refined.control.astype(np.float32))
+    return refined
+
+
+def _hand_models(motions: tuple[HandMotion, ...]) -> tuple[HandModel, ...]:
+    return tuple(load_hand_model(motion.side, motion.model) for motion in motions)
+
+
+def _chosen_vertices(
+    sequence: Sequence,
+    vertex: Float[ndarray, "vertex 3"],
+    models: tuple[HandModel, ...],
+    config: PipelineConfig,
+) -> Int[ndarray, " control"] | None:
+    """Choose among all hands' vertices of frame 0 those that become control nodes; None is all."""
     if config.control_nodes == "all":
-        return control
+        return None
     offset, seen = 0, []
     for model in models:
-        vertex = control[0, offset : offset + model.vertex_count]
-        seen.append(visible_vertices(sequence.views, vertex, model.faces) + offset)
+        surface = vertex[offset : offset + model.vertex_count]
+        seen.append(visible_vertices(sequence.views, surface, model.faces) + offset)
         offset += model.vertex_count
     candidates = np.concatenate(seen)
-    return control[:, candidates[farthest_points(control[0, candidates], config.control_count)]]
+    return candidates[farthest_points(vertex[candidates], config.control_count)]
 
 
 def object_nodes_of(

@@ -1,0 +1,308 @@
+"""Stage 3: correct the hands until the object that they move moves as it was seen to.
+
+Paper, section 3.3 ("Hand Refinement") and its supplement; physics.md §9 and §10.9-10.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numpy import ndarray
+from torch import Tensor
+
+from physhandi.errors import SimulationDivergedError
+from physhandi.fitting.hand_losses import KeypointTarget, reprojection_loss
+from physhandi.fitting.hand_offsets import HandOffsets, OffsetDescent, control_nodes
+from physhandi.fitting.object_problem import ObjectProblem
+from physhandi.fitting.object_reconstruction import problem_parameters
+from physhandi.hand.control_nodes import control_trajectory
+from physhandi.hand.model import HandModel, HandPose
+from physhandi.hand.motion import HandMotion
+from physhandi.progress import Progress
+from physhandi.simulation import differentiable
+from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.simulator import Simulator
+
+STAGE = "hand_refinement"
+STEEPEST = 50.0
+"""A gradient this many times as steep as that of an object tied rigidly to its hand is chaos."""
+HALVINGS = 4
+"""How often a correction that diverges in later frames is tried, each time half as large."""
+DOUBT = 3.0
+"""Keypoints that are wrong by more than so many times the expected error lose their pull."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefinementConfig:
+    """How hands are corrected through the simulator."""
+
+    iterations: int = 40
+    """Updates; 0 skips the stage."""
+    articulation_rate: float = 0.01
+    """Step of the joints [rad]."""
+    rotation_rate: float = 0.01
+    """Step of the wrist's rotation [rad]."""
+    translation_rate: float = 1e-3
+    """Step of the wrist's position [m]."""
+    decay: float = 0.97
+    """What each step is of the one before."""
+    beta_2: float = 0.99
+    """Adam's second moment decay."""
+    steps_by_parameter: bool = False
+    """Every number steps by itself (Adam, as the paper), or all of one frame share one step."""
+    window: int | None = 2
+    """Frames that a gradient reaches back; none is the whole sequence."""
+    track_weight: float = 1.0
+    """Weight of the track term beside the Chamfer term (paper: 1)."""
+    prior_weight: float = 3.0
+    """Weight of the surface's squared displacement from stage 1, beside the object's error."""
+    smoothness_weight: float = 10.0
+    """Weight of the squared change of that displacement from frame to frame."""
+    keypoint_weight: float = 1e-6
+    """Weight of stage 1's keypoint term, which keeps the hands in the images [m²]."""
+    carry_time: float = 0.5
+    """Time in which the last correction fades after the frames that are fitted [s]."""
+
+    def __post_init__(self) -> None:
+        if self.iterations < 0 or (self.window is not None and self.window < 1):
+            raise ValueError("iterations must be at least 0, and window at least 1 or none")
+        rates = (self.articulation_rate, self.rotation_rate, self.translation_rate)
+        if min(rates) < 0 or not 0 < self.decay <= 1 or not 0 <= self.beta_2 < 1:
+            raise ValueError("rates must not be negative, decay in ]0, 1], beta_2 in [0, 1[")
+
+    @property
+    def rates(self) -> dict[str, float]:
+        """The step of every kind of correction, by the names of `HandOffsets`."""
+        return {
+            "articulation": self.articulation_rate,
+            "rotation": self.rotation_rate,
+            "translation": self.translation_rate,
+        }
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RefinementProblem:
+    """The hands of one sequence, and the fitted object that they move."""
+
+    object_: ObjectProblem
+    """What was seen of the object in the frames to fit; nothing of later frames is in it."""
+    model: SpringMassModel
+    """The fitted springs, virtual springs included; they stay as they are."""
+    parameters: SimulationParameters
+    """The global parameters of the object."""
+    motions: tuple[HandMotion, ...]
+    """Hands of stage 1 over all frames, in the order of the control nodes."""
+    hand_models: tuple[HandModel, ...]
+    """The model of each hand."""
+    chosen: Int[ndarray, " control"] | None = None
+    """Which of all hands' vertices are control nodes; all of them if None."""
+    targets: tuple[KeypointTarget, ...] = ()
+    """Keypoints of each hand in the frames to fit; without any there is no keypoint term."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RefinedHands:
+    """The result of stage 3 for one sequence."""
+
+    motions: tuple[HandMotion, ...]
+    """Corrected motion of each hand over all frames."""
+    control: Float[ndarray, "all_frame control 3"]
+    """Control nodes of the corrected hands [m]."""
+    loss_before: float
+    """Mean frame loss that the hands of stage 1 leave [m²]."""
+    loss_after: float
+    """Mean frame loss that the corrected hands leave, simulated again from what is stored [m²]."""
+    curve: list[list[float]]
+    """Iteration and mean frame loss."""
+
+
+def refine_hands(
+    problem: RefinementProblem,
+    config: RefinementConfig,
+    progress: Progress,
+    *,
+    device: str = "cpu",
+) -> RefinedHands:
+    """Correct pose and place of the hands by gradient descent through the simulator.
+
+    Minimises the mean frame loss of the object's simulated motion over articulation, wrist
+    rotation and wrist position in all frames to fit; shape, scale and the object stay as they
+    are. Only what lies near a virtual spring decides the motion: the rest of the hand follows
+    because a frame takes one step as a whole (`OffsetDescent`) and is tied to stage 1.
+
+    The virtual springs keep the rest lengths that stage 2 gave them, so a correction of frame 0
+    moves the hand *against* the object, which shows. Were they laid anew, a correction that all
+    frames share would move nothing and could never be found. The other side of it: an error that
+    all frames shared when stage 2 laid the springs is part of the object by now and stays.
+
+    Args:
+        problem: Hands, object and what was seen.
+        config: Settings.
+        progress: Told once an iteration.
+        device: Warp device.
+
+    Returns:
+        The best correction found; the hands as they were if none explains the object better.
+
+    Raises:
+        SimulationDivergedError: If the object runs away with the hands of stage 1 already.
+        CancelledError: If the user asked to stop.
+    """
+    refinement = _Refinement(problem, config, device)
+    curve: list[list[float]] = []
+    for iteration in range(config.iterations + 1):
+        progress.check_cancelled()
+        message = ""
+        try:
+            loss = refinement.evaluate()
+        except SimulationDivergedError as error:
+            if not curve:
+                raise
+            message = f"step halved: {error}"
+            loss = refinement.go_back()
+        curve.append([float(iteration), loss])
+        progress.report(STAGE, iteration, config.iterations, loss, message)
+        if iteration < config.iterations:
+            refinement.step()
+    return refinement.result(curve, progress)
+
+
+class _Refinement:
+    """The corrections of all hands, their gradient, and the best of them so far."""
+
+    def __init__(self, problem: RefinementProblem, config: RefinementConfig, device: str) -> None:
+        self.problem = problem
+        self.config = config
+        self.device = device
+        self.parameters = problem_parameters(problem.parameters, problem.object_)
+        self.hands = [
+            HandOffsets(motion, model, problem.object_.frame_count)
+            for motion, model in zip(problem.motions, problem.hand_models, strict=True)
+        ]
+        self.reach = config.window or problem.object_.frame_count
+        self.rate = 1.0
+        self.first_loss: float | None = None
+        self.best = [hand.copy() for hand in self.hands]
+        self.best_total = np.inf
+        self._begin_descent()
+
+    def evaluate(self) -> float:
+        """Simulate, remember what is best, and leave the gradient in the corrections.
+
+        Returns:
+            Mean frame loss [m²].
+
+        Raises:
+            SimulationDivergedError: If the motion runs away.
+        """
+        poses = [hand.pose() for hand in self.hands]
+        control = control_nodes([pose.vertex for pose in poses], self.problem.chosen)
+        loss, pull = self._pull_of_object(control.detach())
+        ties = torch.stack([self._ties(number, pose) for number, pose in enumerate(poses)]).sum()
+        total = loss + float(ties.detach())
+        self.first_loss = loss if self.first_loss is None else self.first_loss
+        if total < self.best_total and loss <= self.first_loss:
+            self.best_total = total
+            self.best = [hand.copy() for hand in self.hands]
+        for hand in self.hands:
+            hand.forget_gradient()
+        ((control * pull).sum() + ties).backward()
+        return loss
+
+    def step(self) -> None:
+        """Correct the hands along the gradient, each time a little less."""
+        for descent in self.descents:
+            descent.step(self.rate)
+        self.rate *= self.config.decay
+
+    def go_back(self) -> float:
+        """Return to the best correction, to go on from there in half as long steps."""
+        self._restore(1.0)
+        self.rate /= 2
+        self._begin_descent()
+        return self.evaluate()
+
+    def result(self, curve: list[list[float]], progress: Progress) -> RefinedHands:
+        """Simulate the best correction over all frames; what diverges is halved, then dropped."""
+        before = curve[0][1]
+        motions, after = self.problem.motions, before
+        for halving in range(HALVINGS):
+            self._restore(0.5**halving)
+            carried = self.config.carry_time * self.problem.object_.frame_rate
+            refined = tuple(hand.motion(carried) for hand in self.hands)
+            try:
+                loss = self._simulated_loss(self._control(refined))
+            except SimulationDivergedError as error:
+                total = self.config.iterations
+                progress.report(STAGE, total, total, None, f"correction halved: {error}")
+                continue
+            if loss < before:
+                motions, after = refined, loss
+            break
+        return RefinedHands(
+            motions=motions,
+            control=self._control(motions),
+            loss_before=before,
+            loss_after=after,
+            curve=curve,
+        )
+
+    def _begin_descent(self) -> None:
+        config = self.config
+        self.descents = [
+            OffsetDescent(hand, config.rates, config.beta_2, by_parameter=config.steps_by_parameter)
+            for hand in self.hands
+        ]
+
+    def _pull_of_object(
+        self, control: Float[Tensor, "frame control 3"]
+    ) -> tuple[float, Float[Tensor, "frame control 3"]]:
+        """Give the mean frame loss [m²] and its gradient to the control nodes [m].
+
+        Where motion is chaotic the gradient grows without bound with the frames that it reaches
+        back over and points nowhere; it then reaches half as far, from now on.
+        """
+        while True:
+            moved = control.clone().requires_grad_()
+            node, _ = differentiable.rollout(
+                self.problem.model, self.parameters, moved, device=self.device, window=self.reach
+            )
+            loss = self._object_loss(node)
+            (pull,) = torch.autograd.grad(loss, moved, allow_unused=True)
+            pull = torch.zeros_like(moved) if pull is None else pull
+            steepness = float(pull.double().sum(dim=1).norm())
+            is_sane = steepness <= STEEPEST * float(loss.detach()) ** 0.5
+            if is_sane or self.reach == 1:
+                return float(loss.detach()), torch.nan_to_num(pull)
+            self.reach = max(1, self.reach // 2)
+
+    def _object_loss(self, node: Float[Tensor, "frame node 3"]) -> Float[Tensor, ""]:
+        object_ = self.problem.object_
+        return object_.frame_losses(node[1:], track_weight=self.config.track_weight).mean()
+
+    def _ties(self, number: int, pose: HandPose) -> Float[Tensor, ""]:
+        """Weigh what keeps one hand near stage 1, smooth against it, and in the images [m²]."""
+        config = self.config
+        moved = self.hands[number].displacement(pose)
+        change = moved[1:] - moved[:-1]
+        total = config.prior_weight * (moved**2).sum(-1).mean()
+        total = total + config.smoothness_weight * (change**2).sum(-1).mean()
+        if self.problem.targets and config.keypoint_weight > 0:
+            seen = reprojection_loss(pose.keypoint, self.problem.targets[number], DOUBT)
+            total = total + config.keypoint_weight * seen
+        return total
+
+    def _control(self, motions: tuple[HandMotion, ...]) -> Float[ndarray, "frame control 3"]:
+        control = control_trajectory(motions, self.problem.hand_models)
+        return control if self.problem.chosen is None else control[:, self.problem.chosen]
+
+    def _simulated_loss(self, control: Float[ndarray, "frame control 3"]) -> float:
+        """Simulate all frames as the evaluation will, and score those that are fitted [m²]."""
+        rollout = Simulator(self.problem.model, self.parameters, self.device).rollout(control)
+        node = torch.from_numpy(rollout.position[: self.problem.object_.frame_count])
+        return float(self._object_loss(node))
+
+    def _restore(self, share: float) -> None:
+        for hand, offset in zip(self.hands, self.best, strict=True):
+            hand.restore({name: share * value for name, value in offset.items()})
