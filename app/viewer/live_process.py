@@ -15,7 +15,6 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 import warp as wp
@@ -24,12 +23,11 @@ from app.viewer.fitted_object import FittedObject
 from app.viewer.wire import Message, receive, send
 from physhandi.errors import PhysHandiError, SimulationDivergedError
 from physhandi.simulation.model import SimulationParameters
-from physhandi.simulation.stability import stable_substeps
+from physhandi.simulation.stability import with_stable_substeps
 
 logger = logging.getLogger(__name__)
 
 _PR_SET_PDEATHSIG = 1
-_MIN_SUBSTEPS = 20
 
 
 class Mailboxes:
@@ -138,8 +136,7 @@ class LiveSimulator:
         control = fitted.choose_controls(request["controls"])
         model = fitted.model(parameters)
         if request["automatic_substeps"]:
-            substeps = stable_substeps(model, parameters, control[0])
-            parameters = replace(parameters, substeps_per_frame=max(substeps, _MIN_SUBSTEPS))
+            parameters = with_stable_substeps(parameters, model, control[0])
         send(
             self._connection,
             Message(
