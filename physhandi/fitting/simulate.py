@@ -69,13 +69,15 @@ def simulate_again(
     artefacts.save_sequence_meta(output, sequence)
     if is_known:
         control = _copy_known(source, sequence.name, output)
+        attachment = artefacts.load_attachment(source.out, sequence.name)
         artefacts.copy_hand_observation(source, sequence.name, output)
     else:
         control, node, velocity = _prepare(
             source, sequence, output, (model.object_node, rest_node), progress
         )
+        attachment = control[0]
         model = replace(model, object_node=node, initial_velocity=velocity)
-    model = retopologize(model, parameters, control[0], fitted=fitted, rest_node=rest_node)
+    model = retopologize(model, parameters, attachment, fitted=fitted, rest_node=rest_node)
     if is_automatic:
         in_world = parameters.in_world(
             frame_rate=sequence.frame_rate,
@@ -84,8 +86,11 @@ def simulate_again(
         )
         substeps = with_stable_substeps(in_world, model, control[0]).substeps_per_frame
         parameters = replace(parameters, substeps_per_frame=substeps)
-    check_springs(sequence.name, model, parameters, control[0], rest_node)
-    output.save_array(f"{artefacts.sequence_folder(sequence.name)}/control.npy", control)
+    check_springs(sequence.name, model, parameters, attachment, rest_node)
+    folder = artefacts.sequence_folder(sequence.name)
+    output.save_array(f"{folder}/control.npy", control)
+    if not np.array_equal(attachment, control[0]):
+        output.save_array(f"{folder}/attachment.npy", attachment)
     artefacts.save_model(output, sequence.name, model)
     artefacts.save_object(output, parameters, model, rest_node)
     simulate_sequence(output, sequence, device=device, progress=progress)
