@@ -1,0 +1,180 @@
+"""All springs that any candidate of a search may have, and which of them each one has."""
+
+from collections.abc import Sequence as Many
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, Int32
+from numpy import ndarray
+from scipy.spatial import KDTree
+
+from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.topology import MINIMUM_LENGTH, MINIMUM_VIRTUAL_REST_LENGTH
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MasterTopology:
+    """The springs of the largest radii and neighbor limits; a candidate is a cut-off.
+
+    A spring exists for a candidate if its length is below the candidate's radius and its rank
+    below its neighbor limit: the rank is the place of one end among the other's neighbors,
+    counted from 0, by the end that is quicker to propose it.
+    """
+
+    object_node: Float32[ndarray, "node 3"]
+    """Positions of the object nodes at frame 0 [m]."""
+    initial_velocity: Float32[ndarray, "node 3"]
+    """Velocities of the object nodes at frame 0 [m/s]."""
+    control_count: int
+    """Number of control nodes."""
+    spring_nodes: Int32[ndarray, "spring 2"]
+    """The two nodes of each spring; object springs first, then virtual ones."""
+    length: Float[ndarray, " spring"]
+    """Length at rest [m]."""
+    rank: Int32[ndarray, " spring"]
+    """Place among the neighbors of the end that proposes the spring first."""
+    object_spring_count: int
+    """How many of the springs join two object nodes."""
+
+    @classmethod
+    def of(
+        cls,
+        object_node: Float[ndarray, "node 3"],
+        control_0: Float[ndarray, "control 3"],
+        parameters: Many[SimulationParameters],
+        rest_node: Float[ndarray, "node 3"] | None = None,
+        initial_velocity: Float[ndarray, "node 3"] | None = None,
+    ) -> "MasterTopology":
+        """Find the springs of all candidates at once.
+
+        Args:
+            object_node: Positions of the object nodes at frame 0 [m].
+            control_0: Positions of the control nodes at frame 0 [m].
+            parameters: The candidates.
+            rest_node: The object's rest shape [m], if it differs from frame 0.
+            initial_velocity: Of the object nodes at frame 0 [m/s]; at rest if left out.
+        """
+        node = np.asarray(object_node, dtype=np.float64)
+        rest = node if rest_node is None else np.asarray(rest_node, dtype=np.float64)
+        control = np.asarray(control_0, dtype=np.float64)
+        springs, length, rank = _ranked_neighbors(
+            rest,
+            max(p.connection_radius for p in parameters),
+            max(p.max_neighbors for p in parameters),
+        )
+        virtual, virtual_length, virtual_rank = _ranked_holds(
+            control,
+            node,
+            max(p.virtual_connection_radius for p in parameters),
+            max(p.virtual_max_neighbors for p in parameters),
+        )
+        still = np.zeros(node.shape)
+        return cls(
+            object_node=node.astype(np.float32),
+            initial_velocity=np.asarray(
+                still if initial_velocity is None else initial_velocity, np.float32
+            ),
+            control_count=len(control),
+            spring_nodes=np.concatenate([springs, virtual]).astype(np.int32),
+            length=np.concatenate([length, virtual_length]),
+            rank=np.concatenate([rank, virtual_rank]).astype(np.int32),
+            object_spring_count=len(springs),
+        )
+
+    def has(self, parameters: SimulationParameters) -> Bool[ndarray, " spring"]:
+        """Tell which springs a candidate has."""
+        object_part = slice(None, self.object_spring_count)
+        virtual_part = slice(self.object_spring_count, None)
+        found = np.empty(len(self.length), dtype=bool)
+        for part, radius, most in (
+            (object_part, parameters.connection_radius, parameters.max_neighbors),
+            (
+                virtual_part,
+                parameters.virtual_connection_radius,
+                parameters.virtual_max_neighbors,
+            ),
+        ):
+            found[part] = (self.length[part] < radius) & (self.rank[part] < most)
+        return found
+
+    def rest_length(self, parameters: SimulationParameters) -> Float32[ndarray, " spring"]:
+        """Give the rest length of every spring under a candidate's floors [m]."""
+        virtual_floor = max(parameters.virtual_rest_length_floor, MINIMUM_VIRTUAL_REST_LENGTH)
+        floor = np.full(len(self.length), virtual_floor)
+        floor[: self.object_spring_count] = parameters.rest_length_floor
+        return np.maximum(self.length, floor).astype(np.float32)
+
+    def model(self, parameters: SimulationParameters) -> SpringMassModel:
+        """Build the model of one candidate, as `topology.build_model` does."""
+        kept = self.has(parameters)
+        return self._model(parameters, kept)
+
+    def whole(self, parameters: SimulationParameters) -> SpringMassModel:
+        """Build a model that has all springs."""
+        return self._model(parameters, np.ones(len(self.length), dtype=bool))
+
+    def _model(
+        self, parameters: SimulationParameters, kept: Bool[ndarray, " spring"]
+    ) -> SpringMassModel:
+        is_object = np.arange(len(kept)) < self.object_spring_count
+        stiffness = np.where(is_object, parameters.stiffness, parameters.virtual_stiffness)
+        damping = np.where(stiffness > 0.0, parameters.damping, 0.0)
+        return SpringMassModel(
+            object_node=self.object_node,
+            initial_velocity=self.initial_velocity,
+            spring_nodes=self.spring_nodes[kept],
+            rest_length=self.rest_length(parameters)[kept],
+            stiffness=stiffness[kept].astype(np.float32),
+            damping=damping[kept].astype(np.float32),
+            object_spring_count=int(kept[: self.object_spring_count].sum()),
+            control_count=self.control_count,
+        )
+
+    def without_controls(self) -> "MasterTopology":
+        """Leave the virtual springs out."""
+        count = self.object_spring_count
+        return replace(
+            self,
+            control_count=0,
+            spring_nodes=self.spring_nodes[:count],
+            length=self.length[:count],
+            rank=self.rank[:count],
+        )
+
+
+_Ranked = tuple[Int[ndarray, "spring 2"], Float[ndarray, " spring"], Int[ndarray, " spring"]]
+
+
+def _ranked_neighbors(node: ndarray, radius: float, most: int) -> _Ranked:
+    """List pairs of nodes, how far they are apart and the better of their two ranks."""
+    if most < 1 or len(node) < 2:
+        return np.zeros((0, 2), dtype=np.int64), np.zeros(0), np.zeros(0, dtype=np.int64)
+    count = min(most + 1, len(node))
+    distance, neighbor = (np.asarray(found) for found in KDTree(node).query(node, k=count))
+    own = np.arange(len(node))[:, None]
+    is_other = neighbor != own
+    place = np.cumsum(is_other, axis=1) - 1
+    kept = is_other & (place < most) & (distance < radius) & (distance > MINIMUM_LENGTH)
+    first, second = np.broadcast_to(own, neighbor.shape)[kept], neighbor[kept]
+    key = np.minimum(first, second) * len(node) + np.maximum(first, second)
+    order = np.lexsort((place[kept], key))
+    unique, index = np.unique(key[order], return_index=True)
+    springs = np.stack(np.divmod(unique, len(node)), axis=1)
+    length = np.linalg.norm(node[springs[:, 1]] - node[springs[:, 0]], axis=1)
+    return springs, length, place[kept][order][index]
+
+
+def _ranked_holds(control: ndarray, node: ndarray, radius: float, most: int) -> _Ranked:
+    """List which control nodes may hold which object nodes, how far apart and in which order."""
+    if most < 1 or len(node) == 0 or len(control) == 0:
+        return np.zeros((0, 2), dtype=np.int64), np.zeros(0), np.zeros(0, dtype=np.int64)
+    count = min(most, len(node))
+    distance, neighbor = (
+        np.reshape(found, (len(control), count)) for found in KDTree(node).query(control, k=count)
+    )
+    kept = distance < radius
+    control_index = np.broadcast_to(np.arange(len(control))[:, None], neighbor.shape)[kept]
+    rank = np.broadcast_to(np.arange(count), neighbor.shape)[kept]
+    order = np.lexsort((control_index, neighbor[kept]))
+    springs = np.stack([neighbor[kept], len(node) + control_index], axis=1)[order]
+    return springs, distance[kept][order], rank[order]

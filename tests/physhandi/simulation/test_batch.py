@@ -1,0 +1,165 @@
+"""Many candidates at once, against one simulation for each."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from physhandi.errors import UsageError
+from physhandi.simulation.batch import BatchSimulator
+from physhandi.simulation.master import MasterTopology
+from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.simulator import Simulator
+from physhandi.simulation.topology import build_model
+
+BASE = SimulationParameters(damping=2.0, substeps_per_frame=120, ground_height=0.0)
+
+
+def candidates(count, seed=0):
+    """Draw parameters that differ in every scalar and in topology."""
+    rng = np.random.default_rng(seed)
+    return [
+        replace(
+            BASE,
+            connection_radius=rng.uniform(0.011, 0.02),
+            max_neighbors=int(rng.integers(2, 20)),
+            virtual_connection_radius=rng.uniform(0.002, 0.02),
+            virtual_max_neighbors=int(rng.integers(1, 8)),
+            stiffness=rng.uniform(50, 250),
+            virtual_stiffness=rng.uniform(50, 200),
+            stiffness_scale=rng.uniform(0.5, 1.5),
+            damping=rng.uniform(0.5, 3),
+            drag=rng.uniform(0, 9),
+            restitution=rng.uniform(0, 1),
+            friction=rng.uniform(0, 2),
+            gravity=rng.uniform(5, 12),
+            use_control_velocity=bool(rng.integers(2)),
+        )
+        for _ in range(count)
+    ]
+
+
+def scene(side=5, seed=1):
+    """Drop a block of nodes that some controls pull, on the ground."""
+    rng = np.random.default_rng(seed)
+    axis = 0.01 * np.arange(side)
+    node = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    node = (node + rng.normal(0, 4e-4, node.shape) + np.array([0, 0, 0.002])).astype(np.float32)
+    control = node[node[:, 2] > axis[-1]][::4] + np.array([0, 0, 0.004], dtype=np.float32)
+    path = np.linspace(0, 1, 4)[:, None, None] * np.array([0.006, -0.003, 0.004])
+    velocity = rng.normal(0, 0.03, node.shape) + np.array([0.1, 0.0, -0.3])
+    return node, (control + path).astype(np.float32), velocity.astype(np.float32)
+
+
+def alone(parameters, node, control, velocity, device):
+    model = replace(build_model(node, control[0], parameters), initial_velocity=velocity)
+    return Simulator(model, parameters, device=device).rollout(control).position
+
+
+def test_a_candidate_has_the_springs_that_it_would_find_itself():
+    node, control, _ = scene()
+    drawn = candidates(25, seed=3)
+    master = MasterTopology.of(node, control[0], drawn)
+    counts = set()
+    for parameters in drawn:
+        ours, theirs = master.model(parameters), build_model(node, control[0], parameters)
+        assert np.array_equal(ours.spring_nodes, theirs.spring_nodes)
+        np.testing.assert_array_equal(ours.rest_length, theirs.rest_length)
+        np.testing.assert_array_equal(ours.stiffness, theirs.stiffness)
+        counts.add(len(ours.spring_nodes))
+    assert len(counts) > 15
+    assert min(counts) > 0
+
+
+@pytest.mark.parametrize("count", [1, 32, 45])
+def test_each_candidate_moves_as_if_it_were_alone(device, count):
+    node, control, velocity = scene()
+    drawn = candidates(count)
+    master = MasterTopology.of(node, control[0], drawn, initial_velocity=velocity)
+    batch = BatchSimulator(master, drawn, device=device).rollout(control)
+    assert batch.position.shape == (count, 4, len(node), 3)
+    assert np.all(batch.diverged_frame == -1)
+    for candidate in range(0, count, 1 if device == "cpu" and count < 4 else 7):
+        wanted = alone(drawn[candidate], node, control, velocity, device)
+        assert np.abs(wanted[-1] - wanted[0]).max() > 0.003
+        np.testing.assert_allclose(batch.position[candidate], wanted, atol=2e-6)
+    if count > 1:
+        assert np.abs(batch.position[0] - batch.position[1]).max() > 1e-4
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("side", [3, 9, 13])
+def test_sizes_that_fit_shared_memory_in_different_ways(side):
+    _needs_cuda()
+    node, control, velocity = scene(side)
+    drawn = [replace(p, connection_radius=0.03, max_neighbors=60) for p in candidates(3)]
+    master = MasterTopology.of(node, control[0], drawn, initial_velocity=velocity)
+    batch = BatchSimulator(master, drawn, device="cuda:0").rollout(control)
+    for candidate, parameters in enumerate(drawn):
+        wanted = alone(parameters, node, control, velocity, "cuda:0")
+        np.testing.assert_allclose(batch.position[candidate], wanted, atol=5e-6)
+
+
+@pytest.mark.gpu
+def test_a_node_with_more_neighbors_than_fit_is_simulated_too():
+    _needs_cuda()
+    rng = np.random.default_rng(4)
+    node = rng.uniform(0, 0.05, (500, 3)).astype(np.float32)
+    still = np.zeros((3, 0, 3), np.float32)
+    drawn = [
+        replace(BASE, connection_radius=0.2, max_neighbors=499, stiffness=s, damping=0.05)
+        for s in (0.05, 0.2)
+    ]
+    master = MasterTopology.of(node, still[0], drawn)
+    batch = BatchSimulator(master, drawn, device="cuda:0").rollout(still)
+    wanted = alone(drawn[1], node, still, np.zeros_like(node), "cuda:0")
+    assert np.abs(wanted[-1] - wanted[0]).max() > 1e-3
+    np.testing.assert_allclose(batch.position[1], wanted, atol=5e-6)
+
+
+@pytest.mark.gpu
+def test_a_thousand_candidates_at_once():
+    _needs_cuda()
+    node, control, velocity = scene(3)
+    drawn = candidates(1000)
+    master = MasterTopology.of(node, control[0], drawn, initial_velocity=velocity)
+    simulator = BatchSimulator(master, drawn, device="cuda:0")
+    batch = simulator.rollout(control)
+    for candidate in (0, 499, 999):
+        wanted = alone(drawn[candidate], node, control, velocity, "cuda:0")
+        np.testing.assert_allclose(batch.position[candidate], wanted, atol=2e-6)
+    again = simulator.rollout(control)
+    assert np.array_equal(again.position, batch.position)
+
+
+def test_a_candidate_that_diverges_does_not_harm_the_others(device):
+    node, control, velocity = scene()
+    drawn = candidates(5)
+    drawn[2] = replace(drawn[2], stiffness=1e7, connection_radius=0.02, max_neighbors=19)
+    master = MasterTopology.of(node, control[0], drawn, initial_velocity=velocity)
+    batch = BatchSimulator(master, drawn, device=device).rollout(control)
+    assert batch.diverged_frame[2] >= 1
+    assert np.all(np.delete(batch.diverged_frame, 2) == -1)
+    for candidate in (0, 4):
+        wanted = alone(drawn[candidate], node, control, velocity, device)
+        np.testing.assert_allclose(batch.position[candidate], wanted, atol=2e-6)
+
+
+def test_what_must_be_common_and_what_a_batch_cannot_do_are_refused():
+    node, control, _ = scene(3)
+    master = MasterTopology.of(node, control[0], [BASE])
+    with pytest.raises(UsageError, match="at least one"):
+        BatchSimulator(master, [])
+    with pytest.raises(UsageError, match="rest_length_floor"):
+        BatchSimulator(master, [BASE, replace(BASE, rest_length_floor=2e-3)])
+    with pytest.raises(UsageError, match=r"[Ss]elf-collision"):
+        BatchSimulator(master, [replace(BASE, self_collision=True)])
+    with pytest.raises(ValueError, match="control"):
+        BatchSimulator(master, [BASE]).rollout(control[:, :1])
+
+
+def _needs_cuda():
+    import warp as wp
+
+    if not wp.is_cuda_available():
+        pytest.skip("needs a CUDA device")
