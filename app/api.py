@@ -251,6 +251,7 @@ def _export(
     run = catalog.run(run_id)
     if not run.is_published:
         raise RunError(f"Run '{run_id}' is {run.state}: there is nothing to export yet.")
+    run.verify(allows_more=True)
     folder = Path(tempfile.mkdtemp(prefix="physhandi-export-"))
     try:
         name = f"{run_id}_{kind}" if kind == "ply" else f"{run_id}.{kind}"

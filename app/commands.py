@@ -106,6 +106,17 @@ def find_run(name: str, data_dir: Path | None) -> Run:
     return catalog.run(name)
 
 
+def find_result(name: str, data_dir: Path | None) -> Run:
+    """Open a finished run whose files are all as they were published.
+
+    Raises:
+        RunError: If there is no such run, it is not finished, or a file is missing or changed.
+    """
+    run = find_run(name, data_dir)
+    run.verify(allows_more=True)
+    return run
+
+
 def reconstruct(command: Any, progress: Progress) -> dict[str, Any]:
     """Fit sequences into a run folder; an existing unfinished one of the same kind goes on."""
     if not command.sequences:
@@ -121,11 +132,7 @@ def reconstruct(command: Any, progress: Progress) -> dict[str, Any]:
 
 def simulate(command: Any, progress: Progress) -> dict[str, Any]:
     """Simulate a fitted object again into a run folder of its own."""
-    source = find_run(command.run, command.data_dir)
-    if not source.is_published:
-        raise RunError(
-            f"Run '{source.id}' is {source.state}: only a finished run can be simulated."
-        )
+    source = find_result(command.run, command.data_dir)
     device = pick_device(command.device)
     changes = {n: v for n in OVERRIDES if (v := getattr(command, n)) is not None}
     changed_parameters(SimulationParameters(), changes)  # Tells a wrong value before a run is made.
@@ -177,7 +184,7 @@ def summary(run: Run) -> dict[str, Any]:
 
 def evaluate_run(command: Any) -> dict[str, Any]:
     """Measure a run again from its stored motion."""
-    run = find_run(command.run, command.data_dir)
+    run = find_result(command.run, command.data_dir)
     catalog = open_catalog(command.data_dir)
     return pipeline.evaluate(run, catalog.sequences_of(run))
 
@@ -255,7 +262,7 @@ def export(command: Any) -> Path:
     from physhandi.data.exporters import export_run
 
     return export_run(
-        find_run(command.run, command.data_dir),
+        find_result(command.run, command.data_dir),
         command.format,
         command.out,
         sequence=command.sequence,

@@ -164,7 +164,7 @@ def _stage_observation(
 def _problems(
     sequences: Many[Sequence], config: PipelineConfig, attempt: Attempt
 ) -> list[ObjectProblem]:
-    rest_node = np.load(attempt.out / "object/rest_node.npy", allow_pickle=False)
+    rest_node = artefacts.load_array(attempt.out / "object/rest_node.npy")
     problems = []
     for sequence in sequences:
         folder = attempt.out / artefacts.sequence_folder(sequence.name)
@@ -172,9 +172,9 @@ def _problems(
             build_problem(
                 name=sequence.name,
                 observation=artefacts.load_observation(attempt.out, sequence.name),
-                object_node=np.load(folder / "object_node.npy", allow_pickle=False),
+                object_node=artefacts.load_array(folder / "object_node.npy"),
                 rest_node=rest_node,
-                control=np.load(folder / "control.npy", allow_pickle=False),
+                control=artefacts.load_control(attempt.out, sequence.name),
                 frame_count=len(sequence.reconstruction_frames),
                 frame_rate=sequence.frame_rate,
                 ground_height=sequence.ground_height,

@@ -93,8 +93,11 @@ def open_run(catalog: Catalog, run_id: str, sequence_name: str | None = None) ->
 
     Raises:
         MissingInputError: If the run has no result for that sequence yet.
+        RunError: If a published file is missing or damaged; names it.
     """
     run = catalog.run(run_id)
+    if run.is_published:
+        run.verify(allows_more=True)
     name = sequence_name or run.sequence_names[0]
     if name not in run.sequence_names:
         raise UsageError(f"Run '{run.name}' has no sequence '{name}'.")

@@ -3,9 +3,9 @@
 import os
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-from physhandi.data.atomic import write_json
+from physhandi.data.atomic import named_fields, write_json
 from physhandi.data.run_files import (
     ATTEMPTS,
     CHECKPOINTS,
@@ -18,6 +18,7 @@ from physhandi.data.run_files import (
     inside,
     read_json,
 )
+from physhandi.errors import RunError
 
 
 def take_over(previous: Path, folder: Path) -> list[dict[str, Any]]:
@@ -52,7 +53,7 @@ def prune(run_folder: Path, keep: set[int]) -> None:
 
 def _whole_stages(previous: Path) -> list[dict[str, Any]]:
     """Give the leading finished stages whose files are all still what they were."""
-    stages: list[dict[str, Any]] = read_json(previous / STAGES)
+    stages = _listed_stages(previous / STAGES)
     latest: dict[str, Any] = {}
     for stage in stages:
         latest |= stage["files"]
@@ -61,6 +62,23 @@ def _whole_stages(previous: Path) -> list[dict[str, Any]]:
         if find_damage(previous / OUT, files) is not None:
             return stages[:count]
     return stages
+
+
+def _listed_stages(path: Path) -> list[dict[str, Any]]:
+    """Read the list of finished stages; a damaged one proves nothing, so none is finished."""
+    try:
+        content = read_json(path)
+    except RunError:
+        return []
+    entries: list[Any] = cast("list[Any]", content) if isinstance(content, list) else [None]
+    stages = [named_fields(entry) or {} for entry in entries]
+    is_whole = all(
+        isinstance(stage.get("name"), str)
+        and isinstance(stage.get("files"), dict)
+        and isinstance(stage.get("summary"), dict)
+        for stage in stages
+    )
+    return stages if is_whole else []
 
 
 def _link(source: Path, target: Path) -> None:

@@ -6,14 +6,17 @@ import os
 import re
 import secrets
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from safetensors import SafetensorError
+
 from physhandi.data.atomic import named_fields
 from physhandi.data.plain_yaml import parse_yaml
-from physhandi.errors import RunError
+from physhandi.errors import RunError, UsageError, describe
 
 RUN_FORMAT = "physhandi-run/1"
 SAFE_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
@@ -76,8 +79,11 @@ def file_record(path: Path) -> dict[str, Any]:
 
 def find_damage(folder: Path, records: dict[str, Any]) -> str | None:
     """Name the first file that is not what its record says; None if all are whole."""
-    for rel, record in records.items():
+    for rel, entry in records.items():
+        record = named_fields(entry) or {}
         path = inside(folder, rel)
+        if not {"size", "sha256"} <= set(record):
+            return f"{rel} has no size and SHA-256 on record"
         if not path.is_file():
             return f"{rel} is missing"
         if path.stat().st_size != record["size"]:
@@ -85,6 +91,24 @@ def find_damage(folder: Path, records: dict[str, Any]) -> str | None:
         if file_record(path)["sha256"] != record["sha256"]:
             return f"{rel} has changed (its SHA-256 differs)"
     return None
+
+
+@contextmanager
+def reading(path: Path) -> Generator[None]:
+    """Turn whatever a missing or damaged file of a run raises into one error that names it.
+
+    Raises:
+        RunError: If reading fails.
+    """
+    try:
+        yield
+    except FileNotFoundError:
+        raise RunError(f"{path} is missing. Run it again.") from None
+    except (SafetensorError, KeyError, IndexError, TypeError, ValueError, OSError) as error:
+        reason = f"{error} is not in it" if isinstance(error, KeyError) else describe(error)
+        raise RunError(f"{path} is damaged: {reason.rstrip('.')}. Run it again.") from error
+    except UsageError as error:
+        raise RunError(f"{path} is damaged: {error}") from error
 
 
 def read_json(path: Path) -> Any:

@@ -140,8 +140,12 @@ class RunOutputs:
         """Read plain data from JSON."""
         return read_json(self._existing(rel))
 
-    def verify(self) -> None:
+    def verify(self, *, allows_more: bool = False) -> None:
         """Compare all published files with the hashes of their manifest.
+
+        Args:
+            allows_more: Whether files may lie among the results that the manifest does not know,
+                such as a user's notes.
 
         Raises:
             RunError: If nothing is published, or a file is missing, changed or unknown; names it.
@@ -149,12 +153,14 @@ class RunOutputs:
         number = self._published()
         if number is None:
             raise RunError(
-                f"Run '{self.id}' is {self.state}: there is nothing published to verify."
+                f"Run '{self.id}' is {self.state}: there is nothing published to read yet."
             )
         folder = self.folder / ATTEMPTS / str(number)
-        files: dict[str, Any] = read_mapping(folder / MANIFEST).get("files", {})
+        files = named_fields(read_mapping(folder / MANIFEST).get("files"))
+        if files is None:
+            raise RunError(f"{folder / MANIFEST} lists no files; it is damaged. Run it again.")
         damage = find_damage(folder / OUT, files)
-        if damage is None:
+        if damage is None and not allows_more:
             unknown = [rel for rel, _ in artefacts(folder / OUT) if rel not in files]
             damage = f"{unknown[0]} is not in {MANIFEST}" if unknown else None
         if damage is not None:

@@ -7,15 +7,18 @@ docs/formats.md.
 from pathlib import Path
 
 import numpy as np
-import yaml
 from jaxtyping import Float, Int
 from numpy import ndarray
 from safetensors.numpy import load_file
 
+from physhandi.data.atomic import read_array
 from physhandi.data.attempt import Attempt
 from physhandi.data.observation import ObjectObservation
+from physhandi.data.plain_yaml import parse_yaml
 from physhandi.data.run import Run
+from physhandi.data.run_files import reading
 from physhandi.data.sequence import Sequence
+from physhandi.errors import RunError
 from physhandi.hand.model import load_hand_model
 from physhandi.hand.motion import HandMotion
 from physhandi.hand.skin import hand_skin
@@ -73,25 +76,35 @@ def _thinned(cloud: Float[ndarray, "point 3"], most: int) -> Float[ndarray, "kep
     return np.asarray(cloud, np.float32).reshape(-1, 3)[kept]
 
 
+def load_array(path: Path) -> ndarray:
+    """Read an array of a run.
+
+    Raises:
+        RunError: If the file is missing or damaged.
+    """
+    with reading(path):
+        return read_array(path)
+
+
 def load_observation(out: Path, name: str) -> ObjectObservation:
     """Read back what `save_observation` stored."""
     folder = out / sequence_folder(name) / "observation"
 
     def read(file: str) -> ndarray | None:
-        path = folder / file
-        return np.load(path, allow_pickle=False) if path.exists() else None
+        return load_array(folder / file) if (folder / file).exists() else None
 
     cloud, cloud_end = read("cloud.npy"), read("cloud_end.npy")
     clouds: tuple[ndarray, ...] = ()
     if cloud is not None and cloud_end is not None:
         clouds = tuple(np.split(cloud, cloud_end[:-1]))
-    return ObjectObservation(
-        point=np.load(folder / "point.npy", allow_pickle=False),
-        is_visible=np.load(folder / "is_visible.npy", allow_pickle=False),
-        is_motion_valid=np.load(folder / "is_motion_valid.npy", allow_pickle=False),
-        cloud=clouds,
-        node_of_track=read("node_of_track.npy"),
-    )
+    with reading(folder):
+        return ObjectObservation(
+            point=load_array(folder / "point.npy"),
+            is_visible=load_array(folder / "is_visible.npy"),
+            is_motion_valid=load_array(folder / "is_motion_valid.npy"),
+            cloud=clouds,
+            node_of_track=read("node_of_track.npy"),
+        )
 
 
 def lifted_hand_points(
@@ -152,15 +165,35 @@ def load_attachment(out: Path, name: str) -> Float[ndarray, "control 3"]:
     """
     folder = out / sequence_folder(name)
     if (folder / "attachment.npy").exists():
-        return np.load(folder / "attachment.npy", allow_pickle=False)
-    return np.load(folder / "control.npy", mmap_mode="r", allow_pickle=False)[0].copy()
+        return load_array(folder / "attachment.npy")
+    return load_control(out, name)[0].copy()
+
+
+def load_control(out: Path, name: str) -> Float[ndarray, "frame control 3"]:
+    """Read the control nodes of one sequence [m].
+
+    Raises:
+        RunError: If the file is missing or damaged, or a position is not finite.
+    """
+    path = out / sequence_folder(name) / "control.npy"
+    control = load_array(path)
+    wrong = np.argwhere(~np.isfinite(control))
+    if len(wrong):
+        frame, node = wrong[0][:2]
+        raise RunError(f"{path} is not finite at frame {frame}, control {node}. Run it again.")
+    return control
 
 
 def load_motions(out: Path, name: str) -> tuple[HandMotion, ...]:
     """Read the hand motions of one sequence, the right hand first."""
     folder = out / sequence_folder(name)
     paths = [folder / f"hand_{side}.safetensors" for side in ("right", "left")]
-    return tuple(HandMotion.from_tensors(load_file(path)) for path in paths if path.exists())
+    motions = []
+    for path in paths:
+        if path.exists():
+            with reading(path):
+                motions.append(HandMotion.from_tensors(load_file(path)))
+    return tuple(motions)
 
 
 def save_object(
@@ -186,13 +219,17 @@ def save_object(
 
 def load_parameters(out: Path) -> SimulationParameters:
     """Read the global parameters of a run."""
-    text = (out / "object/parameters.yaml").read_text(encoding="utf-8")
-    return SimulationParameters.from_dict(yaml.safe_load(text))
+    path = out / "object/parameters.yaml"
+    with reading(path):
+        content = parse_yaml(path.read_text(encoding="utf-8"))
+        return SimulationParameters.from_dict(dict(content))
 
 
 def load_rest_node(out: Path) -> Float[ndarray, "node 3"]:
     """Read the rest shape of a run's object [m]."""
-    return load_file(out / "object/material.safetensors")["rest_node"]
+    path = out / "object/material.safetensors"
+    with reading(path):
+        return load_file(path)["rest_node"]
 
 
 def save_model(output: Attempt, name: str, model: SpringMassModel) -> None:
@@ -203,9 +240,9 @@ def save_model(output: Attempt, name: str, model: SpringMassModel) -> None:
 
 def load_model(out: Path, name: str) -> SpringMassModel:
     """Read the springs of one sequence."""
-    return SpringMassModel.from_tensors(
-        load_file(out / sequence_folder(name) / "model.safetensors")
-    )
+    path = out / sequence_folder(name) / "model.safetensors"
+    with reading(path):
+        return SpringMassModel.from_tensors(load_file(path))
 
 
 def save_hand_observation(

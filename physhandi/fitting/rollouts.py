@@ -170,7 +170,7 @@ def simulate_sequence(
         gravity=sequence.gravity,
     )
     folder = artefacts.sequence_folder(sequence.name)
-    control = np.load(output.out / folder / "control.npy", allow_pickle=False)
+    control = artefacts.load_control(output.out, sequence.name)
     positions = []
     for frame, position, _ in Simulator(model, parameters, device=device).frames(control):
         progress.check_cancelled()

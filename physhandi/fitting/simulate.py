@@ -51,10 +51,11 @@ def simulate_again(
         device: Warp device.
 
     Raises:
-        RunError: If the run holds no fitted object.
+        RunError: If the run is not finished, is damaged, or holds no fitted object.
         UsageError: If a parameter is unknown or out of bounds, or leaves no spring.
         SimulationDivergedError: If the motion runs away.
     """
+    source.verify(allows_more=True)
     if not (source.out / "object/material.safetensors").is_file():
         raise RunError(
             f"Run '{source.id}' holds no fitted object, so there is nothing to simulate."
@@ -119,7 +120,7 @@ def _copy_known(source: Run, name: str, output: Attempt) -> np.ndarray:
     artefacts.save_observation(output, name, artefacts.load_observation(source.out, name))
     artefacts.save_motions(output, name, artefacts.load_motions(source.out, name))
     artefacts.copy_hand_vertices(source, name, output)
-    return np.load(source.out / artefacts.sequence_folder(name) / "control.npy", allow_pickle=False)
+    return artefacts.load_control(source.out, name)
 
 
 def _prepare(

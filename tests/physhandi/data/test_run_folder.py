@@ -46,7 +46,7 @@ def test_unusable_folders_are_refused_by_name(tmp_path: Path) -> None:
         make_run(tmp_path / "fit")
     with pytest.raises(RunError, match="has no outputs yet"):
         _ = run.out
-    with pytest.raises(RunError, match="nothing published"):
+    with pytest.raises(RunError, match="nothing published to read yet"):
         run.verify()
     fill(run)
     with pytest.raises(RunError, match=r"has no video\.mp4"):
