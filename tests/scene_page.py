@@ -41,7 +41,7 @@ class ScenePage:
 
     def field(self, label: str) -> Locator:
         """The number beside a slider."""
-        row = self.panel.locator("label", has_text=re.compile(f"^{re.escape(label)}$"))
+        row = self.panel.locator("label", has_text=re.compile(f"^(● )?{re.escape(label)}$"))
         row = row.locator("xpath=ancestor::div[contains(@class, 'mantine-Flex-root')][1]")
         return row.locator("input.mantine-NumberInput-input")
 

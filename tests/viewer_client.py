@@ -52,8 +52,15 @@ class ViewerClient:
         self.send("GuiUpdateMessage", uuid=self.find(label), updates={"value": value})
 
     def find(self, label: str) -> str:
-        labels = ((uuid, props.get("label")) for uuid, props in self.gui.items())
+        # A slider that is not as fitted has a dot before its name.
+        labels = (
+            (uuid, str(props.get("label")).removeprefix("● ")) for uuid, props in self.gui.items()
+        )
         return next((uuid for uuid, known in labels if known == label), "")
+
+    def value(self, label: str) -> Any:
+        """The value of a slider, box or choice."""
+        return self.gui[self.find(label)]["value"]
 
     def texts(self) -> str:
         """All Markdown of the panel."""
@@ -117,8 +124,9 @@ class ViewerClient:
 
 def _fill_in(value: Any, buffers: list[Any]) -> None:
     """Put the arrays of a message in the place of the references to them."""
-    for key, inner in value.items() if isinstance(value, dict) else ():
+    entries = value.items() if isinstance(value, dict) else enumerate(value)
+    for key, inner in list(entries):
         if isinstance(inner, dict) and "__binary_index" in inner:
             value[key] = np.frombuffer(buffers[inner["__binary_index"]], inner["dtype"])
-        else:
+        elif isinstance(inner, dict | list):
             _fill_in(inner, buffers)

@@ -32,6 +32,15 @@ class Eye:
         R_world_camera = viser.transforms.SO3(np.asarray(wxyz, dtype=np.float64)).as_matrix()
         return cls(right=R_world_camera[:, 0], up=-R_world_camera[:, 1])
 
+    @classmethod
+    def at(cls, pose: Pose) -> "Eye":
+        """Find the orientation of a camera that looks at a point."""
+        ahead = pose.look_at - pose.position
+        right = np.cross(ahead, pose.up)
+        right = right / max(float(np.linalg.norm(right)), 1e-12)
+        up = np.cross(right, ahead)
+        return cls(right=right, up=up / max(float(np.linalg.norm(up)), 1e-12))
+
     @property
     def ahead(self) -> Float[ndarray, " 3"]:
         """Into the picture."""
@@ -51,6 +60,7 @@ class FigureCameras:
     def aim(
         self,
         client: viser.ClientHandle,
+        pose: Pose,
         box: Box,
     ) -> None:
         """Move a camera back along its view until the figure fits beside the panel.
@@ -59,11 +69,12 @@ class FigureCameras:
 
         Args:
             client: Whose camera.
+            pose: Where it stands, or is about to stand if the client has just come.
             box: The figure.
         """
         camera = client.camera
-        self._poses.setdefault(client.client_id, Pose.of(camera))
-        eye = Eye.of(camera.wxyz)
+        self._poses.setdefault(client.client_id, pose)
+        eye = Eye.at(pose)
         width, height = max(camera.image_width, 1), max(camera.image_height, 1)
         hidden = _covered(width)
         slope = float(np.tan(_FOV / 2))
@@ -71,7 +82,7 @@ class FigureCameras:
         distance = max(high / 2, wide / 2 * height / (width - hidden)) / slope
         aside = 0.5 * hidden * (2 * slope * distance / height) * eye.right
         with client.atomic():
-            camera.fov = _FOV
+            camera.up_direction, camera.fov = pose.up, _FOV
             camera.position = center + aside - distance * eye.ahead
             camera.look_at = center + aside
 

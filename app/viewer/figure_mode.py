@@ -152,7 +152,7 @@ class FigureMode:
         """Show the figure whole to a client that comes while it is on."""
         with self._lock:
             if self._is_on:
-                self._aim(client)
+                self._aim(client, Pose.first(self._server.initial_camera))
 
     def picture(self, client: viser.ClientHandle) -> dict[str, Any]:
         """Find camera and size of a picture of the figure, as arguments of ``get_render``."""
@@ -198,7 +198,7 @@ class FigureMode:
         self._tell()
         self._text.visible = True
         for client in self._server.get_clients().values():
-            self._aim(client)
+            self._aim(client, Pose.of(client.camera))
 
     def _leave(self) -> None:
         self._is_on = False
@@ -206,12 +206,12 @@ class FigureMode:
         self._text.visible = False
         self._cameras.restore(self._server)
 
-    def _aim(self, client: viser.ClientHandle) -> None:
+    def _aim(self, client: viser.ClientHandle, pose: Pose) -> None:
         """Show the whole figure to a client."""
         figure = self._figure
         if figure is not None:
-            eye = Eye.of(client.camera.wxyz)
-            self._cameras.aim(client, figure.box(eye))
+            eye = Eye.at(pose)
+            self._cameras.aim(client, pose, figure.box(eye))
             figure.turn(eye)
 
     def _hear(self, kind: str, _: int) -> None:

@@ -69,33 +69,42 @@ def create_gate(sessions: Sessions) -> APIRouter:
         if found is None:
             await _refuse(websocket, 404, _GONE)
             return
-        offered = [p for p in websocket.scope["subprotocols"] if p.startswith(_PROTOCOL)]
-        if not offered:
-            await _refuse(websocket, 400, "A viser client must name its version.")
-            return
+        watching[session] += 1
         try:
-            upstream = await connect(
-                f"ws://127.0.0.1:{found.port}",
-                subprotocols=[Subprotocol(protocol) for protocol in offered],
-                compression=None,
-                max_size=None,
-                proxy=None,
-            )
-        except (OSError, websockets.InvalidHandshake) as error:
-            logger.info("the viewer of session did not answer: %s", error)
-            await _refuse(websocket, 502, "The viewer of this session does not answer.")
-            return
-        async with upstream:
-            await websocket.accept(subprotocol=upstream.subprotocol)
-            watching[session] += 1
-            try:
-                await _exchange(websocket, upstream)
-            finally:
-                watching[session] -= 1
-                if watching[session] <= 0:
-                    del watching[session]
+            await _connect(websocket, found.port)
+        finally:
+            watching[session] -= 1
+            if watching[session] <= 0:
+                del watching[session]
 
     return router
+
+
+async def _connect(websocket: WebSocket, port: int) -> None:
+    """Join a client and its session's viser server until one of them is gone."""
+    offered = [p for p in websocket.scope["subprotocols"] if p.startswith(_PROTOCOL)]
+    if not offered:
+        await _refuse(websocket, 400, "A viser client must name its version.")
+        return
+    try:
+        upstream = await connect(
+            f"ws://127.0.0.1:{port}",
+            subprotocols=[Subprotocol(protocol) for protocol in offered],
+            compression=None,
+            max_size=None,
+            proxy=None,
+        )
+    except (OSError, websockets.InvalidHandshake) as error:
+        logger.info("the viewer of session did not answer: %s", error)
+        await _refuse(websocket, 502, "The viewer of this session does not answer.")
+        return
+    async with upstream:
+        try:
+            await websocket.accept(subprotocol=upstream.subprotocol)
+        except (OSError, RuntimeError, WebSocketDisconnect):
+            logger.debug("the client was gone before it came in")
+            return
+        await _exchange(websocket, upstream)
 
 
 async def _is_taken(watching: Counter[str], session: str) -> bool:

@@ -1,16 +1,16 @@
 """The object of one session: its rollouts, the sliders that change them, and what is heard."""
 
-from pathlib import Path
-
 import viser
 
 from app.viewer.content import Content
+from app.viewer.error_panel import ErrorPanel, load_track_error
 from app.viewer.guard import Guard, notify
 from app.viewer.live import LiveSimulation
 from app.viewer.physics_panel import PhysicsPanel
 from app.viewer.playback import Playback
 from app.viewer.resimulation import Resimulation
 from app.viewer.take import Take
+from physhandi.data.run import Run
 from physhandi.simulation.model import SimulationParameters
 
 
@@ -27,7 +27,7 @@ class ObjectSession:
         live: LiveSimulation,
         content: Content,
         fitted: Take,
-        run: Path,
+        run: Run,
     ) -> None:
         """Listen to the live simulation and add the physics panel where the caller stands.
 
@@ -39,7 +39,7 @@ class ObjectSession:
             live: The process that simulates.
             content: What is shown.
             fitted: The fitted rollout.
-            run: Run folder.
+            run: The run.
         """
         self._server = server
         self._playback = playback
@@ -49,11 +49,13 @@ class ObjectSession:
             session,
             live,
             fitted,
-            run=run,
+            run=run.folder,
             sequence=content.sequence_name,
             on_change=self._hear,
         )
         self._panel = PhysicsPanel(server, content, fitted, guard, self._simulate)
+        error = load_track_error(run, content.sequence_name, fitted.frame_count)
+        self._errors = ErrorPanel(server, content, fitted, error)
         self._panel.show(self._resimulation.readout, at_once=True)
 
     @property
@@ -65,6 +67,10 @@ class ObjectSession:
         """Find the rollout to show in a frame, and which of its frames."""
         return self._resimulation.at(frame)
 
+    def show(self, frame: int, *, is_playing: bool) -> None:
+        """Tell the panel which frame is on the screen."""
+        self._errors.show(frame, is_playing=is_playing)
+
     def close(self) -> None:
         """Stop simulating."""
         self._resimulation.close()
@@ -74,6 +80,7 @@ class ObjectSession:
         self.close()
         if self._panel is not None:
             self._panel.remove()
+            self._errors.remove()
             self._panel = None
 
     def _simulate(self, parameters: SimulationParameters, automatic_substeps: bool) -> None:
@@ -92,6 +99,7 @@ class ObjectSession:
             return
         readout = self._resimulation.readout
         panel.show(readout, at_once=kind != "frame")
+        self._errors.follow(self._resimulation.newest, at_once=kind != "frame")
         if kind == "frame":
             self._follow(ready)
             return

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 from physhandi.simulation.model import SimulationParameters
 
+_DIGITS = 3
+
 
 @dataclass(frozen=True, kw_only=True)
 class Knob:
@@ -30,12 +32,15 @@ class Knob:
     """Whether the slider shows the decimal logarithm."""
 
     def to_slider(self, parameters: SimulationParameters) -> float:
-        """Find the slider value of a parameter, moved into the slider's range."""
+        """Find the slider value of a parameter, moved into the slider's range.
+
+        Rounded to what a person reads; a slider that nobody moves leaves the parameter as it is.
+        """
         value = float(getattr(parameters, self.field)) * self.scale
         if self.is_logarithm:
             value = math.log10(max(value, 1e-12))
         value = min(max(value, self.low), self.high)
-        return round(value) if self.is_integer else round(value, 6)
+        return round(value) if self.is_integer else float(f"{value:.{_DIGITS}g}")
 
     def from_slider(self, value: float) -> float:
         """Find the parameter of a slider value; values outside the range are moved into it."""

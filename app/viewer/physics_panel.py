@@ -25,6 +25,7 @@ from physhandi.simulation.model import SimulationParameters
 _FIRST_KNOBS = 5
 _REFRESH = 0.2
 _UNDO, _REDO, _RESET = "Undo", "Redo", "Reset"
+_CHANGED = "● "
 _AS_FITTED, _AUTOMATIC = "as fitted", "automatic"
 
 
@@ -91,8 +92,7 @@ class PhysicsPanel:
         """Simulate what another session of the same object simulates."""
         self._substeps.value = _AUTOMATIC if is_automatic else _AS_FITTED
         self.history.replace(parameters)
-        for knob in self._knobs:
-            self._sliders[knob.field].value = knob.to_slider(parameters)
+        self._show_parameters()
         if is_automatic or parameters != self.history.start:
             self._run()
 
@@ -148,6 +148,7 @@ class PhysicsPanel:
             slider = gui.add_slider(
                 knob.label, knob.low, knob.high, knob.step, start, hint=knob.hint
             )
+            slider.precision = min(slider.precision + 1, 7)  # Typed values may be finer.
         slider.on_update(guard.by_user(lambda _, knob=knob: self._move(knob)))
         self._sliders[knob.field] = slider
 
@@ -161,12 +162,26 @@ class PhysicsPanel:
         before = self.history.current
         act = {_UNDO: self.history.undo, _REDO: self.history.redo, _RESET: self.history.reset}
         now = act[event.target.value]()
-        for knob in self._knobs:
-            self._sliders[knob.field].value = knob.to_slider(now)
+        self._show_parameters()
         if now != before or event.target.value == _RESET:
             self._run()
 
+    def _show_parameters(self) -> None:
+        for knob in self._knobs:
+            self._sliders[knob.field].value = knob.to_slider(self.history.current)
+
+    def _mark_changed(self) -> None:
+        """Put a dot before the name of every slider that is not as fitted."""
+        start, now = self.history.start, self.history.current
+        for knob in self._knobs:
+            is_changed = getattr(start, knob.field) != getattr(now, knob.field)
+            label = f"{_CHANGED}{knob.label}" if is_changed else knob.label
+            slider = self._sliders[knob.field]
+            if slider.label != label:
+                slider.label = label
+
     def _run(self) -> None:
+        self._mark_changed()
         changes = what_changed(self._knobs, self.history.start, self.history.current)
         self._changes.content = f"Changed: {changes}"
         self._simulate(self.history.current, self._substeps.value == _AUTOMATIC)

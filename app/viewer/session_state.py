@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 import viser
 from jaxtyping import Float
 from numpy import ndarray
@@ -57,6 +58,12 @@ class Pose:
             up=camera.up_direction.copy(),
             fov=camera.fov,
         )
+
+    @classmethod
+    def first(cls, camera: viser.InitialCameraConfig) -> "Pose":
+        """Read where the cameras of new clients are put."""
+        up = np.array([0.0, 0.0, 1.0]) if camera.up is None else camera.up
+        return cls(position=camera.position, look_at=camera.look_at, up=up, fov=camera.fov)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -164,8 +164,8 @@ class Session:
         framing = frame_content(content)
         self._scene = Scene(self._server, content, framing)
         self._layers.replace(content, self._scene.layers, framing)
-        run = self._catalog.run(self.target).folder if self.kind == "run" else None
-        self._figure.offer(content, framing, run)
+        run = self._catalog.run(self.target) if self.kind == "run" else None
+        self._figure.offer(content, framing, run.folder if run is not None else None)
         if content.fitted is None or run is None:
             return
         with self._physics_place:
@@ -235,6 +235,8 @@ class Session:
             else:
                 self._scene.draw(frame, take, take_frame, is_playing=is_playing)
             self._timeline.show(frame, is_playing=is_playing)
+            if self._object is not None:
+                self._object.show(frame, is_playing=is_playing)
 
     def _take(self, frame: int) -> tuple[Take | None, int]:
         """Find the rollout to show in a frame, and which of its frames."""

@@ -78,6 +78,11 @@ class Take:
             _difference(self.control, frame, rate),
         )
 
+    def frame_distance(self, other: "Take", frame: int) -> float:
+        """Measure how far the nodes of a frame are from another rollout's, on average [m]."""
+        offset = np.asarray(self.position[frame]) - np.asarray(other.position[frame])
+        return float(np.linalg.norm(offset, axis=-1).mean())
+
     def mean_distance(self, other: "Take") -> float:
         """Measure how far the ready frames are from another rollout, averaged over nodes [m]."""
         count = min(self.ready, other.ready)

@@ -132,6 +132,8 @@ def test_the_halves_stay_left_and_right_as_the_camera_turns(sessions) -> None:
     with watch(sessions) as client:
         enter(client)
         # The camera looks along z with the world's x to its right.
+        client.tell_camera(wxyz=(1.0, 0.0, 0.0, 0.0))
+        client.until(lambda: abs(client.positions["/figure/phystwin"][1]) < 1e-9)
         left, right = (np.array(client.positions[f"/figure/{side}"]) for side in SIDES)
         assert right[0] > 0.05
         np.testing.assert_allclose(left, -right, atol=1e-6)

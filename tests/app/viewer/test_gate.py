@@ -171,10 +171,9 @@ def test_a_second_tab_gets_a_copy_with_the_same_state(address, sessions) -> None
             second.until(lambda: {"/object/nodes", "/forces"} <= set(second.nodes))
             wanted = [m for m in second.messages if m["type"] == "SetCameraPositionMessage"]
             assert wanted[-1]["position"] == pytest.approx((0.3, 0.2, 0.1))
-            labels = {p.get("label"): p["value"] for p in reversed(second.gui.values())}
-            assert labels["Sequence"] == "drag"
-            assert (labels["Frame"], labels["Speed"], labels["stiffness 10^"]) == (7, 0.5, -1.0)
-            assert (labels["Virtual springs"], labels["Background"]) == (False, "dark")
+            names = ("Sequence", "Frame", "Speed", "stiffness 10^", "Virtual springs", "Background")
+            shown = [second.value(name) for name in names]
+            assert shown == ["drag", 7, 0.5, -1.0, False, "dark"]
             assert "/springs/virtual" not in second.nodes
             other = second.array("/object/nodes", "points")
             client.until(lambda: np.array_equal(client.array("/object/nodes", "points"), other))

@@ -1,0 +1,156 @@
+import math
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from viewer_client import ViewerClient
+from viewer_world import (
+    FRAMES,
+    PARAMETERS,
+    FakeSettings,
+    FolderCatalog,
+    content_of,
+    controls,
+    make_run,
+)
+
+from app.viewer.error_panel import ErrorPanel, load_track_error
+from app.viewer.session import Sessions
+from app.viewer.take import Take
+from physhandi.data.run import Run
+
+ERRORS = [None, *[0.001 * frame for frame in range(1, FRAMES)]]
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A run that knows the error of every frame but the first."""
+    errors = {"unit": "m", "frames": list(range(FRAMES)), "rollout": {"track_error": ERRORS}}
+    run = make_run(tmp_path_factory.mktemp("measured") / "runs" / "sheet")
+    with run.begin_attempt() as attempt:
+        for name in run.sequence_names:
+            at = f"sequences/{name}"
+            for array in ("rollout", "control"):
+                attempt.save_array(f"{at}/{array}.npy", run.array(f"{at}/{array}.npy"))
+            attempt.save_tensors(f"{at}/model.safetensors", run.tensors(f"{at}/model.safetensors"))
+            attempt.save_yaml(f"{at}/meta.yaml", run.yaml(f"{at}/meta.yaml"))
+            attempt.save_json(f"{at}/frame_errors.json", errors)
+        attempt.save_yaml("object/parameters.yaml", PARAMETERS.to_dict())
+        attempt.publish()
+    return Run.open(run.folder)
+
+
+@pytest.fixture
+def content():
+    return content_of({}, controls((0.0, 0.0, 1.0)))
+
+
+def rollout(content, ready: int) -> Take:
+    """A rollout whose nodes are 2 mm a frame to the side of the fitted one."""
+    fitted = content.fitted
+    take = Take.empty(fitted.model, fitted.parameters, fitted.control)
+    take.position[:] = fitted.position
+    take.position[..., 0] += 0.002 * np.arange(FRAMES)[:, None]
+    take.ready = ready
+    return take
+
+
+def shown(client: ViewerClient) -> str:
+    texts = (str(p.get("content", "")) for p in client.gui.values())
+    return next((text for text in texts if "from the" in text), "")
+
+
+def curves(client: ViewerClient) -> list[np.ndarray]:
+    return next(p["data"] for p in client.gui.values() if "series" in p)
+
+
+@pytest.fixture
+def panel(server_client, content) -> Iterator[tuple[ErrorPanel, ViewerClient]]:
+    server, client = server_client
+    error = np.array([math.nan if e is None else e for e in ERRORS])
+    panel = ErrorPanel(server, content, content.fitted, error)
+    client.until(lambda: any("series" in p for p in client.gui.values()))
+    yield panel, client
+    panel.remove()
+
+
+def test_errors_are_read_in_their_frames(measured, run) -> None:
+    error = load_track_error(measured, "lift", FRAMES + 2)
+    assert np.isnan(error[[0, FRAMES, FRAMES + 1]]).all()
+    np.testing.assert_allclose(error[1:FRAMES], ERRORS[1:])
+    assert load_track_error(run, "lift", FRAMES) is None
+
+
+def test_the_fit_and_the_re_simulation_are_told_for_the_current_frame(panel, content) -> None:
+    panel, client = panel
+    panel.show(7, is_playing=False)
+    client.until(lambda: "fit 7 mm from the tracks" in shown(client))
+    assert "re-simulated" not in shown(client)
+    panel.follow(rollout(content, FRAMES), at_once=True)
+    client.until(lambda: "re-simulated 14 mm from the fit" in shown(client))
+    frames, track, again, now = curves(client)
+    np.testing.assert_array_equal(frames, np.arange(1, FRAMES))
+    np.testing.assert_allclose(track, np.arange(1, FRAMES))
+    np.testing.assert_allclose(again, 2.0 * np.arange(1, FRAMES), atol=1e-4)
+    assert now.nonzero()[0].tolist() == [6]
+    assert now[6] == pytest.approx(14, abs=1e-4)
+    panel.follow(content.fitted, at_once=True)
+    client.until(lambda: "re-simulated" not in shown(client))
+
+
+def test_the_plot_grows_with_the_simulation_and_not_more_often_than_it_is_read(
+    panel, content
+) -> None:
+    panel, client = panel
+    take = rollout(content, 5)
+    panel.show(3, is_playing=False)
+    panel.follow(take, at_once=True)
+    client.until(lambda: len(curves(client)[0]) == 4)
+    before = len(client.messages)
+    end = time.monotonic() + 0.2
+    while time.monotonic() < end:
+        take.ready = min(take.ready + 1, FRAMES)
+        panel.follow(take, at_once=False)
+    with pytest.raises(AssertionError, match="did not come true"):
+        client.until(lambda: False, seconds=0.2)
+    assert len(client.messages) - before <= 2
+    panel.follow(take, at_once=True)
+    client.until(lambda: len(curves(client)[0]) == FRAMES - 1)
+    assert panel.errors == pytest.approx((0.003, 0.006), abs=1e-7)
+
+
+def test_a_session_follows_frames_and_sliders(measured) -> None:
+    sessions = Sessions(FakeSettings(), FolderCatalog(measured.folder.parents[1]))
+    try:
+        session = sessions.get(sessions.open("run", "sheet", "me"))
+        with ViewerClient(f"ws://127.0.0.1:{session.port}") as client:
+            client.until(lambda: "object springs" in client.texts())
+            client.set("Frame", 9)
+            client.until(lambda: "fit 9 mm from the tracks" in shown(client))
+            client.set("stiffness 10^", -1.0)
+            client.until(lambda: "re-simulated" in shown(client))
+            client.until(lambda: f"simulated {FRAMES}/{FRAMES}" in client.texts())
+            take, _ = session._object.at(0)
+            offset = take.position - measured.array("sequences/lift/rollout.npy")
+            expected = 1e3 * np.linalg.norm(offset[9].astype(np.float64), axis=1).mean()
+            assert expected > 0.1
+            client.until(lambda: f"re-simulated {expected:.3g} mm" in shown(client))
+            client.set("History", "Reset")
+            client.until(lambda: "re-simulated" not in shown(client))
+    finally:
+        sessions.shutdown()
+
+
+def test_a_slider_that_is_not_as_fitted_has_a_dot(sessions) -> None:
+    session = sessions.get(sessions.open("run", "sheet", "me"))
+    with ViewerClient(f"ws://127.0.0.1:{session.port}") as client:
+        client.until(lambda: "object springs" in client.texts())
+        labels = lambda: {str(p.get("label")) for p in client.gui.values()}  # noqa: E731
+        assert "drag [1/s]" in labels()
+        client.set("drag [1/s]", 9.0)
+        client.until(lambda: "● drag [1/s]" in labels())
+        assert "drag [1/s]" not in labels()
+        assert sum(label.startswith("● ") for label in labels()) == 1
+        client.set("History", "Undo")
+        client.until(lambda: "drag [1/s]" in labels())
