@@ -196,23 +196,81 @@ class Export:
 
 @dataclass(frozen=True, kw_only=True)
 class BenchmarkRollout:
-    """Time forward simulation against a plain baseline in the same run."""
+    """Time simulated frames, beside a simulator built as PhysTwin's is."""
 
     device: str = "auto"
-    """Warp device: auto, cpu or cuda:0."""
-    nodes: int = 400
-    """Object nodes of the made-up object."""
-    frames: int = 3
-    """Frames to time."""
-    model: Path | None = None
-    """A PhysTwin-format .npz topology to time instead."""
+    """Warp device: auto, cpu, cuda or cuda:0."""
+    nodes: int = 1000
+    """Object nodes of a made-up block."""
+    topology: Path | None = None
+    """An .npz with position, spring_nodes, rest_length and stiffness to measure instead."""
+    frames: int = 10
+    """Frames of a rollout."""
     json: bool = False
     """Print JSON instead of lines."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BenchmarkGradient(BenchmarkRollout):
-    """Time forward simulation and its gradient against a plain baseline in the same run."""
+    """Time simulated frames and their gradient, beside PhysTwin's way."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchmarkBatch(BenchmarkRollout):
+    """Time many candidates at once, beside one by one."""
+
+    candidates: int = 64
+    """Candidates of the batch."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchmarkScaling:
+    """Time blocks of many sizes, and fit how the time grows."""
+
+    device: str = "auto"
+    """Warp device: auto, cpu, cuda or cuda:0."""
+    nodes: tuple[int, ...] = (500, 1000, 3000, 10_000, 50_000)
+    """Object nodes of the blocks."""
+    springs_at_node: tuple[int, ...] = (9, 18, 57)
+    """Springs that end at a node on average."""
+    frames: int = 3
+    """Frames of a rollout."""
+    time_limit_s: float = 300.0
+    """Blocks that would take longer than this in all are left out [s]."""
+    json: bool = False
+    """Print JSON instead of lines."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchmarkSubsteps:
+    """Compare a run's motion with automatic substeps with that of the reference's 667."""
+
+    run: Positional[str] = "towel_fold_quick"
+    """Folder or id of a finished run."""
+    sequence: str | None = None
+    """One of its sequences; none takes the first one."""
+    substeps: tuple[int, ...] = ()
+    """More numbers of substeps to compare."""
+    device: str = "auto"
+    """Warp device: auto, cpu, cuda or cuda:0."""
+    json: bool = False
+    """Print JSON instead of lines."""
+    data_dir: DataDir = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchmarkLive:
+    """Time from a slider to the first new frame, in the viewer's simulation process."""
+
+    run: Positional[str] = "towel_fold_quick"
+    """Folder or id of a finished run."""
+    sequence: str | None = None
+    """One of its sequences; none takes the first one."""
+    device: str = "auto"
+    """Warp device: auto, cpu, cuda or cuda:0."""
+    json: bool = False
+    """Print JSON instead of lines."""
+    data_dir: DataDir = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,6 +280,10 @@ class Benchmark:
     what: (
         Annotated[BenchmarkRollout, subcommand("rollout", prefix_name=False)]
         | Annotated[BenchmarkGradient, subcommand("gradient", prefix_name=False)]
+        | Annotated[BenchmarkBatch, subcommand("batch", prefix_name=False)]
+        | Annotated[BenchmarkScaling, subcommand("scaling", prefix_name=False)]
+        | Annotated[BenchmarkSubsteps, subcommand("substeps", prefix_name=False)]
+        | Annotated[BenchmarkLive, subcommand("live", prefix_name=False)]
     )
     """What to measure."""
 

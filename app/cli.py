@@ -12,7 +12,6 @@ import tyro
 from app import commands, doctor
 from app.arguments import (
     Benchmark,
-    BenchmarkGradient,
     Command,
     Evaluate,
     EvaluateHands,
@@ -92,9 +91,7 @@ def _dispatch(command: Any) -> int:
         case Export():
             print(commands.export(command))
         case Benchmark(what=what):
-            with_gradient = isinstance(what, BenchmarkGradient)
-            result = commands.benchmark_rollout(what, with_gradient=with_gradient)
-            _show(result, as_json=what.json)
+            _show(commands.benchmark(what), as_json=what.json)
         case _:
             healthy, lines = doctor.examine(command.data_dir)
             print("\n".join(lines))

@@ -1,197 +1,83 @@
 """How long a simulated frame takes, beside a simulator built as PhysTwin's is, in one run."""
 
-import math
-import time
-from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
-from statistics import median
 from typing import Any
 
-import numpy as np
-import torch
 import warp as wp
 
 from physhandi.benchmarks.phystwin_like import PhysTwinLike
-from physhandi.errors import UsageError
-from physhandi.simulation import differentiable
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.benchmarks.scenes import SUBSTEPS, Scene, scene_of
+from physhandi.benchmarks.timing import (
+    describe_difference,
+    describe_scene,
+    describe_times,
+    describe_traffic,
+    time_in_turns,
+)
 from physhandi.simulation.simulator import Simulator
-from physhandi.simulation.stability import stable_substeps
-from physhandi.simulation.topology import build_model
 
-_SPACING = 0.01
-_STIFFNESS = 1e3
+FORWARD_COST = (20, 48, 24)
+"""Bytes of a substep. Spring: two ends, rest length, stiffness, damping. Object node: position
+and velocity in and out. Control node: where the frame starts and ends."""
+_ROUNDS = 3
 
 
 def benchmark_rollout(
     *,
     device: str = "cpu",
     node_count: int = 1000,
-    frame_count: int = 5,
-    substeps_per_frame: int = 667,
-    model_path: str | Path | None = None,
-    includes_backward: bool = True,
+    frame_count: int = 10,
+    substeps_per_frame: int = SUBSTEPS,
+    topology: str | Path | None = None,
 ) -> dict[str, Any]:
-    """Time forward and forward-and-backward frames of a synthetic block and of a given object.
+    """Time rollouts of ours and of the baseline in turns; the median counts.
+
+    Ours includes what a rollout cannot do without: the check for divergence after each frame.
+    Captures and compilation come before.
 
     Args:
         device: Warp device, for example ``"cuda:0"``.
-        node_count: Object nodes of the synthetic block, about 18 springs each; the nearest
-            cube that has at least as many is taken.
-        frame_count: Timed frames; the median counts.
+        node_count: Object nodes of the made-up block, with 18 springs at each.
+        frame_count: Frames of a rollout.
         substeps_per_frame: Integration steps in a frame.
-        model_path: An `.npz` with `position`, `spring_nodes`, `rest_length` and `stiffness`,
-            measured in addition.
-        includes_backward: Whether to time gradients too.
+        topology: An `.npz` with `position`, `spring_nodes`, `rest_length` and `stiffness` to
+            measure instead.
 
     Returns:
-        Milliseconds a frame of both simulators and their ratios (above 1: ours is faster),
-        with Warp's version and the device's name, ready for JSON.
+        Times, the difference of the two motions and the memory traffic, ready for JSON.
 
     Raises:
         UsageError: If a number is not positive or the file is missing or incomplete.
     """
-    if min(node_count, frame_count, substeps_per_frame) < 1:
-        raise UsageError("Nodes, frames and substeps of a benchmark must be positive.")
-    parameters = SimulationParameters(
-        connection_radius=1.8 * _SPACING,
-        max_neighbors=18,
-        stiffness=_STIFFNESS,
-        virtual_stiffness=_STIFFNESS,
-        damping=10.0,
-        use_control_velocity=False,
-        substeps_per_frame=substeps_per_frame,
-    )
-    scenes = {"synthetic": _synthetic_block(node_count, parameters)}
-    if model_path is not None:
-        scenes[Path(model_path).stem] = _recorded_object(Path(model_path), parameters)
-    measured = {
-        name: _measure(model, control, parameters, device, frame_count, includes_backward)
-        for name, (model, control) in scenes.items()
-    }
+    wp.init()
+    scene = scene_of(topology, node_count, frame_count, substeps_per_frame)
+    about = describe_scene(scene, device)
+    measured = measure_rollout(scene, device, rounds=_ROUNDS)
+    seconds = 1e-3 * measured["ms_per_frame"]
     return {
         "benchmark": "rollout",
-        "device": device,
-        "device_name": wp.get_device(device).name,
-        "warp": wp.__version__,
-        "substeps_per_frame": substeps_per_frame,
-        "frames": frame_count,
-        "scenes": measured,
+        **about,
+        **measured,
+        **describe_traffic(scene, FORWARD_COST, seconds, device),
     }
 
 
-def _measure(  # noqa: PLR0917  (private, and all of it is needed)
-    model: SpringMassModel,
-    control: np.ndarray,
-    parameters: SimulationParameters,
-    device: str,
-    frame_count: int,
-    includes_backward: bool,
-) -> dict[str, Any]:
-    """Time one scene, ours and the baseline in turns."""
-    simulator = Simulator(model, parameters, device)
-    baseline = PhysTwinLike(model, parameters, device)
-    graph = baseline.capture_forward(control[0], control[1])
-    result: dict[str, Any] = {
-        "nodes": model.node_count,
-        "springs": len(model.spring_nodes),
-        "virtual_springs": model.virtual_spring_count,
-        "stable_substeps": stable_substeps(model, parameters, control[0]),
-        "forward": _compare(
-            lambda: simulator.step_frame(1, control[0], control[1]),
-            lambda: wp.capture_launch(graph),
-            device,
-            frame_count,
-        ),
-    }
-    if includes_backward:
-        path = torch.from_numpy(control[:2].astype(np.float32))
-        log_stiffness = torch.from_numpy(np.log(model.stiffness)).requires_grad_()
+def measure_rollout(scene: Scene, device: str, *, rounds: int) -> dict[str, float]:
+    """Time the rollout of a scene with both simulators, and compare where they end."""
+    simulator = Simulator(scene.model, scene.parameters, device)
+    baseline = PhysTwinLike(scene.model, scene.parameters, device)
+    control = scene.control
 
-        def step() -> None:
-            position, _ = differentiable.rollout(
-                model, parameters, path, log_stiffness=log_stiffness, device=device
-            )
-            position[-1, :, 2].sum().backward()
+    def ours() -> None:
+        simulator.reset()
+        for frame in range(1, len(control)):
+            simulator.step_frame(frame, control[frame - 1], control[frame])
 
-        both = baseline.capture_backward(control[0], control[1])
-        result["forward_and_backward"] = _compare(
-            step, lambda: wp.capture_launch(both), device, frame_count
-        )
-    return result
-
-
-def _compare(
-    ours: Callable[[], None], baseline: Callable[[], None], device: str, count: int
-) -> dict[str, float]:
-    """Return the median time of each in milliseconds, and how many times faster ours is."""
-    times: dict[str, list[float]] = {"ours": [], "phystwin_like": []}
-    for is_timed in (False, *[True] * count):
-        for name, work in (("ours", ours), ("phystwin_like", baseline)):
-            wp.synchronize_device(device)
-            start = time.perf_counter()
-            work()
-            wp.synchronize_device(device)
-            if is_timed:
-                times[name].append(1e3 * (time.perf_counter() - start))
-    own, other = median(times["ours"]), median(times["phystwin_like"])
+    works = {"ours": ours, "baseline": lambda: baseline.rollout(control)}
+    times = time_in_turns(works, device, rounds)
     return {
-        "ours_ms": round(own, 3),
-        "phystwin_like_ms": round(other, 3),
-        "ratio": round(other / own, 3),
-    }
-
-
-def _synthetic_block(
-    node_count: int, parameters: SimulationParameters
-) -> tuple[SpringMassModel, np.ndarray]:
-    """Build a cube of nodes whose top is pulled up by nine control nodes."""
-    side = max(2, math.ceil(node_count ** (1 / 3) - 1e-9))
-    axis = _SPACING * np.arange(side)
-    node = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    top = node[node[:, 2] == axis[-1]]
-    control = top[np.linspace(0, len(top) - 1, min(9, len(top))).astype(int)]
-    control = control + np.array([0.0, 0.0, 0.4 * _SPACING])
-    return build_model(node, control, parameters), _lifted(control)
-
-
-def _recorded_object(
-    path: Path, parameters: SimulationParameters
-) -> tuple[SpringMassModel, np.ndarray]:
-    """Read springs from a file, floor their rest length, and hold the top nodes."""
-    names = ("position", "spring_nodes", "rest_length", "stiffness")
-    if not path.is_file():
-        raise UsageError(f"There is no object file {path} to measure.")
-    with np.load(path) as data:
-        missing = [name for name in names if name not in data]
-        if missing:
-            raise UsageError(f"{path} lacks the arrays {', '.join(missing)}.")
-        node, springs, rest_length, stiffness = (np.asarray(data[name]) for name in names)
-    node = (node - [0.0, 0.0, node[:, 2].min()]).astype(np.float32)
-    highest = np.argsort(node[:, 2], kind="stable")[-30:]
-    control = node[highest] + np.array([0.0, 0.0, 0.01])
-    few = replace(
-        parameters, max_neighbors=0, virtual_connection_radius=0.04, virtual_max_neighbors=50
-    )
-    held = build_model(node, control, few)
-    count = held.virtual_spring_count
-    floor = np.float32(parameters.rest_length_floor)
-    model = SpringMassModel(
-        object_node=node,
-        initial_velocity=held.initial_velocity,
-        spring_nodes=np.concatenate([springs.astype(np.int32), held.spring_nodes]),
-        rest_length=np.concatenate([np.maximum(rest_length, floor), held.rest_length]),
-        stiffness=np.concatenate(
-            [stiffness, np.full(count, np.median(stiffness), dtype=np.float32)]
+        **describe_times(*(times[name] / scene.frame_count for name in works)),
+        **describe_difference(
+            simulator.position.numpy(), baseline.position.numpy(), scene.model.object_node
         ),
-        damping=np.full(len(springs) + count, 100.0, dtype=np.float32),
-        object_spring_count=len(springs),
-        control_count=len(control),
-    )
-    return model, _lifted(control)
-
-
-def _lifted(control: np.ndarray) -> np.ndarray:
-    """Return two frames in which control nodes rise by 2 mm."""
-    return np.stack([control, control + np.array([0.0, 0.0, 2e-3])]).astype(np.float32)
+    }

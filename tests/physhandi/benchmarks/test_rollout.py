@@ -1,57 +1,108 @@
-"""The benchmark measures two simulators that agree with each other."""
+"""What the rollout and gradient benchmarks tell is measured, compared and complete."""
 
 import json
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from reference.scenes import as_model, cube_scene
 
+from physhandi.benchmarks import gradient, rollout, timing
+from physhandi.benchmarks.gradient import benchmark_gradient
 from physhandi.benchmarks.phystwin_like import PhysTwinLike
 from physhandi.benchmarks.rollout import benchmark_rollout
+from physhandi.benchmarks.scenes import synthetic_block
 from physhandi.errors import UsageError
-from physhandi.simulation.simulator import Simulator
+
+KEYS = {
+    "device", "nodes", "springs", "substeps", "ms_per_frame", "frames_per_s",
+    "baseline_ms_per_frame", "speedup", "max_abs_difference_m", "device_name", "warp", "commit",
+    "frames", "load_average", "stable_substeps", "motion_m", "bytes_per_frame", "bytes_formula",
+    "bandwidth_fraction", "copy_gigabytes_per_s",
+}  # fmt: skip
+SMALL = {"node_count": 60, "frame_count": 3, "substeps_per_frame": 200}
 
 
-def test_the_baseline_simulates_the_same_motion(device):
-    import warp as wp
-
-    scene = cube_scene(moves=False, damping=np.full(33, 2.0))
-    model, parameters = as_model(scene)
-    baseline = PhysTwinLike(model, parameters, device)
-    wp.capture_launch(baseline.capture_forward(scene.control[0], scene.control[1]))
-    expected = Simulator(model, parameters, device=device).rollout(scene.control[:2])
-    assert np.abs(expected.position[1] - expected.position[0]).max() > 0.005
-    np.testing.assert_allclose(baseline.position.numpy(), expected.position[1], atol=1e-6)
+@pytest.fixture(autouse=True)
+def small_copies(monkeypatch):
+    """Copy little, for a bandwidth that no test looks at closely."""
+    monkeypatch.setattr(timing, "_COPY_SIZE", {"cpu": 1 << 20, "cuda": 1 << 20})
 
 
-def test_the_result_is_json_with_times_and_ratios(device, tmp_path):
-    node = np.random.default_rng(0).uniform(0, 0.05, (40, 3)).astype(np.float32)
-    springs = np.stack([np.arange(39), np.arange(1, 40)], axis=1)
-    length = np.linalg.norm(np.diff(node, axis=0), axis=1).astype(np.float32)
-    arrays = {"position": node, "spring_nodes": springs, "rest_length": length}
-    np.savez(tmp_path / "thing.npz", **arrays, stiffness=np.full(39, 100.0, dtype=np.float32))
-    result = benchmark_rollout(
-        device=device,
-        node_count=60,
-        frame_count=1,
-        substeps_per_frame=400,
-        model_path=tmp_path / "thing.npz",
-    )
+def check(result, device):
+    """Assert what is true of every benchmark beside the baseline."""
     assert json.loads(json.dumps(result)) == result
-    assert result["scenes"]["synthetic"]["nodes"] == 64
-    assert result["scenes"]["thing"]["springs"] > 39
-    for scene in result["scenes"].values():
-        for part in ("forward", "forward_and_backward"):
-            assert scene[part]["ours_ms"] > 0.0
-            assert scene[part]["ratio"] > 0.0
+    assert set(result) >= KEYS
+    assert (result["device"], result["nodes"], result["frames"]) == (device, 60, 3)
+    assert result["springs"] == 540 + result["virtual_springs"]
+    assert result["frames_per_s"] * result["ms_per_frame"] == pytest.approx(1e3)
+    ratio = result["baseline_ms_per_frame"] / result["ms_per_frame"]
+    assert result["speedup"] == pytest.approx(ratio)
+    assert 0.0 < result["max_abs_difference_m"] < 2e-6
+    assert 2e-3 < result["motion_m"] < 0.02
+    moved = 1e3 * result["bytes_per_frame"] / result["ms_per_frame"]
+    assert result["gigabytes_per_s"] == pytest.approx(1e-9 * moved)
+    share = result["gigabytes_per_s"] / result["copy_gigabytes_per_s"]
+    assert result["bandwidth_fraction"] == pytest.approx(share)
 
 
-def test_a_missing_or_incomplete_object_is_named(device, tmp_path):
-    small = {"device": device, "node_count": 8, "frame_count": 1, "substeps_per_frame": 2}
-    with pytest.raises(UsageError, match=r"no object file .*gone\.npz"):
-        benchmark_rollout(**small, model_path=tmp_path / "gone.npz")
-    np.savez(tmp_path / "part.npz", position=np.zeros((2, 3)))
-    with pytest.raises(UsageError, match="lacks the arrays spring_nodes, rest_length, stiffness"):
-        benchmark_rollout(**small, model_path=tmp_path / "part.npz")
-    with pytest.raises(UsageError, match="must be positive"):
-        benchmark_rollout(**(small | {"frame_count": 0}))
+def test_a_rollout_is_timed_and_compared(device):
+    result = benchmark_rollout(device=device, **SMALL)
+    check(result, device)
+    # 20 B a spring, 48 B a node and 24 B for each of nine control nodes.
+    assert result["bytes_per_frame"] == 200 * (20 * result["springs"] + 48 * 60 + 24 * 9)
+    assert "20 B x springs + 48 B x nodes + 24 B x control nodes" in result["bytes_formula"]
+
+
+def test_a_gradient_is_timed_and_compared(device):
+    result = benchmark_gradient(device=device, **SMALL)
+    check(result, device)
+    assert result["gradient_norm"] > 1e-3
+    assert 0.0 < result["gradient_relative_difference"] < 1e-4
+    assert result["bytes_per_frame"] == 200 * (76 * result["springs"] + 216 * 60 + 72 * 9)
+
+
+def test_another_physics_is_not_called_the_same(device, monkeypatch):
+    def floating(model, parameters, device):
+        return PhysTwinLike(model, replace(parameters, gravity=0.0), device)
+
+    monkeypatch.setattr(rollout, "PhysTwinLike", floating)
+    monkeypatch.setattr(gradient, "PhysTwinLike", floating)
+    for benchmark in (benchmark_rollout, benchmark_gradient):
+        result = benchmark(device=device, **SMALL)
+        assert result["max_abs_difference_m"] > 1e-4
+    assert result["gradient_relative_difference"] > 0.01
+
+
+def tell(monkeypatch, moments):
+    """Let the benchmarks' clock tell these times."""
+    clock = iter(moments)
+    monkeypatch.setattr(timing, "time", SimpleNamespace(perf_counter=lambda: float(next(clock))))
+
+
+def test_times_are_medians_of_the_timed_rounds_only(device, monkeypatch):
+    tell(monkeypatch, np.cumsum([0, 9, 0, 9, 0, 1, 0, 5, 0, 3, 0, 4, 0, 2, 0, 6]))
+    told = []
+    works = {name: lambda name=name: told.append(name) for name in "ab"}
+    assert timing.time_in_turns(works, device, 3) == {"a": 2.0, "b": 5.0}
+    assert told == list("abababab")
+
+
+def test_a_copy_is_counted_read_and_written(device, monkeypatch):
+    tell(monkeypatch, [0.0, 4.0, 4.0, 6.0] + [10.0, 13.0] * 3)
+    assert timing.copy_bandwidth(device) == 2 * (1 << 20) / 2.0
+
+
+def test_numbers_that_make_no_sense_are_named(device):
+    with pytest.raises(UsageError, match="frames of a benchmark is 0"):
+        benchmark_rollout(device=device, node_count=8, frame_count=0)
+    with pytest.raises(UsageError, match="nodes of a benchmark is -1"):
+        benchmark_gradient(device=device, node_count=-1)
+
+
+def test_the_two_simulators_agree_on_a_longer_and_stiffer_motion(device):
+    scene = synthetic_block(120, frame_count=8, springs_at_node=30)
+    stiff = replace(scene.model, stiffness=scene.model.stiffness * np.float32(10.0))
+    result = rollout.measure_rollout(replace(scene, model=stiff), device, rounds=1)
+    assert result["max_abs_difference_m"] < 5e-6
+    assert result["motion_m"] > 5e-3

@@ -1,0 +1,126 @@
+"""How many frames a second a population of candidates simulates, beside one by one."""
+
+from dataclasses import replace
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from physhandi.benchmarks.phystwin_like import PhysTwinLike
+from physhandi.benchmarks.scenes import SUBSTEPS, check_positive, scene_of
+from physhandi.benchmarks.timing import (
+    describe_difference,
+    describe_scene,
+    describe_times,
+    describe_traffic,
+    time_in_turns,
+)
+from physhandi.simulation.batch import BatchRollout, BatchSimulator
+from physhandi.simulation.master import MasterTopology
+from physhandi.simulation.model import SimulationParameters
+
+_COST = (0, 48, 0)
+"""Bytes of a substep and candidate: position and velocity of each node in and out. What the
+candidates share, springs and control nodes, is not counted."""
+_ROUNDS = 2
+
+
+def benchmark_batch(
+    *,
+    device: str = "cpu",
+    node_count: int = 1000,
+    frame_count: int = 10,
+    candidate_count: int = 64,
+    substeps_per_frame: int = SUBSTEPS,
+    topology: str | Path | None = None,
+) -> dict[str, Any]:
+    """Time one rollout of many candidates; the baseline simulates one of middling size alone.
+
+    Candidates differ in stiffness, damping, drag, ground contact and connection radii, hence
+    also in their springs. The median round counts; what the batch prepares comes before.
+
+    Args:
+        device: Warp device, for example ``"cuda:0"``.
+        node_count: Object nodes of the made-up block, with at most 18 springs at each.
+        frame_count: Frames of a rollout.
+        candidate_count: Candidates of the batch.
+        substeps_per_frame: Integration steps in a frame.
+        topology: An `.npz` as of `recorded_object` to measure instead. Its nodes are taken, and
+            springs join as many of its nearest pairs as it has springs: candidates are made of
+            radii, so none has exactly the springs of the file.
+
+    Returns:
+        Times a frame of a candidate, and the largest difference of the stiffest and the widest
+        candidate from the baseline's motion of the same, ready for JSON.
+
+    Raises:
+        UsageError: If a number is not positive or the file is missing or incomplete.
+    """
+    check_positive(candidates=candidate_count)
+    wp.init()
+    scene = scene_of(topology, node_count, frame_count, substeps_per_frame)
+    candidates = _candidates(scene.parameters, candidate_count)
+    master = MasterTopology.of(scene.model.object_node, scene.control[0], candidates)
+    models = [master.model(parameters) for parameters in candidates]
+    springs = [len(model.spring_nodes) for model in models]
+    widest = replace(scene, model=models[0], parameters=candidates[0])
+    about = describe_scene(widest, device)
+    simulator = BatchSimulator(master, candidates, device)
+    middling = int(np.argsort(springs)[len(springs) // 2])
+    stiffest = int(np.argmax([parameters.stiffness for parameters in candidates]))
+    baselines = {
+        index: PhysTwinLike(models[index], candidates[index], device)
+        for index in {0, middling, stiffest}
+    }
+    found: dict[str, BatchRollout] = {}
+    works = {
+        "ours": lambda: found.update(last=simulator.rollout(scene.control)),
+        "baseline": lambda: baselines[middling].rollout(scene.control),
+    }
+    times = time_in_turns(works, device, _ROUNDS)
+    ours = times["ours"] / (frame_count * candidate_count)
+    differences = []
+    for index in (0, stiffest):
+        baselines[index].rollout(scene.control)
+        differences.append(
+            describe_difference(
+                found["last"].position[index, -1],
+                baselines[index].position.numpy(),
+                scene.model.object_node,
+            )
+        )
+    return {
+        "benchmark": "batch",
+        **about,
+        "candidates": candidate_count,
+        "median_springs": int(median(springs)),
+        "diverged": int(np.sum(found["last"].diverged_frame >= 0)),
+        **describe_times(ours, times["baseline"] / frame_count),
+        **{name: max(d[name] for d in differences) for name in differences[0]},
+        **describe_traffic(widest, _COST, ours, device),
+    }
+
+
+def _candidates(reference: SimulationParameters, count: int) -> list[SimulationParameters]:
+    """Vary every parameter that a search varies; the first candidate is the reference itself."""
+    rng = np.random.default_rng(0)
+    return [
+        reference,
+        *(
+            replace(
+                reference,
+                connection_radius=reference.connection_radius * rng.uniform(0.8, 1.0),
+                virtual_connection_radius=reference.virtual_connection_radius
+                * rng.uniform(0.8, 1.0),
+                stiffness=reference.stiffness * 2.0 ** rng.uniform(-1.0, 1.0),
+                virtual_stiffness=reference.virtual_stiffness * 2.0 ** rng.uniform(-1.0, 1.0),
+                damping=reference.damping * rng.uniform(0.5, 1.0),
+                drag=rng.uniform(0.0, 6.0),
+                restitution=rng.uniform(0.0, 1.0),
+                friction=rng.uniform(0.0, 1.0),
+            )
+            for _ in range(count - 1)
+        ),
+    ]

@@ -1,0 +1,56 @@
+"""The time from a slider to the first new frame is measured in the process that simulates."""
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+from viewer_world import FRAMES
+
+from app.viewer import latency
+from app.viewer.latency import measure_latency
+from physhandi.data.run import Run
+from physhandi.errors import MissingInputError, SimulationError
+
+KINDS = {
+    f"{slider}, substeps {substeps}"
+    for slider in ("stiffness", "radius")
+    for substeps in ("as fitted", "automatic")
+}
+
+
+def test_sliders_are_answered_and_timed(run: Run) -> None:
+    result = measure_latency(run, "lift", moves=2)
+    assert json.loads(json.dumps(result)) == result
+    assert (result["benchmark"], result["device"]) == ("live", "cpu")
+    assert result["frames"] == FRAMES - 1
+    assert set(result["kinds"]) == KINDS
+    for kind in [result, *result["kinds"].values()]:
+        first, worst = kind["first_new_frame_ms"], kind["worst_first_new_frame_ms"]
+        assert 0.0 < first <= worst < math.inf
+    for kind in result["kinds"].values():
+        assert 0.0 < kind["springs_known_ms"] < kind["worst_first_new_frame_ms"]
+        assert 0.0 < kind["ms_per_frame"] < math.inf
+        assert kind["substeps"] > 0
+    assert result["start_ms"] > result["first_new_frame_ms"]
+    worst = max(kind["worst_first_new_frame_ms"] for kind in result["kinds"].values())
+    assert result["worst_first_new_frame_ms"] == worst
+
+
+def test_what_cannot_be_simulated_is_told(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(MissingInputError, match="no object in 'nothing'"):
+        measure_latency(run, "nothing", moves=1)
+    monkeypatch.setattr(latency, "_PATIENCE", 0.0)
+    with pytest.raises(SimulationError, match="said nothing for 0 s"):
+        measure_latency(run, "lift", moves=1)
+
+
+def test_a_run_that_is_gone_fails_by_name(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = latency.LiveRequest
+
+    def elsewhere(**about: object) -> object:
+        return real(**(about | {"run": Path("/nowhere/at-all")}))
+
+    monkeypatch.setattr(latency, "LiveRequest", elsewhere)
+    with pytest.raises(SimulationError, match=r"failed: .*at-all"):
+        measure_latency(run, "lift", moves=1)
