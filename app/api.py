@@ -32,7 +32,7 @@ from physhandi.errors import RunError
 from physhandi.fitting.profile import load_profile, profile_names
 
 Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
-ExportFormat = Literal["ply", "npz", "csv", "yaml"]
+ExportFormat = Literal["ply", "gltf", "npz", "csv", "yaml"]
 
 
 class OpenScene(Protocol):
@@ -254,7 +254,8 @@ def _export(
     run.verify(allows_more=True)
     folder = Path(tempfile.mkdtemp(prefix="physhandi-export-"))
     try:
-        name = f"{run_id}_{kind}" if kind == "ply" else f"{run_id}.{kind}"
+        suffix = "glb" if kind == "gltf" else kind
+        name = f"{run_id}_{kind}" if kind == "ply" else f"{run_id}.{suffix}"
         path = export_run(run, kind, folder / name, sequence=sequence)
         if path.is_dir():
             path = Path(shutil.make_archive(str(path), "zip", path))

@@ -58,11 +58,12 @@ def _probes(data_dir: Path | None) -> Iterator[tuple[str, Callable[[], str]]]:
         return ", ".join(entry.id for entry in entries)
 
     def hand() -> str:
+        from physhandi.hand.mano import hands_folder
         from physhandi.hand.model import load_hand_model
 
-        return ", ".join(
-            f"{s} hand {load_hand_model(s).vertex_count} vertices" for s in ("right", "left")
-        )
+        found = [f"{s} hand {load_hand_model(s).vertex_count} vertices" for s in ("right", "left")]
+        mano = [s for s in ("right", "left") if (hands_folder() / f"mano_{s}.npz").is_file()]
+        return ", ".join([*found, f"MANO: {' and '.join(mano) or 'not imported'}"])
 
     def space() -> str:
         folder = read_settings(data_dir=data_dir).data_dir

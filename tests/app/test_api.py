@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from pygltflib import GLTF2
 from server_world import World
 from sheet_sequence import FITTED, FRAMES, NODE
 from starlette.testclient import TestClient
@@ -167,8 +168,8 @@ def test_exports_read_back_as_what_the_run_holds(world: World) -> None:
     def export(kind: str) -> bytes:
         response = client.get(f"/api/v1/runs/fitted/export?format={kind}")
         assert response.status_code == 200
-        suffix = "fitted_ply.zip" if kind == "ply" else f"fitted.{kind}"
-        assert f'filename="{suffix}"' in response.headers["content-disposition"]
+        name = {"ply": "fitted_ply.zip", "gltf": "fitted.glb"}.get(kind, f"fitted.{kind}")
+        assert f'filename="{name}"' in response.headers["content-disposition"]
         return response.content
 
     with np.load(io.BytesIO(export("npz")), allow_pickle=False) as arrays:
@@ -182,6 +183,8 @@ def test_exports_read_back_as_what_the_run_holds(world: World) -> None:
     rows = list(csv.reader(io.StringIO(export("csv").decode())))
     assert len(rows) > FRAMES * len(NODE)
     assert "parameters" in yaml.safe_load(export("yaml"))
+    scene = GLTF2.load_from_bytes(export("gltf"))
+    assert scene.animations[0].channels
 
 
 @pytest.mark.parametrize(
