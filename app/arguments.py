@@ -181,8 +181,9 @@ class Export:
 
     run: Positional[str]
     """Folder or id of a finished run."""
-    format: Literal["ply", "npz", "csv", "yaml"]
-    """ply: meshes and points per frame; npz and csv: trajectories; yaml: parameters and metrics."""
+    format: Literal["ply", "gltf", "npz", "csv", "yaml"]
+    """ply: meshes and points per frame; gltf: one .glb that moves, hands skinned; npz and csv:
+    trajectories; yaml: parameters and metrics."""
     out: Path
     """File or folder to write."""
     sequence: str | None = None
