@@ -165,7 +165,7 @@ class OffsetDescent:
 
 
 def control_nodes(
-    vertices: Sequence[Float[Tensor, "frame vertex 3"]], chosen: Int[ndarray, " control"] | None
+    vertices: Sequence[Float[Tensor, "frame _ 3"]], chosen: Int[ndarray, " control"] | None
 ) -> Float[Tensor, "frame control 3"]:
     """Join the vertices of all hands, and keep those that are control nodes.
 

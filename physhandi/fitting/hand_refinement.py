@@ -149,7 +149,7 @@ def refine_hands(
         SimulationDivergedError: If the object runs away with the hands of stage 1 already.
         CancelledError: If the user asked to stop.
     """
-    refinement = _Refinement(problem, config, device)
+    refinement = Refinement(problem, config, device)
     curve: list[list[float]] = []
     for iteration in range(config.iterations + 1):
         progress.check_cancelled()
@@ -168,7 +168,7 @@ def refine_hands(
     return refinement.result(curve, progress)
 
 
-class _Refinement:
+class Refinement:
     """The corrections of all hands, their gradient, and the best of them so far."""
 
     def __init__(self, problem: RefinementProblem, config: RefinementConfig, device: str) -> None:
