@@ -2,11 +2,10 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import warp as wp
-from numpy import ndarray
 
 from physhandi.simulation.kernels.dataflow import FORWARD_LOCALS, make_frame_kernel
 from physhandi.simulation.kernels.dataflow_adjoint import (
@@ -14,8 +13,8 @@ from physhandi.simulation.kernels.dataflow_adjoint import (
     make_adjoint_kernel,
     sum_controls,
 )
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
 from physhandi.simulation.partition import Partition, partition_model
+from physhandi.simulation.stage import Stage
 
 LEAST_OWN = 4
 """Fewer nodes in a block cost more waiting than they save work."""
@@ -29,30 +28,6 @@ _LAST_TAG = 2**31 - 2**20
 
 frame_kernel = lru_cache(maxsize=None)(make_frame_kernel)
 adjoint_kernel = lru_cache(maxsize=None)(make_adjoint_kernel)
-
-
-class Stage(Protocol):
-    """What a frame needs of a simulator."""
-
-    model: SpringMassModel
-    parameters: SimulationParameters
-    device: Any
-    world: wp.array
-    first_divergence: wp.array
-
-    @property
-    def material(self) -> tuple[wp.array, wp.array, wp.array]:
-        """Rest length, stiffness and damping of every spring."""
-        ...
-
-    @property
-    def controls(self) -> tuple[wp.array, wp.array]:
-        """Where the control nodes are at the start and the end of the frame."""
-        ...
-
-    def array(self, value: ndarray, dtype: Any) -> wp.array:
-        """Copy an array to the device."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -214,9 +189,9 @@ class DataflowAdjoint:
         ]
 
     @staticmethod
-    def of(simulator: Stage, dataflow: Dataflow | None) -> "DataflowAdjoint | None":
-        """Make one for a simulator; none if its model's blocks do not fit."""
-        if dataflow is None or simulator.parameters.self_collision:
+    def of(simulator: Stage, dataflow: Any) -> "DataflowAdjoint | None":
+        """Make one for a simulator; none if its engine is another or its blocks do not fit."""
+        if not isinstance(dataflow, Dataflow) or simulator.parameters.self_collision:
             return None
         partition, layout = dataflow.partition, dataflow.layout
         fits = (

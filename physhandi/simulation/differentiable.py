@@ -20,6 +20,7 @@ from physhandi.simulation.dataflow import DataflowAdjoint
 from physhandi.simulation.frame_adjoint import FrameAdjoint
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
 from physhandi.simulation.simulator import Simulator
+from physhandi.simulation.threaded import ThreadedAdjoint
 
 _SCALARS = ("drag", "restitution", "friction", "self_restitution", "self_friction")
 CACHED_SIMULATORS = 16
@@ -140,7 +141,7 @@ class _DifferentiableSimulator:
     ) -> None:
         self.simulator = Simulator(model, parameters, device)
         self.torch_device = torch.device(wp.device_to_torch(self.simulator.device))
-        self._adjoint: FrameAdjoint | DataflowAdjoint | None = None
+        self._adjoint: FrameAdjoint | DataflowAdjoint | ThreadedAdjoint | None = None
 
     @contextmanager
     def stream(self) -> Iterator[None]:
@@ -199,8 +200,8 @@ class _DifferentiableSimulator:
         self._place_material(material)
         # Made on first use: many simulators never walk back.
         if self._adjoint is None:
-            simulator = self.simulator
-            fast = DataflowAdjoint.of(simulator, simulator.dataflow)
+            simulator, engine = self.simulator, self.simulator.engine
+            fast = DataflowAdjoint.of(simulator, engine) or ThreadedAdjoint.of(simulator, engine)
             self._adjoint = fast or FrameAdjoint(simulator)
         adjoint = self._adjoint
         bars = adjoint.position_bar, adjoint.velocity_bar

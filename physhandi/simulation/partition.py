@@ -129,3 +129,107 @@ def partition_model(model: SpringMassModel, block_count: int) -> Partition:
         entry=np.stack([local, spring], axis=1).astype(np.int32),
         is_first=is_first.astype(np.int32),
     )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SpringParts:
+    """Parts of the object with whole springs, in groups for a processor's vector unit.
+
+    Places are the nodes part by part, then the control nodes that each part's springs pull at,
+    then one empty place for each part, to which the springs that pad its lists are tied.
+    """
+
+    own_start: Int32[ndarray, " part_1"]
+    """First own node of each part, and the number of nodes."""
+    held_start: Int32[ndarray, " part_1"]
+    """Place of the first control node of each part, and of the first empty place."""
+    inner_start: Int32[ndarray, " part_1"]
+    """First of each part's springs that pull at nothing of another part."""
+    cut_start: Int32[ndarray, " part_1"]
+    """First of each part's springs to a node of another part; its own node comes first."""
+    node: Int32[ndarray, " node"]
+    """Number in the model of the node in each place."""
+    control: Int32[ndarray, " held"]
+    """Which control node is in each place."""
+    spring: Int32[ndarray, " entry"]
+    """Which spring of the model each is; -1 for padding."""
+    spoken: Int32[ndarray, " entry"]
+    """The same, but -1 too where the other part speaks for a cut spring."""
+    ends: Int32[ndarray, "entry 2"]
+    """Four times the place of each end."""
+
+    @property
+    def place_count(self) -> int:
+        """Number of places."""
+        return int(self.held_start[-1]) + len(self.own_start) - 1
+
+
+def group_springs(model: SpringMassModel, part_count: int, group: int) -> SpringParts:
+    """Share out a model's nodes and springs to a few parts.
+
+    Args:
+        model: Nodes and springs; there must be a node.
+        part_count: Number of parts; no more than nodes are made.
+        group: How many springs are worked out at once; lists are padded to a multiple.
+    """
+    count = model.node_count
+    parts = min(part_count, count)
+    order, own_start = bisect_nodes(model.object_node, parts)
+    number = np.arange(count + model.control_count)
+    number[order] = np.arange(count)
+    part = np.repeat(np.arange(parts), np.diff(own_start))
+    ends = np.sort(number[model.spring_nodes], axis=1)
+    is_held = ends[:, 1] >= count
+    home = part[ends[:, 0]]
+    away = np.where(is_held, home, part[np.minimum(ends[:, 1], count - 1)])
+
+    # Each part has places of its own for the control nodes that it needs.
+    width = len(number)
+    held, place = np.unique(home[is_held] * width + ends[is_held, 1], return_inverse=True)
+    ends[is_held, 1] = count + place.reshape(-1)
+    held_start = count + np.searchsorted(held, np.arange(parts + 1) * width)
+
+    springs = np.arange(len(ends))
+    inner = [springs[(home == index) & (away == index)] for index in range(parts)]
+    near = [springs[(home == index) & (away != index)] for index in range(parts)]
+    far = [springs[(home != index) & (away == index)] for index in range(parts)]
+    lists = [np.column_stack([ends[spring], spring, spring]) for spring in inner]
+    # Of a cut spring, a part's own node comes first, and only one part speaks for it.
+    lists += [
+        np.vstack(
+            [
+                np.column_stack([ends[own], own, own]),
+                np.column_stack([ends[other, ::-1], other, np.full(len(other), -1)]),
+            ]
+        )
+        for own, other in zip(near, far, strict=True)
+    ]
+    padded = []
+    for index, entries in enumerate(lists):
+        empty = held_start[-1] + index % parts
+        padding = np.tile([empty, empty, -1, -1], (-len(entries) % group, 1))
+        padded.append(np.vstack([entries[_spread(entries[:, :2])], padding]))
+    start = np.concatenate([[0], np.cumsum([len(entries) for entries in padded])])
+    entry = np.concatenate(padded).astype(np.int32)
+    return SpringParts(
+        own_start=own_start.astype(np.int32),
+        held_start=held_start.astype(np.int32),
+        inner_start=start[: parts + 1].astype(np.int32),
+        cut_start=start[parts:].astype(np.int32),
+        node=order.astype(np.int32),
+        control=(held % width - count).astype(np.int32),
+        spring=entry[:, 2].copy(),
+        spoken=entry[:, 3].copy(),
+        ends=4 * entry[:, :2],
+    )
+
+
+def _spread(pairs: Int[ndarray, "spring 2"]) -> Int[ndarray, " spring"]:
+    """Order springs so that neighbours in the list seldom share a node.
+
+    A processor adds to a node only after the addition before; between, it has others to do.
+    """
+    order = np.lexsort((pairs[:, 1], pairs[:, 0]))
+    first = pairs[order, 0]
+    rank = np.arange(len(order)) - np.searchsorted(first, first)
+    return order[np.lexsort((first, rank))]

@@ -1,4 +1,4 @@
-"""Semi-implicit Euler rollouts of a spring-mass model; one graph replay a frame."""
+"""Semi-implicit Euler rollouts of a spring-mass model; one launch or graph replay a frame."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -19,6 +19,7 @@ from physhandi.simulation.recording import Recording
 from physhandi.simulation.self_collision import SelfCollision
 from physhandi.simulation.spring_sums import SpringSums
 from physhandi.simulation.stability import explain_divergence
+from physhandi.simulation.threaded import Threaded
 
 wp.config.log_level = wp.LOG_WARNING
 
@@ -41,10 +42,9 @@ class Rollout:
 class Simulator:
     """Moves the object nodes of one model; holds model and state on a device.
 
-    One frame is captured once as a graph of two kernels a substep, and once more of three when
-    self-collision is first switched on. Everything tunable lives in device arrays, so
-    `set_parameters` and `set_material` act without another capture.
-    The same input gives the same bits, run after run.
+    An engine moves a frame in one launch; with self-collision, or where the engine does not fit,
+    a frame is captured as a graph of two or three kernels a substep. Everything tunable lives in
+    device arrays, so that both see it. The same input gives the same bits, run after run.
     """
 
     def __init__(
@@ -75,8 +75,8 @@ class Simulator:
         self.pull = wp.zeros(len(model.spring_nodes), dtype=wp.vec3, device=self.device)
         self.first_divergence = self.array(np.array([_NO_DIVERGENCE]), wp.int32)
         self._no_tape = wp.zeros(0, dtype=wp.vec3, device=self.device)
-        self.dataflow = Dataflow.of(self)
-        """The fast way through a frame, for models and devices that it suits."""
+        self.engine = Dataflow.of(self) or Threaded.of(self)
+        """Moves frames without self-collision, where it can."""
         self._collision: SelfCollision | None = None
         self._recordings = {
             collides: Recording(self._launch_frame, self.device) for collides in (False, True)
@@ -231,9 +231,9 @@ class Simulator:
 
     def replay_frame(self) -> None:
         """Advance the state on the device by one frame, with the controls that are there."""
-        if self.dataflow is not None and self.collision is None:
+        if self.engine is not None and self.collision is None:
             state = self.position, self.velocity
-            self.dataflow.advance(state, state)
+            self.engine.advance(state, state)
             return
         version = self.find_candidates(self.position)
         self._recordings[self.parameters.self_collision].replay(version)

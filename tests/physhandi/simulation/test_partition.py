@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from physhandi.simulation.model import SimulationParameters
-from physhandi.simulation.partition import bisect_nodes, partition_model
+from physhandi.simulation.partition import bisect_nodes, group_springs, partition_model
 from physhandi.simulation.topology import build_model
 
 
@@ -65,3 +65,46 @@ def test_a_model_without_springs_has_blocks_without_a_halo():
     model = build_model(np.eye(3, dtype=np.float32), np.zeros((0, 3), np.float32), parameters)
     partition = partition_model(model, 2)
     assert (partition.most_entries, partition.most_locals) == (0, partition.most_own)
+
+
+@pytest.mark.parametrize("parts", [1, 2, 5, 1000])
+def test_every_spring_is_with_the_parts_of_its_nodes(model, parts):
+    grouped = group_springs(model, parts, 8)
+    count = min(parts, 300)
+    assert np.array_equal(np.sort(grouped.node), np.arange(300))
+    part = np.repeat(np.arange(count), np.diff(grouped.own_start))
+    place_node = np.concatenate([grouped.node, 300 + grouped.control, np.full(count, -1)])
+    place_part = np.repeat(np.arange(count), np.diff(grouped.held_start))
+    place_part = np.concatenate([part, place_part, np.arange(count)])
+    assert len(place_node) == grouped.place_count
+    for start, is_cut in ((grouped.inner_start, False), (grouped.cut_start, True)):
+        assert len(start) == count + 1
+        for index in range(count):
+            here = slice(start[index], start[index + 1])
+            assert (start[index + 1] - start[index]) % 8 == 0
+            ends, spring = grouped.ends[here] // 4, grouped.spring[here]
+            padding = spring == -1
+            assert np.all(ends[padding] == grouped.held_start[-1] + index)
+            ends, spring = ends[~padding], spring[~padding]
+            assert np.array_equal(
+                np.sort(place_node[ends], axis=1), np.sort(model.spring_nodes[spring], axis=1)
+            )
+            assert np.all(place_part[ends[:, 0]] == index)
+            assert np.all((place_part[ends[:, 1]] == index) != is_cut)
+            assert np.all(ends[:, 1] < 300) or not is_cut
+    found = Counter(grouped.spring[grouped.spring >= 0].tolist())
+    number = np.empty(300, dtype=int)
+    number[grouped.node] = part
+    first, second = model.spring_nodes.T
+    is_cut = (second < 300) & (number[first] != number[np.minimum(second, 299)])
+    assert is_cut.any() == (parts > 1)
+    assert found == {index: 1 + cut for index, cut in enumerate(is_cut.tolist())}
+    spoken = grouped.spoken[grouped.spoken >= 0]
+    assert np.array_equal(np.sort(spoken), np.arange(len(model.spring_nodes)))
+
+
+def test_springs_in_a_row_seldom_share_their_first_node(model):
+    grouped = group_springs(model, 2, 8)
+    ends = grouped.ends[: grouped.inner_start[1]]
+    groups = ends[: len(ends) // 2 // 8 * 8, 0].reshape(-1, 8)
+    assert all(len(set(group)) == 8 for group in groups.tolist())

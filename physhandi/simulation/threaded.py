@@ -1,0 +1,167 @@
+"""Frames and their adjoints on a CPU: springs by its vector units, parts by its threads."""
+
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from physhandi.simulation.kernels.lanes import LANES, Bars, Material, Parts, Record
+from physhandi.simulation.kernels.threaded import advance_parts
+from physhandi.simulation.kernels.threaded_adjoint import retract_parts
+from physhandi.simulation.partition import SpringParts, group_springs
+from physhandi.simulation.stage import Stage
+from physhandi.simulation.walk import Walk
+
+PARTS = 2
+"""Parts of an object, on every processor the same, because they decide the order of sums."""
+LEAST_SPRINGS = 512
+"""Fewer are not worth it that threads meet."""
+_NEVER = np.iinfo(np.int32).max
+_RECORD: Any = Record
+_PARTS: Any = Parts
+_MATERIAL: Any = Material
+_BARS: Any = Bars
+
+State = tuple[wp.array, wp.array]
+"""Positions and velocities."""
+
+
+class Threaded:
+    """The arrays of one model that a CPU's threads work on."""
+
+    def __init__(self, simulator: Stage, parts: SpringParts) -> None:
+        """Place a partition in memory.
+
+        Args:
+            simulator: Whose controls, material and world are read.
+            parts: Of its model.
+        """
+        self._simulator = simulator
+        self.partition = parts
+        self.threads: int | None = None if len(parts.spring) >= LEAST_SPRINGS else 1
+        """Threads of a launch; if none, as many as measurement finds best. The bits are equal."""
+        self.parts = _PARTS()
+        for field in fields(parts):
+            dtype = wp.vec2i if field.name == "ends" else wp.int32
+            setattr(self.parts, field.name, simulator.array(getattr(parts, field.name), dtype))
+        self.material = _MATERIAL()
+        for name in ("rest", "hooke", "dashpot"):
+            setattr(self.material, name, self.zeros(len(parts.spring), wp.float32))
+        self._state = self.zeros((2, parts.place_count), _RECORD)
+        self._force = self.zeros(parts.place_count, wp.vec4)
+        self._no_tape = self.zeros((0, 0), wp.vec4)
+        self._first = self.zeros(len(parts.own_start) - 1, wp.int32)
+        self._walks: dict[bool, tuple[list[wp.array], Walk]] = {}
+
+    @staticmethod
+    def of(simulator: Stage) -> "Threaded | None":
+        """Make one for a simulator; none on a GPU, or if there is no node."""
+        if simulator.device.is_cuda or simulator.model.node_count == 0:
+            return None
+        return Threaded(simulator, group_springs(simulator.model, PARTS, LANES))
+
+    def zeros(self, shape: int | tuple[int, ...], dtype: Any) -> wp.array:
+        """Make an array of zeros in the processor's memory."""
+        return wp.zeros(shape, dtype=dtype, device=self._simulator.device)
+
+    def tape(self) -> State:
+        """Make room for all states of a frame, and for the velocities before contact."""
+        substeps = self._simulator.parameters.substeps_per_frame
+        places, nodes = self.partition.place_count, len(self.partition.node)
+        return self.zeros((substeps + 1, places), _RECORD), self.zeros((substeps, nodes), wp.vec4)
+
+    def advance(self, before: State, after: State, tape: State | None = None) -> None:
+        """Simulate one frame, from one state to another.
+
+        Args:
+            before: State at its start.
+            after: Where the state at its end goes; may be the same arrays.
+            tape: Where each substep's state and velocity before contact go.
+        """
+        simulator = self._simulator
+        state, free_tape = (self._state, self._no_tape) if tape is None else tape
+        arrays = [*before, *after, state]
+        known, walk = self._walks.get(tape is None, (None, None))
+        if walk is None or known is None or any(map(_differ, arrays, known)):
+            walk = self.walk(
+                advance_parts,
+                [simulator.world, self.parts, *simulator.material, *simulator.controls, *before],
+                [self.material, state, self._force, free_tape, *after, self._first],
+            )
+            self._walks[tape is None] = arrays, walk
+        walk.run(self.threads)
+        told = simulator.first_divergence.numpy()
+        told[0] = min(told[0], *self._first.numpy())
+
+    def walk(self, kernel: Any, *arguments: list[Any]) -> Walk:
+        """Prepare the launches of a kernel over the substeps of a frame."""
+        simulator = self._simulator
+        inputs = [value for part in arguments for value in part]
+        return Walk(kernel, simulator.parameters.substeps_per_frame, inputs, simulator.device)
+
+
+class ThreadedAdjoint:
+    """Simulates a frame again and carries derivatives back; as `FrameAdjoint`, by threads."""
+
+    def __init__(self, simulator: Stage, engine: Threaded) -> None:
+        """Make the tape.
+
+        Args:
+            simulator: Whose frames; its controls, material and world are read.
+            engine: The simulator's.
+        """
+        self._engine = engine
+        model, parts = simulator.model, engine.partition
+        nodes, springs, held = model.node_count, len(model.spring_nodes), len(parts.control)
+        self._tape = engine.tape()
+        self.start = engine.zeros(nodes, wp.vec3), engine.zeros(nodes, wp.vec3)
+        self._end = engine.zeros(nodes, wp.vec3), engine.zeros(nodes, wp.vec3)
+        self.position_bar = engine.zeros(nodes, wp.vec3)
+        self.velocity_bar = engine.zeros(nodes, wp.vec3)
+        self._control_bars = [engine.zeros(model.control_count, wp.vec3) for _ in range(2)]
+        self._material_bars = [engine.zeros(springs, wp.float32) for _ in range(2)]
+        self._scalar_bars = [engine.zeros(nodes, wp.float32) for _ in range(3)]
+        self._self_bars = [engine.zeros(0, wp.float32) for _ in range(2)]
+        self._bars = _BARS()
+        for name, shape, dtype in (
+            ("state", parts.place_count, _RECORD),
+            ("force", (2, parts.place_count), wp.vec4),
+            ("log_stiffness", len(parts.spring), wp.float32),
+            ("damping", len(parts.spring), wp.float32),
+            ("coefficients", nodes, wp.vec3),
+            ("start", held, wp.vec3),
+            ("end", held, wp.vec3),
+        ):
+            setattr(self._bars, name, engine.zeros(shape, dtype))
+        self._walk_back = engine.walk(
+            retract_parts,
+            [simulator.world, engine.parts, engine.material, *self._tape, self._bars],
+            [self.position_bar, self.velocity_bar, *self._material_bars, *self._scalar_bars],
+        )
+
+    @staticmethod
+    def of(simulator: Stage, engine: Any) -> "ThreadedAdjoint | None":
+        """Make one for a simulator; none if its engine is another, or nodes collide."""
+        if not isinstance(engine, Threaded) or simulator.parameters.self_collision:
+            return None
+        return ThreadedAdjoint(simulator, engine)
+
+    @property
+    def sums(self) -> list[wp.array]:
+        """Derivatives that the last frame gave; see `FrameAdjoint.sums`."""
+        return [*self._control_bars, *self._material_bars, *self._scalar_bars, *self._self_bars]
+
+    def carry(self) -> None:
+        """Carry `position_bar` and `velocity_bar` from the frame's end to its start."""
+        engine = self._engine
+        engine.advance(self.start, self._end, self._tape)
+        self._walk_back.run(engine.threads)
+        # A control node has a place in each part that it holds.
+        for bar, held in zip(self._control_bars, (self._bars.start, self._bars.end), strict=True):
+            bar.zero_()
+            np.add.at(bar.numpy(), engine.partition.control, held.numpy())
+
+
+def _differ(one: wp.array, other: wp.array) -> bool:
+    return one.ptr != other.ptr
