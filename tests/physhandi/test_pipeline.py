@@ -60,6 +60,15 @@ def test_every_stage_tells_its_loss_and_lowers_it(fitted: Run) -> None:
         assert len(losses[stage]["curve"]) > 2
 
 
+def test_point_controllers_are_not_refined(fitted: Run) -> None:
+    assert fitted.json("losses.json")[pipeline.REFINEMENT] == {"curve": []}
+    for folder in fitted.sequences:
+        given = np.load(Path(folder) / "control.npy")
+        stored = fitted.array(f"sequences/{Path(folder).name}/control.npy")
+        np.testing.assert_array_equal(stored, given.astype(np.float32))
+        assert not fitted.has(f"sequences/{Path(folder).name}/attachment.npy")
+
+
 def test_the_fit_beats_standing_still(fitted: Run) -> None:
     metrics = fitted.json("metrics.json")
     assert set(metrics) == {"low", "high"}
