@@ -8,9 +8,15 @@ from typing import Any
 import pytest
 
 from app import cli
+from physhandi.benchmarks import timing
 
 BESIDE = {"nodes", "springs", "substeps", "ms_per_frame", "frames_per_s", "baseline_ms_per_frame",
           "speedup", "max_abs_difference_m"}  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def small_copies(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(timing, "_COPY_SIZE", {"cpu": 1 << 20, "cuda": 1 << 20})
 
 
 def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
