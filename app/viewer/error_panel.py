@@ -90,7 +90,7 @@ class ErrorPanel:
         with self._folder:
             self._text = server.gui.add_html("")
             self._plot = server.gui.add_uplot(
-                self._data(), self._series(), **_look(self._unit), height=120
+                self._data(), self._series(), **_look(self._unit, max(count - 1, 1)), height=120
             )
         self._write(at_once=True)
 
@@ -152,9 +152,10 @@ class ErrorPanel:
     def _data(self) -> tuple[ndarray, ...]:
         """Collect the curves, as far as the rollout is simulated; the plot knows no gaps."""
         has_track = np.isfinite(self._track)
-        shown = has_track if has_track.any() else np.ones(len(self._frames), dtype=bool)
+        shown = np.flatnonzero(has_track if has_track.any() else np.ones(len(self._frames)))
         if self._take is not self._fitted:
-            shown = shown & (self._frames < self._measured)
+            # A plot that was empty once does not find its scale again: two points at least.
+            shown = shown[: max(int((shown < self._measured).sum()), 2)]
         track = np.nan_to_num(self._track) * self._per_unit
         again = np.nan_to_num(self._again) * self._per_unit
         # A line along the axis that rises to the curves at the frame on the screen.
@@ -174,10 +175,10 @@ class ErrorPanel:
         )
 
 
-def _look(unit: str) -> dict[str, Any]:
+def _look(unit: str, last: int) -> dict[str, Any]:
     grid: Any = {"show": True, "stroke": "rgba(120,130,145,0.2)"}
     return {
-        "scales": {"x": uplot.Scale(time=False)},
+        "scales": {"x": uplot.Scale(time=False, range=(0.0, float(last)))},
         "axes": (
             uplot.Axis(stroke=_AXIS, grid=grid, size=26),
             uplot.Axis(stroke=_AXIS, grid=grid, size=38, label=unit, labelSize=14),

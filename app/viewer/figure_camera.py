@@ -90,6 +90,10 @@ class FigureCameras:
         """Find where a camera stands, or stood before it was moved to the figure."""
         return self._poses.get(client.client_id) or Pose.of(client.camera)
 
+    def forget(self, client: viser.ClientHandle) -> Pose:
+        """Find where a camera stood, and forget it."""
+        return self._poses.pop(client.client_id, None) or Pose.of(client.camera)
+
     def restore(self, server: viser.ViserServer) -> None:
         """Let all cameras stand again where they stood before."""
         for client in server.get_clients().values():

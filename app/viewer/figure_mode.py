@@ -137,6 +137,11 @@ class FigureMode:
             right = Side(take=take, frame=at, caption=self._caption("PhysTwin-style", take))
         return {"ours": left, "phystwin": right}
 
+    def part(self, client: viser.ClientHandle) -> Pose:
+        """Forget a client; returns where its camera stands in the scene."""
+        with self._lock:
+            return self._cameras.forget(client)
+
     def pose(self) -> Pose | None:
         """Where the first client's camera stands in the scene; None without clients."""
         clients = list(self._server.get_clients().values())

@@ -156,7 +156,7 @@ class Sessions:
             sessions = list(self._sessions.values())
         return [session.info for session in sessions]
 
-    def close(self, session_id: str, reason: str = "It was closed.") -> bool:
+    def close(self, session_id: str, reason: str = "You closed it.") -> bool:
         """Close a session; returns whether there was one.
 
         Args:

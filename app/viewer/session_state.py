@@ -65,6 +65,11 @@ class Pose:
         up = np.array([0.0, 0.0, 1.0]) if camera.up is None else camera.up
         return cls(position=camera.position, look_at=camera.look_at, up=up, fov=camera.fov)
 
+    def give_first(self, camera: viser.InitialCameraConfig) -> None:
+        """Put the cameras of new clients here."""
+        camera.fov, camera.up = self.fov, self.up
+        camera.position, camera.look_at = self.position, self.look_at
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SessionState:

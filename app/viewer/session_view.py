@@ -19,6 +19,7 @@ from app.viewer.scene import Scene
 from app.viewer.session_state import Kind as Kind
 from app.viewer.session_state import SessionInfo as SessionInfo
 from app.viewer.session_state import SessionState
+from app.viewer.stage import Stage
 from app.viewer.take import Take
 from app.viewer.viser_server import start_viser
 
@@ -66,7 +67,6 @@ class Session:
         self._guard = Guard(self._server)
         self._playback = Playback(self._content.frame_count, self._content.frame_rate, self._draw)
         self._object: ObjectSession | None = None
-        self._is_figure_shown = False
         try:
             self._build()
             if state is not None:
@@ -114,7 +114,7 @@ class Session:
                 is_playing=self._playback.is_playing,
                 speed=self._playback.speed,
                 does_loop=self._playback.does_loop,
-                layers=replace(self._scene.layers),
+                layers=replace(self._stage.scene.layers),
                 theme=theme,
                 prefers_dark=prefers_dark,
                 parameters=panel.history.current if panel is not None else None,
@@ -157,13 +157,15 @@ class Session:
         ExportPanel(server, guard, self._snapshot)
         self._fill()
         server.on_client_connect(guard(self._welcome))
+        server.on_client_disconnect(guard(self._part))
 
     def _fill(self) -> None:
         """Build what belongs to the content: scene, switches and physics."""
         content = self._content
         framing = frame_content(content)
-        self._scene = Scene(self._server, content, framing)
-        self._layers.replace(content, self._scene.layers, framing)
+        scene = Scene(self._server, content, framing)
+        self._stage = Stage(scene, self._figure)
+        self._layers.replace(content, scene.layers, framing)
         run = self._catalog.run(self.target) if self.kind == "run" else None
         self._figure.offer(content, framing, run.folder if run is not None else None)
         if content.fitted is None or run is None:
@@ -188,9 +190,7 @@ class Session:
         if self._object is not None and self._object.panel is not None and state.parameters:
             self._object.panel.restore(state.parameters, is_automatic=state.automatic_substeps)
         if state.pose is not None:
-            camera, pose = self._server.initial_camera, state.pose
-            camera.fov, camera.up = pose.fov, pose.up
-            camera.position, camera.look_at = pose.position, pose.look_at
+            state.pose.give_first(self._server.initial_camera)
         if state.is_figure:
             self._figure.toggle()
         self._playback.seek(state.frame)
@@ -203,9 +203,7 @@ class Session:
             if self._object is not None:
                 self._object.remove()
                 self._object = None
-            self._figure.close()
-            self._is_figure_shown = False
-            self._scene.clear()
+            self._stage.clear()
             self._content = content
             self._playback.replace(content.frame_count, content.frame_rate)
             self._timeline.replace(content.frame_count)
@@ -221,19 +219,15 @@ class Session:
             self._has_played = True
             self._playback.play()
 
+    def _part(self, client: viser.ClientHandle) -> None:
+        """Keep the camera of a client that leaves, for the tab that is being reloaded."""
+        self._seen = time.monotonic()
+        self._figure.part(client).give_first(self._server.initial_camera)
+
     def _draw(self, frame: int, is_playing: bool) -> None:
         with self._lock:
             take, take_frame = self._take(frame)
-            is_figure = self._figure.is_on and take is not None
-            if is_figure != self._is_figure_shown:
-                (self._scene if is_figure else self._figure).hide()
-                self._is_figure_shown = is_figure
-            if is_figure and take is not None:
-                self._figure.draw(
-                    take, take_frame, frame, self._scene.layers, is_playing=is_playing
-                )
-            else:
-                self._scene.draw(frame, take, take_frame, is_playing=is_playing)
+            self._stage.draw(frame, take, take_frame, is_playing=is_playing)
             self._timeline.show(frame, is_playing=is_playing)
             if self._object is not None:
                 self._object.show(frame, is_playing=is_playing)
@@ -249,14 +243,4 @@ class Session:
         with self._lock:
             frame = self._playback.frame
             take, take_frame = self._take(frame)
-            is_figure = self._figure.is_on and take is not None
-            sides = self._figure.sides(take, take_frame, frame) if is_figure and take else None
-            picture = self._figure.picture if is_figure else None
-            return Snapshot(
-                content=self._content,
-                frame=frame,
-                take=take,
-                take_frame=take_frame,
-                sides=sides,
-                picture=picture,
-            )
+            return self._stage.snapshot(self._content, frame, take, take_frame)

@@ -122,7 +122,7 @@ def test_sliders_simulate_again_and_reset_returns(scene, fitted, tmp_path):
     scene.press("Reset")
     scene.until(lambda: scene.difference() == 0, "the fitted rollout")
     assert scene.springs() == as_fitted
-    assert scene.value("δ object [mm]") == pytest.approx(1e3 * radius, rel=5e-4 * 10)
+    assert scene.value("δ object [mm]") == pytest.approx(1e3 * radius, rel=5e-3)
 
 
 def test_another_tab_is_left_alone(scene: ScenePage, open_home: Callable[[], Page]):

@@ -134,8 +134,16 @@ def test_a_tab_that_is_reloaded_keeps_its_session(address, sessions) -> None:
     session = sessions.open("run", "sheet", "me")
     with ViewerClient(f"ws://{address}/viewer/{session}") as client:
         client.until(lambda: client.nodes)
+        client.tell_camera(position=(0.5, 0.4, 0.3))
+        live = sessions.get(session)
+        client.until(lambda: live.state.pose is not None)
+        client.until(lambda: live.state.pose.position.tolist() == [0.5, 0.4, 0.3])
     assert fetch(f"http://{address}/viewer/{session}/")[0] == 200
     assert [info.id for info in sessions.list()] == [session]
+    with ViewerClient(f"ws://{address}/viewer/{session}") as client:
+        client.until(lambda: "object springs" in client.texts())
+        first = [m for m in client.messages if m["type"] == "SetCameraPositionMessage"]
+        assert first[-1]["position"] == pytest.approx((0.5, 0.4, 0.3))
 
 
 def test_a_second_tab_gets_a_copy_with_the_same_state(address, sessions) -> None:
@@ -175,9 +183,12 @@ def test_a_second_tab_gets_a_copy_with_the_same_state(address, sessions) -> None
             shown = [second.value(name) for name in names]
             assert shown == ["drag", 7, 0.5, -1.0, False, "dark"]
             assert "/springs/virtual" not in second.nodes
+            fitted = own._content.fitted.position[7]
+            second.until(
+                lambda: np.abs(second.array("/object/nodes", "points") - fitted).max() > 1e-4
+            )
             other = second.array("/object/nodes", "points")
             client.until(lambda: np.array_equal(client.array("/object/nodes", "points"), other))
-            assert np.abs(other - own._content.fitted.position[7]).max() > 1e-4
 
 
 def test_no_client_can_open_a_public_tunnel(sessions) -> None:

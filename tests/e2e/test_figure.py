@@ -1,0 +1,87 @@
+"""The paper's figure and sessions of one's own, in a real browser."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Page, expect
+from scene_page import ScenePage
+
+pytestmark = pytest.mark.e2e
+FRAME = 30
+
+
+@pytest.fixture
+def scene(home: Page) -> ScenePage:
+    scene = ScenePage.opened_from(home)
+    scene.pause()
+    return scene
+
+
+def hue(image: np.ndarray, low: int, high: int) -> np.ndarray:
+    """Find the pixels of a strong color between two hues of OpenCV's circle of 180."""
+    hsv = cv2.cvtColor(image, cv2.COLOR_BGR2HSV)
+    return (hsv[..., 0] >= low) & (hsv[..., 0] <= high) & (hsv[..., 1] > 110)
+
+
+def test_the_figure_shows_both_topologies_in_one_picture(scene: ScenePage, tmp_path: Path) -> None:
+    scene.page.keyboard.press("f")
+    scene.until(lambda: scene.has("PhysTwin-style: simulated 60/60 frames"), "the figure")
+    scene.set("Frame", FRAME)
+    scene.unfold("Export")
+    with np.load(scene.download("NPZ", tmp_path)) as data:
+        assert data["ours_frame"] == data["phystwin_frame"] == FRAME
+        assert data["phystwin_control"].shape == (60, 30, 3)
+        mean = {}
+        for side in ("ours", "phystwin"):
+            assert data[f"{side}_force"].shape == data[f"{side}_position"].shape
+            mean[side] = data[f"{side}_rest_length"][data[f"{side}_object_spring_count"] :].mean()
+        held = [
+            (np.linalg.norm(data[f"{side}_force"][FRAME], axis=1) > 1e-6).sum()
+            for side in ("ours", "phystwin")
+        ]
+    # The paper's point: longer virtual springs, and forces spread over more nodes.
+    assert mean["phystwin"] > 2 * mean["ours"]
+    assert held[1] > 2 * held[0]
+    image = cv2.imread(str(scene.download("PNG", tmp_path)))
+    assert image.shape[1] == 1600
+    halves = image[:, :800], image[:, 800:]
+    object_nodes = [hue(half, 100, 125).sum() for half in halves]
+    virtual_springs = [hue(half, 20, 32).sum() for half in halves]
+    # The object is the same on both sides; the long springs are PhysTwin's.
+    assert min(object_nodes) > 2_000
+    assert max(object_nodes) < 2 * min(object_nodes)
+    assert virtual_springs[1] > 500
+    assert virtual_springs[1] > 3 * virtual_springs[0]
+    scene.page.frame_locator("#scene").get_by_role("button", name="Back to the scene").click()
+    scene.until(lambda: scene.has("Compare with PhysTwin"), "the scene")
+
+
+def test_a_scene_is_one_tab_s_own(scene: ScenePage, browser: Browser, served) -> None:
+    scene.set("Frame", FRAME)
+    scene.set("stiffness 10^", -1)
+    scene.until(lambda: (scene.difference() or 0) > 0, "another rollout")
+    difference, address = scene.difference(), scene.page.url
+
+    second = scene.page.context.new_page()
+    second.goto(address)
+    copied = ScenePage(second)
+    copied.until(lambda: copied.difference() == difference, "the same rollout")
+    assert second.url != address
+    assert copied.value("Frame") == FRAME
+    copied.set("stiffness 10^", 0.5)
+    copied.until(lambda: copied.difference() not in {None, difference}, "a rollout of its own")
+    assert scene.difference() == difference
+
+    own = second.url
+    second.reload()
+    copied.until(lambda: copied.has("object springs"), "the scene again")
+    assert second.url == own
+    assert copied.value("stiffness 10^") == 0.5
+
+    stranger = browser.new_context().new_page()
+    stranger.goto(served.url)
+    assert stranger.goto(address).status == 404
+    expect(stranger.locator("main")).to_contain_text("belongs to another browser")
+    stranger.context.close()
