@@ -28,6 +28,8 @@ from physhandi.simulation.model import SimulationParameters, SpringMassModel
 
 STORED_CLOUD = 500
 """Most points of one frame's cloud that a run keeps, evenly picked, unless they are markers."""
+STORED_HAND = 300
+"""Most points that a run keeps of one hand in one frame; evenly picked."""
 
 
 def sequence_folder(name: str) -> str:
@@ -119,7 +121,7 @@ def lifted_hand_points(
     if not sequence.hands or not any(view.has_depth and view.has_mask for view in sequence.views):
         return None
     points = [
-        [_thinned(cloud, STORED_CLOUD) for cloud in frames]
+        [_thinned(cloud, STORED_HAND) for cloud in frames]
         for frames in hand_points(sequence, progress)
     ]
     count = np.array([[len(cloud) for cloud in frames] for frames in points], dtype=np.int64)

@@ -52,7 +52,7 @@ class Recipe:
     """Distance between the nodes of the simulated sheet [m]."""
     substeps_per_frame: int = 1334
     """Integration steps in one frame."""
-    track_count: int = 200
+    track_count: int = 100
     """Tracks in each view."""
 
 
