@@ -46,9 +46,9 @@ def test_the_towel_stays_within_a_millimetre_of_the_reference(device):
 
 def test_the_towel_diverges_just_beyond_the_limit_of_stability(device):
     model, parameters, control = bundled()
-    # 40 with a margin of 1.25 means that 32 are needed.
+    # 40 with a margin of 1.25 means that 32 are needed; 30 may last until the towel moves.
     with pytest.raises(SimulationDivergedError):
-        benchmark_substeps(model, parameters, control, name="towel", device=device, substeps=(30,))
+        benchmark_substeps(model, parameters, control, name="towel", device=device, substeps=(28,))
 
 
 def test_a_motion_of_no_frame_is_refused(device):
