@@ -46,7 +46,7 @@ class Threaded:
             dtype = wp.vec2i if field.name == "ends" else wp.int32
             setattr(self.parts, field.name, simulator.array(getattr(parts, field.name), dtype))
         self.material = _MATERIAL()
-        for name in ("rest", "hooke", "dashpot"):
+        for name in ("rest", "elastic", "dashpot"):
             setattr(self.material, name, self.zeros(len(parts.spring), wp.float32))
         self._state = self.zeros((2, parts.place_count), _RECORD)
         self._force = self.zeros(parts.place_count, wp.vec4)

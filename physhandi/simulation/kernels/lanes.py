@@ -37,10 +37,10 @@ class Parts:
 
 @wp.struct
 class Material:
-    """Rest length [m], stiffness [N/m] and damping [N·s/m] of the springs part by part."""
+    """Rest length [m], scaled stiffness [N], damping [N·s/m] of the springs part by part."""
 
     rest: wp.array[wp.float32]
-    hooke: wp.array[wp.float32]
+    elastic: wp.array[wp.float32]
     dashpot: wp.array[wp.float32]
 
 
@@ -104,10 +104,12 @@ _OPEN = f"""
         const lanes dz = fronts(z03, z47), sz = backs(z03, z47);
         const lanes length = __builtin_elementwise_sqrt(dx * dx + dy * dy + dz * dz);
         const lanes inverse = 1.0f / __builtin_elementwise_max(length, (lanes){{}} + 1.0e-6f);
-        const lanes stiff = at(material.hooke.data + g), dash = at(material.dashpot.data + g);
-        const lanes longer = length - at(material.rest.data + g);
+        const lanes elastic = at(material.elastic.data + g), dash = at(material.dashpot.data + g);
+        const lanes rest_length = at(material.rest.data + g);
+        // Stiffness over rest length, rounded beforehand, would shift long trajectories tenfold.
+        const lanes strain = (length - rest_length) / rest_length;
         const lanes rate = (dx * sx + dy * sy + dz * sz) * inverse;
-        const lanes tension = stiff * longer + dash * rate;
+        const lanes tension = elastic * strain + dash * rate;
         const lanes by_offset = tension * inverse;
 """
 _CLOSE = """
@@ -137,10 +139,10 @@ _RETRACT = f"""
         const lanes fx = first_two(fxy0, fxy1), fy = last_two(fxy0, fxy1);
         const lanes fz = first_two(high(f04, f15), high(f26, f37));
         const lanes closing = (dx * fx + dy * fy + dz * fz) * inverse;
-        *(lanes*)(bars.log_stiffness.data + g) += closing * stiff * longer;
+        *(lanes*)(bars.log_stiffness.data + g) += closing * elastic * strain;
         *(lanes*)(bars.damping.data + g) += closing * rate;
         const lanes b = by_offset, c = dash * closing * inverse;
-        const lanes a = (stiff * closing - b * closing - c * rate) * inverse;
+        const lanes a = (elastic / rest_length * closing - b * closing - c * rate) * inverse;
         const lanes ox = a * dx + b * fx + c * sx, tx = c * dx;
         const lanes oy = a * dy + b * fy + c * sy, ty = c * dy;
         const lanes oz = a * dz + b * fz + c * sz, tz = c * dz;

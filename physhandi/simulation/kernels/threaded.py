@@ -57,12 +57,11 @@ def gather_material(
         for place in range(first, last):
             spring = parts.spring[place]
             material.rest[place] = 1.0
-            material.hooke[place] = 0.0
+            material.elastic[place] = 0.0
             material.dashpot[place] = 0.0
             if spring >= 0:
-                rest = rest_length[spring]
-                material.rest[place] = rest
-                material.hooke[place] = world.stiffness_scale * stiffness[spring] / rest
+                material.rest[place] = rest_length[spring]
+                material.elastic[place] = world.stiffness_scale * stiffness[spring]
                 material.dashpot[place] = damping[spring]
 
 

@@ -146,9 +146,9 @@ def retract_parts(
     restitution_bar_out: wp.array[float],
     friction_bar_out: wp.array[float],
 ):
-    """Carry the adjoints of a thread's parts back over a frame's steps `job_out[0]` to `job_out[1]`.
+    """Carry the adjoints of a thread's parts back from step `job_out[0]` to `job_out[1]`.
 
-    Step 0 is the last substep; `job_out[2]` becomes the step that was reached.
+    Step 0 is a frame's last substep; `job_out[2]` becomes the step that was reached.
     """
     here = world[0]
     part_count = parts.own_start.shape[0] - 1
