@@ -8,20 +8,10 @@ import numpy as np
 import viser
 
 from app.viewer.content import Content
+from app.viewer.dress import set_theme
 from app.viewer.framing import Framing
 from app.viewer.guard import Guard
-from app.viewer.layers import (
-    BLUE,
-    GREEN,
-    GREY,
-    RED,
-    SKIN,
-    THEMES,
-    YELLOW,
-    Layers,
-    Theme,
-)
-from app.viewer.observed import DepthCloud
+from app.viewer.layers import THEMES, Layers, Theme
 from app.viewer.playback import Playback
 from physhandi.data.view import View
 
@@ -39,6 +29,7 @@ class TimelinePanel:
         self._frame = gui.add_slider(
             "Frame", 0, max(playback.frame_count - 1, 1), 1, 0, hint="Arrow keys step by one frame"
         )
+        self._written = 0
         step = gui.add_button_group("Step", ("◀ 1", "1 ▶"), hint="Left and right arrow keys")
         speed = gui.add_slider("Speed", *_SPEEDS, 0.1, 1.0, hint="Sequence seconds per second")
         loop = gui.add_checkbox("Loop", initial_value=True)
@@ -62,7 +53,9 @@ class TimelinePanel:
 
     def show(self, frame: int, *, is_playing: bool) -> None:
         """Follow the clock."""
-        self._frame.value = frame
+        # Another value than the last one that was written here is a user's, about to be heard.
+        if self._frame.value == self._written:
+            self._frame.value = self._written = frame
         label = "Pause" if is_playing else "Play"
         if self._play.label != label:
             self._play.label = label
@@ -70,7 +63,7 @@ class TimelinePanel:
 
     def replace(self, frame_count: int) -> None:
         """Fit the slider to another sequence."""
-        self._frame.value = 0
+        self._frame.value = self._written = 0
         self._frame.max = max(frame_count - 1, 1)
 
     def restore(self, speed: float, *, does_loop: bool) -> None:
@@ -83,10 +76,10 @@ class TimelinePanel:
         self._playback.play(on=not self._playback.is_playing)
 
     async def _scrub(self, event: Any) -> None:
-        # At once, in viser's own thread: in another one, the running clock could have moved the
-        # slider on before it is read.
+        # At once, in viser's own thread, so that the running clock has no time to interfere.
         frame = event.target.value
         if event.client is not None:
+            self._written = frame
             self._playback.play(on=False)
             self._playback.seek(frame)
 
@@ -218,32 +211,3 @@ class LayersPanel:
             eye.fov = float(2 * np.arctan2(camera.height / 2, camera.K[1, 1]))
             eye.up_direction = -down
             eye.position, eye.look_at = origin, origin + distance * ahead
-
-
-def set_theme(server: viser.ViserServer, *, dark: bool) -> None:
-    """Dress the page."""
-    server.gui.configure_theme(
-        dark_mode=dark, show_logo=False, show_share_button=False, brand_color=(36, 99, 203)
-    )
-
-
-def add_legend(server: viser.ViserServer, content: Content) -> None:
-    """Tell what the colors mean."""
-    entries: list[tuple[tuple[int, int, int], str]] = []
-    if content.hands or content.skeletons:
-        entries.append((SKIN["right"], "hand"))
-    if content.fitted is not None:
-        entries += [(BLUE, "object"), (RED, "controls, forces"), (YELLOW, "virtual springs")]
-    elif content.control is not None:
-        entries.append((RED, "controls"))
-    if content.observed is not None and not isinstance(content.observed, DepthCloud):
-        entries.append((GREEN, "observed"))
-    if content.views:
-        entries.append((GREY, "cameras"))
-    dots = "".join(
-        '<span style="white-space:nowrap;margin-right:0.8em">'
-        f'<span style="display:inline-block;width:0.7em;height:0.7em;border-radius:50%;'
-        f'background:rgb{color};margin-right:0.35em"></span>{label}</span>'
-        for color, label in entries
-    )
-    server.gui.add_html(f'<div style="font-size:0.8em;padding:0.2em 0.9em 0.5em">{dots}</div>')

@@ -7,13 +7,14 @@ from dataclasses import replace
 import viser
 
 from app.viewer.content import Catalog, Content, open_run, open_sequence
+from app.viewer.dress import add_legend, set_theme
 from app.viewer.export_panel import ExportPanel, Snapshot
 from app.viewer.figure_mode import FigureMode
 from app.viewer.framing import frame_content
 from app.viewer.guard import Guard, plain
 from app.viewer.live import LiveSimulation
 from app.viewer.object_session import ObjectSession
-from app.viewer.panels import LayersPanel, TimelinePanel, add_legend, set_theme
+from app.viewer.panels import LayersPanel, TimelinePanel
 from app.viewer.playback import Playback
 from app.viewer.scene import Scene
 from app.viewer.session_state import Kind as Kind
