@@ -12,6 +12,7 @@ _REMEDIES = {
     errno.ENOTDIR: "There is a file where a folder is needed; choose another place",
     errno.EEXIST: "There is a file where a folder is needed; choose another place",
     errno.EISDIR: "There is a folder where a file is needed; choose another place",
+    errno.EFBIG: "This disk, or a limit of this process, allows no larger file",
     errno.ENOENT: "Check the path",
 }
 

@@ -6,6 +6,7 @@ import os
 import secrets
 import shutil
 import socket
+import tokenize
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path, PurePath
 from typing import Any, BinaryIO, cast
@@ -15,6 +16,7 @@ import psutil
 import yaml
 from safetensors import numpy as safetensors_numpy
 
+_ODD = (tokenize.TokenError, SyntaxError, TypeError, KeyError, OverflowError, MemoryError)
 _HOST = socket.gethostname().replace("-", "_").replace(".", "_")[:32] or "host"
 
 
@@ -47,11 +49,18 @@ def sweep_temporary(paths: Iterator[Path]) -> int:
     return count
 
 
+def _named(error: OSError, path: Path) -> OSError:
+    """Name what is being written, which a full disk does not."""
+    return OSError(error.errno, error.strerror, str(path))
+
+
 def sync_folder(folder: Path) -> None:
     """Make a folder's entries durable (a rename is lost in a power cut otherwise)."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
+    except OSError as error:
+        raise _named(error, folder) from error
     finally:
         os.close(descriptor)
 
@@ -76,8 +85,8 @@ def write_atomically(
         temporary.replace(path)
     except BaseException as error:
         temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError):  # A full disk is told without a name; name what is written.
-            error.filename, error.filename2 = str(path), None
+        if isinstance(error, OSError) and error.errno is not None:
+            raise _named(error, path) from error
         raise
     if is_durable:
         sync_folder(path.parent)
@@ -151,6 +160,8 @@ def read_array(path: Path, *, mmap: bool = False) -> np.ndarray:
         mapped: Any = np.load(path, mmap_mode="r", allow_pickle=False)
     except EOFError:
         raise ValueError("the file is empty") from None
+    except _ODD as error:  # What NumPy lets out of a header that it cannot parse.
+        raise ValueError(f"its header is damaged ({error})") from error
     if isinstance(mapped, np.lib.npyio.NpzFile):
         mapped.close()
         raise ValueError("it is an archive, not one array")  # noqa: TRY004 - the content is wrong

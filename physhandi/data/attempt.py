@@ -239,9 +239,11 @@ class Attempt:
             kind = type(error).__name__ if isinstance(error, BaseException) else ""
             told = describe(error) if isinstance(error, BaseException) else error
             content |= {"error": told, "error_type": kind}
-        write_json(self.run_folder / EXIT, content)
-        self._lease.release()
-        self._is_open = False
+        try:
+            write_json(self.run_folder / EXIT, content)
+        finally:  # On a full disk the end cannot be noted, but the run must be free again.
+            self._is_open = False
+            self._lease.release()
 
     def _path(self, rel: str) -> Path:
         if not self._is_open:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, cast
 
+from physhandi.data.atomic import named_fields
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.plain_yaml import parse_yaml
 from physhandi.errors import SequenceError
@@ -195,7 +196,10 @@ _LARGEST = 10**300
 
 def _short(value: Any) -> str:
     # YAML's aliases can make a few lines stand for more text than there is memory.
-    text = reprlib.repr(value)
+    try:
+        text = reprlib.repr(value)
+    except ValueError:  # Python writes no whole number of more than 4300 digits.
+        return "a huge number"
     return text if len(text) <= 80 else text[:77] + "..."
 
 
@@ -216,7 +220,7 @@ class _Fields:
         if type(value) is not kind:
             names = {str: "text", bool: "true or false", list: "a list", dict: "named fields"}
             self.fail(name, value, names.get(kind, kind.__name__))
-        return value
+        return named_fields(value) if kind is dict else value
 
     def _any(self, name: str, default: Any) -> Any:
         if name not in self._left and default is _MISSING:

@@ -43,6 +43,7 @@ _SWITCHES = (
     "uses_sequence_gravity",
     "rounds_decay",
 )
+_LARGEST = 1e30  # Larger numbers, squared or multiplied, leave the simulator's float32.
 _OPTIONAL = ("ground_height", "frame_duration")
 # float32 exp(-5e-5 drag) on an H200 for drag 0, 1, …, 20, less the nearest float32, in units of
 # 2^-24 (measured). PhysTwin truncates its drag to a whole number.
@@ -115,10 +116,10 @@ class SimulationParameters:
             if isinstance(value, bool) or not isinstance(value, int | float | np.number):
                 raise UsageError(f"Simulation parameter {name} is {value!r}; expected a number.")
             is_inside = (low is None or value >= low) and (high is None or value <= high)
-            if not (math.isfinite(value) and is_inside):
+            if not (math.isfinite(value) and is_inside and abs(value) <= _LARGEST):
                 raise UsageError(
-                    f"Simulation parameter {name} is {value}; expected a finite value "
-                    f"in [{low if low is not None else '-∞'}, {high if high is not None else '∞'}]."
+                    f"Simulation parameter {name} is {value}; expected a finite value in "
+                    f"[{-_LARGEST if low is None else low}, {_LARGEST if high is None else high}]."
                 )
 
     @property
@@ -203,11 +204,13 @@ def _converted(name: str, value: Any) -> Any:
         return bool(value)
     try:
         number = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise UsageError(f"Simulation parameter {name} is {value!r}; expected a number.") from None
+    if isinstance(value, bool):
+        raise UsageError(f"Simulation parameter {name} is {value!r}; expected a number.")
     if name not in _INTEGERS:
         return number
-    if number != math.floor(number):
+    if not number.is_integer():
         raise UsageError(f"Simulation parameter {name} is {value!r}; expected a whole number.")
     return int(number)
 

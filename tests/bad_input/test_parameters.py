@@ -102,7 +102,7 @@ ORDERS = {
         ("frames", "positive"),
     ),
     "benchmark model not there": (
-        ["benchmark", "rollout", "--model", "twin.npz", "--device", "cpu"],
+        ["benchmark", "rollout", "--topology", "twin.npz", "--device", "cpu"],
         2,
         ("twin.npz",),
     ),

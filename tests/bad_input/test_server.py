@@ -1,0 +1,285 @@
+"""Bad requests and damaged folders, met through the server's API and pages."""
+
+import errno
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bad_input_world import bad, both, fields, put, removed, table, text, truncated
+from server_world import World, make_world
+from starlette.testclient import TestClient
+
+from app.jobs.worker import work
+from physhandi.data.run import Run
+
+OUT = "attempts/1/out"
+SHEET = f"{OUT}/sequences/sheet"
+
+
+@pytest.fixture
+def world(tmp_path: Path, sheet_folder: Path, filmed_folder: Path, fitted_folder: Path) -> World:
+    data = tmp_path / "data"
+    for folder in (sheet_folder, filmed_folder):
+        shutil.copytree(folder, data / "sequences" / folder.name)
+    shutil.copytree(fitted_folder, data / "runs" / "fitted")
+    return make_world(data, bundled=tmp_path / "nothing")
+
+
+@pytest.fixture
+def client(world: World) -> Iterator[TestClient]:
+    yield world.script()
+    world.sessions.shutdown()
+
+
+def refusal(response: Any) -> str:
+    """Check that an answer of the API is a clear refusal; returns its message."""
+    assert 400 <= response.status_code < 500, response.text
+    assert list(response.json()) == ["error"]
+    assert "Traceback" not in response.text
+    return response.json()["error"]["message"]
+
+
+RUN = {"sequences": ["sheet"]}
+LAUNCHES: dict[str, tuple[Any, int, str]] = {
+    "no body": ("", 422, "body"),
+    "no JSON": ("{'sequences'", 422, "JSON"),
+    "no object": ([1, 2], 422, "body"),
+    "no sequences": ({"sequences": []}, 422, "sequences"),
+    "too many sequences": ({"sequences": ["sheet"] * 65}, 422, "sequences"),
+    "text for a list": ({"sequences": "sheet"}, 422, "sequences"),
+    "NaN for a list": ('{"sequences": NaN}', 422, "sequences"),
+    "unknown sequence": ({"sequences": ["towel"]}, 404, "'towel'"),
+    "path for a sequence": ({"sequences": ["../../etc"]}, 422, "sequences"),
+    "same sequence twice": ({"sequences": ["sheet", "sheet"]}, 409, "'sheet'"),
+    "unknown profile": (RUN | {"profile": "fastest"}, 422, "'fastest'"),
+    "path for a profile": (RUN | {"profile": "../quick"}, 422, "profile"),
+    "endless name": (RUN | {"name": "x" * 121}, 422, "name"),
+    "negative parameter": (RUN | {"parameters": {"drag": -1}}, 422, "parameters"),
+    "NaN parameter": ('{"sequences": ["sheet"], "drag": NaN}', 422, "drag"),
+    "deep body": ("[" * 100_000, 400, "body"),
+}
+
+
+@table(LAUNCHES)
+def test_a_senseless_launch_is_refused(
+    world: World, client: TestClient, case: tuple[Any, int, str]
+) -> None:
+    body, status, word = case
+    content = body if isinstance(body, str) else json.dumps(body)
+    headers = {"Content-Type": "application/json"}
+    response = client.post("/api/v1/runs", content=content, headers=headers)
+    assert response.status_code == status, response.text
+    assert word in refusal(response)
+    assert [path.name for path in world.settings.run_dir.iterdir()] == ["fitted"]
+
+
+def test_an_endless_body_is_not_read(client: TestClient) -> None:
+    headers = {"Content-Type": "application/json"}
+    response = client.post("/api/v1/runs", content="[" * (2**20 + 1), headers=headers)
+    assert (response.status_code, response.text) == (413, "Content Too Large")
+
+
+SESSIONS: dict[str, tuple[Any, int, str]] = {
+    "unknown run": ({"kind": "run", "id": "mine"}, 404, "'mine'"),
+    "unknown sequence": ({"kind": "sequence", "id": "towel"}, 404, "'towel'"),
+    "unknown kind": ({"kind": "file", "id": "fitted"}, 422, "kind"),
+    "path for an id": ({"kind": "run", "id": "../fitted"}, 422, "id"),
+    "number for an id": ({"kind": "run", "id": 7}, 422, "id"),
+}
+
+
+@table(SESSIONS)
+def test_a_senseless_scene_is_refused(client: TestClient, case: tuple[Any, int, str]) -> None:
+    body, status, word = case
+    response = client.post("/api/v1/sessions", json=body)
+    assert response.status_code == status
+    assert word in refusal(response)
+
+
+IDS = ("../../etc", "%2e%2e", "..%2f..%2fetc%2fpasswd", "a.b", "x" * 65, "%00", "a%0ab", "-/-")
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "runs/{}",
+        "runs/{}/losses",
+        "runs/{}/frame_errors",
+        "runs/{}/log",
+        "runs/{}/export?format=npz",
+        "runs/{}/events",
+        "sequences/{}",
+    ],
+)
+def test_an_id_is_never_a_path(client: TestClient, path: str) -> None:
+    for id_ in IDS:
+        assert refusal(client.get(f"/api/v1/{path.format(id_)}"))
+
+
+@pytest.mark.parametrize("path", ["runs/{}", "live/{}", "sequences/{}/thumbnail"])
+def test_a_page_of_nothing_is_a_page(world: World, path: str) -> None:
+    browser = world.browser()
+    for id_ in (*IDS, "mine"):
+        response = browser.get(f"/{path.format(id_)}")
+        assert 400 <= response.status_code < 500
+        assert response.headers["content-type"].startswith("text/html")
+        assert "Traceback" not in response.text
+
+
+RUNS: dict[str, tuple[Callable[[Path], Any], str]] = {
+    # damage, what a page or the scene names
+    "no run.yaml": (removed("run.yaml"), "run.yaml"),
+    "torn job.yaml": (truncated("job.yaml", 50), "job.yaml"),
+    "job.yaml of a list": (text("job.yaml", lambda _: "[1, 2]"), "job.yaml"),
+    "torn metrics": (truncated(f"{OUT}/metrics.json", 30), "metrics.json"),
+    "metrics of a list": (text(f"{OUT}/metrics.json", lambda _: "[1]"), "metrics.json"),
+    "metrics of numbers": (text(f"{OUT}/metrics.json", lambda _: '{"sheet": 3}'), "metrics.json"),
+    "torn losses": (truncated(f"{OUT}/losses.json", 30), "losses.json"),
+    "losses of numbers": (text(f"{OUT}/losses.json", lambda _: '{"a": 1}'), "losses.json"),
+    "torn parameters": (truncated(f"{OUT}/object/parameters.yaml", 30), "parameters.yaml"),
+    "parameters of a list": (
+        text(f"{OUT}/object/parameters.yaml", lambda _: "[1]"),
+        "parameters.yaml",
+    ),
+    "torn frame errors": (truncated(f"{SHEET}/frame_errors.json", 9), "frame_errors.json"),
+    "frame errors of a list": (
+        text(f"{SHEET}/frame_errors.json", lambda _: "[]"),
+        "frame_errors.json",
+    ),
+    "torn stages": (truncated("attempts/1/stages.json", 40), "stages.json"),
+    "stages of numbers": (text("attempts/1/stages.json", lambda _: "[3]"), "stages.json"),
+    "torn manifest": (truncated("attempts/1/MANIFEST.json", 40), "MANIFEST.json"),
+    "torn rollout": (truncated(f"{SHEET}/rollout.npy"), "rollout.npy"),
+    "no model": (removed(f"{SHEET}/model.safetensors"), "model.safetensors"),
+    "torn meta": (truncated(f"{SHEET}/meta.yaml", 12), "meta.yaml"),
+    "torn exit.json": (truncated("exit.json", 10), "exit.json"),
+    "exit.json of a list": (text("exit.json", lambda _: "[]"), "exit.json"),
+    "torn events": (text("events.jsonl", lambda t: t + '{"seq": 1, "st\n[3]\n"x"\n'), ""),
+    "progress of a list": (
+        lambda folder: (folder / "progress.json").write_text("[]"),
+        "progress.json",
+    ),
+    "current of words": (lambda folder: (folder / "current").write_text("the last"), ""),
+    "current that is not there": (lambda folder: (folder / "current").write_text("7\n"), ""),
+    "bytes as a log": (lambda folder: (folder / "log.txt").write_bytes(b"\xff\x00<b>"), ""),
+}
+PATHS = ("", "/losses", "/frame_errors", "/log", "/export?format=npz", "/export?format=yaml")
+
+
+@table(RUNS)
+def test_a_damaged_run_is_told_and_hides_no_other(
+    world: World, client: TestClient, case: tuple[Callable[[Path], Any], str]
+) -> None:
+    damage, word = case
+    shutil.copytree(world.settings.run_dir / "fitted", world.settings.run_dir / "whole")
+    damage(world.settings.run_dir / "fitted")
+    told = ""
+    for path in PATHS:
+        response = client.get(f"/api/v1/runs/fitted{path}")
+        assert response.status_code < 500, response.text
+        assert "Traceback" not in response.text
+        told += response.text if path != "/log" else ""
+    body = {"kind": "run", "id": "fitted"}
+    told += client.post("/api/v1/sessions", json=body).text
+    browser = world.browser()
+    for path in ("/", "/runs/fitted", "/runs/fitted/parts"):
+        page = browser.get(path)
+        assert page.status_code < 500
+        assert page.headers["content-type"].startswith("text/html")
+        assert "Traceback" not in page.text
+        told += page.text
+    assert word in told
+    listed = {run["id"]: run for run in client.get("/api/v1/runs").json()["runs"]}
+    assert set(listed) == {"fitted", "whole"}
+    assert listed["whole"]["state"] == "succeeded"
+    assert client.post("/api/v1/sessions", json=body | {"id": "whole"}).status_code == 201
+
+
+SEQUENCES = {
+    "no view": bad(lambda folder: shutil.rmtree(folder / "views"), "views/front"),
+    "torn yaml": bad(truncated("sequence.yaml", 30), "sequence.yaml"),
+    "unknown field": bad(fields(colour="red"), "'colour'"),
+    "no frames": bad(fields(frame_count=0), "frame_count is 0"),
+    "endless frames": bad(fields(frame_count=10**12), "frame_count is 1000000000000"),
+    "frames with a gap": bad(removed("views/front/mask/00001.png"), "mask of frame 1"),
+    "20 joints": bad(
+        lambda folder: np.save(folder / "views/front/keypoint.npy", np.zeros((4, 1, 20, 3))), "20"
+    ),
+}
+
+
+@table(SEQUENCES)
+def test_a_damaged_recording_is_told_and_hides_no_other(
+    world: World, client: TestClient, case: Any
+) -> None:
+    case.damage(world.settings.sequence_dir / "filmed")
+    listed = {item["id"]: item for item in client.get("/api/v1/sequences").json()["sequences"]}
+    assert listed["sheet"]["error"] is None
+    assert all(word in listed["filmed"]["error"] for word in case.words)
+    for response in (
+        client.post("/api/v1/runs", json={"sequences": ["filmed"]}),
+        client.post("/api/v1/sessions", json={"kind": "sequence", "id": "filmed"}),
+        client.get("/sequences/filmed/thumbnail"),
+    ):
+        message = refusal(response)
+        assert all(word in message for word in case.words)
+    browser = world.browser()
+    home = browser.get("/")
+    assert home.status_code == 200
+    assert all(word.replace("'", "&#39;") in home.text for word in case.words)
+    page = browser.get("/sequences/filmed/thumbnail")
+    assert page.status_code == 422
+    assert "Traceback" not in page.text
+
+
+VALUES = {
+    # What is only seen when values are read: the fit tells, not the listing.
+    "NaN in control": ("sheet", put("control.npy", (4, 0, 0), np.nan), ("control.npy", "frame 4")),
+    "millimetres": (
+        "sheet",
+        both(put("object_node.npy", (3, 0), 250.0)),
+        ("object_node.npy", "millimetres"),
+    ),
+    "torn depth": ("filmed", truncated("views/front/depth/00002.png"), ("depth of frame 2",)),
+    "torn color": ("filmed", truncated("views/front/color.mp4", 300), ("color.mp4",)),
+}
+
+
+@table(VALUES)
+def test_a_fit_of_wrong_values_fails_with_its_reason_and_advice(
+    world: World,
+    client: TestClient,
+    caplog: pytest.LogCaptureFixture,
+    case: tuple[str, Callable[[Path], Any], tuple[str, ...]],
+) -> None:
+    name, damage, words = case
+    response = client.post("/api/v1/runs", json={"sequences": [name]})
+    damage(world.settings.sequence_dir / name)
+    run_id = response.json()["id"]
+    assert work(world.settings.run_dir / run_id, "cpu") == 1
+    assert "Traceback" not in caplog.text
+    (world.settings.run_dir / run_id / "queued.json").unlink()
+    shown = client.get(f"/api/v1/runs/{run_id}").json()
+    assert shown["state"] == "failed"
+    assert all(word in shown["failure"]["message"] for word in words), shown["failure"]
+    assert "sequence" in shown["failure"]["advice"]
+    page = world.browser().get(f"/runs/{run_id}")
+    assert page.status_code == 200
+    assert shown["failure"]["advice"] in page.text
+    assert "Traceback" not in page.text
+    assert not Run.open(world.settings.run_dir / run_id).is_published
+
+
+def test_a_full_disk_is_told(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    response = world.script().post("/api/v1/runs", json=RUN)
+    assert response.status_code == 507
+    assert "Free some space" in response.json()["error"]["message"]
+    assert [path.name for path in world.settings.run_dir.iterdir()] == ["fitted"]
