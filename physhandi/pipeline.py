@@ -26,6 +26,7 @@ from physhandi.fitting.rollouts import (
     object_nodes_of,
     refine_sequence,
     simulate_sequence,
+    store_refined,
 )
 from physhandi.fitting.simulate import simulate_again
 from physhandi.fitting.spring_optimisation import optimise_springs
@@ -238,11 +239,16 @@ def _stage_refinement(
     before, after, curve = [], [], []
     if config.refinement.iterations and held:
         problems = _problems(held, config, attempt)
-        for sequence, problem in zip(held, problems, strict=True):
-            result = refine_sequence(attempt, sequence, problem, config, progress, device=device)
-            before.append(result.loss_before)
-            after.append(result.loss_after)
-            curve = curve or result.curve
+        results = [
+            refine_sequence(attempt, sequence, problem, config, progress, device=device)
+            for sequence, problem in zip(held, problems, strict=True)
+        ]
+        # Earlier stages' files are replaced, so an interruption before this must leave them all.
+        for sequence, problem, result in zip(held, problems, results, strict=True):
+            store_refined(attempt, sequence, problem, result)
+        before = [result.loss_before for result in results]
+        after = [result.loss_after for result in results]
+        curve = results[0].curve
     _finish(attempt, REFINEMENT, before, after, curve)
 
 

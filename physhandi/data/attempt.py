@@ -18,6 +18,7 @@ from physhandi.data.atomic import (
     write_yaml,
 )
 from physhandi.data.checkpoint import packed, read_checkpoint, write_checkpoint
+from physhandi.data.environment import ENVIRONMENT
 from physhandi.data.lease import Lease, locked
 from physhandi.data.resume import prune, take_over
 from physhandi.data.run_files import (
@@ -42,6 +43,8 @@ from physhandi.errors import CancelledError, RunError, describe
 from physhandi.progress import Progress
 
 _LOSSES = "losses.json"
+_ATTEMPT_FILES = {_LOSSES, ENVIRONMENT}
+"""Written anew by every attempt, so that no stage can stand for them."""
 
 
 class Attempt:
@@ -159,7 +162,7 @@ class Attempt:
         files = {
             rel: record
             for rel, record in self._hash_outputs().items()
-            if known.get(rel) != record and rel != _LOSSES
+            if known.get(rel) != record and rel not in _ATTEMPT_FILES
         }
         self._stages = [stage for stage in self._stages if stage["name"] != name]
         self._stages.append(

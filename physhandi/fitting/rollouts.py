@@ -55,19 +55,15 @@ def refine_sequence(
     *,
     device: str,
 ) -> RefinedHands:
-    """Correct the stored hands of a sequence so that its stored object moves as it was seen to.
-
-    The hands as they were are kept as ``hand_<side>_initial``, and where their control nodes were
-    when the springs were laid as ``attachment``: a topology built anew must begin there.
-    """
+    """Correct the stored hands of a sequence so that its stored object moves as it was seen to."""
     motions = artefacts.load_motions(output.out, sequence.name)
     models = _hand_models(motions)
     vertex = control_trajectory(motions, models)
-    folder = artefacts.sequence_folder(sequence.name)
-    keypoint = np.load(output.out / folder / "keypoint.npy", allow_pickle=False)
+    folder = output.out / artefacts.sequence_folder(sequence.name)
+    keypoint = np.load(folder / "keypoint.npy", allow_pickle=False)
     cameras = [view.camera for view in sequence.views]
     seen = keypoint[:, : problem.frame_count]
-    refined = refine_hands(
+    return refine_hands(
         RefinementProblem(
             object_=problem,
             model=artefacts.load_model(output.out, sequence.name),
@@ -88,9 +84,20 @@ def refine_sequence(
         progress,
         device=device,
     )
+
+
+def store_refined(
+    output: Attempt, sequence: Sequence, problem: ObjectProblem, refined: RefinedHands
+) -> None:
+    """Put corrected hands in the place of the stored ones.
+
+    The hands as they were are kept as ``hand_<side>_initial``, and where their control nodes were
+    when the springs were laid as ``attachment``: a topology built anew must begin there.
+    """
+    motions = artefacts.load_motions(output.out, sequence.name)
     artefacts.save_refinement(output, sequence.name, motions, problem.control[0], refined.motions)
+    folder = artefacts.sequence_folder(sequence.name)
     output.save_array(f"{folder}/control.npy", refined.control.astype(np.float32))
-    return refined
 
 
 def _hand_models(motions: tuple[HandMotion, ...]) -> tuple[HandModel, ...]:

@@ -303,3 +303,16 @@ def test_only_one_of_several_processes_may_begin(tmp_path: Path) -> None:
         for child in children:
             child.join()
         assert run.state == "failed"
+
+
+def test_a_run_that_is_interrupted_again_and_again_keeps_its_stages(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "fit")
+    for number in range(4):
+        attempt = run.begin_attempt()
+        assert attempt.stage_done("hands") == (number > 0)
+        attempt.save_json("environment.json", {"started": number})
+        if number == 0:
+            attempt.save_array("hands.npy", np.arange(3.0))
+            attempt.finish_stage("hands")
+        attempt.cancelled()
+    assert run.begin_attempt().stage_done("hands")
