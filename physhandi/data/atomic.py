@@ -16,6 +16,7 @@ import psutil
 import yaml
 from safetensors import numpy as safetensors_numpy
 
+_MAGIC = b"\x93NUMPY"
 _ODD = (tokenize.TokenError, SyntaxError, TypeError, KeyError, OverflowError, MemoryError)
 _HOST = socket.gethostname().replace("-", "_").replace(".", "_")[:32] or "host"
 
@@ -156,15 +157,15 @@ def read_array(path: Path, *, mmap: bool = False) -> np.ndarray:
         ValueError: If the file is not a whole array of plain numbers.
         FileNotFoundError: If there is no such file.
     """
+    with path.open("rb") as stream:
+        start = stream.read(len(_MAGIC))
+    if start != _MAGIC:
+        kinds = {b"": "the file is empty", b"PK": "it is an archive, not one array"}
+        raise ValueError(kinds.get(start[:2], "it does not begin as one"))
     try:
         mapped: Any = np.load(path, mmap_mode="r", allow_pickle=False)
-    except EOFError:
-        raise ValueError("the file is empty") from None
     except _ODD as error:  # What NumPy lets out of a header that it cannot parse.
         raise ValueError(f"its header is damaged ({error})") from error
-    if isinstance(mapped, np.lib.npyio.NpzFile):
-        mapped.close()
-        raise ValueError("it is an archive, not one array")  # noqa: TRY004 - the content is wrong
     return mapped if mmap else np.array(mapped)
 
 

@@ -1,4 +1,4 @@
-"""Tells lengths that were given in another unit than metres: they are off by a thousand."""
+"""Tells lengths that were given in another unit: metres off by a thousand, parts of an image."""
 
 import numpy as np
 from jaxtyping import Float
@@ -6,6 +6,7 @@ from numpy import ndarray
 
 FARTHEST = 20.0
 """A point or camera farther from the origin than this was not given in metres [m]."""
+_FAR_OUTSIDE = 5.0  # From the centre, in image sizes; a hand may reach out of the image.
 SMALLEST = 2e-3
 """An object smaller than this was not given in metres [m]."""
 
@@ -47,6 +48,34 @@ def doubt_extent(point: Float[ndarray, "point 3"], smallest: float = SMALLEST) -
         f"shows an object of only {extent * 1e3:.2g} mm, whose unit looks 1000 times too large; "
         "multiply by 1000, metres are expected"
     )
+
+
+def doubt_keypoints(
+    keypoint: Float[ndarray, "frame hand 21 3"], width: int, height: int
+) -> tuple[tuple[int, ...], str] | None:
+    """Find a keypoint that cannot be given in pixels of its view.
+
+    Args:
+        keypoint: Pixel x, pixel y and confidence; those that nobody saw are not looked at.
+        width: Width of the view's images [px].
+        height: Their height [px].
+
+    Returns:
+        Its frame, hand and joint, and what is wrong with it; None if all is well.
+    """
+    is_seen = np.isfinite(keypoint).all(axis=-1) & (np.nan_to_num(keypoint[..., 2]) > 0)
+    size = np.array([width, height])
+    is_far = (np.abs(keypoint[..., :2] / size - 0.5) > _FAR_OUTSIDE).any(axis=-1) & is_seen
+    x, y = keypoint[..., 0][is_seen], keypoint[..., 1][is_seen]
+    is_part = min(width, height) > 2 and len(x) > 0 and max(x.max(), y.max()) <= 1.0
+    wrong = np.argwhere(is_far if not is_part else is_seen)
+    if not len(wrong):
+        return None
+    place = tuple(int(index) for index in wrong[0])
+    at = f"is at ({keypoint[place][0]:.4g}, {keypoint[place][1]:.4g})"
+    if is_part:
+        return place, f"{at}, a part of the image; multiply by {width} and {height}, pixels count"
+    return place, f"{at} px, far outside of the {width}x{height} image; repair it or make it NaN"
 
 
 def doubt_depth(largest: int) -> str | None:

@@ -7,7 +7,13 @@ import numpy as np
 from numpy import ndarray
 
 from physhandi.data.atomic import read_array
-from physhandi.data.length_unit import FARTHEST, doubt_depth, doubt_extent, doubt_position
+from physhandi.data.length_unit import (
+    FARTHEST,
+    doubt_depth,
+    doubt_extent,
+    doubt_keypoints,
+    doubt_position,
+)
 from physhandi.data.sequence_schema import FILE, SequenceMeta
 from physhandi.data.truth import FOLDER as TRUTH
 from physhandi.data.view import View
@@ -91,6 +97,7 @@ def check_values(
         for file in VIEW_ARRAYS:
             _check_finite(folder, view.folder / file, name)
         _check_tracks(view, name)
+        _check_keypoints(view, name)
         readers = ((view.has_color and reads_color, view.color), (view.has_mask, view.mask))
         for read in [read for is_there, read in readers if is_there]:
             for frame in range(view.frame_count):
@@ -225,6 +232,16 @@ def _check_tracks(view: View, name: str) -> None:
             f"is NaN at frame {frame}, track {track}, which track_visible.npy calls visible. "
             "Mark it as not visible",
         )
+
+
+def _check_keypoints(view: View, name: str) -> None:
+    if view.keypoint is None:
+        return
+    doubt = doubt_keypoints(view.keypoint, view.camera.width, view.camera.height)
+    if doubt is not None:
+        frame, hand, joint = doubt[0]
+        file = f"views/{view.name}/keypoint.npy: frame {frame}, hand {hand}, joint {joint}"
+        _fail(name, file, doubt[1])
 
 
 def _fail(name: str, file: str, reason: str) -> NoReturn:

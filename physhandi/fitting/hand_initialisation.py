@@ -77,7 +77,8 @@ def guess_wrist(
     if not is_known.any():
         raise FitError(
             f"The {model.side} hand cannot be placed: no frame shows "
-            f"{_MIN_PALM_POINTS} keypoints of its palm. Check the keypoints and the calibration."
+            f"{_MIN_PALM_POINTS} keypoints of its palm apart from each other. Check the keypoints "
+            "and the calibration."
         )
     rotation, translation = _bridge(rotation, translation, is_known)
     return WristGuess(rotation, translation, scale)
@@ -124,9 +125,12 @@ def _guess_from_one_view(
         return None
     camera, seen = cameras[view], np.flatnonzero(is_seen[view, :])
     pixel = camera.undistort(keypoint[view, seen, :2].astype(np.float64))
-    found, vector, offset = cv2.solvePnP(
-        template[seen], pixel, camera.K, None, flags=cv2.SOLVEPNP_SQPNP
-    )
+    try:
+        found, vector, offset = cv2.solvePnP(
+            template[seen], pixel, camera.K, None, flags=cv2.SOLVEPNP_SQPNP
+        )
+    except cv2.error:  # The keypoints are all in one place.
+        return None
     if not found:
         return None
     pose = camera.T_world_camera

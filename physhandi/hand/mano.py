@@ -207,7 +207,7 @@ class ManoHand(HandModel):
 def _read(path: Path, _changed: int, side: Side) -> ManoHand:
     """Read an imported file; `_changed` makes a file that was imported anew another one."""
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
             return ManoHand({name: stored[name] for name in _NAMES}, side)
     except (OSError, ValueError, KeyError, IndexError, zipfile.BadZipFile) as error:
         raise MissingInputError(

@@ -1,8 +1,10 @@
 """Broken recordings, each given to ``physhandi reconstruct``."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from bad_input_world import (
     FILMED_FRAMES,
     Bad,
@@ -21,6 +23,9 @@ from bad_input_world import (
     text,
     truncated,
 )
+from server_world import tiny_config
+
+from app import commands
 
 DEPTH, MASK, VIDEO, KEYPOINT = (
     f"views/front/{part}"
@@ -190,6 +195,24 @@ FILMED = {
     "infinite keypoint": bad(
         put(KEYPOINT, (1, 0, 8, 0), np.inf), "keypoint.npy", "inf", "frame 1", "hand 0"
     ),
+    "keypoints as parts of the image": bad(
+        array(KEYPOINT, lambda k: k / np.array([48, 36, 1], np.float32)),
+        "keypoint.npy",
+        "frame 0, hand 0, joint 0",
+        "multiply by 48 and 36",
+    ),
+    "keypoint far outside": bad(
+        put(KEYPOINT, (2, 0, 5, 1), 4e6), "keypoint.npy", "frame 2, hand 0, joint 5", "far outside"
+    ),
+    "keypoints in one place": bad(
+        put(KEYPOINT, (..., slice(2)), 20.0), "'filmed'", "apart from each other"
+    ),
+    "keypoints nobody has seen": bad(
+        put(KEYPOINT, slice(None), np.nan), "'filmed'", "hand", "keypoints of its palm"
+    ),
+    "neither keypoints nor video": bad(
+        both(removed(KEYPOINT), removed(VIDEO)), "'filmed'", "color", "keypoint.npy"
+    ),
     "K of 2x2": bad(camera(K=[[1.0, 0.0], [0.0, 1.0]]), "'front'", "K", "(3, 3)", "(2, 2)"),
     "K of text": bad(camera(K="wide"), "'front'", "K", "numbers"),
     "negative focal length": bad(
@@ -225,3 +248,40 @@ def test_a_broken_recording_of_views_is_refused(
     terminal.refused(
         case.code, case.words, "reconstruct", filmed, "--out", "out", "--device", "cpu"
     )
+
+
+HANDS = {
+    # What lies in the folder of hand models, and what the refusal must say.
+    "no MANO": bad(lambda _: None, "MANO model is missing", "MANO_RIGHT.pkl", "import mano"),
+    "torn MANO": bad(
+        lambda folder: (folder / "mano_right.npz").write_bytes(b"PK\x03\x04"),
+        "mano_right.npz",
+        "damaged",
+        "import mano",
+    ),
+    "another archive": bad(
+        lambda folder: np.savez(folder / "mano_right.npz", f=np.zeros(3)),
+        "mano_right.npz",
+        "v_template",
+    ),
+    "a pickle": bad(
+        lambda folder: np.savez(
+            folder / "mano_right.npz", v_template=np.array([{}]), allow_pickle=True
+        ),
+        "mano_right.npz",
+        "damaged",
+    ),
+}
+
+
+@table(HANDS)
+def test_a_fit_with_mano_needs_a_whole_one(
+    terminal: Terminal, filmed: Path, monkeypatch: pytest.MonkeyPatch, case: Bad
+) -> None:
+    config = tiny_config()
+    config = replace(config, hand=replace(config.hand, model="mano"))
+    monkeypatch.setattr(commands, "load_profile", lambda _: config)
+    monkeypatch.setenv("PHYSHANDI_HANDS", str(terminal.folder))
+    case.damage(terminal.folder)
+    order = ("reconstruct", filmed, "--out", "out", "--device", "cpu")
+    terminal.refused(case.code, case.words, *order)

@@ -1,0 +1,73 @@
+"""Broken recordings and runs, as a user of the browser meets them on a real server."""
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bad_input_world import fields, put, truncated
+from playwright.sync_api import Browser, Page, expect
+from sheet_sequence import write_sheet
+
+pytestmark = pytest.mark.e2e
+BUNDLED_RUN = Path(__file__).parents[2] / "sequences/runs/towel_fold_quick"
+ROLLOUT = "sequences/towel_fold/rollout.npy"
+
+
+@pytest.fixture
+def page(browser: Browser, served) -> Iterator[Page]:
+    """A tab beside damaged recordings and a damaged run; nothing in it may fail by itself."""
+    for name in ("unreadable", "lost"):
+        write_sheet(served.data_dir / "sequences" / name)
+    fields(colour="red")(served.data_dir / "sequences/unreadable")
+    put("control.npy", (4, 1, 2), np.nan)(served.data_dir / "sequences/lost")
+    torn = served.data_dir / "runs/torn"
+    shutil.copytree(BUNDLED_RUN, torn)
+    truncated(f"attempts/1/out/{ROLLOUT}")(torn)
+    context = browser.new_context()
+    defects: list[str] = []
+    context.on("weberror", lambda error: defects.append(str(error.error)))
+    page = context.new_page()
+    page.goto(served.url)
+    yield page
+    context.close()
+    assert defects == []
+
+
+def test_what_is_broken_is_told_where_the_user_meets_it(page: Page) -> None:
+    # A recording that cannot be read says why, where its buttons would be.
+    card = page.locator("[data-sequence=unreadable]")
+    expect(card.locator(".problem")).to_contain_text("field 'colour' is not known")
+    expect(card.get_by_role("button")).to_have_count(0)
+
+    # A run whose files have changed is not shown, and the page stays.
+    page.locator("#runs [data-run=torn] [data-open]").click()
+    expect(page.locator("#toast")).to_contain_text(f"{ROLLOUT} has 60 bytes instead of")
+    expect(page.locator("h1")).to_be_visible()
+
+    # A fit of wrong values fails with its reason, and with what to do.
+    page.locator("article[data-sequence=lost]").get_by_role("button", name="Launch fit").click()
+    page.locator("#launch button[type=submit]").click()
+    row = page.locator("#runs tr", has_text="lost")
+    expect(row.locator(".state")).to_have_text("failed")
+    row.locator("a").click()
+    failure = page.locator(".failure")
+    expect(failure).to_contain_text("control.npy is nan at frame 4, control 1")
+    expect(failure.locator(".advice")).to_contain_text("Repair the named file of the sequence")
+    assert "Traceback" not in page.locator("body").inner_text()
+
+    # An address of nothing is a page with a way home.
+    for path in ("/runs/nothing", "/runs/..%2f..%2fetc", "/live/nothing", "/sequences/x/thumbnail"):
+        answer = page.goto(_at(page, path))
+        assert answer is not None
+        assert answer.status == 404
+        text = page.locator("body").inner_text()
+        assert "Traceback" not in text
+        assert "{" not in text
+        expect(page.locator("a[href='/']").first).to_be_visible()
+
+
+def _at(page: Page, path: str) -> str:
+    scheme, _, rest = page.url.partition("://")
+    return f"{scheme}://{rest.partition('/')[0]}{path}"
