@@ -118,7 +118,7 @@ def test_markers_become_identified_tracks(tmp_path: Path):
 
 
 def test_judged_markers_are_the_cloud_and_keep_their_judgement(tmp_path: Path):
-    marker = np.arange(3 * 4 * 3, dtype=np.float32).reshape(3, 4, 3)
+    marker = 0.1 * np.arange(3 * 4 * 3, dtype=np.float32).reshape(3, 4, 3)
     marker[1, 1] = marker[2, 3] = np.nan
     # Seen in both frames: all but markers 1 (twice) and 3 (frame 2); marker 0 slipped to frame 1.
     is_valid = np.array([[0, 0, 0, 0], [0, 0, 1, 1], [1, 0, 1, 0]], dtype=bool)
