@@ -210,7 +210,7 @@ def _listen(host: str, port: int) -> socket.socket:
         listener.close()
         raise OSError(
             f"Port {port} of {host} cannot be used ({error.strerror}). "
-            "Choose another one with --port."
+            "Choose another --port or --host."
         ) from error
     return listener
 

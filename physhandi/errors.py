@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 
 _REMEDIES = {
     errno.ENOSPC: "Free some space on this disk, or choose another folder",
@@ -15,6 +16,8 @@ _REMEDIES = {
     errno.EFBIG: "This disk, or a limit of this process, allows no larger file",
     errno.ENOENT: "Check the path",
 }
+# What is written beside its place at first is told by the name of the place.
+_TEMPORARY = re.compile(r"\.([^/]+)\.\w+-\d+-[0-9a-f]{8}\.tmp")
 
 
 def describe(error: BaseException) -> str:
@@ -23,7 +26,7 @@ def describe(error: BaseException) -> str:
         return str(error) or type(error).__name__
     reason = error.strerror or os.strerror(error.errno)
     has_name = isinstance(error.filename, str | bytes | os.PathLike)
-    where = f"{os.fsdecode(error.filename)}: " if has_name else ""
+    where = _TEMPORARY.sub(r"\1", os.fsdecode(error.filename)) + ": " if has_name else ""
     remedy = _REMEDIES.get(error.errno)
     return f"{where}{reason}." + (f" {remedy}." if remedy else "")
 

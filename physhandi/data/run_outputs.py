@@ -152,6 +152,11 @@ class RunOutputs:
         """
         number = self._published()
         if number is None:
+            if self.state == "succeeded":
+                raise RunError(
+                    f"Run '{self.id}' has ended, but its results are not whole: '{CURRENT}' does "
+                    f"not lead to an attempt with a {MANIFEST}. Run it again."
+                )
             raise RunError(
                 f"Run '{self.id}' is {self.state}: there is nothing published to read yet."
             )

@@ -192,7 +192,8 @@ def _check_finite(root: Path, path: Path, name: str) -> None:
     is_wrong: ndarray = np.isinf(array) if may_be_nan else ~np.isfinite(array)
     if is_wrong.any():
         place = tuple(int(index) for index in np.argwhere(is_wrong)[0])
-        at = ", ".join(f"{axis} {index}" for axis, index in zip(axes, place[:-1], strict=False))
+        named = ("joint" if axis == 21 else axis for axis in axes)
+        at = ", ".join(f"{axis} {index}" for axis, index in zip(named, place[:-1], strict=False))
         file = path.relative_to(root).as_posix()
         _fail(name, file, f"is {array[place]} at {at}. Repair or cut out these frames")
 

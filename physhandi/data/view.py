@@ -168,7 +168,9 @@ class View:
             self._fail(kind, frame, f"is missing ({path.relative_to(self.folder)})")
         image: ndarray | None = cv2.imread(str(path), flags)
         if image is None:
-            self._fail(kind, frame, f"cannot be decoded ({path.relative_to(self.folder)})")
+            self._fail(
+                kind, frame, f"cannot be decoded ({path.relative_to(self.folder)}); re-export it"
+            )
         return image
 
     def _check(self, frame: int) -> None:

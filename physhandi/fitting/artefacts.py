@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from safetensors.numpy import load_file
 
-from physhandi.data.atomic import read_array
+from physhandi.data.atomic import named_fields, read_array
 from physhandi.data.attempt import Attempt
 from physhandi.data.observation import ObjectObservation
 from physhandi.data.plain_yaml import parse_yaml
@@ -223,8 +223,10 @@ def load_parameters(out: Path) -> SimulationParameters:
     """Read the global parameters of a run."""
     path = out / "object/parameters.yaml"
     with reading(path):
-        content = parse_yaml(path.read_text(encoding="utf-8"))
-        return SimulationParameters.from_dict(dict(content))
+        content = named_fields(parse_yaml(path.read_text(encoding="utf-8")))
+        if content is None:
+            raise ValueError("it must hold named fields")
+        return SimulationParameters.from_dict(content)
 
 
 def load_rest_node(out: Path) -> Float[ndarray, "node 3"]:

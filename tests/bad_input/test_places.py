@@ -154,6 +154,7 @@ def test_what_cannot_be_written_leaves_nothing(
     assert "Traceback" not in told
     assert all(word in line for word in words), line
     assert "out" in line, line
+    assert ".tmp" not in line, line
     after_all = tree(here.folder)
     assert before.items() <= after_all.items()
     left = set(after_all) - set(before)
@@ -172,7 +173,7 @@ def test_a_taken_port_is_named(here: Terminal) -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        words = (f"Port {port} of 127.0.0.1", "--port")
+        words = (f"Port {port} of 127.0.0.1", "Address already in use", "--port")
         here.refused(1, words, "serve", "--port", port, "--device", "cpu", "--data-dir", "new")
 
 

@@ -63,9 +63,11 @@ RUNS = {
         "job.yaml",
         "dream",
     ),
-    "no manifest": bad(removed("attempts/1/MANIFEST.json"), "fitted"),
-    "half-written attempt": bad(removed("current"), "fitted"),
-    "nothing of the attempt": bad(lambda folder: shutil.rmtree(folder / "attempts"), "fitted"),
+    "no manifest": bad(removed("attempts/1/MANIFEST.json"), "not whole", "MANIFEST.json"),
+    "half-written attempt": bad(removed("current"), "not whole", "'current'"),
+    "nothing of the attempt": bad(
+        lambda folder: shutil.rmtree(folder / "attempts"), "not whole", "Run it again"
+    ),
     "no model": bad(removed(MODEL), "model.safetensors"),
     "torn model": bad(truncated(MODEL), "model.safetensors"),
     "no material": bad(removed(MATERIAL), "material.safetensors"),

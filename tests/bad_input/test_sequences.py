@@ -142,10 +142,11 @@ SHEET = {
     ),
     "nodes all in one place": bad(
         both(
-            put("object_node.npy", slice(None), 0.1),
-            put("rest_node.npy", slice(None), 0.1),
+            put("object_node.npy", slice(None), [0.0, 0.0, 0.2]),
+            put("rest_node.npy", slice(None), [0.0, 0.0, 0.2]),
         ),
-        "object",
+        "25 object nodes are in one place",
+        "connection_radius",
     ),
 }
 
