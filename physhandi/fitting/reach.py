@@ -36,7 +36,7 @@ def check_problem(
 
     radius = widest("virtual_connection_radius")
     gap = _control_gap(problem.control[0], problem.object_node)
-    if gap >= radius:
+    if gap >= radius and problem.control.shape[1] > 0:
         raise FitError(
             f"Sequence '{problem.name}': at frame 0 the control nodes are {gap:.3g} m or more away "
             f"from the object, but virtual springs reach {radius:.3g} m at most "

@@ -198,7 +198,7 @@ def test_a_run_that_holds_no_hand_points_is_measured_with_those_of_its_sequence(
     # A perfect hand has 5.4 mm, too: the points are 8 mm apart and miss the sides nobody sees.
     assert 0.004 < right["chamfer_symmetric"] < 0.006
     assert 0.002 < right["chamfer_points_to_mesh"] < 0.004
-    assert scores["contact"]["frame_0"]["accuracy_10mm"] > 0.9
+    assert scores["contact"]["frame_0"]["accuracy_10mm"] > 0.8
 
 
 def test_a_sequence_with_nothing_to_fit_says_what_is_missing(

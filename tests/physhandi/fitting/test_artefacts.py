@@ -12,6 +12,7 @@ from physhandi.data.observation import ObjectObservation
 from physhandi.data.run import Run
 from physhandi.fitting.artefacts import (
     STORED_CLOUD,
+    STORED_HAND,
     copy_hand_observation,
     lifted_hand_points,
     load_observation,
@@ -60,7 +61,7 @@ def test_measured_hand_points_lie_on_the_hand_of_their_frame(tmp_path: Path) -> 
     assert end.shape == (1, 3)
     assert point.shape == (end[0, -1], 3)
     frames = np.split(point, end[0, :-1])
-    assert [len(points) for points in frames] == [STORED_CLOUD] * 3
+    assert [len(points) for points in frames] == [STORED_HAND] * 3
     for number, points in enumerate(frames):
         assert np.median(cKDTree(vertex[number]).query(points)[0]) < 0.003
     assert np.median(cKDTree(vertex[0]).query(frames[2])[0]) > 0.004
