@@ -70,6 +70,14 @@ class Simulate:
     """Ground restitution."""
     friction: float | None = None
     """Ground friction."""
+    self_collision: bool | None = None
+    """Whether object nodes collide with each other."""
+    collision_distance: float | None = None
+    """Object nodes nearer than this may collide; 1.25 to 2 node distances [m]."""
+    self_restitution: float | None = None
+    """Restitution between object nodes."""
+    self_friction: float | None = None
+    """Friction between object nodes."""
     substeps_per_frame: int | Literal["auto"] | None = None
     """Integration steps in one frame; auto takes as few as are stable, and prints how many."""
     device: str = "auto"

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import tyro
 
-from app import commands, doctor
+from app import commands, doctor, speed
 from app.arguments import (
     Benchmark,
     Command,
@@ -91,7 +91,7 @@ def _dispatch(command: Any) -> int:
         case Export():
             print(commands.export(command))
         case Benchmark(what=what):
-            _show(commands.benchmark(what), as_json=what.json)
+            _show(speed.measure(what), as_json=what.json)
         case _:
             healthy, lines = doctor.examine(command.data_dir)
             print("\n".join(lines))

@@ -210,6 +210,18 @@ def test_a_run_is_simulated_again_with_other_parameters(terminal: Terminal) -> N
     assert np.abs(run.array("sequences/sheet/rollout.npy") - fitted).max() > 1e-5
 
 
+def test_nodes_collide_when_a_simulation_is_told_so(terminal: Terminal) -> None:
+    order = ("simulate", "fitted", "--device", "cpu", "--collides-rest-neighbors", "True")
+    assert terminal(*order, "--out", "no") == 2
+    order = ("simulate", "fitted", "--device", "cpu", "--self-collision", "True")
+    assert terminal(*order, "--collision-distance", "0.02", "--out", "wide") == 0
+    parameters = load_parameters(Run.open("wide").out)
+    assert (parameters.self_collision, parameters.collision_distance) == (True, 0.02)
+    assert "collision_distance" in terminal.refused(
+        2, *order, "--collision-distance", "-1", "--out", "x"
+    )
+
+
 def test_substeps_are_chosen_for_the_springs_told_and_stored(terminal: Terminal) -> None:
     order = ("simulate", "fitted", "--device", "cpu", "--substeps-per-frame", "auto")
     chosen = []
