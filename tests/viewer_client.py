@@ -17,7 +17,13 @@ class ViewerClient:
 
     def __init__(self, url: str, **options: Any) -> None:
         self.connection = connect(
-            url, subprotocols=[PROTOCOL], max_size=None, compression=None, proxy=None, **options
+            url,
+            subprotocols=[PROTOCOL],
+            max_size=None,
+            compression=None,
+            proxy=None,
+            ping_interval=None,  # Many scenes in one process may answer late.
+            **options,
         )
         self.gui: dict[str, dict[str, Any]] = {}
         self.nodes: dict[str, dict[str, Any]] = {}

@@ -31,6 +31,7 @@ class Fitted:
     rest_node: np.ndarray
     object_node: np.ndarray
     control: np.ndarray
+    attachment: np.ndarray  # the controls when springs were laid, before stage 3
     rollout: np.ndarray
 
     def object_springs(self, radius: float) -> set[tuple[int, int]]:
@@ -38,7 +39,7 @@ class Fitted:
 
     def virtual_springs(self, radius: float) -> set[tuple[int, int]]:
         most = self.parameters["virtual_max_neighbors"]
-        return virtual_springs(self.control[0], self.object_node, radius, most)
+        return virtual_springs(self.attachment, self.object_node, radius, most)
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +54,7 @@ def fitted() -> Fitted:
         rest_node=np.load(run.out / "object" / "rest_node.npy").astype(np.float64),
         object_node=np.load(motion / "object_node.npy").astype(np.float64),
         control=np.load(motion / "control.npy").astype(np.float64),
+        attachment=np.load(motion / "attachment.npy").astype(np.float64),
         rollout=np.load(motion / "rollout.npy"),
     )
 

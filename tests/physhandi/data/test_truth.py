@@ -58,5 +58,5 @@ def test_truth_that_is_not_finite_is_refused(tmp_path: Path) -> None:
     broken = np.zeros((3, 21, 3))
     broken[2, 4] = np.nan
     np.save(folder / "truth" / "hand_right_keypoint.npy", broken)
-    with pytest.raises(SequenceError, match=r"hand_right_keypoint\.npy is nan at frame 2, 21 4"):
+    with pytest.raises(SequenceError, match=r"hand_right_keypoint\.npy is nan at frame 2, joint 4"):
         Sequence.load(folder).validate()
