@@ -1,7 +1,7 @@
 """All springs that any candidate of a search may have, and which of them each one has."""
 
 from collections.abc import Sequence as Many
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32
@@ -128,17 +128,6 @@ class MasterTopology:
             damping=damping[kept].astype(np.float32),
             object_spring_count=int(kept[: self.object_spring_count].sum()),
             control_count=self.control_count,
-        )
-
-    def without_controls(self) -> "MasterTopology":
-        """Leave the virtual springs out."""
-        count = self.object_spring_count
-        return replace(
-            self,
-            control_count=0,
-            spring_nodes=self.spring_nodes[:count],
-            length=self.length[:count],
-            rank=self.rank[:count],
         )
 
 

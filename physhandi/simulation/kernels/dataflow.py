@@ -12,6 +12,7 @@ import warp as wp
 from physhandi.simulation.kernels.contacts import advance
 from physhandi.simulation.kernels.integration import free_velocity, is_too_fast
 from physhandi.simulation.kernels.intrinsics import (
+    SHARED_SLOTS,
     block_barrier,
     inverse_length,
     lane_sum,
@@ -23,7 +24,7 @@ from physhandi.simulation.kernels.intrinsics import (
 )
 from physhandi.simulation.kernels.world import World
 
-FORWARD_LOCALS = 704
+FORWARD_LOCALS = SHARED_SLOTS // 4
 """Most nodes, its own and its halo, that a block can hold; four slots of shared memory each."""
 
 

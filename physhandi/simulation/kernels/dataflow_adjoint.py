@@ -22,9 +22,7 @@ from physhandi.simulation.kernels.intrinsics import (
 from physhandi.simulation.kernels.world import World
 
 ADJOINT_LOCALS = 448
-"""Most nodes, its own and its halo, that a block can hold."""
-ADJOINT_OWN = 128
-"""Most nodes that a block can own."""
+"""Most nodes, its own and its halo, that a block can hold; six slots of shared memory each."""
 
 
 @wp.struct

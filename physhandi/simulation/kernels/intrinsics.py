@@ -13,7 +13,7 @@ _BARRIER = """
 
 _SHARED = """
 #if defined(__CUDA_ARCH__)
-    __shared__ float4 slots[2816];
+    __shared__ float4 slots[COUNT];
     if (is_write) {
         slots[slot] = make_float4(value[0], value[1], value[2], value[3]);
         return value;
@@ -23,7 +23,7 @@ _SHARED = """
 #else
     return value;
 #endif
-"""
+""".replace("COUNT", str(SHARED_SLOTS))
 
 # A 16-byte access is one transaction: whoever sees the tag sees the three floats before it too,
 # so blocks can wait for each other's values without a barrier or a fence.
