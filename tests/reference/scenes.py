@@ -55,6 +55,23 @@ def bare_scene(
     return in_float32(replace(scene, **changes))
 
 
+def star_scene():
+    """Let one node hang on five hundred springs, whose other ends drift."""
+    rng = np.random.default_rng(2)
+    direction = rng.normal(size=(500, 3))
+    node = np.vstack([np.zeros(3), 0.1 * direction / np.linalg.norm(direction, axis=1)[:, None]])
+    return bare_scene(
+        node,
+        velocity=rng.normal(0, 0.2, node.shape),
+        springs=[(0, i) for i in range(1, 501)],
+        rest=np.full(500, 0.09),
+        stiffness=np.full(500, 2.0),
+        damping=np.full(500, 0.05),
+        frames=3,
+        substeps=60,
+    )
+
+
 def crossing_scene(**changes):
     """Let two springy sheets of nine nodes fly through each other at an angle, above the ground.
 

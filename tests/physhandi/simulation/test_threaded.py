@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 from reference.blocks import PARAMETERS, as_scene, block_gradients, recorded, thrown_block
 from reference.gradients import directional_difference, gradients, loss_weights
-from reference.scenes import as_model, bare_scene
+from reference.scenes import as_model, bare_scene, star_scene
 from reference.spring_mass import simulate
 
 from physhandi.errors import SimulationDivergedError
@@ -102,19 +102,7 @@ def test_gradients_have_the_same_bits_with_one_thread_and_with_two():
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_a_node_with_five_hundred_springs_agrees_with_the_oracle(threads):
-    rng = np.random.default_rng(2)
-    direction = rng.normal(size=(500, 3))
-    node = np.vstack([np.zeros(3), 0.1 * direction / np.linalg.norm(direction, axis=1)[:, None]])
-    scene = bare_scene(
-        node,
-        velocity=rng.normal(0, 0.2, node.shape),
-        springs=[(0, i) for i in range(1, 501)],
-        rest=np.full(500, 0.09),
-        stiffness=np.full(500, 2.0),
-        damping=np.full(500, 0.05),
-        frames=3,
-        substeps=60,
-    )
+    scene = star_scene()
     position, _ = simulate(scene)
     rollout = simulator_of(*as_model(scene), threads).rollout(scene.control)
     assert np.abs(position[-1, 0] - position[0, 0]).max() > 1e-4
