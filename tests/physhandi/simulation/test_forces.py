@@ -6,7 +6,12 @@ import numpy as np
 from reference.scenes import as_model, bare_scene, cube_scene
 from reference.spring_mass import spring_force
 
-from physhandi.simulation.forces import virtual_forces
+from physhandi.simulation.forces import (
+    node_means,
+    spring_strains,
+    spring_tensions,
+    virtual_forces,
+)
 
 
 def test_one_virtual_spring_pulls_with_strain_and_closing_speed():
@@ -54,3 +59,50 @@ def test_an_object_that_nothing_holds_feels_nothing():
     assert not virtual_forces(
         model, parameters, model.object_node, model.initial_velocity, none, none
     ).any()
+
+
+def test_strain_and_tension_of_three_springs_that_were_computed_by_hand():
+    # Nodes 1 m apart; the object springs are stretched by 25 % and squeezed by 20 %, the virtual
+    # one (written control first) is stretched by 50 %.
+    scene = bare_scene(
+        [[0.0, 0, 0], [1.0, 0, 0], [1.0, 2.0, 0]],
+        springs=[(0, 1), (2, 1), (3, 0)],
+        rest=[0.8, 2.5, 0.4],
+        stiffness=[10.0, 20.0, 30.0],
+        damping=[3.0, 5.0, 7.0],
+    )
+    control = np.array([[0.0, 0.0, 0.6]])
+    model, parameters = as_model(replace(scene, control=np.stack([control] * 2)))
+    np.testing.assert_allclose(
+        spring_strains(model, model.object_node, control), [0.25, -0.2, 0.5], rtol=1e-6
+    )
+    velocity = np.array([[0.0, 0, 0.1], [2.0, 1.0, 0], [0, 0, 0]])
+    tension = spring_tensions(
+        model, parameters, model.object_node, velocity, control, np.array([[9.0, 0, 0.3]])
+    )
+    # 10·0.25 + 3·2 as node 1 flees; -20·0.2 - 5·1 as it nears node 2; 30·0.5 + 7·(0.3 - 0.1).
+    np.testing.assert_allclose(tension, [8.5, -9.0, 16.4], rtol=1e-6)
+    # The middle node ends two object springs; the virtual spring counts for none.
+    np.testing.assert_allclose(node_means(model, tension), [8.5, -0.25, -9.0], rtol=1e-6)
+
+
+def test_tensions_add_up_to_the_oracle_s_forces():
+    scene = cube_scene()
+    model, parameters = as_model(scene)
+    held, rate = scene.control[2], (scene.control[2] - scene.control[1]) * 30.0
+    tension = spring_tensions(model, parameters, scene.node, scene.velocity, held, rate)
+    point = np.vstack([scene.node, held])
+    first, second = model.spring_nodes.T
+    along = point[second] - point[first]
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    force = np.zeros_like(point)
+    np.add.at(force, first, tension[:, None] * along)
+    np.add.at(force, second, -tension[:, None] * along)
+    expected = spring_force(scene, point, np.vstack([scene.velocity, rate]))
+    assert np.abs(expected[:8]).max() > 1.0
+    np.testing.assert_allclose(force[:8], expected[:8], atol=1e-4)
+
+
+def test_a_node_without_object_springs_has_no_mean():
+    model, _ = as_model(bare_scene([[0.0, 0, 0], [1, 0, 0]]))
+    assert np.isnan(node_means(model, np.zeros(0))).all()

@@ -1,0 +1,223 @@
+"""A triangulated surface through an object's nodes, for looking at it.
+
+A sheet (nodes that lie flat around every node) is triangulated in the tangent planes of its nodes
+and stays open at its borders. A volume gets the outside of its alpha shape: of the tetrahedra
+between its nodes, those that are no larger than its sampling. What is neither, such as a rope, has
+no surface.
+"""
+
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+from scipy.spatial import Delaunay, KDTree, QhullError
+
+_AROUND = 16
+"""Neighbors that tell how an object lies around a node."""
+_REACH = 2.6
+"""Neighbors are not farther away than this many typical distances to the fourth one."""
+_LINE, _PLANE = 0.06, 0.18
+"""Second and third extent, relative to the one before, below which nodes form a line or plane."""
+_LARGEST_CIRCLE, _LARGEST_SPHERE = 1.35, 1.5
+"""Largest circumradius of triangles and tetrahedra, in distances to the fourth neighbor."""
+_LEAST_VOTES, _GAP_ROUNDS = 2, 3
+_OVERLAP = 0.5
+"""Cosine of the angle below which two triangles at an edge cover each other."""
+_FLATTEST = 1e-6
+_SHAKE = 0.03
+"""Part of the sampling by which nodes are moved, so that no four of a grid lie on one circle."""
+
+
+def triangulate_nodes(node: Float[ndarray, "node 3"]) -> Int[ndarray, "face 3"]:
+    """Lay triangles through the nodes of an object.
+
+    Args:
+        node: Nodes of the object at rest or in its first frame [m].
+
+    Returns:
+        Triangles, turned the same way around wherever they meet; none where the nodes have no
+        surface.
+    """
+    point = np.asarray(node, dtype=np.float64)
+    if len(point) < 4 or not np.isfinite(point).all():
+        return np.zeros((0, 3), np.int32)
+    tree: Any = KDTree(point)
+    distance, near = tree.query(point, k=min(_AROUND + 1, len(point)))
+    pitch = float(np.median(distance[:, min(4, len(point) - 1)]))
+    if pitch <= 0.0:
+        return np.zeros((0, 3), np.int32)
+    is_near = distance <= _REACH * pitch
+    shake = np.random.default_rng(0).uniform(-_SHAKE, _SHAKE, point.shape)
+    point = point + pitch * shake
+    axes, extent = _local_axes(point, near, is_near)
+    second = np.median(extent[:, 1] / np.maximum(extent[:, 0], 1e-12))
+    third = np.median(extent[:, 2] / np.maximum(extent[:, 1], 1e-12))
+    if second < _LINE:
+        return np.zeros((0, 3), np.int32)
+    if third < _PLANE:
+        return _sheet(point, near, is_near, axes, _LARGEST_CIRCLE * pitch)
+    return _volume(point, _LARGEST_SPHERE * pitch)
+
+
+def _local_axes(
+    point: Float[ndarray, "node 3"],
+    near: Int[ndarray, "node neighbor"],
+    is_near: Bool[ndarray, "node neighbor"],
+) -> tuple[Float[ndarray, "node 3 3"], Float[ndarray, "node 3"]]:
+    """Find the principal axes (as rows) and extents of the neighborhood of every node."""
+    weight = is_near.astype(np.float64)
+    weight /= weight.sum(axis=1, keepdims=True)
+    offset = point[near] - np.einsum("nk,nki->ni", weight, point[near])[:, None]
+    spread = np.einsum("nk,nki,nkj->nij", weight, offset, offset)
+    values, vectors = np.linalg.eigh(spread)
+    extent = np.sqrt(np.maximum(values[:, ::-1], 0.0))
+    return vectors[:, :, ::-1].transpose(0, 2, 1), extent
+
+
+def _sheet(
+    point: Float[ndarray, "node 3"],
+    near: Int[ndarray, "node neighbor"],
+    is_near: Bool[ndarray, "node neighbor"],
+    axes: Float[ndarray, "node 3 3"],
+    largest: float,
+) -> Int[ndarray, "face 3"]:
+    """Keep the triangles on which the tangent planes of their corners agree."""
+    votes: dict[tuple[int, ...], int] = {}
+    for center in range(len(point)):
+        around = near[center, is_near[center]]
+        for face in _tangent_triangles(point[around], axes[center, :2], around, center):
+            votes[face] = votes.get(face, 0) + 1
+    # Those that all corners agree on come first, so that they win where triangles overlap.
+    ranked = sorted(votes, key=lambda face: (-votes[face], face))
+    faces = np.array(ranked, dtype=np.int64).reshape(-1, 3)
+    is_small = _circumradius(point[faces]) <= largest
+    is_agreed = np.array([votes[face] >= _LEAST_VOTES for face in ranked], dtype=bool)
+    patch = _Patch(point)
+    patch.add(faces[is_small & is_agreed], least=0)
+    # What one corner alone wants may close gaps between the others.
+    for _ in range(_GAP_ROUNDS):
+        patch.add(faces[is_small & ~is_agreed], least=2)
+    return _oriented(np.array(patch.faces, dtype=np.int64).reshape(-1, 3))
+
+
+class _Patch:
+    """Triangles of which no more than two meet at an edge, and then on its two sides."""
+
+    def __init__(self, point: Float[ndarray, "node 3"]) -> None:
+        self.faces: list[list[int]] = []
+        self._point = point
+        self._sides: dict[tuple[int, int], list[ndarray]] = {}
+
+    def add(self, candidates: Int[ndarray, "face 3"], *, least: int) -> None:
+        """Take in the triangles that fit and share at least some edges with those before."""
+        for face in candidates.tolist():
+            sides = [(edge, self._side(face, *edge)) for edge in combinations(face, 2)]
+            known = [(self._sides.get(edge, []), side) for edge, side in sides]
+            if sum(len(found) for found, _ in known) < least:
+                continue
+            if all(len(found) < 2 and _lies_beside(found, side) for found, side in known):
+                self.faces.append(face)
+                for edge, side in sides:
+                    self._sides.setdefault(edge, []).append(side)
+
+    def _side(self, face: list[int], start: int, end: int) -> Float[ndarray, " 3"]:
+        """Find the direction from an edge of a triangle to its third corner."""
+        (apex,) = set(face) - {start, end}
+        along = self._point[end] - self._point[start]
+        across = self._point[apex] - self._point[start]
+        across = across - along * (across @ along) / max(float(along @ along), 1e-300)
+        return across / max(float(np.linalg.norm(across)), 1e-300)
+
+
+def _lies_beside(found: list[ndarray], side: Float[ndarray, " 3"]) -> bool:
+    """Tell whether a triangle does not cover another one at their common edge."""
+    return all(float(other @ side) < _OVERLAP for other in found)
+
+
+def _tangent_triangles(
+    point: Float[ndarray, "neighbor 3"],
+    axes: Float[ndarray, "2 3"],
+    number: Int[ndarray, " neighbor"],
+    center: int,
+) -> list[tuple[int, ...]]:
+    """Triangulate a neighborhood in its plane and give the triangles that touch its center."""
+    if len(number) < 3:
+        return []
+    try:
+        corners = number[Delaunay((point - point.mean(axis=0)) @ axes.T).simplices]
+    except QhullError:  # All neighbors lie on one line.
+        return []
+    return [tuple(sorted(map(int, c))) for c in corners if center in c]
+
+
+def _oriented(faces: Int[ndarray, "face 3"]) -> Int[ndarray, "face 3"]:
+    """Turn triangles so that neighbors run through their common edge in opposite directions."""
+    of_edge: dict[tuple[int, int], list[int]] = {}
+    for index, (a, b, c) in enumerate(faces.tolist()):
+        for edge in ((a, b), (b, c), (a, c)):
+            of_edge.setdefault(edge, []).append(index)
+    turned = faces.copy()
+    is_done = np.zeros(len(faces), dtype=bool)
+    for start in range(len(faces)):
+        waiting = [] if is_done[start] else [start]
+        is_done[start] = True
+        while waiting:
+            corners = turned[waiting.pop()].tolist()
+            for a, b in zip(corners, corners[1:] + corners[:1], strict=True):
+                for other in of_edge[min(a, b), max(a, b)]:
+                    if not is_done[other]:
+                        is_done[other] = True
+                        waiting.append(other)
+                        if _runs(turned[other].tolist(), a, b):
+                            turned[other] = turned[other][::-1]
+    return turned.astype(np.int32)
+
+
+def _runs(corners: list[int], a: int, b: int) -> bool:
+    """Tell whether a triangle runs from corner a to corner b."""
+    return corners[(corners.index(a) + 1) % 3] == b
+
+
+def _volume(point: Float[ndarray, "node 3"], largest: float) -> Int[ndarray, "face 3"]:
+    """Take the faces of small tetrahedra that no other small tetrahedron shares."""
+    try:
+        tetrahedra = Delaunay(point).simplices.astype(np.int64)
+    except QhullError:
+        return np.zeros((0, 3), np.int32)
+    tetrahedra = tetrahedra[_circumsphere(point[tetrahedra]) <= largest]
+    opposite = np.concatenate([tetrahedra[:, i] for i in range(4)])
+    faces = np.concatenate([np.delete(tetrahedra, i, axis=1) for i in range(4)])
+    _, first, count = np.unique(
+        np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
+    )
+    first = first[count == 1]
+    faces, opposite = faces[first], opposite[first]
+    a, b, c = (point[faces[:, i]] for i in range(3))
+    looks_in = np.sum(np.cross(b - a, c - a) * (point[opposite] - a), axis=1) > 0
+    faces[looks_in] = faces[looks_in][:, ::-1]
+    return faces.astype(np.int32)
+
+
+def _circumradius(corner: Float[ndarray, "face 3 3"]) -> Float[ndarray, " face"]:
+    """Measure the circle through the corners of each triangle [m]; infinite for a flat one."""
+    a, b, c = (corner[:, i] for i in range(3))
+    sides = [np.linalg.norm(x, axis=1) for x in (b - a, c - b, a - c)]
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    product = sides[0] * sides[1] * sides[2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        radius = product / (4.0 * area)
+    return np.where(np.isfinite(radius), radius, np.inf)
+
+
+def _circumsphere(corner: Float[ndarray, "cell 4 3"]) -> Float[ndarray, " cell"]:
+    """Measure the sphere through the corners of each tetrahedron [m]; infinite for a flat one."""
+    edge = corner[:, 1:] - corner[:, :1]
+    size = np.linalg.norm(edge, axis=2).max(axis=1)
+    volume = np.abs(np.linalg.det(edge))
+    is_flat = volume <= _FLATTEST * size**3
+    edge[is_flat] = np.eye(3)
+    half = 0.5 * np.sum(edge**2, axis=2)
+    center = np.linalg.solve(edge, half[..., None])[..., 0]
+    return np.where(is_flat, np.inf, np.linalg.norm(center, axis=1))
