@@ -151,9 +151,18 @@ def load_fitted(run: Run, sequence_name: str) -> Take | None:
     if not all(run.has(name) for name in needed):
         return None
     position = run.array(needed[0])
+    parameters = SimulationParameters.from_dict(run.yaml("object/parameters.yaml"))
+    if run.has(f"{folder}/meta.yaml"):
+        # As the rollout was simulated: what is stored of the world is the profile's, not this one.
+        meta = run.yaml(f"{folder}/meta.yaml")
+        parameters = parameters.in_world(
+            frame_rate=float(meta["frame_rate"]),
+            ground_height=meta.get("ground_height"),
+            gravity=float(meta.get("gravity", parameters.gravity)),
+        )
     return Take(
         model=SpringMassModel.from_tensors(run.tensors(needed[2])),
-        parameters=SimulationParameters.from_dict(run.yaml("object/parameters.yaml")),
+        parameters=parameters,
         control=run.array(needed[1])[: len(position)],
         position=position,
         ready=len(position),

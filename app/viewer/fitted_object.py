@@ -21,8 +21,9 @@ from physhandi.simulation.topology import (
 )
 
 # Parameters that are built into the model; the others are read by the simulator.
+_MATERIAL = ("stiffness", "virtual_stiffness", "damping")
 _TOPOLOGY = (
-    "damping",
+    *_MATERIAL,
     "connection_radius",
     "max_neighbors",
     "virtual_connection_radius",
@@ -103,17 +104,32 @@ class FittedObject:
         fitted, model = self.take.parameters, self.take.model
         if self._chosen is not None:
             return _hold_anew(model, parameters, self._attached)
-        if all(getattr(parameters, n) == getattr(fitted, n) for n in _TOPOLOGY if n != "damping"):
-            if parameters.damping == fitted.damping:
-                return model
-            if fitted.damping > 0:
-                damping = model.damping * np.float32(parameters.damping / fitted.damping)
-            else:
-                damping = np.full_like(model.damping, parameters.damping)
-            return replace(model, damping=damping)
+        is_changed = {n for n in _TOPOLOGY if getattr(parameters, n) != getattr(fitted, n)}
+        if is_changed <= set(_MATERIAL):
+            return _scale_material(model, fitted, parameters) if is_changed else model
         return retopologize(
             model, parameters, self._attached, fitted=fitted, rest_node=self._rest_node
         )
+
+
+def _scale_material(
+    model: SpringMassModel, fitted: SimulationParameters, parameters: SimulationParameters
+) -> SpringMassModel:
+    """Scale stiffness and damping of the springs as the parameters for all of them changed."""
+
+    def scaled(value: ndarray, field: str) -> ndarray:
+        was, now = getattr(fitted, field), getattr(parameters, field)
+        if was == now:
+            return value
+        return value * np.float32(now / was) if was > 0 else np.full_like(value, now)
+
+    own, virtual = np.split(model.stiffness, [model.object_spring_count])
+    stiffness = [scaled(own, "stiffness"), scaled(virtual, "virtual_stiffness")]
+    return replace(
+        model,
+        stiffness=np.concatenate(stiffness),
+        damping=scaled(model.damping, "damping"),
+    )
 
 
 def _hold_anew(

@@ -41,6 +41,7 @@ _SWITCHES = (
     "self_collision",
     "collides_rest_neighbors",
     "uses_sequence_gravity",
+    "uses_sequence_ground",
     "rounds_decay",
 )
 _LARGEST = 1e30  # Larger numbers, squared or multiplied, leave the simulator's float32.
@@ -82,6 +83,8 @@ class SimulationParameters:
     """Acceleration along -z [m/s²]."""
     uses_sequence_gravity: bool = True
     """Whether `in_world` takes the sequence's gravity; PhysTwin's own is 9.8 everywhere."""
+    uses_sequence_ground: bool = True
+    """Whether `in_world` takes the sequence's ground."""
     frame_rate: float = 30.0
     """Frames in a second [Hz]."""
     frame_duration: float | None = None
@@ -159,13 +162,14 @@ class SimulationParameters:
 
         Args:
             frame_rate: Frames in a second of the recording [Hz]; `frame_duration` stays.
-            ground_height: Height of its ground plane [m], or none.
+            ground_height: Height of its ground plane [m], or none; ignored without
+                `uses_sequence_ground`.
             gravity: Acceleration along -z [m/s²]; ignored without `uses_sequence_gravity`.
         """
         return replace(
             self,
             frame_rate=frame_rate,
-            ground_height=ground_height,
+            ground_height=ground_height if self.uses_sequence_ground else self.ground_height,
             gravity=gravity if self.uses_sequence_gravity else self.gravity,
         )
 

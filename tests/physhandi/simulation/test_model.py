@@ -50,6 +50,10 @@ def test_a_world_is_taken_over_as_far_as_the_parameters_let_it():
     own = own.in_world(**world)
     assert (own.frame_rate, own.ground_height, own.gravity) == (60.0, None, 9.8)
     assert own.dt == pytest.approx(5e-5)
+    raised = SimulationParameters(ground_height=0.2, uses_sequence_ground=False).in_world(
+        frame_rate=60.0, ground_height=0.5, gravity=1.62
+    )
+    assert (raised.ground_height, raised.gravity) == (0.2, 1.62)
 
 
 @pytest.mark.parametrize(
