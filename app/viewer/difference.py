@@ -148,7 +148,7 @@ def triangle_distance(
     is_above = ~is_flat & (u >= 0) & (v >= 0) & (u + v <= 1)
     off_plane = np.linalg.norm(ap - u[:, None] * ab - v[:, None] * ac, axis=-1)
     edges = [_edge_distance(point, *ends) for ends in ((a, b), (b, c), (c, a))]
-    return np.where(is_above, off_plane, np.minimum.reduce(edges))
+    return np.where(is_above, off_plane, np.min(np.stack(edges), axis=0))
 
 
 def _edge_distance(
@@ -161,4 +161,4 @@ def _edge_distance(
 
 
 def _dot(one: Float[ndarray, "row 3"], other: Float[ndarray, "row 3"]) -> Float[ndarray, " row"]:
-    return (one * other).sum(axis=-1)
+    return np.sum(one * other, axis=-1)

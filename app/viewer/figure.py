@@ -11,6 +11,7 @@ from numpy import ndarray
 from app.viewer.content import Content
 from app.viewer.figure_camera import Eye
 from app.viewer.framing import Framing
+from app.viewer.halves import GAP, Extents
 from app.viewer.layers import SKIN, YELLOW, Layers
 from app.viewer.nodes import SceneNodes
 from app.viewer.object_drawing import ObjectDrawing, Style, share_bytes, strengths
@@ -21,9 +22,6 @@ ARROWS = 300
 FIGURE_BYTES = 92_000
 """What a frame of both sides may weigh while the clock is running."""
 SIDES = ("ours", "phystwin")
-_SAMPLED_FRAMES = 10
-_SAMPLED_POINTS = 300
-_GAP = 1.08
 _NARROWEST = 13.0
 _ABOVE, _BELOW = 4.0, 2.6
 _LONGEST = 0.3
@@ -71,13 +69,7 @@ class Figure:
             side: ObjectDrawing(self._nodes, framing, root=f"/figure/{side}", style=_STYLE)
             for side in SIDES
         }
-        frames = np.unique(np.linspace(0, fitted.ready - 1, _SAMPLED_FRAMES).astype(int))
-        tracks = [fitted.position, fitted.control]
-        parts = [np.asarray(track[f]) for track in tracks for f in frames]
-        parts = [part[:: max(1, len(part) // _SAMPLED_POINTS)] for part in parts]
-        point = np.concatenate(parts).astype(np.float64)
-        low, high = np.quantile(point, [0.002, 0.998], axis=0)
-        self._point = np.clip(point, low, high)
+        self._extents = Extents([fitted.position, fitted.control], fitted.ready)
         self._eye = Eye(right=np.array([1.0, 0.0, 0.0]), up=np.array([0.0, 0.0, 1.0]))
         self._captions = dict.fromkeys(SIDES, "")
         self._placed: tuple[tuple[float, ...], tuple[str, ...]] | None = None
@@ -108,23 +100,14 @@ class Figure:
         Returns:
             Middle, width and height.
         """
-        middle, wide, high = self._half(eye)
+        middle, wide, high = self._extents.seen(eye)
         line = self._line
         middle = middle + 0.5 * (_ABOVE - _BELOW) * line * eye.up
-        return middle, 2 * _GAP * max(wide, _NARROWEST * line), high + (_ABOVE + _BELOW) * line
+        return middle, 2 * GAP * max(wide, _NARROWEST * line), high + (_ABOVE + _BELOW) * line
 
     @property
     def _line(self) -> float:
         return _LINE * self._framing.extent
-
-    def _half(self, eye: Eye) -> tuple[Float[ndarray, " 3"], float, float]:
-        """Measure one half before it is moved aside: middle, width and height."""
-        middle, extents = np.zeros(3), list[float]()
-        for axis in (eye.right, eye.up, eye.ahead):
-            along = self._point @ axis
-            middle += 0.5 * (along.min() + along.max()) * axis
-            extents.append(float(np.ptp(along)))
-        return middle, extents[0], extents[1]
 
     def hide(self) -> None:
         """Hide the figure until it is drawn again."""
@@ -198,10 +181,10 @@ class Figure:
         if placed == self._placed:
             return
         self._placed = placed
-        middle, wide, high = self._half(eye)
+        middle, wide, high = self._extents.seen(eye)
         wide = max(wide, _NARROWEST * line)
         for sign, name in zip((-1.0, 1.0), SIDES, strict=True):
-            aside = 0.5 * sign * _GAP * wide * eye.right
+            aside = 0.5 * sign * GAP * wide * eye.right
             nodes.frame(f"/figure/{name}", aside)
             title, _, detail = self._captions[name].partition("\n")
             for part, text, size, lines in (
