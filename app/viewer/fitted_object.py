@@ -1,5 +1,6 @@
 """The fitted object of a run, rebuilt for other parameters."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from physhandi.data.run import Run
 from physhandi.errors import MissingInputError
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
 from physhandi.simulation.simulator import Simulator
+from physhandi.simulation.stability import largest_stable_step
 from physhandi.simulation.topology import (
     MINIMUM_VIRTUAL_REST_LENGTH,
     retopologize,
@@ -53,6 +55,7 @@ class FittedObject:
         self._chosen: tuple[int, ...] | None = None
         self._latest: tuple[tuple[float, ...], SpringMassModel] | None = None
         self._simulator: Simulator | None = None
+        self._limit: tuple[SpringMassModel, float, float] | None = None
         self._rest_node = None
         if run.has("object/material.safetensors"):
             self._rest_node = run.tensors("object/material.safetensors").get("rest_node")
@@ -83,6 +86,14 @@ class FittedObject:
         if self._latest is None or self._latest[0] != key:
             self._latest = (key, self._build(parameters))
         return self._latest[1]
+
+    def needed_substeps(self, model: SpringMassModel, parameters: SimulationParameters) -> int:
+        """Estimate the fewest substeps a frame that a model survives, without any margin."""
+        known, scale = self._limit, parameters.stiffness_scale
+        if known is None or known[0] is not model or known[1] != scale:
+            step = largest_stable_step(model, parameters, self._control[0])
+            known = self._limit = (model, scale, step)
+        return max(1, math.ceil(1.0 / (parameters.simulated_frame_rate * known[2])))
 
     def simulator(
         self, model: SpringMassModel, parameters: SimulationParameters, device: str

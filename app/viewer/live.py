@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 
+from app.viewer.holds import PAUSE, RESUME, STEP
 from app.viewer.wire import Message, WireError, receive, send
 from physhandi.simulation.model import SimulationParameters
 
@@ -44,7 +45,7 @@ class LiveSimulation:
     """Owns the live simulation process; one for all sessions.
 
     Answers reach a session's listener in the thread of this object: messages ``started``,
-    ``frame``, ``finished``, ``diverged``, ``failed`` of the process, and ``crashed`` when the
+    ``frame``, ``stability``, ``finished``, ``diverged``, ``failed`` of the process, and ``crashed`` when the
     process is gone. After a crash the process is started again, and a request that was cut off
     is sent once more.
     """
@@ -60,6 +61,7 @@ class LiveSimulation:
         self._wake = threading.Condition(self._lock)
         self._listeners: dict[str, Listener] = {}
         self._pending: dict[str, tuple[Message, bool]] = {}
+        self._held: set[str] = set()
         self._numbers = count(1)
         self._connection: socket.socket | None = None
         self._process: subprocess.Popen[bytes] | None = None
@@ -89,6 +91,7 @@ class LiveSimulation:
         with self._lock:
             self._listeners.pop(session, None)
             self._pending.pop(session, None)
+            self._held.discard(session)
         self._send(Message("close", {"session": session}))
 
     def request(self, session: str, request: LiveRequest) -> int:
@@ -112,6 +115,7 @@ class LiveSimulation:
                 "parameters": request.parameters.to_dict(),
                 "automatic_substeps": request.automatic_substeps,
                 "controls": None if request.controls is None else list(request.controls),
+                "is_held": session in self._held,
             },
         )
         with self._lock:
@@ -121,6 +125,17 @@ class LiveSimulation:
             self._wake.notify_all()
         self._send(message)
         return number
+
+    def hold(self, session: str, *, on: bool) -> None:
+        """Hold the session's simulation, this one and those to come, or let it go on."""
+        with self._lock:
+            (self._held.add if on else self._held.discard)(session)
+            self._hold_pending(session, is_held=on)
+        self._send(Message(PAUSE if on else RESUME, {"session": session}))
+
+    def step(self, session: str) -> None:
+        """Let a held simulation go on by one frame."""
+        self._send(Message(STEP, {"session": session}))
 
     def cancel(self, session: str) -> None:
         """Stop what is being simulated for a session."""
@@ -144,6 +159,13 @@ class LiveSimulation:
                 process.wait()
         if self._thread is not None:
             self._thread.join(timeout=5)
+
+    def _hold_pending(self, session: str, *, is_held: bool) -> None:
+        """Let an unfinished request, should it be sent again, be held or not as it is now."""
+        if session in self._pending:
+            message, is_new = self._pending[session]
+            message = Message(message.kind, {**message.fields, "is_held": is_held})
+            self._pending[session] = (message, is_new)
 
     def _send(self, message: Message) -> None:
         """Write a message; a broken connection is the supervisor's business."""

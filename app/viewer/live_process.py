@@ -20,6 +20,7 @@ import numpy as np
 import warp as wp
 
 from app.viewer.fitted_object import FittedObject
+from app.viewer.holds import CONTROLS, Holds
 from app.viewer.wire import Message, receive, send
 from physhandi.errors import PhysHandiError, SimulationDivergedError
 from physhandi.simulation.model import SimulationParameters
@@ -36,12 +37,16 @@ class Mailboxes:
     def __init__(self) -> None:
         self._condition = threading.Condition()
         self._latest: dict[str, Message] = {}
+        self._controls: list[Message] = []
         self._is_closed = False
 
     def put(self, message: Message) -> None:
-        """Replace the request of the message's session."""
+        """Replace the request of the message's session; what changes its pace is kept beside it."""
         with self._condition:
-            self._latest[message["session"]] = message
+            if message.kind in CONTROLS:
+                self._controls.append(message)
+            else:
+                self._latest[message["session"]] = message
             self._condition.notify()
 
     def take(self, *, wait: bool) -> list[Message] | None:
@@ -51,14 +56,15 @@ class Mailboxes:
             wait: Whether to wait for a request if there is none.
 
         Returns:
-            Requests of different sessions, or None after `close`.
+            Requests of different sessions, then what changes their pace, or None after `close`.
         """
         with self._condition:
-            while wait and not self._latest and not self._is_closed:
+            while wait and not (self._latest or self._controls or self._is_closed):
                 self._condition.wait()
             if self._is_closed:
                 return None
-            taken, self._latest = list(self._latest.values()), {}
+            taken = [*self._latest.values(), *self._controls]
+            self._latest, self._controls = {}, []
             return taken
 
     def close(self) -> None:
@@ -76,21 +82,25 @@ class LiveSimulator:
         self._device = device
         self._mailboxes = Mailboxes()
         self._objects: dict[str, tuple[tuple[str, str], FittedObject]] = {}
-        self._active: dict[str, Iterator[None]] = {}
+        self._active: dict[str, Iterator[int]] = {}
+        self._holds = Holds()
         self._newest: dict[str, int] = {}
 
     def run(self) -> None:
         """Work until the parent closes the connection."""
         threading.Thread(target=self._read, name="live-requests", daemon=True).start()
         while True:
-            requests = self._mailboxes.take(wait=not self._active)
+            is_idle = not any(self._holds.may_go_on(session) for session in self._active)
+            requests = self._mailboxes.take(wait=is_idle)
             if requests is None:
                 return
             for request in requests:
                 self._start(request)
             for session, frames in list(self._active.items()):
+                if not self._holds.may_go_on(session):
+                    continue
                 try:
-                    next(frames)
+                    self._holds.count(session, next(frames))
                 except StopIteration:
                     del self._active[session]
 
@@ -103,6 +113,9 @@ class LiveSimulator:
 
     def _start(self, request: Message) -> None:
         session = request["session"]
+        if request.kind in CONTROLS:
+            self._holds.hear(request)
+            return
         if request.kind == "simulate":
             if self._newest.get(session) == request["request"]:
                 return  # The server repeats a request if it is not sure that it arrived.
@@ -110,12 +123,14 @@ class LiveSimulator:
         self._active.pop(session, None)
         if request.kind == "simulate":
             self._active[session] = self._answer(request)
+            self._holds.start(session, is_held=bool(request["is_held"]))
         elif request.kind == "close":
             self._objects.pop(session, None)
             self._newest.pop(session, None)
+            self._holds.forget(session)
 
-    def _answer(self, request: Message) -> Iterator[None]:
-        """Simulate one request; pauses after each frame."""
+    def _answer(self, request: Message) -> Iterator[int]:
+        """Simulate one request; pauses after each frame and gives the number of frames."""
         about = {"session": request["session"], "request": request["request"]}
         try:
             yield from self._simulate(request, about)
@@ -130,7 +145,7 @@ class LiveSimulator:
             logger.exception("request %s failed", about)
             send(self._connection, Message("failed", {**about, "error": str(error)}))
 
-    def _simulate(self, request: Message, about: dict[str, object]) -> Iterator[None]:
+    def _simulate(self, request: Message, about: dict[str, object]) -> Iterator[int]:
         fitted = self._object(request)
         parameters = SimulationParameters.from_dict(request["parameters"])
         control = fitted.choose_controls(request["controls"])
@@ -145,7 +160,7 @@ class LiveSimulator:
                 model.to_tensors(),
             ),
         )
-        yield
+        yield 0
         simulator = fitted.simulator(model, parameters, self._device)
         clock = time.perf_counter()
         for frame, position, velocity in simulator.frames(control):
@@ -161,7 +176,10 @@ class LiveSimulator:
                     },
                 ),
             )
-            yield
+            if frame == 1:  # Not before the user sees the first frame that moves.
+                needed = fitted.needed_substeps(model, parameters)
+                send(self._connection, Message("stability", {**about, "needed": needed}))
+            yield int(frame) + 1
             clock = time.perf_counter()
         send(self._connection, Message("finished", about))
 

@@ -75,7 +75,8 @@ def recount(radius: float, most: int) -> int:
 def test_the_fitted_parameters_give_the_fitted_rollout(live, mailbox, run) -> None:
     live.request("a", ask(run))
     messages = mailbox.until("finished")
-    assert [m.kind for m in messages] == ["started", *["frame"] * FRAMES, "finished"]
+    kinds = [m.kind for m in messages if m.kind != "stability"]
+    assert kinds == ["started", *["frame"] * FRAMES, "finished"]
     np.testing.assert_array_equal(frames(messages), run.array("sequences/lift/rollout.npy"))
 
 
@@ -139,6 +140,49 @@ def test_automatic_substeps_survive_what_the_fitted_number_does_not(live, mailbo
     messages = mailbox.until("diverged", "finished")
     assert messages[-1].kind == "finished"
     assert messages[0]["substeps_per_frame"] > PARAMETERS.substeps_per_frame
+
+
+def test_a_held_simulation_goes_on_frame_by_frame_and_gives_the_same_motion(
+    live, mailbox, run
+) -> None:
+    live.hold("a", on=True)
+    live.request("a", ask(run))
+    seen = mailbox.until("frame")
+    time.sleep(0.2)
+    assert mailbox.messages.empty()
+    for frame in (1, 2):
+        live.step("a")
+        seen += mailbox.until("frame")
+        assert seen[-1]["frame"] == frame
+    live.hold("a", on=False)
+    seen += mailbox.until("finished")
+    np.testing.assert_array_equal(frames(seen), run.array("sequences/lift/rollout.npy"))
+
+
+def test_a_killed_process_comes_back_held(live, mailbox, run) -> None:
+    live.hold("a", on=True)
+    live.request("a", ask(run))
+    mailbox.until("frame")
+    os.kill(live.process_id, signal.SIGKILL)
+    assert mailbox.until("frame")[-1]["frame"] == 0
+    time.sleep(0.2)
+    assert mailbox.messages.empty()
+    live.hold("a", on=False)
+    mailbox.until("finished")
+
+
+def test_the_fewest_stable_substeps_are_told(live, mailbox, run) -> None:
+    live.request("a", ask(run))
+    (soft,) = (m["needed"] for m in mailbox.until("finished") if m.kind == "stability")
+    # Without dashpots the limit goes with the square root of the stiffness.
+    live.request("a", ask(run, damping=0.0))
+    (bare,) = (m["needed"] for m in mailbox.until("finished") if m.kind == "stability")
+    live.request("a", ask(run, damping=0.0, stiffness_scale=4.0, substeps_per_frame=4 * bare))
+    (stiff,) = (m["needed"] for m in mailbox.until("finished") if m.kind == "stability")
+    assert soft < PARAMETERS.substeps_per_frame
+    assert stiff == pytest.approx(2 * bare, abs=1)
+    live.request("a", ask(run, damping=0.0, stiffness_scale=4.0, substeps_per_frame=bare // 2))
+    assert mailbox.until("finished", "diverged")[-1].kind == "diverged"
 
 
 def test_a_request_that_makes_no_sense_is_answered(live, mailbox, run) -> None:
