@@ -58,7 +58,7 @@ _LOCKED_PAGE = (
     "in <code>?token=…</code>. Your browser then remembers it until the server stops.</p>"
     "<p>Was the server restarted? Then it has a new token: use the new address.</p>"
     # A browser that came from another site brings its cookie only when it is asked again from here.
-    "<p>Did you just open that address? <a href='/'>Try again</a></p></html>"
+    "<p>Did you just open that address? <a href=''>Try again</a></p></html>"
 )
 
 

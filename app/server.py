@@ -17,6 +17,7 @@ from fastapi.staticfiles import StaticFiles
 from starlette.exceptions import HTTPException
 
 from app.api import create_api
+from app.exports import create_exports
 from app.jobs.catalog import Catalog, NotFoundError
 from app.jobs.describe import describe_run
 from app.jobs.feed import Feed
@@ -97,6 +98,7 @@ def create_app(
     app.state.security = security
     app.include_router(create_api(catalog, scheduler, feed, sessions))
     app.include_router(create_pages(catalog, scheduler, feed, sessions, pages))
+    app.include_router(create_exports(sessions))
     app.include_router(create_gate(sessions))
     app.mount("/assets", StaticFiles(directory=WEB_ASSETS), name="assets")
 

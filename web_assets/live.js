@@ -1,9 +1,11 @@
 "use strict";
 
-/* The page around a live scene: its address, its color scheme, and its end. */
+/* The page around a live scene: its address and link, its color scheme, and its end. */
 
 {
   const WATCH_MS = 15000;
+  const FOLLOW_MS = 2000;
+  const LINK_KEY = "p";
   const scene = document.getElementById("scene");
   const isDark = matchMedia("(prefers-color-scheme: dark)");
   let session = scene.dataset.session;
@@ -19,8 +21,51 @@
       history.replaceState(null, "", `/live/${shown}`);
       toast("Another tab shows this scene too. This tab has a copy of its own now.");
     }
+    for (const entry of document.querySelectorAll("[data-session-export]")) {
+      entry.href = `/api/v1/sessions/${session}/export?format=${entry.dataset.sessionExport}`;
+    }
+    scene.contentWindow.addEventListener("keydown", onKey);
     wish();
     scene.contentWindow.focus();
+  }
+
+  /* The link restores frame, camera, layers and parameters; the address bar follows it. */
+  async function copyLink() {
+    const link = await send("GET", `/api/v1/sessions/${session}/link`);
+    const address = new URL(link.url, location.href).href;
+    const inside = document.activeElement === scene ? scene.contentWindow : window;
+    try {
+      await inside.navigator.clipboard.writeText(address);
+    } catch {
+      if (!copyByHand(address, inside.document)) {
+        prompt("Copy this link:", address);
+        return;
+      }
+    }
+    toast("Link copied: it opens this run as you see it now.");
+  }
+
+  /* Outside of localhost and https, browsers have no clipboard for pages but this one. */
+  function copyByHand(text, place) {
+    const field = place.body.appendChild(place.createElement("textarea"));
+    field.value = text;
+    field.select();
+    const isDone = place.execCommand("copy");
+    field.remove();
+    return isDone;
+  }
+
+  function onKey(event) {
+    const isTyping = event.target.matches?.("input:not([type=checkbox]), textarea, select");
+    if (isTyping || event.ctrlKey || event.metaKey || event.altKey || event.repeat) return;
+    if (event.key.toLowerCase() === LINK_KEY) copyLink().catch((error) => toast(error.message, true));
+  }
+
+  async function follow() {
+    if (document.hidden) return;
+    const link = await send("GET", `/api/v1/sessions/${session}/link`).catch(() => null);
+    const address = link && `/live/${session}?${link.query}`;
+    if (address && address !== location.pathname + location.search) history.replaceState(null, "", address);
   }
 
   /* A closed scene says so, and why: the server renders that page at the same address. */
@@ -34,5 +79,9 @@
   if (scene.contentDocument?.readyState === "complete") settle();
   isDark.addEventListener("change", wish);
   document.addEventListener("visibilitychange", watch);
+  document.addEventListener("keydown", onKey);
+  const button = document.querySelector("[data-copy-link]");
+  button.addEventListener("click", () => busy(button, copyLink));
   setInterval(watch, WATCH_MS);
+  setInterval(follow, FOLLOW_MS);
 }

@@ -130,7 +130,8 @@ def create_pages(
             return pages.render("live.html", session=session_id, scene=scene.info)
         closed = scenes.farewell(session_id, request.state.owner)
         if closed is not None:
-            return pages.render("closed.html", status=404, scene=closed)
+            query = request.url.query
+            return pages.render("closed.html", status=404, scene=closed, query=query)
         return pages.error(
             404,
             "This live scene was closed, or it belongs to another browser. "

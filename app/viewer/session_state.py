@@ -1,7 +1,8 @@
 """What there is to say about a session, and what a user has set up in it."""
 
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import numpy as np
 import viser
@@ -75,8 +76,8 @@ class Pose:
 class SessionState:
     """Everything that a copy of a session begins with."""
 
-    sequence_name: str
-    """Sequence of the run."""
+    sequence_name: str | None
+    """Sequence of the run; None for its first."""
     frame: int
     """Frame that is due."""
     is_playing: bool
@@ -85,8 +86,8 @@ class SessionState:
     """Sequence seconds per second."""
     does_loop: bool
     """Whether playing starts over at the end."""
-    layers: Layers
-    """What is shown."""
+    layers: Layers | None
+    """What is shown; None for what suits the content."""
     theme: Theme
     """Which background was chosen."""
     prefers_dark: bool
@@ -99,3 +100,7 @@ class SessionState:
     """Whether the figure is shown instead of the scene."""
     pose: Pose | None
     """Camera of the first client; None if nobody looked."""
+    layer_changes: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    """Without `layers`: fields of `Layers` that differ from what suits the content."""
+    parameter_changes: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    """Parameters that differ from the fitted ones; they count if there are no `parameters`."""

@@ -16,6 +16,7 @@ from app.viewer.live import LiveSimulation
 from app.viewer.object_session import ObjectSession
 from app.viewer.panels import LayersPanel, TimelinePanel
 from app.viewer.playback import Playback
+from app.viewer.restoring import complete_state, differences
 from app.viewer.scene import Scene
 from app.viewer.session_state import Kind as Kind
 from app.viewer.session_state import SessionInfo as SessionInfo
@@ -63,6 +64,7 @@ class Session:
         if kind == "run":
             self._names = tuple(catalog.run(target).sequence_names)
         self._content = self._load(state.sequence_name if state is not None else None)
+        state = None if state is None else complete_state(state, self._content)
         self._lock = threading.RLock()
         self._server = start_viser(plain(self._content.title))
         self._guard = Guard(self._server)
@@ -122,6 +124,7 @@ class Session:
                 automatic_substeps=panel is not None and panel.is_automatic,
                 is_figure=self._figure.is_on,
                 pose=self._figure.pose(),
+                parameter_changes=differences(panel),
             )
 
     def prefer_dark(self, *, on: bool) -> None:
@@ -187,7 +190,8 @@ class Session:
         """Go on where another session stands."""
         self._has_played = True
         self._timeline.restore(state.speed, does_loop=state.does_loop)
-        self._layers.restore(state.layers, state.theme, prefers_dark=state.prefers_dark)
+        if state.layers is not None:
+            self._layers.restore(state.layers, state.theme, prefers_dark=state.prefers_dark)
         if self._object is not None and self._object.panel is not None and state.parameters:
             self._object.panel.restore(state.parameters, is_automatic=state.automatic_substeps)
         if state.pose is not None:

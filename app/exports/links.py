@@ -1,0 +1,87 @@
+"""Permalinks: an address that opens a live scene as somebody left it, and the way back."""
+
+from collections.abc import Mapping
+from typing import Annotated, Literal
+from urllib.parse import urlencode
+
+from fastapi import APIRouter, Request
+from fastapi.responses import RedirectResponse
+from pydantic import BaseModel, Field
+from starlette.exceptions import HTTPException
+
+from app.permalink import state_from_query, state_to_query
+from app.viewer.session import Sessions
+from physhandi.errors import UsageError
+
+Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
+_LONGEST = 4_000
+_CLOSED = "This live scene was closed, or it is not yours."
+
+
+class Link(BaseModel):
+    """Where a live scene can be found again."""
+
+    url: str
+    """Address on this server that opens a scene in the same state."""
+    query: str
+    """Its part after the question mark."""
+
+
+def create_links(sessions: Sessions) -> APIRouter:
+    """Make the routes.
+
+    Args:
+        sessions: The live scenes.
+    """
+    router = APIRouter()
+
+    def open_scene(kind: Literal["run", "sequence"], target: str, request: Request) -> str:
+        purpose = request.headers.get("sec-purpose", "") + request.headers.get("purpose", "")
+        if "prefetch" in purpose:
+            # A browser that only expects a visit must not take a place among the live scenes.
+            raise HTTPException(503, "A live scene is not opened in advance.")
+        query = read_query(request)
+        state = state_from_query(query)
+        session = sessions.open(kind, target, request.state.owner, state=state)
+        rest = urlencode(query, safe=",")
+        return f"/live/{session}" + (f"?{rest}" if rest else "")
+
+    @router.get("/runs/{run_id}/view", include_in_schema=False)
+    def view_run(run_id: Id, request: Request) -> RedirectResponse:
+        return RedirectResponse(open_scene("run", run_id, request), 303)
+
+    @router.get("/sequences/{sequence_id}/view", include_in_schema=False)
+    def view_sequence(sequence_id: Id, request: Request) -> RedirectResponse:
+        return RedirectResponse(open_scene("sequence", sequence_id, request), 303)
+
+    @router.get("/api/v1/sessions/{session_id}/link")
+    def show_link(session_id: Id, request: Request) -> Link:
+        """Tell the address that opens another scene in the state of this one."""
+        session = sessions.find(session_id, request.state.owner)
+        if session is None:
+            raise HTTPException(404, _CLOSED)
+        query = urlencode(state_to_query(session.state), safe=",")
+        return Link(url=f"/{session.kind}s/{session.target}/view?{query}", query=query)
+
+    return router
+
+
+def read_query(request: Request, *, without: tuple[str, ...] = ()) -> Mapping[str, str]:
+    """Read the fields of an address.
+
+    Args:
+        request: Who asks.
+        without: Fields that mean something else.
+
+    Raises:
+        UsageError: If there is too much of it, or a field comes twice; names the field.
+    """
+    if len(request.url.query) > _LONGEST:
+        raise UsageError(f"The link is longer than {_LONGEST} characters.")
+    query: dict[str, str] = {}
+    for name, text in request.query_params.multi_items():
+        if name in query:
+            raise UsageError(f"{name[:40]}: the link has this field twice.")
+        if name not in without:
+            query[name] = text
+    return query

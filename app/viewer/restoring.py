@@ -1,0 +1,65 @@
+"""Making a state that somebody asked for, as by a link, fit what is there."""
+
+from dataclasses import fields, replace
+from typing import Any
+
+from app.viewer.content import Content
+from app.viewer.layers import default_layers
+from app.viewer.physics_panel import PhysicsPanel
+from app.viewer.session_state import SessionState
+from physhandi.errors import UsageError
+from physhandi.simulation.model import SimulationParameters
+
+
+def complete_state(state: SessionState, content: Content) -> SessionState:
+    """Fill in what a state leaves open: layers that suit the content and fitted parameters.
+
+    Args:
+        state: What is asked for.
+        content: What there is.
+
+    Returns:
+        The state with its layers and, if there is an object, its parameters.
+
+    Raises:
+        UsageError: If the content has no such frame, view, object or figure; names the field.
+    """
+    if state.sequence_name not in {None, content.sequence_name}:
+        raise UsageError(f"sequence: '{content.sequence_name}' is shown, nothing else is there.")
+    if not 0 <= state.frame < content.frame_count:
+        raise UsageError(
+            f"f: '{content.sequence_name}' has frames 0 to {content.frame_count - 1}, "
+            f"not {state.frame}."
+        )
+    layers = state.layers or replace(default_layers(content), **state.layer_changes)
+    views = [view.name for view in content.views]
+    if layers.looks_from is not None and layers.looks_from not in views:
+        raise UsageError(
+            f"from: '{content.sequence_name}' has no view {layers.looks_from!r}. "
+            f"It has: {', '.join(views) or 'none'}."
+        )
+    has_wish = bool(state.parameter_changes) or state.automatic_substeps or state.is_figure
+    if content.fitted is None and has_wish:
+        name = next(iter(state.parameter_changes), "fig" if state.is_figure else "substeps")
+        raise UsageError(f"{name}: nothing is simulated here, since no object was fitted.")
+    parameters = state.parameters
+    if parameters is None and content.fitted is not None:
+        parameters = replace(content.fitted.parameters, **state.parameter_changes)
+    return replace(state, layers=layers, parameters=parameters)
+
+
+def differences(panel: PhysicsPanel | None) -> dict[str, Any]:
+    """Find the parameters of a panel that are not as fitted."""
+    if panel is None:
+        return {}
+    start, now = panel.history.start, panel.history.current
+    return parameter_differences(start, now)
+
+
+def parameter_differences(start: SimulationParameters, now: SimulationParameters) -> dict[str, Any]:
+    """Find the parameters that differ, with their new values."""
+    return {
+        item.name: getattr(now, item.name)
+        for item in fields(start)
+        if getattr(now, item.name) != getattr(start, item.name)
+    }
