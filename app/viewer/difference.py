@@ -147,8 +147,11 @@ def triangle_distance(
     v = (aa * along_c - cross * along_b) / safe
     is_above = ~is_flat & (u >= 0) & (v >= 0) & (u + v <= 1)
     off_plane = np.linalg.norm(ap - u[:, None] * ab - v[:, None] * ac, axis=-1)
-    edges = [_edge_distance(point, *ends) for ends in ((a, b), (b, c), (c, a))]
-    return np.where(is_above, off_plane, np.min(np.stack(edges), axis=0))
+    found = _edge_distance(point, a, b)
+    for start, end in ((b, c), (c, a)):
+        found = np.minimum(found, _edge_distance(point, start, end))
+    found[is_above] = off_plane[is_above]
+    return found
 
 
 def _edge_distance(

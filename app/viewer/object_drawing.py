@@ -75,6 +75,8 @@ class Style:
     """Color of control nodes."""
     spring: Color = GREY
     """Color of object springs."""
+    virtual: Color = YELLOW
+    """Color of virtual springs."""
     arrow: Color = RED
     """Color of force arrows."""
     node_size: float = 0.36
@@ -151,7 +153,7 @@ class ObjectDrawing:
         self._nodes.segments(
             f"{root}/springs/virtual",
             _ends(point, springs[count:], budget.virtual),
-            YELLOW,
+            style.virtual,
             style.virtual_width,
             is_visible=layers.virtual_springs,
         )

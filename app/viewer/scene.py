@@ -32,7 +32,7 @@ class Scene:
         self._force_unit = automatic_force_unit(content.fitted, framing)
         self._cameras = CameraNodes(server, content.views, framing)
         self._aim()
-        self._add_ground()
+        add_ground(self._nodes, content, framing)
 
     def clear(self) -> None:
         """Remove everything, to make room for another content."""
@@ -86,16 +86,6 @@ class Scene:
         camera.look_at = self._framing.look_at
         camera.position = self._framing.camera
 
-    def _add_ground(self) -> None:
-        height, extent = self._content.ground_height, self._framing.extent
-        if height is None:
-            height = self._framing.low - 0.02 * extent
-        power = 10.0 ** float(np.floor(np.log10(extent / 3)))
-        cell = max(step * power for step in (1, 2, 5) if step * power <= extent / 3)
-        x, y = (round(float(self._framing.center[axis]) / cell) * cell for axis in (0, 1))
-        count = int(np.ceil(4 * extent / cell))
-        self._nodes.ground("/ground", (x, y, float(height) - 0.001 * extent), cell, count)
-
     def _draw_hands(self, frame: int) -> None:
         is_visible = self.layers.hands
         for hand in self._content.hands:
@@ -135,3 +125,15 @@ class Scene:
         if layers.hands:
             point_count += sum(hand.vertex.shape[1] for hand in self._content.hands)
         return share_bytes(FRAME_BYTES - 12 * point_count, take, layers, _PLAYING_ARROWS)
+
+
+def add_ground(nodes: SceneNodes, content: Content, framing: Framing) -> None:
+    """Draw the grid of ``/ground``; below everything if the ground is not known."""
+    height, extent = content.ground_height, framing.extent
+    if height is None:
+        height = framing.low - 0.02 * extent
+    power = 10.0 ** float(np.floor(np.log10(extent / 3)))
+    cell = max(step * power for step in (1, 2, 5) if step * power <= extent / 3)
+    x, y = (round(float(framing.center[axis]) / cell) * cell for axis in (0, 1))
+    count = int(np.ceil(4 * extent / cell))
+    nodes.ground("/ground", (x, y, float(height) - 0.001 * extent), cell, count)
