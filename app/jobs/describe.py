@@ -7,7 +7,8 @@ from typing import Any, cast
 
 from app.jobs.catalog import RunItem, SequenceItem
 from app.jobs.failures import explain
-from app.jobs.scheduler import Scheduler
+from app.jobs.remaining import time_of_running, time_of_waiting
+from app.jobs.scheduler import JobView, Scheduler
 from app.jobs.stages import stages_of
 from physhandi.data.atomic import named_fields
 from physhandi.data.environment import ENVIRONMENT
@@ -18,6 +19,9 @@ PARTS = ("color", "depth", "mask", "keypoint", "track", "control", "marker", "ob
 _RESULTS = ("losses.json", "metrics.json", "object/parameters.yaml", ENVIRONMENT)
 CURVE_LIMIT = 2000
 """Most points of a curve that are sent to a browser."""
+# Runs and the views of ended runs stay the same objects while nothing changes on disk, so a long
+# list is described once; a run at work has a new view, and is described anew, each time.
+_described: WeakKeyDictionary[Run, tuple[JobView, dict[str, Any]]] = WeakKeyDictionary()
 
 
 def describe_sequence(item: SequenceItem) -> dict[str, Any]:
@@ -51,6 +55,15 @@ def describe_sequence(item: SequenceItem) -> dict[str, Any]:
 def describe_run(item: RunItem, scheduler: Scheduler) -> dict[str, Any]:
     """Describe one run of a listing, with how far it is."""
     view = scheduler.view(item)
+    known = _described.get(item.run) if item.run else None
+    if known is None or known[0] is not view:
+        known = (view, _describe(item, view))
+        if item.run is not None:
+            _described[item.run] = known
+    return dict(known[1])
+
+
+def _describe(item: RunItem, view: JobView) -> dict[str, Any]:
     described: dict[str, Any] = {
         "id": item.id,
         "name": item.id,
@@ -65,19 +78,25 @@ def describe_run(item: RunItem, scheduler: Scheduler) -> dict[str, Any]:
         "created": "",
         "sequences": [],
         "profile": "",
+        "tags": [],
     }
     run = item.run
     if run is None:
-        return described
+        return described | asdict(RunSummary())
     profile = named_fields(run.config.get("profile")) or {}
-    return described | {
-        "name": run.name,
-        "kind": run.kind,
-        "created": run.created,
-        "sequences": run.sequence_names,
-        "profile": str(profile.get("profile", "")),
-        "error": view.reason if view.state == "failed" else None,
-    }
+    return (
+        described
+        | {
+            "name": run.name,
+            "kind": run.kind,
+            "created": run.created,
+            "sequences": run.sequence_names,
+            "profile": str(profile.get("profile", "")),
+            "tags": tags_of(run.label),
+            "error": view.reason if view.state == "failed" else None,
+        }
+        | asdict(summarize(run) if view.is_published else RunSummary())
+    )
 
 
 def follow_run(item: RunItem, scheduler: Scheduler) -> dict[str, Any]:
@@ -101,7 +120,7 @@ def follow_run(item: RunItem, scheduler: Scheduler) -> dict[str, Any]:
     except (PhysHandiError, OSError) as error:
         described |= {"state": "failed", "reason": str(error)}
     failure = asdict(explain(run, described["reason"])) if state == "failed" else None
-    shown = [described | {"progress": None}, results, failure]
+    shown = [described | {"progress": None, "estimate": None}, results, failure]
     shown += [stage | {"seconds": None} for stage in stages]
     revision = hashlib.sha256(json.dumps(shown, default=str).encode()).hexdigest()[:16]
     return described | {"stages": stages, "failure": failure, "revision": revision}

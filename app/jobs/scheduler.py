@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from app.jobs.catalog import Catalog, RunItem
+from app.jobs.forecast import Forecast
 from app.jobs.local import WORKER, start_supervisor
 from app.jobs.processes import end_processes, marked_processes, processes_of, supervisor_of
 from app.jobs.supervise import note_end
@@ -70,12 +71,15 @@ class Scheduler:
         self._settings = settings
         self._catalog = catalog
         self._worker = worker
+        self.forecast = Forecast(catalog, settings.device)
+        """Estimates how long fits still take."""
         self._lock = threading.RLock()
         self._started: dict[str, subprocess.Popen[bytes]] = {}
         self._stopping: dict[str, threading.Thread] = {}
         self._ended: dict[str, tuple[int, JobView]] = {}
         self._line: tuple[str, ...] = ()
         self._busy: tuple[str, ...] = ()
+        self._known: dict[str, Run] = {}
         self._claim: int | None = None
         self._closed = threading.Event()
         self._wake = threading.Event()
@@ -181,6 +185,19 @@ class Scheduler:
                 )
             run.delete()
 
+    @property
+    def slots(self) -> int:
+        """How many fits run side by side."""
+        return self._settings.parallel_fits
+
+    def at_work(self) -> list[Run]:
+        """List the runs that have a place, as the queue saw them last."""
+        return [self._known[run_id] for run_id in self._busy if run_id in self._known]
+
+    def in_line(self) -> list[Run]:
+        """List the runs that wait, the next one first."""
+        return [self._known[run_id] for run_id in self._line if run_id in self._known]
+
     def view(self, item: RunItem) -> JobView:
         """Tell how far a run is and why it waits."""
         if item.run is None:
@@ -275,6 +292,8 @@ class Scheduler:
             queue = self._queue(items)
             views = {item.id: self.view(item) for item in items}
             self._busy = tuple(run_id for run_id, view in views.items() if view.state in AT_WORK)
+            moving = {*self._busy, *(item.id for item in queue)}
+            self._known = {item.id: item.run for item in items if item.run and item.id in moving}
             free = max(0, self._settings.parallel_fits - len(self._busy))
             ready = [item for item in queue if supervisor_of(item.folder) is None]
             for item in ready[:free]:
