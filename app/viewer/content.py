@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from app.viewer.observed import CloudSet, DepthCloud, Observed, PointSet
+from app.viewer.observed import CloudSet, DepthCloud, Observed, PointSet, Tracks
 from app.viewer.skeleton import lift_keypoints
 from app.viewer.take import Take
 from physhandi.data.run import Run
@@ -74,6 +74,8 @@ class Content:
     """The object's fitted rollout."""
     observed: Observed | None = None
     """What the cameras or markers saw."""
+    tracks: Tracks | None = None
+    """Points that were followed over the frames."""
     views: Listing[View] = field(default_factory=tuple)
     """The recording's views."""
 
@@ -122,6 +124,7 @@ def open_run(catalog: Catalog, run_id: str, sequence_name: str | None = None) ->
         control=control,
         fitted=load_fitted(run, name),
         observed=_run_observation(run, folder) or (_observation(sequence) if sequence else None),
+        tracks=_run_tracks(run, folder),
         views=sequence.views if sequence else (),
     )
 
@@ -210,6 +213,16 @@ def _run_observation(run: Run, folder: str) -> Observed | None:
     if not all(run.has(name) for name in files):
         return None
     return PointSet(run.array(files[0]), run.array(files[1]))
+
+
+def _run_tracks(run: Run, folder: str) -> Tracks | None:
+    files = (f"{folder}/observation/point.npy", f"{folder}/observation/is_visible.npy")
+    if not all(run.has(name) for name in files):
+        return None
+    point, is_visible = (run.array(name) for name in files)
+    nodes = f"{folder}/observation/node_of_track.npy"
+    node = run.array(nodes) if run.has(nodes) else None
+    return Tracks(point=point, is_visible=is_visible, node=node) if point.shape[1] else None
 
 
 def _observation(sequence: Sequence) -> Observed | None:

@@ -1,7 +1,7 @@
 """Which parts of a scene are shown, and in which colors."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from app.viewer.content import Content
 from app.viewer.take import Take
@@ -17,6 +17,12 @@ Theme = Literal["as the browser", "light", "dark"]
 """Which background a user can choose."""
 THEMES: tuple[Theme, ...] = ("as the browser", "light", "dark")
 
+Coloring = Literal[
+    "plain", "error", "stiffness", "damping", "strain", "speed", "force", "difference"
+]
+"""What the colors of an object tell."""
+COLORINGS: tuple[Coloring, ...] = get_args(Coloring)
+
 PLAYING_SPRINGS = 2_000
 """Most springs that are streamed while the clock is running."""
 
@@ -29,6 +35,8 @@ class Layers:
     """Hand meshes."""
     nodes: bool = True
     """Object nodes."""
+    surface: bool = False
+    """Surface of the object, laid through its nodes."""
     controls: bool = True
     """Control nodes that hold the object by a virtual spring."""
     all_controls: bool = False
@@ -51,6 +59,10 @@ class Layers:
     """Dark background."""
     force_scale: float = 1.0
     """Length of the force arrows, relative to the automatic one."""
+    color: Coloring = "plain"
+    """What the colors of nodes, surface and springs tell."""
+    color_range: tuple[float, float] | None = None
+    """Values at the ends of the color scale, in SI units; None for those of the sequence."""
 
 
 def default_layers(content: Content) -> Layers:

@@ -1,6 +1,7 @@
 """Observed points of a frame, from markers or from depth images."""
 
 from collections.abc import Sequence as Listing
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -23,6 +24,18 @@ class Observed(Protocol):
     def colors(self) -> UInt8[ndarray, "point 3"] | UInt8[ndarray, " 3"]:
         """Tell the color of the points of the frame asked for last."""
         ...
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Tracks:
+    """Points that keep their identity over the frames, so that errors can be told for each."""
+
+    point: Float[ndarray, "frame track 3"]
+    """Observed places [m]."""
+    is_visible: Bool[ndarray, "frame track"]
+    """Whether a track is seen."""
+    node: Int[ndarray, " track"] | None = None
+    """Node that each track observes; None if the nodes around it carry it."""
 
 
 class PointSet:

@@ -6,7 +6,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from physhandi.simulation.forces import virtual_forces, virtual_spring_forces
+from physhandi.simulation.forces import (
+    spring_strains,
+    spring_tensions,
+    virtual_forces,
+    virtual_spring_forces,
+)
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
 
 
@@ -58,14 +63,23 @@ class Take:
 
     def forces(self, frame: int) -> Float[ndarray, "node 3"]:
         """Compute the sum of the virtual springs' forces on each object node [N]."""
-        return virtual_forces(self.model, self.parameters, *self._state(frame))
+        return virtual_forces(self.model, self.parameters, *self.state(frame))
 
     def spring_forces(self, frame: int) -> Float[ndarray, "virtual 3"]:
         """Compute the force of each virtual spring on its object node [N]."""
-        return virtual_spring_forces(self.model, self.parameters, *self._state(frame))
+        return virtual_spring_forces(self.model, self.parameters, *self.state(frame))
 
-    def _state(self, frame: int) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-        """Collect positions and velocities of object nodes and control nodes."""
+    def strains(self, frame: int) -> Float[ndarray, " spring"]:
+        """Measure how much longer each spring is than at rest, as a part of its rest length."""
+        position, control = self.position[frame], self.control[frame]
+        return spring_strains(self.model, np.asarray(position), np.asarray(control))
+
+    def tensions(self, frame: int) -> Float[ndarray, " spring"]:
+        """Compute how hard each spring pulls its ends together [N]."""
+        return spring_tensions(self.model, self.parameters, *self.state(frame))
+
+    def state(self, frame: int) -> tuple[ndarray, ndarray, ndarray, ndarray]:
+        """Collect positions and velocities of object nodes, then of control nodes [m, m/s]."""
         rate = self.parameters.frame_rate
         if self.velocity is not None:
             velocity = self.velocity[frame]

@@ -1,0 +1,205 @@
+"""What colors tell, against values that were computed by hand or by the metrics."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from viewer_world import FolderCatalog
+
+from app.viewer.coloring import Painter
+from app.viewer.colormaps import UNKNOWN, levels, paint, table
+from app.viewer.content import Content, open_run
+from app.viewer.layers import COLORINGS, Layers
+from app.viewer.observed import PointSet, Tracks
+from app.viewer.quantities import QUANTITIES, measure
+from app.viewer.take import Take
+from physhandi.simulation.model import SimulationParameters, SpringMassModel
+
+BUNDLED = Path(__file__).parents[3] / "sequences"
+
+
+def two_springs(frames: int = 4) -> Take:
+    """Node 1 runs away from node 0 at 3 m/s; a control stands above node 0."""
+    model = SpringMassModel(
+        object_node=np.array([[0, 0, 0], [1, 0, 0], [5, 5, 5]], np.float32),
+        initial_velocity=np.zeros((3, 3), np.float32),
+        spring_nodes=np.array([[0, 1], [3, 0]], np.int32),
+        rest_length=np.array([1.0, 0.5], np.float32),
+        stiffness=np.array([10.0, 40.0], np.float32),
+        damping=np.array([2.0, 0.0], np.float32),
+        object_spring_count=1,
+        control_count=1,
+    )
+    position = np.repeat(model.object_node[None], frames, axis=0)
+    position[:, 1, 0] += 0.1 * np.arange(frames)
+    control = np.full((frames, 1, 3), [0.0, 0.0, 1.0], np.float32)
+    parameters = SimulationParameters(stiffness_scale=2.0, frame_rate=30.0)
+    return Take(
+        model=model, parameters=parameters, control=control, position=position, ready=frames
+    )
+
+
+def content_of(take: Take, **fields) -> Content:
+    return Content(
+        title="t",
+        sequence_name="s",
+        frame_count=take.frame_count,
+        frame_rate=30.0,
+        reconstruction_count=take.frame_count,
+        length_unit="m",
+        ground_height=0.0,
+        control=take.control,
+        fitted=take,
+        **fields,
+    )
+
+
+def test_values_of_two_springs():
+    take = two_springs()
+
+    def at(coloring, frame=2, **options):
+        values = measure(coloring, take, frame, **options)
+        return values.node.tolist(), values.spring.tolist()
+
+    nan = np.nan
+    node, spring = at("strain")
+    assert node[:2] == pytest.approx([0.2, 0.2])
+    assert np.isnan(node[2])
+    assert spring == [pytest.approx([0.2, 0.2]), pytest.approx([1.0, 1.0])]
+    node, spring = at("stiffness")
+    assert node == pytest.approx([20.0, 20.0, nan], nan_ok=True)
+    assert spring == [pytest.approx([20.0] * 2), pytest.approx([80.0] * 2)]
+    node, spring = at("damping")
+    assert node == pytest.approx([2.0, 2.0, nan], nan_ok=True)
+    node, spring = at("speed")
+    assert node == pytest.approx([0.0, 3.0, 0.0], abs=1e-5)
+    assert spring[0] == pytest.approx([0.0, 3.0], abs=1e-5)
+    # 20·0.2 + 2·3 = 10 N pull at both ends; the hand holds node 0 with 80·1 N.
+    node, spring = at("force")
+    assert node == pytest.approx([80.0, 0.0, 0.0])
+    assert spring == [pytest.approx([10.0, 10.0], rel=1e-5), pytest.approx([80.0, 80.0])]
+    other = replace(take, position=take.position + np.float32([0, 0.3, 0.4]))
+    node, spring = at("difference", reference=other)
+    assert node == pytest.approx([0.5] * 3)
+    # A control node has no difference of its own: its spring shows the held node's.
+    assert spring == [pytest.approx([0.5, 0.5]), pytest.approx([0.5, 0.5])]
+    assert np.isnan(at("difference")[0]).all()
+    assert np.isnan(at("error")[0]).all()
+
+
+def test_every_coloring_is_described_and_measured():
+    assert set(QUANTITIES) == set(COLORINGS) - {"plain"}
+    take = two_springs()
+    for coloring in QUANTITIES:
+        values = measure(coloring, take, 1, error_of=lambda *_: np.zeros(3), reference=take)
+        assert values.node.shape == (3,)
+        assert values.spring.shape == (2, 2)
+
+
+def test_the_error_of_a_track_is_the_metric_s():
+    content = open_run(FolderCatalog(BUNDLED), "towel_fold_quick")
+    name = content.sequence_name
+    out = BUNDLED / "runs" / "towel_fold_quick" / "attempts" / "1" / "out" / "sequences" / name
+    measured = json.loads((out / "frame_errors.json").read_text())
+    errors = Painter(content).errors
+    assert errors.source == "the tracks"
+    assert content.fitted is not None
+    for frame in (3, 30, 59):
+        error, is_seen = errors.tracks(content.fitted, frame)
+        wanted = measured["rollout"]["track_error"][measured["frames"].index(frame)]
+        assert error[is_seen].mean() == pytest.approx(wanted, rel=1e-3)
+        node = errors.nodes(content.fitted, frame)
+        assert 0.5 * wanted < np.nanmean(node) < 2 * wanted
+
+
+def test_an_error_is_told_only_where_something_was_seen():
+    take = two_springs()
+    seen = np.array([[1, 1, 1], [1, 0, 1], [0, 0, 0], [1, 1, 1]], bool)
+    tracks = Tracks(
+        point=take.position + np.float32([0, 0, 0.25]), is_visible=seen, node=np.array([0, 1, 2])
+    )
+    errors = Painter(content_of(take, tracks=tracks)).errors
+    assert errors.nodes(take, 0) == pytest.approx([0.25] * 3)
+    assert np.isnan(errors.nodes(take, 2)).all()
+    # Node 1 lies beside track 0, so that this one speaks for it when its own is hidden.
+    assert errors.nodes(take, 1) == pytest.approx([0.25] * 3)
+    assert errors.tracks(take, 1)[1].tolist() == [True, False, True]
+
+
+def test_without_tracks_the_nearest_observed_point_counts():
+    take = two_springs()
+    point = np.repeat(np.float32([[[0, 0, 0.5], [1, 0, 0.0]]]), 4, axis=0)
+    observed = PointSet(point, np.ones(point.shape[:2], bool))
+    errors = Painter(content_of(take, observed=observed)).errors
+    assert errors.source == "the nearest observed point"
+    assert errors.nodes(take, 1)[:2] == pytest.approx([0.5, 0.1], abs=1e-6)
+
+
+def test_the_range_is_that_of_the_sequence_until_it_is_fixed():
+    take = two_springs(20)
+    painter = Painter(content_of(take))
+    first = painter.paint(take, 1, Layers(color="strain"))
+    last = painter.paint(take, 19, Layers(color="strain"))
+    assert first.limits == last.limits
+    low, high = last.limits
+    assert low == -high
+    assert 1.7 < high <= 2.0
+    assert painter.legend.highest == pytest.approx(1.9, rel=1e-5)
+    assert not painter.legend.is_fixed
+    fixed = painter.paint(take, 1, Layers(color="strain", color_range=(0.0, 0.1)))
+    assert fixed.limits == (0.0, 0.1)
+    assert painter.legend.is_fixed
+    # At 0.1 the scale ends; the third node has no spring.
+    np.testing.assert_array_equal(fixed.node[0], table("diverging")[-1])
+    np.testing.assert_array_equal(fixed.node[2], UNKNOWN)
+    np.testing.assert_array_equal(fixed.springs(slice(0, 1))[0], table("diverging")[[-1, -1]])
+    assert painter.paint(take, 1, Layers()) is None
+    assert painter.legend is None
+
+
+def test_the_range_grows_with_a_rollout_that_is_being_computed():
+    fitted = two_springs(20)
+    painter = Painter(content_of(fitted))
+    take = replace(fitted, ready=2)
+    assert painter.limits("difference", take)[1] == pytest.approx(1e-3)
+    before = painter.limits("speed", take)
+    take.position[2:, 1, 0] += np.arange(18, dtype=np.float32)
+    take.ready = 3
+    assert painter.limits("speed", take) == before
+    take.ready = 4
+    assert painter.limits("speed", take)[1] > 8 * before[1]
+
+
+def test_colors_are_viridis_and_the_ends_are_reached():
+    ramp = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)
+    painted = paint(np.array([-5.0, 0.0, 0.5, 1.0, 9.0, np.nan]), (0.0, 1.0))
+    np.testing.assert_array_equal(painted[0], painted[1])
+    np.testing.assert_array_equal(painted[3], painted[4])
+    np.testing.assert_array_equal(painted[5], UNKNOWN)
+    assert np.abs(ramp[130, 0, ::-1].astype(int) - painted[2]).max() < 5
+    blue, middle, red = paint(np.array([-2.0, 0.0, 2.0]), (-2.0, 2.0), "diverging").astype(int)
+    assert blue[2] > blue[0] + 80
+    assert red[0] > red[2] + 80
+    assert np.ptp(middle) < 4
+
+
+def test_equal_ratios_are_equal_steps_on_a_logarithmic_scale():
+    value = np.array([10.0, 100.0, 1000.0, 0.0])
+    np.testing.assert_allclose(
+        levels(value, (10.0, 1000.0), is_logarithmic=True), [0, 0.5, 1, 0], atol=1e-12
+    )
+    np.testing.assert_allclose(levels(value, (0.0, 1000.0)), [0.01, 0.1, 1, 0])
+    # A range without extent splits what lies above it from the rest.
+    assert levels(np.array([1.0, 2.0, 3.0]), (2.0, 2.0)).tolist() == [0.0, 0.0, 1.0]
+
+
+def test_units_follow_the_content():
+    take = two_springs()
+    painter = Painter(replace(content_of(take), length_unit="squares"))
+    assert (painter.quantity("error").unit, painter.quantity("error").factor) == ("squares", 1.0)
+    assert painter.quantity("speed").unit == "squares/s"
+    assert painter.quantity("strain").unit == "%"
+    assert Painter(content_of(take)).quantity("error").unit == "mm"
