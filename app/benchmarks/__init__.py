@@ -1,0 +1,1 @@
+"""What the running application is measured with."""

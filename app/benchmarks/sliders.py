@@ -1,0 +1,147 @@
+"""How long it takes from a slider of a live scene to the first new frame, without a browser."""
+
+import time
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from app.benchmarks.served import Served
+from app.benchmarks.streams import Screen, percentiles
+from app.viewer.fitted_object import FittedObject
+from app.viewer.parameters import Knob, knobs
+from physhandi.data.run import Run
+from physhandi.simulation.stability import with_stable_substeps
+
+FIELDS = ("stiffness_scale", "connection_radius")
+"""Parameters whose sliders are moved."""
+_TOLERANCE = 1e-7
+_DRAGGED = 3
+"""Of so many moves all but the last cut the rollout before them off."""
+
+
+@dataclass(frozen=True)
+class Move:
+    """One position of a slider, and what the object does there."""
+
+    value: float
+    """Value on the slider."""
+    rollout: Float[ndarray, "frame node 3"]
+    """Object node positions [m], simulated by the benchmark itself."""
+
+
+class Slider:
+    """One slider of a run, and rollouts for some of its positions."""
+
+    def __init__(self, run: Run, sequence: str, field: str) -> None:
+        """Load the run.
+
+        Args:
+            run: A finished run with an object.
+            sequence: One of its sequences.
+            field: Parameter that the slider moves.
+        """
+        self._fitted = FittedObject(str(run.folder), sequence)
+        meta = run.yaml(f"sequences/{sequence}/meta.yaml")
+        unit = "m" if meta.get("metric", True) else str(meta.get("length_unit", "units"))
+        start = self._fitted.take.parameters
+        known = {knob.field: knob for knob in knobs(start, length_unit=unit)}
+        self.knob: Knob = known[field]
+        self._start = start
+
+    @property
+    def fitted(self) -> Float[ndarray, "frame node 3"]:
+        """The fitted rollout [m]."""
+        return np.asarray(self._fitted.take.position)
+
+    def moves(self, count: int, *, automatic: bool) -> list[Move]:
+        """Choose positions, each further than the one before, and simulate them.
+
+        A step that changes nothing, as when no node is that near, is not among them.
+
+        Args:
+            count: How many at most.
+            automatic: Whether with as few substeps as are stable.
+        """
+        value = self.knob.to_slider(self._start)
+        # Softer objects are safe at every number of substeps, and wider radii change the springs.
+        step = -self.knob.step if self.knob.is_logarithm else self.knob.step
+        chosen: list[Move] = []
+        before = self.fitted
+        while len(chosen) < count and self.knob.low < value < self.knob.high:
+            value = round(value + step, 6)
+            move = self._move(value, automatic)
+            if float(np.abs(move.rollout[1] - before[1]).max()) > _TOLERANCE:
+                chosen.append(move)
+                before = move.rollout
+        return chosen
+
+    def _move(self, value: float, automatic: bool) -> Move:
+        value = min(max(round(value, 6), self.knob.low), self.knob.high)
+        chosen = {self.knob.field: self.knob.from_slider(value)}
+        parameters = replace(self._start, **chosen)
+        model = self._fitted.model(parameters)
+        control = self._fitted.choose_controls(None)
+        if automatic:
+            parameters = with_stable_substeps(parameters, model, control[0])
+        simulator = self._fitted.simulator(model, parameters, "cpu")
+        return Move(value, np.stack([position for _, position, _ in simulator.frames(control)]))
+
+
+def is_new_frame(
+    shown: Float[ndarray, "node 3"],
+    rollout: Float[ndarray, "frame node 3"],
+    before: Float[ndarray, "frame node 3"],
+) -> bool:
+    """Tell whether nodes stand as in a frame of one rollout and in none of the one before."""
+
+    def is_of(frames: ndarray) -> bool:
+        return bool((np.abs(frames - shown).max(axis=(1, 2)) <= _TOLERANCE).any())
+
+    return is_of(rollout) and not is_of(before)
+
+
+def measure_slider(
+    served: Served, run_id: str, slider: Slider, moves: list[Move], *, is_playing: bool
+) -> dict[str, Any]:
+    """Move a slider, most times while the rollout before is still being simulated.
+
+    Args:
+        served: The server; its live simulation runs on the CPU.
+        run_id: The run to show.
+        slider: The slider.
+        moves: Where to.
+        is_playing: Whether the clock runs; else it is paused in the middle, and the first new
+            frame is that one.
+
+    Returns:
+        Time from the slider's message to that of the first node positions that only the new
+        rollout has.
+    """
+    session = served.open("run", run_id)
+    seconds: list[float] = []
+    before = slider.fitted
+    with served.watch(session) as client:
+        screen = Screen(client)
+        screen.play(on=True)
+        client.listen(0.5)
+        if not is_playing:
+            client.set("Frame", len(before) // 2)
+            client.until(lambda: not screen.is_playing)
+            client.listen(0.3)
+        for number, move in enumerate(moves):
+            start = time.perf_counter()
+            label = slider.knob.label
+            client.set(label, move.value)
+            new, old = move.rollout, before
+            seconds.append(
+                screen.seconds_until(lambda p, new=new, old=old: is_new_frame(p, new, old)) - start
+            )
+            if number % _DRAGGED == _DRAGGED - 1:
+                total = f"simulated {len(new)}/{len(new)}"
+                client.until(lambda total=total: total in client.texts())
+            before = move.rollout
+    served.shut(session)
+    return {"moves": len(moves), **percentiles(seconds)}
