@@ -4,12 +4,15 @@ import hashlib
 import json
 from dataclasses import asdict
 from typing import Any, cast
+from weakref import WeakKeyDictionary
 
 from app.jobs.catalog import RunItem, SequenceItem
 from app.jobs.failures import explain
-from app.jobs.remaining import time_of_running, time_of_waiting
+from app.jobs.listing import tags_of
+from app.jobs.remaining import with_time
 from app.jobs.scheduler import JobView, Scheduler
 from app.jobs.stages import stages_of
+from app.jobs.summary import RunSummary, summarize
 from physhandi.data.atomic import named_fields
 from physhandi.data.environment import ENVIRONMENT
 from physhandi.data.run import Run, read_events
@@ -53,14 +56,14 @@ def describe_sequence(item: SequenceItem) -> dict[str, Any]:
 
 
 def describe_run(item: RunItem, scheduler: Scheduler) -> dict[str, Any]:
-    """Describe one run of a listing, with how far it is."""
+    """Describe one run of a listing, with how far it is and how long it still takes."""
     view = scheduler.view(item)
     known = _described.get(item.run) if item.run else None
     if known is None or known[0] is not view:
         known = (view, _describe(item, view))
         if item.run is not None:
             _described[item.run] = known
-    return dict(known[1])
+    return with_time(known[1], item.run, view, scheduler)
 
 
 def _describe(item: RunItem, view: JobView) -> dict[str, Any]:

@@ -4,7 +4,38 @@ from typing import Any
 
 from app.jobs.estimate import Estimate
 from app.jobs.forecast import Forecast
+from app.jobs.scheduler import JobView, Scheduler
 from physhandi.data.run import Run
+
+
+def with_time(
+    described: dict[str, Any], run: Run | None, view: JobView, scheduler: Scheduler
+) -> dict[str, Any]:
+    """Add to a run's description how long it still takes.
+
+    Args:
+        described: What `describe_run` says of it.
+        run: The run; None if it is damaged.
+        view: How far the queue says it is.
+        scheduler: Knows what is at work and in line.
+
+    Returns:
+        The description with ``estimate`` (see `time_of_running` and `time_of_waiting`, else none)
+        and, as ``eta_s`` of its ``progress``, the time that the stage at work still takes.
+    """
+    estimate = None
+    if run is not None and view.state in {"starting", "running"}:
+        estimate = time_of_running(run, scheduler.forecast)
+    elif run is not None and view.state == "queued":
+        line = scheduler.in_line()
+        ids = [other.id for other in line]
+        if run.id in ids:
+            ahead, busy = line[: ids.index(run.id)], scheduler.at_work()
+            estimate = time_of_waiting(run, ahead, busy, scheduler.slots, scheduler.forecast)
+    progress = dict(described["progress"])
+    if progress and estimate and "stage_left_s" in estimate:
+        progress["eta_s"] = estimate["stage_left_s"]
+    return described | {"estimate": estimate, "progress": progress}
 
 
 def time_of_running(run: Run, forecast: Forecast) -> dict[str, Any] | None:
