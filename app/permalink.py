@@ -9,6 +9,7 @@
 ``up``, ``fov``     what is upwards for the camera, if not z; its vertical field of view [degrees]
 ``show``            layers that are shown, separated by commas; all others are hidden
 ``color`` …         every choice of `Layers`, by its own name
+``range``           values at the ends of the color scale, in SI units
 ``scale``           length of the force arrows
 ``from``            view whose image is the backdrop
 ``theme``           ``light`` or ``dark``
@@ -33,13 +34,14 @@ from physhandi.simulation.model import SimulationParameters
 AUTOMATIC = "auto"
 """Instead of a number of substeps: as few as are stable."""
 _FARTHEST = 1e5
+_LARGEST_VALUE = 1e12
 _LAST_FRAME = 10_000_000
 _LONGEST = 200
 _MOST_SUBSTEPS = 20_000
 _SCALES, _SPEEDS, _FOVS = (0.1, 5.0), (0.1, 2.0), (1.0, 170.0)
 _UP = (0.0, 0.0, 1.0)
 _KEYS = (
-    *("f", "sequence", "cam", "up", "fov", "show", "scale", "from"),
+    *("f", "sequence", "cam", "up", "fov", "show", "range", "scale", "from"),
     *("theme", "fig", "play", "speed", "loop"),
 )
 _LAYER_TYPES: dict[str, Any] = get_type_hints(Layers)
@@ -144,6 +146,8 @@ def _layers_to_query(layers: Mapping[str, Any]) -> dict[str, str]:
             query[name] = str(layers[name])
     if layers.get("force_scale", 1.0) != 1.0:
         query["scale"] = _number(layers["force_scale"])
+    if layers.get("color_range"):
+        query["range"] = _numbers(layers["color_range"])
     if layers.get("looks_from"):
         query["from"] = str(layers["looks_from"])
     return query
@@ -168,6 +172,11 @@ def _layers_from_query(query: Mapping[str, str]) -> dict[str, Any]:
             layers[name] = query[name]
     if "scale" in query:
         layers["force_scale"] = _real(query, "scale", _SCALES, 1.0)
+    ends = _reals(query, "range", 2)
+    if ends is not None:
+        if ends[0] >= ends[1]:
+            raise UsageError("range: the first value is not smaller than the second one.")
+        layers["color_range"] = ends
     if query.get("from"):
         layers["looks_from"] = query["from"]
     return layers
@@ -205,7 +214,8 @@ def _reals(query: Mapping[str, str], name: str, count: int) -> tuple[float, ...]
     parts = query[name].split(",")
     if len(parts) != count:
         raise UsageError(f"{name}: expected {count} numbers separated by commas, got {len(parts)}.")
-    return tuple(_finite(name, part, (-_FARTHEST, _FARTHEST)) for part in parts)
+    most = _LARGEST_VALUE if name == "range" else _FARTHEST
+    return tuple(_finite(name, part, (-most, most)) for part in parts)
 
 
 def _real(query: Mapping[str, str], name: str, bounds: tuple[float, float], usual: float) -> float:

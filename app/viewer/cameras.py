@@ -1,6 +1,7 @@
 """Camera frustums with the frame's image in them."""
 
 import time
+from collections.abc import Callable
 from collections.abc import Sequence as Listing
 
 import cv2
@@ -22,7 +23,14 @@ _COLOR = (90, 100, 118)
 class CameraNodes:
     """The frustums of all views; used by one thread."""
 
-    def __init__(self, server: viser.ViserServer, views: Listing[View], framing: Framing) -> None:
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        views: Listing[View],
+        framing: Framing,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._clock = clock
         self._server = server
         self._views = list(views)
         self._framing = framing
@@ -62,7 +70,7 @@ class CameraNodes:
             node.visible = is_visible and looks_from in {None, view.name}
             node.scale = self._backdrop(view) if view.name == looks_from else self._scale
         width = _WIDTH if is_playing else _PAUSED_WIDTH
-        now = time.monotonic()
+        now = self._clock()
         is_soon = is_playing and now - self._time < _IMAGE_INTERVAL
         if not is_visible or is_soon or self._shown == (frame, width):
             return

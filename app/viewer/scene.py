@@ -1,9 +1,15 @@
 """The nodes of one session's scene and how they follow the frames."""
 
+import time
+from collections.abc import Callable
+
 import numpy as np
 import viser
+from jaxtyping import Int
+from numpy import ndarray
 
 from app.viewer.cameras import CameraNodes
+from app.viewer.coloring import Painted, Painter
 from app.viewer.content import Content
 from app.viewer.framing import Framing
 from app.viewer.layers import SKIN, default_layers
@@ -11,6 +17,7 @@ from app.viewer.nodes import SceneNodes
 from app.viewer.object_drawing import Budget, ObjectDrawing, automatic_force_unit, share_bytes
 from app.viewer.skeleton import BONES
 from app.viewer.take import Take
+from physhandi.simulation.surface import triangulate_nodes
 
 FRAME_BYTES = 92_000
 """What a frame may weigh while the clock is running; springs and arrows give way."""
@@ -22,7 +29,25 @@ _PLAYING_OBSERVED = 2_000
 class Scene:
     """Draws frames into a viser server; used by one thread."""
 
-    def __init__(self, server: viser.ViserServer, content: Content, framing: Framing) -> None:
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        content: Content,
+        framing: Framing,
+        *,
+        frame_bytes: int = FRAME_BYTES,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Prepare to draw.
+
+        Args:
+            server: Where to.
+            content: What can be shown.
+            framing: Sizes.
+            frame_bytes: What a frame may weigh while the clock is running.
+            clock: Tells when the pictures of the cameras are due again [s].
+        """
+        self._frame_bytes = frame_bytes
         self._server = server
         self._content = content
         self._framing = framing
@@ -30,7 +55,9 @@ class Scene:
         self._nodes = SceneNodes(server)
         self._object = ObjectDrawing(self._nodes, framing)
         self._force_unit = automatic_force_unit(content.fitted, framing)
-        self._cameras = CameraNodes(server, content.views, framing)
+        self.painter = Painter(content)
+        self._faces: Int[ndarray, "face 3"] | None = None
+        self._cameras = CameraNodes(server, content.views, framing, clock)
         self._aim()
         add_ground(self._nodes, content, framing)
 
@@ -48,10 +75,12 @@ class Scene:
             take_frame: Frame of the rollout, which may lag behind while it is being computed.
             is_playing: Whether the clock is running, so that less may be sent.
         """
+        has_object = take is not None and take.ready > 0
+        painted = self.painter.paint(take, take_frame, self.layers) if has_object else None
         with self._server.atomic():
             self._draw_hands(frame)
-            self._draw_observed(frame, is_playing)
-            if take is not None and take.ready > 0:
+            self._draw_observed(frame, is_playing, painted, take, take_frame)
+            if take is not None and has_object:
                 self._object.draw(
                     take,
                     take_frame,
@@ -59,6 +88,8 @@ class Scene:
                     self._budget(take) if is_playing else Budget(arrows=_ARROWS),
                     force_unit=self._force_unit,
                     longest=0.22 * self._framing.extent,
+                    painted=painted,
+                    faces=self.faces if self.layers.surface else None,
                 )
             elif self._content.control is not None:
                 control = np.asarray(self._content.control[frame], dtype=np.float32)
@@ -71,6 +102,15 @@ class Scene:
             )
             self._nodes.show("/ground", is_visible=self.layers.ground)
             self._nodes.color_ground("/ground", is_dark=self.layers.dark)
+
+    @property
+    def faces(self) -> Int[ndarray, "face 3"]:
+        """Triangles between the object's nodes; none where they have no surface."""
+        if self._faces is None:
+            fitted = self._content.fitted
+            node = np.zeros((0, 3)) if fitted is None else fitted.model.object_node
+            self._faces = triangulate_nodes(node)
+        return self._faces
 
     def hide(self) -> None:
         """Hide everything until the next frame is drawn."""
@@ -103,7 +143,15 @@ class Scene:
                 f"/hand/skeleton_{index}", bones, SKIN["right"], 4.0, is_visible=is_visible
             )
 
-    def _draw_observed(self, frame: int, is_playing: bool) -> None:
+    def _draw_observed(
+        self,
+        frame: int,
+        is_playing: bool,
+        painted: Painted | None,
+        take: Take | None,
+        take_frame: int,
+    ) -> None:
+        """Draw what was seen; colored by error, its points tell their own."""
         observed = self._content.observed
         if observed is None or not self.layers.observed:
             self._nodes.show("/observed", is_visible=False)
@@ -112,6 +160,9 @@ class Scene:
         color = observed.colors()
         every = max(1, -(-len(point) // _PLAYING_OBSERVED)) if is_playing else 1
         color = color[::every] if color.ndim == 2 else color
+        if painted is not None and take is not None and self.layers.color == "error":
+            distance = self.painter.errors.points(point[::every], take, take_frame)
+            color = painted.points(distance)
         size = 0.4 * self._framing.spacing
         self._nodes.points("/observed", point[::every], color, size, is_visible=True)
 
@@ -124,7 +175,12 @@ class Scene:
         point_count += _PLAYING_OBSERVED if layers.observed else 0
         if layers.hands:
             point_count += sum(hand.vertex.shape[1] for hand in self._content.hands)
-        return share_bytes(FRAME_BYTES - 12 * point_count, take, layers, _PLAYING_ARROWS)
+        if layers.surface:
+            # Where colors divide the surface, triangles are sent as well, and corners twice.
+            node_count = len(np.unique(self.faces))
+            is_plain = layers.color == "plain"
+            point_count += node_count if is_plain else 2 * node_count + len(self.faces)
+        return share_bytes(self._frame_bytes - 12 * point_count, take, layers, _PLAYING_ARROWS)
 
 
 def add_ground(nodes: SceneNodes, content: Content, framing: Framing) -> None:

@@ -10,7 +10,7 @@ from numpy import ndarray
 from physhandi.data.atomic import temporary_name
 from physhandi.data.exporters.gltf import write_gltf
 from physhandi.data.exporters.mesh import write_frame, write_frames
-from physhandi.data.exporters.scene_data import read_scene
+from physhandi.data.exporters.scene_data import SceneData, read_scene
 from physhandi.data.exporters.table import (
     write_npz,
     write_summary,
@@ -21,6 +21,7 @@ from physhandi.data.run import Run
 from physhandi.errors import UsageError
 
 FORMATS = ("ply", "npz", "csv", "yaml", "gltf")
+SCENE_FORMATS = ("ply", "npz", "csv", "gltf")
 
 
 def export_run(
@@ -64,15 +65,56 @@ def export_run(
     if format == "yaml":
         return _publish(out, lambda path: write_summary(path, run), is_folder=False)
     scene = read_scene(run, sequence, faces)
+    if format == "csv" and is_folder:
+        return _publish(out, lambda path: write_tables(path, run, scene), is_folder=True)
+    return _write_scene(scene, format, out, frame, is_folder=is_folder)
+
+
+def export_scene(
+    scene: SceneData,
+    format: str,  # noqa: A002
+    out_path: Path | str,
+    *,
+    frame: int | None = None,
+) -> Path:
+    """Write motion that need not be in any run, such as one that was simulated just now.
+
+    Args:
+        scene: The motion.
+        format: ``ply``, ``npz``, ``csv`` (trajectories) or ``gltf``; see `export_run`.
+        out_path: File to write, or a folder for all frames as PLY.
+        frame: Only this frame (PLY).
+
+    Returns:
+        What was written.
+
+    Raises:
+        UsageError: If format or frame do not exist, or the path is in use.
+    """
+    out = Path(out_path)
+    if format not in SCENE_FORMATS:
+        known = ", ".join(SCENE_FORMATS)
+        raise UsageError(f"'{format}' is not a format of motion; choose one of {known}.")
+    is_folder = format == "ply" and out.suffix != ".ply"
+    _check_target(out, format, is_folder=is_folder, overwrite=False)
+    return _write_scene(scene, format, out, frame, is_folder=is_folder)
+
+
+def _write_scene(
+    scene: SceneData,
+    format: str,  # noqa: A002
+    out: Path,
+    frame: int | None,
+    *,
+    is_folder: bool,
+) -> Path:
     whole: dict[str, Callable[[Path], None]] = {
-        "npz": lambda path: write_npz(path, run, scene),
-        "gltf": lambda path: write_gltf(path, run, scene),
-        "csv": lambda path: (
-            write_tables(path, run, scene) if is_folder else write_trajectories(path, scene)
-        ),
+        "npz": lambda path: write_npz(path, scene),
+        "gltf": lambda path: write_gltf(path, scene),
+        "csv": lambda path: write_trajectories(path, scene),
     }
     if format in whole:
-        return _publish(out, whole[format], is_folder=is_folder)
+        return _publish(out, whole[format], is_folder=False)
     if frame is not None and not 0 <= frame < scene.frame_count:
         raise UsageError(
             f"Sequence '{scene.sequence}' has frames 0 to {scene.frame_count - 1}, not {frame}."

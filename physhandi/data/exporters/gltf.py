@@ -6,6 +6,7 @@ animation that Blender and three.js both read. Between frames both interpolate l
 do. three.js holds every weight in a shader constant, of which WebGL 2 promises 256.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,27 +16,24 @@ from numpy import ndarray
 from physhandi.data.atomic import write_bytes
 from physhandi.data.exporters.gltf_document import LINES, POINTS, TRIANGLES, GltfDocument
 from physhandi.data.exporters.scene_data import HandSurface, SceneData
-from physhandi.data.run import Run
 
 _OBJECT, _SPRING, _HAND = (0.045, 0.156, 0.716), (0.35, 0.45, 0.75), (0.753, 0.457, 0.328)
 
 
-def write_gltf(path: Path, run: Run, scene: SceneData) -> None:
+def write_gltf(path: Path, scene: SceneData) -> None:
     """Write hands, object nodes and object springs of all frames to a ``.glb`` file.
 
     A hand without a skin (in runs of version 0.1) becomes a mesh with a morph target a frame.
 
     Args:
         path: File to write.
-        run: The run, which holds the hands' skins.
         scene: The motion.
     """
-    extras = {"sequence": scene.sequence, "run": run.id, "length_unit": scene.length_unit}
+    extras = {"sequence": scene.sequence, "run": scene.run, "length_unit": scene.length_unit}
     document = GltfDocument(scene.frame_rate, scene.frame_count, extras)
     for side, hand in scene.hands.items():
-        stored = f"sequences/{scene.sequence}/hand_{side}_skin.safetensors"
-        if run.has(stored):
-            _add_skinned_hand(document, side, run.tensors(stored), scene.frame_count)
+        if side in scene.skins:
+            _add_skinned_hand(document, side, scene.skins[side], scene.frame_count)
         else:
             _add_moving_surface(document, side, hand, scene.frame_count)
     if scene.rollout.shape[1]:
@@ -44,7 +42,7 @@ def write_gltf(path: Path, run: Run, scene: SceneData) -> None:
 
 
 def _add_skinned_hand(
-    document: GltfDocument, side: str, skin: dict[str, ndarray], frame_count: int
+    document: GltfDocument, side: str, skin: Mapping[str, ndarray], frame_count: int
 ) -> None:
     name = f"{side}_hand"
     bones: list[int] = []

@@ -1,7 +1,7 @@
 """What exporters take from a run: the motion of one sequence."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -9,6 +9,9 @@ from numpy import ndarray
 
 from physhandi.data.run import Run
 from physhandi.errors import RunError, UsageError
+
+SIDES = ("right", "left")
+"""Names of the hands."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -41,6 +44,14 @@ class SceneData:
     """Number of leading springs that join two object nodes; the others are virtual springs."""
     hands: dict[str, HandSurface]
     """Surface of each hand by its side."""
+    run: str = ""
+    """Id of the run."""
+    model: Mapping[str, ndarray] = field(default_factory=dict[str, ndarray])
+    """The springs' tensors, as a run stores them; none without an object."""
+    skins: Mapping[str, Mapping[str, ndarray]] = field(
+        default_factory=dict[str, Mapping[str, ndarray]]
+    )
+    """Bones and weights of the hands that have them, by side; see `read_skins`."""
 
     @property
     def frame_count(self) -> int:
@@ -77,7 +88,7 @@ def read_scene(
         raise RunError(f"Run '{run.id}' has nothing of sequence '{name}'; it is {run.state}.")
     meta = run.yaml(f"{folder}/meta.yaml")
     hands: dict[str, HandSurface] = {}
-    for side in ("right", "left"):
+    for side in SIDES:
         if run.has(f"{folder}/hand_{side}_vertex.npy"):
             face = None if faces is None else faces.get(side)
             if run.has(f"{folder}/hand_{side}_face.npy"):
@@ -104,4 +115,22 @@ def read_scene(
         spring_nodes=model.get("spring_nodes", np.zeros((0, 2), np.int32)),
         object_spring_count=int(model["object_spring_count"][0]) if model else 0,
         hands=hands,
+        run=run.id,
+        model=model,
+        skins=read_skins(run, name),
     )
+
+
+def read_skins(run: Run, sequence: str) -> dict[str, Mapping[str, ndarray]]:
+    """Read what moves the hands' surfaces; runs of version 0.1 do not hold it.
+
+    Args:
+        run: The run.
+        sequence: Name of one of its sequences.
+
+    Returns:
+        By side: ``name``, ``parent``, ``T_bone_hand``, ``vertex``, ``faces``, ``vertex_bone``,
+        ``vertex_weight``, ``translation`` and ``rotation``, as docs/formats.md describes them.
+    """
+    stored = {side: f"sequences/{sequence}/hand_{side}_skin.safetensors" for side in SIDES}
+    return {side: run.tensors(rel) for side, rel in stored.items() if run.has(rel)}

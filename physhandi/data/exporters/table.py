@@ -29,7 +29,7 @@ _SHARED_FILES = (
 TRAJECTORY_COLUMNS = ("sequence", "frame", "time_s", "kind", "index", "x", "y", "z")
 
 
-def write_npz(path: Path, run: Run, scene: SceneData) -> None:
+def write_npz(path: Path, scene: SceneData) -> None:
     """Write the motion and the springs as one NPZ archive without pickles."""
     arrays: dict[str, Any] = {
         "sequence": np.array(scene.sequence),
@@ -42,9 +42,7 @@ def write_npz(path: Path, run: Run, scene: SceneData) -> None:
         arrays[f"hand_{side}_vertex"] = hand.vertex
         if hand.face is not None:
             arrays[f"hand_{side}_face"] = hand.face
-    rel = f"sequences/{scene.sequence}/model.safetensors"
-    if run.has(rel):
-        arrays |= run.tensors(rel)
+    arrays |= scene.model
     write_atomically(path, lambda stream: np.savez(stream, allow_pickle=False, **arrays))
 
 
