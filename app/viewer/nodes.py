@@ -48,16 +48,24 @@ class SceneNodes:
         color: tuple[int, int, int],
         *,
         is_visible: bool,
-        opacity: float = 0.62,
+        opacity: float | None = 0.62,
+        is_flat: bool = False,
     ) -> None:
-        """Draw a semi-transparent surface."""
+        """Draw a surface: semi-transparent or, without `opacity`, solid; smooth or in facets."""
         node = self._nodes.get(name)
         if node is None and is_visible:
             self._nodes[name] = self._scene.add_mesh_simple(
-                name, vertex, face, color=color, opacity=opacity, side="double"
+                name,
+                vertex,
+                face,
+                color=color,
+                opacity=opacity,
+                side="double",
+                flat_shading=is_flat,
             )
         elif node is not None and is_visible:
-            node.vertices = vertex
+            node.vertices, node.color = vertex, color
+            node.faces = np.asarray(face, dtype=np.uint32)
         self.show(name, is_visible=is_visible)
 
     def points(
@@ -83,15 +91,14 @@ class SceneNodes:
             )
         elif node is not None and is_visible:
             node.points = np.asarray(point, dtype=np.float32)
-            if np.ndim(color) == 2:
-                node.colors = color
+            node.colors = np.asarray(color, dtype=np.uint8)
         self.show(name, is_visible=is_visible)
 
     def spheres(
         self,
         name: str,
         point: Float[ndarray, "point 3"],
-        color: tuple[int, int, int],
+        color: Any,
         size: float,
         *,
         is_visible: bool,
@@ -115,6 +122,7 @@ class SceneNodes:
             )
         elif node is not None and is_visible:
             node.batched_positions = np.asarray(point, dtype=np.float32)
+            node.batched_colors = np.asarray(color, dtype=np.uint8)
         self.show(name, is_visible=is_visible)
 
     def frame(self, name: str, position: Float[ndarray, " 3"]) -> None:
@@ -147,12 +155,12 @@ class SceneNodes:
         self,
         name: str,
         segment: Float[ndarray, "segment 2 3"],
-        color: tuple[int, int, int],
+        color: Any,
         width: float,
         *,
         is_visible: bool,
     ) -> None:
-        """Draw lines of a width in pixels."""
+        """Draw lines of a width in pixels, of one color or of a color for each end."""
         node = self._nodes.get(name)
         is_visible = is_visible and len(segment) > 0
         if node is None and is_visible:
@@ -165,6 +173,7 @@ class SceneNodes:
             )
         elif node is not None and is_visible:
             node.points = np.asarray(segment, dtype=np.float32)
+            node.colors = np.asarray(color, dtype=np.uint8)
         self.show(name, is_visible=is_visible)
 
     def arrows(

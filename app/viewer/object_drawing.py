@@ -6,9 +6,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from app.viewer.coloring import Painted
 from app.viewer.framing import Framing
 from app.viewer.layers import BLUE, GREY, PLAYING_SPRINGS, RED, YELLOW, Layers
 from app.viewer.nodes import SceneNodes
+from app.viewer.surface_drawing import SurfaceDrawing
 from app.viewer.take import Take
 
 Color = tuple[int, int, int]
@@ -39,7 +41,8 @@ def share_bytes(left: int, take: Take, layers: Layers, arrows: int) -> Budget:
         layers: Tells whether there are object springs and arrows at all.
         arrows: Most force arrows.
     """
-    count = left // 24 - (arrows if layers.forces else 0)
+    each = 24 if layers.color == "plain" else 30
+    count = left // each - (arrows if layers.forces else 0)
     count = min(max(count, PLAYING_SPRINGS // 10), PLAYING_SPRINGS)
     virtual = min(take.model.virtual_spring_count, count)
     if layers.object_springs:
@@ -110,6 +113,7 @@ class ObjectDrawing:
         self._root = root
         self._style = style or Style()
         self._balls = nodes.spheres if self._style.is_solid else nodes.points
+        self._surface = SurfaceDrawing(nodes, root)
         self._model_shown: Take | None = None
         self._attached: Int[ndarray, " control"] = np.zeros(0, np.int64)
 
@@ -130,6 +134,8 @@ class ObjectDrawing:
         *,
         force_unit: float,
         longest: float,
+        painted: Painted | None = None,
+        faces: Int[ndarray, "face 3"] | None = None,
     ) -> None:
         """Bring the object to a frame.
 
@@ -140,30 +146,37 @@ class ObjectDrawing:
             budget: How much may be sent.
             force_unit: Length of an arrow of 1 N.
             longest: No arrow is longer than this.
+            painted: Colors of nodes and springs; None for those of the style.
+            faces: Triangles between the nodes; None without a surface.
         """
         root, count = self._root, take.model.object_spring_count
         position = np.asarray(take.position[frame], dtype=np.float32)
         control = np.asarray(take.control[frame], dtype=np.float32)
         style = self._style
         size = style.node_size * self._framing.spacing
-        self._balls(f"{root}/object/nodes", position, style.node, size, is_visible=layers.nodes)
+        color = style.node if painted is None else painted.node
+        self._balls(f"{root}/object/nodes", position, color, size, is_visible=layers.nodes)
+        self._surface.draw(
+            position,
+            np.zeros((0, 3), np.int32) if faces is None else faces,
+            painted,
+            is_visible=layers.surface,
+        )
         self.draw_controls(control, self.attached(take), layers)
         point = np.concatenate([position, control])
-        springs = take.model.spring_nodes
-        self._nodes.segments(
-            f"{root}/springs/virtual",
-            _ends(point, springs[count:], budget.virtual),
-            style.virtual,
-            style.virtual_width,
-            is_visible=layers.virtual_springs,
-        )
-        self._nodes.segments(
-            f"{root}/springs/object",
-            _ends(point, springs[: count if layers.object_springs else 0], budget.springs),
-            style.spring,
-            style.spring_width,
-            is_visible=layers.object_springs,
-        )
+        own = _thinned(0, count, budget.springs)
+        held = _thinned(count, len(take.model.spring_nodes), budget.virtual)
+        for name, chosen, color, width, is_visible in (
+            ("virtual", held, style.virtual, style.virtual_width, layers.virtual_springs),
+            ("object", own, style.spring, style.spring_width, layers.object_springs),
+        ):
+            self._nodes.segments(
+                f"{root}/springs/{name}",
+                point[take.model.spring_nodes[chosen if is_visible else slice(0)]],
+                painted.springs(chosen) if painted is not None and is_visible else color,
+                width,
+                is_visible=is_visible,
+            )
         arrows = np.zeros((0, 2, 3), np.float32)
         if layers.forces:
             unit = force_unit * layers.force_scale
@@ -219,9 +232,6 @@ def force_arrows(
     return np.stack([start, start + offset], axis=1).astype(np.float32)
 
 
-def _ends(
-    point: Float[ndarray, "point 3"], spring_nodes: Int[ndarray, "spring 2"], most: int | None
-) -> Float[ndarray, "segment 2 3"]:
-    """Look up the end points of springs, thinned out evenly to at most `most`."""
-    every = 1 if most is None else max(1, -(-len(spring_nodes) // most))
-    return point[spring_nodes[::every]]
+def _thinned(start: int, stop: int, most: int | None) -> slice:
+    """Choose springs, thinned out evenly to at most `most`."""
+    return slice(start, stop, 1 if most is None else max(1, -(-(stop - start) // most)))

@@ -75,12 +75,12 @@ class Scene:
             take_frame: Frame of the rollout, which may lag behind while it is being computed.
             is_playing: Whether the clock is running, so that less may be sent.
         """
-        has_object = take is not None and take.ready > 0
-        painted = self.painter.paint(take, take_frame, self.layers) if has_object else None
+        take = take if take is not None and take.ready > 0 else None
+        painted = None if take is None else self.painter.paint(take, take_frame, self.layers)
         with self._server.atomic():
             self._draw_hands(frame)
             self._draw_observed(frame, is_playing, painted, take, take_frame)
-            if take is not None and has_object:
+            if take is not None:
                 self._object.draw(
                     take,
                     take_frame,
