@@ -13,6 +13,7 @@ from app.viewer.figure import Figure, Side
 from app.viewer.figure_camera import Eye, FigureCameras, picture_of_figure
 from app.viewer.framing import Framing
 from app.viewer.guard import Guard, notify
+from app.viewer.keyboard import bind
 from app.viewer.layers import Layers
 from app.viewer.live import LiveSimulation
 from app.viewer.resimulation import Resimulation
@@ -63,8 +64,7 @@ class FigureMode:
         self._text = server.gui.add_markdown("")
         self._text.visible = False
         self._button.on_click(guard(lambda _: self.toggle()))
-        command = server.gui.add_command("Figure: ours and PhysTwin", hotkey="F")
-        command.on_trigger(guard(lambda _: self.toggle()))
+        bind(server, guard, "figure", lambda _, __: self.toggle())
 
     @property
     def is_on(self) -> bool:
@@ -158,6 +158,11 @@ class FigureMode:
         with self._lock:
             if self._is_on:
                 self._aim(client, Pose.first(self._server.initial_camera))
+
+    def reset_view(self, client: viser.ClientHandle) -> None:
+        """Show the whole figure to a client that looked elsewhere."""
+        with self._lock:
+            self._aim(client, Pose.of(client.camera))
 
     def picture(self, client: viser.ClientHandle) -> dict[str, Any]:
         """Find camera and size of a picture of the figure, as arguments of ``get_render``."""

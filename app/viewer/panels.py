@@ -1,4 +1,4 @@
-"""The panel of one session: timeline, layers and view."""
+"""The panel of one session: layers and view."""
 
 from collections.abc import Callable
 from dataclasses import fields
@@ -7,81 +7,17 @@ from typing import Any
 import numpy as np
 import viser
 
+from app.keys import LAYER_KEYS
 from app.viewer.content import Content
 from app.viewer.dress import set_theme
 from app.viewer.framing import Framing
 from app.viewer.guard import Guard
+from app.viewer.keyboard import bind
 from app.viewer.layers import THEMES, Layers, Theme
-from app.viewer.playback import Playback
+from app.viewer.timeline_panel import TimelinePanel as TimelinePanel
 from physhandi.data.view import View
 
 _OVERVIEW = "Overview"
-_SPEEDS = (0.1, 2.0)
-
-
-class TimelinePanel:
-    """Play, scrub, step, speed and loop, with hot keys."""
-
-    def __init__(self, server: viser.ViserServer, playback: Playback, guard: Guard) -> None:
-        self._playback = playback
-        gui = server.gui
-        self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY, hint="Space")
-        self._frame = gui.add_slider(
-            "Frame", 0, max(playback.frame_count - 1, 1), 1, 0, hint="Arrow keys step by one frame"
-        )
-        self._written = 0
-        step = gui.add_button_group("Step", ("◀ 1", "1 ▶"), hint="Left and right arrow keys")
-        speed = gui.add_slider("Speed", *_SPEEDS, 0.1, 1.0, hint="Sequence seconds per second")
-        loop = gui.add_checkbox("Loop", initial_value=True)
-        self._speed, self._loop = speed, loop
-
-        self._play.on_click(guard(lambda _: self._toggle()))
-        self._frame.on_update(self._scrub)
-        step.on_click(guard(lambda event: playback.step(1 if event.target.value == "1 ▶" else -1)))
-        speed.on_update(guard.by_user(lambda _: playback.set_speed(speed.value)))
-        loop.on_update(guard.by_user(lambda _: playback.set_loop(on=loop.value)))
-        commands: tuple[tuple[str, Any, Any, Callable[[], None]], ...] = (
-            ("Play or pause", "space", None, self._toggle),
-            ("Next frame", "arrowright", None, lambda: playback.step(1)),
-            ("Previous frame", "arrowleft", None, lambda: playback.step(-1)),
-            ("Ten frames on", "arrowright", "shift", lambda: playback.step(10)),
-            ("Ten frames back", "arrowleft", "shift", lambda: playback.step(-10)),
-        )
-        for label, key, modifier, act in commands:
-            command = gui.add_command(label, hotkey=key, modifier=modifier)
-            command.on_trigger(guard(lambda _, act=act: act()))
-
-    def show(self, frame: int, *, is_playing: bool) -> None:
-        """Follow the clock."""
-        # Another value than the last one that was written here is a user's, about to be heard.
-        if self._frame.value == self._written:
-            self._frame.value = self._written = frame
-        label = "Pause" if is_playing else "Play"
-        if self._play.label != label:
-            self._play.label = label
-            self._play.icon = viser.Icon.PLAYER_PAUSE if is_playing else viser.Icon.PLAYER_PLAY
-
-    def replace(self, frame_count: int) -> None:
-        """Fit the slider to another sequence."""
-        self._frame.value = self._written = 0
-        self._frame.max = max(frame_count - 1, 1)
-
-    def restore(self, speed: float, *, does_loop: bool) -> None:
-        """Run the clock as it ran in another session."""
-        self._speed.value, self._loop.value = speed, does_loop
-        self._playback.set_speed(speed)
-        self._playback.set_loop(on=does_loop)
-
-    def _toggle(self) -> None:
-        self._playback.play(on=not self._playback.is_playing)
-
-    async def _scrub(self, event: Any) -> None:
-        # At once, in viser's own thread, so that the running clock has no time to interfere.
-        frame = event.target.value
-        if event.client is not None:
-            self._written = frame
-            self._playback.play(on=False)
-            self._playback.seek(frame)
 
 
 class LayersPanel:
@@ -102,6 +38,7 @@ class LayersPanel:
             for field, label in (
                 ("hands", "Hands"),
                 ("nodes", "Object nodes"),
+                ("surface", "Surface"),
                 ("controls", "Control nodes"),
                 ("all_controls", "All control nodes"),
                 ("virtual_springs", "Virtual springs"),
@@ -122,9 +59,13 @@ class LayersPanel:
             self._place.on_update(guard.by_user(self._look))
             self._theme = gui.add_dropdown("Background", THEMES)
             self._theme.on_update(guard.by_user(lambda _: self._dress()))
+        bind(server, guard, "layer", lambda _, number: self._press(LAYER_KEYS[number][0]))
+        bind(server, guard, "theme", lambda _, __: self._turn_theme())
         self._prefers_dark = False
 
-    def replace(self, content: Content, layers: Layers, framing: Framing) -> None:
+    def replace(
+        self, content: Content, layers: Layers, framing: Framing, *, has_surface: bool = False
+    ) -> None:
         """Show the switches that a content needs, as its layers stand."""
         self._layers, self._framing = layers, framing
         layers.dark, layers.force_scale = self._is_dark, self._scale.value
@@ -133,6 +74,7 @@ class LayersPanel:
         is_there = {
             "hands": bool(content.hands or content.skeletons),
             "nodes": has_object,
+            "surface": has_surface,
             "controls": has_control,
             "all_controls": has_object,
             "virtual_springs": has_object,
@@ -174,6 +116,23 @@ class LayersPanel:
         for field, switch in self._switches.items():
             switch.value = getattr(layers, field)
         self._place.value = layers.looks_from or _OVERVIEW
+        self._dress()
+
+    def reset_view(self, event: Any) -> None:
+        """Put the camera of the client that asks for it back to the overview."""
+        self._place.value = _OVERVIEW
+        self._look(event)
+
+    def _press(self, field: str) -> None:
+        """Switch a layer by its key, if there is anything in it."""
+        switch = self._switches[field]
+        if switch.visible:
+            switch.value = not switch.value
+            setattr(self._layers, field, switch.value)
+            self._redraw()
+
+    def _turn_theme(self) -> None:
+        self._theme.value = "light" if self._is_dark else "dark"
         self._dress()
 
     def _switch(self, field: str) -> Callable[[Any], None]:

@@ -1,0 +1,152 @@
+"""Every key and mouse action of the viewer: what is bound, shown in the help and documented."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+Action = Literal[
+    "play",
+    "next",
+    "previous",
+    "ten_on",
+    "ten_back",
+    "first",
+    "last",
+    "slower",
+    "pause",
+    "faster",
+    "layer",
+    "color",
+    "color_back",
+    "clear",
+    "reset",
+    "snapshot",
+    "figure",
+    "theme",
+]
+"""What a key does in the live scene."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Key:
+    """One key, or a row of keys that do the same to different things."""
+
+    shown: tuple[str, ...]
+    """How it is written, key by key."""
+    about: str
+    """What it does."""
+    action: Action | None = None
+    """What it triggers in the live scene; None for what the browser or the page does."""
+    hotkeys: tuple[str, ...] = ()
+    """Names by which the scene knows the keys."""
+    modifier: Literal["shift"] | None = None
+    """Key that is held with it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeyGroup:
+    """Keys that belong together."""
+
+    title: str
+    """Heading."""
+    keys: tuple[Key, ...]
+    """The keys."""
+
+
+LAYER_KEYS = (
+    ("hands", "hands"),
+    ("nodes", "object nodes"),
+    ("surface", "surface"),
+    ("object_springs", "object springs"),
+    ("virtual_springs", "virtual springs"),
+    ("controls", "control nodes"),
+    ("forces", "force arrows"),
+    ("observed", "observed points"),
+    ("cameras", "cameras"),
+)
+"""Layers that the keys 1 to 9 switch, by the names of their fields, and what they are called."""
+
+_ROW = tuple(str(number) for number in range(1, len(LAYER_KEYS) + 1))
+_LAYERS = ", ".join(f"{key} {name}" for key, (_, name) in zip(_ROW, LAYER_KEYS, strict=True))
+
+KEYS: tuple[KeyGroup, ...] = (
+    KeyGroup(
+        title="Time",
+        keys=(
+            Key(shown=("space",), about="play or pause", action="play", hotkeys=("space",)),
+            Key(shown=("→",), about="one frame on", action="next", hotkeys=("arrowright",)),
+            Key(shown=("←",), about="one frame back", action="previous", hotkeys=("arrowleft",)),
+            Key(
+                shown=("shift", "→"),
+                about="ten frames on",
+                action="ten_on",
+                hotkeys=("arrowright",),
+                modifier="shift",
+            ),
+            Key(
+                shown=("shift", "←"),
+                about="ten frames back",
+                action="ten_back",
+                hotkeys=("arrowleft",),
+                modifier="shift",
+            ),
+            Key(shown=("home",), about="first frame", action="first", hotkeys=("home",)),
+            Key(shown=("end",), about="last frame", action="last", hotkeys=("end",)),
+            Key(shown=("J",), about="play slower", action="slower", hotkeys=("J",)),
+            Key(shown=("K",), about="pause", action="pause", hotkeys=("K",)),
+            Key(shown=("L",), about="play faster", action="faster", hotkeys=("L",)),
+        ),
+    ),
+    KeyGroup(
+        title="Look",
+        keys=(
+            Key(
+                shown=("1", "…", "9"),
+                about=f"show or hide a layer: {_LAYERS}",
+                action="layer",
+                hotkeys=_ROW,
+            ),
+            Key(shown=("C",), about="color by the next quantity", action="color", hotkeys=("C",)),
+            Key(
+                shown=("shift", "C"),
+                about="color by the quantity before",
+                action="color_back",
+                hotkeys=("C",),
+                modifier="shift",
+            ),
+            Key(shown=("R",), about="camera back to the overview", action="reset", hotkeys=("R",)),
+            Key(shown=("T",), about="light or dark", action="theme", hotkeys=("T",)),
+            Key(shown=("F",), about="figure: ours and PhysTwin's", action="figure", hotkeys=("F",)),
+            Key(shown=("S",), about="save a picture", action="snapshot", hotkeys=("S",)),
+            Key(shown=("P",), about="copy a link to this view"),
+        ),
+    ),
+    KeyGroup(
+        title="Inspect",
+        keys=(
+            Key(
+                shown=("click",),
+                about="read a node, spring, control node or hand vertex, and its history",
+            ),
+            Key(shown=("shift", "click"), about="read the hand, also in front of the object"),
+            Key(
+                shown=("esc",), about="forget what was clicked", action="clear", hotkeys=("escape",)
+            ),
+            Key(shown=("click in a chart",), about="go to that frame"),
+        ),
+    ),
+    KeyGroup(
+        title="Camera",
+        keys=(
+            Key(shown=("drag",), about="turn; with the right button move"),
+            Key(shown=("wheel",), about="zoom"),
+            Key(shown=("W", "A", "D", "Q", "E"), about="move ahead and aside, down and up"),
+            Key(shown=("?",), about="this help"),
+        ),
+    ),
+)
+"""All keys of the live scene."""
+
+
+def key_of(action: Action) -> Key:
+    """Find the key that triggers an action."""
+    return next(key for group in KEYS for key in group.keys if key.action == action)
