@@ -2,13 +2,15 @@
 
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from physhandi.data.atomic import json_line, write_json
 from physhandi.data.lease import Lease
+from physhandi.data.preview import PreviewFile
 from physhandi.data.run_files import CANCEL, EVENTS, PROGRESS, read_events
 from physhandi.errors import CancelledError
-from physhandi.progress import Progress
+from physhandi.progress import Preview, Progress
 
 _SNAPSHOT_INTERVAL_S = 0.2
 _HEARTBEAT_INTERVAL_S = 5.0
@@ -32,6 +34,7 @@ class RunProgress(Progress):
         self._stage_start = (0.0, 0)
         self._snapshot_time = -_SNAPSHOT_INTERVAL_S
         self._heartbeat_time = time.monotonic()
+        self._preview = PreviewFile(folder)
         self._end_torn_line()
 
     def report(
@@ -72,6 +75,14 @@ class RunProgress(Progress):
             self._lease.heartbeat()
         if self._also is not None:
             self._also.report(stage, iteration, total, loss, message)
+
+    def wants_preview(self) -> bool:
+        """Tell whether it is time for a preview; see `PreviewFile`."""
+        return self._preview.is_due()
+
+    def preview(self, make: Callable[[], Preview]) -> None:
+        """Replace the run's preview file."""
+        self._preview.write(make)
 
     def check_cancelled(self) -> None:
         """Raise `CancelledError` if the run's ``CANCEL`` file is there."""

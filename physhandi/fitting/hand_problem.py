@@ -29,7 +29,7 @@ from physhandi.fitting.hand_losses import (
 from physhandi.hand.model import HandModel
 from physhandi.hand.motion import HandMotion
 from physhandi.hand.rotation import quaternion_matrix
-from physhandi.progress import Progress
+from physhandi.progress import Preview, Progress
 
 STAGE = "hand_reconstruction"
 
@@ -65,6 +65,9 @@ class HandProblem:
         guess = guess_wrist(cameras, keypoint, model, metric=sequence.metric, tolerance=tolerance)
         self.frame_rate = sequence.frame_rate
         self.parameters = _parameters(guess, len(keypoint[0]))
+        self.name = sequence.name
+        self.joints: Tensor | None = None
+        """The 21 keypoints of every frame, as the latest loss saw them."""
         self.depth: DepthTarget | None = None
         if sequence.metric and config.depth_iterations:
             self.depth = depth_target(sequence, model.side, config.depth_points)
@@ -82,6 +85,7 @@ class HandProblem:
         still = torch.zeros_like(translation)
         local = self.model.keypoints(shape, articulation, still, still)
         metres = local @ rotation.transpose(-1, -2) + translation[:, None]
+        self.joints = (metres * scale).detach()
         reach = config.acceleration_noise / self.frame_rate**2
         turn = config.turn_noise * 30 / self.frame_rate
         return (
@@ -121,6 +125,7 @@ class HandProblem:
                 curve.append((iteration, value))
                 message = f"{self.model.side.capitalize()} hand"
                 progress.report(STAGE, iteration, total, value, message)
+                self._show(value, progress)
 
         with _one_thread():
             self._descend(
@@ -142,6 +147,20 @@ class HandProblem:
                 f"The fit of the {self.model.side} hand did not stay finite (loss {after})."
             )
         return SolvedHand(self._motion(), before, after, curve)
+
+    def _show(self, loss: float, progress: Progress) -> None:
+        """Let people see the hand as it is."""
+        joints = self.joints
+        if joints is not None and progress.wants_preview():
+            progress.preview(
+                lambda: Preview(
+                    stage=STAGE,
+                    sequence=self.name,
+                    loss=loss,
+                    frame_rate=self.frame_rate,
+                    points={"joints": joints.numpy()},
+                )
+            )
 
     def _descend(
         self,
