@@ -23,6 +23,7 @@ from app.jobs.describe import (
     loss_curves,
 )
 from app.jobs.feed import Feed
+from app.jobs.listing import RunQuery, page_of, select_runs
 from app.jobs.log import open_log
 from app.jobs.scheduler import Scheduler
 from app.jobs.streams import News, Streams
@@ -115,8 +116,9 @@ def _add_listings(router: APIRouter, catalog: Catalog, scheduler: Scheduler) -> 
         return describe_sequence(catalog.sequence_item(sequence_id))
 
     @router.get("/runs")
-    def list_runs() -> dict[str, Any]:
-        return {"runs": [describe_run(item, scheduler) for item in catalog.runs()]}
+    def list_runs(query: Annotated[RunQuery, Query()]) -> dict[str, Any]:
+        runs = select_runs([describe_run(item, scheduler) for item in catalog.runs()], query)
+        return {"runs": page_of(runs, query), "total": len(runs)}
 
     @router.get("/runs/{run_id}")
     def show_run(run_id: Id) -> dict[str, Any]:

@@ -1,7 +1,8 @@
 """Which sequences and runs there are: the bundled ones and those of the data folder."""
 
+import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, TypeVar
@@ -107,9 +108,10 @@ class Catalog:
         Raises:
             UnknownSequenceError: If there is no such sequence.
         """
-        for item in self.sequences():
-            if item.id == sequence_id:
-                return item
+        for root, is_bundled in self._sequence_dirs:
+            found = self._sequences.find(root, sequence_id)
+            if found is not None:
+                return SequenceItem(sequence_id, root / sequence_id, is_bundled, *found)
         raise UnknownSequenceError(f"There is no sequence '{sequence_id}'.")
 
     def sequence(self, sequence_id: str, /) -> Sequence:
@@ -130,9 +132,10 @@ class Catalog:
         Raises:
             UnknownRunError: If there is no such run.
         """
-        for item in self.runs():
-            if item.id == run_id:
-                return item
+        for root, is_bundled in self._run_dirs:
+            found = self._runs.find(root, run_id)
+            if found is not None:
+                return RunItem(run_id, root / run_id, is_bundled, *found)
         raise UnknownRunError(f"There is no run '{run_id}'.")
 
     def run(self, run_id: str, /) -> Run:
@@ -172,46 +175,64 @@ class _Folders(Generic[T]):
         self._load = load
         self._watched = watched
         self._lock = threading.Lock()
-        self._known: dict[Path, tuple[object, tuple[T | None, str | None]]] = {}
+        self._known: dict[str, tuple[object, Path, tuple[T | None, str | None]]] = {}
 
     def list(self, root: Path) -> list[tuple[Path, tuple[T | None, str | None]]]:
         """Open all folders directly below a root; what cannot be opened says why."""
-        if not root.is_dir():
-            return []
-        found: list[tuple[Path, tuple[T | None, str | None]]] = []
-        for folder in sorted(root.iterdir()):
-            stamp = self._stamp(folder)
-            if folder.name.startswith(".") or stamp is None:
-                continue
-            with self._lock:
-                known = self._known.get(folder)
-            if known is None or known[0] != stamp:
-                known = (stamp, self._open(folder))
-                with self._lock:
-                    self._known[folder] = known
-            found.append((folder, known[1]))
+        # Plain texts, since a list of thousands is asked for several times a second.
+        listed = [entry for name in _names_in(root) if (entry := self._look(f"{root}/{name}"))]
         with self._lock:
-            listed = {folder for folder, _ in found}
-            for folder in [f for f in self._known if f.parent == root and f not in listed]:
-                del self._known[folder]
-        return found
+            prefix = f"{root}/"
+            if sum(path.startswith(prefix) for path in self._known) > len(listed):
+                present = {str(folder) for folder, _ in listed}
+                for path in [p for p in self._known if p.startswith(prefix) and p not in present]:
+                    del self._known[path]
+        return listed
 
-    def _stamp(self, folder: Path) -> tuple[tuple[int, int], ...] | None:
+    def find(self, root: Path, name: str) -> tuple[T | None, str | None] | None:
+        """Open the folder of that name directly below a root; None if there is none."""
+        if not name or name.startswith(".") or {"/", "\\", "\0"} & set(name):
+            return None
+        found = self._look(f"{root}/{name}")
+        return None if found is None else found[1]
+
+    def _look(self, path: str) -> tuple[Path, tuple[T | None, str | None]] | None:
+        stamp = self._stamp(path)
+        if stamp is None:
+            return None
+        known = self._known.get(path)
+        if known is None or known[0] != stamp:
+            folder = Path(path)
+            known = (stamp, folder, self._open(folder))
+            with self._lock:
+                self._known[path] = known
+        return known[1], known[2]
+
+    def _stamp(self, path: str) -> tuple[int, ...] | None:
         """Summarise what would change with the folder; None if it is not one of the kind."""
-        stamps: list[tuple[int, int]] = []
+        stamps: list[int] = []
         for name in self._watched:
             try:
-                status = (folder / name).stat()
-                stamps.append((status.st_mtime_ns, status.st_size))
+                status = os.stat(f"{path}/{name}")  # noqa: PTH116  # see `list`
+                stamps += (status.st_mtime_ns, status.st_size)
             except OSError:
-                stamps.append((0, 0))
-        return tuple(stamps) if any(stamp != (0, 0) for stamp in stamps) else None
+                stamps += (0, 0)
+        return tuple(stamps) if any(stamps) else None
 
     def _open(self, folder: Path) -> tuple[T | None, str | None]:
         try:
             return self._load(folder), None
         except (PhysHandiError, OSError) as error:
             return None, str(error)
+
+
+def _names_in(root: Path) -> Iterator[str]:
+    """Name what lies in a folder, in order; nothing if there is no such folder."""
+    try:
+        names = os.listdir(root)  # noqa: PTH208  # see `_Folders.list`
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    yield from sorted(name for name in names if not name.startswith("."))
 
 
 def _open_sequence(folder: Path) -> Sequence:

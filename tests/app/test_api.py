@@ -44,7 +44,7 @@ def test_sequences_are_listed_with_what_they_have(client: TestClient) -> None:
 
 def test_runs_are_listed_with_how_far_they_are(client: TestClient) -> None:
     answer = client.get("/api/v1/runs").json()
-    assert list(answer) == ["runs"]
+    assert list(answer) == ["runs", "total"]
     run = answer["runs"][0]
     assert (run["id"], run["name"], run["state"]) == ("fitted", "a sheet", "succeeded")
     assert (run["sequences"], run["profile"], run["kind"]) == (["sheet"], "quick", "reconstruction")

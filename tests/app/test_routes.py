@@ -21,7 +21,7 @@ def test_the_lists_are_wrapped_and_tell_what_people_ask_first(world: QueueWorld)
     assert [entry["id"] for entry in sequences] == ["sheet"]
     assert sequences[0]["frame_count"] == 10
     assert world.client.get("/api/v1/sequences/sheet").json() == sequences[0]
-    assert world.client.get("/api/v1/runs").json() == {"runs": []}
+    assert world.client.get("/api/v1/runs").json() == {"runs": [], "total": 0}
     profiles = world.client.get("/api/v1/profiles").json()["profiles"]
     assert {"quick", "default", "paper", "phystwin"} == {entry["name"] for entry in profiles}
     assert all(entry["description"] for entry in profiles)
