@@ -1,9 +1,9 @@
 """What a session's client sees: the scene or, instead of it, the figure."""
 
 from app.viewer.content import Content
-from app.viewer.export_panel import Snapshot
 from app.viewer.figure_mode import FigureMode
 from app.viewer.scene import Scene
+from app.viewer.snapshot import Snapshot
 from app.viewer.take import Take
 
 
