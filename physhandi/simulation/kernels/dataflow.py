@@ -10,6 +10,7 @@ so two places a node suffice.
 import warp as wp
 
 from physhandi.simulation.kernels.contacts import advance
+from physhandi.simulation.kernels.half_edges import entries_of, make_loader
 from physhandi.simulation.kernels.integration import free_velocity, is_too_fast
 from physhandi.simulation.kernels.intrinsics import (
     SHARED_SLOTS,
@@ -75,8 +76,7 @@ def make_frame_kernel(lanes: int, kept: int) -> wp.Kernel:
         lanes: Threads that sum one node's springs: 8, 16 or 32.
         kept: Half-edges that each thread keeps in registers; more are read every substep.
     """
-    kept_float = wp.types.vector(length=kept, dtype=wp.float32)
-    kept_int = wp.types.vector(length=kept, dtype=wp.int32)
+    load_half_edges = make_loader(lanes, kept)
 
     @wp.kernel(enable_backward=False, module="unique", launch_bounds=1024)
     def advance_frame(
@@ -120,24 +120,17 @@ def make_frame_kernel(lanes: int, kept: int) -> wp.Kernel:
         locals_first = local_start[block]
         halo = local_start[block + 1] - locals_first - own
 
-        index = kept_int()
-        rest = kept_float()
-        hooke = kept_float()
-        dashpot = kept_float()
-        entry_first = int(0)
-        entry_last = int(0)
-        if row < own:
-            entry_first = entry_start[first + row]
-            entry_last = entry_start[first + row + 1]
-        for k in range(wp.static(kept)):
-            e = entry_first + lane + wp.static(lanes) * k
-            index[k] = -1
-            if e < entry_last:
-                spring = entry[e][1]
-                index[k] = entry[e][0]
-                rest[k] = rest_length[spring]
-                hooke[k] = here.stiffness_scale * stiffness[spring] / rest_length[spring]
-                dashpot[k] = damping[spring]
+        entry_first, entry_last = entries_of(row, own, first, entry_start)
+        index, _, rest, hooke, dashpot = load_half_edges(
+            entry_first,
+            entry_last,
+            lane,
+            here.stiffness_scale,
+            entry,
+            rest_length,
+            stiffness,
+            damping,
+        )
 
         for i in range(place, own, threads):
             node = first + i

@@ -9,6 +9,7 @@ import warp as wp
 from physhandi.simulation.kernels.adjoint import before_drag, retract
 from physhandi.simulation.kernels.contacts import Motion
 from physhandi.simulation.kernels.dataflow import control_position, control_velocity
+from physhandi.simulation.kernels.half_edges import entries_of, make_loader
 from physhandi.simulation.kernels.intrinsics import (
     block_barrier,
     inverse_length,
@@ -102,7 +103,7 @@ def make_adjoint_kernel(lanes: int, kept: int) -> wp.Kernel:
         kept: Half-edges that each thread keeps in registers; there must be no more.
     """
     kept_float = wp.types.vector(length=kept, dtype=wp.float32)
-    kept_int = wp.types.vector(length=kept, dtype=wp.int32)
+    load_half_edges = make_loader(lanes, kept)
 
     @wp.kernel(enable_backward=False, module="unique", launch_bounds=768)
     def retract_frame(
@@ -153,28 +154,19 @@ def make_adjoint_kernel(lanes: int, kept: int) -> wp.Kernel:
         locals_count = local_start[block + 1] - locals_first
         halo = locals_count - own
 
-        index = kept_int()
-        held = kept_int()
-        rest = kept_float()
-        hooke = kept_float()
-        dashpot = kept_float()
+        entry_first, entry_last = entries_of(row, own, first, entry_start)
+        index, spring, rest, hooke, dashpot = load_half_edges(
+            entry_first,
+            entry_last,
+            lane,
+            here.stiffness_scale,
+            entry,
+            rest_length,
+            stiffness,
+            damping,
+        )
         log_stiffness_bar = kept_float()
         damping_bar = kept_float()
-        entry_first = int(0)
-        entry_last = int(0)
-        if row < own:
-            entry_first = entry_start[first + row]
-            entry_last = entry_start[first + row + 1]
-        for k in range(wp.static(kept)):
-            e = entry_first + lane + wp.static(lanes) * k
-            index[k] = -1
-            if e < entry_last:
-                spring = entry[e][1]
-                index[k] = entry[e][0]
-                held[k] = spring - object_spring_count
-                rest[k] = rest_length[spring]
-                hooke[k] = here.stiffness_scale * stiffness[spring] / rest_length[spring]
-                dashpot[k] = damping[spring]
 
         # The row's first lane carries its node's adjoints from substep to substep.
         own_node = wp.min(first + row, first + own - 1)
@@ -261,12 +253,13 @@ def make_adjoint_kernel(lanes: int, kept: int) -> wp.Kernel:
                     speed_bar -= bar.stretch
                     log_stiffness_bar[k] += bar.log_stiffness
                     damping_bar[k] += bar.damping
-                    if held[k] >= 0:
+                    held = spring[k] - object_spring_count
+                    if held >= 0:
                         # No other thread adds to this spring, so the sum has one order.
                         by_rate = here.control_rate * bar.stretch
                         at_start = (1.0 - fraction) * bar.offset - by_rate
-                        wp.atomic_add(start_bar_out, held[k], at_start)
-                        wp.atomic_add(end_bar_out, held[k], fraction * bar.offset + by_rate)
+                        wp.atomic_add(start_bar_out, held, at_start)
+                        wp.atomic_add(end_bar_out, held, fraction * bar.offset + by_rate)
             place_bar = lane_sum(place_bar, wp.static(lanes))
             speed_bar = lane_sum(speed_bar, wp.static(lanes))
             if is_owner:
@@ -283,9 +276,8 @@ def make_adjoint_kernel(lanes: int, kept: int) -> wp.Kernel:
         for k in range(wp.static(kept)):
             e = entry_first + lane + wp.static(lanes) * k
             if index[k] >= 0 and is_first[e] == 1:
-                spring = entry[e][1]
-                log_stiffness_bar_out[spring] = log_stiffness_bar[k]
-                damping_bar_out[spring] = damping_bar[k]
+                log_stiffness_bar_out[spring[k]] = log_stiffness_bar[k]
+                damping_bar_out[spring[k]] = damping_bar[k]
 
     return retract_frame
 

@@ -1,0 +1,60 @@
+"""The springs at a node, as the threads of a CUDA block keep them in registers.
+
+Each spring is there twice, once for each end: a half-edge. The lanes of a row, which are
+neighbouring threads, share the half-edges of one node.
+"""
+
+import warp as wp
+
+
+@wp.func
+def entries_of(row: int, own: int, first: int, entry_start: wp.array[int]):
+    """Return where the half-edges of a row's node begin and end; rows without a node have none."""
+    begin = int(0)
+    end = int(0)
+    if row < own:
+        begin = entry_start[first + row]
+        end = entry_start[first + row + 1]
+    return begin, end
+
+
+def make_loader(lanes: int, kept: int) -> wp.Function:
+    """Make the function that loads a thread's half-edges.
+
+    Args:
+        lanes: Threads that sum one node's springs.
+        kept: Half-edges that each thread keeps.
+    """
+    kept_float = wp.types.vector(length=kept, dtype=wp.float32)
+    kept_int = wp.types.vector(length=kept, dtype=wp.int32)
+
+    @wp.func
+    def load_half_edges(
+        entry_first: int,
+        entry_last: int,
+        lane: int,
+        stiffness_scale: float,
+        entry: wp.array[wp.vec2i],
+        rest_length: wp.array[float],
+        stiffness: wp.array[float],
+        damping: wp.array[float],
+    ):
+        """Return other end, -1 if there is none, spring, rest length, stiffness, damping."""
+        other = kept_int()
+        spring = kept_int()
+        rest = kept_float()
+        hooke = kept_float()
+        dashpot = kept_float()
+        for k in range(wp.static(kept)):
+            e = entry_first + lane + wp.static(lanes) * k
+            other[k] = -1
+            if e < entry_last:
+                s = entry[e][1]
+                other[k] = entry[e][0]
+                spring[k] = s
+                rest[k] = rest_length[s]
+                hooke[k] = stiffness_scale * stiffness[s] / rest_length[s]
+                dashpot[k] = damping[s]
+        return other, spring, rest, hooke, dashpot
+
+    return load_half_edges
