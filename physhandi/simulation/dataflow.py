@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from physhandi.simulation.frame_sums import FrameSums
 from physhandi.simulation.kernels.dataflow import FORWARD_LOCALS, make_frame_kernel
 from physhandi.simulation.kernels.dataflow_adjoint import (
     ADJOINT_LOCALS,
@@ -15,6 +16,8 @@ from physhandi.simulation.kernels.dataflow_adjoint import (
 )
 from physhandi.simulation.partition import Partition, partition_model
 from physhandi.simulation.stage import Stage
+from physhandi.simulation.trajectory import Layout as TapeLayout
+from physhandi.simulation.trajectory import Tape
 
 LEAST_OWN = 4
 """Fewer nodes in a block cost more waiting than they save work."""
@@ -151,34 +154,34 @@ class Dataflow:
         )
 
 
+def tape_layout(nodes: int, substeps: int) -> TapeLayout:
+    """Say what is kept of a frame: position, velocity and velocity before contact, side by side."""
+    return (((substeps, 3 * nodes), wp.vec4),)
+
+
 class DataflowAdjoint:
-    """Simulates a frame again and carries derivatives back; as `FrameAdjoint`, in two launches."""
+    """Simulates frames and carries derivatives back; as `FrameAdjoint`, in a launch each."""
 
     def __init__(self, simulator: Stage, dataflow: Dataflow) -> None:
-        """Make the tape.
+        """Make room for the derivatives.
 
         Args:
-            simulator: Whose frames; its controls, material and world are read.
+            simulator: Whose frames; its controls, material and world are read, its state moved.
             dataflow: The simulator's.
         """
         self._dataflow = dataflow
         model, device = simulator.model, simulator.device
-        nodes, springs = model.node_count, len(model.spring_nodes)
-        held = springs - model.object_spring_count
+        nodes = model.node_count
+        held = len(model.spring_nodes) - model.object_spring_count
 
         def zeros(count: int, dtype: Any) -> wp.array:
             return wp.zeros(count, dtype=dtype, device=device)
 
-        substeps = simulator.parameters.substeps_per_frame
-        self._tape = wp.zeros((substeps, 3 * nodes), dtype=wp.vec4, device=device)
-        self.start = zeros(nodes, wp.vec3), zeros(nodes, wp.vec3)
-        self._end = zeros(nodes, wp.vec3), zeros(nodes, wp.vec3)
+        self.layout = tape_layout(nodes, simulator.parameters.substeps_per_frame)
+        self._state = simulator.position, simulator.velocity
         self.position_bar, self.velocity_bar = zeros(nodes, wp.vec3), zeros(nodes, wp.vec3)
-        self._control_bars = [zeros(model.control_count, wp.vec3) for _ in range(2)]
         self._held_bars = [zeros(held, wp.vec3) for _ in range(2)]
-        self._material_bars = [zeros(springs, wp.float32) for _ in range(2)]
-        self._scalar_bars = [zeros(nodes, wp.float32) for _ in range(3)]
-        self._self_bars = [zeros(0, wp.float32) for _ in range(2)]
+        self.sums = FrameSums.zeros(model, device)
         self._is_first = simulator.array(dataflow.partition.is_first, wp.int32)
         control = model.spring_nodes[model.object_spring_count :].max(axis=1, initial=0) - nodes
         by_control = np.argsort(control, kind="stable")
@@ -201,26 +204,25 @@ class DataflowAdjoint:
         )
         return DataflowAdjoint(simulator, dataflow) if fits else None
 
-    @property
-    def sums(self) -> list[wp.array]:
-        """Derivatives that the last frame gave; see `FrameAdjoint.sums`."""
-        return [*self._control_bars, *self._material_bars, *self._scalar_bars, *self._self_bars]
+    def record(self, tape: Tape) -> None:
+        """Advance the simulator by one frame and keep its substeps in `tape`."""
+        self._dataflow.advance(self._state, self._state, *tape)
 
-    def carry(self) -> None:
-        """Carry `position_bar` and `velocity_bar` from the frame's end to its start."""
-        self._dataflow.advance(self.start, self._end, self._tape)
+    def carry(self, tape: Tape) -> None:
+        """Carry `position_bar` and `velocity_bar` back; see `FrameAdjoint.carry`."""
+        sums, (substeps,) = self.sums, tape
         for value in self._held_bars:
             value.zero_()
         self._dataflow.walk_back(
-            self._tape,
+            substeps,
             self._is_first,
             [self.position_bar, self.velocity_bar],
-            [*self._material_bars, *self._scalar_bars, *self._held_bars],
+            [*sums.material, sums.drag, *sums.ground, *self._held_bars],
         )
         wp.launch(
             sum_controls,
-            dim=len(self._control_bars[0]),
+            dim=len(sums.control_start),
             inputs=[*self._held, *self._held_bars],
-            outputs=self._control_bars,
-            device=self._control_bars[0].device,
+            outputs=[*sums.controls],
+            device=sums.control_start.device,
         )

@@ -1,13 +1,13 @@
 """Rollouts that PyTorch can differentiate, by a hand-written adjoint over any number of frames.
 
-Memory is one frame's substeps: the forward pass keeps the state at each frame, the backward
-pass simulates a frame again and walks back through it. No atomics: gradients are the same
-bits run after run.
+The forward pass keeps the state at each frame, and the substeps of as many frames as memory
+allows (`trajectory`); the backward pass simulates the other frames again and walks back through
+all. No atomics: gradients are the same bits run after run, and however many frames are kept.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -18,11 +18,12 @@ from torch import Tensor
 
 from physhandi.simulation.dataflow import DataflowAdjoint
 from physhandi.simulation.frame_adjoint import FrameAdjoint
+from physhandi.simulation.frame_sums import SCALARS
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
 from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.threaded import ThreadedAdjoint
+from physhandi.simulation.trajectory import Layout, Trajectory
 
-_SCALARS = ("drag", "restitution", "friction", "self_restitution", "self_friction")
 CACHED_SIMULATORS = 16
 """How many models keep their captured graphs and tape between calls of `rollout`."""
 
@@ -43,6 +44,7 @@ def rollout(
     initial_velocity: Float[Tensor, "node 3"] | None = None,
     device: str = "cpu",
     window: int | None = None,
+    memory: int | None = None,
 ) -> tuple[Float[Tensor, "frame node 3"], Float[Tensor, "frame node 3"]]:
     """Simulate and remember how, so that a loss of the result can be differentiated.
 
@@ -69,6 +71,8 @@ def rollout(
             `control` is.
         window: Frames after which gradients are cut: 1 is PhysTwin's one-frame gradient,
             none the gradient over the whole horizon.
+        memory: That substeps may take until the backward pass is done [B], one frame's at the
+            least; if none, as `trajectory.memory_budget` says. Changes no bit, only the time.
 
     Returns:
         Positions [m] and velocities [m/s] of the object nodes in every frame; frame 0 is the
@@ -101,8 +105,17 @@ def rollout(
         for value, default in given
     ]
     bridge.check(tensors)
-    position, velocity = _Rollout.apply(bridge, window, *tensors)
+    trajectory = None
+    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
+        device_ = bridge.simulator.device
+        trajectory = Trajectory(bridge.adjoint, device_, len(control) - 1, memory)
+    position, velocity = _Rollout.apply(bridge, trajectory, window, *tensors)
     return position.to(control.device), velocity.to(control.device)
+
+
+def tape_layout(model: SpringMassModel, parameters: SimulationParameters, device: str) -> Layout:
+    """Say what a rollout with these arguments keeps of a frame; see `trajectory.frame_bytes`."""
+    return _bridge(model, parameters, device).adjoint.layout
 
 
 @lru_cache(maxsize=CACHED_SIMULATORS)
@@ -116,21 +129,27 @@ class _Rollout(torch.autograd.Function):
     """Connects the simulator and its adjoint to PyTorch."""
 
     @staticmethod
-    def forward(ctx: Any, bridge: "_DifferentiableSimulator", window: int | None, *tensors: Tensor):
+    def forward(
+        ctx: Any,
+        bridge: "_DifferentiableSimulator",
+        trajectory: Trajectory | None,
+        window: int | None,
+        *tensors: Tensor,
+    ):
         with bridge.stream():
-            position, velocity = bridge.forward(*tensors)
-        ctx.bridge = bridge
-        ctx.window = window
+            position, velocity = bridge.forward(tensors, trajectory)
+        ctx.bridge, ctx.trajectory, ctx.window = bridge, trajectory, window
         ctx.save_for_backward(*tensors, position, velocity)
         return position, velocity
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor):
         *tensors, position, velocity = ctx.saved_tensors
+        states = position, velocity
         window = ctx.window or len(position)
         with ctx.bridge.stream():
-            gradients = ctx.bridge.backward(tensors, (position, velocity), grad_outputs, window)
-        return None, None, *gradients
+            gradients = ctx.bridge.backward(tensors, states, grad_outputs, ctx.trajectory, window)
+        return None, None, None, *gradients
 
 
 class _DifferentiableSimulator:
@@ -141,7 +160,16 @@ class _DifferentiableSimulator:
     ) -> None:
         self.simulator = Simulator(model, parameters, device)
         self.torch_device = torch.device(wp.device_to_torch(self.simulator.device))
-        self._adjoint: FrameAdjoint | DataflowAdjoint | ThreadedAdjoint | None = None
+
+    @cached_property
+    def adjoint(self) -> FrameAdjoint | DataflowAdjoint | ThreadedAdjoint:
+        """The adjoint of one frame; made on first use, since many rollouts never walk back."""
+        simulator = self.simulator
+        if simulator.collision is not None:
+            return FrameAdjoint(simulator)
+        engine = simulator.engine
+        fast = DataflowAdjoint.of(simulator, engine) or ThreadedAdjoint.of(simulator, engine)
+        return fast or FrameAdjoint(simulator)
 
     @contextmanager
     def stream(self) -> Iterator[None]:
@@ -166,14 +194,16 @@ class _DifferentiableSimulator:
             ("damping", damping, model.rest_length.shape),
             ("initial_position", position, model.object_node.shape),
             ("initial_velocity", velocity, model.object_node.shape),
-            *((name, value, ()) for name, value in zip(_SCALARS, scalars, strict=True)),
+            *((name, value, ()) for name, value in zip(SCALARS, scalars, strict=True)),
         ):
             if tuple(value.shape) != tuple(shape):
                 raise ValueError(f"{name} has shape {tuple(value.shape)}; expected {tuple(shape)}.")
 
-    def forward(self, control: Tensor, *rest: Tensor) -> tuple[Tensor, Tensor]:
-        """Simulate all frames; return positions and velocities."""
-        *material, position, velocity = rest
+    def forward(
+        self, tensors: Sequence[Tensor], trajectory: Trajectory | None
+    ) -> tuple[Tensor, Tensor]:
+        """Simulate all frames, keep the substeps of some; return positions and velocities."""
+        control, *material, position, velocity = tensors
         self._place_material(material)
         simulator = self.simulator
         _copy_in(simulator.position, position)
@@ -182,7 +212,10 @@ class _DifferentiableSimulator:
         positions, velocities = [position], [velocity]
         for frame in range(1, len(control)):
             self._place_control(control, frame)
-            simulator.replay_frame()
+            if trajectory is not None and trajectory.keeps(frame):
+                trajectory.record(frame)
+            else:
+                simulator.replay_frame()
             simulator.check_divergence(frame)
             positions.append(_copy_out(simulator.position))
             velocities.append(_copy_out(simulator.velocity))
@@ -193,17 +226,14 @@ class _DifferentiableSimulator:
         tensors: list[Tensor],
         states: tuple[Tensor, Tensor],
         outputs: tuple[Tensor, ...],
+        trajectory: Trajectory,
         window: int,
     ) -> list[Tensor]:
-        """Return the gradients of all tensors, in their order."""
+        """Return the gradients of all tensors, in their order, and let the trajectory go."""
         control, *material, _, _ = tensors
         self._place_material(material)
-        # Made on first use: many simulators never walk back.
-        if self._adjoint is None:
-            simulator, engine = self.simulator, self.simulator.engine
-            fast = DataflowAdjoint.of(simulator, engine) or ThreadedAdjoint.of(simulator, engine)
-            self._adjoint = fast or FrameAdjoint(simulator)
-        adjoint = self._adjoint
+        simulator, adjoint = self.simulator, self.adjoint
+        begin = simulator.position, simulator.velocity
         bars = adjoint.position_bar, adjoint.velocity_bar
         # Sums over many substeps and frames keep their digits in float64.
         sums = [torch.zeros_like(value, dtype=torch.float64) for value in tensors[:-2]]
@@ -211,9 +241,11 @@ class _DifferentiableSimulator:
             _copy_in(bar, output[-1])
         for frame in range(len(control) - 1, 0, -1):
             self._place_control(control, frame)
-            for place, state in zip(adjoint.start, states, strict=True):
-                _copy_in(place, state[frame - 1])
-            adjoint.carry()
+            if not trajectory.holds(frame):
+                for place, state in zip(begin, states, strict=True):
+                    _copy_in(place, state[frame - 1])
+                trajectory.record(frame)
+            adjoint.carry(trajectory.tape(frame))
             start, end, *rest = (_copy_out(value) for value in adjoint.sums)
             sums[0][frame - 1] += start
             sums[0][frame] += end
@@ -224,6 +256,7 @@ class _DifferentiableSimulator:
             for bar, output in zip(bars, outputs, strict=True):
                 earlier = output[frame - 1]
                 _copy_in(bar, earlier if is_cut else _copy_out(bar) + earlier)
+        trajectory.release()
         return [value.float() for value in sums] + [_copy_out(bar) for bar in bars]
 
     def _place_material(self, material: list[Tensor]) -> None:
@@ -232,7 +265,7 @@ class _DifferentiableSimulator:
         _copy_in(self.simulator.damping, damping)
         self.simulator.override_world(
             velocity_loss=self.simulator.parameters.velocity_loss(float(drag)),
-            **{n: float(v) for n, v in zip(_SCALARS[1:], coefficients, strict=True)},
+            **{n: float(v) for n, v in zip(SCALARS[1:], coefficients, strict=True)},
         )
 
     def _place_control(self, control: Tensor, frame: int) -> None:

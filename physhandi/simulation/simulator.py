@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -61,9 +62,6 @@ class Simulator:
         self.model = model
         self.parameters = parameters
         self.device = wp.get_device(device)
-        self.sums = SpringSums(model, self.device)
-        self._row_pull = self.sums.scratch()
-        self.spring_nodes = self.array(model.spring_nodes, wp.vec2i)
         self.rest_length = self.array(model.rest_length, wp.float32)
         self.stiffness = self.array(model.stiffness, wp.float32)
         self.damping = self.array(model.damping, wp.float32)
@@ -72,11 +70,8 @@ class Simulator:
         self.velocity = self.array(model.initial_velocity, wp.vec3)
         self.control_start = wp.zeros(model.control_count, dtype=wp.vec3, device=self.device)
         self.control_end = wp.zeros(model.control_count, dtype=wp.vec3, device=self.device)
-        self.pull = wp.zeros(len(model.spring_nodes), dtype=wp.vec3, device=self.device)
         self.first_divergence = self.array(np.array([_NO_DIVERGENCE]), wp.int32)
         self._no_tape = wp.zeros(0, dtype=wp.vec3, device=self.device)
-        self.engine = Dataflow.of(self) or Threaded.of(self)
-        """Moves frames without self-collision, where it can."""
         self._collision: SelfCollision | None = None
         self._recordings = {
             collides: Recording(self._launch_frame, self.device) for collides in (False, True)
@@ -218,25 +213,28 @@ class Simulator:
 
     def checked_control(self, control: Float[ndarray, "frame control 3"]) -> ndarray:
         """Return the control trajectory, or raise `ValueError` if it does not fit the model."""
-        control = np.asarray(control, dtype=np.float32)
-        if control.ndim != 3 or control.shape[1:] != (self.model.control_count, 3):
-            raise ValueError(
-                f"control has shape {control.shape}; expected "
-                f"(frames, {self.model.control_count}, 3)."
-            )
-        bad = np.argwhere(~np.isfinite(control))
-        if len(bad):
-            raise ValueError(f"control is not finite at frame {bad[0][0]}, node {bad[0][1]}.")
-        return control
+        return checked_control(control, self.model.control_count)
 
     def replay_frame(self) -> None:
         """Advance the state on the device by one frame, with the controls that are there."""
-        if self.engine is not None and self.collision is None:
+        if self.collision is None and self.engine is not None:
             state = self.position, self.velocity
             self.engine.advance(state, state)
             return
+        # Arrays that launches use cannot be made while they are captured.
+        _ = self.sums
         version = self.find_candidates(self.position)
         self._recordings[self.parameters.self_collision].replay(version)
+
+    @cached_property
+    def engine(self) -> Dataflow | Threaded | None:
+        """Moves frames without self-collision, where it can; laid out when it is first asked to."""
+        return Dataflow.of(self) or Threaded.of(self)
+
+    @cached_property
+    def sums(self) -> SpringSums:
+        """What the recorded kernels need of the springs; laid out when they first run."""
+        return SpringSums(self.model, self.device)
 
     @property
     def material(self) -> tuple[wp.array, wp.array, wp.array]:
@@ -273,7 +271,8 @@ class Simulator:
 
     def spring_inputs(self, fraction: float, state: tuple[wp.array, wp.array]) -> list[Any]:
         """List what a spring kernel reads, a `fraction` of a frame after its start."""
-        return [fraction, self.world, self.spring_nodes, *self.material, *state, *self.controls]
+        model = [self.world, self.sums.spring_nodes, *self.material]
+        return [fraction, *model, *state, *self.controls]
 
     def launch_substep(
         self,
@@ -298,10 +297,10 @@ class Simulator:
             pull_springs,
             dim=len(self.model.spring_nodes),
             inputs=self.spring_inputs(fraction, before),
-            outputs=[self.pull],
+            outputs=[self.sums.pull],
             device=self.device,
         )
-        start, entry, value = self.sums.of(self.pull, self._row_pull)
+        start, entry, value = self.sums.of(self.sums.pull, self.sums.row_pull)
         collision = self.collision
         if collision is not None:
             collision.launch_free(start, entry, before[1], value, free_velocity)
@@ -348,3 +347,22 @@ class Simulator:
             self.launch_substep(substep, (before, self.velocity), (after, self.velocity))
         if places[count % 2] is not self.position:
             wp.copy(self.position, places[count % 2])
+
+
+def checked_control(control: Float[ndarray, "frame control 3"], count: int) -> ndarray:
+    """Return a control trajectory as float32.
+
+    Args:
+        control: Positions of the control nodes in every frame [m].
+        count: Number of control nodes that there must be.
+
+    Raises:
+        ValueError: If it is of another shape or not finite.
+    """
+    control = np.asarray(control, dtype=np.float32)
+    if control.ndim != 3 or control.shape[1:] != (count, 3):
+        raise ValueError(f"control has shape {control.shape}; expected (frames, {count}, 3).")
+    bad = np.argwhere(~np.isfinite(control))
+    if len(bad):
+        raise ValueError(f"control is not finite at frame {bad[0][0]}, node {bad[0][1]}.")
+    return control

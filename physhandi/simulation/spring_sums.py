@@ -22,6 +22,10 @@ class SpringSums:
 
     def __init__(self, model: SpringMassModel, device: Any) -> None:
         self._device = device
+        self.spring_nodes = wp.array(model.spring_nodes, dtype=wp.vec2i, device=device)
+        """Both ends of each spring."""
+        self.pull = wp.zeros(len(model.spring_nodes), dtype=wp.vec3, device=device)
+        """Room for the force of each spring."""
         start, entry = half_edges(model.spring_nodes, model.node_count + model.control_count)
         self._half_edge = wp.array(entry, dtype=wp.int32, device=device)
         self._row_start: wp.array | None = None
@@ -31,6 +35,8 @@ class SpringSums:
             entry = np.arange(len(row) - 1, dtype=np.int32)
         self._start = wp.array(start, dtype=wp.int32, device=device)
         self._entry = wp.array(entry, dtype=wp.int32, device=device)
+        self.row_pull = self.scratch()
+        """Room for the rows of their sums."""
 
     def scratch(self) -> wp.array:
         """Make room for the rows of one sum."""

@@ -16,6 +16,8 @@ class Stage(Protocol):
     device: Any
     world: wp.array
     first_divergence: wp.array
+    position: wp.array
+    velocity: wp.array
 
     @property
     def material(self) -> tuple[wp.array, wp.array, wp.array]:

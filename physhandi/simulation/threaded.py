@@ -6,11 +6,13 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from physhandi.simulation.frame_sums import FrameSums
 from physhandi.simulation.kernels.lanes import LANES, Bars, Material, Parts, Record
 from physhandi.simulation.kernels.threaded import advance_parts
 from physhandi.simulation.kernels.threaded_adjoint import retract_parts
 from physhandi.simulation.partition import SpringParts, group_springs
 from physhandi.simulation.stage import Stage
+from physhandi.simulation.trajectory import Layout, Tape
 from physhandi.simulation.walk import Walk
 
 PARTS = 2
@@ -48,11 +50,12 @@ class Threaded:
         self.material = _MATERIAL()
         for name in ("rest", "elastic", "dashpot"):
             setattr(self.material, name, self.zeros(len(parts.spring), wp.float32))
-        self._state = self.zeros((2, parts.place_count), _RECORD)
+        self.state = self.zeros((2, parts.place_count), _RECORD)
+        """States of two substeps in turn, while no tape is written."""
         self._force = self.zeros(parts.place_count, wp.vec4)
-        self._no_tape = self.zeros((0, 0), wp.vec4)
+        self.no_tape = self.zeros((0, 0), wp.vec4)
         self._first = self.zeros(len(parts.own_start) - 1, wp.int32)
-        self._walks: dict[bool, tuple[list[wp.array], Walk]] = {}
+        self._walks: dict[bool, Walk] = {}
 
     @staticmethod
     def of(simulator: Stage) -> "Threaded | None":
@@ -65,13 +68,7 @@ class Threaded:
         """Make an array of zeros in the processor's memory."""
         return wp.zeros(shape, dtype=dtype, device=self._simulator.device)
 
-    def tape(self) -> State:
-        """Make room for all states of a frame, and for the velocities before contact."""
-        substeps = self._simulator.parameters.substeps_per_frame
-        places, nodes = self.partition.place_count, len(self.partition.node)
-        return self.zeros((substeps + 1, places), _RECORD), self.zeros((substeps, nodes), wp.vec4)
-
-    def advance(self, before: State, after: State, tape: State | None = None) -> None:
+    def advance(self, before: State, after: State, tape: Tape | None = None) -> None:
         """Simulate one frame, from one state to another.
 
         Args:
@@ -80,16 +77,22 @@ class Threaded:
             tape: Where each substep's state and velocity before contact go.
         """
         simulator = self._simulator
-        state, free_tape = (self._state, self._no_tape) if tape is None else tape
-        arrays = [*before, *after, state]
-        known, walk = self._walks.get(tape is None, (None, None))
-        if walk is None or known is None or any(map(_differ, arrays, known)):
-            walk = self.walk(
+        walk = self._walks.get(tape is None)
+        if walk is None:
+            walk = self._walks[tape is None] = self.walk(
                 advance_parts,
                 [simulator.world, self.parts, *simulator.material, *simulator.controls, *before],
-                [self.material, state, self._force, free_tape, *after, self._first],
+                [self.material, self.state, self._force, self.no_tape, *after, self._first],
             )
-            self._walks[tape is None] = arrays, walk
+        state, free_tape = (self.state, self.no_tape) if tape is None else tape
+        walk.aim(
+            position=before[0],
+            velocity=before[1],
+            state_out=state,
+            free_tape_out=free_tape,
+            position_out=after[0],
+            velocity_out=after[1],
+        )
         walk.run(self.threads)
         told = simulator.first_divergence.numpy()
         told[0] = min(told[0], *self._first.numpy())
@@ -101,28 +104,36 @@ class Threaded:
         return Walk(kernel, simulator.parameters.substeps_per_frame, inputs, simulator.device)
 
 
+def tape_layout(places: int, nodes: int, substeps: int) -> Layout:
+    """Say what is kept of a frame: states in all places, and velocities before contact.
+
+    Args:
+        places: Nodes, and control nodes once for each part that they hold.
+        nodes: Object nodes.
+        substeps: In a frame.
+    """
+    return ((substeps + 1, places), _RECORD), ((substeps, nodes), wp.vec4)
+
+
 class ThreadedAdjoint:
-    """Simulates a frame again and carries derivatives back; as `FrameAdjoint`, by threads."""
+    """Simulates frames and carries derivatives back; as `FrameAdjoint`, by threads."""
 
     def __init__(self, simulator: Stage, engine: Threaded) -> None:
-        """Make the tape.
+        """Make room for the derivatives.
 
         Args:
-            simulator: Whose frames; its controls, material and world are read.
+            simulator: Whose frames; its controls, material and world are read, its state moved.
             engine: The simulator's.
         """
         self._engine = engine
         model, parts = simulator.model, engine.partition
-        nodes, springs, held = model.node_count, len(model.spring_nodes), len(parts.control)
-        self._tape = engine.tape()
-        self.start = engine.zeros(nodes, wp.vec3), engine.zeros(nodes, wp.vec3)
-        self._end = engine.zeros(nodes, wp.vec3), engine.zeros(nodes, wp.vec3)
+        nodes, held = model.node_count, len(parts.control)
+        substeps = simulator.parameters.substeps_per_frame
+        self.layout = tape_layout(parts.place_count, nodes, substeps)
+        self._state = simulator.position, simulator.velocity
         self.position_bar = engine.zeros(nodes, wp.vec3)
         self.velocity_bar = engine.zeros(nodes, wp.vec3)
-        self._control_bars = [engine.zeros(model.control_count, wp.vec3) for _ in range(2)]
-        self._material_bars = [engine.zeros(springs, wp.float32) for _ in range(2)]
-        self._scalar_bars = [engine.zeros(nodes, wp.float32) for _ in range(3)]
-        self._self_bars = [engine.zeros(0, wp.float32) for _ in range(2)]
+        self.sums = FrameSums.zeros(model, simulator.device)
         self._bars = _BARS()
         for name, shape, dtype in (
             ("state", parts.place_count, _RECORD),
@@ -136,8 +147,9 @@ class ThreadedAdjoint:
             setattr(self._bars, name, engine.zeros(shape, dtype))
         self._walk_back = engine.walk(
             retract_parts,
-            [simulator.world, engine.parts, engine.material, *self._tape, self._bars],
-            [self.position_bar, self.velocity_bar, *self._material_bars, *self._scalar_bars],
+            [simulator.world, engine.parts, *simulator.material, engine.material],
+            [engine.state, engine.no_tape, self._bars, self.position_bar, self.velocity_bar],
+            [*self.sums.material, self.sums.drag, *self.sums.ground],
         )
 
     @staticmethod
@@ -147,21 +159,17 @@ class ThreadedAdjoint:
             return None
         return ThreadedAdjoint(simulator, engine)
 
-    @property
-    def sums(self) -> list[wp.array]:
-        """Derivatives that the last frame gave; see `FrameAdjoint.sums`."""
-        return [*self._control_bars, *self._material_bars, *self._scalar_bars, *self._self_bars]
+    def record(self, tape: Tape) -> None:
+        """Advance the simulator by one frame and keep its substeps in `tape`."""
+        self._engine.advance(self._state, self._state, tape)
 
-    def carry(self) -> None:
-        """Carry `position_bar` and `velocity_bar` from the frame's end to its start."""
+    def carry(self, tape: Tape) -> None:
+        """Carry `position_bar` and `velocity_bar` back; see `FrameAdjoint.carry`."""
         engine = self._engine
-        engine.advance(self.start, self._end, self._tape)
+        state, free_tape = tape
+        self._walk_back.aim(state=state, free_tape=free_tape)
         self._walk_back.run(engine.threads)
         # A control node has a place in each part that it holds.
-        for bar, held in zip(self._control_bars, (self._bars.start, self._bars.end), strict=True):
+        for bar, held in zip(self.sums.controls, (self._bars.start, self._bars.end), strict=True):
             bar.zero_()
             np.add.at(bar.numpy(), engine.partition.control, held.numpy())
-
-
-def _differ(one: wp.array, other: wp.array) -> bool:
-    return one.ptr != other.ptr

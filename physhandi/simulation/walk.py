@@ -89,6 +89,7 @@ class Walk:
         self._pace = Pace()
         # A recorded launch does not keep its arrays alive.
         self._inputs = inputs
+        self._aims: dict[str, wp.array] = {}
         between = [substeps, _give_way(), self._job, self._meeting]
 
         def record(thread: int, threads: int) -> Any:
@@ -97,6 +98,15 @@ class Walk:
 
         self._alone = record(0, 1)
         self._together = record(0, 2), record(1, 2)
+
+    def aim(self, **arrays: wp.array) -> None:
+        """Let the kernel's arguments of these names be other arrays from now on."""
+        for name, array in arrays.items():
+            if self._aims.get(name) is array:
+                continue
+            self._aims[name] = array
+            for launch in (self._alone, *self._together):
+                launch.set_param_by_name(name, array)
 
     def run(self, threads: int | None = None) -> None:
         """Take all substeps.

@@ -43,13 +43,14 @@ def arguments(scene):
     return {name: value.astype(np.float32).astype(float) for name, value in values.items()}
 
 
-def gradients(scene, device, weights, window=None):
+def gradients(scene, device, weights, window=None, memory=None):
     """Differentiate the weighted sum of positions and velocities by every argument."""
     model, parameters = as_model(scene)
     tensors = {
         name: torch.tensor(value, requires_grad=True) for name, value in arguments(scene).items()
     }
-    state = differentiable.rollout(model, parameters, device=device, window=window, **tensors)
+    options = {"device": device, "window": window, "memory": memory}
+    state = differentiable.rollout(model, parameters, **options, **tensors)
     loss = sum(
         (torch.tensor(w) * value.double()).sum() for w, value in zip(weights, state, strict=True)
     )

@@ -20,6 +20,7 @@ from physhandi.simulation.kernels.lanes import (
 from physhandi.simulation.kernels.meeting import meet
 from physhandi.simulation.kernels.threaded import (
     as_record,
+    gather_material,
     record_position,
     record_velocity,
 )
@@ -130,6 +131,9 @@ def retract_parts(
     # Model:
     world: wp.array[World],
     parts: Parts,
+    rest_length: wp.array[float],
+    stiffness: wp.array[float],
+    damping: wp.array[float],
     # Scratch:
     material_out: Material,
     # State in:
@@ -158,6 +162,7 @@ def retract_parts(
     last = job_out[1]
     if first == 0:
         for part in range(part_first, part_last):
+            gather_material(part, here, parts, rest_length, stiffness, damping, material_out)
             begin_part(part, parts, position_bar_out, velocity_bar_out, bars_out)
     waited = meet(meeting_out, 0, threads, 0, give_way)
     step = int(first)

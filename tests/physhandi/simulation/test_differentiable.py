@@ -11,7 +11,7 @@ from reference.gradients import (
     gradients,
     loss_weights,
 )
-from reference.scenes import as_model, cube_scene
+from reference.scenes import as_model, cube_scene, in_float32
 from reference.spring_mass import simulate
 
 from physhandi.simulation import differentiable
@@ -80,6 +80,39 @@ def test_a_window_of_one_frame_sees_only_that_frame(device):
     np.testing.assert_allclose(whole["log_stiffness"], expected, atol=1e-5 * np.abs(expected).max())
     full = gradients(scene, device, loss_weights(scene))["log_stiffness"]
     assert np.abs(full - whole["log_stiffness"]).max() > 0.1 * np.abs(full).max()
+
+
+def truncated_difference(scene, weights, window, name, direction):
+    """Differentiate the oracle's loss of each window, whose start is given, and add them up."""
+    position, velocity = simulate(scene)
+    last, total = len(scene.control) - 1, 0.0
+    for begin in range(0, last, window):
+        if begin > 0 and name.startswith("initial"):
+            break
+        part = slice(begin, min(begin + window, last) + 1)
+        start = {"node": position[begin], "velocity": velocity[begin]} if begin else {}
+        # A frame's own loss belongs to the window that ends in it.
+        own = tuple(np.concatenate([(begin == 0) * w[:1], w[part][1:]]) for w in weights)
+        along = direction[part] if name == "control" else direction
+        piece = replace(scene, control=scene.control[part], **start)
+        total += directional_difference(piece, own, name, along)
+    return total
+
+
+@pytest.mark.parametrize("window", [1, 3])
+def test_a_window_s_gradient_is_that_of_truncated_backpropagation(device, window):
+    path = 0.004 * np.sin(np.arange(8))[:, None, None] * np.array([1.0, -0.5, 0.3])
+    scene = cube_scene()
+    scene = in_float32(replace(scene, control=scene.control[:1] + path, substeps=20))
+    weights = loss_weights(scene)
+    found, whole = (gradients(scene, device, weights, window=w) for w in (window, None))
+    rng = np.random.default_rng(4)
+    for name in ("control", "log_stiffness", "damping", "drag", "friction", "initial_velocity"):
+        direction = rng.normal(size=found[name].shape)
+        along, far = (float((values[name] * direction).sum()) for values in (found, whole))
+        expected = truncated_difference(scene, weights, window, name, direction)
+        assert along == pytest.approx(expected, rel=2e-4), name
+        assert abs(far - along) > 0.01 * abs(along), name
 
 
 def test_a_window_cuts_every_so_many_frames(device):

@@ -91,7 +91,7 @@ def block():
     wanted = simulator.rollout(control).position
     simulator.engine.threads = 2
     simulator.rollout(control)
-    return simulator, control, wanted, simulator.engine._walks[True][1]
+    return simulator, control, wanted, simulator.engine._walks[True]
 
 
 @needs_processor
