@@ -75,8 +75,12 @@ class RolloutPreview:
     ) -> Preview:
         frames = len(node)
         moved = problem.control[:frames] if control is None else control.detach().cpu().numpy()
-        unknown = problem.cloud.new_tensor(math.nan)
-        seen = where(problem.is_observed[:frames, :, None], problem.cloud[:frames], unknown)
+        # Markers have no cloud, but tracks.
+        point, is_known = problem.cloud, problem.is_observed
+        if not point.shape[1]:
+            point, is_known = problem.track, problem.is_valid
+        unknown = point.new_tensor(math.nan)
+        seen = where(is_known[:frames, :, None], point[:frames], unknown)
         return Preview(
             stage=self._stage,
             sequence=problem.name,
