@@ -1,0 +1,156 @@
+"""Chooses what colors tell, shows the legend and holds the range."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import viser
+
+from app.viewer.coloring import Painter, Range
+from app.viewer.content import Content
+from app.viewer.guard import Guard
+from app.viewer.keyboard import bind
+from app.viewer.layers import COLORINGS, Coloring, Layers
+from app.viewer.legend import legend_html
+
+_NOT_PLAIN = COLORINGS[1:]
+
+
+class ColorPanel:
+    """A choice, a legend and a range that follows the sequence or is held."""
+
+    def __init__(self, server: viser.ViserServer, guard: Guard, redraw: Callable[[], None]) -> None:
+        """Add the panel, hidden until there is an object.
+
+        Args:
+            server: Where to.
+            guard: Wraps the callbacks.
+            redraw: Draws the current frame again.
+        """
+        self._redraw = redraw
+        self._layers = Layers()
+        self._painter: Painter | None = None
+        self._is_metric = True
+        self._written: tuple[float, float] | None = None
+        self._said = ""
+        gui = server.gui
+        self._folder = gui.add_folder("Colors", visible=False)
+        with self._folder:
+            self._choice: Any = gui.add_dropdown(
+                "Color by", ("plain",), hint="C: the next one, shift C: the one before"
+            )
+            self._legend = gui.add_html("")
+            self._hold = gui.add_checkbox(
+                "Hold range", initial_value=False, hint="Keep the ends when the rollout changes"
+            )
+            self._low = gui.add_number("From", 0.0, step=1e-6)
+            self._high = gui.add_number("To", 1.0, step=1e-6)
+        self._choice.on_update(guard.by_user(lambda _: self.choose(self._choice.value)))
+        self._hold.on_update(guard.by_user(lambda _: self._toggle_hold()))
+        for field in (self._low, self._high):
+            field.on_update(guard.by_user(lambda _: self._type()))
+        bind(server, guard, "color", lambda _, __: self.next(1))
+        bind(server, guard, "color_back", lambda _, __: self.next(-1))
+        self._show_range_fields()
+
+    def replace(self, content: Content, layers: Layers, painter: Painter) -> None:
+        """Offer what a content can tell."""
+        before = self._layers
+        self._layers, self._painter = layers, painter
+        self._is_metric = content.is_metric
+        has_object = content.fitted is not None
+        self._folder.visible = has_object
+        self._choice.options = ("plain", *self._offered())
+        layers.color = before.color if before.color in self._choice.options else "plain"
+        layers.color_range = before.color_range if layers.color == before.color else None
+        self._follow()
+
+    def restore(self) -> None:
+        """Show what the layers say now."""
+        if self._layers.color not in self._choice.options:
+            self._layers.color, self._layers.color_range = "plain", None
+        self._follow()
+
+    def choose(self, coloring: Coloring) -> None:
+        """Color by another quantity, in the range of its sequence."""
+        if coloring != self._layers.color:
+            self._layers.color, self._layers.color_range = coloring, None
+        self._follow()
+        self._redraw()
+
+    def next(self, step: int) -> None:
+        """Color by the next quantity of the list, or by one before."""
+        options = list(self._choice.options)
+        if self._folder.visible:
+            at = options.index(self._layers.color)
+            self.choose(options[(at + step) % len(options)])
+
+    def show(self, *, is_playing: bool) -> None:
+        """Follow what was painted last."""
+        painter = self._painter
+        legend = painter.legend if painter is not None else None
+        said = "" if legend is None else legend_html(legend, highest=not is_playing)
+        if is_playing and self._legend_head(said) == self._legend_head(self._said):
+            return
+        if said != self._said:
+            self._said = said
+            self._legend.content = said
+        if legend is None or painter is None:
+            return
+        factor = painter.quantity(self._layers.color).factor
+        self._write((legend.limits[0] * factor, legend.limits[1] * factor))
+
+    def _offered(self) -> tuple[Coloring, ...]:
+        painter = self._painter
+        can_tell_error = painter is not None and painter.errors.is_known
+        return tuple(c for c in _NOT_PLAIN if c != "error" or can_tell_error)
+
+    @staticmethod
+    def _legend_head(said: str) -> str:
+        """Cut off what changes with every frame."""
+        return said.partition("highest node")[0]
+
+    def _follow(self) -> None:
+        self._choice.value = self._layers.color
+        self._hold.value = self._layers.color_range is not None
+        self._show_range_fields()
+
+    def _show_range_fields(self) -> None:
+        is_colored = self._layers.color != "plain"
+        for field in (self._hold, self._low, self._high):
+            field.visible = is_colored
+        self._legend.visible = is_colored
+
+    def _write(self, limits: Range) -> None:
+        """Show the ends, unless they are a user's that are about to be heard."""
+        rounded = (_rounded(limits[0]), _rounded(limits[1]))
+        if rounded != self._written:
+            self._written = rounded
+            self._low.value, self._high.value = rounded
+
+    def _toggle_hold(self) -> None:
+        legend = self._painter.legend if self._painter is not None else None
+        if self._hold.value and legend is not None:
+            self._layers.color_range = legend.limits
+        else:
+            self._layers.color_range = None
+        self._redraw()
+
+    def _type(self) -> None:
+        """Take over the ends that a user typed, and hold them."""
+        painter = self._painter
+        if painter is None or self._layers.color == "plain":
+            return
+        factor = painter.quantity(self._layers.color).factor
+        low, high = float(self._low.value), float(self._high.value)
+        if not (math.isfinite(low) and math.isfinite(high)) or high <= low:
+            return  # Half-typed numbers; the scale waits until they make sense.
+        self._written = (low, high)
+        self._layers.color_range = (low / factor, high / factor)
+        self._hold.value = True
+        self._redraw()
+
+
+def _rounded(value: float) -> float:
+    """Keep four digits."""
+    return float(f"{value:.4g}")
