@@ -105,10 +105,7 @@ def rollout(
         for value, default in given
     ]
     bridge.check(tensors)
-    trajectory = None
-    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
-        device_ = bridge.simulator.device
-        trajectory = Trajectory(bridge.adjoint, device_, len(control) - 1, memory)
+    trajectory = bridge.trajectory(tensors, memory)
     position, velocity = _Rollout.apply(bridge, trajectory, window, *tensors)
     return position.to(control.device), velocity.to(control.device)
 
@@ -170,6 +167,12 @@ class _DifferentiableSimulator:
         engine = simulator.engine
         fast = DataflowAdjoint.of(simulator, engine) or ThreadedAdjoint.of(simulator, engine)
         return fast or FrameAdjoint(simulator)
+
+    def trajectory(self, tensors: list[Tensor], memory: int | None) -> Trajectory | None:
+        """Decide which frames to keep; none if nobody can ask for a gradient."""
+        if not torch.is_grad_enabled() or not any(tensor.requires_grad for tensor in tensors):
+            return None
+        return Trajectory(self.adjoint, self.simulator.device, len(tensors[0]) - 1, memory)
 
     @contextmanager
     def stream(self) -> Iterator[None]:

@@ -63,7 +63,7 @@ def as_scene(model, control, parameters=PARAMETERS):
     )
 
 
-def block_gradients(model, control, parameters, device):
+def block_gradients(model, control, parameters, device, memory=None):
     """Differentiate a random sum of the last positions and velocities by every input."""
     aim = torch.from_numpy(np.random.default_rng(5).normal(0, 1, model.object_node.shape)).float()
     inputs = {
@@ -77,6 +77,7 @@ def block_gradients(model, control, parameters, device):
         "initial_velocity": torch.from_numpy(model.initial_velocity),
     }
     inputs = {name: value.clone().requires_grad_() for name, value in inputs.items()}
-    position, velocity = differentiable.rollout(model, parameters, device=device, **inputs)
+    options = {"device": device, "memory": memory}
+    position, velocity = differentiable.rollout(model, parameters, **options, **inputs)
     ((position[-1] * aim).sum() + 0.01 * (velocity[-1] * aim).sum()).backward()
     return {name: value.grad.numpy() for name, value in inputs.items()}

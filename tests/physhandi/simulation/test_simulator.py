@@ -204,6 +204,22 @@ def test_tunables_act_without_another_capture(device):
     assert simulator._recordings[False].graph is graph
 
 
+def test_only_what_moves_the_nodes_is_laid_out(device):
+    scene = cube_scene()
+    model, parameters = as_model(scene)
+    plain = Simulator(model, parameters, device=device)
+    colliding = Simulator(model, replace(parameters, self_collision=True), device=device)
+    for simulator in (plain, colliding):
+        assert not {"engine", "sums"} & set(vars(simulator))
+        simulator.rollout(scene.control)
+    assert {"engine", "sums"} & set(vars(plain)) == {"engine"}
+    assert {"engine", "sums"} & set(vars(colliding)) == {"sums"}
+    # What is laid out later sees the same state.
+    wanted = plain.rollout(scene.control).position
+    colliding.set_parameters(parameters)
+    assert np.array_equal(colliding.rollout(scene.control).position, wanted)
+
+
 def test_a_substep_of_another_length_needs_another_simulator(device):
     model, parameters = as_model(cube_scene())
     simulator = Simulator(model, parameters, device=device)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from reference.blocks import PARAMETERS, block_gradients, thrown_block
 from reference.gradients import gradients, loss_weights
 from reference.scenes import as_model, crossing_scene, cube_scene
 
@@ -186,6 +187,14 @@ def test_stored_and_simulated_again_give_the_same_bits(device, kind, monkeypatch
     assert any(np.frombuffer(found[None]["control"]))
     if kind == "collisions":
         assert any(np.frombuffer(found[None]["self_restitution"]))
+
+
+def test_a_block_in_many_parts_has_the_same_gradients_stored_and_simulated_again(device):
+    model, control = thrown_block(9, frames=4)
+    found = [block_gradients(model, control, PARAMETERS, device, memory) for memory in (0, None)]
+    for name, value in found[0].items():
+        assert np.abs(value).max() > 0
+        assert np.array_equal(value, found[1][name]), name
 
 
 @pytest.mark.parametrize("stored", [1, 3, FRAMES])
