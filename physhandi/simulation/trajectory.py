@@ -114,7 +114,8 @@ class Trajectory:
         self._held.clear()
 
 
-# Fresh memory costs a CPU as much as half a frame, so that of the last trajectory is used again.
+# Writing to fresh memory can cost a CPU as much as simulating the frame, so what a trajectory no
+# longer needs is kept for the next.
 _spare: dict[str, tuple[Layout, list[Tape]]] = {}
 _lock = Lock()
 

@@ -3,7 +3,6 @@
 from pathlib import Path
 from types import SimpleNamespace
 
-import psutil
 import pytest
 
 from physhandi.simulation import memory
@@ -43,7 +42,7 @@ def test_a_container_leaves_its_limit_less_what_is_used(tmp_path, files, left):
 def test_the_smaller_of_machine_and_container_counts(tmp_path, monkeypatch):
     device = SimpleNamespace(is_cuda=False)
     machine = SimpleNamespace(available=2000)
-    monkeypatch.setattr(psutil, "virtual_memory", lambda: machine)
+    monkeypatch.setattr("psutil.virtual_memory", lambda: machine)
     monkeypatch.setattr(memory, "_CGROUP", tmp_path)
     assert free_memory(device) == 2000
     write(tmp_path, {"memory.max": "1000\n", **VERSION_2})
