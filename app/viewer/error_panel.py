@@ -90,7 +90,7 @@ class ErrorPanel:
         with self._folder:
             self._text = server.gui.add_html("")
             self._plot = server.gui.add_uplot(
-                self._data(), self._series(), **_look(self._unit, max(count - 1, 1)), height=120
+                self._data(), self._series(), **plot_look(self._unit, max(count - 1, 1)), height=120
             )
         self._write(at_once=True)
 
@@ -175,7 +175,8 @@ class ErrorPanel:
         )
 
 
-def _look(unit: str, last: int) -> dict[str, Any]:
+def plot_look(unit: str, last: int) -> dict[str, Any]:
+    """Choose scales and axes of a small plot over the frames up to `last`."""
     grid: Any = {"show": True, "stroke": "rgba(120,130,145,0.2)"}
     return {
         "scales": {"x": uplot.Scale(time=False, range=(0.0, float(last)))},

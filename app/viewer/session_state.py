@@ -12,7 +12,7 @@ from numpy import ndarray
 from app.viewer.layers import Layers, Theme
 from physhandi.simulation.model import SimulationParameters
 
-Kind = Literal["run", "sequence"]
+Kind = Literal["run", "sequence", "comparison"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,9 +22,9 @@ class SessionInfo:
     id: str
     """Unguessable id, part of its address."""
     kind: Kind
-    """Whether a run or a sequence is shown."""
+    """Whether a run, a sequence or two runs together are shown."""
     target: str
-    """Id of the run or the sequence."""
+    """Id of the run or the sequence; of a comparison the query after ``/compare?``."""
     owner: str
     """Who opened it."""
     title: str

@@ -1,0 +1,291 @@
+"""The scene of a comparison: two rollouts beside each other, or one over the other."""
+
+import threading
+from dataclasses import dataclass, replace
+
+import numpy as np
+import viser
+from jaxtyping import Float
+from numpy import ndarray
+
+from app.viewer.clipped_nodes import ClippedNodes, Plane
+from app.viewer.compare_look import GHOST, SIDES, STYLES, Look, difference_colors, shade
+from app.viewer.content import Content
+from app.viewer.difference import Way, take_difference
+from app.viewer.figure import ARROWS, FIGURE_BYTES, Side
+from app.viewer.figure_camera import Box, Eye
+from app.viewer.framing import Framing
+from app.viewer.halves import GAP, Extents
+from app.viewer.layers import GREEN, SKIN, Layers
+from app.viewer.object_drawing import Color, ObjectDrawing, share_bytes, strengths
+from app.viewer.scene import add_ground
+from app.viewer.take import Take
+
+_NARROWEST = 13.0
+_ABOVE, _BELOW = 4.0, 0.6
+_LINE = 0.034
+_LONGEST = 0.22
+_SAME_HAND = 1e-5
+_HAND_OPACITY = 0.4
+_PLAYING_OBSERVED = 1_000
+_ROOT = "/compare"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Half:
+    """One side of the comparison at a moment."""
+
+    side: Side
+    """Rollout, its frame and caption."""
+    content: Content
+    """Hands and observation."""
+    frame: int
+    """Frame of hands and observation."""
+
+
+Halves = dict[str, Half]
+"""Both sides by their names, ``a`` and ``b``."""
+
+
+class CompareDrawing:
+    """Draws both sides around the middle of the scene; both are seen by one camera.
+
+    The thread of the clock draws; a camera may turn the sides from another one.
+    """
+
+    def __init__(
+        self, server: viser.ViserServer, content: Content, framing: Framing, takes: list[Take]
+    ) -> None:
+        """Measure what has to fit; nothing is drawn yet.
+
+        Args:
+            server: Where to.
+            content: Tells the ground, and what has to fit if there are no rollouts.
+            framing: Sizes.
+            takes: The rollouts that are complete.
+        """
+        self._server = server
+        self._content = content
+        self._framing = framing
+        self._nodes = ClippedNodes(server)
+        self._drawings = {
+            name: ObjectDrawing(self._nodes, framing, root=f"{_ROOT}/{name}", style=STYLES[name])
+            for name in SIDES
+        }
+        self._extents = _measure(content, framing, takes)
+        self._eye = Eye(right=np.array([1.0, 0.0, 0.0]), up=np.array([0.0, 0.0, 1.0]))
+        self._lock = threading.RLock()
+        self._captions = dict.fromkeys(SIDES, "")
+        self._look = Look()
+        self._way: Way | None = None
+        known = [float(np.quantile(s, 0.9)) for s in map(strengths, takes) if len(s)]
+        self._force_unit = 0.07 * framing.extent / max(known, default=1.0)
+        self._is_ground_laid = False
+
+    def box(self, eye: Eye) -> Box:
+        """Measure both sides with their captions, as they are seen beside each other."""
+        middle, wide, high = self._extents.seen(eye)
+        line = self._line
+        middle = middle + 0.5 * (_ABOVE - _BELOW) * line * eye.up
+        return middle, 2 * GAP * max(wide, _NARROWEST * line), high + (_ABOVE + _BELOW) * line
+
+    def hide(self) -> None:
+        """Hide everything until it is drawn again."""
+        with self._lock, self._server.atomic():
+            self._nodes.hide()
+
+    def clear(self) -> None:
+        """Remove everything."""
+        with self._lock:
+            self._nodes.clear()
+            self._is_ground_laid = False
+
+    def turn(self, eye: Eye) -> None:
+        """Keep the sides left and right as the camera turns."""
+        with self._lock, self._server.atomic():
+            self._eye = eye
+            if self._captions["a"]:
+                self._place()
+
+    def draw(
+        self, halves: Halves, look: Look, layers: Layers, way: Way | None, *, is_playing: bool
+    ) -> None:
+        """Bring both sides to a moment.
+
+        Args:
+            halves: What is on both sides.
+            look: What the panel chose.
+            layers: What is shown.
+            way: How the rollouts are compared; None if they cannot be.
+            is_playing: Whether the clock is running, so that less may be sent.
+        """
+        has_one_hand = look.mode != "side" and _have_same_hands(halves)
+        with self._lock, self._server.atomic():
+            self._look, self._way = replace(look), way
+            self._captions = {name: half.side.caption for name, half in halves.items()}
+            if not self._is_ground_laid:
+                self._is_ground_laid = True
+                add_ground(self._nodes, self._content, self._framing)
+            self._nodes.show("/ground", is_visible=layers.ground)
+            self._nodes.color_ground("/ground", is_dark=layers.dark)
+            self._place()
+            for name, half in halves.items():
+                is_shown = look.strength(name) > 0.0
+                is_lone = not (has_one_hand and name == "b")
+                self._draw_hands(name, half, is_visible=layers.hands and is_shown and is_lone)
+                is_observed = layers.observed and is_shown and is_lone
+                self._nodes.plane = self._plane(name)
+                self._draw_observed(name, half, is_playing, is_visible=is_observed)
+                self._draw_object(name, halves, layers, is_playing=is_playing)
+                self._nodes.plane = None
+
+    def _draw_object(self, name: str, halves: Halves, layers: Layers, *, is_playing: bool) -> None:
+        half, other = halves[name], halves["b" if name == "a" else "a"].side
+        take, drawing, strength = half.side.take, self._drawings[name], self._look.strength(name)
+        if take is None or take.ready == 0:
+            return
+        # Springs would hide the other side long before they have faded.
+        is_strong = strength > 0.5
+        shown = replace(
+            layers,
+            nodes=False,
+            all_controls=False,
+            controls=layers.controls and is_strong,
+            virtual_springs=layers.virtual_springs and is_strong,
+            object_springs=layers.object_springs and is_strong,
+            forces=layers.forces and is_strong,
+        )
+        hands = sum(hand.vertex.shape[1] for hand in half.content.hands) if layers.hands else 0
+        observed = _PLAYING_OBSERVED if layers.observed else 0
+        points = take.model.node_count + len(drawing.attached(take)) + hands + observed
+        budget = share_bytes(FIGURE_BYTES // 2 - 15 * points, take, layers, ARROWS)
+        if not is_playing:
+            budget = replace(budget, virtual=None, springs=None)
+        drawing.draw(
+            take,
+            half.side.frame,
+            shown,
+            budget,
+            force_unit=self._force_unit,
+            longest=_LONGEST * self._framing.extent,
+        )
+        point = np.asarray(take.position[half.side.frame], dtype=np.float32)
+        color = self._colors(name, half.side, other, is_dark=layers.dark)
+        size = STYLES[name].node_size * self._framing.spacing
+        is_visible = layers.nodes and strength > 0.0
+        path = f"{_ROOT}/{name}/object/compared"
+        self._nodes.points(path, point, color, size, is_visible=is_visible)
+
+    def _colors(self, name: str, side: Side, other: Side, *, is_dark: bool) -> ndarray:
+        """Choose the color of every node."""
+        take, look = side.take, self._look
+        count = 0 if take is None else take.model.node_count
+        strength = look.strength(name)
+        color: Color = STYLES[name].node
+        can = take is not None and other.take is not None and other.take.ready > 0
+        if look.tint == "difference" and self._way is not None and can and take and other.take:
+            # Over each other B tells the difference, and A stays as a shadow of itself.
+            if name == "b" or look.mode != "overlay" or look.fade == 0.0:
+                distance = take_difference(take, side.frame, other.take, other.frame, self._way)
+                return difference_colors(distance, look.scale, strength, is_dark=is_dark)
+            color = GHOST
+        return np.tile(np.array(shade(color, strength, is_dark=is_dark), np.uint8), (count, 1))
+
+    def _draw_hands(self, name: str, half: Half, *, is_visible: bool) -> None:
+        for hand in half.content.hands:
+            path = f"{_ROOT}/{name}/hand/{hand.side}"
+            vertex = np.asarray(hand.vertex[min(half.frame, len(hand.vertex) - 1)], np.float32)
+            if hand.face is None:
+                size = 0.006 * self._framing.extent
+                self._nodes.points(path, vertex, SKIN[hand.side], size, is_visible=is_visible)
+            else:
+                self._nodes.mesh(
+                    path,
+                    vertex,
+                    hand.face,
+                    SKIN[hand.side],
+                    is_visible=is_visible,
+                    opacity=_HAND_OPACITY,
+                )
+
+    def _draw_observed(self, name: str, half: Half, is_playing: bool, *, is_visible: bool) -> None:
+        observed, path = half.content.observed, f"{_ROOT}/{name}/observed"
+        if observed is None or not is_visible:
+            self._nodes.show(path, is_visible=False)
+            return
+        point = observed.points(half.frame)
+        every = max(1, -(-len(point) // _PLAYING_OBSERVED)) if is_playing else 1
+        size = 0.4 * self._framing.spacing
+        self._nodes.points(path, point[::every], GREEN, size, is_visible=True)
+
+    @property
+    def _line(self) -> float:
+        """Height of a line of text."""
+        return _LINE * self._framing.extent
+
+    def _plane(self, name: str) -> Plane | None:
+        """Find the part of the scene that belongs to a side."""
+        if self._look.mode != "wipe":
+            return None
+        sign = 1.0 if (name == "a") != self._look.is_swapped else -1.0
+        return Plane(
+            direction=(sign * self._eye.right).astype(np.float32), limit=sign * self._border()
+        )
+
+    def _border(self) -> float:
+        """Find where the line of the wipe is along the camera's right hand."""
+        middle, wide, _ = self._extents.seen(self._eye)
+        return float(middle @ self._eye.right) + (self._look.wipe - 0.5) * 1.04 * wide
+
+    def _place(self) -> None:
+        """Put sides, captions and the line of the wipe where the camera sees them."""
+        eye, nodes, line, look = self._eye, self._nodes, self._line, self._look
+        middle, wide, high = self._extents.seen(eye)
+        wide = max(wide, _NARROWEST * line)
+        is_side = look.mode == "side"
+        for name in SIDES:
+            sign = -1.0 if (name == "a") != look.is_swapped else 1.0
+            aside = 0.5 * sign * GAP * wide * eye.right if is_side else np.zeros(3)
+            nodes.frame(f"{_ROOT}/{name}", aside)
+            title, _, detail = self._captions[name].partition("\n")
+            for part, text, size, lines in (
+                ("title", title, 1.2, 2.9),
+                ("detail", detail, 0.9, 1.5),
+            ):
+                path = f"{_ROOT}/{part}_{name}"
+                if is_side:
+                    place = middle + aside + (0.5 * high + lines * line) * eye.up
+                    height = size * line
+                    nodes.label(path, text, place, anchor="center-center", height=height)
+                nodes.show(path, is_visible=is_side and bool(text))
+        foot = middle + (self._border() - float(middle @ eye.right)) * eye.right
+        ends = [foot + sign * 0.55 * high * eye.up for sign in (-1.0, 1.0)]
+        segment = np.stack(ends)[None].astype(np.float32)
+        nodes.segments(f"{_ROOT}/wipe", segment, GHOST, 2.0, is_visible=look.mode == "wipe")
+
+
+def _measure(content: Content, framing: Framing, takes: list[Take]) -> Extents:
+    tracks: list[Float[ndarray, "frame point 3"]] = []
+    for take in takes:
+        tracks += [take.position, take.control]
+    if not tracks:
+        tracks = [hand.vertex for hand in content.hands]
+    count = min((len(track) for track in tracks), default=0)
+    if count == 0:
+        corners = framing.center + 0.35 * framing.extent * np.array([[-1.0] * 3, [1.0] * 3])
+        return Extents([corners[None]], 1)
+    return Extents(tracks, count)
+
+
+def _have_same_hands(halves: Halves) -> bool:
+    """Tell whether both sides show the same hands, so that one is enough where they overlap."""
+    first, second = (
+        {h.side: np.asarray(h.vertex[min(half.frame, len(h.vertex) - 1)]) for h in hands}
+        for half in halves.values()
+        for hands in (half.content.hands,)
+    )
+    return first.keys() == second.keys() and all(
+        first[side].shape == second[side].shape
+        and np.allclose(first[side], second[side], rtol=0.0, atol=_SAME_HAND)
+        for side in first
+    )

@@ -1,0 +1,91 @@
+"""How two rollouts are shown together: side by side, one over the other, and in which colors."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from numpy import ndarray
+
+from app.viewer.colormaps import paint
+from app.viewer.object_drawing import Color, Style
+
+Mode = Literal["side", "overlay", "wipe"]
+"""Beside each other, one over the other, or A on one side of a line and B on the other."""
+MODES: dict[Mode, str] = {"side": "side by side", "overlay": "overlay", "wipe": "wipe"}
+"""What the modes are called on the panel."""
+Tint = Literal["side", "difference"]
+"""Whether nodes have the color of their side, or that of their difference."""
+SIDES = ("a", "b")
+STYLES = {
+    "a": Style(
+        node=(47, 111, 222),
+        control=(19, 60, 140),
+        spring=(152, 182, 236),
+        virtual=(92, 178, 236),
+        arrow=(24, 70, 170),
+        node_size=0.44,
+    ),
+    "b": Style(
+        node=(232, 118, 24),
+        control=(150, 66, 8),
+        spring=(243, 196, 150),
+        virtual=(244, 176, 40),
+        arrow=(196, 78, 6),
+        node_size=0.34,
+    ),
+}
+"""Colors of both sides, told apart by people who confuse red and green too; the nodes of B are
+smaller, so that both are seen where they agree."""
+GHOST: Color = (140, 148, 160)
+"""Color of A's nodes where B shows the difference from them."""
+_BACKGROUND = {False: (255, 255, 255), True: (24, 25, 28)}
+
+
+@dataclass(kw_only=True)
+class Look:
+    """What the panel of the comparison chooses."""
+
+    mode: Mode = "side"
+    """How both are placed."""
+    tint: Tint = "side"
+    """What the colors of the nodes mean."""
+    fade: float = 0.5
+    """In an overlay: 0 shows A alone, 1 shows B alone, 0.5 shows both."""
+    wipe: float = 0.5
+    """Where the line of a wipe is, as a part of the width from the left."""
+    is_swapped: bool = False
+    """Whether B is on the left."""
+    scale: float = 0.0
+    """Difference that the end of the color scale means [m]; 0 if it is not known yet."""
+
+    def strength(self, side: str) -> float:
+        """Tell how strongly a side is drawn: 0 for not at all, 1 for in its own colors."""
+        if self.mode != "overlay":
+            return 1.0
+        part = 1.0 - self.fade if side == "a" else self.fade
+        return min(1.0, 2.0 * part)
+
+
+def shade(color: Color, strength: float, *, is_dark: bool) -> Color:
+    """Let a color fade into the background."""
+    mixed = strength * np.array(color) + (1.0 - strength) * np.array(_BACKGROUND[is_dark])
+    red, green, blue = (round(float(part)) for part in mixed)
+    return red, green, blue
+
+
+def scale_end(value: float) -> float:
+    """Choose a round end of a color scale: the next of 1, 2, 5 times a power of ten."""
+    if not np.isfinite(value) or value <= 0.0:
+        return 0.0
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(next(step * power for step in (1, 2, 5, 10) if step * power >= 0.999999 * value))
+
+
+def difference_colors(
+    distance: Float[ndarray, " node"], end: float, strength: float = 1.0, *, is_dark: bool = False
+) -> UInt8[ndarray, "node 3"]:
+    """Color distances from dark blue (none) to yellow (`end` and more)."""
+    color = paint(distance, (0.0, end)).astype(np.float64)
+    mixed = strength * color + (1.0 - strength) * np.array(_BACKGROUND[is_dark])
+    return np.round(mixed).astype(np.uint8)

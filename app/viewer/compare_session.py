@@ -1,0 +1,257 @@
+"""A live session that shows two runs together, on one clock and for one camera."""
+
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+import viser
+
+from app.viewer.compare_curve import Pairing
+from app.viewer.compare_drawing import CompareDrawing, Half, Halves
+from app.viewer.compare_look import SIDES
+from app.viewer.compare_pair import CompareAsk, open_pair
+from app.viewer.compare_view import CompareView
+from app.viewer.content import Catalog, Content
+from app.viewer.dress import set_theme
+from app.viewer.export_panel import ExportPanel
+from app.viewer.figure import Side
+from app.viewer.figure_camera import FigureCameras
+from app.viewer.framing import Framing, frame_content
+from app.viewer.guard import Guard, plain
+from app.viewer.layers import Layers, default_layers
+from app.viewer.panels import LayersPanel, TimelinePanel
+from app.viewer.playback import Playback
+from app.viewer.session_state import Kind, Pose, SessionInfo, SessionState
+from app.viewer.snapshot import Snapshot
+from app.viewer.viser_server import start_viser
+
+
+class CompareSession:
+    """What one browser tab looks at: two runs in one viser server, with one panel and clock."""
+
+    kind: Kind = "comparison"
+
+    def __init__(
+        self,
+        session_id: str,
+        *,
+        target: str,
+        owner: str,
+        catalog: Catalog,
+        state: SessionState | None = None,
+    ) -> None:
+        """Open both runs; raises the catalog's errors before a server is started.
+
+        Args:
+            session_id: Unguessable id.
+            target: Query of a `CompareAsk`.
+            owner: Whose session it is.
+            catalog: Finds the runs.
+            state: What to begin with, as `state` of another session told it.
+        """
+        self.id = session_id
+        self.owner = owner
+        self.created = time.time()
+        self._ask = CompareAsk.parse(target)
+        self._pair = open_pair(catalog, self._ask)
+        self._seen = time.monotonic()
+        self._has_played = False
+        self._lock = threading.RLock()
+        self._cameras = FigureCameras()
+        self._server = start_viser(plain(self._pair.title))
+        self._guard = Guard(self._server)
+        clock = self._pair.clock
+        self._playback = Playback(clock.tick_count, clock.rate, self._draw)
+        try:
+            self._build()
+            self._restore(state)
+        except BaseException:
+            self._server.stop()
+            raise
+        self._playback.start()
+
+    @property
+    def port(self) -> int:
+        """Loopback port of the viser server."""
+        return self._server.get_port()
+
+    @property
+    def target(self) -> str:
+        """Query of what is shown now, for ``/compare?…``."""
+        look = self._view.look
+        now = replace(self._ask, mode=look.mode, color=look.tint, f=self._playback.frame)
+        return now.query
+
+    @property
+    def info(self) -> SessionInfo:
+        """What a listing says about it."""
+        return SessionInfo(
+            id=self.id,
+            kind=self.kind,
+            target=self.target,
+            owner=self.owner,
+            title=self._pair.title,
+            client_count=len(self._server.get_clients()),
+            created=self.created,
+            idle=self.idle,
+        )
+
+    @property
+    def idle(self) -> float:
+        """How long nobody has looked at it [s]."""
+        if self._server.get_clients():
+            self._seen = time.monotonic()
+        return time.monotonic() - self._seen
+
+    @property
+    def state(self) -> SessionState:
+        """What the user has set up besides `target`, for a copy of this session."""
+        theme, prefers_dark = self._layers_panel.theme
+        clients = list(self._server.get_clients().values())
+        return SessionState(
+            sequence_name=self._pair.contents[0].sequence_name,
+            frame=self._playback.frame,
+            is_playing=self._playback.is_playing,
+            speed=self._playback.speed,
+            does_loop=self._playback.does_loop,
+            layers=replace(self._layers),
+            theme=theme,
+            prefers_dark=prefers_dark,
+            parameters=None,
+            automatic_substeps=False,
+            is_figure=False,
+            pose=self._cameras.before(clients[0]) if clients else None,
+        )
+
+    @property
+    def link(self) -> str:
+        """Address on this server that shows the same."""
+        return f"/compare?{self.target}"
+
+    def prefer_dark(self, *, on: bool) -> None:
+        """Follow the browser's color scheme, unless the user has chosen a background."""
+        self._layers_panel.prefer_dark(on=on)
+
+    def snapshot(self) -> Snapshot:
+        """Collect what is on the screen, for the export panel."""
+        with self._lock:
+            tick = self._playback.frame
+            halves = self._halves(tick)
+            first = halves["a"]
+            return Snapshot(
+                content=first.content,
+                frame=first.frame,
+                take=first.side.take,
+                take_frame=first.side.frame,
+                sides={name: half.side for name, half in halves.items()},
+                picture=self._view.picture(),
+                layers=replace(self._layers),
+                link=self.link,
+            )
+
+    def close(self) -> None:
+        """Stop clock, measuring and server."""
+        self._playback.close()
+        self._view.curve.close()
+        self._server.stop()
+        for content in self._pair.contents:
+            for view in content.views:
+                view.close()
+
+    def _build(self) -> None:
+        server, guard, pair = self._server, self._guard, self._pair
+        set_theme(server, dark=False)
+        shown = replace(pair.contents[0], views=())
+        framing = frame_content(shown)
+        self._layers = _first_layers(shown)
+        _place_first(server, framing)
+        takes = [content.fitted for content in pair.contents if content.fitted is not None]
+        drawing = CompareDrawing(server, shown, framing, takes)
+        self._timeline = TimelinePanel(server, self._playback, guard)
+        self._view = CompareView(
+            server,
+            guard,
+            drawing,
+            self._cameras,
+            look=self._ask.look,
+            redraw=self._playback.redraw,
+            has_keys=True,
+        )
+        self._layers_panel = LayersPanel(server, shown, guard, self._playback.redraw)
+        self._layers_panel.replace(shown, self._layers, framing)
+        ExportPanel(server, guard, self.snapshot)
+        names = {side: c.title for side, c in zip(SIDES, pair.contents, strict=True)}
+        unit = pair.contents[0].length_unit
+        self._view.panel.name(names, pair.notes, unit=unit, tick_count=pair.clock.tick_count)
+        if pair.can_measure:
+            ticks = range(pair.clock.tick_count)
+            frames = tuple(pair.clock.frames(tick) for tick in ticks)
+            self._view.follow(Pairing(first=takes[0], second=takes[1], frames=frames))
+        server.on_client_connect(guard(self._welcome))
+        server.on_client_disconnect(guard(self._part))
+
+    def _restore(self, state: SessionState | None) -> None:
+        """Go to the frame that is asked for, or on where another session stands."""
+        self._playback.seek(self._ask.f)
+        self._has_played = self._ask.f > 0
+        if state is None:
+            return
+        self._has_played = True
+        self._timeline.restore(state.speed, does_loop=state.does_loop)
+        if state.layers is not None:
+            self._layers_panel.restore(state.layers, state.theme, prefers_dark=state.prefers_dark)
+        if state.pose is not None:
+            state.pose.give_first(self._server.initial_camera)
+        self._playback.play(on=state.is_playing)
+
+    def _welcome(self, client: viser.ClientHandle) -> None:
+        """Start playing when the first client is there, and follow its camera."""
+        self._seen = time.monotonic()
+        self._view.welcome(client)
+        client.camera.on_update(self._guard(lambda _: self._view.turn(client)))
+        if not self._has_played:
+            self._has_played = True
+            self._playback.play()
+
+    def _part(self, client: viser.ClientHandle) -> None:
+        """Keep the camera of a client that leaves, for the tab that is being reloaded."""
+        self._seen = time.monotonic()
+        self._cameras.forget(client).give_first(self._server.initial_camera)
+
+    def _draw(self, tick: int, is_playing: bool) -> None:
+        with self._lock:
+            self._view.draw(tick, self._halves(tick), self._layers, is_playing=is_playing)
+            self._timeline.show(tick, is_playing=is_playing)
+
+    def _halves(self, tick: int) -> Halves:
+        frames = self._pair.clock.frames(tick)
+        parts = zip(SIDES, self._pair.contents, frames, strict=True)
+        return {side: _half(side, content, frame) for side, content, frame in parts}
+
+
+def _half(name: str, content: Content, frame: int) -> Half:
+    take = content.fitted
+    detail = "no object" if take is None else f"{take.model.node_count} nodes · frame {frame}"
+    side = Side(
+        take=take,
+        frame=min(frame, take.ready - 1) if take is not None else 0,
+        caption=f"{name.upper()} · {content.title}\n{detail}",
+    )
+    return Half(side=side, content=content, frame=frame)
+
+
+def _first_layers(content: Content) -> Layers:
+    """Show objects and hands; what holds the object would hide how two of them differ."""
+    return replace(
+        default_layers(content), controls=False, virtual_springs=False, forces=False, cameras=False
+    )
+
+
+def _place_first(server: viser.ViserServer, framing: Framing) -> None:
+    """Put the cameras of new clients where everything is seen."""
+    camera = server.initial_camera
+    camera.near, camera.far = 0.005 * framing.extent, 200.0 * framing.extent
+    up = np.array([0.0, 0.0, 1.0])
+    first = Pose(position=framing.camera, look_at=framing.look_at, up=up, fov=framing.fov)
+    first.give_first(camera)
