@@ -3,6 +3,7 @@
 import errno
 import os
 import re
+from collections.abc import Mapping
 
 _REMEDIES = {
     errno.ENOSPC: "Free some space on this disk, or choose another folder",
@@ -37,6 +38,20 @@ class PhysHandiError(Exception):
 
 class UsageError(PhysHandiError):
     """A command or request was given values that make no sense (exit code 2)."""
+
+
+class SettingsError(UsageError):
+    """Some settings of a fit make no sense; all of them are named at once."""
+
+    def __init__(self, fields: Mapping[str, str]) -> None:
+        """Tell what is wrong.
+
+        Args:
+            fields: For each setting what is wrong with it, as a sentence.
+        """
+        self.fields = dict(fields)
+        """For each setting what is wrong with it."""
+        super().__init__(" ".join(self.fields.values()))
 
 
 class SequenceError(PhysHandiError):

@@ -1,12 +1,8 @@
 """The simulation's parameters as a table: what was found beside what it began with."""
 
-import ast
-import inspect
 import math
-import re
 from collections.abc import Mapping
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +11,10 @@ from app.pages.render import short
 from physhandi.data.atomic import named_fields
 from physhandi.data.run import Run
 from physhandi.errors import PhysHandiError
+from physhandi.fitting.field_notes import notes_of
 from physhandi.simulation.model import SimulationParameters
 
 _FOUND = "object/parameters.yaml"
-_UNIT = re.compile(r"\s*\[((?:1/)?[A-Za-z][^\]\d]*)\]")
 
 
 def parameter_rows(run: Run, found: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -49,21 +45,7 @@ def parameter_rows(run: Run, found: Mapping[str, Any]) -> list[dict[str, Any]]:
 @cache
 def field_notes() -> dict[str, tuple[str, str]]:
     """Read what each simulation parameter means, and its unit, from where it is declared."""
-    (declared,) = ast.parse(inspect.getsource(SimulationParameters)).body
-    notes: dict[str, tuple[str, str]] = {}
-    body = declared.body if isinstance(declared, ast.ClassDef) else []
-    for field, note in pairwise(body):
-        if (
-            isinstance(field, ast.AnnAssign)
-            and isinstance(field.target, ast.Name)
-            and isinstance(note, ast.Expr)
-            and isinstance(note.value, ast.Constant)
-        ):
-            text = " ".join(str(note.value.value).split())
-            unit = _UNIT.search(text)
-            about = _UNIT.sub("", text)
-            notes[field.target.id] = (about, unit[1].strip() if unit else "")
-    return notes
+    return notes_of(SimulationParameters)
 
 
 def _start_of(run: Run) -> dict[str, Any]:

@@ -11,8 +11,7 @@ from numpy import ndarray
 
 from physhandi.errors import UsageError
 
-# Field -> lowest and highest value; None leaves that side open.
-_BOUNDS: dict[str, tuple[float | None, float | None]] = {
+BOUNDS: dict[str, tuple[float | None, float | None]] = {
     "connection_radius": (0.0, None),
     "max_neighbors": (0, 1000),
     "virtual_connection_radius": (0.0, None),
@@ -35,6 +34,7 @@ _BOUNDS: dict[str, tuple[float | None, float | None]] = {
     "rest_length_floor": (0.0, None),
     "virtual_rest_length_floor": (0.0, None),
 }
+"""Lowest and highest value of each parameter that is a number; None leaves that side open."""
 _INTEGERS = ("max_neighbors", "virtual_max_neighbors", "substeps_per_frame")
 _SWITCHES = (
     "use_control_velocity",
@@ -112,7 +112,7 @@ class SimulationParameters:
     """Whether nodes collide that are nearer than `collision_distance` at frame 0 (PhysTwin)."""
 
     def __post_init__(self) -> None:
-        for name, (low, high) in _BOUNDS.items():
+        for name, (low, high) in BOUNDS.items():
             value = getattr(self, name)
             if value is None and name in _OPTIONAL:
                 continue
