@@ -81,8 +81,11 @@ class ExportPanel:
         return _SIZES[self._size.value]
 
     def _press(self, event: Any) -> None:
+        self.save(event.target.value, event.client)
+
+    def save(self, kind: str, client: viser.ClientHandle) -> None:
+        """Send a file to a client, as the button of that name does."""
         snapshot = self._snapshot()
-        kind, client = event.target.value, event.client
         stem = re.sub(r"[^A-Za-z0-9_-]+", "_", snapshot.content.title)[:60] or "physhandi"
         sides, suffix = snapshot.sides, {"PLYs": "ply.zip"}.get(kind, kind.lower())
         is_of_frame = kind in _FRAME

@@ -24,6 +24,8 @@ FRAME_BYTES = 92_000
 _ARROWS = 800
 _PLAYING_ARROWS = 400
 _PLAYING_OBSERVED = 2_000
+_MANY_NODES = 2_500
+"""The surface of more nodes is not laid before somebody asks for it."""
 
 
 class Scene:
@@ -100,8 +102,16 @@ class Scene:
                 looks_from=self.layers.looks_from,
                 is_playing=is_playing,
             )
-            self._nodes.show("/ground", is_visible=self.layers.ground)
+            self._draw_ground(take)
             self._nodes.color_ground("/ground", is_dark=self.layers.dark)
+
+    @property
+    def may_have_surface(self) -> bool:
+        """Whether there are triangles; of many nodes it is not yet known."""
+        fitted = self._content.fitted
+        if fitted is None:
+            return False
+        return fitted.model.node_count > _MANY_NODES or len(self.faces) > 0
 
     @property
     def faces(self) -> Int[ndarray, "face 3"]:
@@ -125,6 +135,15 @@ class Scene:
         camera.far = 200.0 * self._framing.extent
         camera.look_at = self._framing.look_at
         camera.position = self._framing.camera
+
+    def _draw_ground(self, take: Take | None) -> None:
+        """Lay the grid where the rollout's ground is; a grid that is mere decoration stays."""
+        recorded = self._content.ground_height
+        height = recorded if take is None else take.parameters.ground_height
+        is_there = height is not None or recorded is None
+        if height is not None:
+            self._nodes.lift("/ground", height - 0.001 * self._framing.extent)
+        self._nodes.show("/ground", is_visible=self.layers.ground and is_there)
 
     def _draw_hands(self, frame: int) -> None:
         is_visible = self.layers.hands

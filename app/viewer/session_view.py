@@ -2,16 +2,21 @@
 
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import viser
 
 from app.viewer.content import Catalog, Content, open_run, open_sequence
 from app.viewer.dress import add_legend, set_theme
-from app.viewer.export_panel import ExportPanel, Snapshot
+from app.viewer.export_panel import ExportPanel
 from app.viewer.figure_mode import FigureMode
+from app.viewer.frame_strip import FrameStrip
 from app.viewer.framing import frame_content
 from app.viewer.guard import Guard, plain
+from app.viewer.inspection import Inspection
+from app.viewer.keep_panel import Keeping
 from app.viewer.live import LiveSimulation
 from app.viewer.object_session import ObjectSession
 from app.viewer.panels import LayersPanel, TimelinePanel
@@ -21,6 +26,7 @@ from app.viewer.scene import Scene
 from app.viewer.session_state import Kind as Kind
 from app.viewer.session_state import SessionInfo as SessionInfo
 from app.viewer.session_state import SessionState
+from app.viewer.snapshot import Snapshot
 from app.viewer.stage import Stage
 from app.viewer.take import Take
 from app.viewer.viser_server import start_viser
@@ -39,6 +45,7 @@ class Session:
         catalog: Catalog,
         live: LiveSimulation,
         state: SessionState | None = None,
+        keeping: Keeping | None = None,
     ) -> None:
         """Open a run or a sequence; raises the catalog's errors before a server is started.
 
@@ -50,14 +57,17 @@ class Session:
             catalog: Finds runs and sequences.
             live: The process that simulates.
             state: What to begin with, as `state` of another session told it.
+            keeping: Where presets and runs are kept.
         """
         self.id = session_id
         self.kind: Kind = kind
         self.target = target
         self.owner = owner
         self.created = time.time()
+        self.link_of: Callable[[Session], str] = lambda _: ""
         self._catalog = catalog
         self._live = live
+        self._keeping = keeping
         self._seen = time.monotonic()
         self._has_played = False
         self._names: tuple[str, ...] = ()
@@ -124,8 +134,20 @@ class Session:
                 automatic_substeps=panel is not None and panel.is_automatic,
                 is_figure=self._figure.is_on,
                 pose=self._figure.pose(),
-                parameter_changes=differences(panel),
+                parameter_changes=differences(panel.history.start, panel.history.current)
+                if panel is not None
+                else {},
             )
+
+    def snapshot(self) -> Snapshot:
+        """Collect what is on the screen, to be saved."""
+        run = self._catalog.run(self.target) if self.kind == "run" else None
+        with self._lock:
+            frame = self._playback.frame
+            take, take_frame = self._take(frame)
+            snapshot = self._stage.snapshot(self._content, frame, take, take_frame)
+            layers = replace(self._stage.scene.layers)
+        return replace(snapshot, run=run, layers=layers, link=self.link_of(self))
 
     def prefer_dark(self, *, on: bool) -> None:
         """Follow the browser's color scheme, unless the user has chosen a background."""
@@ -155,10 +177,18 @@ class Session:
             choice = server.gui.add_dropdown("Sequence", self._names, initial_value=now)
             choice.on_update(guard.by_user(lambda event: self._switch(event.target.value)))
         self._timeline = TimelinePanel(server, self._playback, guard)
+        self._strip = FrameStrip(server, self._timeline.behind_slider)
         self._figure = FigureMode(server, guard, self._live, self.id, self._playback.redraw)
+        self._inspection = Inspection(
+            server,
+            guard,
+            self._playback.redraw,
+            reset_view=self._reset_view,
+            snapshot=lambda event: export.save("PNG", event.client),
+        )
         self._physics_place = server.gui.add_folder(None)
         self._layers = LayersPanel(server, self._content, guard, self._playback.redraw)
-        ExportPanel(server, guard, self._snapshot)
+        export = ExportPanel(server, guard, self.snapshot)
         self._fill()
         server.on_client_connect(guard(self._welcome))
         server.on_client_disconnect(guard(self._part))
@@ -169,7 +199,8 @@ class Session:
         framing = frame_content(content)
         scene = Scene(self._server, content, framing)
         self._stage = Stage(scene, self._figure)
-        self._layers.replace(content, scene.layers, framing)
+        self._layers.replace(content, scene.layers, framing, has_surface=scene.may_have_surface)
+        self._inspection.replace(content, scene, framing)
         run = self._catalog.run(self.target) if self.kind == "run" else None
         self._figure.offer(content, framing, run.folder if run is not None else None)
         if content.fitted is None or run is None:
@@ -184,6 +215,8 @@ class Session:
                 content=content,
                 fitted=content.fitted,
                 run=run,
+                strip=self._strip,
+                keeping=self._keeping,
             )
 
     def _restore(self, state: SessionState) -> None:
@@ -192,6 +225,7 @@ class Session:
         self._timeline.restore(state.speed, does_loop=state.does_loop)
         if state.layers is not None:
             self._layers.restore(state.layers, state.theme, prefers_dark=state.prefers_dark)
+            self._inspection.colors.restore()
         if self._object is not None and self._object.panel is not None and state.parameters:
             self._object.panel.restore(state.parameters, is_automatic=state.automatic_substeps)
         if state.pose is not None:
@@ -224,6 +258,12 @@ class Session:
             self._has_played = True
             self._playback.play()
 
+    def _reset_view(self, event: Any) -> None:
+        if self._figure.is_on:
+            self._figure.reset_view(event.client)
+        else:
+            self._layers.reset_view(event)
+
     def _part(self, client: viser.ClientHandle) -> None:
         """Keep the camera of a client that leaves, for the tab that is being reloaded."""
         self._seen = time.monotonic()
@@ -234,8 +274,16 @@ class Session:
             take, take_frame = self._take(frame)
             self._stage.draw(frame, take, take_frame, is_playing=is_playing)
             self._timeline.show(frame, is_playing=is_playing)
+            self._inspection.show(
+                take,
+                frame,
+                take_frame,
+                is_playing=is_playing,
+                is_hidden=self._figure.is_on and take is not None,
+            )
             if self._object is not None:
                 self._object.show(frame, is_playing=is_playing)
+        self._server.flush()  # viser would wait for more, up to 17 ms.
 
     def _take(self, frame: int) -> tuple[Take | None, int]:
         """Find the rollout to show in a frame, and which of its frames."""
@@ -243,9 +291,3 @@ class Session:
             return self._object.at(frame)
         fitted = self._content.fitted
         return fitted, frame if fitted is None else min(frame, fitted.ready - 1)
-
-    def _snapshot(self) -> Snapshot:
-        with self._lock:
-            frame = self._playback.frame
-            take, take_frame = self._take(frame)
-            return self._stage.snapshot(self._content, frame, take, take_frame)

@@ -1,0 +1,184 @@
+"""What there is to read of one thing in the scene."""
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from app.viewer.coloring import Painter
+from app.viewer.content import Content
+from app.viewer.layers import Coloring
+from app.viewer.legend import number
+from app.viewer.over_time import length_unit, springs_at, track_of
+from app.viewer.picking import Pick
+from app.viewer.take import Take
+
+_NAMED = 6
+Rows = list[tuple[str, str]]
+
+
+class Readings:
+    """Reads values from rollouts and hands of one content."""
+
+    def __init__(self, content: Content, painter: Painter) -> None:
+        self._content = content
+        self._painter = painter
+        self._unit = "m" if content.is_metric else content.length_unit
+
+    def settle(self, pick: Pick) -> Pick:
+        """Take a hand's vertex for the control node that it is, if it is one."""
+        first = self._first_control(pick.side) if pick.kind == "hand" else None
+        return pick if first is None else Pick(kind="control", index=first + pick.index)
+
+    def title(self, pick: Pick, take: Take | None) -> str:
+        """Name a thing."""
+        if pick.kind == "spring" and take is not None:
+            is_own = pick.index < take.model.object_spring_count
+            return f"{'object' if is_own else 'virtual'} spring {pick.index}"
+        if pick.kind == "hand":
+            return f"{pick.side} hand, vertex {pick.index}"
+        if pick.kind == "control":
+            for hand in self._content.hands:
+                first = self._first_control(hand.side)
+                if first is not None and 0 <= pick.index - first < hand.vertex.shape[1]:
+                    vertex = pick.index - first
+                    return f"control node {pick.index} ({hand.side} hand, vertex {vertex})"
+            return f"control node {pick.index}"
+        return f"object node {pick.index}"
+
+    def exists(self, pick: Pick, take: Take | None) -> bool:
+        """Tell whether a thing is there still, when the springs may be others."""
+        if pick.kind == "hand":
+            return True
+        if take is None:
+            return pick.kind == "control"
+        model = take.model
+        count = {
+            "node": model.node_count,
+            "spring": len(model.spring_nodes),
+            "control": model.control_count,
+        }
+        return pick.index < count[pick.kind]
+
+    def place(
+        self, pick: Pick, take: Take | None, frame: int, take_frame: int
+    ) -> Float[ndarray, "end 3"]:
+        """Find where a thing is: one point, or both ends of a spring [m]."""
+        if pick.kind == "hand":
+            return track_of(pick, self._content)[[min(frame, self._content.frame_count - 1)]]
+        if take is None:
+            control = self._content.control
+            return np.zeros((0, 3)) if control is None else np.asarray(control[frame])[[pick.index]]
+        point = np.concatenate([take.position[take_frame], take.control[take_frame]])
+        if pick.kind == "spring":
+            return point[take.model.spring_nodes[pick.index]]
+        offset = take.model.node_count if pick.kind == "control" else 0
+        return point[[pick.index + offset]]
+
+    def links(
+        self, pick: Pick, take: Take | None, take_frame: int
+    ) -> Float[ndarray, "segment 2 3"]:
+        """Find the spring itself, or the virtual springs that end at a thing [m]."""
+        if take is None or pick.kind == "hand":
+            return np.zeros((0, 2, 3), np.float32)
+        point = np.concatenate([take.position[take_frame], take.control[take_frame]])
+        if pick.kind == "spring":
+            return point[take.model.spring_nodes[[pick.index]]]
+        offset = take.model.node_count if pick.kind == "control" else 0
+        joined = springs_at(take, pick.index + offset)
+        return point[take.model.spring_nodes[joined[joined >= take.model.object_spring_count]]]
+
+    def rows(self, pick: Pick, take: Take | None, frame: int, take_frame: int) -> Rows:
+        """List names and values of everything that is known of a thing now."""
+        place = self.place(pick, take, frame, take_frame)
+        if pick.kind == "hand" or take is None:
+            return [("position", self._vector(place[0], self._unit))] if len(place) else []
+        if pick.kind == "spring":
+            return self._spring_rows(pick.index, take, take_frame)
+        rows = [("position", self._vector(place[0], self._unit))]
+        node_velocity, control_velocity = (take.state(take_frame)[i] for i in (1, 3))
+        velocity = (node_velocity if pick.kind == "node" else control_velocity)[pick.index]
+        rows.append(("velocity", self._vector(velocity, f"{self._unit}/s", size=True)))
+        own = take.model.object_spring_count
+        offset = take.model.node_count if pick.kind == "control" else 0
+        joined = springs_at(take, pick.index + offset)
+        held = joined[joined >= own]
+        force = take.spring_forces(take_frame)[held - own].sum(axis=0)
+        if pick.kind == "node":
+            rows.append(("force of the hand", self._vector(force, "N", size=True)))
+            rows += self._node_rows(pick.index, take, take_frame, int((joined < own).sum()))
+            rows.append(("held by", self._partners(take, take_frame, held, is_control=True)))
+        else:
+            rows.append(("force on the object", self._vector(force, "N", size=True)))
+            rows.append(("holds", self._partners(take, take_frame, held, is_control=False)))
+        return rows
+
+    def _spring_rows(self, spring: int, take: Take, frame: int) -> Rows:
+        model = take.model
+        point = np.concatenate([take.position[frame], take.control[frame]])
+        a, b = (int(end) for end in model.spring_nodes[spring])
+        length = float(np.linalg.norm(point[b] - point[a]))
+        unit, factor = length_unit(self._content)
+        names = [
+            f"node {end}" if end < model.node_count else f"control node {end - model.node_count}"
+            for end in (a, b)
+        ]
+        stiffness = take.parameters.stiffness_scale * float(model.stiffness[spring])
+        rest = float(model.rest_length[spring])
+        lengths = f"{number(factor * length)} {unit}, at rest {number(factor * rest)} {unit}"
+        return [
+            ("joins", " and ".join(names)),
+            ("length", lengths),
+            ("strain", f"{number(1e2 * float(take.strains(frame)[spring]))} %"),
+            ("pull", f"{number(float(take.tensions(frame)[spring]))} N"),
+            ("stiffness", f"{number(stiffness)} N"),
+            ("damping", f"{number(float(model.damping[spring]))} N·s/m"),
+        ]
+
+    def _node_rows(self, node: int, take: Take, frame: int, spring_count: int) -> Rows:
+        rows: Rows = []
+        kinds: tuple[Coloring, ...] = ("stiffness", "damping", "strain", "error", "difference")
+        for kind in kinds:
+            if kind == "error" and not self._painter.errors.is_known:
+                continue
+            quantity = self._painter.quantity(kind)
+            value = float(self._painter.measure(kind, take, frame).node[node]) * quantity.factor
+            shown = f"{number(value)} {quantity.unit}" if np.isfinite(value) else "not known"
+            rows.append((quantity.label.lower(), shown))
+        return [*rows, ("object springs", str(spring_count))]
+
+    def _partners(
+        self, take: Take, frame: int, springs: Int[ndarray, " spring"], *, is_control: bool
+    ) -> str:
+        """Name what virtual springs join a thing to, the one that pulls hardest first."""
+        if len(springs) == 0:
+            return "nothing"
+        pull = np.abs(take.tensions(frame)[springs])
+        ends = take.model.spring_nodes[springs]
+        partner = ends.max(axis=1) - take.model.node_count if is_control else ends.min(axis=1)
+        order = np.argsort(-pull, kind="stable")
+        what = "control" if is_control else "node"
+        named = [f"{what} {int(partner[i])} ({number(float(pull[i]))} N)" for i in order[:_NAMED]]
+        more = len(springs) - len(named)
+        return ", ".join(named) + (f" and {more} more" if more else "")
+
+    def _first_control(self, side: str | None) -> int | None:
+        """Find the control node that is the first vertex of a hand; None if they are others."""
+        control = self._content.control
+        total = sum(hand.vertex.shape[1] for hand in self._content.hands)
+        if control is None or control.shape[1] != total:
+            return None
+        sides = [hand.side for hand in self._content.hands]
+        for order in (self._content.hands, self._content.hands[::-1]):
+            vertex = np.concatenate([np.asarray(hand.vertex[0]) for hand in order])
+            if np.allclose(vertex, control[0], rtol=0.0, atol=1e-5) and side in sides:
+                counts = [h.vertex.shape[1] for h in order]
+                at = [h.side for h in order].index(side)  # pyright: ignore[reportArgumentType]
+                return sum(counts[:at])
+        return None
+
+    @staticmethod
+    def _vector(value: ndarray, unit: str, *, size: bool = False) -> str:
+        parts = ", ".join(number(round(float(v), 6)) for v in value)
+        if not size:
+            return f"{parts} {unit}"
+        return f"{number(float(np.linalg.norm(value)))} {unit} ({parts})"
