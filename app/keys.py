@@ -22,6 +22,10 @@ Action = Literal[
     "snapshot",
     "figure",
     "theme",
+    "undo",
+    "redo",
+    "hold",
+    "one_frame",
 ]
 """What a key does in the live scene."""
 
@@ -38,7 +42,7 @@ class Key:
     """What it triggers in the live scene; None for what the browser or the page does."""
     hotkeys: tuple[str, ...] = ()
     """Names by which the scene knows the keys."""
-    modifier: Literal["shift"] | None = None
+    modifier: Literal["shift", "cmd/ctrl", "cmd/ctrl+shift"] | None = None
     """Key that is held with it."""
 
 
@@ -118,6 +122,27 @@ KEYS: tuple[KeyGroup, ...] = (
             Key(shown=("F",), about="figure: ours and PhysTwin's", action="figure", hotkeys=("F",)),
             Key(shown=("S",), about="save a picture", action="snapshot", hotkeys=("S",)),
             Key(shown=("P",), about="copy a link to this view"),
+        ),
+    ),
+    KeyGroup(
+        title="Physics",
+        keys=(
+            Key(
+                shown=("ctrl", "Z"),
+                about="undo a change of the parameters",
+                action="undo",
+                hotkeys=("Z",),
+                modifier="cmd/ctrl",
+            ),
+            Key(
+                shown=("ctrl", "shift", "Z"),
+                about="redo it",
+                action="redo",
+                hotkeys=("Z",),
+                modifier="cmd/ctrl+shift",
+            ),
+            Key(shown=("H",), about="hold the simulation or go on", action="hold", hotkeys=("H",)),
+            Key(shown=("N",), about="simulate one more frame", action="one_frame", hotkeys=("N",)),
         ),
     ),
     KeyGroup(

@@ -93,6 +93,7 @@ class ViewerClient:
 
     def set(self, label: str, value: Any) -> None:
         """Move a slider, tick a box, choose or press."""
+        self.until(lambda: self.find(label))
         self.send("GuiUpdateMessage", uuid=self.find(label), updates={"value": value})
 
     def find(self, label: str) -> str:

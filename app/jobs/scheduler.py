@@ -135,6 +135,11 @@ class Scheduler:
             self._enqueue(run)
         return run
 
+    def start_now(self, run: Run) -> None:
+        """Start a run beside the line, for what takes seconds while somebody waits."""
+        with self._lock:
+            self._start(RunItem(run.id, run.folder, False, run, None))
+
     def resume(self, run_id: str) -> None:
         """Queue a run that did not succeed again; it goes on after its last finished stage.
 

@@ -11,7 +11,7 @@ from app.viewer.guard import Guard
 
 def bind(
     server: viser.ViserServer, guard: Guard, action: Action, act: Callable[[Any, int], None]
-) -> None:
+) -> list[viser.CommandHandle]:
     """Let the keys of an action, as `app.keys` lists them, call a function.
 
     Args:
@@ -19,8 +19,12 @@ def bind(
         guard: Wraps the callback.
         action: Which keys.
         act: Gets the event and, if the action has several keys, which of them it was.
+
+    Returns:
+        The commands, for one who takes them away before the server stops.
     """
     key = key_of(action)
+    commands: list[viser.CommandHandle] = []
     for number, hotkey in enumerate(key.hotkeys):
         name: Any = hotkey
         label = key.about
@@ -30,3 +34,5 @@ def bind(
             label[0].upper() + label[1:], hotkey=name, modifier=key.modifier
         )
         command.on_trigger(guard(lambda event, number=number: act(event, number)))
+        commands.append(command)
+    return commands

@@ -163,6 +163,10 @@ class SceneNodes:
         """Draw lines of a width in pixels, of one color or of a color for each end."""
         node = self._nodes.get(name)
         is_visible = is_visible and len(segment) > 0
+        if node is not None and is_visible and node.colors.ndim != np.ndim(color):
+            # The viewer's lines do not change between one color and a color for each end.
+            self._nodes.pop(name).remove()
+            node = None
         if node is None and is_visible:
             self._nodes[name] = self._scene.add_line_segments(
                 name,
@@ -216,6 +220,12 @@ class SceneNodes:
             fade_distance=2.0 * cell * count,
             position=center,
         )
+
+    def lift(self, name: str, height: float) -> None:
+        """Put a node at another height."""
+        node = self._nodes.get(name)
+        if node is not None and abs(float(node.position[2]) - height) > 1e-9:
+            node.position = (float(node.position[0]), float(node.position[1]), height)
 
     def color_ground(self, name: str, *, is_dark: bool) -> None:
         """Color the grid for a light or a dark background."""

@@ -1,16 +1,22 @@
 """The object of one session: its rollouts, the sliders that change them, and what is heard."""
 
+import threading
+
 import viser
 
 from app.viewer.content import Content
 from app.viewer.error_panel import ErrorPanel, load_track_error
+from app.viewer.frame_strip import FrameStrip
 from app.viewer.guard import Guard, notify
+from app.viewer.keep_panel import Keeping
 from app.viewer.live import LiveSimulation
-from app.viewer.physics_panel import PhysicsPanel
+from app.viewer.physics_panel import GO, STEP, PhysicsPanel
 from app.viewer.playback import Playback
 from app.viewer.resimulation import Resimulation
+from app.viewer.save_run import run_changes
 from app.viewer.take import Take
 from physhandi.data.run import Run
+from physhandi.errors import UsageError
 from physhandi.simulation.model import SimulationParameters
 
 
@@ -28,6 +34,8 @@ class ObjectSession:
         content: Content,
         fitted: Take,
         run: Run,
+        strip: FrameStrip,
+        keeping: Keeping | None = None,
     ) -> None:
         """Listen to the live simulation and add the physics panel where the caller stands.
 
@@ -40,10 +48,17 @@ class ObjectSession:
             content: What is shown.
             fitted: The fitted rollout.
             run: The run.
+            strip: Shows which frames are new.
+            keeping: Where presets and runs are kept; None where nothing can be kept.
         """
         self._server = server
         self._playback = playback
         self._fitted = fitted
+        self._run = run
+        self._sequence = content.sequence_name
+        self._strip = strip
+        self._keeping = keeping
+        self._closed = threading.Event()
         self._panel: PhysicsPanel | None = None
         self._resimulation = Resimulation(
             session,
@@ -53,7 +68,16 @@ class ObjectSession:
             sequence=content.sequence_name,
             on_change=self._hear,
         )
-        self._panel = PhysicsPanel(server, content, fitted, guard, self._simulate)
+        self._panel = PhysicsPanel(
+            server,
+            content,
+            fitted,
+            guard,
+            self._simulate,
+            set_pace=self._set_pace,
+            keeping=keeping,
+            save=self._save,
+        )
         error = load_track_error(run, content.sequence_name, fitted.frame_count)
         self._errors = ErrorPanel(server, content, fitted, error)
         self._panel.show(self._resimulation.readout, at_once=True)
@@ -73,7 +97,10 @@ class ObjectSession:
 
     def close(self) -> None:
         """Stop simulating."""
+        self._closed.set()
         self._resimulation.close()
+        if self._panel is not None:
+            self._panel.close()
 
     def remove(self) -> None:
         """Stop simulating and take the panel away."""
@@ -81,6 +108,7 @@ class ObjectSession:
         if self._panel is not None:
             self._panel.remove()
             self._errors.remove()
+            self._strip.hide()
             self._panel = None
 
     def _simulate(self, parameters: SimulationParameters, automatic_substeps: bool) -> None:
@@ -88,9 +116,51 @@ class ObjectSession:
         if parameters == self._fitted.parameters and not automatic_substeps:
             resimulation.show_fitted()
             return
-        resimulation.request(parameters, automatic_substeps=automatic_substeps)
+        self._request()
+
+    def _request(self) -> None:
+        """Simulate the parameters in force, even the fitted ones."""
+        panel = self._panel
+        if panel is not None:
+            parameters, is_automatic = panel.history.current, panel.is_automatic
+            self._resimulation.request(parameters, automatic_substeps=is_automatic)
+            self._show_readout(at_once=True)
+
+    def _set_pace(self, pace: str) -> None:
+        """Hold the simulation, compute one frame of it or let it run."""
+        resimulation = self._resimulation
+        readout = resimulation.readout
+        if pace != GO and not readout.is_held:
+            resimulation.hold(on=True)
+        if pace == GO:
+            resimulation.hold(on=False)
+        elif pace == STEP:
+            if not readout.is_busy:
+                self._request()
+            resimulation.step()
+        self._show_readout(at_once=True)
+
+    def _save(self, name: str) -> None:
+        """Have what is on the screen simulated and measured as a run of its own."""
+        panel, keeping = self._panel, self._keeping
+        if panel is None or panel.keep is None or keeping is None:
+            return
+        readout = self._resimulation.readout
+        if readout.error is not None:
+            raise UsageError(
+                f"The simulation stopped at frame {readout.simulated_count}, and as a run it would "
+                "too. Change the parameters until it reaches the end."
+            )
+        now, is_automatic = panel.history.current, panel.is_automatic
+        changes = run_changes(self._run, self._fitted.parameters, now, is_automatic=is_automatic)
+        run = keeping.saver.save(self._run.id, self._sequence, name, changes)
+        keeping.saver.follow(run, panel.keep.tell, self._closed)
+
+    def _show_readout(self, *, at_once: bool) -> None:
+        readout = self._resimulation.readout
         if self._panel is not None:
-            self._panel.show(resimulation.readout, at_once=True)
+            self._panel.show(readout, at_once=at_once)
+            self._strip.show(readout, at_once=at_once)
 
     def _hear(self, kind: str, ready: int) -> None:
         """Follow the live simulation; runs in its thread."""
@@ -98,10 +168,13 @@ class ObjectSession:
         if panel is None:
             return
         readout = self._resimulation.readout
-        panel.show(readout, at_once=kind != "frame")
+        panel.show(readout, at_once=kind != "frame" or readout.is_held)
+        self._strip.show(readout, at_once=kind != "frame" or readout.is_held)
         self._errors.follow(self._resimulation.newest, at_once=kind != "frame")
         if kind == "frame":
-            self._follow(ready)
+            self._follow(ready, is_held=readout.is_held)
+            return
+        if kind in {"stability", "ready"}:
             return
         self._playback.limit(self._playback.frame_count)
         if kind == "diverged":
@@ -115,10 +188,13 @@ class ObjectSession:
             title = "The live simulation stopped and was started anew"
             notify(self._server, title, then, color="orange")
 
-    def _follow(self, ready: int) -> None:
+    def _follow(self, ready: int, *, is_held: bool) -> None:
         """Let the running clock follow the frames that are ready, from the first one on."""
         playback = self._playback
-        if playback.is_playing:
+        if is_held:
+            playback.play(on=False)
+            playback.seek(ready - 1)
+        elif playback.is_playing:
             playback.limit(ready)
             if ready == 1:
                 playback.seek(0)

@@ -6,6 +6,12 @@ from dataclasses import dataclass
 from physhandi.simulation.model import SimulationParameters
 
 _DIGITS = 3
+_OTHERS = {
+    "substeps_per_frame": "substeps",
+    "rest_length_floor": "shortest object spring [m]",
+    "virtual_rest_length_floor": "shortest virtual spring [m]",
+    "use_control_velocity": "dashpots see the hand move",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,6 +30,8 @@ class Knob:
     """Distance of two slider values."""
     hint: str
     """What it does."""
+    name: str = ""
+    """What it is called outside of its folder; empty for the label."""
     scale: float = 1.0
     """Slider value for a parameter of 1."""
     is_integer: bool = False
@@ -54,6 +62,10 @@ class Knob:
         value = getattr(parameters, self.field) * self.scale
         return f"x{value:.3g}" if self.is_logarithm else f"{value:.4g}"
 
+    def differs(self, start: SimulationParameters, now: SimulationParameters) -> bool:
+        """Tell whether two sets of parameters differ in this one."""
+        return getattr(start, self.field) != getattr(now, self.field)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Switch:
@@ -65,18 +77,29 @@ class Switch:
     """Name beside the box."""
     hint: str
     """What it does."""
+    name: str = ""
+    """What it is called outside of its folder; empty for the label."""
 
     def to_slider(self, parameters: SimulationParameters) -> bool:
         """Find whether the box is ticked."""
         return bool(getattr(parameters, self.field))
 
-    def from_slider(self, value: float) -> bool:
+    def from_slider(self, value: float) -> bool | float | None:
         """Find the parameter of a box."""
         return bool(value)
 
     def text(self, parameters: SimulationParameters) -> str:
         """Write the parameter as a person reads it."""
         return "on" if self.to_slider(parameters) else "off"
+
+    def differs(self, start: SimulationParameters, now: SimulationParameters) -> bool:
+        """Tell whether the box is ticked in one of two sets of parameters only."""
+        return self.to_slider(start) != self.to_slider(now)
+
+
+def name_of(knob: Knob | Switch) -> str:
+    """Give the name by which a parameter is known outside of its folder."""
+    return (knob.name or knob.label).replace(" 10^", "")
 
 
 def knobs(parameters: SimulationParameters, *, length_unit: str) -> tuple[Knob, ...]:
@@ -88,15 +111,30 @@ def knobs(parameters: SimulationParameters, *, length_unit: str) -> tuple[Knob, 
     """
 
     def radius(field: str, label: str, hint: str) -> Knob:
-        return _length(parameters, field, label, hint, length_unit, widest=80.0, step=0.5)
+        return length_knob(parameters, field, label, hint, length_unit, widest=80.0, step=0.5)
 
     def neighbors(field: str, label: str, hint: str) -> Knob:
         high = max(80, getattr(parameters, field))
         return Knob(field=field, label=label, low=1, high=high, step=1, hint=hint, is_integer=True)
 
     def plain(field: str, label: str, high: float, step: float, hint: str) -> Knob:
-        high = max(high, 2 * getattr(parameters, field))
+        high = max(high, round_up(2 * getattr(parameters, field)))
         return Knob(field=field, label=label, low=0.0, high=high, step=step, hint=hint)
+
+    def apart(field: str, label: str, hint: str) -> tuple[Knob, ...]:
+        """Make a slider that multiplies one kind of stiffness; none where it was fitted to 0."""
+        fitted = getattr(parameters, field)
+        knob = Knob(
+            field=field,
+            label=label,
+            low=-2.0,
+            high=1.0,
+            step=0.05,
+            hint=hint,
+            scale=1.0 / max(fitted, 1e-30),
+            is_logarithm=True,
+        )
+        return (knob,) if fitted > 0 else ()
 
     return (
         radius("connection_radius", "δ object", "Object nodes nearer than this get a spring."),
@@ -118,56 +156,19 @@ def knobs(parameters: SimulationParameters, *, length_unit: str) -> tuple[Knob, 
             hint="Multiplies the stiffness of every spring: 0 is as fitted, -1 a tenth.",
             is_logarithm=True,
         ),
+        *apart("stiffness", "k object 10^", "Multiplies the stiffness of object springs alone."),
+        *apart(
+            "virtual_stiffness",
+            "k virtual 10^",
+            "Multiplies the stiffness of virtual springs alone.",
+        ),
         plain("damping", "damping [N·s/m]", 300.0, 1.0, "Dashpot along each spring."),
         plain("drag", "drag [1/s]", 20.0, 0.1, "How fast every motion dies out."),
         plain("gravity", "gravity [m/s²]", 20.0, 0.1, "Acceleration downwards."),
     )
 
 
-def self_collision_knobs(
-    parameters: SimulationParameters, *, length_unit: str
-) -> tuple[Knob | Switch, ...]:
-    """List what changes the collisions of object nodes with each other; see `knobs`."""
-    return (
-        Switch(
-            field="self_collision",
-            label="nodes collide",
-            hint="Object nodes bounce off each other, so that layers of cloth stay apart.",
-        ),
-        _length(
-            parameters,
-            "collision_distance",
-            "distance",
-            "Nodes that approach each other nearer than this collide.",
-            length_unit,
-            widest=20.0,
-            step=0.1,
-        ),
-        Knob(
-            field="self_restitution",
-            label="restitution of nodes",
-            low=0.0,
-            high=1.0,
-            step=0.05,
-            hint="Part of the approach speed that a collision gives back.",
-        ),
-        Knob(
-            field="self_friction",
-            label="friction of nodes",
-            low=0.0,
-            high=2.0,
-            step=0.05,
-            hint="How much nodes that touch resist sliding past each other.",
-        ),
-        Switch(
-            field="collides_rest_neighbors",
-            label="also rest neighbors",
-            hint="Also collide nodes nearer than the distance at frame 0, as PhysTwin does.",
-        ),
-    )
-
-
-def _length(
+def length_knob(
     parameters: SimulationParameters,
     field: str,
     label: str,
@@ -181,7 +182,7 @@ def _length(
     is_metric = length_unit == "m"
     per_metre, unit = (1e3, "mm") if is_metric else (1.0, length_unit)
     fitted = getattr(parameters, field) * per_metre
-    high = max(widest, 1.5 * fitted) if is_metric else max(4 * fitted, 1e-6)
+    high = max(widest, round_up(1.5 * fitted)) if is_metric else max(4 * fitted, 1e-6)
     step = step if is_metric else high / 200
     return Knob(
         field=field,
@@ -194,13 +195,56 @@ def _length(
     )
 
 
-def what_changed(
-    knobs: tuple[Knob | Switch, ...], start: SimulationParameters, now: SimulationParameters
-) -> str:
-    """Say which parameters differ from the fitted ones, for example ``δ object 20 → 35 mm``."""
-    parts = [
-        f"{knob.label.replace(' 10^', '')} {knob.text(start)} → {knob.text(now)}"
-        for knob in knobs
-        if getattr(start, knob.field) != getattr(now, knob.field)
+def round_up(value: float) -> float:
+    """Give the next number of two digits, as the end of a slider."""
+    unit = 10.0 ** (math.floor(math.log10(max(value, 1e-12))) - 1)
+    return float(f"{math.ceil(value / unit) * unit:.3g}")
+
+
+@dataclass(frozen=True)
+class Change:
+    """One parameter that is not as fitted."""
+
+    name: str
+    """What people call it."""
+    fields: tuple[str, ...]
+    """Fields of `SimulationParameters` that it is."""
+    text: str
+    """What became of it, for example ``δ object [mm] 20 → 35``."""
+
+
+def changes_in(
+    knobs: tuple[Knob | Switch, ...],
+    start: SimulationParameters,
+    now: SimulationParameters,
+    *,
+    is_automatic: bool = False,
+) -> tuple[Change, ...]:
+    """List what is not as fitted: in the sliders' words, and what no slider moves by its field.
+
+    Args:
+        knobs: The sliders and boxes.
+        start: The fitted parameters.
+        now: Those in force.
+        is_automatic: Whether the substeps are chosen automatically.
+    """
+    changes = [
+        Change(name := name_of(k), (k.field,), f"{name} {k.text(start)} → {k.text(now)}")
+        for k in knobs
+        if k.differs(start, now)
     ]
-    return ", ".join(parts) or "nothing: parameters as fitted"
+    shown = {knob.field for knob in knobs}
+    was, values = start.to_dict(), now.to_dict()
+    if is_automatic:
+        values["substeps_per_frame"] = "automatic"
+    for field, value in values.items():
+        if field not in shown and value != was[field]:
+            name = _OTHERS.get(field, field)
+            changes.append(Change(name, (field,), f"{name} {_said(was[field])} → {_said(value)}"))
+    return tuple(changes)
+
+
+def _said(value: object) -> str:
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,4 +1,4 @@
-"""The panel that changes the physics: sliders, undo, and what the simulation says."""
+"""The panel that changes the physics: sliders, undo, pace, and what the simulation says."""
 
 import math
 import threading
@@ -6,31 +6,33 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import viser
 
+from app.keys import Action
+from app.viewer.contact_knobs import ground_knobs, self_collision_knobs
 from app.viewer.content import Content
 from app.viewer.guard import Guard
 from app.viewer.history import History
-from app.viewer.parameters import (
-    Knob,
-    Switch,
-    knobs,
-    self_collision_knobs,
-    what_changed,
-)
-from app.viewer.resimulation import Readout
+from app.viewer.keep_panel import Keeping, KeepPanel, PresetChoice
+from app.viewer.keyboard import bind
+from app.viewer.parameters import changes_in, knobs
+from app.viewer.resimulation import STARTING, Readout
+from app.viewer.slider_set import SliderSet
+from app.viewer.substeps_choice import SubstepsChoice, warning
 from app.viewer.take import Take
 from physhandi.simulation.model import SimulationParameters
 
 _FIRST_KNOBS = 5
 _REFRESH = 0.2
 _UNDO, _REDO, _RESET = "Undo", "Redo", "Reset"
-_CHANGED = "● "
-_AS_FITTED, _AUTOMATIC = "as fitted", "automatic"
+HOLD, STEP, GO = "Hold", "1 frame", "Go"
+"""The pace of the simulation: wait, compute one frame, run."""
+_PUT_BACK = "choose…"
 
 
 class PhysicsPanel:
-    """Sliders that re-simulate the object, and the readout below them."""
+    """Sliders that re-simulate the object, and the readout above them."""
 
     def __init__(
         self,
@@ -39,6 +41,10 @@ class PhysicsPanel:
         fitted: Take,
         guard: Guard,
         simulate: Callable[[SimulationParameters, bool], None],
+        *,
+        set_pace: Callable[[str], None],
+        keeping: Keeping | None = None,
+        save: Callable[[str], None] | None = None,
     ) -> None:
         """Add the panel.
 
@@ -48,57 +54,92 @@ class PhysicsPanel:
             fitted: The fitted rollout.
             guard: Wraps the callbacks.
             simulate: Simulates parameters, with substeps chosen automatically or not.
+            set_pace: Lets the simulation wait, compute one frame or run (`HOLD`, `STEP`, `GO`).
+            keeping: Where presets and runs are kept; None where nothing can be kept.
+            save: Makes a run of a name out of what is on the screen.
         """
         self.history = History(fitted.parameters)
         self._simulate = simulate
-        unit = content.length_unit
-        main_knobs = knobs(fitted.parameters, length_unit=unit)
-        collision_knobs = self_collision_knobs(fitted.parameters, length_unit=unit)
-        self._knobs = (*main_knobs, *collision_knobs)
+        self._set_pace = set_pace
+        self._is_held = False
+        self._changed: dict[str, tuple[str, ...]] = {}
         self._is_metric = content.is_metric
         self._unit = "mm" if content.is_metric else content.length_unit
-        self._sliders: dict[str, Any] = {}
         self._refreshed = -math.inf
         self._lock = threading.Lock()
-        gui = server.gui
+        self.keep: KeepPanel | None = None
+        gui, unit, parameters = server.gui, content.length_unit, fitted.parameters
+        height = np.asarray(fitted.position[0])[:, 2]
+        low, high = float(height.min()), float(height.max())
+        main_knobs = knobs(parameters, length_unit=unit)
+        store = None if keeping is None else keeping.presets
         self._folder = gui.add_folder("Physics")
         with self._folder:
             self._status = gui.add_markdown("")
-            self._progress = gui.add_progress_bar(100.0, color="blue")
-            for knob in main_knobs[:_FIRST_KNOBS]:
-                self._add_slider(gui, knob, guard)
-            buttons = gui.add_button_group("History", (_UNDO, _REDO, _RESET))
-            buttons.on_click(guard(self._press))
+            pace = gui.add_button_group(
+                "Simulation",
+                (HOLD, STEP, GO),
+                hint="Hold it, compute one frame (N), or let it go on (H)",
+            )
+            pace.on_click(guard(lambda event: set_pace(event.target.value)))
+            self._presets = PresetChoice(
+                gui, guard, self.history, length_unit=unit, store=store, moved=self._run
+            )
+            self._sliders = SliderSet(gui, guard, self.history, self._moved)
+            self._sliders.add(*main_knobs[:_FIRST_KNOBS])
+            buttons = gui.add_button_group(
+                "History", (_UNDO, _REDO, _RESET), hint="Ctrl+Z and Ctrl+Shift+Z"
+            )
+            buttons.on_click(guard(lambda event: self._press(event.target.value)))
             self._changes = gui.add_markdown("")
+            self._put_back: Any = gui.add_dropdown(
+                "Put back",
+                (_PUT_BACK,),
+                visible=False,
+                hint="Give one parameter its fitted value again",
+            )
+            self._put_back.on_update(guard.by_user(lambda _: self._put_one_back()))
             with gui.add_folder("More physics", expand_by_default=False):
-                for knob in main_knobs[_FIRST_KNOBS:]:
-                    self._add_slider(gui, knob, guard)
-                self._substeps = gui.add_dropdown(
-                    "substeps",
-                    (_AS_FITTED, _AUTOMATIC),
-                    hint="Automatic takes as few substeps as are stable at frame 0",
-                )
-                self._substeps.on_update(guard.by_user(lambda _: self._run()))
+                self._sliders.add(*main_knobs[_FIRST_KNOBS:])
+                self._substeps = SubstepsChoice(gui, guard, self.history, self._run)
+            with gui.add_folder("Ground", expand_by_default=False):
+                self._sliders.add(*ground_knobs(parameters, length_unit=unit, low=low, high=high))
             with gui.add_folder("Self-collision", expand_by_default=False):
-                for knob in collision_knobs:
-                    self._add_slider(gui, knob, guard)
+                self._sliders.add(*self_collision_knobs(parameters, length_unit=unit))
+            if keeping is not None and save is not None:
+                self.keep = KeepPanel(
+                    gui,
+                    guard,
+                    self.history,
+                    choice=self._presets,
+                    length_unit=unit,
+                    keeping=keeping,
+                    save=save,
+                )
+        self._commands = self._add_keys(server, guard)
 
     @property
     def is_automatic(self) -> bool:
         """Whether the number of substeps is chosen automatically."""
-        return self._substeps.value == _AUTOMATIC
+        return self.history.is_automatic
 
     def restore(self, parameters: SimulationParameters, *, is_automatic: bool) -> None:
         """Simulate what another session of the same object simulates."""
-        self._substeps.value = _AUTOMATIC if is_automatic else _AS_FITTED
-        self.history.replace(parameters)
-        self._show_parameters()
-        if is_automatic or parameters != self.history.start:
+        self.history.replace(parameters, is_automatic=is_automatic)
+        if self.history.is_changed:
             self._run()
 
     def remove(self) -> None:
         """Take the panel away."""
+        self.close()
+        for command in self._commands:
+            command.remove()
         self._folder.remove()
+
+    def close(self) -> None:
+        """Stop listening to what others keep."""
+        if self.keep is not None:
+            self.keep.close()
 
     def show(self, readout: Readout, *, at_once: bool) -> None:
         """Write the readout, not more often than people can read.
@@ -112,76 +153,88 @@ class PhysicsPanel:
             if not at_once and now - self._refreshed < _REFRESH:
                 return
             self._refreshed = now
+        self._is_held = readout.is_held
+        self._substeps.hear(readout)
         self._status.content = self._text(readout)
-        self._progress.value = 100.0 * readout.simulated_count / max(readout.frame_count, 1)
-        self._progress.animated = readout.is_busy
-        self._progress.color = "red" if readout.error else "blue"
 
     def _text(self, readout: Readout) -> str:
+        pace = ""
+        if math.isfinite(readout.frame_duration):
+            rate = 1.0 / max(readout.frame_duration, 1e-6)
+            pace = f" · {readout.frame_duration * 1e3:.3g} ms a frame · {rate:.0f} frames/s"
         lines = [
             f"object springs {readout.object_spring_count} · "
             f"virtual springs {readout.virtual_spring_count}",
-            f"nodes {readout.node_count} · substeps {readout.substeps_per_frame}"
-            + (
-                f" · {readout.frame_duration * 1e3:.3g} ms a frame"
-                if math.isfinite(readout.frame_duration)
-                else ""
-            ),
-            f"simulated {readout.simulated_count}/{readout.frame_count} frames",
+            f"nodes {readout.node_count} · substeps {readout.substeps_per_frame}",
+            f"simulated {readout.simulated_count}/{readout.frame_count} frames{pace}",
         ]
+        if readout.is_starting:
+            lines.insert(0, STARTING)
         if math.isfinite(readout.difference):
             value = readout.difference * (1e3 if self._is_metric else 1.0)
             lines.append(f"{value:.3g} {self._unit} from the fitted rollout (mean)")
+        if readout.virtual_spring_count == 0:
+            lines.append("**⚠ No virtual spring: nothing holds the object.** Raise δ virtual.")
+        if unstable := warning(readout):
+            lines.append(unstable)
         if readout.error is not None:
             lines.append(f"**Stopped at frame {readout.simulated_count}; last good state shown**")
+        elif readout.is_held and readout.is_busy:
+            lines.append(f"**Held at frame {max(readout.simulated_count - 1, 0)}**")
+        elif readout.is_held:
+            lines.append("**Held: the next simulation waits at frame 0**")
         return "<br/>".join(lines)
 
-    def _add_slider(self, gui: viser.GuiApi, knob: Knob | Switch, guard: Guard) -> None:
-        start = knob.to_slider(self.history.start)
-        if isinstance(knob, Switch):
-            slider = gui.add_checkbox(knob.label, bool(start), hint=knob.hint)
-        elif knob.is_integer:
-            slider = gui.add_slider(
-                knob.label, int(knob.low), int(knob.high), 1, int(start), hint=knob.hint
-            )
-        else:
-            slider = gui.add_slider(
-                knob.label, knob.low, knob.high, knob.step, start, hint=knob.hint
-            )
-            slider.precision = min(slider.precision + 1, 7)  # Typed values may be finer.
-        slider.on_update(guard.by_user(lambda _, knob=knob: self._move(knob)))
-        self._sliders[knob.field] = slider
+    def _add_keys(self, server: viser.ViserServer, guard: Guard) -> list[viser.CommandHandle]:
+        actions: dict[Action, Callable[[], None]] = {
+            "undo": lambda: self._press(_UNDO),
+            "redo": lambda: self._press(_REDO),
+            "one_frame": lambda: self._set_pace(STEP),
+            "hold": lambda: self._set_pace(GO if self._is_held else HOLD),
+        }
+        return [
+            command
+            for action, act in actions.items()
+            for command in bind(server, guard, action, lambda _, __, act=act: act())
+        ]
 
-    def _move(self, knob: Knob | Switch) -> None:
-        value = knob.from_slider(self._sliders[knob.field].value)
-        before = self.history.current
-        if self.history.set(knob.field, value) != before:
+    def _press(self, name: str) -> None:
+        history = self.history
+        before = (history.current, history.is_automatic)
+        {_UNDO: history.undo, _REDO: history.redo, _RESET: history.reset}[name]()
+        if (history.current, history.is_automatic) != before or name == _RESET:
             self._run()
 
-    def _press(self, event: Any) -> None:
-        before = self.history.current
-        act = {_UNDO: self.history.undo, _REDO: self.history.redo, _RESET: self.history.reset}
-        now = act[event.target.value]()
-        self._show_parameters()
-        if now != before or event.target.value == _RESET:
+    def _put_one_back(self) -> None:
+        fields = self._changed.get(self._put_back.value)
+        if fields:
+            self.history.put_back(*fields)
             self._run()
-
-    def _show_parameters(self) -> None:
-        for knob in self._knobs:
-            self._sliders[knob.field].value = knob.to_slider(self.history.current)
-
-    def _mark_changed(self) -> None:
-        """Put a dot before the name of every slider that is not as fitted."""
-        start, now = self.history.start, self.history.current
-        for knob in self._knobs:
-            is_changed = getattr(start, knob.field) != getattr(now, knob.field)
-            label = f"{_CHANGED}{knob.label}" if is_changed else knob.label
-            slider = self._sliders[knob.field]
-            if slider.label != label:
-                slider.label = label
 
     def _run(self) -> None:
-        self._mark_changed()
-        changes = what_changed(self._knobs, self.history.start, self.history.current)
-        self._changes.content = f"Changed: {changes}"
-        self._simulate(self.history.current, self._substeps.value == _AUTOMATIC)
+        """Show the parameters in force and simulate them."""
+        self._sliders.show()
+        self._moved()
+
+    def _moved(self) -> None:
+        """Simulate what is in force, leaving the sliders to the user who moves them."""
+        history = self.history
+        self._sliders.mark()
+        self._substeps.show()
+        self._presets.show()
+        if self.keep is not None:
+            self.keep.show()
+        self._show_changes()
+        self._simulate(history.current, history.is_automatic)
+
+    def _show_changes(self) -> None:
+        history = self.history
+        changes = changes_in(
+            self._sliders.knobs, history.start, history.current, is_automatic=history.is_automatic
+        )
+        self._changed = {change.name: change.fields for change in changes}
+        text = ", ".join(change.text for change in changes)
+        self._changes.content = f"Changed: {text or 'nothing: parameters as fitted'}"
+        self._put_back.options = (_PUT_BACK, *self._changed)
+        self._put_back.value = _PUT_BACK
+        self._put_back.visible = bool(changes)

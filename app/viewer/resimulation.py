@@ -12,6 +12,9 @@ from app.viewer.take import Take
 from app.viewer.wire import Message
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
 
+STARTING = "**The simulation is starting …** The first time on a machine this takes a while."
+"""What a panel says until the live simulation has loaded or compiled what it needs."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Readout:
@@ -35,6 +38,14 @@ class Readout:
     """Mean distance from the fitted rollout over the ready frames [m]."""
     is_busy: bool
     """Whether frames are being simulated."""
+    is_starting: bool
+    """Whether the live simulation process is still loading or compiling what it needs."""
+    is_held: bool
+    """Whether the simulation goes on only when it is told to."""
+    is_fitted: bool
+    """Whether nothing but the fitted rollout is shown."""
+    needed_substeps: int | None
+    """Fewest substeps of a frame that are stable; None while that is not known."""
     error: str | None
     """Why the simulation ended early, if it did."""
 
@@ -82,7 +93,13 @@ class Resimulation:
         self._parameters = fitted.parameters
         self._durations: list[float] = []
         self._is_busy = False
+        self._is_held = False
+        self._needed: int | None = None
         live.subscribe(session, self._hear)
+        if controls is None:
+            live.prepare(
+                session, LiveRequest(run=run, sequence=sequence, parameters=fitted.parameters)
+            )
 
     def request(self, parameters: SimulationParameters, *, automatic_substeps: bool) -> None:
         """Ask for a rollout with other parameters."""
@@ -90,7 +107,7 @@ class Resimulation:
             self._parameters = parameters
             self._is_busy = True
             self._incoming = None
-            self._durations = []
+            self._durations, self._needed = [], None
             # Answers to earlier requests are refused from here on.
             self._request = self._live.request(
                 self._session,
@@ -103,13 +120,23 @@ class Resimulation:
                 ),
             )
 
+    def hold(self, *, on: bool) -> None:
+        """Hold the simulation, and those asked for from now on, or let it go on."""
+        with self._lock:
+            self._is_held = on
+            self._live.hold(self._session, on=on)
+
+    def step(self) -> None:
+        """Let the held simulation go on by one frame."""
+        self._live.step(self._session)
+
     def show_fitted(self) -> None:
         """Go back to the fitted rollout without simulating it."""
         with self._lock:
             self._live.cancel(self._session)
             self._request = 0
             self._shown, self._incoming = self.fitted, None
-            self._durations, self._is_busy = [], False
+            self._durations, self._is_busy, self._needed = [], False, None
         self._on_change("finished", self.fitted.ready)
 
     def close(self) -> None:
@@ -150,12 +177,16 @@ class Resimulation:
                 frame_duration=float(np.mean(durations)) if durations else float("nan"),
                 difference=take.mean_distance(self.fitted) if not self._is_busy else float("nan"),
                 is_busy=self._is_busy,
+                is_starting=not self._live.is_ready,
+                is_held=self._is_held,
+                is_fitted=take is self.fitted and not self._is_busy,
+                needed_substeps=self._needed,
                 error=take.error,
             )
 
     def _hear(self, message: Message) -> None:
         with self._lock:
-            if message.kind != "crashed" and message["request"] != self._request:
+            if message.kind not in {"crashed", "ready"} and message["request"] != self._request:
                 return
             self._take_in(message)
             ready = self._incoming.ready if self._incoming is not None else 0
@@ -185,6 +216,8 @@ class Resimulation:
                 )
             take.error = str(message["error"])
             self._is_busy = False
+        elif message.kind == "stability":
+            self._needed = int(message["needed"])
         elif message.kind == "finished":
             self._is_busy = False
         elif message.kind == "crashed":

@@ -1,8 +1,16 @@
+from dataclasses import replace
+
 import pytest
 
+from app.viewer.contact_knobs import self_collision_knobs
 from app.viewer.history import History
-from app.viewer.parameters import knobs, self_collision_knobs, what_changed
+from app.viewer.parameters import changes_in, knobs
 from physhandi.simulation.model import SimulationParameters
+
+
+def what_changed(*arguments, **options) -> str:
+    return ", ".join(change.text for change in changes_in(*arguments, **options))
+
 
 START = SimulationParameters(connection_radius=0.0237, damping=20.0)
 
@@ -78,7 +86,15 @@ def test_what_changed_is_said_in_the_sliders_units() -> None:
     now = SimulationParameters(connection_radius=0.035, damping=20.0, stiffness_scale=0.5)
     text = what_changed(knobs(START, length_unit="m"), START, now)
     assert text == "δ object [mm] 23.7 → 35, stiffness x1 → x0.5"
-    assert "as fitted" in what_changed(knobs(START, length_unit="m"), START, START)
+    assert what_changed(knobs(START, length_unit="m"), START, START) == ""
+    other = replace(START, use_control_velocity=False, rest_length_floor=0.0)
+    changes = changes_in(knobs(START, length_unit="m"), START, other, is_automatic=True)
+    assert [change.text for change in changes] == [
+        "substeps 667 → automatic",
+        "shortest object spring [m] 0.001 → 0",
+        "dashpots see the hand move on → off",
+    ]
+    assert changes[1].fields == ("rest_length_floor",)
 
 
 def test_self_collision_is_a_box_and_its_sliders() -> None:

@@ -17,12 +17,24 @@ class FakeLive:
         self.listener = None
         self.requests: list[LiveRequest] = []
         self.cancelled = 0
+        self.paces: list[str] = []
 
     def subscribe(self, _, listener) -> None:
         self.listener = listener
 
     def unsubscribe(self, _) -> None:
         self.listener = None
+
+    is_ready = True
+
+    def prepare(self, _, request) -> None:
+        self.prepared = request
+
+    def hold(self, _, *, on: bool) -> None:
+        self.paces.append("hold" if on else "go")
+
+    def step(self, _) -> None:
+        self.paces.append("step")
 
     def cancel(self, _) -> None:
         self.cancelled += 1

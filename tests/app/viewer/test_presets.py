@@ -1,0 +1,142 @@
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from app.viewer.preset_store import PRESET_FORMAT, PresetStore, checked_name
+from app.viewer.presets import AS_FITTED, builtin_presets, changes_of
+from physhandi.errors import UsageError
+from physhandi.simulation.model import SimulationParameters
+
+FITTED = SimulationParameters(connection_radius=0.035, drag=2.0, substeps_per_frame=230)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> PresetStore:
+    return PresetStore(tmp_path / "presets")
+
+
+def write(store: PresetStore, name: str, content: object) -> None:
+    store.folder.mkdir(exist_ok=True)
+    text = content if isinstance(content, str) else json.dumps(content)
+    (store.folder / name).write_text(text, encoding="utf-8")
+
+
+def good(**changes: object) -> dict[str, object]:
+    return {"format": PRESET_FORMAT, "name": "Good", "parameters": {"drag": 5.0}} | changes
+
+
+def test_built_in_presets_change_what_they_say() -> None:
+    by_name = {preset.name: preset for preset in builtin_presets()}
+    assert by_name[AS_FITTED].apply(FITTED) == (FITTED, False)
+    stiff, is_automatic = by_name["stiff"].apply(FITTED)
+    assert (stiff.stiffness_scale, is_automatic, stiff.drag) == (5.0, True, 2.0)
+    # As the profiles of the paper and of PhysTwin have it (docs/conventions.md).
+    paper, _ = by_name["paper's hold"].apply(FITTED)
+    assert (paper.virtual_connection_radius, paper.virtual_max_neighbors) == (0.002, 3)
+    twin, _ = by_name["PhysTwin's hold"].apply(FITTED)
+    assert (twin.virtual_connection_radius, twin.virtual_max_neighbors) == (0.04, 50)
+    assert (twin.use_control_velocity, twin.substeps_per_frame) == (False, 667)
+    assert (twin.stiffness, twin.connection_radius) == (FITTED.stiffness, 0.035)
+    assert by_name["on the moon"].apply(FITTED)[0].gravity == pytest.approx(1.62)
+
+
+def test_presets_that_make_no_sense_for_an_object_are_not_offered() -> None:
+    floating = SimulationParameters(ground_height=None)
+    for unit, fitted, missing in (
+        ("m", FITTED, set()),
+        ("m", floating, {"ice", "trampoline"}),
+        ("squares", FITTED, {"paper's hold", "PhysTwin's hold", "on the moon", "weightless"}),
+    ):
+        offered = {p.name for p in builtin_presets() if p.suits(fitted, unit)}
+        assert {p.name for p in builtin_presets()} - offered == missing
+
+
+def test_a_preset_is_kept_read_by_another_server_and_deleted(store) -> None:
+    heard: list[int] = []
+    stop = store.subscribe(lambda: heard.append(1))
+    now = SimulationParameters.from_dict(FITTED.to_dict() | {"drag": 7.5, "ground_height": None})
+    changes = changes_of(FITTED, now, is_automatic=True)
+    store.save("  Wet   towel ", changes, "m")
+    (path,) = store.folder.iterdir()
+    assert path.name == "wet-towel.yaml"
+    assert yaml.safe_load(path.read_text())["parameters"] == {
+        "drag": 7.5,
+        "ground_height": None,
+        "substeps_per_frame": "auto",
+    }
+    (preset,), problems = PresetStore(store.folder).presets()
+    assert (preset.name, preset.label, problems) == ("Wet towel", "★ Wet towel", ())
+    assert preset.apply(FITTED) == (now, True)
+    store.delete("Wet towel")
+    assert list(store.folder.iterdir()) == []
+    assert len(heard) == 2
+    stop()
+    store.save("Other", {"drag": 1.0}, "m")
+    assert len(heard) == 2
+
+
+def test_the_same_name_replaces_and_another_one_of_the_same_letters_does_not(store) -> None:
+    store.save("A b", {"drag": 1.0}, "m")
+    store.save("a B", {"drag": 2.0}, "m")
+    store.save("A-b", {"drag": 3.0}, "m")
+    found = {p.name: p.changes["drag"] for p in store.presets()[0]}
+    assert found == {"a B": 2.0, "A-b": 3.0}
+    assert sorted(path.name for path in store.folder.iterdir()) == ["a-b-2.yaml", "a-b.yaml"]
+
+
+def test_json_is_read_and_stays_json(store) -> None:
+    write(store, "good.json", good())
+    (preset,), _ = store.presets()
+    assert preset.changes == {"drag": 5.0}
+    store.save("Good", {"drag": 6.0}, "m")
+    assert json.loads((store.folder / "good.json").read_text())["parameters"] == {"drag": 6.0}
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        ("a: [", "it is not YAML or JSON"),
+        ("just text", "it holds no fields"),
+        (good(format="other/1"), "expected 'physhandi-preset/1'"),
+        (good(color="red"), "field 'color' is unknown"),
+        (good(name=7), "name and length_unit must be text"),
+        (good(name="<b>x</b>"), "letters, digits"),
+        (good(name="soft"), "is a preset of the program"),
+        (good(parameters={}), "parameters is empty"),
+        (good(parameters={"drag": [1, 2]}), "parameters.drag is a list"),
+        (good(parameters={"dragg": 1}), "Unknown simulation parameter 'dragg'"),
+        (good(parameters={"friction": 3}), r"friction is 3.0; expected"),
+        (good(parameters={"drag": "fast"}), "drag is 'fast'; expected a number"),
+        (good(parameters={"frame_rate": 60}), "frame_rate belongs to the recording"),
+        ("x" * 70_000, "more than 64 kB"),
+    ],
+)
+def test_a_bad_file_says_what_is_wrong_and_the_others_stay(store, content, told) -> None:
+    write(store, "bad.yaml", content)
+    write(store, "fine.yaml", good(name="Fine"))
+    presets, problems = store.presets()
+    assert [preset.name for preset in presets] == ["Fine"]
+    (problem,) = problems
+    assert problem.startswith("presets/bad.yaml: ")
+    assert told in problem
+
+
+def test_two_files_of_one_name_are_told(store) -> None:
+    write(store, "a.yaml", good())
+    write(store, "b.yaml", good(name="good"))
+    presets, problems = store.presets()
+    assert len(presets) == 1
+    assert problems == ("presets/b.yaml: name 'good' is that of a.yaml too. Rename one.",)
+
+
+def test_nothing_is_kept_without_a_name_or_a_change(store) -> None:
+    for name in ("", "  ", "x" * 61, "As Fitted"):
+        with pytest.raises(UsageError):
+            checked_name(name)
+    with pytest.raises(UsageError, match="Nothing is changed"):
+        store.save("Empty", {}, "m")
+    with pytest.raises(UsageError, match="no preset of yours called 'soft'"):
+        store.delete("soft")
+    assert not store.folder.exists()
