@@ -26,6 +26,9 @@ from app.pages import Pages, create_pages
 from app.security import Gatekeeper, Security
 from app.settings import WEB_ASSETS, Settings
 from app.viewer.gate import create_gate
+from app.viewer.keep_panel import Keeping
+from app.viewer.presets import PresetStore
+from app.viewer.save_run import RunSaver
 from app.viewer.session import Sessions, TooManySessionsError
 from physhandi import __version__
 from physhandi.errors import (
@@ -73,7 +76,11 @@ def create_app(
     security = security or Security(settings)
     catalog = catalog or Catalog(settings)
     scheduler = scheduler or Scheduler(settings, catalog)
-    sessions = sessions or Sessions(settings, catalog)
+    keeping = Keeping(
+        PresetStore(settings.data_dir / "presets"),
+        RunSaver(catalog, settings.run_dir, scheduler.start_now),
+    )
+    sessions = sessions or Sessions(settings, catalog, keeping)
     feed = Feed(lambda: [describe_run(item, scheduler) for item in catalog.runs()])
     pages = Pages()
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from app.viewer.content import Catalog
+from app.viewer.keep_panel import Keeping
 from app.viewer.live import LiveSimulation
 from app.viewer.session_state import Kind, SessionInfo, SessionState
 from app.viewer.session_view import Session as Session
@@ -69,13 +70,16 @@ class Sessions:
         self,
         settings: ViewerSettings,
         catalog: Catalog,
+        keeping: Keeping | None = None,
     ) -> None:
         """Prepare; nothing is started before the first session.
 
         Args:
             settings: Limits and device.
             catalog: Finds runs and sequences.
+            keeping: Where users keep presets and runs; None if they cannot.
         """
+        self._keeping = keeping
         self._settings = settings
         self._catalog = catalog
         self._lock = threading.Lock()
@@ -117,6 +121,7 @@ class Sessions:
                 catalog=self._catalog,
                 live=self.live,
                 state=state,
+                keeping=self._keeping,
             )
             with self._lock:
                 self._sessions[session_id] = session
