@@ -27,7 +27,7 @@ from app.security import Gatekeeper, Security
 from app.settings import WEB_ASSETS, Settings
 from app.viewer.gate import create_gate
 from app.viewer.keep_panel import Keeping
-from app.viewer.presets import PresetStore
+from app.viewer.preset_store import PresetStore
 from app.viewer.save_run import RunSaver
 from app.viewer.session import Sessions, TooManySessionsError
 from physhandi import __version__
