@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg, subcommand
 
+from app.benchmarks.parts import Part
+
 DataDir = Annotated[
     Path | None,
     arg(help="Folder with `sequences/` and `runs/` (PHYSHANDI_DATA_DIR, else `data`)."),
@@ -283,6 +285,36 @@ class BenchmarkLive:
 
 
 @dataclass(frozen=True, kw_only=True)
+class BenchmarkViewer:
+    """Measure the real server, its pages and live scenes, with clients and a real browser.
+
+    It starts a server of its own on a free loopback port, with a data folder of its own. The JSON
+    says for each figure its `value`, its `goal` and whether it is `reached` (`figures`), beside
+    `load_average` before and after, and what each part found:
+    paint: first paint of the home page in new browser profiles (p50_ms, p95_ms, worst_ms);
+    scrub: timeline slider to the message with that frame's nodes;
+    slider: slider message to the first node positions of the new rollout, at a websocket client;
+    browser: mouse press on a slider to the first new frame drawn (arrived_…: received);
+    start: the first slider move after the server's start (first_move_ms), also with nothing
+    compiled (nothing_compiled), and whether the panel said that it was starting (is_start_shown);
+    bytes: size of a playing frame of 2 hands, 3,000 nodes and 300 arrows (frame_bytes);
+    sessions: ten such scenes at once (worst_frames_per_s, worst_skipped_per_s, server_cpu_share);
+    runs: home page and list of 1,000 runs;
+    live: frames simulated in a second with automatic substeps (frames_per_s).
+    """
+
+    run: Positional[str] = "towel_fold_quick"
+    """Folder or id of a finished run with an object."""
+    parts: tuple[Part, ...] = ()
+    """What to measure; none measures everything."""
+    quick: bool = False
+    """Repeat everything less often."""
+    json: bool = False
+    """Print JSON instead of lines."""
+    data_dir: DataDir = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class Benchmark:
     """Measure speed."""
 
@@ -293,6 +325,7 @@ class Benchmark:
         | Annotated[BenchmarkScaling, subcommand("scaling", prefix_name=False)]
         | Annotated[BenchmarkSubsteps, subcommand("substeps", prefix_name=False)]
         | Annotated[BenchmarkLive, subcommand("live", prefix_name=False)]
+        | Annotated[BenchmarkViewer, subcommand("viewer", prefix_name=False)]
     )
     """What to measure."""
 

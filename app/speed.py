@@ -8,6 +8,7 @@ from app.arguments import (
     BenchmarkLive,
     BenchmarkScaling,
     BenchmarkSubsteps,
+    BenchmarkViewer,
 )
 from app.commands import find_result, pick_device
 from physhandi.errors import UsageError
@@ -19,6 +20,8 @@ def measure(what: Any) -> dict[str, Any]:
     Raises:
         UsageError: If a number makes no sense, or the device or a file is missing.
     """
+    if isinstance(what, BenchmarkViewer):
+        return _benchmark_viewer(what)
     device = pick_device(what.device)
     match what:
         case BenchmarkScaling():
@@ -57,6 +60,15 @@ def _benchmark_scene(what: Any, device: str) -> dict[str, Any]:
             from physhandi.benchmarks.rollout import benchmark_rollout
 
             return benchmark_rollout(**common)
+
+
+def _benchmark_viewer(what: BenchmarkViewer) -> dict[str, Any]:
+    from app.benchmarks.parts import PARTS
+    from app.benchmarks.viewer import measure_viewer
+
+    run = find_result(what.run, what.data_dir)
+    parts = what.parts or PARTS
+    return measure_viewer(run, run.sequence_names[0], parts=parts, is_quick=what.quick)
 
 
 def _benchmark_run(what: Any, device: str) -> dict[str, Any]:

@@ -12,12 +12,13 @@ from app.benchmarks.served import Served
 from app.benchmarks.streams import Screen, percentiles
 from app.viewer.fitted_object import FittedObject
 from app.viewer.parameters import Knob, knobs
+from app.viewer.resimulation import STARTING
 from physhandi.data.run import Run
-from physhandi.simulation.stability import with_stable_substeps
 
 FIELDS = ("stiffness_scale", "connection_radius")
 """Parameters whose sliders are moved."""
-_TOLERANCE = 1e-7
+TOLERANCE = 1e-7
+"""Positions that differ by less are the same [m]."""
 _DRAGGED = 3
 """Of so many moves all but the last cut the rollout before them off."""
 
@@ -56,14 +57,13 @@ class Slider:
         """The fitted rollout [m]."""
         return np.asarray(self._fitted.take.position)
 
-    def moves(self, count: int, *, automatic: bool) -> list[Move]:
+    def moves(self, count: int) -> list[Move]:
         """Choose positions, each further than the one before, and simulate them.
 
         A step that changes nothing, as when no node is that near, is not among them.
 
         Args:
             count: How many at most.
-            automatic: Whether with as few substeps as are stable.
         """
         value = self.knob.to_slider(self._start)
         # Softer objects are safe at every number of substeps, and wider radii change the springs.
@@ -72,20 +72,18 @@ class Slider:
         before = self.fitted
         while len(chosen) < count and self.knob.low < value < self.knob.high:
             value = round(value + step, 6)
-            move = self._move(value, automatic)
-            if float(np.abs(move.rollout[1] - before[1]).max()) > _TOLERANCE:
+            move = self._move(value)
+            if float(np.abs(move.rollout[1] - before[1]).max()) > TOLERANCE:
                 chosen.append(move)
                 before = move.rollout
         return chosen
 
-    def _move(self, value: float, automatic: bool) -> Move:
+    def _move(self, value: float) -> Move:
         value = min(max(round(value, 6), self.knob.low), self.knob.high)
         chosen = {self.knob.field: self.knob.from_slider(value)}
         parameters = replace(self._start, **chosen)
         model = self._fitted.model(parameters)
         control = self._fitted.choose_controls(None)
-        if automatic:
-            parameters = with_stable_substeps(parameters, model, control[0])
         simulator = self._fitted.simulator(model, parameters, "cpu")
         return Move(value, np.stack([position for _, position, _ in simulator.frames(control)]))
 
@@ -98,7 +96,7 @@ def is_new_frame(
     """Tell whether nodes stand as in a frame of one rollout and in none of the one before."""
 
     def is_of(frames: ndarray) -> bool:
-        return bool((np.abs(frames - shown).max(axis=(1, 2)) <= _TOLERANCE).any())
+        return bool((np.abs(frames - shown).max(axis=(1, 2)) <= TOLERANCE).any())
 
     return is_of(rollout) and not is_of(before)
 
@@ -118,7 +116,7 @@ def measure_slider(
 
     Returns:
         Time from the slider's message to that of the first node positions that only the new
-        rollout has.
+        rollout has, also one by one (``seconds``).
     """
     session = served.open("run", run_id)
     seconds: list[float] = []
@@ -144,4 +142,49 @@ def measure_slider(
                 client.until(lambda total=total: total in client.texts())
             before = move.rollout
     served.shut(session)
-    return {"moves": len(moves), **percentiles(seconds)}
+    return {"moves": len(moves), **percentiles(seconds), "seconds": seconds}
+
+
+def measure_first_move(
+    served: Served, run_id: str, slider: Slider, moves: list[Move]
+) -> dict[str, Any]:
+    """Move a slider of the first scene of a server as soon as it is there, and then again.
+
+    Args:
+        served: The server, just started; its live simulation runs on the CPU.
+        run_id: The run to show.
+        slider: The slider.
+        moves: The first and the second position.
+
+    Returns:
+        Times to the first new frame of both moves, whether the panel said meanwhile that the
+        simulation was still starting, and how long it took to start the server and to open the
+        scene.
+    """
+    start = time.perf_counter()
+    session = served.open("run", run_id)
+    opened = time.perf_counter()
+    before, seconds = slider.fitted, list[float]()
+    is_told = False
+    with served.watch(session) as client:
+        screen = Screen(client)
+        for move in moves:
+            new, old = move.rollout, before
+            begin = time.perf_counter()
+            client.set(slider.knob.label, move.value)
+
+            def is_there(shown: ndarray, new: ndarray = new, old: ndarray = old) -> bool:
+                nonlocal is_told
+                is_told = is_told or STARTING in client.texts()
+                return is_new_frame(shown, new, old)
+
+            seconds.append(screen.seconds_until(is_there) - begin)
+            before = move.rollout
+    served.shut(session)
+    return {
+        "server_start_ms": 1e3 * served.start_seconds,
+        "scene_open_ms": 1e3 * (opened - start),
+        "first_move_ms": 1e3 * seconds[0],
+        "second_move_ms": 1e3 * seconds[1],
+        "is_start_shown": is_told,
+    }

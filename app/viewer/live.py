@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 from app.viewer.holds import PAUSE, RESUME, STEP
 from app.viewer.wire import Message, WireError, receive, send
@@ -44,10 +45,10 @@ class LiveRequest:
 class LiveSimulation:
     """Owns the live simulation process; one for all sessions.
 
-    Answers reach a session's listener in the thread of this object: messages ``started``,
-    ``frame``, ``stability``, ``finished``, ``diverged``, ``failed`` of the process, and ``crashed`` when the
-    process is gone. After a crash the process is started again, and a request that was cut off
-    is sent once more.
+    Answers reach a session's listener in the thread of this object: messages ``ready`` when the
+    process has warmed up, ``started``, ``frame``, ``stability``, ``finished``, ``diverged``,
+    ``failed`` of the process, and ``crashed`` when it is gone. After a crash it is started again,
+    and a request that was cut off is sent once more.
     """
 
     def __init__(self, device: str = "cpu") -> None:
@@ -61,12 +62,14 @@ class LiveSimulation:
         self._wake = threading.Condition(self._lock)
         self._listeners: dict[str, Listener] = {}
         self._pending: dict[str, tuple[Message, bool]] = {}
+        self._early: dict[str, Message] = {}
         self._held: set[str] = set()
         self._numbers = count(1)
         self._connection: socket.socket | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._crashes: deque[float] = deque(maxlen=_MAX_CRASHES)
         self._is_closed = False
+        self._is_ready = False
         self._thread: threading.Thread | None = None
         self._write_lock = threading.Lock()
 
@@ -76,21 +79,42 @@ class LiveSimulation:
         process = self._process
         return process.pid if process is not None and process.poll() is None else None
 
-    def subscribe(self, session: str, listener: Listener) -> None:
-        """Name the listener of a session, and have the process warm up."""
+    @property
+    def is_ready(self) -> bool:
+        """Whether the process has loaded what every simulation needs."""
+        return self._is_ready
+
+    def start(self) -> None:
+        """Start the process and have it warm up, unless it was started before."""
         with self._lock:
-            self._listeners[session] = listener
             if self._thread is None:
                 self._thread = threading.Thread(
                     target=self._supervise, name="live-simulation", daemon=True
                 )
                 self._thread.start()
 
+    def subscribe(self, session: str, listener: Listener) -> None:
+        """Name the listener of a session, and have the process warm up."""
+        with self._lock:
+            self._listeners[session] = listener
+        self.start()
+
+    def prepare(self, session: str, request: LiveRequest) -> None:
+        """Have loaded what a session's first request will need; a request goes before it."""
+        message = Message("prepare", {"session": session, **_described(request)})
+        with self._lock:
+            is_early = self._connection is None
+            if is_early:
+                self._early[session] = message
+        if not is_early:
+            self._send(message)
+
     def unsubscribe(self, session: str) -> None:
         """Forget a session and stop what is simulated for it."""
         with self._lock:
             self._listeners.pop(session, None)
             self._pending.pop(session, None)
+            self._early.pop(session, None)
             self._held.discard(session)
         self._send(Message("close", {"session": session}))
 
@@ -110,11 +134,7 @@ class LiveSimulation:
             {
                 "session": session,
                 "request": number,
-                "run": str(request.run),
-                "sequence": request.sequence,
-                "parameters": request.parameters.to_dict(),
-                "automatic_substeps": request.automatic_substeps,
-                "controls": None if request.controls is None else list(request.controls),
+                **_described(request),
                 "is_held": session in self._held,
             },
         )
@@ -207,11 +227,19 @@ class LiveSimulation:
 
     def _resend(self) -> None:
         with self._lock:
-            messages = [message for message, _ in self._pending.values()]
-        for message in messages:
+            early, self._early = self._early, {}
+            early |= {session: message for session, (message, _) in self._pending.items()}
+        for message in early.values():
             self._send(message)
 
     def _deliver(self, message: Message) -> None:
+        if message.kind == "ready":
+            self._is_ready = True
+            with self._lock:
+                listeners = list(self._listeners.values())
+            for listener in listeners:
+                self._tell(listener, message)
+            return
         session = message["session"]
         with self._lock:
             listener = self._listeners.get(session)
@@ -223,6 +251,7 @@ class LiveSimulation:
             self._tell(listener, message)
 
     def _bury(self, connection: socket.socket) -> None:
+        self._is_ready = False
         with self._write_lock:
             self._connection = None
             connection.close()
@@ -260,6 +289,17 @@ class LiveSimulation:
             listener(message)
         except Exception:
             logger.exception("a session could not take a %s message", message.kind)
+
+
+def _described(request: LiveRequest) -> dict[str, Any]:
+    """Give a request as plain fields of a message."""
+    return {
+        "run": str(request.run),
+        "sequence": request.sequence,
+        "parameters": request.parameters.to_dict(),
+        "automatic_substeps": request.automatic_substeps,
+        "controls": None if request.controls is None else list(request.controls),
+    }
 
 
 def _shut(connection: socket.socket) -> None:

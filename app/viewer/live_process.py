@@ -21,6 +21,7 @@ import warp as wp
 
 from app.viewer.fitted_object import FittedObject
 from app.viewer.holds import CONTROLS, Holds
+from app.viewer.warm_up import warm_up
 from app.viewer.wire import Message, receive, send
 from physhandi.errors import PhysHandiError, SimulationDivergedError
 from physhandi.simulation.model import SimulationParameters
@@ -89,6 +90,8 @@ class LiveSimulator:
     def run(self) -> None:
         """Work until the parent closes the connection."""
         threading.Thread(target=self._read, name="live-requests", daemon=True).start()
+        warm_up(self._device)
+        send(self._connection, Message("ready", {"session": "", "request": 0}))
         while True:
             is_idle = not any(self._holds.may_go_on(session) for session in self._active)
             requests = self._mailboxes.take(wait=is_idle)
@@ -107,7 +110,8 @@ class LiveSimulator:
     def _read(self) -> None:
         try:
             while (message := receive(self._connection)) is not None:
-                self._mailboxes.put(message)
+                arrived = {**message.fields, "arrived": time.perf_counter()}
+                self._mailboxes.put(Message(message.kind, arrived))
         finally:
             self._mailboxes.close()
 
@@ -124,6 +128,8 @@ class LiveSimulator:
         if request.kind == "simulate":
             self._active[session] = self._answer(request)
             self._holds.start(session, is_held=bool(request["is_held"]))
+        elif request.kind == "prepare":
+            self._active[session] = self._prepare(request)
         elif request.kind == "close":
             self._objects.pop(session, None)
             self._newest.pop(session, None)
@@ -144,6 +150,20 @@ class LiveSimulator:
         except (ValueError, OSError, RuntimeError, MemoryError) as error:
             logger.exception("request %s failed", about)
             send(self._connection, Message("failed", {**about, "error": str(error)}))
+
+    def _prepare(self, request: Message) -> Iterator[int]:
+        """Load what a session's first request will need, and simulate one frame of it."""
+        try:
+            fitted = self._object(request)
+            parameters = SimulationParameters.from_dict(request["parameters"])
+            model, control = fitted.model(parameters), fitted.choose_controls(None)
+            yield 0
+            for frame, _, _ in fitted.simulator(model, parameters, self._device).frames(control):
+                yield int(frame) + 1
+                if frame > 0:
+                    return
+        except (PhysHandiError, ValueError, OSError, RuntimeError, MemoryError):
+            logger.exception("%s could not be prepared", request["session"])
 
     def _simulate(self, request: Message, about: dict[str, object]) -> Iterator[int]:
         fitted = self._object(request)
@@ -169,7 +189,12 @@ class LiveSimulator:
                 self._connection,
                 Message(
                     "frame",
-                    {**about, "frame": int(frame), "duration": now - clock},
+                    {
+                        **about,
+                        "frame": int(frame),
+                        "duration": now - clock,
+                        "elapsed": now - request["arrived"],
+                    },
                     {
                         "position": np.asarray(position, dtype=np.float32),
                         "velocity": np.asarray(velocity, dtype=np.float32),

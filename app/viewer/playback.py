@@ -1,6 +1,7 @@
 """The clock of one session: which frame is on the screen, and when the next one is due."""
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -8,6 +9,8 @@ from collections.abc import Callable
 logger = logging.getLogger(__name__)
 
 _MAX_RATE = 30.0
+_SHORT_OF = 1e-3
+"""The clock stops so much before a frame that is not ready, which is then due at once."""
 
 
 class Playback:
@@ -108,8 +111,17 @@ class Playback:
         self._change(_does_loop=on)
 
     def limit(self, frame_count: int) -> None:
-        """Keep the running clock inside the first frames, while later ones are being computed."""
-        self._change(_limit=min(max(frame_count, 1), self.frame_count))
+        """Keep the running clock inside the first frames, while later ones are being computed.
+
+        Frames that come to be ready are drawn when the clock reaches them, not before.
+        """
+        with self._condition:
+            is_late = self._is_starved()
+            self._limit = min(max(frame_count, 1), self.frame_count)
+            if self._limit == self.frame_count:
+                self._needs_drawing = True
+            if self._needs_drawing or is_late:
+                self._condition.notify_all()
 
     def replace(self, frame_count: int, frame_rate: float) -> None:
         """Start over with another sequence."""
@@ -139,7 +151,7 @@ class Playback:
                 is_due = self._needs_drawing or is_new
                 self._needs_drawing = False
                 frame, is_playing = int(self._position), self._is_playing
-                rate = min(self.frame_rate * self._speed, _MAX_RATE)
+                due = now + self._until_next()
             if is_due:
                 try:
                     self._draw(frame, is_playing)
@@ -148,7 +160,24 @@ class Playback:
             with self._condition:
                 if self._is_closed:
                     return
-                self._condition.wait(max(1.0 / rate - (time.monotonic() - last), 0.001))
+                if not self._needs_drawing:
+                    self._condition.wait(max(due - time.monotonic(), 0.001))
+
+    def _until_next(self) -> float:
+        """Tell how long the clock takes to the next frame that is drawn [s].
+
+        The time is not a fixed period: its errors would add up until a frame is left out.
+        """
+        rate = self._speed * self.frame_rate
+        if self._is_starved():
+            return 1.0 / rate
+        step = math.ceil(rate / _MAX_RATE - 1e-9)
+        return (int(self._position) + step - self._position) / rate
+
+    def _is_starved(self) -> bool:
+        """Tell whether the clock waits for a frame that is still being computed."""
+        is_limited = self._limit < self.frame_count
+        return is_limited and self._position >= self._limit - _SHORT_OF
 
     def _advance(self, elapsed: float) -> bool:
         """Move the clock on; returns whether another frame is due."""
@@ -157,7 +186,7 @@ class Playback:
         before = int(self._position)
         position = self._position + min(elapsed, 0.5) * self._speed * self.frame_rate
         if self._limit < self.frame_count:
-            position = min(position, self._limit - 1)
+            position = min(position, self._limit - _SHORT_OF)
         elif position >= self.frame_count:
             if self._does_loop:
                 position %= self.frame_count

@@ -2,6 +2,8 @@
 
 import json
 import math
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -12,6 +14,7 @@ from app.viewer.latency import measure_latency
 from physhandi.data.run import Run
 from physhandi.errors import MissingInputError, SimulationError
 
+ROOT = Path(__file__).parents[3]
 KINDS = {
     f"{slider}, substeps {substeps}"
     for slider in ("stiffness", "radius")
@@ -32,6 +35,13 @@ def test_sliders_are_answered_and_timed(run: Run) -> None:
         assert 0.0 < kind["springs_known_ms"] < kind["worst_first_new_frame_ms"]
         assert 0.0 < kind["ms_per_frame"] < math.inf
         assert kind["substeps"] > 0
+        # The process knows of a request later, and of its answer sooner, than the server.
+        assert 0.0 < kind["in_process_ms"] < kind["first_new_frame_ms"]
+        assert kind["in_process_ms"] <= kind["worst_in_process_ms"]
+        assert kind["ms_per_frame"] <= kind["p95_ms_per_frame"]
+        mean = 1e3 / kind["frames_per_s"]
+        assert 0.2 * kind["ms_per_frame"] < mean < 20.0 * kind["p95_ms_per_frame"]
+    assert result["sequence_frames_per_s"] == 30.0
     assert result["start_ms"] > result["first_new_frame_ms"]
     worst = max(kind["worst_first_new_frame_ms"] for kind in result["kinds"].values())
     assert result["worst_first_new_frame_ms"] == worst
@@ -54,3 +64,15 @@ def test_a_run_that_is_gone_fails_by_name(run: Run, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(latency, "LiveRequest", elsewhere)
     with pytest.raises(SimulationError, match=r"failed: .*at-all"):
         measure_latency(run, "lift", moves=1)
+
+
+def test_it_needs_no_package_of_the_server() -> None:
+    missing = ["fastapi", "open3d", "pydantic", "torch", "trimesh", "tyro", "uvicorn", "viser"]
+    code = (
+        f"import sys; sys.modules.update(dict.fromkeys({missing!r}))\n"
+        "import app.viewer.latency, app.viewer.live_process, app.viewer.warm_up\n"
+        "print('imported')"
+    )
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
+    assert done.stdout.endswith("imported\n"), done.stderr

@@ -75,7 +75,7 @@ def recount(radius: float, most: int) -> int:
 def test_the_fitted_parameters_give_the_fitted_rollout(live, mailbox, run) -> None:
     live.request("a", ask(run))
     messages = mailbox.until("finished")
-    kinds = [m.kind for m in messages if m.kind != "stability"]
+    kinds = [m.kind for m in messages if m.kind not in {"ready", "stability"}]
     assert kinds == ["started", *["frame"] * FRAMES, "finished"]
     np.testing.assert_array_equal(frames(messages), run.array("sequences/lift/rollout.npy"))
 
@@ -240,3 +240,41 @@ def _is_running(process: int) -> bool:
             return stat.read().rsplit(")", 1)[1].split()[0] != "Z"
     except FileNotFoundError:
         return False
+
+
+def test_the_process_warms_up_by_itself(run) -> None:
+    live = LiveSimulation()
+    try:
+        live.start()
+        live.start()
+        first = Mailbox()
+        live.subscribe("a", first)
+        live.prepare("a", ask(run))  # Before the process is there, perhaps.
+        end = time.monotonic() + SECONDS
+        while not live.is_ready:
+            assert time.monotonic() < end
+            time.sleep(0.02)
+        process = live.process_id
+        live.request("a", ask(run, drag=9.0))
+        messages = first.until("finished")
+        # What was prepared says nothing and leaves no trace in what is asked for.
+        kinds = [m.kind for m in messages if m.kind not in {"ready", "stability"}]
+        assert kinds == ["started", *["frame"] * FRAMES, "finished"]
+        other = Mailbox()
+        live.subscribe("b", other)
+        live.request("b", ask(run, drag=9.0))
+        np.testing.assert_array_equal(frames(messages), frames(other.until("finished")))
+        assert live.process_id == process
+    finally:
+        live.close()
+    assert live.process_id is None
+
+
+def test_a_frame_tells_how_long_ago_it_was_asked_for(live, mailbox, run) -> None:
+    start = time.perf_counter()
+    live.request("a", ask(run, drag=8.0))
+    messages = [m for m in mailbox.until("finished") if m.kind == "frame"]
+    passed = time.perf_counter() - start
+    elapsed = [m["elapsed"] for m in messages]
+    assert elapsed == sorted(elapsed)
+    assert sum(m["duration"] for m in messages) < elapsed[-1] < passed

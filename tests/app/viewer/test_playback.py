@@ -22,6 +22,14 @@ class Screen:
             time.sleep(0.005)
         raise AssertionError(f"frame {frame} was not drawn: {self.drawn}")
 
+    def wait_beyond(self, frame: int, seconds: float = 5.0) -> float:
+        """Wait for a later frame; returns how long that took."""
+        start = time.monotonic()
+        while all(drawn <= frame for drawn, _ in self.drawn):
+            assert time.monotonic() < start + seconds, self.drawn
+            time.sleep(0.002)
+        return time.monotonic() - start
+
 
 @pytest.fixture
 def screen() -> Screen:
@@ -77,7 +85,52 @@ def test_the_running_clock_waits_for_frames_that_are_being_computed(
     time.sleep(0.15)
     assert max(frame for frame, _ in screen.drawn) == 3
     playback.limit(10)
-    screen.wait_for(9)
+    screen.wait_beyond(3)
+
+
+def test_a_frame_that_was_waited_for_is_drawn_at_once() -> None:
+    screen = Screen()
+    playback = Playback(10, 2.0, screen)  # A frame lasts half a second.
+    playback.limit(2)
+    playback.start()
+    playback.play()
+    screen.wait_for(1)
+    time.sleep(0.7)
+    assert screen.drawn[-1][0] == 1
+    playback.limit(3)
+    assert screen.wait_beyond(1) < 0.25
+    playback.close()
+
+
+def test_frames_that_become_ready_later_are_not_drawn_before(screen: Screen) -> None:
+    playback = Playback(1000, 4.0, screen)
+    playback.start()
+    playback.play()
+    for ready in range(2, 400):
+        playback.limit(ready)
+        time.sleep(0.001)
+    playback.close()
+    assert 1 <= len(screen.drawn) < 10
+
+
+def test_no_frame_is_left_out_while_drawing_takes_time() -> None:
+    screen = Screen()
+
+    def draw(frame: int, is_playing: bool) -> None:
+        screen(frame, is_playing)
+        time.sleep(0.012)
+
+    playback = Playback(1000, 25.0, draw)
+    playback.start()
+    playback.play()
+    time.sleep(2.0)
+    playback.close()
+    frames = [frame for frame, is_playing in screen.drawn if is_playing]
+    assert frames[-1] == pytest.approx(50, abs=4)
+    steps = [after - before for before, after in pairwise(frames)]
+    # A busy machine may be late by a whole frame now and then, a clock that drifts is so always.
+    assert sum(step > 1 for step in steps) <= 2
+    assert steps.count(1) > 40
 
 
 def test_steps_wrap_and_stop_the_clock(playback: Playback, screen: Screen) -> None:

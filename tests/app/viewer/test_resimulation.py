@@ -152,3 +152,18 @@ def test_forces_are_those_of_the_virtual_springs(resimulation) -> None:
     held = np.unique(model.spring_nodes[model.object_spring_count :, 0])
     assert np.abs(np.delete(force, held, axis=0)).max() == 0.0
     assert force[held].sum(axis=0)[2] > 10.0
+
+
+def test_the_run_is_prepared_before_anybody_asks(resimulation, live, run) -> None:
+    assert live.prepared == LiveRequest(run=run.folder, sequence="lift", parameters=PARAMETERS)
+    assert live.requests == []
+
+
+def test_that_the_process_is_starting_is_told(resimulation, live, changes) -> None:
+    live.is_ready = False
+    assert resimulation.readout.is_starting
+    live.is_ready = True
+    live.listener(Message("ready", {"session": "", "request": 0}))
+    assert changes == [("ready", 0)]
+    assert not resimulation.readout.is_starting
+    assert resimulation.at(3) == (resimulation.fitted, 3)

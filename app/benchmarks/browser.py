@@ -1,0 +1,219 @@
+"""What a person sees in a real browser, and when: the home page, and a slider of a live scene."""
+
+import re
+import shutil
+import time
+from collections.abc import Generator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from app.benchmarks.served import Served, ServerFailedError
+from app.benchmarks.sliders import TOLERANCE, Move, Slider
+from app.benchmarks.streams import percentiles
+from physhandi.errors import MissingInputError
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Frame, Page
+
+_FLAGS = ("--no-sandbox", "--use-angle=gl-egl", "--ignore-gpu-blocklist")
+_SIZE = (1280, 800)
+_PATIENCE_MS = 60_000
+_NOTICED_S = 5.0
+_PAINTED = """() => {
+  const paint = performance.getEntriesByName("first-contentful-paint")[0];
+  const page = performance.getEntriesByType("navigation")[0];
+  return paint && page.loadEventEnd > 0
+    ? { painted: paint.startTime, answered: page.responseEnd, loaded: page.loadEventEnd } : null;
+}"""
+# viser's messages come in through a worker: the page is told of them after they were unpacked.
+_WATCH = """(() => {
+  const watch = { expected: null, pressed: 0, arrived: 0, drawn: 0, frames: 0 };
+  window.physhandiWatch = watch;
+  const isOf = (rollout, shown) => rollout.some((frame) =>
+    frame.length === shown.length
+      && frame.every((value, i) => Math.abs(value - shown[i]) <= watch.expected.tolerance));
+  const isNew = (shown) =>
+    isOf(watch.expected.rollout, shown) && !isOf(watch.expected.before, shown);
+  const look = ({ data }) => {
+    if (data?.type !== "message_batch") return;
+    for (const message of data.messages) {
+      const moved = message.type === "SceneNodeUpdateMessage" && message.name === "/object/nodes"
+        && message.updates.points;
+      if (!moved) continue;
+      watch.frames += 1;
+      if (watch.arrived || !watch.expected || !watch.pressed || !isNew(message.updates.points))
+        continue;
+      watch.arrived = performance.now();
+      // The next callback draws it; when the one after that begins, it is on its way to the screen.
+      const note = () => { watch.drawn = performance.now(); };
+      requestAnimationFrame(() => requestAnimationFrame(note));
+    }
+  };
+  const Original = window.Worker;
+  window.Worker = class extends Original {
+    constructor(...given) {
+      super(...given);
+      this.addEventListener("message", look);
+    }
+  };
+  addEventListener("pointerdown", (event) => { watch.pressed = event.timeStamp; }, true);
+  addEventListener("mousedown", (event) => { watch.pressed ||= event.timeStamp; }, true);
+})()"""
+# A scene belongs to the browser that opened it.
+_OPEN = """(id) => fetch("/api/v1/sessions", {
+  method: "POST", headers: { "Content-Type": "application/json" },
+  body: JSON.stringify({ kind: "run", id }),
+}).then((answer) => answer.json()).then((answer) => { location.href = answer.url; })"""
+_CLOSE = """() => fetch(`/api/v1/sessions/${location.pathname.split("/").pop()}`, {
+  method: "DELETE" })"""
+_EXPECT = """([rollout, before, tolerance]) => Object.assign(window.physhandiWatch, {
+  expected: { rollout, before, tolerance }, pressed: 0, arrived: 0, drawn: 0,
+})"""
+
+
+@contextmanager
+def open_chromium() -> "Generator[Browser]":
+    """Start a headless Chromium.
+
+    Raises:
+        MissingInputError: If Playwright's package or Chromium is not installed.
+    """
+    try:
+        from playwright.sync_api import sync_playwright
+    except ImportError:
+        raise MissingInputError(
+            "Measuring in a browser needs Playwright: pip install playwright. "
+            "Or leave these parts out with --parts."
+        ) from None
+    executable = shutil.which("chromium") or shutil.which("chromium-browser")
+    if executable is None:
+        raise MissingInputError(
+            "Measuring in a browser needs Chromium: apt-get install chromium libegl-mesa0 "
+            "libgl1-mesa-dri. Or leave these parts out with --parts."
+        )
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=executable, args=list(_FLAGS))
+        try:
+            yield browser
+        finally:
+            browser.close()
+
+
+def measure_first_paint(served: Served, browser: "Browser", visits: int) -> dict[str, Any]:
+    """Open the home page in new browser profiles, which know nothing of it.
+
+    Args:
+        served: The server.
+        browser: The browser.
+        visits: How often.
+
+    Returns:
+        Time from the navigation to the first paint of content, and medians of when the page had
+        been answered and when everything on it had been loaded.
+    """
+    visited: list[dict[str, float]] = []
+    for _ in range(visits):
+        with _new_page(browser) as page:
+            page.goto(served.url, wait_until="load")
+            page.wait_for_function(_PAINTED)
+            visited.append(page.evaluate(_PAINTED))
+    return {
+        "visits": visits,
+        **percentiles([1e-3 * visit["painted"] for visit in visited]),
+        "answered_ms": float(np.median([visit["answered"] for visit in visited])),
+        "loaded_ms": float(np.median([visit["loaded"] for visit in visited])),
+    }
+
+
+def measure_slider_in_browser(
+    served: Served, browser: "Browser", run_id: str, slider: Slider, moves: list[Move]
+) -> dict[str, Any]:
+    """Press on a slider of a playing scene, and wait for the first new frame.
+
+    Args:
+        served: The server; its live simulation runs on the CPU.
+        browser: The browser.
+        run_id: The run to show.
+        slider: The slider.
+        moves: Where to.
+
+    Returns:
+        Time from the press to the arrival of the first node positions that only the new rollout
+        has (``arrived_…``), and until they are drawn; and how many frames a second arrived.
+    """
+    arrived: list[float] = []
+    drawn: list[float] = []
+    before = slider.fitted
+    with _new_page(browser) as page:
+        page.add_init_script(_WATCH)
+        page.goto(served.url)
+        page.evaluate(_OPEN, run_id)
+        page.wait_for_url("**/live/**")
+        frame = page.wait_for_selector("#scene")
+        scene = frame.content_frame() if frame is not None else None
+        if scene is None:
+            raise ServerFailedError("The page of the live scene holds no scene.")
+        scene.get_by_role("button", name="Pause", exact=True).wait_for()
+        scene.wait_for_function("() => window.physhandiWatch.frames > 30")
+        opened = 1e-3 * float(page.evaluate("() => performance.now()"))
+        for move in moves:
+            pair = [r.reshape(len(r), -1).tolist() for r in (move.rollout, before)]
+            scene.evaluate(_EXPECT, [*pair, TOLERANCE])
+            _press(page, scene, slider, move)
+            scene.wait_for_function("() => window.physhandiWatch.drawn > 0")
+            told = scene.evaluate("() => window.physhandiWatch")
+            arrived.append(1e-3 * (told["arrived"] - told["pressed"]))
+            drawn.append(1e-3 * (told["drawn"] - told["pressed"]))
+            page.wait_for_timeout(300)
+            before = move.rollout
+        rate = _rate(page, scene)
+        page.evaluate(_CLOSE)
+    when = {f"arrived_{name}": value for name, value in percentiles(arrived).items()}
+    return {
+        "moves": len(moves),
+        **percentiles(drawn),
+        **when,
+        "playing_after_ms": 1e3 * opened,
+        "frames_per_s": rate,
+    }
+
+
+@contextmanager
+def _new_page(browser: "Browser") -> "Generator[Page]":
+    context = browser.new_context(viewport={"width": _SIZE[0], "height": _SIZE[1]})
+    context.set_default_timeout(_PATIENCE_MS)
+    try:
+        yield context.new_page()
+    finally:
+        context.close()
+
+
+def _press(page: "Page", scene: "Frame", slider: Slider, move: Move) -> None:
+    """Press on the slider's track where the value is, as a mouse does."""
+    knob = slider.knob
+    label = scene.locator("label", has_text=re.compile(f"^(● )?{re.escape(knob.label)}$"))
+    row = label.locator("xpath=ancestor::div[contains(@class, 'mantine-Flex-root')][1]")
+    track = row.locator(".mantine-Slider-trackContainer")
+    track.scroll_into_view_if_needed()
+    box = track.bounding_box()
+    if box is None:
+        raise ServerFailedError(f"The slider '{knob.label}' is not on the page.")
+    part = (move.value - knob.low) / (knob.high - knob.low)
+    page.mouse.click(box["x"] + part * box["width"], box["y"] + 0.5 * box["height"])
+    field = row.locator("input.mantine-NumberInput-input")
+    end = time.monotonic() + _NOTICED_S
+    while abs((shown := float(field.input_value())) - move.value) > 0.01 * knob.step:
+        if time.monotonic() > end:
+            raise ServerFailedError(f"The slider went to {shown:g} instead of {move.value:g}.")
+        page.wait_for_timeout(50)
+
+
+def _rate(page: "Page", scene: "Frame") -> float:
+    """Count the frames that arrive in a second."""
+    start = time.perf_counter()
+    count = scene.evaluate("() => window.physhandiWatch.frames")
+    page.wait_for_timeout(3000)
+    count = scene.evaluate("() => window.physhandiWatch.frames") - count
+    return float(count / (time.perf_counter() - start))

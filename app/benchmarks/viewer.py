@@ -1,0 +1,269 @@
+"""Figures of the whole application on this machine: pages, live scenes and their sliders."""
+
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import warp as wp
+
+from app.benchmarks.browser import (
+    measure_first_paint,
+    measure_slider_in_browser,
+    open_chromium,
+)
+from app.benchmarks.parts import PARTS, Part
+from app.benchmarks.scenes import (
+    HEAVY,
+    HEAVY_FRAMES,
+    HEAVY_NODES,
+    make_heavy_run,
+    make_many_runs,
+)
+from app.benchmarks.served import Served
+from app.benchmarks.sliders import FIELDS, Slider, measure_first_move, measure_slider
+from app.benchmarks.streams import measure_scrub, measure_sessions, percentiles
+from app.settings import BUNDLED
+from physhandi.benchmarks.timing import describe_machine
+from physhandi.data.run import Run
+from physhandi.errors import MissingInputError
+
+_RATE = 30.0
+_SESSIONS = 10
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What a figure is to reach."""
+
+    part: Part
+    """Which part measures it."""
+    path: tuple[str, ...]
+    """Where the figure stands in what the part returns."""
+    limit: float
+    """The goal."""
+    is_least: bool = False
+    """Whether the figure is to be at least the goal, instead of below it."""
+
+
+GOALS: Mapping[str, Goal] = {
+    "first_paint_ms": Goal("paint", ("p50_ms",), 1000.0),
+    "scrub_p95_ms": Goal("scrub", ("p95_ms",), 60.0),
+    "slider_p95_ms": Goal("slider", ("p95_ms",), 500.0),
+    "slider_in_browser_p95_ms": Goal("browser", ("p95_ms",), 500.0),
+    "first_move_after_start_ms": Goal("start", ("first_move_ms",), 500.0),
+    "frame_bytes": Goal("bytes", ("frame_bytes", "p95"), 100_000.0),
+    "ten_sessions_frames_per_s": Goal("sessions", ("worst_frames_per_s",), 29.0, is_least=True),
+    "ten_sessions_skipped_per_s": Goal("sessions", ("worst_skipped_per_s",), 1.0),
+    "list_of_1000_runs_p95_ms": Goal("runs", ("p95_ms",), 300.0),
+    "live_frames_per_s": Goal("live", ("frames_per_s",), _RATE, is_least=True),
+}
+"""The figures that are asked of the viewer."""
+
+
+@dataclass(frozen=True)
+class _Effort:
+    """How often things are repeated."""
+
+    moves: int
+    visits: int
+    seconds: float
+    runs: int
+
+
+_FULL = _Effort(moves=40, visits=10, seconds=20.0, runs=1000)
+_QUICK = _Effort(moves=8, visits=3, seconds=4.0, runs=1000)
+
+
+def measure_viewer(
+    run: Run, sequence: str, *, parts: tuple[Part, ...] = PARTS, is_quick: bool = False
+) -> dict[str, Any]:
+    """Measure the real server on a free loopback port, with data of its own.
+
+    Args:
+        run: A finished run with an object, whose scene is played and whose sliders are moved.
+        sequence: Its first sequence, which its scenes show.
+        parts: What to measure.
+        is_quick: Whether to repeat everything less often.
+
+    Returns:
+        The machine, ``figures`` (for each its ``value``, ``goal`` and whether it is ``reached``)
+        and what each part found.
+
+    Raises:
+        MissingInputError: If the run has no object there, or a browser is asked for and missing.
+        ServerFailedError: If the server does not start or does not do what it is asked.
+    """
+    wp.init()
+    about = describe_machine("cpu")
+    effort = _QUICK if is_quick else _FULL
+    position = f"sequences/{sequence}/rollout.npy"
+    if not run.has(position):
+        raise MissingInputError(f"Run '{run.name}' has no object in '{sequence}' to simulate.")
+    with (
+        tempfile.TemporaryDirectory(prefix="physhandi_benchmark_") as folder,
+        _Bench(run, sequence, Path(folder), effort) as bench,
+    ):
+        found = {part: bench.measure(part) for part in PARTS if part in parts}
+    return {
+        "benchmark": "viewer",
+        **about,
+        "load_average_after": os.getloadavg()[0],
+        "cpu_count": os.cpu_count(),
+        "scene": f"{run.name}: {sequence}",
+        "is_quick": is_quick,
+        "figures": compare_with_goals(found),
+        **found,
+    }
+
+
+def compare_with_goals(found: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Hold what was measured against the goals.
+
+    Args:
+        found: What each part returned.
+
+    Returns:
+        For each figure of these parts its ``value``, ``goal``, and whether it is ``reached``.
+    """
+    figures: dict[str, dict[str, Any]] = {}
+    for name, goal in GOALS.items():
+        if goal.part not in found:
+            continue
+        value: Any = found[goal.part]
+        for key in goal.path:
+            value = value[key]
+        is_reached = value >= goal.limit if goal.is_least else value < goal.limit
+        figures[name] = {"value": value, "goal": goal.limit, "reached": bool(is_reached)}
+    return figures
+
+
+class _Bench:
+    """Measures one part after the other, those that show the run with one server."""
+
+    def __init__(self, run: Run, sequence: str, folder: Path, effort: _Effort) -> None:
+        self._run = run
+        self._sequence = sequence
+        self._folder = folder
+        self._effort = effort
+        self._stack = ExitStack()
+        self._server: Served | None = None
+
+    def __enter__(self) -> "_Bench":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def measure(self, part: Part) -> dict[str, Any]:
+        """Measure one part."""
+        works: dict[Part, Callable[[], dict[str, Any]]] = {
+            "paint": self._paint,
+            "scrub": self._scrub,
+            "slider": self._slider,
+            "browser": self._browser,
+            "start": self._start,
+            "bytes": lambda: self._heavy(1),
+            "sessions": lambda: self._heavy(_SESSIONS),
+            "runs": self._many_runs,
+            "live": self._live,
+        }
+        load = os.getloadavg()[0]
+        return {"load_average": load, **works[part]()}
+
+    def _data(self, name: str) -> Path:
+        """Make a data folder in which the run is, unless the program brings it along."""
+        data = self._folder / name
+        (data / "runs").mkdir(parents=True, exist_ok=True)
+        target = data / "runs" / self._run.id
+        if self._run.folder.parent != BUNDLED / "runs" and not target.exists():
+            shutil.copytree(self._run.folder, target)
+        return data
+
+    def _served(self) -> Served:
+        """Start the server that shows the run, unless it was started before."""
+        if self._server is None:
+            self._server = self._stack.enter_context(Served(self._data("plain")))
+        return self._server
+
+    def _paint(self) -> dict[str, Any]:
+        with open_chromium() as browser:
+            return measure_first_paint(self._served(), browser, self._effort.visits)
+
+    def _scrub(self) -> dict[str, Any]:
+        rollout = self._run.array(f"sequences/{self._sequence}/rollout.npy")
+        return measure_scrub(self._served(), self._run.id, rollout, 3 * self._effort.moves)
+
+    def _slider(self) -> dict[str, Any]:
+        kinds: dict[str, Any] = {}
+        seconds: list[float] = []
+        served = self._served()
+        for field in FIELDS:
+            slider = Slider(self._run, self._sequence, field)
+            moves = slider.moves(self._effort.moves)
+            for is_playing in (True, False):
+                measured = measure_slider(
+                    served, self._run.id, slider, moves, is_playing=is_playing
+                )
+                seconds += measured.pop("seconds")
+                how = "playing" if is_playing else "paused"
+                kinds[f"{field}, {how}"] = measured
+        return {"moves": len(seconds), **percentiles(seconds), "kinds": kinds}
+
+    def _browser(self) -> dict[str, Any]:
+        slider = Slider(self._run, self._sequence, FIELDS[0])
+        moves = slider.moves(self._effort.moves)
+        with open_chromium() as browser:
+            served = self._served()
+            return measure_slider_in_browser(served, browser, self._run.id, slider, moves)
+
+    def _start(self) -> dict[str, Any]:
+        slider = Slider(self._run, self._sequence, FIELDS[0])
+        moves = slider.moves(2)
+        found: dict[str, Any] = {}
+        with Served(self._data("fresh")) as served:
+            found |= measure_first_move(served, self._run.id, slider, moves)
+        # Nothing compiled before is found in an empty cache.
+        empty = {"WARP_CACHE_PATH": str(self._folder / "kernels")}
+        with Served(self._data("fresh"), environment=empty) as served:
+            found["nothing_compiled"] = measure_first_move(served, self._run.id, slider, moves)
+        return found
+
+    def _heavy(self, count: int) -> dict[str, Any]:
+        data = self._folder / "heavy"
+        if not data.exists():
+            make_heavy_run(data / "runs")
+        with Served(data) as served:
+            measured = measure_sessions(
+                served,
+                HEAVY,
+                count=count,
+                frame_count=HEAVY_FRAMES,
+                frame_rate=_RATE,
+                seconds=self._effort.seconds,
+            )
+        return {"nodes": HEAVY_NODES, "hands": 2, **measured}
+
+    def _many_runs(self) -> dict[str, Any]:
+        data = self._data("many")
+        make_many_runs(data / "runs", self._effort.runs)
+        found: dict[str, Any] = {"runs": self._effort.runs}
+        times: list[float] = []
+        with Served(data) as served:
+            found["first_ms"] = 1e3 * served.get("/")[0]
+            for path in ("/", "/api/v1/runs"):
+                seconds = [served.get(path)[0] for _ in range(2 * self._effort.visits)]
+                found[path] = {**percentiles(seconds), "bytes": len(served.get(path)[1])}
+                times += seconds
+        return {**found, **percentiles(times)}
+
+    def _live(self) -> dict[str, Any]:
+        from app.viewer.latency import measure_latency
+
+        measured = measure_latency(self._run, self._sequence, device="cpu")
+        kind = measured["kinds"]["stiffness, substeps automatic"]
+        return {**kind, "sequence_frames_per_s": measured["sequence_frames_per_s"]}

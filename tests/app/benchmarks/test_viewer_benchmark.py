@@ -1,0 +1,167 @@
+"""The benchmark of the viewer runs against the real server, and its numbers fit each other."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app import cli
+from app.benchmarks import browser, streams, viewer
+from app.benchmarks.parts import PARTS
+from app.benchmarks.scenes import HEAVY, HEAVY_ARROWS, HEAVY_NODES, make_heavy_run, make_many_runs
+from app.benchmarks.served import Served, ServerFailedError
+from app.benchmarks.sliders import is_new_frame
+from app.benchmarks.streams import percentiles
+from app.benchmarks.viewer import GOALS, compare_with_goals, measure_viewer
+from app.jobs.catalog import Catalog
+from app.settings import BUNDLED, Settings
+from app.viewer.content import load_fitted
+from app.viewer.object_drawing import QUIET_FORCE
+from physhandi.data.run import Run
+from physhandi.errors import MissingInputError
+
+BUNDLED_RUN = "towel_fold_quick"
+
+
+@pytest.fixture
+def little(monkeypatch: pytest.MonkeyPatch) -> None:
+    effort = viewer._Effort(moves=3, visits=1, seconds=1.0, runs=20)
+    monkeypatch.setattr(viewer, "_QUICK", effort)
+
+
+def call(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+    with pytest.raises(SystemExit) as end:
+        cli.main(["benchmark", "viewer", *arguments])
+    return int(end.value.code or 0), *capsys.readouterr()
+
+
+def is_in_order(times: dict[str, float]) -> bool:
+    return 0.0 < times["p50_ms"] <= times["p95_ms"] <= times["worst_ms"]
+
+
+@pytest.mark.slow
+def test_clients_without_a_browser_measure_the_real_server(
+    little: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    parts = ("scrub", "slider", "bytes", "runs", "live")
+    code, out, error = call(capsys, "--quick", "--json", "--parts", *parts)
+    assert code == 0, error
+    result = json.loads(out)
+    assert (result["benchmark"], result["is_quick"]) == ("viewer", True)
+    assert result["load_average"] >= 0.0
+    assert set(parts) == set(PARTS) & set(result)
+    for part in ("scrub", "slider", "runs"):
+        assert is_in_order(result[part])
+    assert result["scrub"]["moves"] == 9
+    kinds = result["slider"]["kinds"]
+    assert set(kinds) == {
+        f"{field}, {how}"
+        for field in ("stiffness_scale", "connection_radius")
+        for how in ("playing", "paused")
+    }
+    assert result["slider"]["moves"] == sum(kind["moves"] for kind in kinds.values()) == 12
+    assert result["slider"]["worst_ms"] == max(kind["worst_ms"] for kind in kinds.values())
+    heavy = result["bytes"]
+    assert (heavy["nodes"], heavy["hands"], heavy["arrows"]) == (3000, 2, 300)
+    # Nodes, hands and arrows alone are 3,000 + 2 x 1,159 + 2 x 300 points of 12 bytes.
+    assert 70_000 < heavy["frame_bytes"]["p50"] <= heavy["frame_bytes"]["largest"]
+    assert heavy["sessions"] == 1
+    assert 0.0 < heavy["worst_frames_per_s"] <= heavy["frames_per_s"] < 45.0
+    assert result["runs"]["runs"] == 20
+    assert result["runs"]["/"]["bytes"] > 1000
+    assert result["live"]["frames_per_s"] > 0.0
+    assert set(result["figures"]) == {n for n, goal in GOALS.items() if goal.part in parts}
+    assert result["figures"]["scrub_p95_ms"]["value"] == result["scrub"]["p95_ms"]
+
+
+@pytest.mark.e2e
+@pytest.mark.slow
+def test_a_browser_sees_the_first_paint_and_the_first_new_frame(little: None) -> None:
+    run = Run.open(BUNDLED / "runs" / BUNDLED_RUN)
+    result = measure_viewer(run, "towel_fold", parts=("paint", "browser"), is_quick=True)
+    paint, slider = result["paint"], result["browser"]
+    assert is_in_order(paint)
+    assert 0.0 < paint["answered_ms"] <= paint["loaded_ms"]
+    assert is_in_order(slider)
+    assert slider["moves"] == 3
+    # It arrives, and then it is drawn.
+    for name in ("p50_ms", "p95_ms", "worst_ms"):
+        assert 0.0 < slider[f"arrived_{name}"] < slider[name]
+    assert set(result["figures"]) == {"first_paint_ms", "slider_in_browser_p95_ms"}
+
+
+def test_goals_are_compared_in_the_right_direction() -> None:
+    found = {
+        "scrub": {"p95_ms": 59.0},
+        "sessions": {"worst_frames_per_s": 28.0, "worst_skipped_per_s": 1.0},
+        "live": {"frames_per_s": 30.0},
+    }
+    figures = compare_with_goals(found)
+    assert {name: figure["reached"] for name, figure in figures.items()} == {
+        "scrub_p95_ms": True,
+        "ten_sessions_frames_per_s": False,
+        "ten_sessions_skipped_per_s": False,
+        "live_frames_per_s": True,
+    }
+    assert figures["scrub_p95_ms"] == {"value": 59.0, "goal": 60.0, "reached": True}
+    assert {goal.part for goal in GOALS.values()} == set(PARTS)
+
+
+def test_percentiles_are_those_of_a_sorted_list() -> None:
+    seconds = [0.001 * number for number in range(101)]
+    expected = {"p50_ms": 50.0, "p95_ms": 95.0, "worst_ms": 100.0}
+    assert percentiles(seconds[::-1]) == pytest.approx(expected)
+
+
+def test_frames_that_never_came_are_counted_around_the_end() -> None:
+    received = streams._Received(frames=[57, 58, 0, 1, 4, 5])
+    assert received.skipped(60) == 1 + 2  # 59, and 2 and 3
+
+
+def test_a_new_frame_is_one_that_only_the_new_rollout_has() -> None:
+    rng = np.random.default_rng(5)
+    before = rng.uniform(size=(4, 3, 3)).astype(np.float32)
+    after = np.concatenate([before[:1], before[1:] + np.float32(0.01)])
+    assert is_new_frame(after[2], after, before)
+    assert not is_new_frame(after[0], after, before)  # The state that both start from.
+    assert not is_new_frame(before[2], after, before)
+    assert not is_new_frame(after[2] + np.float32(0.01), after, before)
+
+
+def test_the_heavy_scene_pulls_at_three_hundred_nodes(tmp_path: Path) -> None:
+    run = make_heavy_run(tmp_path)
+    run.verify()
+    take = load_fitted(run, HEAVY)
+    assert take is not None
+    assert take.model.node_count == HEAVY_NODES == 3000
+    assert take.model.object_spring_count > 5000
+    for frame in (1, 30, 58):
+        force = np.linalg.norm(take.forces(frame), axis=-1)
+        assert np.count_nonzero(force > QUIET_FORCE) == HEAVY_ARROWS == 300
+
+
+def test_many_runs_are_listed(tmp_path: Path) -> None:
+    make_many_runs(tmp_path / "runs", 12)
+    items = Catalog(Settings(data_dir=tmp_path), bundled=tmp_path / "none").runs()
+    assert {item.id for item in items} == {f"many_{number:04d}" for number in range(12)}
+    names = {item.run.name for item in items if item.run is not None}
+    assert names == {f"Run {number}" for number in range(12)}
+    assert all(item.run is not None and item.run.is_published for item in items)
+
+
+def test_what_is_missing_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, _, error = call(capsys, "--parts", "everything")
+    assert (code, "everything" in error) == (2, True)
+    assert call(capsys, "nothing")[0] == 1
+    monkeypatch.setattr(browser.shutil, "which", lambda _: None)
+    with pytest.raises(MissingInputError, match="apt-get install chromium"):
+        browser.open_chromium().__enter__()
+    monkeypatch.setitem(__import__("sys").modules, "playwright.sync_api", None)
+    with pytest.raises(MissingInputError, match="pip install playwright"):
+        browser.open_chromium().__enter__()
+    monkeypatch.setattr("app.benchmarks.served._START", "raise SystemExit('no such day')")
+    with pytest.raises(ServerFailedError, match="did not start: no such day"):
+        Served(tmp_path)
