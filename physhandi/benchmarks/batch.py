@@ -1,4 +1,4 @@
-"""How many frames a second a population of candidates simulates, beside one by one."""
+"""How many frames a second a population of candidates is simulated and judged at."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from physhandi.benchmarks.phystwin_like import PhysTwinLike
-from physhandi.benchmarks.scenes import SUBSTEPS, check_positive, scene_of
+from physhandi.benchmarks.scenes import SUBSTEPS, Scene, check_positive, scene_of
 from physhandi.benchmarks.timing import (
     describe_difference,
     describe_scene,
@@ -17,7 +17,8 @@ from physhandi.benchmarks.timing import (
     describe_traffic,
     time_in_turns,
 )
-from physhandi.simulation.batch import BatchRollout, BatchSimulator
+from physhandi.simulation.batch import BatchSimulator
+from physhandi.simulation.batch_losses import MotionTarget
 from physhandi.simulation.master import MasterTopology
 from physhandi.simulation.model import SimulationParameters
 
@@ -25,6 +26,7 @@ _COST = (0, 48, 0)
 """Bytes of a substep and candidate: position and velocity of each node in and out. What the
 candidates share, springs and control nodes, is not counted."""
 _ROUNDS = 2
+_POINTS, _TRACKS = 300, 100
 
 
 def benchmark_batch(
@@ -36,10 +38,12 @@ def benchmark_batch(
     substeps_per_frame: int = SUBSTEPS,
     topology: str | Path | None = None,
 ) -> dict[str, Any]:
-    """Time one rollout of many candidates; the baseline simulates one of middling size alone.
+    """Time one generation of a search; the baseline simulates one candidate of middling size.
 
     Candidates differ in stiffness, damping, drag, ground contact and connection radii, hence
-    also in their springs. The median round counts; what the batch prepares comes before.
+    also in their springs. Ours also compares every frame of every candidate with made-up points
+    and tracks, on the device; the baseline compares nothing. The median round counts; what the
+    batch prepares comes before.
 
     Args:
         device: Warp device, for example ``"cuda:0"``.
@@ -74,19 +78,20 @@ def benchmark_batch(
         index: PhysTwinLike(models[index], candidates[index], device)
         for index in {0, middling, stiffest}
     }
-    found: dict[str, BatchRollout] = {}
+    target = _target(scene)
     works = {
-        "ours": lambda: found.update(last=simulator.rollout(scene.control)),
+        "ours": lambda: simulator.losses(scene.control, target),
         "baseline": lambda: baselines[middling].rollout(scene.control),
     }
     times = time_in_turns(works, device, _ROUNDS)
     ours = times["ours"] / (frame_count * candidate_count)
+    found = simulator.rollout(scene.control)
     differences = []
     for index in (0, stiffest):
         baselines[index].rollout(scene.control)
         differences.append(
             describe_difference(
-                found["last"].position[index, -1],
+                found.position[index, -1],
                 baselines[index].position.numpy(),
                 scene.model.object_node,
             )
@@ -95,12 +100,32 @@ def benchmark_batch(
         "benchmark": "batch",
         **about,
         "candidates": candidate_count,
+        "observed_points": target.cloud.shape[1],
+        "observed_tracks": target.track.shape[1],
         "median_springs": int(median(springs)),
-        "diverged": int(np.sum(found["last"].diverged_frame >= 0)),
+        "diverged": int(np.sum(found.diverged_frame >= 0)),
         **describe_times(ours, times["baseline"] / frame_count),
         **{name: max(d[name] for d in differences) for name in differences[0]},
         **describe_traffic(widest, _COST, ours, device),
     }
+
+
+def _target(scene: Scene) -> MotionTarget:
+    """Make up observations of the usual number: points and tracks near where the nodes began."""
+    node, frames = scene.model.object_node, len(scene.control)
+    rng = np.random.default_rng(1)
+    points, tracks = (rng.integers(0, len(node), count) for count in (_POINTS, _TRACKS))
+    cloud = node[points] + rng.normal(0.0, 0.003, (frames, _POINTS, 3))
+    return MotionTarget(
+        cloud=cloud,
+        cloud_weight=np.full((frames, _POINTS), 1.0 / _POINTS),
+        surface_count=None,
+        track=np.repeat(node[tracks][None], frames, axis=0),
+        track_weight=np.full((frames, _TRACKS), 1.0 / _TRACKS),
+        carrier=tracks[:, None],
+        carrier_weight=np.ones((_TRACKS, 1)),
+        track_offset=np.zeros((_TRACKS, 3)),
+    )
 
 
 def _candidates(reference: SimulationParameters, count: int) -> list[SimulationParameters]:

@@ -1,6 +1,7 @@
 """Adam on an object's material, one update for every window of frames."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -9,7 +10,7 @@ from torch import Tensor
 from physhandi.fitting.material import Material
 from physhandi.fitting.object_config import ObjectFitConfig
 from physhandi.fitting.object_problem import ObjectProblem
-from physhandi.fitting.object_reconstruction import problem_parameters
+from physhandi.fitting.object_simulation import problem_parameters
 from physhandi.simulation import differentiable
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
 
@@ -105,6 +106,7 @@ class Descent:
         while reach >= 1:
             self._optimizer.zero_grad()
             log_stiffness, damping = self.material.of(problem.name)
+            contact: dict[str, Any] = self.material.contact()
             node, velocity = differentiable.rollout(
                 model,
                 problem_parameters(self._parameters, problem),
@@ -115,7 +117,7 @@ class Descent:
                 initial_velocity=state[1],
                 device=self._device,
                 window=reach,
-                **self.material.contact(),
+                **contact,
             )
             frame_losses = problem.frame_losses(
                 node[1:],

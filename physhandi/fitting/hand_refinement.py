@@ -15,7 +15,8 @@ from physhandi.errors import SimulationDivergedError
 from physhandi.fitting.hand_losses import KeypointTarget, reprojection_loss
 from physhandi.fitting.hand_offsets import HandOffsets, OffsetDescent, control_nodes
 from physhandi.fitting.object_problem import ObjectProblem
-from physhandi.fitting.object_reconstruction import problem_parameters
+from physhandi.fitting.object_simulation import problem_parameters
+from physhandi.fitting.preview import RolloutPreview
 from physhandi.fitting.refinement_config import RefinementConfig as RefinementConfig
 from physhandi.hand.control_nodes import control_trajectory
 from physhandi.hand.model import HandModel, HandPose
@@ -103,6 +104,7 @@ def refine_hands(
         CancelledError: If the user asked to stop.
     """
     refinement = Refinement(problem, config, device)
+    preview = RolloutPreview(STAGE, progress)
     curve: list[list[float]] = []
     for iteration in range(config.iterations + 1):
         progress.check_cancelled()
@@ -116,6 +118,9 @@ def refine_hands(
             loss = refinement.go_back()
         curve.append([float(iteration), loss])
         progress.report(STAGE, iteration, config.iterations, loss, message)
+        if refinement.simulated is not None:
+            preview.see(problem.object_, *refinement.simulated)
+            preview.show(loss)
         if iteration < config.iterations:
             refinement.step()
     return refinement.result(curve, progress)
@@ -138,6 +143,8 @@ class Refinement:
         self.first_loss: float | None = None
         self.best = [hand.copy() for hand in self.hands]
         self.best_total = np.inf
+        self.simulated: tuple[Tensor, Tensor] | None = None
+        """Object nodes and control nodes of the latest evaluation."""
         self._begin_descent()
 
     def evaluate(self) -> float:
@@ -221,6 +228,7 @@ class Refinement:
             node, _ = differentiable.rollout(
                 self.problem.model, self.parameters, moved, device=self.device, window=self.reach
             )
+            self.simulated = node.detach(), control
             loss = self._object_loss(node)
             (pull,) = torch.autograd.grad(loss, moved, allow_unused=True)
             pull = torch.zeros_like(moved) if pull is None else pull

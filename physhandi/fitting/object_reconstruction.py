@@ -1,107 +1,14 @@
 """Stage 2: find the spring-mass object whose simulated motion explains what was seen."""
 
-import math
 from collections.abc import Sequence as Many
-from dataclasses import replace
 
-import numpy as np
-import torch
-from jaxtyping import Float
-from torch import Tensor
-
-from physhandi.errors import SimulationDivergedError
-from physhandi.fitting.losses import acceleration_loss
+from physhandi.fitting.candidates import Judge
 from physhandi.fitting.object_config import ObjectFitConfig
 from physhandi.fitting.object_problem import ObjectProblem
 from physhandi.fitting.reach import check_problem
 from physhandi.fitting.search import SearchResult, search_parameters
 from physhandi.progress import Progress
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
-from physhandi.simulation.simulator import Simulator
-from physhandi.simulation.stability import stable_substeps
-from physhandi.simulation.topology import build_model
-
-SAFETY = 1.25
-"""Margin of the substeps over the stability limit."""
-
-
-def problem_parameters(
-    parameters: SimulationParameters, problem: ObjectProblem
-) -> SimulationParameters:
-    """Set the frame rate, ground and gravity of one sequence, as far as the parameters let it."""
-    return parameters.in_world(
-        frame_rate=problem.frame_rate,
-        ground_height=problem.ground_height,
-        gravity=problem.gravity,
-    )
-
-
-def build_problem_model(
-    problem: ObjectProblem, parameters: SimulationParameters
-) -> SpringMassModel:
-    """Connect the object's nodes and attach the control nodes of frame 0."""
-    model = build_model(
-        problem.object_node,
-        problem.control[0],
-        problem_parameters(parameters, problem),
-        rest_node=problem.rest_node,
-    )
-    return replace(model, initial_velocity=problem.initial_velocity)
-
-
-def simulate_problem(
-    problem: ObjectProblem, model: SpringMassModel, parameters: SimulationParameters, device: str
-) -> tuple[Float[Tensor, "frame node 3"], Float[Tensor, "frame node 3"]]:
-    """Roll the model out over the frames to fit; positions [m] and velocities [m/s]."""
-    simulator = Simulator(model, problem_parameters(parameters, problem), device=device)
-    rollout = simulator.rollout(problem.control[: problem.frame_count])
-    return torch.from_numpy(rollout.position), torch.from_numpy(rollout.velocity)
-
-
-def mean_loss(
-    problems: Many[ObjectProblem],
-    models: dict[str, SpringMassModel],
-    parameters: SimulationParameters,
-    config: ObjectFitConfig,
-    device: str,
-    *,
-    acceleration_weight: float = 0.0,
-) -> float:
-    """Simulate every sequence and average its frame losses; infinite if one diverges [m²].
-
-    The mean is over the frames 1, 2, … to fit (physics.md §4.1); frame 0 is given.
-    """
-    losses = []
-    for problem in problems:
-        try:
-            node, velocity = simulate_problem(problem, models[problem.name], parameters, device)
-        except SimulationDivergedError:
-            return math.inf
-        frame_losses = problem.frame_losses(
-            node[1:], track_weight=config.track_weight, freeze_counts=config.freezes_counts
-        )
-        if acceleration_weight > 0.0:
-            frame_losses = frame_losses + acceleration_weight * acceleration_loss(velocity)[1:]
-        losses.append(float(frame_losses.mean()))
-    return float(np.mean(losses))
-
-
-def settle_substeps(
-    models: Many[SpringMassModel],
-    parameters: SimulationParameters,
-    config: ObjectFitConfig,
-    *,
-    safety: float = SAFETY,
-) -> SimulationParameters:
-    """Choose the substeps that keep all models stable, if the configuration says so.
-
-    A step near the limit may stay bounded and still be noise: a search without this finds
-    parameters whose simulation no longer has useful gradients.
-    """
-    if not config.automatic_substeps:
-        return parameters
-    needed = max(stable_substeps(model, parameters, safety=safety) for model in models)
-    return replace(parameters, substeps_per_frame=10 * math.ceil(needed / 10))
+from physhandi.simulation.model import SimulationParameters
 
 
 def search_object(
@@ -129,18 +36,5 @@ def search_object(
     """
     for problem in problems:
         check_problem(problem, start, config.search)
-
-    def evaluate(parameters: SimulationParameters) -> float:
-        models = {p.name: build_problem_model(p, parameters) for p in problems}
-        has_springs = all(len(model.spring_nodes) > 0 for model in models.values())
-        if not has_springs or parameters.substeps_per_frame > config.most_substeps:
-            return math.inf
-        weight = config.acceleration_weight
-        return mean_loss(problems, models, parameters, config, device, acceleration_weight=weight)
-
-    def settle(parameters: SimulationParameters) -> SimulationParameters:
-        parameters = problem_parameters(parameters, problems[0])
-        models = [build_problem_model(p, parameters) for p in problems]
-        return settle_substeps(models, parameters, config)
-
-    return search_parameters(evaluate, start, config.search, progress, settle)
+    judge = Judge(problems, config, progress, device=device)
+    return search_parameters(judge, start, config.search, progress)

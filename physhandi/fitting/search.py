@@ -3,6 +3,7 @@
 import math
 import warnings
 from collections.abc import Callable
+from collections.abc import Sequence as Many
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -88,21 +89,21 @@ class SearchResult:
     """Evaluations so far and best loss, once a generation."""
 
 
+Judgement = Callable[[list[SimulationParameters]], Many[tuple[SimulationParameters, float]]]
+"""Completes candidates by what follows from their values, such as their substeps, and gives each
+its loss [m²], infinite where its simulation diverges."""
+
+
 def search_parameters(
-    evaluate: Callable[[SimulationParameters], float],
-    start: SimulationParameters,
-    config: SearchConfig,
-    progress: Progress,
-    settle: Callable[[SimulationParameters], SimulationParameters] = lambda parameters: parameters,
+    judge: Judgement, start: SimulationParameters, config: SearchConfig, progress: Progress
 ) -> SearchResult:
     """Search global parameters with CMA-ES (paper, zeroth-order stage; PhysTwin §4.2).
 
     Args:
-        evaluate: Loss of a candidate [m²]; infinite where its simulation diverges.
+        judge: Called once with the start and once with each generation.
         start: Parameters to start from; those that are not searched keep their values.
         config: Intervals and effort.
         progress: Told once a generation.
-        settle: Derives what follows from a candidate's values, such as its substeps.
 
     Returns:
         The best parameters ever seen and how the loss went.
@@ -116,8 +117,7 @@ def search_parameters(
         import cma
 
     names = list(config.variables)
-    start = settle(start)
-    loss_before = evaluate(start)
+    ((start, loss_before),) = judge([start])
     best, best_loss = start, loss_before
     curve = [[1.0, loss_before]]
     if not names or config.generations == 0:
@@ -130,7 +130,7 @@ def search_parameters(
             n: config.variables[n].from_unit(float(u)) for n, u in zip(names, unit, strict=True)
         }
         values |= {name: values[other] for name, other in config.tied.items() if other in values}
-        return settle(replace(start, **values))
+        return replace(start, **values)
 
     if not config.keeps_start:
         best_loss = math.inf
@@ -152,15 +152,14 @@ def search_parameters(
     strategy = cma.CMAEvolutionStrategy(np.clip(first, 0.01, 0.99), config.sigma, options)
     evaluations = 1
     for generation in range(config.generations):
+        progress.check_cancelled()
         units = strategy.ask()
-        losses = []
-        for unit in units:
-            progress.check_cancelled()
-            losses.append(evaluate(candidate(unit)))
+        judged = judge([candidate(unit) for unit in units])
+        losses = [loss for _, loss in judged]
         evaluations += len(losses)
         winner = int(np.argmin(losses))
         if losses[winner] < best_loss:
-            best, best_loss = candidate(units[winner]), losses[winner]
+            best, best_loss = judged[winner]
         # Rank decides in CMA, so any value above all finite ones stands for "diverged".
         finite = [loss for loss in losses if math.isfinite(loss)]
         worst = max(finite, default=1.0)

@@ -11,12 +11,13 @@ from physhandi.fitting.descent import Descent
 from physhandi.fitting.material import Material
 from physhandi.fitting.object_config import FirstOrderConfig, ObjectFitConfig
 from physhandi.fitting.object_problem import ObjectProblem
-from physhandi.fitting.object_reconstruction import (
+from physhandi.fitting.object_simulation import (
     SAFETY,
     build_problem_model,
     mean_loss,
     settle_substeps,
 )
+from physhandi.fitting.preview import RolloutPreview
 from physhandi.progress import Progress
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
 
@@ -90,6 +91,7 @@ def optimise_springs(
     best_loss = math.inf if settings.judges_online else loss_before
     curve = [[0.0, loss_before]]
     descent = Descent(material, parameters, config, device)
+    preview = RolloutPreview(STAGE, progress)
     for iteration in range(settings.iterations):
         progress.check_cancelled()
         try:
@@ -106,7 +108,8 @@ def optimise_springs(
         if settings.judges_online:
             loss = float(np.mean([value for value in met if value is not None]))
         else:
-            loss = mean_loss(problems, now, now_parameters, config, device)
+            loss = mean_loss(problems, now, now_parameters, config, device, seen=preview.see)
+            preview.show(loss)
         if _is_judged(iteration, settings) and loss < best_loss:
             best, best_parameters, best_loss = now, now_parameters, loss
         curve.append([float(iteration + 1), loss])

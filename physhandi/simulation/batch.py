@@ -1,53 +1,28 @@
 """Many candidates of one object at once: one launch moves them all by a substep on CUDA."""
 
+from collections.abc import Iterator
 from collections.abc import Sequence as Many
-from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import warp as wp
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Float, Float32
 from numpy import ndarray
 
 from physhandi.errors import SimulationDivergedError, UsageError
-from physhandi.simulation.kernels.batch import (
-    FIELDS,
-    make_batch_kernel,
-    note_divergence,
-    place_batch,
-    take_batch,
-)
+from physhandi.simulation.batch_losses import LossSum, MotionTarget
 from physhandi.simulation.master import MasterTopology
 from physhandi.simulation.model import SimulationParameters
-from physhandi.simulation.partition import bisect_nodes
-from physhandi.simulation.recording import Recording
-from physhandi.simulation.simulator import SPEED_LIMIT, Simulator
+from physhandi.simulation.population import BatchLosses, BatchRollout, Population
+from physhandi.simulation.simulator import Simulator, checked_control
 
-THREADS = 256
-"""Threads of a block: eight nodes are at work at a time."""
-BLOCK_NODES = 4
-"""Nodes are ordered so that so many neighbours in memory are neighbours in space."""
 _COMMON = ("rest_length_floor", "virtual_rest_length_floor", "frame_rate", "frame_duration")
-
-batch_kernel = lru_cache(maxsize=None)(make_batch_kernel)
-
-
-@dataclass(frozen=True, eq=False)
-class BatchRollout:
-    """The motion of every candidate."""
-
-    position: Float32[ndarray, "candidate frame node 3"]
-    """Positions of the object nodes [m]; not finite or far away after a divergence."""
-    diverged_frame: Int[ndarray, " candidate"]
-    """First frame in which a node was not finite or too fast; -1 where none was."""
 
 
 class BatchSimulator:
     """Rolls out many candidates that differ in parameters and in topology.
 
-    On CUDA they share every launch, on a CPU they take turns. All take the substeps of the one
-    that needs most. Self-collision is not simulated.
+    On CUDA they share every launch and take the substeps of the one that needs most; on a CPU
+    they take turns. Self-collision is not simulated.
     """
 
     def __init__(
@@ -75,7 +50,7 @@ class BatchSimulator:
         self.parameters = tuple(parameters)
         self.substeps = max(p.substeps_per_frame for p in parameters)
         self.device = wp.get_device(device)
-        self._lanes: _Lanes | None = None
+        self._population: Population | None = None
 
     def rollout(self, control: Float[ndarray, "frame control 3"]) -> BatchRollout:
         """Simulate all frames of a control trajectory.
@@ -84,209 +59,70 @@ class BatchSimulator:
             control: Positions of the control nodes in every frame [m].
 
         Raises:
-            ValueError: If the trajectory does not fit the master topology.
+            ValueError: If the trajectory does not fit the master topology or is not finite.
         """
-        control = np.asarray(control, dtype=np.float32)
-        if control.ndim != 3 or control.shape[1:] != (self.master.control_count, 3):
-            raise ValueError(
-                f"control has shape {control.shape}; expected "
-                f"(frames, {self.master.control_count}, 3)."
-            )
-        if not self.device.is_cuda or len(self.master.object_node) == 0:
-            return self._in_turns(control)
-        if self._lanes is None:
-            self._lanes = _Lanes(self.master, self.parameters, self.substeps, self.device)
-        return self._lanes.rollout(control)
-
-    def _in_turns(self, control: Float32[ndarray, "frame control 3"]) -> BatchRollout:
+        control = checked_control(control, self.master.control_count)
+        population = self._on_device()
+        if population is not None:
+            return population.rollout(control)
         shape = (len(self.parameters), len(control), len(self.master.object_node), 3)
         position = np.full(shape, np.nan, dtype=np.float32)
         diverged = np.full(len(self.parameters), -1)
         for candidate, parameters in enumerate(self.parameters):
-            model = self.master.model(parameters)
-            simulator = Simulator(model, parameters, device=str(self.device))
             try:
-                for frame, state, _ in simulator.frames(control):
+                for frame, state, _ in self._alone(parameters, control):
                     position[candidate, frame] = state
             except SimulationDivergedError as error:
                 diverged[candidate] = error.frame
         return BatchRollout(position, diverged)
 
+    def losses(
+        self, control: Float[ndarray, "frame control 3"], target: MotionTarget
+    ) -> BatchLosses:
+        """Simulate the observed frames and compare every candidate with what was observed.
 
-class _Lanes:
-    """The arrays of a batch on a CUDA device."""
+        On CUDA the losses are added up on the device, and the host waits for it once.
 
-    def __init__(
-        self,
-        master: MasterTopology,
-        parameters: tuple[SimulationParameters, ...],
-        substeps: int,
-        device: Any,
-    ) -> None:
-        self._device = device
-        self._substeps = substeps
-        self._count = len(parameters)
-        self._nodes = len(master.object_node)
-        # More candidates a thread share more of the reading, but small batches need all threads.
-        self._each = 1 if self._count <= 64 else 2
-        self._width = 32 * self._each
-        self._groups = -(-self._count // self._width)
-        # Candidates with like reach share a group, so that few of them wait for others.
-        reach = np.array([(p.connection_radius, p.virtual_connection_radius) for p in parameters])
-        self._order = np.lexsort(reach.T[::-1])
-        lanes = np.full(self._groups * self._width, self._order[-1])
-        lanes[: self._count] = self._order
-        numbers = [[_number(parameters[i], name, substeps) for i in lanes] for name in FIELDS]
-        group_reach = reach[lanes].reshape(self._groups, self._width, 2).max(axis=1)
-        blocks = max(1, self._nodes // BLOCK_NODES)
-        self._model_node = bisect_nodes(master.object_node, blocks)[0]
-        rest_length = master.rest_length(parameters[0])
-        self._inputs = [
-            self._array(np.array(numbers, dtype=np.float32), wp.float32),
-            self._array(group_reach.T.astype(np.float32), wp.float32),
-            *self._entries(master, rest_length, group_reach[:, 0]),
-            *self._held(master, rest_length),
-        ]
-        self._node_of = self._array(self._model_node.astype(np.int32), wp.int32)
-        size = len(lanes) * self._nodes * 6
-        self._state = [wp.zeros(size, dtype=wp.float32, device=device) for _ in range(2)]
-        self._controls = [
-            wp.zeros(master.control_count, dtype=wp.vec3, device=device) for _ in range(2)
-        ]
-        self._start = [
-            self._array(value, wp.vec3) for value in (master.object_node, master.initial_velocity)
-        ]
-        self._diverged = wp.zeros(len(lanes), dtype=wp.int32, device=device)
-        self._frame = Recording(self._launch_frame, device)
+        Args:
+            control: Positions of the control nodes, in the observed frames at least [m].
+            target: What was observed.
 
-    def rollout(self, control: Float32[ndarray, "frame control 3"]) -> BatchRollout:
-        """Simulate all frames; the host waits once, at the end."""
-        path = self._array(control.reshape(-1, 3), wp.vec3)
-        shape = (len(control), self._count, self._nodes)
-        found = wp.zeros(shape, dtype=wp.vec3, device=self._device)
-        first = wp.full(len(self._diverged), -1, dtype=wp.int32, device=self._device)
-        self._diverged.zero_()
-        self._launch(
-            place_batch,
-            (self._nodes, len(self._diverged)),
-            [self._width, self._node_of, *self._start],
-            [self._state[0]],
-        )
-        for frame in range(len(control)):
-            if frame > 0:
-                for place, source in zip(self._controls, (frame - 1, frame), strict=True):
-                    count = len(place)
-                    if count:
-                        wp.copy(place, path, src_offset=source * count, count=count)
-                self._frame.replay()
-                self._launch(note_divergence, len(first), [frame, self._diverged], [first])
-            self._launch(
-                take_batch,
-                (self._nodes, self._count),
-                [self._width, self._node_of, self._state[0]],
-                [found[frame]],
+        Raises:
+            ValueError: If the trajectory does not fit the master topology, is not finite, or is
+                shorter than what was observed.
+        """
+        control = checked_control(control, self.master.control_count)
+        if len(control) < target.frame_count:
+            raise ValueError(
+                f"control has {len(control)} frames, but {target.frame_count} were observed."
             )
-        position = np.empty((self._count, len(control), self._nodes, 3), dtype=np.float32)
-        position[self._order] = found.numpy().swapaxes(0, 1)
-        diverged = np.empty(self._count, dtype=np.int64)
-        diverged[self._order] = first.numpy()[: self._count]
-        return BatchRollout(position, diverged)
+        population = self._on_device()
+        if population is not None:
+            return population.losses(control, target)
+        loss = np.full(len(self.parameters), np.inf, dtype=np.float32)
+        diverged = np.full(len(self.parameters), -1)
+        nodes = len(self.master.object_node)
+        good = wp.full(1, -1, dtype=wp.int32, device=self.device)
+        for candidate, parameters in enumerate(self.parameters):
+            sums = LossSum(target, np.arange(nodes), lanes=1, width=1, device=self.device)
+            try:
+                for frame, *state in self._alone(parameters, control[: target.frame_count]):
+                    flat = np.concatenate(state, axis=1).ravel()
+                    sums.add(frame, wp.array(flat, dtype=wp.float32, device=self.device), good)
+                loss[candidate] = sums.loss.numpy()[0]
+            except SimulationDivergedError as error:
+                diverged[candidate] = error.frame
+        return BatchLosses(loss, diverged)
 
-    def _launch_frame(self) -> None:
-        threads = 32 * self._groups * self._nodes
-        for substep in range(self._substeps):
-            before, after = self._state[substep % 2], self._state[(substep + 1) % 2]
-            fraction = (substep + 1) / self._substeps
-            self._launch(
-                batch_kernel(self._each),
-                threads,
-                [self._groups, fraction, *self._inputs, *self._controls, before],
-                [after, self._diverged],
-            )
-        if self._substeps % 2:
-            wp.copy(self._state[0], self._state[1])
+    def _on_device(self) -> Population | None:
+        if not self.device.is_cuda or len(self.master.object_node) == 0:
+            return None
+        if self._population is None:
+            self._population = Population(self.master, self.parameters, self.substeps, self.device)
+        return self._population
 
-    def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
-        wp.launch(
-            kernel,
-            dim=dim,
-            inputs=inputs,
-            outputs=outputs,
-            block_dim=THREADS,
-            device=self._device,
-        )
-
-    def _entries(
-        self, master: MasterTopology, rest_length: ndarray, reach: Float[ndarray, " group"]
-    ) -> list[wp.array]:
-        """List object half-edges, the nearest neighbor of a node first, and where groups end."""
-        ends = self._numbered(master.spring_nodes[: master.object_spring_count])
-        spring = np.tile(np.arange(len(ends)), 2)
-        source, other = np.concatenate([ends, ends[:, ::-1]]).T
-        start, order = self._sorted(source, master.length[spring])
-        other, spring, source = other[order], spring[order], source[order]
-        end = [
-            start[:-1] + np.bincount(source[master.length[spring] < far], minlength=self._nodes)
-            for far in reach
-        ]
-        return [
-            self._array(start.astype(np.int32), wp.int32),
-            self._array(np.array(end, dtype=np.int32), wp.int32),
-            *self._springs(master, rest_length, other, spring),
-        ]
-
-    def _held(self, master: MasterTopology, rest_length: ndarray) -> list[wp.array]:
-        """List virtual springs by object node, the nearest control node first."""
-        spring = np.arange(master.object_spring_count, len(master.length))
-        ends = np.sort(master.spring_nodes[spring], axis=1)
-        source, control = self._numbered(ends[:, 0]), ends[:, 1] - self._nodes
-        start, order = self._sorted(source, master.length[spring])
-        lists = self._springs(master, rest_length, control[order], spring[order])
-        return [self._array(start.astype(np.int32), wp.int32), *lists]
-
-    def _numbered(self, node: Int[ndarray, "*ends"]) -> Int[ndarray, "*ends"]:
-        """Turn the model's numbers of object nodes into those of the batch."""
-        number = np.empty(self._nodes, dtype=np.int64)
-        number[self._model_node] = np.arange(self._nodes)
-        return number[node]
-
-    def _sorted(
-        self, source: Int[ndarray, " entry"], length: Float[ndarray, " entry"]
-    ) -> tuple[Int[ndarray, " node_1"], Int[ndarray, " entry"]]:
-        """Order entries by node and length; return where each node's entries begin."""
-        order = np.lexsort((length, source))
-        return np.searchsorted(source[order], np.arange(self._nodes + 1)), order
-
-    def _springs(
-        self, master: MasterTopology, rest_length: ndarray, other: ndarray, spring: ndarray
-    ) -> list[wp.array]:
-        rest = rest_length[spring]
-        rows = [master.length[spring], rest, 1.0 / rest, np.zeros(len(spring))]
-        pair = np.stack([other, master.rank[spring]], axis=1)
-        return [
-            self._array(pair.astype(np.int32), wp.vec2i),
-            self._array(np.stack(rows, axis=1).astype(np.float32), wp.vec4),
-        ]
-
-    def _array(self, value: ndarray, dtype: Any) -> wp.array:
-        return wp.array(np.ascontiguousarray(value), dtype=dtype, device=self._device)
-
-
-def _number(parameters: SimulationParameters, name: str, substeps: int) -> float:
-    """Give one of the kernel's numbers of a candidate."""
-    duration = 1.0 / parameters.simulated_frame_rate
-    height = parameters.ground_height
-    scale = parameters.stiffness_scale
-    derived = {
-        "dt": duration / substeps,
-        "velocity_loss": -np.expm1(-duration / substeps * parameters.drag),
-        "has_ground": float(height is not None),
-        "ground_height": 0.0 if height is None else height,
-        "control_rate": parameters.simulated_frame_rate * parameters.use_control_velocity,
-        "speed_limit": SPEED_LIMIT,
-        "stiffness": scale * parameters.stiffness,
-        "virtual_stiffness": scale * parameters.virtual_stiffness,
-        "damping": parameters.damping * (parameters.stiffness > 0.0),
-        "virtual_damping": parameters.damping * (parameters.virtual_stiffness > 0.0),
-    }
-    return float(derived.get(name, getattr(parameters, name, 0.0)))
+    def _alone(
+        self, parameters: SimulationParameters, control: Float32[ndarray, "frame control 3"]
+    ) -> Iterator[tuple[int, ndarray, ndarray]]:
+        model = self.master.model(parameters)
+        return Simulator(model, parameters, device=str(self.device)).frames(control)

@@ -18,7 +18,8 @@ class MasterTopology:
 
     A spring exists for a candidate if its length is below the candidate's radius and its rank
     below its neighbor limit: the rank is the place of one end among the other's neighbors,
-    counted from 0, by the end that is quicker to propose it.
+    counted from 0, by the end that is quicker to propose it. Where a limit cuts between neighbors
+    that are equally far, the choice may be another one than `topology.build_model`'s.
     """
 
     object_node: Float32[ndarray, "node 3"]

@@ -34,34 +34,20 @@ FIELDS = (
     "virtual_max_neighbors",
 )
 """Rows of the candidates' numbers."""
+_LEAST_THREADS = 256
 
 
-@wp.func
-def candidate_world(number: wp.array2d[float], candidate: int):
-    """Collect what all nodes of a candidate share."""
-    world = World()
-    world.dt = number[wp.static(FIELDS.index("dt")), candidate]
-    world.velocity_loss = number[wp.static(FIELDS.index("velocity_loss")), candidate]
-    world.gravity = number[wp.static(FIELDS.index("gravity")), candidate]
-    world.has_ground = int(number[wp.static(FIELDS.index("has_ground")), candidate])
-    world.ground_height = number[wp.static(FIELDS.index("ground_height")), candidate]
-    world.restitution = number[wp.static(FIELDS.index("restitution")), candidate]
-    world.friction = number[wp.static(FIELDS.index("friction")), candidate]
-    world.control_rate = number[wp.static(FIELDS.index("control_rate")), candidate]
-    world.speed_limit = number[wp.static(FIELDS.index("speed_limit")), candidate]
-    return world
-
-
-# `dataflow.pull` summed over a node's springs, for several candidates a thread: wide loads at
-# fixed offsets, which Warp's strided arrays do not give, make it 2.5 times as fast.
+# What follows is `dataflow.pull` summed over a node's springs, for several candidates a thread.
+# Wide loads at fixed offsets, which Warp's strided arrays do not give, make it 2.5 times as fast.
+# Springs that all candidates of the group have come first and need no question. The root of
+# `intrinsics` is inlined with the sum of squares kept away from zero.
 _SUM_SPRINGS = """
 #if defined(__CUDA_ARCH__)
     typedef WIDE wide;
     const wide* states = (const wide*)state.data + group_first;
     const float4* lengths = (const float4*)entry_length.data;
     const int2* others = (const int2*)entry.data;
-    #pragma unroll 4
-    for (int e = begin; e < end; ++e) {
+    const auto pull = [&](const int e, const bool is_certain) {
         const float4 length = __ldg(lengths + e);
         const int2 other = __ldg(others + e);
         const wide* place = states + 192 * other.x;
@@ -70,50 +56,103 @@ _SUM_SPRINGS = """
         for (int k = 0; k < 6; ++k) found[k] = __ldg(place + 32 * k);
         #pragma unroll
         for (int i = 0; i < COUNT; ++i) {
-            const float dx = ((const float*)&found[0])[i] - x.data[i][0];
-            const float dy = ((const float*)&found[1])[i] - x.data[i][1];
-            const float dz = ((const float*)&found[2])[i] - x.data[i][2];
-            const float ux = ((const float*)&found[3])[i] - v.data[i][0];
-            const float uy = ((const float*)&found[4])[i] - v.data[i][1];
-            const float uz = ((const float*)&found[5])[i] - v.data[i][2];
+            const float dx = ((const float*)&found[0])[i] - x.data[0][i];
+            const float dy = ((const float*)&found[1])[i] - x.data[1][i];
+            const float dz = ((const float*)&found[2])[i] - x.data[2][i];
+            const float ux = ((const float*)&found[3])[i] - v.data[0][i];
+            const float uy = ((const float*)&found[4])[i] - v.data[1][i];
+            const float uz = ((const float*)&found[5])[i] - v.data[2][i];
             const float squared = fmaf(dx, dx, fmaf(dy, dy, fmaf(dz, dz, 1.0e-20f)));
-            const float inverse = rsqrtf(squared);
+            float inverse;
+            asm("rsqrt.approx.ftz.f32 %0, %1;" : "=f"(inverse) : "f"(squared));
             float now = squared * inverse;
             now = fmaf(0.5f * inverse, fmaf(-now, now, squared), now);
             const float rate = inverse * fmaf(ux, dx, fmaf(uy, dy, uz * dz));
-            const float strain = (now - length.y) * length.z;
-            const float tension = fmaf(material.data[i][0], strain, material.data[i][1] * rate);
-            const bool exists = length.x < material.data[i][2] && other.y < material.data[i][3];
+            const float strain = fmaf(now, length.z, -1.0f);
+            const float tension = fmaf(material.data[0][i], strain, material.data[1][i] * rate);
+            const bool exists = is_certain
+                || (length.x < material.data[2][i] && other.y < material.data[3][i]);
             const float scale = exists ? tension * inverse : 0.0f;
-            force.data[i][0] = fmaf(scale, dx, force.data[i][0]);
-            force.data[i][1] = fmaf(scale, dy, force.data[i][1]);
-            force.data[i][2] = fmaf(scale, dz, force.data[i][2]);
+            force.data[0][i] = fmaf(scale, dx, force.data[0][i]);
+            force.data[1][i] = fmaf(scale, dy, force.data[1][i]);
+            force.data[2][i] = fmaf(scale, dz, force.data[2][i]);
         }
-    }
+    };
+    #pragma unroll 3
+    for (int e = begin + part; e < certain_end; e += PARTS) pull(e, true);
+    #pragma unroll 1
+    for (int e = certain_end + part; e < end; e += PARTS) pull(e, false);
 #endif
     return force;
 """
+# Warps that share a node add up what they found, always in the same order.
+_ADD_PARTS = """
+#if defined(__CUDA_ARCH__)
+    __shared__ float found[PARTS][3][COUNT][32];
+    for (int k = 0; k < 3; ++k)
+        for (int i = 0; i < COUNT; ++i) found[part][k][i][lane] = force.data[k][i];
+    __syncthreads();
+    for (int k = 0; k < 3; ++k)
+        for (int i = 0; i < COUNT; ++i) {
+            float sum = found[0][k][i][lane];
+            for (int other = 1; other < PARTS; ++other) sum += found[other][k][i][lane];
+            force.data[k][i] = sum;
+        }
+#endif
+    return force;
+"""
+_LOAD = """
+    FLOATS value;
+#if defined(__CUDA_ARCH__)
+    const WIDE wide = __ldg((const WIDE*)data.data + place);
+    for (int i = 0; i < COUNT; ++i) value[i] = ((const float*)&wide)[i];
+#endif
+    return value;
+"""
+_STORE = """
+#if defined(__CUDA_ARCH__)
+    WIDE wide;
+    for (int i = 0; i < COUNT; ++i) ((float*)&wide)[i] = value[i];
+    ((WIDE*)data.data)[place] = wide;
+#endif
+"""
 
 
-def make_batch_kernel(count: int) -> wp.Kernel:
+def block_threads(parts: int) -> int:
+    """Give the threads of a block whose nodes are shared by so many warps each."""
+    return max(_LEAST_THREADS, 32 * parts)
+
+
+def make_batch_kernel(count: int, parts: int) -> wp.Kernel:
     """Make the kernel of one substep.
 
     Args:
         count: Candidates of each thread: 1 or 2.
+        parts: Warps that share the springs of a node: 1, or a whole block of 8 or more.
     """
-    vectors = wp.types.matrix(shape=(count, 3), dtype=wp.float32)
-    materials = wp.types.matrix(shape=(count, 4), dtype=wp.float32)
+    if parts not in {1, 8, 16, 32}:
+        raise ValueError(f"{parts} warps cannot share a node.")
+    floats = wp.types.vector(length=count, dtype=wp.float32)
+    vectors = wp.types.matrix(shape=(3, count), dtype=wp.float32)
+    materials = wp.types.matrix(shape=(4, count), dtype=wp.float32)
     wide = {1: "float", 2: "float2"}[count]
-    snippet = _SUM_SPRINGS.replace("WIDE", wide).replace("COUNT", str(count))
 
-    @wp.func_native(snippet=snippet)
+    def native(snippet: str) -> str:
+        snippet = snippet.replace("FLOATS", f"wp::vec_t<{count}, wp::float32>")
+        return (
+            snippet.replace("WIDE", wide).replace("COUNT", str(count)).replace("PARTS", str(parts))
+        )
+
+    @wp.func_native(snippet=native(_SUM_SPRINGS))
     def sum_springs(
         state: wp.array[float],
         group_first: int,
         entry: wp.array[wp.vec2i],
         entry_length: wp.array[wp.vec4],
         begin: int,
+        certain_end: int,
         end: int,
+        part: int,
         x: vectors,
         v: vectors,
         material: materials,
@@ -121,14 +160,30 @@ def make_batch_kernel(count: int) -> wp.Kernel:
     ) -> vectors:
         """Sum the object springs of one node for several candidates."""
 
-    @wp.kernel(enable_backward=False, module="unique", launch_bounds=256)
+    @wp.func_native(snippet=native(_ADD_PARTS))
+    def add_parts(part: int, lane: int, force: vectors) -> vectors:
+        """Sum what the warps of a block found."""
+
+    @wp.func_native(snippet=native(_LOAD))
+    def load(data: wp.array[float], place: int) -> floats:
+        """Load the numbers of a thread's candidates."""
+
+    @wp.func_native(snippet=native(_STORE))
+    def store(data: wp.array[float], place: int, value: floats):
+        """Store the numbers of a thread's candidates."""
+
+    # Registers for three blocks of the common size: fewer spill, more leave places empty.
+    bounds = (block_threads(parts), 3 if parts == 1 else 1)
+
+    @wp.kernel(enable_backward=False, module="unique", launch_bounds=bounds)
     def advance_batch(
         groups: int,
         fraction: float,
         # Model:
-        number: wp.array2d[float],
+        number: wp.array[float],
         reach: wp.array2d[float],
         entry_start: wp.array[int],
+        entry_certain: wp.array2d[int],
         entry_end: wp.array2d[int],
         entry: wp.array[wp.vec2i],
         entry_length: wp.array[wp.vec4],
@@ -143,72 +198,101 @@ def make_batch_kernel(count: int) -> wp.Kernel:
         state_out: wp.array[float],
         diverged_out: wp.array[int],
     ):
-        """Advance each node for each group of candidates (a warp a node and group)."""
+        """Advance each node for each group of candidates (`parts` warps a node and group)."""
         thread = wp.tid()
         lane = thread % 32
+        part = thread // 32 % wp.static(parts)
         nodes = held_start.shape[0] - 1
-        node = (thread // 32) % nodes
-        group = thread // (32 * nodes)
+        task = thread // wp.static(32 * parts)
+        group = task // nodes
+        node = task - group * nodes
         if group >= groups:
             return
-        candidate = wp.static(count) * (32 * group + lane)
-        base = wp.static(count) * (192 * (group * nodes + node) + lane)
+        own = 192 * (group * nodes + node) + lane
+        numbers = wp.static(32 * len(FIELDS)) * group + lane
         x = vectors()
         v = vectors()
-        material = materials()
         force = vectors()
-        for i in range(wp.static(count)):
-            for k in range(3):
-                x[i, k] = state[base + i + wp.static(32 * count) * k]
-                v[i, k] = state[base + i + wp.static(32 * count) * (3 + k)]
-            material[i, 0] = number[wp.static(FIELDS.index("stiffness")), candidate + i]
-            material[i, 1] = number[wp.static(FIELDS.index("damping")), candidate + i]
-            material[i, 2] = number[wp.static(FIELDS.index("connection_radius")), candidate + i]
-            material[i, 3] = number[wp.static(FIELDS.index("max_neighbors")), candidate + i]
+        for k in range(3):
+            x[k] = load(state, own + 32 * k)
+            v[k] = load(state, own + 96 + 32 * k)
+        material = materials()
+        for k in range(4):
+            material[k] = load(number, numbers + 32 * (wp.static(FIELDS.index("stiffness")) + k))
         force = sum_springs(
             state,
             192 * group * nodes + lane,
             entry,
             entry_length,
             entry_start[node],
+            entry_certain[group, node],
             entry_end[group, node],
+            part,
             x,
             v,
             material,
             force,
         )
-        for i in range(wp.static(count)):
-            here = candidate_world(number, candidate + i)
-            own_position = wp.vec3(x[i, 0], x[i, 1], x[i, 2])
-            own_velocity = wp.vec3(v[i, 0], v[i, 1], v[i, 2])
-            total = wp.vec3(force[i, 0], force[i, 1], force[i, 2])
-            radius = number[wp.static(FIELDS.index("virtual_connection_radius")), candidate + i]
-            most = number[wp.static(FIELDS.index("virtual_max_neighbors")), candidate + i]
-            for e in range(held_start[node], held_start[node + 1]):
-                length = held_length[e]
-                # The nearest control comes first, so no later one is in reach either.
-                if length[0] >= reach[1, group]:
-                    break
-                control = held[e]
-                if length[0] < radius and float(control[1]) < most:
-                    at = control_position(control[0], fraction, control_start, control_end)
+        dt = load(number, numbers + wp.static(32 * FIELDS.index("dt")))
+        velocity_loss = load(number, numbers + wp.static(32 * FIELDS.index("velocity_loss")))
+        gravity = load(number, numbers + wp.static(32 * FIELDS.index("gravity")))
+        has_ground = load(number, numbers + wp.static(32 * FIELDS.index("has_ground")))
+        ground_height = load(number, numbers + wp.static(32 * FIELDS.index("ground_height")))
+        restitution = load(number, numbers + wp.static(32 * FIELDS.index("restitution")))
+        friction = load(number, numbers + wp.static(32 * FIELDS.index("friction")))
+        control_rate = load(number, numbers + wp.static(32 * FIELDS.index("control_rate")))
+        speed_limit = load(number, numbers + wp.static(32 * FIELDS.index("speed_limit")))
+        for e in range(held_start[node] + part, held_start[node + 1], wp.static(parts)):
+            length = held_length[e]
+            # The nearest control comes first, so no later one is in reach either.
+            if length[0] >= reach[1, group]:
+                break
+            control = held[e]
+            at = control_position(control[0], fraction, control_start, control_end)
+            tie = materials()
+            for k in range(4):
+                tie[k] = load(
+                    number, numbers + 32 * (wp.static(FIELDS.index("virtual_stiffness")) + k)
+                )
+            for i in range(wp.static(count)):
+                if length[0] < tie[2, i] and float(control[1]) < tie[3, i]:
                     speed = control_velocity(
-                        control[0], here.control_rate, control_start, control_end
+                        control[0], control_rate[i], control_start, control_end
                     )
-                    total += pull(
-                        at - own_position,
-                        speed - own_velocity,
+                    tension = pull(
+                        at - wp.vec3(x[0, i], x[1, i], x[2, i]),
+                        speed - wp.vec3(v[0, i], v[1, i], v[2, i]),
                         length[1],
-                        number[wp.static(FIELDS.index("virtual_stiffness")), candidate + i]
-                        * length[2],
-                        number[wp.static(FIELDS.index("virtual_damping")), candidate + i],
+                        tie[0, i] * length[2],
+                        tie[1, i],
                     )
-            motion = advance(here, own_position, free_velocity(here, own_velocity, total))
+                    for k in range(3):
+                        force[k, i] = force[k, i] + tension[k]
+        if wp.static(parts > 1):
+            force = add_parts(part, lane, force)
+            if part > 0:
+                return
+        for i in range(wp.static(count)):
+            here = World()
+            here.dt = dt[i]
+            here.velocity_loss = velocity_loss[i]
+            here.gravity = gravity[i]
+            here.has_ground = int(has_ground[i])
+            here.ground_height = ground_height[i]
+            here.restitution = restitution[i]
+            here.friction = friction[i]
+            here.speed_limit = speed_limit[i]
+            total = wp.vec3(force[0, i], force[1, i], force[2, i])
+            free = free_velocity(here, wp.vec3(v[0, i], v[1, i], v[2, i]), total)
+            motion = advance(here, wp.vec3(x[0, i], x[1, i], x[2, i]), free)
             for k in range(3):
-                state_out[base + i + wp.static(32 * count) * k] = motion.position[k]
-                state_out[base + i + wp.static(32 * count) * (3 + k)] = motion.velocity[k]
+                x[k, i] = motion.position[k]
+                v[k, i] = motion.velocity[k]
             if is_too_fast(here, motion.velocity):
-                diverged_out[candidate + i] = 1
+                diverged_out[wp.static(count) * (32 * group + lane) + i] = 1
+        for k in range(3):
+            store(state_out, own + 32 * k, x[k])
+            store(state_out, own + 96 + 32 * k, v[k])
 
     return advance_batch
 

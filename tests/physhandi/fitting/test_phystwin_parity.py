@@ -17,7 +17,7 @@ from physhandi.fitting.descent import Descent
 from physhandi.fitting.material import Material
 from physhandi.fitting.object_config import ObjectFitConfig
 from physhandi.fitting.object_problem import ObjectProblem, build_problem
-from physhandi.fitting.object_reconstruction import build_problem_model, mean_loss, simulate_problem
+from physhandi.fitting.object_simulation import build_problem_model, mean_loss, simulate_problem
 from physhandi.fitting.profile import PipelineConfig, load_profile
 from physhandi.simulation.model import SpringMassModel
 

@@ -2,13 +2,19 @@
 
 import math
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 
 from physhandi.errors import CancelledError, FitError
 from physhandi.fitting.profile import load_profile
-from physhandi.fitting.search import SearchConfig, SearchVariable, search_parameters
+from physhandi.fitting.search import (
+    Judgement,
+    SearchConfig,
+    SearchVariable,
+    search_parameters,
+)
 from physhandi.progress import NullProgress, Progress
 from physhandi.simulation.model import SimulationParameters
 
@@ -28,9 +34,14 @@ def bowl(parameters: SimulationParameters) -> float:
     )
 
 
+def each(evaluate: Callable[[SimulationParameters], float]) -> Judgement:
+    """Judge one candidate after the other."""
+    return lambda candidates: [(candidate, evaluate(candidate)) for candidate in candidates]
+
+
 def test_search_finds_the_bottom_of_a_bowl() -> None:
     config = SearchConfig(generations=60, population=10, variables=VARIABLES)
-    result = search_parameters(bowl, START, config, NullProgress())
+    result = search_parameters(each(bowl), START, config, NullProgress())
     assert result.loss_before == pytest.approx(bowl(START))
     assert result.loss_after < 0.01 < result.loss_before
     assert result.parameters.stiffness == pytest.approx(2e3, rel=0.15)
@@ -42,8 +53,8 @@ def test_search_finds_the_bottom_of_a_bowl() -> None:
 
 def test_the_same_seed_gives_the_same_answer() -> None:
     config = SearchConfig(generations=4, variables=VARIABLES)
-    first = search_parameters(bowl, START, config, NullProgress())
-    assert search_parameters(bowl, START, config, NullProgress()) == first
+    first = search_parameters(each(bowl), START, config, NullProgress())
+    assert search_parameters(each(bowl), START, config, NullProgress()) == first
 
 
 def test_divergent_candidates_do_not_stop_the_search() -> None:
@@ -51,7 +62,7 @@ def test_divergent_candidates_do_not_stop_the_search() -> None:
         return math.inf if parameters.stiffness > 5e3 else bowl(parameters)
 
     config = SearchConfig(generations=40, population=10, variables=VARIABLES)
-    result = search_parameters(cliff, START, config, NullProgress())
+    result = search_parameters(each(cliff), START, config, NullProgress())
     assert math.isinf(result.loss_before)
     assert result.loss_after < 0.1
 
@@ -59,7 +70,7 @@ def test_divergent_candidates_do_not_stop_the_search() -> None:
 def test_nothing_but_divergence_is_an_error() -> None:
     config = SearchConfig(generations=2, variables=VARIABLES)
     with pytest.raises(FitError, match=r"diverged.*stiffness"):
-        search_parameters(lambda _: math.inf, START, config, NullProgress())
+        search_parameters(each(lambda _: math.inf), START, config, NullProgress())
 
 
 def test_tied_parameters_follow() -> None:
@@ -68,12 +79,12 @@ def test_tied_parameters_follow() -> None:
         variables={"stiffness": VARIABLES["stiffness"]},
         tied={"virtual_stiffness": "stiffness"},
     )
-    result = search_parameters(bowl, START, config, NullProgress())
+    result = search_parameters(each(bowl), START, config, NullProgress())
     assert result.parameters.virtual_stiffness == result.parameters.stiffness != START.stiffness
 
 
 def test_without_generations_the_start_is_the_answer() -> None:
-    result = search_parameters(bowl, START, SearchConfig(generations=0), NullProgress())
+    result = search_parameters(each(bowl), START, SearchConfig(generations=0), NullProgress())
     assert result.parameters == START
 
 
@@ -84,7 +95,7 @@ def test_search_stops_when_told() -> None:
 
     with pytest.raises(CancelledError):
         search_parameters(
-            bowl, START, SearchConfig(generations=1, variables=VARIABLES), Impatient()
+            each(bowl), START, SearchConfig(generations=1, variables=VARIABLES), Impatient()
         )
 
 
@@ -135,7 +146,7 @@ def test_cma_is_set_up_as_phystwins(
         seen.append(parameters)
         return abs(parameters.drag - 7.0)
 
-    search_parameters(evaluate, profile.simulation, profile.object_.search, NullProgress())
+    search_parameters(each(evaluate), profile.simulation, profile.object_.search, NullProgress())
     # physics.md §4.2; 4 + ⌊3 ln 12⌋ = 11, and the start is looked at once before.
     x0 = [0.3, 0.25, 0.5, 3 / 7, 4 / 7, 0.5, 0.15, 0.7, 0.15, 0.25, 0.15, 0.5]
     if name == "paper":
@@ -160,10 +171,10 @@ def test_the_start_is_returned_only_if_it_may_be() -> None:
         return 0.0 if parameters == START else 1.0 + parameters.drag
 
     config = SearchConfig(generations=2, variables=VARIABLES)
-    kept = search_parameters(jealous, START, config, NullProgress())
+    kept = search_parameters(each(jealous), START, config, NullProgress())
     assert (kept.parameters, kept.loss_after) == (START, 0.0)
     config = SearchConfig(generations=2, variables=VARIABLES, keeps_start=False)
-    best = search_parameters(jealous, START, config, NullProgress())
+    best = search_parameters(each(jealous), START, config, NullProgress())
     assert best.parameters != START
     assert best.loss_after == 1.0 + best.parameters.drag > best.loss_before == 0.0
 
@@ -179,6 +190,6 @@ def test_a_bounded_step_stays_near_the_start() -> None:
     config = SearchConfig(
         generations=1, population=20, sigma=1 / 6, longest_step=1e-3, variables=two
     )
-    search_parameters(downhill, START, config, NullProgress())
+    search_parameters(each(downhill), START, config, NullProgress())
     # The drag's interval is 20 wide: a step of at most a thousandth of it is 0.02.
     assert 0.005 < max(abs(drag - START.drag) for drag in seen) < 0.1

@@ -14,7 +14,8 @@ from physhandi.fitting.descent import Descent
 from physhandi.fitting.material import Material
 from physhandi.fitting.object_config import FirstOrderConfig, ObjectFitConfig
 from physhandi.fitting.object_problem import ObjectProblem, build_problem
-from physhandi.fitting.object_reconstruction import build_problem_model, mean_loss, search_object
+from physhandi.fitting.object_reconstruction import search_object
+from physhandi.fitting.object_simulation import build_problem_model, mean_loss
 from physhandi.fitting.search import SearchConfig, SearchVariable
 from physhandi.fitting.spring_optimisation import FirstOrderResult, optimise_springs
 from physhandi.progress import NullProgress
@@ -105,7 +106,7 @@ def returned_iteration(
             self.material.logarithms()[0][0] += 0.1
         return next(waiting)
 
-    def simulated(*_: object) -> float:
+    def simulated(*_: object, **__: object) -> float:
         return 2.0
 
     monkeypatch.setattr(Descent, "walk", walk)

@@ -1,0 +1,180 @@
+"""The judge of the search against simulating and comparing each candidate with torch."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from physhandi.data.observation import ObjectObservation
+from physhandi.errors import CancelledError
+from physhandi.fitting.candidates import Judge
+from physhandi.fitting.object_config import ObjectFitConfig
+from physhandi.fitting.object_problem import ObjectProblem, build_problem
+from physhandi.fitting.object_simulation import build_problem_model, mean_loss
+from physhandi.progress import NullProgress, Preview, Progress
+from physhandi.simulation.model import SimulationParameters
+
+PARAMETERS = SimulationParameters(
+    connection_radius=0.16,
+    max_neighbors=8,
+    virtual_connection_radius=0.03,
+    virtual_max_neighbors=1,
+    stiffness=300.0,
+    virtual_stiffness=3000.0,
+    damping=5.0,
+    drag=1.0,
+    substeps_per_frame=40,
+)
+FRAMES = 5
+AXIS = np.arange(4) * 0.1
+NODE = np.stack([*np.meshgrid(AXIS, AXIS, indexing="ij"), np.zeros((4, 4))], axis=-1).reshape(-1, 3)
+# Of neighbors that are equally far, each topology may choose its own.
+NODE = NODE + np.random.default_rng(6).normal(0, 0.003, NODE.shape)
+
+
+def sheet(name: str, lift: float, gravity: float = 9.81, **more: object) -> ObjectProblem:
+    """A sheet that two risen corners pull, seen as noise about where it lay: nothing fits it."""
+    rng = np.random.default_rng(len(name))
+    corner = NODE[[0, 3]] + [0.0, 0.0, 0.01]
+    rise = np.linspace(0, 1, FRAMES + 2)[:, None, None] * np.array([0.0, 0.0, lift])
+    point = np.repeat(NODE[None, :6], FRAMES + 2, axis=0) + rng.normal(0, 0.02, (FRAMES + 2, 6, 3))
+    visible = rng.uniform(size=point.shape[:2]) < 0.7
+    visible[0] = True
+    valid = visible.copy()
+    valid[0] = False
+    clouds = tuple(rng.uniform(0, 0.3, (7 + 3 * frame, 3)) for frame in range(FRAMES + 2))
+    observation = ObjectObservation(
+        point=point.astype(np.float32), is_visible=visible, is_motion_valid=valid, cloud=clouds
+    )
+    settings = {
+        "name": name,
+        "observation": observation,
+        "object_node": NODE,
+        "rest_node": NODE,
+        "control": (corner[None] + rise).astype(np.float32),
+        "frame_count": FRAMES,
+        "frame_rate": 30.0,
+        "ground_height": None,
+        "gravity": gravity,
+    }
+    return build_problem(**(settings | more))
+
+
+def drawn(count: int) -> list[SimulationParameters]:
+    rng = np.random.default_rng(7)
+    return [
+        replace(
+            PARAMETERS,
+            connection_radius=rng.uniform(0.11, 0.2),
+            max_neighbors=int(rng.integers(2, 8)),
+            stiffness=rng.uniform(100, 600),
+            drag=rng.uniform(0, 8),
+        )
+        for _ in range(count)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("config", "more"),
+    [
+        (ObjectFitConfig(), {}),
+        (ObjectFitConfig(track_weight=1 / 6, freezes_counts=True), {"surface_count": 9}),
+        (ObjectFitConfig(acceleration_weight=0.01), {"gravity": 3.0}),
+        (ObjectFitConfig(automatic_substeps=True), {}),
+    ],
+)
+def test_a_judgement_is_the_mean_loss_of_all_sequences(
+    device: str, config: ObjectFitConfig, more: dict[str, object]
+) -> None:
+    problems = [sheet("slow", 0.05, **more), sheet("quicker", 0.2, **more)]
+    candidates = drawn(4)
+    judged = Judge(problems, config, NullProgress(), device=device)(candidates)
+    assert [p.stiffness for p, _ in judged] == [p.stiffness for p in candidates]
+    if device != "cpu":  # There all take the substeps of the one that needs most.
+        most = max(p.substeps_per_frame for p, _ in judged)
+        judged = [(replace(p, substeps_per_frame=most), loss) for p, loss in judged]
+    for parameters, loss in judged:
+        assert (parameters.substeps_per_frame == 40) != config.automatic_substeps
+        models = {p.name: build_problem_model(p, parameters) for p in problems}
+        wanted = mean_loss(
+            problems,
+            models,
+            parameters,
+            config,
+            device,
+            acceleration_weight=config.acceleration_weight,
+        )
+        assert wanted > 1e-3
+        assert loss == pytest.approx(wanted, rel=2e-5)
+    assert len({loss for _, loss in judged}) == 4
+
+
+def test_what_cannot_be_simulated_is_infinitely_bad_and_harms_nobody(device: str) -> None:
+    problems = [sheet("slow", 0.05)]
+    good = drawn(2)
+    bare = replace(good[0], connection_radius=1e-3, virtual_connection_radius=1e-3)
+    wild = replace(good[0], stiffness=1e9)
+    config = ObjectFitConfig()
+    alone = [loss for _, loss in Judge(problems, config, NullProgress(), device=device)(good)]
+    mixed = Judge(problems, config, NullProgress(), device=device)([good[0], bare, wild, good[1]])
+    losses = [loss for _, loss in mixed]
+    assert losses[1:3] == [math.inf, math.inf]
+    assert [losses[0], losses[3]] == pytest.approx(alone, rel=1e-6)
+    frugal = replace(config, automatic_substeps=True, most_substeps=300)
+    ((greedy, loss),) = Judge(problems, frugal, NullProgress(), device=device)([wild])
+    assert greedy.substeps_per_frame > 300
+    assert loss == math.inf
+
+
+def test_colliding_candidates_are_judged_with_their_collisions(device: str) -> None:
+    problem = sheet("slow", 0.05, gravity=0.0)
+    free = drawn(1)[0]
+    crowded = replace(
+        free, self_collision=True, collision_distance=0.12, collides_rest_neighbors=True
+    )
+    config = ObjectFitConfig()
+    (_, apart), (_, loss) = Judge([problem], config, NullProgress(), device=device)([free, crowded])
+    models = {"slow": build_problem_model(problem, crowded)}
+    assert loss == pytest.approx(mean_loss([problem], models, crowded, config, device), rel=1e-6)
+    assert abs(loss - apart) > 1e-8
+
+
+def test_the_best_motion_is_shown_once_to_whoever_watches() -> None:
+    class Watcher(Progress):
+        def __init__(self) -> None:
+            self.shown: list[Preview] = []
+
+        def wants_preview(self) -> bool:
+            return True
+
+        def preview(self, make: Callable[[], Preview]) -> None:
+            self.shown.append(make())
+
+    watcher, problem = Watcher(), sheet("slow", 0.05)
+    judge = Judge([problem], ObjectFitConfig(), watcher)
+    judged = judge(drawn(3))
+    best, loss = min(judged, key=lambda pair: pair[1])
+    judge(drawn(1))
+    (shown,) = watcher.shown
+    assert shown.loss == loss
+    models = {"slow": build_problem_model(problem, best)}
+    assert mean_loss([problem], models, best, ObjectFitConfig(), "cpu") == pytest.approx(loss)
+    assert shown.points["object"].shape == (FRAMES, 16, 3)
+    assert np.abs(shown.points["object"][-1] - NODE).max() > 1e-3
+
+
+def test_judging_stops_between_candidates() -> None:
+    class Impatient(Progress):
+        asked = 0
+
+        def check_cancelled(self) -> None:
+            self.asked += 1
+            if self.asked == 3:
+                raise CancelledError
+
+    progress = Impatient()
+    with pytest.raises(CancelledError):
+        Judge([sheet("slow", 0.05)], ObjectFitConfig(), progress)(drawn(4))
+    assert progress.asked == 3
