@@ -43,12 +43,12 @@ class ColorPanel:
             self._hold = gui.add_checkbox(
                 "Hold range", initial_value=False, hint="Keep the ends when the rollout changes"
             )
-            self._low = gui.add_number("From", 0.0, step=1e-6)
-            self._high = gui.add_number("To", 1.0, step=1e-6)
+            self._ends = gui.add_vector2(
+                "Range", (0.0, 1.0), step=1e-4, hint="Values at the ends; typing holds them"
+            )
         self._choice.on_update(guard.by_user(lambda _: self.choose(self._choice.value)))
         self._hold.on_update(guard.by_user(lambda _: self._toggle_hold()))
-        for field in (self._low, self._high):
-            field.on_update(guard.by_user(lambda _: self._type()))
+        self._ends.on_update(guard.by_user(lambda _: self._type()))
         bind(server, guard, "color", lambda _, __: self.next(1))
         bind(server, guard, "color_back", lambda _, __: self.next(-1))
         self._show_range_fields()
@@ -117,8 +117,7 @@ class ColorPanel:
 
     def _show_range_fields(self) -> None:
         is_colored = self._layers.color != "plain"
-        for field in (self._hold, self._low, self._high):
-            field.visible = is_colored
+        self._hold.visible = self._ends.visible = is_colored
         self._legend.visible = is_colored
 
     def _write(self, limits: Range) -> None:
@@ -126,7 +125,7 @@ class ColorPanel:
         rounded = (_rounded(limits[0]), _rounded(limits[1]))
         if rounded != self._written:
             self._written = rounded
-            self._low.value, self._high.value = rounded
+            self._ends.value = rounded
 
     def _toggle_hold(self) -> None:
         legend = self._painter.legend if self._painter is not None else None
@@ -142,7 +141,7 @@ class ColorPanel:
         if painter is None or self._layers.color == "plain":
             return
         factor = painter.quantity(self._layers.color).factor
-        low, high = float(self._low.value), float(self._high.value)
+        low, high = (float(end) for end in self._ends.value)
         if not (math.isfinite(low) and math.isfinite(high)) or high <= low:
             return  # Half-typed numbers; the scale waits until they make sense.
         self._written = (low, high)

@@ -31,6 +31,8 @@ class Legend:
     """Values at the ends, in SI units."""
     is_fixed: bool
     """Whether the user has fixed the ends."""
+    unknown: int
+    """Nodes of which nothing is known in this frame."""
     is_known: bool
     """Whether any value is known in this frame."""
     highest: float
@@ -116,6 +118,7 @@ class Painter:
             quantity=quantity,
             limits=limits,
             is_fixed=layers.color_range is not None,
+            unknown=len(values.node) - len(known),
             is_known=bool(len(known)),
             highest=float(known.max(initial=0.0)),
         )
@@ -175,9 +178,11 @@ def _ends(value: Float[ndarray, " value"], quantity: Quantity) -> Range | None:
     if quantity.scale == "diverging":
         high = _rounded_up(float(np.quantile(np.abs(value), _STRONG)))
         return -high, high
-    high = float(np.quantile(value, _STRONG))
-    low = float(np.quantile(value, 1.0 - _STRONG)) if quantity.is_static else 0.0
-    return (low, max(high, low)) if quantity.is_static else (0.0, _rounded_up(high))
+    if quantity.is_static:
+        low, high = np.quantile(value, [1.0 - _STRONG, _STRONG])
+        return float(low), float(high)
+    some = value[value > 0.0]  # Forces are zero wherever the hand holds nothing.
+    return 0.0, _rounded_up(float(np.quantile(some, _STRONG))) if len(some) else 0.0
 
 
 def _rounded_up(value: float) -> float:

@@ -16,8 +16,8 @@ UNKNOWN = (128, 133, 140)
 _STEPS = 256
 _TRIM = (0.06, 0.96)
 """Part of viridis that is seen on a black and on a white background."""
-_BELOW, _ZERO, _ABOVE = (0.50, -0.035, -0.15), (0.76, 0.0, 0.0), (0.55, 0.18, 0.09)
-"""Ends and middle of the diverging scale in Oklab: blue, light gray, red."""
+_BELOW, _ZERO, _ABOVE = (0.50, -0.035, -0.15), (0.66, 0.0, 0.0), (0.55, 0.18, 0.09)
+"""Ends and middle of the diverging scale in Oklab: blue, gray, red."""
 _TO_CONE = np.array(
     [
         [1, 0.3963377774, 0.2158037573],

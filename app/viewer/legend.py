@@ -45,17 +45,17 @@ def legend_html(legend: Legend, *, highest: bool) -> str:
     at = np.round(np.linspace(0, len(ramp) - 1, _STOPS)).astype(int)
     stops = ",".join(f"rgb({r},{g},{b})" for r, g, b in ramp[at].tolist())
     ticks = "".join(f"<span>{number(value)}</span>" for value in tick_values(legend))
-    grey = "rgb({},{},{})".format(*UNKNOWN)
     notes = [html.escape(quantity.about)]
+    if quantity.is_logarithmic:
+        notes.append("logarithmic")
     if not legend.is_known:
         notes.append("<b>not known in this frame</b>")
     elif highest:
         top = number(legend.highest * quantity.factor)
         notes.append(f"highest node now {top}&nbsp;{html.escape(quantity.unit)}")
-    notes.append(
-        f'<span style="color:{grey}">■</span> not known'
-        + (" · logarithmic" if quantity.is_logarithmic else "")
-    )
+        if legend.unknown:
+            gray = "rgb({},{},{})".format(*UNKNOWN)
+            notes.append(f'<span style="color:{gray}">■</span> {legend.unknown} nodes not known')
     return (
         '<div style="padding:0.1em 0.9em 0.5em;font-size:0.8em" data-legend>'
         '<div style="display:flex;justify-content:space-between;margin-bottom:0.2em">'

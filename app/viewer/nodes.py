@@ -13,6 +13,16 @@ _GRID = {
 }
 """Colors of the grid's thin and thick lines on a light and on a dark background."""
 
+_LINEAR = np.round(
+    255
+    * np.where(
+        np.arange(256) < 11,
+        np.arange(256) / 3294.6,
+        ((np.arange(256) / 255 + 0.055) / 1.055) ** 2.4,
+    )
+).astype(np.uint8)
+"""Brightness of each color value: the viewer takes colors of single line ends for brightness."""
+
 
 class SceneNodes:
     """The nodes of one scene by their path; a part without content is hidden, not sent."""
@@ -161,17 +171,19 @@ class SceneNodes:
         is_visible: bool,
     ) -> None:
         """Draw lines of a width in pixels, of one color or of a color for each end."""
+        # The viewer's lines do not change from one color to many: these are other lines.
+        painted = f"{name}_painted"
+        is_painted = np.ndim(color) > 1
+        self.show(name if is_painted else painted, is_visible=False)
+        name = painted if is_painted else name
+        color = _LINEAR[np.asarray(color, dtype=np.uint8)] if is_painted else color
         node = self._nodes.get(name)
         is_visible = is_visible and len(segment) > 0
-        if node is not None and is_visible and node.colors.ndim != np.ndim(color):
-            # The viewer's lines do not change between one color and a color for each end.
-            self._nodes.pop(name).remove()
-            node = None
         if node is None and is_visible:
             self._nodes[name] = self._scene.add_line_segments(
                 name,
                 np.asarray(segment, dtype=np.float32),
-                color,
+                np.asarray(color, dtype=np.uint8),
                 thickness=width,
                 thickness_units="screen",
             )

@@ -173,7 +173,7 @@ class ObjectDrawing:
             self._nodes.segments(
                 f"{root}/springs/{name}",
                 point[take.model.spring_nodes[chosen if is_visible else slice(0)]],
-                painted.springs(chosen) if painted is not None and is_visible else color,
+                painted.springs(chosen) if painted is not None else color,
                 width,
                 is_visible=is_visible,
             )
