@@ -1,6 +1,5 @@
 """The queue of fits: one thread starts them, watches them and ends cancelled ones."""
 
-import fcntl
 import json
 import logging
 import os
@@ -13,8 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from app.jobs.catalog import Catalog, RunItem
+from app.jobs.claim import claim_folder
 from app.jobs.forecast import Forecast
 from app.jobs.local import WORKER, start_supervisor
+from app.jobs.order import default_name, fit_config
 from app.jobs.processes import end_processes, marked_processes, processes_of, supervisor_of
 from app.jobs.supervise import note_end
 from app.settings import Settings
@@ -23,7 +24,6 @@ from physhandi.data.lease import live_holder
 from physhandi.data.run import Run, new_run_id
 from physhandi.data.run_files import EXIT
 from physhandi.errors import PhysHandiError, RunError, UsageError
-from physhandi.fitting.profile import config_to_dict, load_profile
 
 logger = logging.getLogger(__name__)
 
@@ -31,7 +31,6 @@ QUEUED = "queued.json"
 """File in a run's folder that puts it into the queue; the queue survives a restart."""
 AT_WORK = frozenset({"starting", "running", "stopping"})
 ENDED = frozenset({"succeeded", "failed", "cancelled"})
-_LOCK = ".server.lock"
 _INTERVAL_S = 0.25
 _IDLE_INTERVAL_S = 1.0
 _SWEEP_INTERVAL_S = 5.0
@@ -92,7 +91,7 @@ class Scheduler:
             RunError: If another server works on the same data folder.
         """
         if self._claim is None:
-            self._claim = _claim_folder(self._settings.data_dir)
+            self._claim = claim_folder(self._settings.data_dir)
             self._settings.run_dir.mkdir(exist_ok=True)
             self._settings.sequence_dir.mkdir(exist_ok=True)
             self._step()
@@ -108,17 +107,36 @@ class Scheduler:
             os.close(self._claim)
             self._claim = None
 
-    def launch(self, sequence_ids: list[str], profile: str, name: str = "") -> Run:
+    def launch(
+        self,
+        sequence_ids: list[str],
+        profile: str,
+        name: str = "",
+        *,
+        overrides: Mapping[str, Any] | None = None,
+        parent: str | None = None,
+    ) -> Run:
         """Make a run of one or several sequences and queue it.
+
+        Args:
+            sequence_ids: What to fit.
+            profile: Name of the settings.
+            name: What the user calls it; empty for a name of the program's.
+            overrides: Settings that differ from the profile, by their paths.
+            parent: Id of the run that it was made from.
 
         Raises:
             UsageError: If there is no sequence or no such profile.
+            SettingsError: If settings are unknown or wrong.
+            UnknownRunError: If there is no such parent.
             SequenceError: If a sequence is unknown or damaged.
             QueueFullError: If too many runs wait already.
         """
         if not sequence_ids:
             raise UsageError("Name at least one sequence to fit.")
-        config = {"profile": config_to_dict(load_profile(profile))}
+        if parent is not None:
+            self._catalog.run_item(parent)
+        config = fit_config(profile, overrides, parent)
         sequences = [self._catalog.sequence(sequence_id) for sequence_id in sequence_ids]
         with self._lock:
             if len(self._queue(self._catalog.runs())) >= self._settings.waiting_fits:
@@ -127,7 +145,7 @@ class Scheduler:
                 )
             run = Run.create(
                 self._settings.run_dir / new_run_id(),
-                name=name.strip() or f"{sequences[0].name} · {profile}",
+                name=name.strip() or default_name(sequences[0].name, config),
                 kind="reconstruction",
                 sequences=[str(sequence.folder) for sequence in sequences],
                 config=config,
@@ -346,23 +364,6 @@ class Scheduler:
             if started is not None:
                 started.poll()
             time.sleep(0.05)
-
-
-def _claim_folder(data_dir: Path) -> int:
-    data_dir.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(data_dir / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        holder = os.read(descriptor, 32).decode(errors="replace") or "unknown"
-        os.close(descriptor)
-        raise RunError(
-            f"Another server (process {holder}) works on {data_dir}. "
-            "Stop it, or choose another --data-dir."
-        ) from None
-    os.ftruncate(descriptor, 0)
-    os.write(descriptor, str(os.getpid()).encode())
-    return descriptor
 
 
 def _queued_at(path: Path) -> float:

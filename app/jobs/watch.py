@@ -1,16 +1,19 @@
 """What one browser is told about one run: its state, its progress and its log."""
 
 import re
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from app.jobs.log import read_log
-from app.jobs.scheduler import ENDED
+from app.jobs.preview import preview_number
+from app.jobs.scheduler import AT_WORK, ENDED
 from app.jobs.streams import News
 from physhandi.data.run import read_events
 from physhandi.errors import PhysHandiError
 
+_LOAD_INTERVAL_S = 2.0
 _CURSOR = re.compile(r"(-?\d{1,15})(?:-(\d{1,15}))?")
 
 
@@ -18,13 +21,18 @@ class Watch:
     """Follows a run from where a reader left it.
 
     Its events are ``run`` (see `follow_run`; first of all, then on every change), ``progress``
-    (one report of the worker), ``log`` (``text is_whole``, see `LogPart`) and ``gone``. Each is
-    named ``<number of the last report>-<position in the log>``, so that a reader that comes back
-    with the last name goes on without gap or repetition.
+    (one report of the worker), ``log`` (``text is_whole``, see `LogPart`) and ``gone``; of a run
+    at work also ``preview`` (``number`` of a new one) and now and then ``load``. Each is named
+    ``<number of the last report>-<position in the log>``, so that a reader that comes back with
+    the last name goes on without gap or repetition.
     """
 
     def __init__(
-        self, folder: Path, look: Callable[[], dict[str, Any]], cursor: str | None
+        self,
+        folder: Path,
+        look: Callable[[], dict[str, Any]],
+        cursor: str | None,
+        load: Callable[[], dict[str, Any]] | None = None,
     ) -> None:
         """Prepare.
 
@@ -33,6 +41,7 @@ class Watch:
             look: Describes the run as it is now.
             cursor: Name of the last event that the reader saw. Without one, or with one that is
                 none, reports come from the first on, and the log from `TAIL_BYTES` before its end.
+            load: Tells what the machine and the run's processes do.
         """
         found = _CURSOR.fullmatch(cursor or "")
         self._folder = folder
@@ -42,6 +51,9 @@ class Watch:
         self._offset = 0
         self._known: dict[str, Any] | None = None
         self._is_gone = False
+        self._load = load
+        self._load_time = -_LOAD_INTERVAL_S
+        self._preview = 0
 
     def news(self) -> Iterator[News]:
         """Give what is new since the last call."""
@@ -55,6 +67,8 @@ class Watch:
         run = self._described()
         yield from self._reports()
         yield from self._lines(is_ended=run["state"] in ENDED)
+        if run["state"] in AT_WORK:
+            yield from self._shown()
         if run != self._known:
             self._known = run
             yield self._name, "run", run
@@ -77,6 +91,15 @@ class Watch:
             if number > self._seen:
                 self._seen = number
                 yield self._name, "progress", event
+
+    def _shown(self) -> Iterator[News]:
+        number = preview_number(self._folder)
+        if number not in {0, self._preview}:
+            self._preview = number
+            yield self._name, "preview", {"number": number}
+        if self._load is not None and time.monotonic() - self._load_time >= _LOAD_INTERVAL_S:
+            self._load_time = time.monotonic()
+            yield self._name, "load", self._load()
 
     def _lines(self, *, is_ended: bool) -> Iterator[News]:
         part = read_log(self._folder, self._log, is_ended=is_ended)

@@ -1,0 +1,122 @@
+"""What a fit was asked to do: a profile, what differs from it, and the run it was made from."""
+
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any
+
+from physhandi.data.atomic import named_fields
+from physhandi.data.run import Run
+from physhandi.errors import UsageError
+from physhandi.fitting.overrides import apply_overrides, changes, values_of
+from physhandi.fitting.profile import (
+    PipelineConfig,
+    config_from_dict,
+    config_to_dict,
+    load_profile,
+    profile_names,
+)
+from physhandi.fitting.settings import GROUPS, Setting, all_settings
+
+
+def fit_config(
+    profile: str, overrides: Mapping[str, Any] | None = None, parent: str | None = None
+) -> dict[str, Any]:
+    """Make the configuration that a run stores.
+
+    All settings are stored, so that a run stays what it is when a profile changes; ``overrides``
+    holds those that differ from the profile as it is now.
+
+    Args:
+        profile: Name of a profile.
+        overrides: New values of settings by their paths; those that change nothing are dropped.
+        parent: The run that it was made from.
+
+    Raises:
+        UsageError: If there is no such profile.
+        SettingsError: If settings are unknown or wrong; names all of them.
+    """
+    base = load_profile(profile)
+    config = apply_overrides(base, overrides or {})
+    changed = changes(config, base)
+    stored: dict[str, Any] = {"profile": config_to_dict(config)}
+    return (
+        stored
+        | ({"overrides": changed} if changed else {})
+        | ({"parent": parent} if parent else {})
+    )
+
+
+def default_name(sequence: str, config: Mapping[str, Any]) -> str:
+    """Name a fit that its user gave no name."""
+    count = len(config.get("overrides", {}))
+    changed = f", {count} change{'' if count == 1 else 's'}" if count else ""
+    return f"{sequence} · {config['profile']['profile']}{changed}"
+
+
+def settings_of_run(run: Run) -> PipelineConfig | None:
+    """Read the settings of a fit; none if it is no fit, or of another version of the program."""
+    profile = named_fields(run.config.get("profile"))
+    if run.kind != "reconstruction" or not profile:
+        return None
+    try:
+        return config_from_dict(profile)
+    except UsageError:
+        return None
+
+
+def describe_order(run: Run) -> dict[str, Any]:
+    """Describe what a run was asked to do.
+
+    Returns:
+        ``parent`` (id of the run that it was made from, else none), ``overrides`` (values by
+        their paths) and ``changes``: rows of ``path name group about unit base value``.
+    """
+    parent = run.config.get("parent")
+    overrides = named_fields(run.config.get("overrides")) or {}
+    profile = named_fields(run.config.get("profile")) or {}
+    base = _base_values(str(profile.get("profile", "")))
+    known = {setting.path: setting for setting in all_settings()}
+    rows = [
+        _row(known[path], base.get(path), value)
+        for path, value in overrides.items()
+        if path in known
+    ]
+    return {
+        "parent": parent if isinstance(parent, str) else None,
+        "overrides": overrides,
+        "changes": rows,
+    }
+
+
+def shown_value(value: Any) -> str:
+    """Write the value of a setting for people."""
+    fields = named_fields(value)
+    if fields is not None:
+        scale = "" if fields.get("scale") in {"linear", None} else f" ({fields['scale']})"
+        return f"{shown_value(fields.get('low'))} to {shown_value(fields.get('high'))}{scale}"
+    if value is None:
+        return "none"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _row(setting: Setting, base: Any, value: Any) -> dict[str, Any]:
+    is_interval = setting.kind == "interval"
+    before, after = (
+        "not searched" if is_interval and v is None else shown_value(v) for v in (base, value)
+    )
+    return {
+        "path": setting.path,
+        "name": setting.name,
+        "group": GROUPS[setting.group],
+        "about": setting.about,
+        "unit": setting.unit,
+        "base": before,
+        "value": after,
+    }
+
+
+@lru_cache(maxsize=32)
+def _base_values(profile: str) -> dict[str, Any]:
+    return values_of(load_profile(profile)) if profile in profile_names() else {}
