@@ -184,7 +184,8 @@ def _layers_from_query(query: Mapping[str, str]) -> dict[str, Any]:
 
 def _pose_to_query(pose: Pose) -> dict[str, str]:
     query = {
-        "cam": _numbers((*pose.position, *pose.look_at)),
+        # A micrometre is nothing here; without this, rounding would be written as 1e-18.
+        "cam": _numbers(np.round((*pose.position, *pose.look_at), 6) + 0.0),
         "fov": _number(math.degrees(pose.fov)),
     }
     if not np.allclose(pose.up, _UP, atol=1e-6):

@@ -9,13 +9,16 @@ from fastapi.responses import RedirectResponse
 from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 
+from app.exports.schema import errors
 from app.permalink import state_from_query, state_to_query
 from app.viewer.session import Sessions
+from app.viewer.session_view import Session
 from physhandi.errors import UsageError
 
 Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
 _LONGEST = 4_000
-_CLOSED = "This live scene was closed, or it is not yours."
+CLOSED = "This live scene was closed, or it is not yours."
+"""What is said to who asks for a scene that is not there."""
 
 
 class Link(BaseModel):
@@ -54,16 +57,26 @@ def create_links(sessions: Sessions) -> APIRouter:
     def view_sequence(sequence_id: Id, request: Request) -> RedirectResponse:
         return RedirectResponse(open_scene("sequence", sequence_id, request), 303)
 
-    @router.get("/api/v1/sessions/{session_id}/link")
+    @router.get("/api/v1/sessions/{session_id}/link", responses=errors(404))
     def show_link(session_id: Id, request: Request) -> Link:
         """Tell the address that opens another scene in the state of this one."""
         session = sessions.find(session_id, request.state.owner)
-        if session is None:
-            raise HTTPException(404, _CLOSED)
-        query = urlencode(state_to_query(session.state), safe=",")
-        return Link(url=f"/{session.kind}s/{session.target}/view?{query}", query=query)
+        if not isinstance(session, Session):
+            raise HTTPException(404, CLOSED)
+        link = link_of(session)
+        return Link(url=link, query=link.partition("?")[2])
 
     return router
+
+
+def link_of(session: Session) -> str:
+    """Write the address on this server that opens another scene like one."""
+    return address(session.kind, session.target, state_to_query(session.state))
+
+
+def address(kind: str, target: str, query: Mapping[str, str]) -> str:
+    """Write the address on this server that opens a run or a sequence in some state."""
+    return f"/{kind}s/{target}/view?{urlencode(query, safe=',')}"
 
 
 def read_query(request: Request, *, without: tuple[str, ...] = ()) -> Mapping[str, str]:

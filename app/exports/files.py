@@ -1,0 +1,216 @@
+"""Files of runs and of live scenes, over HTTP."""
+
+import shutil
+import tempfile
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Request
+from fastapi.responses import FileResponse, Response
+from pydantic import Field
+from starlette.background import BackgroundTask
+from starlette.exceptions import HTTPException
+
+from app.exports.links import CLOSED, Id, address, read_query
+from app.exports.order import SMALLEST, SUFFIXES, Order
+from app.exports.painter import LARGEST
+from app.exports.schema import MEDIA_TYPES, RunFormat, errors, files
+from app.exports.take_store import store_take
+from app.exports.workshop import Workshop
+from app.jobs.catalog import Catalog
+from app.permalink import state_from_query, state_to_query
+from app.viewer.session import Sessions
+from app.viewer.session_view import Session
+from app.viewer.snapshot_files import write_yaml
+from physhandi.data.exporters import export_run
+from physhandi.data.run import Run
+from physhandi.errors import PhysHandiError, RunError, UsageError
+
+_OWN_FIELDS = ("format", "width", "height", "download")
+_SIMPLE = ("ply", "gltf", "npz", "csv", "yaml")
+Side = Annotated[int, Field(ge=SMALLEST, le=LARGEST)]
+Link = Annotated[
+    str | None,
+    Query(max_length=600, description="As in a link of the viewer; see the page's “Copy link”."),
+]
+
+
+def create_files(catalog: Catalog, sessions: Sessions, workshop: Workshop) -> APIRouter:
+    """Make the routes.
+
+    Args:
+        catalog: Finds runs and sequences.
+        sessions: The live scenes.
+        workshop: Makes files.
+    """
+    router = APIRouter(prefix="/api/v1")
+
+    @router.get(
+        "/runs/{run_id}/export",
+        response_class=FileResponse,
+        responses=files() | errors(404, 409, 422, 429),
+    )
+    def export(
+        *,
+        request: Request,
+        run_id: Id,
+        kind: Annotated[RunFormat, Query(alias="format")],
+        sequence: Annotated[str | None, Query(max_length=200)] = None,
+        f: Annotated[int | None, Query(ge=0, description="Frame of PNG, ZIP and PLY.")] = None,
+        width: Annotated[Side, Query(description="Of PNG and ZIP [px].")] = 1280,
+        height: Annotated[Side, Query(description="Of PNG and ZIP [px].")] = 720,
+        cam: Link = None,
+        fov: Link = None,
+        show: Link = None,
+        color: Link = None,
+        scale: Link = None,
+        theme: Link = None,
+    ) -> FileResponse:
+        """Write a run as a file that other programs read.
+
+        `ply`, `gltf`, `npz`, `csv`: motion; `yaml`: parameters and metrics; `png`: a picture;
+        `zip`: a picture with all its data; `viser`, `html`: a recording that plays without
+        the server. All fields of a link are understood. A parameter of the simulation by its
+        name, such as `drag=4`, has the object simulated anew before it is written.
+        """
+        del cam, fov, show, color, scale, theme  # Read with the rest of the link.
+        query = read_query(request, without=_OWN_FIELDS)
+        state = state_from_query(query)
+        is_changed = bool(state.parameter_changes) or state.automatic_substeps
+        if kind in _SIMPLE and not is_changed:
+            return _simple(catalog, run_id, kind, sequence, f)
+        if kind == "yaml":
+            raise UsageError("format: yaml describes the run itself; leave changed parameters out.")
+        order = order_of(catalog, "run", run_id, kind, query)
+        path = workshop.make(replace(order, width=width, height=height))
+        return _answer(path, run_id, kind, query)
+
+    @router.get(
+        "/sessions/{session_id}/export",
+        response_class=FileResponse,
+        responses=files() | errors(404, 409, 422, 429),
+    )
+    def export_scene(
+        request: Request,
+        session_id: Id,
+        kind: Annotated[RunFormat, Query(alias="format")],
+        width: Annotated[Side, Query(description="Of PNG and ZIP [px].")] = 1280,
+        height: Annotated[Side, Query(description="Of PNG and ZIP [px].")] = 720,
+    ) -> Response:
+        """Write what a live scene shows: the rollout that its sliders asked for, as it looks."""
+        session = sessions.find(session_id, request.state.owner)
+        if not isinstance(session, Session):
+            raise HTTPException(404, CLOSED)
+        snapshot, state = session.snapshot(), session.state
+        if kind == "yaml":
+            return _attached(write_yaml(snapshot), f"{session.target}.yaml", kind)
+        query = state_to_query(state)
+        if "theme" not in query and state.prefers_dark:
+            query["theme"] = "dark"
+        order = order_of(catalog, session.kind, session.target, kind, query)
+        order = replace(order, width=width, height=height, link=snapshot.link)
+        take = snapshot.take
+        if take is None:
+            return _answer(workshop.make(order), session.target, kind, query)
+        with workshop.once(order, lambda folder: store_take(folder, take)) as path:
+            return _attached(path.read_bytes(), _name(session.target, kind, query), kind)
+
+    return router
+
+
+def order_of(
+    catalog: Catalog,
+    kind: str,
+    target: str,
+    format: Any,  # noqa: A002
+    query: Mapping[str, str],
+) -> Order:
+    """Describe a file of a run or a sequence.
+
+    Args:
+        catalog: Finds it.
+        kind: What `target` is the id of, ``run`` or ``sequence``.
+        target: Id of the run or the sequence.
+        format: Which kind of file.
+        query: What a link would say of it.
+
+    Raises:
+        PhysHandiError: If there is no such run, or it is not finished.
+    """
+    if kind == "sequence":
+        folder = catalog.sequence_item(target).folder
+        return Order(kind="sequence", folder=str(folder), format=format, query=query)
+    run = catalog.run(target)
+    if not run.is_published:
+        raise RunError(f"Run '{target}' is {run.state}: there is nothing to export yet.")
+    recordings: dict[str, str] = {}
+    for name in run.sequence_names:
+        try:
+            recordings[name] = str(catalog.sequence_item(name).folder)
+        except PhysHandiError:
+            continue  # A run can be looked at without its recording.
+    _check_frame(run, query)
+    return Order(
+        kind="run",
+        folder=str(run.folder),
+        format=format,
+        query=query,
+        recordings=recordings,
+        link=address("run", target, query),
+    )
+
+
+def _check_frame(run: Run, query: Mapping[str, str]) -> None:
+    """Say at once, not after a process was started, that there is no such frame."""
+    name = query.get("sequence") or run.sequence_names[0]
+    if name not in run.sequence_names:
+        known = ", ".join(run.sequence_names)
+        raise UsageError(f"sequence: run '{run.id}' has no sequence '{name[:80]}', but {known}.")
+    meta = f"sequences/{name}/meta.yaml"
+    count = int(run.yaml(meta).get("frame_count", 0)) if run.has(meta) else 0
+    frame = state_from_query(query).frame
+    if count and frame >= count:
+        raise UsageError(f"f: '{name}' has frames 0 to {count - 1}, not {frame}.")
+
+
+def _name(target: str, kind: str, query: Mapping[str, str]) -> str:
+    frame = f"_{int(query.get('f', '0')):05d}" if kind in {"png", "zip"} else ""
+    suffix = SUFFIXES.get(kind, kind)
+    return f"{target}{frame}{'_ply' if kind == 'ply' else ''}.{suffix}"
+
+
+def _answer(path: Path, target: str, kind: str, query: Mapping[str, str]) -> FileResponse:
+    return FileResponse(path, filename=_name(target, kind, query), media_type=MEDIA_TYPES[kind])
+
+
+def _attached(content: bytes, name: str, kind: str) -> Response:
+    headers = {"Content-Disposition": f'attachment; filename="{name}"'}
+    return Response(content, media_type=MEDIA_TYPES[kind], headers=headers)
+
+
+def _simple(
+    catalog: Catalog, run_id: str, kind: str, sequence: str | None, frame: int | None
+) -> FileResponse:
+    """Write what needs no scene to be drawn."""
+    run = catalog.run(run_id)
+    if not run.is_published:
+        raise RunError(f"Run '{run_id}' is {run.state}: there is nothing to export yet.")
+    run.verify(allows_more=True)
+    folder = Path(tempfile.mkdtemp(prefix="physhandi-export-"))
+    is_one = kind == "ply" and frame is not None
+    try:
+        name = f"{run_id}_{frame:05d}.ply" if is_one else f"{run_id}.{SUFFIXES.get(kind, kind)}"
+        name = f"{run_id}_ply" if kind == "ply" and not is_one else name
+        path = export_run(
+            run, kind, folder / name, sequence=sequence, frame=frame if is_one else None
+        )
+        if path.is_dir():
+            path = Path(shutil.make_archive(str(path), "zip", path))
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    clean_up = BackgroundTask(shutil.rmtree, folder, ignore_errors=True)
+    media = "application/octet-stream" if is_one else MEDIA_TYPES[kind]
+    return FileResponse(path, filename=path.name, media_type=media, background=clean_up)

@@ -1,0 +1,136 @@
+"""A scene that nobody watches: drawn as in a live session, for pictures and recordings."""
+
+from dataclasses import dataclass, fields, replace
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+import viser
+from jaxtyping import Float
+from numpy import ndarray
+
+from app.viewer.content import Content
+from app.viewer.framing import frame_content
+from app.viewer.guard import plain
+from app.viewer.scene import FRAME_BYTES, Scene
+from app.viewer.session_state import Pose, SessionState
+from app.viewer.take import Take
+from app.viewer.viser_server import start_viser
+
+GRID = 2.0**-14
+"""Positions of recordings are rounded to a multiple of this part of the scene's size."""
+
+
+class Offscreen:
+    """The scene of one sequence in a viser server of its own; used by one thread."""
+
+    def __init__(
+        self,
+        content: Content,
+        take: Take | None,
+        state: SessionState,
+        *,
+        frame_bytes: int = FRAME_BYTES,
+        is_rounded: bool = False,
+    ) -> None:
+        """Build the scene; nothing is drawn yet.
+
+        Args:
+            content: What can be shown.
+            take: The object's rollout; None without an object.
+            state: Layers and camera, as `complete_state` returns them.
+            frame_bytes: What a frame may weigh while the clock is running.
+            is_rounded: Whether positions may be rounded to `GRID`, so that they pack better.
+        """
+        framing = frame_content(content)
+        self.recorded = 0.0
+        self.content = content
+        if is_rounded and (state.layers is None or state.layers.color == "plain"):
+            step = GRID * 2.0 ** float(np.floor(np.log2(framing.extent)))
+            self.content, take = _rounded(content, take, step)
+        self._take = take
+        self.server: viser.ViserServer = start_viser(plain(content.title))
+        try:
+            self._scene = Scene(
+                self.server,
+                self.content,
+                framing,
+                frame_bytes=frame_bytes,
+                clock=lambda: self.recorded,
+            )
+            if state.layers is not None:
+                for field in fields(state.layers):
+                    setattr(self._scene.layers, field.name, getattr(state.layers, field.name))
+            self._scene.layers.dark = state.theme == "dark"
+            if state.pose is not None:
+                state.pose.give_first(self.server.initial_camera)
+            else:
+                # The live scene leaves room for its panel; here is none.
+                offset = framing.look_at - framing.center
+                camera = self.server.initial_camera
+                camera.position = framing.camera - offset
+                camera.look_at = framing.center
+        except BaseException:
+            self.server.stop()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.server.stop()
+
+    @property
+    def is_dark(self) -> bool:
+        """Whether the background is dark."""
+        return self._scene.layers.dark
+
+    @property
+    def pose(self) -> Pose:
+        """Where the camera stands."""
+        return Pose.first(self.server.initial_camera)
+
+    def draw(self, frame: int, *, is_playing: bool) -> None:
+        """Bring the scene to a frame.
+
+        Args:
+            frame: The frame.
+            is_playing: Whether less may be drawn, as while the clock of a session is running.
+        """
+        take = self._take
+        at = 0 if take is None else min(frame, take.ready - 1)
+        self._scene.draw(frame, take, at, is_playing=is_playing)
+
+
+@dataclass(eq=False, kw_only=True)
+class _RoundedTake(Take):
+    """Shows rounded positions, but its forces are those of the exact ones."""
+
+    exact: Take
+
+    def forces(self, frame: int) -> Float[ndarray, "node 3"]:
+        return self.exact.forces(frame)
+
+    def spring_forces(self, frame: int) -> Float[ndarray, "virtual 3"]:
+        return self.exact.spring_forces(frame)
+
+
+def _rounded(content: Content, take: Take | None, step: float) -> tuple[Content, Take | None]:
+    """Round all that moves to a grid, on which half of a float's digits are zero."""
+
+    def rounded(point: ndarray) -> ndarray:
+        return (np.round(np.asarray(point, np.float64) / step) * step).astype(np.float32)
+
+    hands = tuple(replace(hand, vertex=rounded(hand.vertex)) for hand in content.hands)
+    control = None if content.control is None else rounded(content.control)
+    content = replace(content, hands=hands, control=control)
+    if take is None:
+        return content, None
+    known = {field.name: getattr(take, field.name) for field in fields(take)}
+    known |= {"position": rounded(take.position), "control": rounded(take.control)}
+    return content, _RoundedTake(**known, exact=take)

@@ -1,0 +1,63 @@
+"""Recordings of a scene that play without the server that made them: ``.viser`` and HTML."""
+
+from collections.abc import Callable
+from html import escape
+
+from app.exports.offscreen import Offscreen
+from app.viewer.content import Content
+from app.viewer.session_state import SessionState
+from app.viewer.take import Take
+from physhandi.errors import UsageError
+
+MOST_FRAMES = 3_000
+"""Longer sequences are not recorded."""
+BYTES_FOR_300_FRAMES = 20_000_000
+"""What a recording of 300 frames may weigh, springs and arrows giving way."""
+_PACKING = 0.97
+"""What is left for frames of a file, beside what describes the scene."""
+
+
+def record(
+    content: Content,
+    take: Take | None,
+    state: SessionState,
+    report: Callable[[int, int], None],
+    *,
+    as_html: bool,
+) -> bytes:
+    """Record all frames of a sequence.
+
+    Args:
+        content: What can be shown.
+        take: The object's rollout; None without an object.
+        state: Layers, camera, theme and speed, as `complete_state` returns them.
+        report: Told how many frames are recorded, and of how many.
+        as_html: Whether to make a page that plays by itself, instead of a ``.viser`` file.
+
+    Returns:
+        The file's content.
+
+    Raises:
+        UsageError: If the sequence is too long.
+    """
+    count = content.frame_count
+    if count > MOST_FRAMES:
+        raise UsageError(
+            f"'{content.sequence_name}' has {count} frames; at most {MOST_FRAMES} are recorded."
+        )
+    frame_bytes = int(_PACKING * BYTES_FOR_300_FRAMES / 300)
+    pause = 1.0 / (content.frame_rate * state.speed)
+    with Offscreen(content, take, state, frame_bytes=frame_bytes, is_rounded=True) as scene:
+        scene.draw(0, is_playing=True)
+        serializer = scene.server.get_scene_serializer()
+        for frame in range(count):
+            scene.recorded = (frame + 1) / content.frame_rate
+            if frame:
+                scene.draw(frame, is_playing=True)
+            serializer.insert_sleep(pause)
+            report(frame + 1, count)
+        if not as_html:
+            return serializer.serialize()
+        page = serializer.as_html(dark_mode=scene.is_dark)
+    title = escape(f"{content.title} · PhysHanDI")
+    return page.replace("<title>Viser</title>", f"<title>{title}</title>", 1).encode()

@@ -1,0 +1,146 @@
+"""Replays: recordings that play in the browser without a live session."""
+
+import gzip
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+from urllib.parse import urlencode
+
+import viser
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.responses import FileResponse, HTMLResponse
+from pydantic import BaseModel
+
+from app.exports.files import order_of
+from app.exports.links import Id, read_query
+from app.exports.order import Order
+from app.exports.schema import errors, files
+from app.exports.workshop import Work, Workshop
+from app.jobs.catalog import Catalog
+from app.pages.render import Pages
+from app.permalink import state_from_query
+from physhandi.errors import UsageError, describe
+
+_CLIENT = Path(viser.__file__).parent / "client" / "build" / "index.html"
+_CAMERA = ("cam", "up", "fov")
+_KNOWN = ("sequence", "theme", *_CAMERA)
+Sequence = Annotated[str | None, Query(max_length=200)]
+Theme = Annotated[Literal["light", "dark"], Query()]
+
+
+class Replay(BaseModel):
+    """How far a replay is."""
+
+    state: Literal["making", "ready", "failed"]
+    """Whether it is being made, is there, or could not be made."""
+    done: int
+    """Frames that are recorded."""
+    of: int
+    """Frames that there are; 0 before that is known."""
+    url: str
+    """The file."""
+    bytes: int = 0
+    """Its size, when it is ready."""
+    message: str = ""
+    """Why it could not be made."""
+
+
+def create_replays(catalog: Catalog, workshop: Workshop, pages: Pages) -> APIRouter:
+    """Make the routes.
+
+    ``/viewer/replay/`` is viser's page, which plays the file that its query names. It holds no data
+    and opens no connection but the one for that file.
+
+    Args:
+        catalog: Finds runs.
+        workshop: Makes the files.
+        pages: Renders.
+    """
+    router = APIRouter()
+    client = _CLIENT.read_bytes()
+    packed = gzip.compress(client, mtime=0)
+
+    def order(run_id: str, sequence: str | None, theme: str) -> Order:
+        query = {"sequence": sequence} if sequence else {}
+        return order_of(catalog, "run", run_id, "viser", query | {"theme": theme})
+
+    @router.get("/runs/{run_id}/replay", include_in_schema=False)
+    def show_page(run_id: Id, request: Request) -> HTMLResponse:
+        query = read_query(request)
+        unknown = [name for name in query if name not in _KNOWN]
+        if unknown:
+            raise UsageError(
+                f"{unknown[0][:40]}: a replay has no such field. It has: {', '.join(_KNOWN)}."
+            )
+        camera = _camera(query)
+        item = catalog.run_item(run_id)
+        run = catalog.run(run_id)
+        sequence = query.get("sequence") or run.sequence_names[0]
+        if sequence not in run.sequence_names:
+            raise UsageError(f"sequence: run '{run_id}' has no sequence '{sequence[:80]}'.")
+        return pages.render(
+            "replay.html",
+            run_id=item.id,
+            title=run.name,
+            sequence=sequence,
+            sequences=run.sequence_names,
+            camera=urlencode(camera),
+            theme=query.get("theme", ""),
+        )
+
+    @router.post("/api/v1/runs/{run_id}/replay", responses=errors(404, 409, 422, 429))
+    def prepare(run_id: Id, sequence: Sequence = None, theme: Theme = "light") -> Replay:
+        """Have the replay of a run made, unless it is there, and tell how far it is."""
+        work = workshop.begin(order(run_id, sequence, theme))
+        query = {"theme": theme} | ({"sequence": sequence} if sequence else {})
+        return _describe(work, f"/api/v1/runs/{run_id}/replay.viser?{urlencode(query)}")
+
+    @router.get(
+        "/api/v1/runs/{run_id}/replay.viser",
+        response_class=FileResponse,
+        responses=files("viser") | errors(404, 409, 422, 429),
+    )
+    def fetch(run_id: Id, sequence: Sequence = None, theme: Theme = "light") -> FileResponse:
+        """Give the replay of a run as viser's recording; made when it is missing."""
+        path = workshop.make(order(run_id, sequence, theme))
+        headers = {"Cache-Control": "private, no-cache"}
+        return FileResponse(path, media_type="application/octet-stream", headers=headers)
+
+    @router.get("/viewer/replay/", include_in_schema=False)
+    def show_client(request: Request) -> Response:
+        is_packed = "gzip" in request.headers.get("accept-encoding", "")
+        headers = {"Cache-Control": "no-cache", "Vary": "Accept-Encoding"}
+        if is_packed:
+            headers["Content-Encoding"] = "gzip"
+        content = packed if is_packed else client
+        return Response(content, media_type="text/html", headers=headers)
+
+    return router
+
+
+def _describe(work: Work, url: str) -> Replay:
+    size, message = 0, ""
+    if work.state == "ready":
+        size = work.path.stat().st_size
+    elif work.state == "failed" and (error := work.future.exception()) is not None:
+        message = describe(error)
+    return Replay(
+        state=work.state, done=work.done, of=work.of, url=url, bytes=size, message=message
+    )
+
+
+def _camera(query: Mapping[str, str]) -> dict[str, Any]:
+    """Write the camera of a link as viser's page reads it."""
+    pose = state_from_query({n: text for n, text in query.items() if n != "sequence"}).pose
+    if pose is None:
+        return {}
+
+    def numbers(values: Any) -> str:
+        return ",".join(f"{float(value):.6g}" for value in values)
+
+    return {
+        "initialCameraPosition": numbers(pose.position),
+        "initialCameraLookAt": numbers(pose.look_at),
+        "initialCameraUp": numbers(pose.up),
+        "initialCameraFov": f"{pose.fov:.6g}",
+    }

@@ -1,0 +1,30 @@
+"""The routes of links, replays and files."""
+
+from fastapi import APIRouter
+
+from app.exports.files import create_files
+from app.exports.links import create_links, link_of
+from app.exports.replay import create_replays
+from app.exports.workshop import Workshop
+from app.jobs.catalog import Catalog
+from app.pages import Pages
+from app.viewer.session import Sessions
+
+
+def create_exports(
+    catalog: Catalog, sessions: Sessions, pages: Pages, workshop: Workshop
+) -> APIRouter:
+    """Make the routes of links, replays and files, and let scenes know their links.
+
+    Args:
+        catalog: Finds runs and sequences.
+        sessions: The live scenes.
+        pages: Renders.
+        workshop: Makes files.
+    """
+    sessions.link_of = link_of
+    router = APIRouter()
+    router.include_router(create_links(sessions))
+    router.include_router(create_files(catalog, sessions, workshop))
+    router.include_router(create_replays(catalog, workshop, pages))
+    return router
