@@ -17,12 +17,17 @@ from fastapi.staticfiles import StaticFiles
 from starlette.exceptions import HTTPException
 
 from app.api import create_api
-from app.exports import create_exports
+from app.exports.routes import create_exports
+from app.exports.workshop import TooManyFilesError, Workshop
 from app.jobs.catalog import Catalog, NotFoundError
 from app.jobs.describe import describe_run
 from app.jobs.feed import Feed
+from app.jobs.machine import Machine
 from app.jobs.scheduler import QueueFullError, Scheduler
+from app.monitor import create_monitor
+from app.monitor.overview import Overview
 from app.pages import Pages, create_pages
+from app.previews.store import Previews
 from app.security import Gatekeeper, Security
 from app.settings import WEB_ASSETS, Settings
 from app.viewer.gate import create_gate
@@ -35,6 +40,7 @@ from physhandi.errors import (
     MissingInputError,
     PhysHandiError,
     SequenceError,
+    SettingsError,
     UsageError,
     describe,
 )
@@ -50,6 +56,7 @@ _STATUS: tuple[tuple[type[PhysHandiError], int, str], ...] = (
     (NotFoundError, 404, "not_found"),
     (TooManySessionsError, 429, "too_many_sessions"),
     (QueueFullError, 429, "queue_full"),
+    (TooManyFilesError, 429, "too_many_files"),
     (UsageError, 422, "invalid"),
     (SequenceError, 422, "unusable_sequence"),
     (MissingInputError, 422, "missing_input"),
@@ -81,15 +88,21 @@ def create_app(
         RunSaver(catalog, settings.run_dir, scheduler.start_now),
     )
     sessions = sessions or Sessions(settings, catalog, keeping)
+    machine = Machine(settings.data_dir)
     feed = Feed(lambda: [describe_run(item, scheduler) for item in catalog.runs()])
     pages = Pages()
+    previews = Previews(settings, catalog)
+    workshop = Workshop(settings.data_dir / "cache" / "exports")
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncGenerator[None]:
         scheduler.start()
+        previews.start()
         yield
+        previews.shutdown()
         scheduler.shutdown()
         sessions.shutdown()
+        workshop.close()
 
     app = FastAPI(
         title="PhysHanDI",
@@ -102,10 +115,13 @@ def create_app(
     )
     app.state.stopping = threading.Event()
     app.state.scheduler = scheduler
+    app.state.sessions = sessions
     app.state.security = security
-    app.include_router(create_api(catalog, scheduler, feed, sessions))
-    app.include_router(create_pages(catalog, scheduler, feed, sessions, pages))
-    app.include_router(create_exports(sessions))
+    app.include_router(create_api(catalog, scheduler, feed, sessions, machine))
+    overview = Overview(settings, catalog, scheduler, machine)
+    app.include_router(create_monitor(catalog, scheduler, overview, pages))
+    app.include_router(create_pages(catalog, scheduler, feed, sessions, pages, previews=previews))
+    app.include_router(create_exports(catalog, sessions, pages, workshop))
     app.include_router(create_gate(sessions))
     app.mount("/assets", StaticFiles(directory=WEB_ASSETS), name="assets")
 
@@ -136,7 +152,12 @@ def _answer_errors(app: FastAPI, pages: Pages) -> None:
         status, code = _status_of(error)
         if status >= 500:
             logger.error("a request failed: %s: %s", request.url.path, describe(error))
-        return answer(request, status, code, describe(error))
+        fields = (
+            [{"field": path, "message": told} for path, told in error.fields.items()]
+            if isinstance(error, SettingsError)
+            else None
+        )
+        return answer(request, status, code, describe(error), fields)
 
     @app.exception_handler(HTTPException)
     def on_http(request: Request, error: HTTPException) -> Response:
@@ -188,6 +209,7 @@ def serve(settings: Settings, on_ready: Callable[[str], None], *, queue_demo: bo
         port = int(listener.getsockname()[1])
         security = Security(settings, port=port)
         app = create_app(settings, security=security)
+        app.state.sessions.live.start()  # Warm before the first slider moves.
         scheduler: Scheduler = app.state.scheduler
         scheduler.start()
         if queue_demo:

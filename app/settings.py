@@ -86,3 +86,8 @@ class Settings(BaseSettings):
     def sequence_dir(self) -> Path:
         """Where imported sequences are."""
         return self.data_dir / "sequences"
+
+    @property
+    def preview_dir(self) -> Path:
+        """Where small pictures are kept; they are made again when they are deleted."""
+        return self.data_dir / "cache" / "previews"

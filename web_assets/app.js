@@ -81,7 +81,9 @@ async function launch(form) {
   form.reset();
   toast(`“${run.name}” is in line`);
   refresh("runs");
-  document.getElementById("runs-heading").scrollIntoView({ behavior: "smooth" });
+  const heading = document.getElementById("runs-heading");
+  if (heading) heading.scrollIntoView({ behavior: "smooth" });
+  else location.href = "/runs";
 }
 
 document.addEventListener("click", (event) => {
@@ -109,6 +111,10 @@ document.addEventListener("keydown", (event) => {
   if (event.key === "?") help.open ? help.close() : help.showModal();
   else if (document.querySelector("dialog[open]")) return;
   else if (event.key === "h") location.href = "/";
+  else if (event.key === "/" && document.querySelector("[data-filter]")) {
+    event.preventDefault();
+    document.querySelector("[data-filter]").select();
+  }
   else if (event.key === "n") showForm();
   else if (event.key === "o") document.querySelector("[data-featured], #run [data-open]")?.click();
 });
@@ -122,10 +128,18 @@ function duration(seconds) {
   return minutes ? `${minutes} min ${rest} s` : `${rest} s`;
 }
 
-function describe(report) {
+/** Write a time that is only estimated. */
+function about(seconds) {
+  if (seconds < 5) return "a few seconds";
+  const step = seconds < 60 ? 5 : seconds < 600 ? 10 : 60;
+  return `about ${duration(Math.max(step, Math.round(seconds / step) * step))}`;
+}
+
+function describe(report, estimate) {
   const parts = [report.stage.replaceAll("_", " "), `${report.iteration} of ${report.total}`];
   if (Number.isFinite(report.loss)) parts.push(`loss ${report.loss.toPrecision(4)}`);
-  if (report.eta_s > 0) parts.push(`${duration(Math.round(report.eta_s))} left in this stage`);
+  if (Number.isFinite(estimate?.left_s)) parts.push(`${about(estimate.left_s)} left`);
+  else if (report.eta_s > 0) parts.push(`${about(report.eta_s)} left in this stage`);
   return parts.join(" · ");
 }
 
@@ -135,7 +149,7 @@ function showProgress(row, run) {
   if (!bar || !text || !run.progress.total) return false;
   bar.max = run.progress.total;
   bar.value = run.progress.iteration;
-  text.textContent = describe(run.progress);
+  text.textContent = describe(run.progress, run.estimate);
   return true;
 }
 

@@ -94,19 +94,19 @@ def _rows(columns: dict[str, dict[str, Any]], unit: str) -> list[dict[str, Any]]
             continue
         parts = set(quantity.split("_"))
         local = next((str(c["unit"]) for c in columns.values() if "unit" in c), unit)
-        kind = _unit_of(parts, local)
-        is_higher = bool(parts & _HIGHER)
+        kind = unit_of(parts, local)
+        is_higher = is_higher_better(parts)
         is_contest = "rollout" in columns and len(known) > 1 and not parts & _COUNTS
         best = (max if is_higher else min)(known) if is_contest else None
         rows.append(
             {
                 "name": quantity,
-                "about": next((text for start, text in _ABOUT if start in quantity), ""),
+                "about": about_quantity(quantity),
                 "unit": scaled(None, kind)[1],
                 "is_higher_better": is_higher,
                 "cells": [
                     {
-                        "text": _figure(scaled(value, kind)[0]),
+                        "text": figure(scaled(value, kind)[0]),
                         "is_best": best is not None and value == best,
                     }
                     for value in values
@@ -116,7 +116,22 @@ def _rows(columns: dict[str, dict[str, Any]], unit: str) -> list[dict[str, Any]]
     return rows
 
 
-def _figure(value: Any) -> str:
+def about_quantity(name: str) -> str:
+    """Tell what a quantity means; empty if its name says it all."""
+    return next((text for start, text in _ABOUT if start in name), "")
+
+
+def is_higher_better(parts: set[str]) -> bool:
+    """Tell by the words of its name whether more of a quantity is better."""
+    return bool(parts & _HIGHER)
+
+
+def is_count(parts: set[str]) -> bool:
+    """Tell by the words of its name whether a quantity counts what was measured."""
+    return bool(parts & _COUNTS)
+
+
+def figure(value: Any) -> str:
     """Show four digits, the last ones too if they are zero, so that columns compare."""
     if not isinstance(value, int | float):
         return "–"  # noqa: RUF001  # a dash, as tables have it
@@ -124,7 +139,7 @@ def _figure(value: Any) -> str:
     return f"{value:#.4g}" if is_plain else short(value)
 
 
-def _unit_of(parts: set[str], unit: str) -> str:
+def unit_of(parts: set[str], unit: str) -> str:
     """Tell what a quantity is measured in by the words of its name; empty for a mere number."""
     if parts & _COUNTS:
         return ""
@@ -142,6 +157,6 @@ def _fact(name: str, value: Any) -> str:
     fields = named_fields(value)
     if fields is not None:
         return ", ".join(f"{words(key)} {_fact(key, inner)}" for key, inner in fields.items())
-    kind = _unit_of(set(name.split("_")), "m")
+    kind = unit_of(set(name.split("_")), "m")
     shown, unit = scaled(value, kind)
     return f"{short(shown)} {unit}".strip()

@@ -1,11 +1,14 @@
 """Filling templates, and how numbers, names and times are written on pages."""
 
+from collections.abc import Iterable
 from typing import Any
+from urllib.parse import urlencode
 
 from fastapi.responses import HTMLResponse
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 
 from app.jobs.log import level_of
+from app.keys import KEYS
 from app.settings import WEB_ASSETS
 
 _SPELLINGS = {
@@ -40,7 +43,16 @@ class Pages:
             trim_blocks=True,
             lstrip_blocks=True,
         )
-        environment.filters.update(short=short, words=words, duration=duration, level=level_of)
+        environment.filters.update(
+            short=short,
+            words=words,
+            duration=duration,
+            about=about,
+            level=level_of,
+            millimetres=millimetres,
+            query=query,
+        )
+        environment.globals["key_groups"] = KEYS
         self._environment: Environment = environment
 
     def render(self, name: str, *, status: int = 200, **values: Any) -> HTMLResponse:
@@ -70,6 +82,19 @@ def words(value: Any) -> str:
     return " ".join(_SPELLINGS.get(part, part) for part in str(value).replace("_", " ").split(" "))
 
 
+def millimetres(metres: Any) -> str:
+    """Show a length of a list, in which the column names the unit."""
+    if metres is None:
+        return "–"  # noqa: RUF001  # a dash, as tables have it
+    value = metres * 1000.0
+    return f"{value:.2f}" if abs(value) < 10 else f"{value:.1f}"
+
+
+def query(values: Iterable[str], name: str) -> str:
+    """Write the part of an address that gives one field several values."""
+    return urlencode([(name, value) for value in values])
+
+
 def duration(seconds: Any) -> str:
     """Show a time that is left or was taken."""
     if seconds is None:
@@ -81,3 +106,11 @@ def duration(seconds: Any) -> str:
     if hours:
         return f"{hours} h {minutes} min"
     return f"{minutes} min {rest} s" if minutes else f"{rest} s"
+
+
+def about(seconds: float) -> str:
+    """Show a time that is only estimated, in steps that promise no more than is known."""
+    if seconds < 5:
+        return "a few seconds"
+    step = 5 if seconds < 60 else 10 if seconds < 600 else 60
+    return f"about {duration(max(step, round(seconds / step) * step))}"

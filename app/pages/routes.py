@@ -1,29 +1,32 @@
-"""The pages: home, one run, one live scene."""
+"""The pages: lists, one run, several runs compared, one live scene."""
 
-from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 import cv2
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse
 from pydantic import Field
 from starlette.exceptions import HTTPException
 
 from app.jobs.catalog import Catalog, RunItem
-from app.jobs.describe import describe_results, describe_run, describe_sequence, follow_run
+from app.jobs.describe import describe_results, describe_run, follow_run
 from app.jobs.feed import Feed
 from app.jobs.log import read_log
+from app.jobs.order import order_of
 from app.jobs.scheduler import ENDED, Scheduler
+from app.pages.browse import add_lists
+from app.pages.diff import LEAST, MOST, compare_runs
 from app.pages.metrics import METHODS, tabulate
 from app.pages.parameters import parameter_rows
+from app.pages.pictures import add_pictures
 from app.pages.render import Pages
+from app.previews.store import Previews
 from physhandi.data.sequence import Sequence
-from physhandi.fitting.profile import load_profile, profile_names
+from physhandi.errors import UsageError
 
 Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
-_RUNS_SHOWN = 50
 _THUMBNAIL_WIDTH = 640
 
 
@@ -77,7 +80,13 @@ class Scenes(Protocol):
 
 
 def create_pages(
-    catalog: Catalog, scheduler: Scheduler, feed: Feed, scenes: Scenes, pages: Pages
+    catalog: Catalog,
+    scheduler: Scheduler,
+    feed: Feed,
+    scenes: Scenes,
+    pages: Pages,
+    *,
+    previews: Previews,
 ) -> APIRouter:
     """Make the routes of the pages.
 
@@ -87,41 +96,51 @@ def create_pages(
         feed: Names the state that a page shows.
         scenes: Finds live scenes.
         pages: Renders.
+        previews: Keeps small pictures.
     """
     router = APIRouter(include_in_schema=False)
-
-    @router.get("/")
-    def home(*, all: bool = False) -> HTMLResponse:  # noqa: A002  # the query's name
-        cursor = feed.cursor()
-        runs = [describe_run(item, scheduler) for item in catalog.runs()]
-        sequences = [describe_sequence(item) for item in catalog.sequences()]
-        return pages.render(
-            "home.html",
-            cursor=cursor,
-            sequences=sequences,
-            runs=runs
-            if all
-            else runs[:_RUNS_SHOWN] + [r for r in runs[_RUNS_SHOWN:] if _is_kept(r)],
-            address="/?all=true" if all else "/",
-            hidden_count=0 if all else sum(not _is_kept(r) for r in runs[_RUNS_SHOWN:]),
-            featured=_featured(runs),
-            profiles=[(name, load_profile(name).description) for name in ordered_profiles()],
-        )
+    add_lists(router, catalog, scheduler, feed, pages, previews=previews)
+    add_pictures(router, previews)
 
     @router.get("/runs/{run_id}")
     def run(run_id: Id) -> HTMLResponse:
         item = catalog.run_item(run_id)
         described = follow_run(item, scheduler)
         log = read_log(item.folder, is_ended=described["state"] in ENDED)
-        return pages.render(
-            "run.html", log=log, is_listed=item.run is not None, **run_values(item, described)
-        )
+        values = run_values(item, described, catalog)
+        return pages.render("run.html", log=log, is_listed=item.run is not None, **values)
 
     @router.get("/runs/{run_id}/parts")
     def parts(run_id: Id) -> HTMLResponse:
         """Give the parts of a run's page that change when a stage or the run ends."""
         item = catalog.run_item(run_id)
-        return pages.render("parts.html", **run_values(item, follow_run(item, scheduler)))
+        return pages.render("parts.html", **run_values(item, follow_run(item, scheduler), catalog))
+
+    @router.get("/diff")
+    def diff(
+        run: Annotated[list[Id], Query(max_length=20)] = [],  # noqa: B006  # FastAPI copies it
+        show: Literal["differences", "all"] = "differences",
+    ) -> HTMLResponse:
+        ids = list(dict.fromkeys(run))
+        if not LEAST <= len(ids) <= MOST:
+            raise UsageError(
+                f"Choose {LEAST} to {MOST} runs in the list of runs to compare them; "
+                f"this address names {len(ids)}."
+            )
+        items = [catalog.run_item(run_id) for run_id in ids]
+        described = [describe_run(item, scheduler) for item in items]
+        sections = compare_runs(
+            described,
+            [item.run.config if item.run else {} for item in items],
+            [describe_results(item.run) if item.run else {} for item in items],
+        )
+        return pages.render(
+            "diff.html",
+            runs=[entry | {"picture": previews.look("run", entry["id"])} for entry in described],
+            sections=sections,
+            shows_all=show == "all",
+            least=LEAST,
+        )
 
     @router.get("/live/{session_id}")
     def live(session_id: Id, request: Request) -> HTMLResponse:
@@ -150,39 +169,25 @@ def create_pages(
     return router
 
 
-def ordered_profiles() -> list[str]:
-    """Give the profiles, the quickest first."""
-    return sorted(profile_names(), key=lambda name: (name != "quick", name != "default", name))
-
-
-def run_values(item: RunItem, described: dict[str, Any]) -> dict[str, Any]:
+def run_values(item: RunItem, described: dict[str, Any], catalog: Catalog) -> dict[str, Any]:
     """Collect what the page of a run shows of its state and its results.
 
     Args:
         item: The run.
         described: What `follow_run` says of it.
+        catalog: Knows the run that it was made from.
     """
     results = describe_results(item.run) if item.run else {}
     found = results.get("parameters", {})
     return {
         "run": described,
+        "order": order_of(item, catalog),
         "metrics": {name: tabulate(v) for name, v in results.get("metrics", {}).items()},
         "parameters": parameter_rows(item.run, found) if item.run else [],
         "environment": results.get("environment", {}),
         "problem": results.get("problem", {}).get("message"),
         "methods": METHODS,
     }
-
-
-def _is_kept(run: Mapping[str, Any]) -> bool:
-    """Tell whether the home page lists a run however old it is."""
-    return run["is_bundled"] or run["state"] not in ENDED
-
-
-def _featured(runs: list[dict[str, Any]]) -> dict[str, Any] | None:
-    """Choose the finished run that the home page offers first: a bundled one, else the newest."""
-    finished = [run for run in runs if run["is_published"] and run["kind"] == "reconstruction"]
-    return min(finished, key=lambda run: not run["is_bundled"], default=None)
 
 
 @lru_cache(maxsize=256)

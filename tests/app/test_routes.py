@@ -195,7 +195,13 @@ def test_the_home_page_stays_short_however_many_runs_there_are(world: QueueWorld
         folder.mkdir()
         (folder / "run.yaml").write_text("damaged")
     page = world.client.get("/").text
-    assert page.count("<tr data-run=") == 50
+    rows = '<tr class="plays" data-run='
+    assert page.count(rows) == 8
     assert first in page
-    assert "Show 11 older runs" in page
-    assert world.client.get("/?all=true").text.count("<tr data-run=") == 61
+    assert "All 61 runs" in page
+    assert world.client.get("/runs").text.count(rows) == 61
+    half = world.client.get("/runs?limit=40&offset=40&sort=name").text
+    assert half.count(rows) == 21
+    assert "41 to 61 of 61" in half
+    assert 'rel="prev" href="/runs?sort=name&amp;limit=40"' in half
+    assert 'rel="next"' not in half

@@ -1,0 +1,247 @@
+"""What several runs have in common and where they differ, as one table."""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+from app.pages.metrics import about_quantity, figure, is_count, is_higher_better, scaled, unit_of
+from app.pages.parameters import field_notes
+from app.pages.render import duration, short, words
+from physhandi.data.atomic import named_fields
+
+LEAST, MOST = 2, 5
+"""How many runs can be compared."""
+_COMMIT_DIGITS = 12
+_SPLITS = {"reconstruction": "fitted frames", "future": "predicted frames"}
+_UNCOMPARED = {"description", "aggregation", "unit", "frames"}
+
+_Scores = dict[tuple[str, str, str], tuple[float, str]]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What one run has of a quantity."""
+
+    text: str
+    is_best: bool = False
+    """Whether no other run is better."""
+    change: str = ""
+    """How much it differs from the first run."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One quantity of all runs."""
+
+    name: str
+    cells: list[Cell]
+    differs: bool
+    """Whether the runs do not all have the same."""
+    about: str = ""
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class Section:
+    """Rows that belong together."""
+
+    name: str
+    rows: list[Row] = field(default_factory=list[Row])
+
+    @property
+    def shown(self) -> list[Row]:
+        """The rows that differ."""
+        return [row for row in self.rows if row.differs]
+
+
+def compare_runs(
+    described: Sequence[Mapping[str, Any]],
+    configs: Sequence[Mapping[str, Any]],
+    results: Sequence[Mapping[str, Mapping[str, Any]]],
+) -> list[Section]:
+    """Lay runs side by side.
+
+    Args:
+        described: What `describe_run` says of each.
+        configs: Configuration of each.
+        results: What `describe_results` says of each.
+
+    Returns:
+        Sections of facts, scores, found parameters, settings and surroundings; one without rows is
+        left out. Only scores have a best value.
+    """
+    parameters = [result.get("parameters", {}) for result in results]
+    surroundings = [_surroundings_of(result.get("environment", {})) for result in results]
+    sections = [
+        Section("The runs", _plain_rows([_facts_of(run) for run in described])),
+        *_score_sections([_scores_of(result.get("metrics", {})) for result in results]),
+        Section("Loss at the end of each stage", _plain_rows([_losses_of(r) for r in results])),
+        Section("Parameters that the simulation ended with", _parameter_rows(parameters)),
+        Section("Settings", _plain_rows([_settings_of(config) for config in configs])),
+        Section("Computed with", _plain_rows(surroundings)),
+    ]
+    return [section for section in sections if section.rows]
+
+
+def flatten(value: Any, name: str = "") -> dict[str, Any]:
+    """Name every value inside nested fields by its path, with dots between."""
+    fields = named_fields(value)
+    if fields is None:
+        return {name: value}
+    flat: dict[str, Any] = {}
+    for key, inner in fields.items():
+        flat |= flatten(inner, f"{name}.{key}" if name else key)
+    return flat
+
+
+def _facts_of(run: Mapping[str, Any]) -> dict[str, Any]:
+    facts = {
+        "state": run["state"],
+        "kind": run["kind"],
+        "sequences": ", ".join(run["sequences"]),
+        "profile": run["profile"],
+        "tags": ", ".join(run["tags"]),
+        "created": run["created"][:16].replace("T", " "),
+        "took": duration(run["duration_s"]),
+    }
+    return {name: fact for name, fact in facts.items() if fact}
+
+
+def _plain_rows(columns: Sequence[Mapping[str, Any]]) -> list[Row]:
+    rows: list[Row] = []
+    for name in _names(columns):
+        values = [column.get(name) for column in columns]
+        if any(value is not None for value in values):
+            cells = [Cell(_text(column, name)) for column in columns]
+            shown = " / ".join(words(part.rstrip("_")) for part in name.split("."))
+            rows.append(Row(shown, cells, _differ(values)))
+    return rows
+
+
+def _parameter_rows(columns: Sequence[Mapping[str, Any]]) -> list[Row]:
+    rows: list[Row] = []
+    for name in _names(columns):
+        about, unit = field_notes().get(name, ("", ""))
+        values = [column.get(name) for column in columns]
+        scaled_columns = [
+            {name: scaled(column[name], unit)[0]} if name in column else {} for column in columns
+        ]
+        cells = [Cell(_text(column, name)) for column in scaled_columns]
+        rows.append(Row(words(name), cells, _differ(values), about, scaled(None, unit)[1]))
+    return rows
+
+
+def _score_sections(columns: Sequence[_Scores]) -> list[Section]:
+    parts = dict.fromkeys((sequence, part) for column in columns for sequence, part, _ in column)
+    return [
+        Section(
+            f"Scores of {sequence}, {words(part)}",
+            [
+                _score_row(columns, (sequence, part, name))
+                for name in dict.fromkeys(
+                    key[2] for column in columns for key in column if key[:2] == (sequence, part)
+                )
+            ],
+        )
+        for sequence, part in parts
+    ]
+
+
+def _score_row(columns: Sequence[_Scores], key: tuple[str, str, str]) -> Row:
+    name = key[2]
+    words_of_name = set(name.rsplit(".", 1)[-1].split("_"))
+    values = [column[key][0] if key in column else None for column in columns]
+    numbers = [value for value in values if value is not None]
+    unit = unit_of(words_of_name, next(column[key][1] for column in columns if key in column))
+    best = (max if is_higher_better(words_of_name) else min)(numbers)
+    is_score = key[1] != "topology" and not is_count(words_of_name)
+    is_contest = is_score and any(not _same(value, best) for value in numbers)
+    cells = [
+        Cell(
+            figure(scaled(value, unit)[0]),
+            is_contest and value is not None and _same(value, best),
+            _change(values[0], value) if number else "",
+        )
+        for number, value in enumerate(values)
+    ]
+    shown = " / ".join(words(part) for part in name.split("."))
+    return Row(shown, cells, _differ(values), about_quantity(name), scaled(None, unit)[1])
+
+
+def _scores_of(metrics: Mapping[str, Any]) -> _Scores:
+    """Find every score of the rollout by sequence, part and name, with its unit of length."""
+    found: _Scores = {}
+    for sequence, scores in metrics.items():
+        fields = named_fields(scores) or {}
+        unit = str(fields.get("unit", "m"))
+        for part, content in fields.items():
+            inside = named_fields(content) or {}
+            of_object = named_fields(inside.get("rollout"))
+            local = str(inside.get("unit", unit))
+            for name, value in flatten(inside if of_object is None else of_object).items():
+                if _is_number(value) and name.rsplit(".", 1)[-1] not in _UNCOMPARED:
+                    found[sequence, _SPLITS.get(part, part), name] = (float(value), local)
+    return found
+
+
+def _losses_of(result: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    losses = result.get("losses", {})
+    return {stage: (named_fields(summary) or {}).get("after") for stage, summary in losses.items()}
+
+
+def _settings_of(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Flatten a configuration; the settings of a profile are named without saying so."""
+    profile = named_fields(config.get("profile")) or {}
+    others = {key: value for key, value in config.items() if key != "profile"}
+    flat = flatten(profile) | flatten(others)
+    return {name: value for name, value in flat.items() if name not in _UNCOMPARED}
+
+
+def _surroundings_of(environment: Mapping[str, Any]) -> dict[str, Any]:
+    flat = flatten({key: value for key, value in environment.items() if key != "started"})
+    commit = flat.get("commit")
+    if environment:
+        flat["commit"] = str(commit)[:_COMMIT_DIGITS] if commit else "not run from a checkout"
+    return flat
+
+
+def _names(columns: Iterable[Mapping[str, Any]]) -> list[str]:
+    return list(dict.fromkeys(name for column in columns for name in column))
+
+
+def _text(column: Mapping[str, Any], name: str) -> str:
+    if name not in column:
+        return "–"  # noqa: RUF001  # a dash, as tables have it
+    value = column[name]
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list):
+        return ", ".join(short(item) for item in cast("list[Any]", value)) or "none"
+    return "none" if value in ({}, None) else short(value)
+
+
+def _change(first: Any, value: Any) -> str:
+    """Tell how much more or less a value is than the first run's."""
+    if not (_is_number(first) and _is_number(value)) or not first or _same(first, value):
+        return ""
+    percent = 100.0 * (value - first) / abs(first)
+    sign = "+" if percent > 0 else "−"  # noqa: RUF001  # the sign for minus
+    if abs(percent) >= 1000:
+        return f"{sign}{abs(percent) / 100:.0f}×"  # noqa: RUF001  # times
+    return f"{sign}{abs(percent):.0f} %" if abs(percent) >= 1 else f"{sign}{abs(percent):.1g} %"
+
+
+def _differ(values: Sequence[Any]) -> bool:
+    return any(not _same(values[0], value) for value in values[1:])
+
+
+def _same(first: Any, second: Any) -> bool:
+    if _is_number(first) and _is_number(second):
+        return math.isclose(first, second, rel_tol=1e-9)
+    return type(first) is type(second) and first == second
+
+
+def _is_number(value: Any) -> bool:
+    is_one = isinstance(value, int | float) and not isinstance(value, bool)
+    return is_one and math.isfinite(value)

@@ -1,0 +1,240 @@
+"""Which previews there are, and the thread that has the missing ones drawn."""
+
+import hashlib
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections import OrderedDict
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from app.jobs.catalog import Catalog, NotFoundError, RunItem
+from app.previews.worker import MOVING, NONE, STILL
+from app.settings import PACKAGE_ROOT, Settings
+from physhandi.data.atomic import write_bytes
+from physhandi.data.run_files import CURRENT
+from physhandi.data.sequence_schema import FILE
+
+logger = logging.getLogger(__name__)
+
+Kind = Literal["run", "sequence"]
+_VERSION = 1
+_BATCH = 8
+_ENDED_FROM_OUTSIDE = (-signal.SIGTERM, -signal.SIGINT)
+_SECONDS_EACH = 60.0
+_MOST_WAITING = 400
+_MOST_FILES = 4_000
+_THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+_SECRETS = ("PHYSHANDI_TOKEN",)
+
+
+@dataclass(frozen=True)
+class Picture:
+    """The preview of a run or a sequence."""
+
+    state: Literal["ready", "pending", "none"]
+    """Whether it is there, is being made, or cannot be made."""
+    still: str = ""
+    """Address of the still picture, which is made first; empty if it is not there."""
+    moving: str = ""
+    """Address of the moving picture; empty if it is not there."""
+
+
+@dataclass(frozen=True)
+class _Source:
+    """What a preview shows, and the name of its files, which changes whenever its source does."""
+
+    kind: Kind
+    id: str
+    folder: Path
+    stamp: int
+
+    @property
+    def prefix(self) -> str:
+        return f"{self.kind}-{self.id}-"
+
+    @property
+    def key(self) -> str:
+        text = f"{_VERSION}\0{self.folder}\0{self.stamp}"
+        return self.prefix + hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+class Previews:
+    """Keeps small pictures in a folder beside the data, which may be deleted at any time.
+
+    One process at a time draws them, out of the way of all else; a page is never kept waiting.
+    """
+
+    def __init__(self, settings: Settings, catalog: Catalog) -> None:
+        """Prepare; `start` begins to draw.
+
+        Args:
+            settings: Tells the data folder.
+            catalog: Finds sequences and runs.
+        """
+        self._catalog = catalog
+        self._folder = settings.preview_dir
+        self._lock = threading.Condition()
+        self._waiting: OrderedDict[str, _Source] = OrderedDict()
+        self._child: subprocess.Popen[bytes] | None = None
+        self._is_closed = False
+        self._thread = threading.Thread(target=self._work, name="previews", daemon=True)
+
+    def start(self) -> None:
+        """Begin to draw what pages have asked for."""
+        self._thread.start()
+
+    def shutdown(self) -> None:
+        """Stop drawing at once."""
+        with self._lock:
+            self._is_closed = True
+            self._lock.notify_all()
+            if self._child is not None:
+                self._child.kill()
+        if self._thread.is_alive():
+            self._thread.join(timeout=5)
+
+    def look(self, kind: Kind, item_id: str) -> Picture:
+        """Tell whether there is a preview, and have it drawn if there is none.
+
+        A run without results shows its first sequence.
+
+        Raises:
+            NotFoundError: If there is no such run or sequence.
+        """
+        source = self._source(kind, item_id)
+        if source is None:
+            return Picture("none")
+        address, version = f"/{source.kind}s/{source.id}", source.key[-16:]
+        still = f"{address}/still?v={version}" if self._path(source, STILL).is_file() else ""
+        if self._path(source, MOVING).is_file():
+            return Picture("ready", still, f"{address}/preview?v={version}")
+        if self._path(source, NONE).is_file():
+            return Picture("none")
+        with self._lock:
+            # What was asked for last is on a screen now, so it is drawn first.
+            self._waiting.setdefault(source.key, source)
+            while len(self._waiting) > _MOST_WAITING:
+                self._waiting.popitem(last=False)
+            self._lock.notify_all()
+        return Picture("pending", still)
+
+    def file(self, kind: Kind, item_id: str, *, is_moving: bool) -> Path | None:
+        """Give the file of a preview; None if it is not there.
+
+        Raises:
+            NotFoundError: If there is no such run or sequence.
+        """
+        source = self._source(kind, item_id)
+        path = source and self._path(source, MOVING if is_moving else STILL)
+        return path if path is not None and path.is_file() else None
+
+    def _source(self, kind: Kind, item_id: str) -> _Source | None:
+        if kind == "sequence":
+            item = self._catalog.sequence_item(item_id)
+            return _source("sequence", item_id, item.folder, FILE) if item.sequence else None
+        run_item = self._catalog.run_item(item_id)
+        return _source("run", item_id, run_item.folder, CURRENT) or self._first_sequence(run_item)
+
+    def _first_sequence(self, item: RunItem) -> _Source | None:
+        for name in item.run.sequence_names if item.run else ():
+            try:
+                return self._source("sequence", name)
+            except NotFoundError:
+                continue  # It is elsewhere, or was deleted since.
+        return None
+
+    def _path(self, source: _Source, ending: str) -> Path:
+        return self._folder / f"{source.key}{ending}"
+
+    def _work(self) -> None:
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            while batch := self._next_batch():
+                self._draw(batch)
+                self._tidy(batch)
+        except OSError as error:
+            logger.warning("no previews are made: %s", error)
+
+    def _next_batch(self) -> list[_Source]:
+        with self._lock:
+            while not self._waiting and not self._is_closed:
+                self._lock.wait()
+            if self._is_closed:
+                return []
+            count = min(_BATCH, len(self._waiting))
+            return [self._waiting.popitem(last=True)[1] for _ in range(count)]
+
+    def _draw(self, batch: list[_Source]) -> None:
+        missing = [source for source in batch if not self._is_settled(source)]
+        orders = [
+            {"kind": s.kind, "folder": str(s.folder), "target": str(self._folder / s.key)}
+            for s in missing
+        ]
+        environment = {k: v for k, v in os.environ.items() if k not in _SECRETS} | _THREADS
+        with self._lock:
+            if self._is_closed or not orders:
+                return
+            self._child = subprocess.Popen(
+                [sys.executable, "-m", "app.previews.worker", str(os.getpid())],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                cwd=PACKAGE_ROOT,
+                env=environment,
+            )
+        try:
+            self._child.communicate(
+                json.dumps(orders).encode(), timeout=_SECONDS_EACH * len(orders)
+            )
+        except subprocess.TimeoutExpired:
+            self._child.kill()
+            self._child.wait()
+        code, self._child = self._child.returncode, None
+        undone = [s for s in missing if not self._is_settled(s)]
+        if undone and code not in _ENDED_FROM_OUTSIDE and not self._is_closed:
+            # The first one ended the process or kept it too long; the others are tried again.
+            guilty = next((s for s in undone if not self._path(s, STILL).is_file()), undone[0])
+            logger.warning("the preview of %s %s could not be drawn", guilty.kind, guilty.id)
+            write_bytes(self._path(guilty, NONE), f"Its process ended with {code}.".encode())
+            with self._lock:
+                others = {source.key: source for source in undone if source is not guilty}
+                self._waiting.update(others)
+
+    def _is_settled(self, source: _Source) -> bool:
+        return any(self._path(source, ending).is_file() for ending in (MOVING, NONE))
+
+    def _tidy(self, batch: list[_Source]) -> None:
+        """Remove previews of what has changed since, and the oldest ones if there are too many."""
+        files = [
+            (entry.name, entry.stat().st_mtime, entry.path) for entry in os.scandir(self._folder)
+        ]
+        current = {source.prefix: source.key for source in batch}
+        stale = [path for name, _, path in files if _is_stale(name, current)]
+        files.sort(key=lambda file: file[1])
+        _remove(stale)
+        _remove(path for _, _, path in files[: max(0, len(files) - _MOST_FILES)])
+
+
+def _source(kind: Kind, item_id: str, folder: Path, watched: str) -> _Source | None:
+    try:
+        return _Source(kind, item_id, folder, (folder / watched).stat().st_mtime_ns)
+    except OSError:
+        return None
+
+
+def _is_stale(name: str, current: dict[str, str]) -> bool:
+    stem = name.split(".", 1)[0]
+    prefix = f"{stem.rpartition('-')[0]}-"
+    return prefix in current and stem != current[prefix]
+
+
+def _remove(paths: Iterable[str]) -> None:
+    for path in paths:
+        Path(path).unlink(missing_ok=True)

@@ -1,0 +1,63 @@
+"""The process that draws previews: reads what to draw from its input, writes files, ends."""
+
+import json
+import logging
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+import cv2
+
+from app.jobs.processes import die_with_parent
+from app.previews.clip import clip_of_run, clip_of_sequence
+from physhandi.data.atomic import write_bytes
+from physhandi.errors import describe
+
+STILL, MOVING, NONE = ".still.webp", ".moving.webp", ".none"
+"""Endings of the two pictures, and of the note that says why there are none."""
+_POLITENESS = 10
+
+
+def draw(order: Mapping[str, str], *, is_still: bool) -> None:
+    """Draw one preview, or note why that cannot be done.
+
+    Args:
+        order: ``kind`` (``sequence`` or ``run``), ``folder`` to show, and ``target``, the path of
+            the files without their endings.
+        is_still: Whether to draw the still picture; else the moving one.
+    """
+    target = order["target"]
+    if Path(f"{target}{NONE}").exists():
+        return
+    show = clip_of_run if order["kind"] == "run" else clip_of_sequence
+    try:
+        clip = show(Path(order["folder"]), is_still=is_still)
+        if clip is None:
+            reason = "There is nothing to show."
+        else:
+            if is_still:
+                clip.write_still(Path(f"{target}{STILL}"))
+            else:
+                clip.write_moving(Path(f"{target}{MOVING}"))
+            return
+    except Exception as error:  # noqa: BLE001  # whatever is wrong with it, the next one is drawn
+        reason = describe(error)
+    write_bytes(Path(f"{target}{NONE}"), reason.encode())
+
+
+def main() -> None:
+    """Draw what the server asks for, out of its way."""
+    die_with_parent(int(sys.argv[1]))
+    os.nice(_POLITENESS)
+    cv2.setNumThreads(1)
+    logging.getLogger("physhandi").setLevel(logging.ERROR)
+    orders: list[dict[str, str]] = json.loads(sys.stdin.read())
+    # A list is told apart by its still pictures, so all of those come first.
+    for is_still in (True, False):
+        for order in orders:
+            draw(order, is_still=is_still)
+
+
+if __name__ == "__main__":
+    main()

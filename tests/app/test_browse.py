@@ -1,0 +1,184 @@
+"""The pages that list runs and sequences, and the one that compares runs."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from server_world import World
+
+from app.pages.diff import Section, compare_runs, flatten
+from physhandi.data.run import Run
+
+
+def described(**fields: Any) -> dict[str, Any]:
+    return {
+        "state": "succeeded",
+        "kind": "reconstruction",
+        "sequences": ["towel"],
+        "profile": "quick",
+        "tags": [],
+        "created": "2026-11-21T09:21:11",
+        "duration_s": None,
+    } | fields
+
+
+def scores(error: float, f1: float) -> dict[str, Any]:
+    part = {"frames": [1, 9], "rollout": {"track_error": error, "contact_f1_5mm": f1}}
+    return {"towel": {"unit": "m", "reconstruction": part, "topology": {"node_count": 140}}}
+
+
+def row_of(sections: list[Section], section: str, name: str) -> Any:
+    (found,) = [part for part in sections if part.name == section]
+    (row,) = [row for row in found.rows if row.name == name]
+    return row
+
+
+def test_runs_are_laid_side_by_side_with_the_best_marked_and_the_change_told() -> None:
+    configs = [
+        {"profile": {"profile": "quick", "object_": {"search": {"generations": 6, "seed": 42}}}},
+        {"profile": {"profile": "quick", "object_": {"search": {"generations": 40, "seed": 42}}}},
+    ]
+    results: list[dict[str, Any]] = [
+        {
+            "metrics": scores(0.004, 0.8),
+            "parameters": {"drag": 3.0, "virtual_connection_radius": 0.0125, "damping": 2.0},
+            "environment": {"device": "cpu", "commit": "0123456789abcdef", "started": "a"},
+            "losses": {"first_order": {"before": 2.0, "after": 0.5}},
+        },
+        {
+            "metrics": scores(0.005, 0.9),
+            "parameters": {"drag": 3.0 + 1e-12, "virtual_connection_radius": 0.02},
+            "environment": {"device": "cuda:0", "commit": None, "started": "b"},
+            "losses": {"first_order": {"before": 2.0, "after": 0.5}},
+        },
+    ]
+    pair = [described(duration_s=90), described(tags=["best"])]
+    sections = compare_runs(pair, configs, results)
+
+    error = row_of(sections, "Scores of towel, fitted frames", "track error")
+    assert [(cell.text, cell.is_best, cell.change) for cell in error.cells] == [
+        ("4.000", True, ""),
+        ("5.000", False, "+25 %"),
+    ]
+    assert (error.unit, error.differs) == ("mm", True)
+    assert "tracked point" in error.about
+    contact = row_of(sections, "Scores of towel, fitted frames", "contact F1 5 mm")
+    assert [cell.is_best for cell in contact.cells] == [False, True]
+    assert contact.unit == "%"
+    nodes = row_of(sections, "Scores of towel, topology", "node count")
+    assert not nodes.differs
+    assert not any(cell.is_best for cell in nodes.cells)
+
+    found = "Parameters that the simulation ended with"
+    radius = row_of(sections, found, "virtual connection radius")
+    assert ([cell.text for cell in radius.cells], radius.unit) == (["12.5", "20"], "mm")
+    assert not any(cell.is_best for cell in radius.cells)
+    assert not row_of(sections, found, "drag").differs
+    damping = row_of(sections, found, "damping")
+    assert [cell.text for cell in damping.cells] == ["2", "–"]  # noqa: RUF001
+    assert damping.differs
+
+    generations = row_of(sections, "Settings", "object / search / generations")
+    assert [cell.text for cell in generations.cells] == ["6", "40"]
+    assert not row_of(sections, "Settings", "object / search / seed").differs
+    assert not row_of(sections, "Loss at the end of each stage", "first order").differs
+    commit = row_of(sections, "Computed with", "commit")
+    assert [cell.text for cell in commit.cells] == ["0123456789ab", "not run from a checkout"]
+    took = row_of(sections, "The runs", "took")
+    assert [cell.text for cell in took.cells] == ["1 min 30 s", "–"]  # noqa: RUF001
+    with pytest.raises(ValueError, match="unpack"):
+        row_of(sections, "Computed with", "started")
+
+
+def test_nested_fields_are_named_by_their_path() -> None:
+    assert flatten({"a": {"b": 1, "c": {}}, "d": [1]}) == {"a.b": 1, "d": [1]}
+
+
+def test_the_list_says_what_it_shows_and_every_column_sorts_by_a_link(world: World) -> None:
+    client = world.browser()
+    page = client.get("/runs?q=sheet&sort=-created").text
+    assert '<tr class="plays" data-run="fitted"' in page
+    assert "towel_fold_quick" not in page.partition('id="runs"')[2]
+    assert re.search(r"<strong>1</strong> of \d+ runs", page)
+    sorted_by = re.findall(r'class="col-(\w+)" aria-sort="(\w+)"><a href="([^"]+)"', page)
+    assert [name for name, _, _ in sorted_by] == [
+        "name",
+        "state",
+        "created",
+        "duration",
+        "fitted",
+        "predicted",
+    ]
+    assert ("created", "descending") in [entry[:2] for entry in sorted_by]
+    for _, _, address in sorted_by:
+        again = client.get(address.replace("&amp;", "&"))
+        assert again.status_code == 200
+        assert 'data-run="fitted"' in again.text
+    assert 'value="succeeded" >succeeded (2)' in page
+    headers = client.get("/runs?q=&state=&sort=name", headers={"HX-Trigger": "filter"}).headers
+    assert headers["HX-Replace-Url"] == "/runs?sort=name"
+    assert "HX-Push-Url" in client.get("/runs?q=a").headers
+    quiet = client.get("/runs?q=a", headers={"HX-Trigger": "runs"}).headers
+    assert not {"hx-push-url", "hx-replace-url"} & set(quiet)
+
+
+@pytest.mark.parametrize(
+    ("query", "text"),
+    [
+        ("q=nothing-like-this", "No run fits this filter"),
+        ("q=is:nice", "knows no &#39;is:nice&#39;"),
+        ("q=%3Cimg%20src%3Dx%3E", 'value="&lt;img src=x&gt;"'),
+        ("profile=gone", '<option value="gone" selected>gone (0)</option>'),
+        ("offset=500", "This list ends before"),
+    ],
+)
+def test_an_empty_list_says_why(world: World, query: str, text: str) -> None:
+    page = world.browser().get(f"/runs?{query}")
+    assert page.status_code == 200
+    assert text in page.text
+    assert "<img src=x" not in page.text
+
+
+def test_a_wrong_address_of_a_list_is_told(world: World) -> None:
+    for wrong in ("/runs?sort=size", "/runs?limit=0", "/diff?run=a%2Fb&run=c", "/diff?show=some"):
+        assert world.browser().get(wrong).status_code == 422
+
+
+def test_sequences_are_filtered_and_lead_to_their_runs(world: World) -> None:
+    client = world.browser()
+    page = client.get("/sequences?q=marker%20control").text
+    assert 'data-sequence="sheet"' in page
+    assert "towel_fold" not in page.partition('id="sequences"')[2].partition("<dialog")[0]
+    assert '<a href="/runs?sequence=sheet">1 run</a>' in page
+    ordered = client.get("/sequences?sort=-frame_count").text
+    assert ordered.index('data-sequence="towel_fold"') < ordered.index('data-sequence="sheet"')
+    assert "No sequence fits this filter" in client.get("/sequences?q=nothing").text
+
+
+def test_two_runs_are_compared_by_their_address(world: World) -> None:
+    client = world.browser()
+    address = "/diff?run=fitted&run=towel_fold_quick"
+    page = client.get(address).text
+    assert "2 runs compared" in page
+    assert "a sheet" in page
+    assert "Towel fold, fitted" in page
+    assert "★" in page
+    same = '<th scope="row">kind</th>'
+    assert same not in page
+    assert same in client.get(f"{address}&show=all").text
+    assert 'href="/compare?a=fitted&amp;b=towel_fold_quick"' in page
+    for run, status in (("", 422), ("&run=fitted", 422), ("&run=gone", 404), ("&run=..", 422)):
+        assert client.get(f"/diff?run=fitted{run}").status_code == status
+    many = "".join(f"&run=r{n}" for n in range(6))
+    assert "2 to 5 runs" in client.get(f"/diff?{many}").text
+
+
+def test_a_damaged_run_can_be_compared_too(world: World) -> None:
+    run = Run.open(world.settings.run_dir / "fitted")
+    (run.out / "metrics.json").write_text("{")
+    (world.settings.run_dir / "broken").mkdir()
+    Path(world.settings.run_dir / "broken" / "run.yaml").write_text("name: [")
+    page = world.browser().get("/diff?run=fitted&run=broken&run=towel_fold_quick")
+    assert page.status_code == 200
+    assert "leave out" in page.text

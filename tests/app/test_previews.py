@@ -1,0 +1,218 @@
+"""Small pictures of sequences and runs: what they show, how they are made and kept."""
+
+import os
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image, ImageSequence
+from server_world import World
+
+from app.previews import worker
+from app.previews.camera import fitting_camera
+from app.previews.clip import clip_of_run, clip_of_sequence
+from app.previews.draw import HEIGHT, WIDTH, Motion, draw_motion
+from app.previews.store import Previews
+from app.settings import BUNDLED
+from physhandi.data.camera import PinholeCamera
+from physhandi.data.sequence import Sequence
+
+SQUARE = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+
+
+def colored(picture: np.ndarray, channel: int) -> np.ndarray:
+    """Pixels (y, x) in which a channel is much stronger than the other two."""
+    solid = picture[picture[..., 3] > 200].astype(int)
+    where = np.argwhere(picture[..., 3] > 200)
+    others = [c for c in range(3) if c != channel]
+    return where[solid[:, channel] > solid[:, others].max(axis=1) + 40]
+
+
+def test_a_camera_fills_the_picture_from_above_and_in_front() -> None:
+    rng = np.random.default_rng(0)
+    point = rng.uniform([-0.2, 0.3, 0.0], [0.4, 0.5, 0.1], (4000, 3))
+    camera = fitting_camera(point, 384, 240)
+    pixel = camera.project(point)
+    low, high = pixel.min(axis=0), pixel.max(axis=0)
+    assert (low > -2).all()
+    assert (high < [386, 242]).all()
+    assert ((high - low) / [384, 240]).max() > 0.8
+    np.testing.assert_allclose((low + high) / 2, [192, 120], atol=6)
+    top, bottom = camera.project(np.array([[0.1, 0.4, 0.1], [0.1, 0.4, 0.0]]))
+    assert top[1] < bottom[1] - 5
+    assert camera.T_world_camera[2, 3] > 0.1
+    assert np.isfinite(fitting_camera(np.zeros((1, 3)), 384, 240).project(np.zeros((1, 3)))).all()
+
+
+def test_a_point_is_drawn_where_the_camera_sees_it_on_a_clear_ground() -> None:
+    moved = np.stack([SQUARE, SQUARE + np.array([0.0, 0.0, 0.5])])
+    first, second = draw_motion(Motion(marker=moved), [0, 1])
+    assert first.shape == (HEIGHT, WIDTH, 4)
+    assert (first[..., 3] == 0).mean() > 0.9
+    camera: PinholeCamera = fitting_camera(moved.reshape(-1, 3), WIDTH, HEIGHT)
+    for picture, point in ((first, moved[0]), (second, moved[1])):
+        green = colored(picture, 1)
+        seen = camera.project(point)[:, ::-1]
+        nearest = np.linalg.norm(green[:, None] - seen[None], axis=-1).min(axis=0)
+        assert nearest.max() < 3.0
+        assert np.linalg.norm(green[:, None] - seen[None], axis=-1).min(axis=1).max() < 12.0
+    assert colored(second, 1)[:, 0].mean() < colored(first, 1)[:, 0].mean() - 10
+
+
+def test_a_surface_hides_what_lies_behind_it_and_not_what_lies_before() -> None:
+    face = np.array([[0, 1, 2], [0, 2, 3]])
+    wall = SQUARE[:, [0, 2, 1]][None]
+    spots = {"before": [0.2, -0.5, 0.0], "behind": [-0.2, 0.5, 0.0]}
+    counts = {}
+    for name, spot in spots.items():
+        motion = Motion(hands=((wall, face),), control=np.array([[spot]]))
+        counts[name] = len(colored(draw_motion(motion, [0])[0], 0))
+    assert counts["behind"] == 0
+    assert counts["before"] > 20
+
+
+def test_nothing_finite_is_refused() -> None:
+    with pytest.raises(ValueError, match="finite"):
+        draw_motion(Motion(marker=np.full((2, 3, 3), np.nan)), [0])
+
+
+def test_clips_keep_the_pace_and_show_video_points_or_what_was_fitted(world: World) -> None:
+    towel = clip_of_sequence(BUNDLED / "towel_fold")
+    assert towel is not None
+    assert len(towel.frames) == 28
+    assert towel.frame_ms * len(towel.frames) == pytest.approx(2000, rel=0.05)
+    view = Sequence.load(BUNDLED / "towel_fold").views[0]
+    half = view.color(0)[:, :, :].mean(axis=(0, 1))
+    np.testing.assert_allclose(towel.frames[0].mean(axis=(0, 1)), half, atol=8)
+    sheet = clip_of_sequence(world.settings.sequence_dir / "sheet")
+    assert sheet is not None
+    assert (len(sheet.frames), sheet.frame_ms) == (10, 40)
+    assert len(colored(sheet.frames[0], 1)) > 50
+    fitted = clip_of_run(world.settings.run_dir / "fitted", is_still=True)
+    assert fitted is not None
+    assert len(fitted.frames) == 1
+    assert len(colored(fitted.frames[0], 2)) > 50
+    assert len(colored(fitted.frames[0], 0)) > 10
+
+
+def test_depth_is_shown_where_there_is_no_color(tmp_path: Path) -> None:
+    folder = tmp_path / "towel_fold"
+    shutil.copytree(BUNDLED / "towel_fold", folder, ignore=shutil.ignore_patterns("color.mp4"))
+    clip = clip_of_sequence(folder, is_still=True)
+    assert clip is not None
+    assert clip.frames[0].reshape(-1, 3).std(axis=0).min() > 10
+
+
+def until(is_so: Callable[[], bool]) -> None:
+    end = time.monotonic() + 60.0
+    while not is_so():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def until_ready(previews: Previews, kind: str, name: str) -> None:
+    until(lambda: previews.look(kind, name).state != "pending")
+
+
+def test_pictures_are_made_beside_the_server_kept_and_made_again(world: World) -> None:
+    kept = world.settings.preview_dir
+    sheet = world.settings.sequence_dir / "sheet"
+    (world.settings.sequence_dir / "empty").mkdir()
+    about = yaml.safe_load((sheet / "sequence.yaml").read_text()) | {"name": "empty"}
+    (world.settings.sequence_dir / "empty" / "sequence.yaml").write_text(yaml.safe_dump(about))
+    previews = Previews(world.settings, world.catalog)
+    assert previews.look("sequence", "sheet").state == "pending"
+    assert previews.file("sequence", "sheet", is_moving=True) is None
+    assert previews.look("sequence", "empty").state == "pending"
+    before = sorted(world.settings.run_dir.rglob("*"))
+    previews.start()
+    try:
+        until_ready(previews, "sequence", "sheet")
+        until_ready(previews, "sequence", "empty")
+        assert previews.look("sequence", "empty").state == "none"
+        picture = previews.look("sequence", "sheet")
+        assert picture.still.startswith("/sequences/sheet/still?v=")
+        path = previews.file("sequence", "sheet", is_moving=True)
+        assert path is not None
+        with Image.open(path) as moving:
+            assert (moving.size, moving.n_frames) == ((WIDTH, HEIGHT), 10)
+            frames = [
+                np.asarray(f.convert("RGBA"), dtype=int) for f in ImageSequence.Iterator(moving)
+            ]
+        assert np.abs(frames[0] - frames[-1]).mean() > 1
+        still = previews.file("sequence", "sheet", is_moving=False)
+        assert still is not None
+        with Image.open(still) as image:
+            assert image.size == (WIDTH, HEIGHT)
+        # A changed sequence has a new picture in the place of the old one.
+        os.utime(sheet / "sequence.yaml", ns=(1, 1))
+        assert previews.look("sequence", "sheet").state == "pending"
+        until_ready(previews, "sequence", "sheet")
+        until(lambda: len(list(kept.glob("sequence-sheet-*.moving.webp"))) == 1)
+        shutil.rmtree(kept)
+        kept.mkdir()
+        assert previews.look("run", "fitted").state == "pending"
+        until_ready(previews, "run", "fitted")
+        assert previews.look("run", "fitted").moving.startswith("/runs/fitted/preview?v=")
+        assert sorted(world.settings.run_dir.rglob("*")) == before
+    finally:
+        previews.shutdown()
+
+
+def test_what_ends_its_process_is_noted_and_the_others_are_drawn(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    previews = Previews(world.settings, world.catalog)
+    drawn: list[str] = []
+
+    def break_at_the_first(batch: list) -> None:
+        drawn.append(batch[0].id)
+        (world.settings.preview_dir / f"{batch[0].key}.none").write_text("crashed")
+
+    monkeypatch.setattr(previews, "_draw", break_at_the_first)
+    previews.look("sequence", "sheet")
+    previews.start()
+    try:
+        until_ready(previews, "sequence", "sheet")
+    finally:
+        previews.shutdown()
+    assert drawn == ["sheet"]
+    assert previews.look("sequence", "sheet").state == "none"
+
+
+def test_a_picture_that_cannot_be_drawn_leaves_a_note_that_says_why(tmp_path: Path) -> None:
+    order = {"kind": "run", "folder": str(tmp_path / "gone"), "target": str(tmp_path / "run-x")}
+    worker.draw(order, is_still=True)
+    assert "is not a run" in (tmp_path / "run-x.none").read_text()
+    (tmp_path / "run-x.none").write_text("kept")
+    worker.draw(order, is_still=False)
+    assert (tmp_path / "run-x.none").read_text() == "kept"
+
+
+def test_a_run_without_results_shows_its_sequence(world: World) -> None:
+    client = world.script()
+    run_id = client.post("/api/v1/runs", json={"sequences": ["sheet"]}).json()["id"]
+    waiting = client.get(f"/runs/{run_id}/picture")
+    assert waiting.json() == {"state": "pending", "still": "", "moving": ""}
+    assert client.get(f"/runs/{run_id}/still").status_code == 202
+    previews = Previews(world.settings, world.catalog)
+    previews.look("sequence", "sheet")
+    (source,) = previews._waiting.values()
+    world.settings.preview_dir.mkdir(parents=True)
+    for ending in (worker.STILL, worker.MOVING):
+        (world.settings.preview_dir / f"{source.key}{ending}").write_bytes(b"RIFF")
+    told = client.get(f"/runs/{run_id}/picture").json()
+    assert told["state"] == "ready"
+    assert told["moving"].startswith("/sequences/sheet/preview?v=")
+    answer = client.get(told["moving"])
+    assert (answer.content, answer.headers["content-type"]) == (b"RIFF", "image/webp")
+    assert "immutable" in answer.headers["cache-control"]
+    assert client.get("/sequences/sheet/still?v=old").headers["cache-control"] == "no-store"
+    page = client.get("/sequences").text
+    assert f'<img class="still" src="{told["still"]}"' in page.replace("&amp;", "&")
+    for missing in ("/runs/nothing/still", "/sequences/nothing/preview"):
+        assert client.get(missing).status_code == 404
