@@ -26,6 +26,9 @@ Action = Literal[
     "redo",
     "hold",
     "one_frame",
+    "pin",
+    "compare_mode",
+    "swap",
 ]
 """What a key does in the live scene."""
 
@@ -143,6 +146,24 @@ KEYS: tuple[KeyGroup, ...] = (
             ),
             Key(shown=("H",), about="hold the simulation or go on", action="hold", hotkeys=("H",)),
             Key(shown=("N",), about="simulate one more frame", action="one_frame", hotkeys=("N",)),
+        ),
+    ),
+    KeyGroup(
+        title="Compare",
+        keys=(
+            Key(
+                shown=("V",),
+                about="keep this rollout as A and compare with it; again to stop",
+                action="pin",
+                hotkeys=("V",),
+            ),
+            Key(
+                shown=("M",),
+                about="A and B side by side, over each other, or wiped",
+                action="compare_mode",
+                hotkeys=("M",),
+            ),
+            Key(shown=("X",), about="swap the sides of A and B", action="swap", hotkeys=("X",)),
         ),
     ),
     KeyGroup(

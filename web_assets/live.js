@@ -12,6 +12,8 @@
 
   const wish = () => send("PATCH", `/api/v1/sessions/${session}`, { dark: isDark.matches }).catch(() => {});
 
+  const seek = (frame) => send("PATCH", `/api/v1/sessions/${session}`, { frame }).catch((error) => toast(error.message, true));
+
   /* A scene that another tab shows already is copied by the server, which sends the frame on. */
   function settle() {
     const shown = /^\/viewer\/([\w-]+)\/$/.exec(scene.contentWindow.location.pathname)?.[1];
@@ -25,6 +27,7 @@
       entry.href = `/api/v1/sessions/${session}/export?format=${entry.dataset.sessionExport}`;
     }
     scene.contentWindow.addEventListener("keydown", onKey);
+    wireScene(scene, seek);
     wish();
     scene.contentWindow.focus();
   }
@@ -75,6 +78,7 @@
     if (answer && (answer.status === 404 || answer.status === 401)) location.reload();
   }
 
+  forwardKeys(scene);
   scene.addEventListener("load", settle);
   if (scene.contentDocument?.readyState === "complete") settle();
   isDark.addEventListener("change", wish);

@@ -182,7 +182,7 @@ class Inspector:
         links = readings.links(chosen, take, take_frame)
         with self._server.atomic():
             self._nodes.points(
-                "/picked/point", place, MARK, 0.62 * framing.spacing, is_visible=not is_hidden
+                "/picked/point", place, MARK, 0.46 * framing.spacing, is_visible=not is_hidden
             )
             self._nodes.segments("/picked/links", links, MARK, 3.0, is_visible=not is_hidden)
             name = readings.title(chosen, take).partition(" (")[0]
@@ -195,7 +195,7 @@ class Inspector:
                 name,
                 above,
                 anchor="bottom-center",
-                height=0.03 * framing.extent,
+                height=0.02 * framing.extent,
             )
 
     def _choose_history(self) -> None:
@@ -260,14 +260,14 @@ class Inspector:
 def _table(title: str, rows: Rows) -> str:
     """Lay out names and values; all text is the program's, and escaped all the same."""
     lines = "".join(
-        f'<tr><td style="opacity:0.75;padding-right:0.8em;vertical-align:top;white-space:nowrap">'
-        f'{html.escape(name)}</td><td style="font-variant-numeric:tabular-nums">'
+        '<tr><td style="opacity:0.75;padding:0 0.8em 0 0;vertical-align:top;white-space:nowrap">'
+        f'{html.escape(name)}</td><td style="padding:0;font-variant-numeric:tabular-nums">'
         f"{html.escape(value)}</td></tr>"
         for name, value in rows
     )
     color = "rgb({},{},{})".format(*MARK)
     return (
-        '<div style="font-size:0.8em;line-height:1.45;padding:0 0.9em 0.4em" data-reading>'
+        '<div style="font-size:0.8em;line-height:1.35;padding:0 0.9em 0.4em" data-reading>'
         f'<b><span style="color:{color}">●</span> {html.escape(title)}</b>'
         f"<table>{lines}</table></div>"
     )

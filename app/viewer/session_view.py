@@ -149,6 +149,10 @@ class Session:
             layers = replace(self._stage.scene.layers)
         return replace(snapshot, run=run, layers=layers, link=self.link_of(self))
 
+    def go(self, frame: int) -> None:
+        """Stop at a frame."""
+        self._timeline.go(frame)
+
     def prefer_dark(self, *, on: bool) -> None:
         """Follow the browser's color scheme, unless the user has chosen a background."""
         self._layers.prefer_dark(on=on)

@@ -1,0 +1,56 @@
+"use strict";
+
+/* A live scene in a frame: keys that work in it and on the page around it, and charts to click. */
+
+{
+  const OF_PAGE = ["?", "p", "P", "Tab", "Enter"];
+  const NAMED = ["Escape", "Home", "End", "ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown"];
+  /* viser moves the camera while these are held; here they save a picture and step through frames. */
+  const NOT_FOR_CAMERA = ["KeyS", "ArrowLeft", "ArrowRight"];
+  const CLICK_PIXELS = 4;
+
+  const isTyping = (event) => event.target.matches?.("input:not([type=checkbox]), textarea, select");
+
+  /* Keys that the page around has no use for go to the scene, as if it had the focus. */
+  function forward(event, scene) {
+    const isCombined = event.ctrlKey || event.metaKey || event.altKey;
+    if (isCombined ? event.key.toLowerCase() !== "z" : event.key.length > 1 && !NAMED.includes(event.key)) return;
+    if (isTyping(event) || OF_PAGE.includes(event.key) || document.querySelector("dialog[open], details[open]")) return;
+    if (event.key === " " && event.target.closest?.("button, summary, a")) return;
+    event.preventDefault();
+    event.stopImmediatePropagation();
+    const { key, code, shiftKey, ctrlKey, metaKey, altKey } = event;
+    const inside = scene.contentWindow;
+    const copy = new inside.KeyboardEvent("keydown", { key, code, shiftKey, ctrlKey, metaKey, altKey, bubbles: true, cancelable: true });
+    inside.document.documentElement.dispatchEvent(copy);
+  }
+
+  /* The frame under a click in a chart over frames; none in any other chart, or after a drag. */
+  function frameAt(event, inside, start) {
+    const over = event.target.closest?.(".u-over");
+    if (!over || Math.abs(event.clientX - start) > CLICK_PIXELS) return null;
+    const charts = Object.values(inside.__viserTestpoints?.uplots ?? {});
+    const chart = charts.map((entry) => entry.chart).find((entry) => entry.over === over);
+    if (chart?.series[0].label !== "frame") return null;
+    return Math.max(0, Math.round(chart.posToVal(event.clientX - over.getBoundingClientRect().left, "x")));
+  }
+
+  /* To be called whenever the frame has loaded a scene. */
+  globalThis.wireScene = (scene, seek) => {
+    const inside = scene.contentWindow;
+    const root = inside.document.documentElement;
+    let start = 0;
+    root.addEventListener("keydown", (event) => NOT_FOR_CAMERA.includes(event.code) && event.stopPropagation());
+    inside.addEventListener("keydown", (event) => {
+      if (event.key === "?" && !isTyping(event)) document.getElementById("help").showModal();
+    }, true);
+    root.addEventListener("pointerdown", (event) => (start = event.clientX), true);
+    root.addEventListener("click", (event) => {
+      const frame = frameAt(event, inside, start);
+      if (frame !== null) seek(frame);
+    });
+  };
+
+  /* To be called once; the frame may load other scenes later. */
+  globalThis.forwardKeys = (scene) => document.addEventListener("keydown", (event) => forward(event, scene), true);
+}
