@@ -6,11 +6,13 @@ const page = {
   run: document.getElementById("run").dataset.run,
   losses: document.getElementById("losses"),
   frames: document.getElementById("frames"),
+  now: document.getElementById("now"),
   charts: new Map(),
   loaded: -1, // number of the last report that the curves were loaded with
   live: [], // points that came since
   drawn: 0, // how many of them the charts show
   report: { seq: -1 },
+  estimate: null, // how long the whole fit still takes
   log: null,
 };
 
@@ -109,7 +111,7 @@ async function loadLosses() {
 /** Reports come at once, the run's own summary of them with the time left a little later. */
 function showReport(report) {
   if (report.seq >= page.report.seq) page.report = { ...report, eta_s: report.stage === page.report.stage ? (report.eta_s ?? page.report.eta_s) : report.eta_s };
-  if (page.report.total) showProgress(document.getElementById("run"), { progress: page.report });
+  if (page.report.total) showProgress(document.getElementById("run"), { progress: page.report, estimate: page.estimate });
 }
 
 function onProgress(event) {
@@ -179,7 +181,24 @@ function holdFrame(title, frame, values) {
 
 /* ---- start ---- */
 
+/** Show how much of the whole fit is done. */
+function showEstimate(estimate) {
+  page.estimate = estimate;
+  const share = document.querySelector("[data-whole-share]");
+  if (share && estimate) share.textContent = `${Math.round(100 * estimate.share)} %`;
+}
+
+function onLoad({ machine, run }) {
+  showMachine(page.now, machine);
+  const takes = page.now.querySelector("[data-takes]");
+  const card = run && Number.isFinite(run.card_memory) ? `, ${bytes(run.card_memory)} on the graphics card` : "";
+  takes.textContent = run ? `This fit takes ${bytes(run.memory)} of memory${card} and keeps ${run.processors.toFixed(1)} of ${machine.processor.count} processors busy.` : "";
+}
+
 function onRun(run) {
+  page.now.hidden = !["starting", "running", "stopping"].includes(run.state);
+  if (page.now.hidden) page.preview.stop();
+  showEstimate(run.state === "running" ? run.estimate : null);
   const head = document.getElementById("run");
   if (run.revision !== head.dataset.revision) {
     refreshParts();
@@ -205,6 +224,9 @@ async function begin() {
   listeners.progress = onProgress;
   listeners.log = (part) => page.log.add(part);
   listeners.gone = onGone;
+  listeners.load = onLoad;
+  page.preview = new Preview(page.now.querySelector(".preview"), `/api/v1/runs/${page.run}/preview`);
+  listeners.preview = ({ number }) => page.preview.load(number);
   let seq = -1;
   try {
     seq = await loadLosses();

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any
 
+from app.jobs.catalog import Catalog, RunItem, UnknownRunError
 from physhandi.data.atomic import named_fields
 from physhandi.data.run import Run
 from physhandi.errors import UsageError
@@ -62,6 +63,23 @@ def settings_of_run(run: Run) -> PipelineConfig | None:
         return config_from_dict(profile)
     except UsageError:
         return None
+
+
+def order_of(item: RunItem, catalog: Catalog) -> dict[str, Any]:
+    """Describe what a listed run was asked to do, for its page.
+
+    Returns:
+        `describe_order` of it, and ``parent_name``: none if the parent is gone.
+    """
+    order: dict[str, Any] = {"parent": None, "changes": []}
+    order = describe_order(item.run) if item.run else order
+    if order["parent"] is None:
+        return order
+    try:
+        parent = catalog.run_item(order["parent"]).run
+    except UnknownRunError:
+        return order | {"parent_name": None}
+    return order | {"parent_name": parent.name if parent else order["parent"]}
 
 
 def describe_order(run: Run) -> dict[str, Any]:

@@ -7,13 +7,13 @@ from app.jobs.catalog import Catalog
 from app.jobs.describe import describe_run
 from app.jobs.forecast import Forecast
 from app.jobs.machine import Machine
-from app.jobs.order import fit_config, settings_of_run, shown_value
+from app.jobs.order import settings_of_run, shown_value
 from app.jobs.scheduler import Scheduler
 from app.settings import Settings
 from physhandi.data.environment import describe_environment
-from physhandi.errors import UsageError
+from physhandi.errors import SettingsError, UsageError
 from physhandi.fitting.overrides import apply_overrides, changes, values_of
-from physhandi.fitting.profile import load_profile
+from physhandi.fitting.profile import config_to_dict, load_profile
 from physhandi.fitting.settings import GROUPS, all_settings
 
 
@@ -132,16 +132,20 @@ def check_order(
     """Tell what a fit would be, without launching it.
 
     Returns:
-        ``overrides`` that differ from the profile, and ``expected``: ``seconds basis``, none if
-        no earlier fit is known.
+        ``problems`` (``field message`` of each setting that is wrong), ``overrides`` that differ
+        from the profile, and ``expected``: ``seconds basis``, none if no earlier fit is known.
 
     Raises:
-        UsageError: If there is no such profile, or settings are wrong.
+        UsageError: If there is no such profile.
         SequenceError: If a sequence is unknown or damaged.
     """
     base = load_profile(profile)
-    changed = changes(apply_overrides(base, overrides), base)
     frames = [catalog.sequence(sequence_id).frame_count for sequence_id in sequence_ids]
-    plan = forecast.of_order(fit_config(profile, overrides)["profile"], frames) if frames else None
+    try:
+        config = apply_overrides(base, overrides)
+    except SettingsError as error:
+        problems = [{"field": path, "message": told} for path, told in error.fields.items()]
+        return {"problems": problems, "overrides": {}, "expected": None}
+    plan = forecast.of_order(config_to_dict(config), frames) if frames else None
     expected = plan and {"seconds": float(round(plan.seconds)), "basis": plan.basis}
-    return {"overrides": changed, "expected": expected}
+    return {"problems": [], "overrides": changes(config, base), "expected": expected}

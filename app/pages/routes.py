@@ -99,7 +99,7 @@ def create_pages(
         previews: Keeps small pictures.
     """
     router = APIRouter(include_in_schema=False)
-    add_lists(router, catalog, scheduler, feed, pages, previews=previews)
+    add_lists(router, catalog, feed, pages, previews=previews)
     add_pictures(router, previews)
 
     @router.get("/runs/{run_id}")
