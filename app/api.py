@@ -1,18 +1,16 @@
 """The REST interface below /api/v1: nothing but translation."""
 
 import asyncio
-import shutil
-import tempfile
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol
 
 from fastapi import APIRouter, Header, Query, Request, Response
-from fastapi.responses import FileResponse, StreamingResponse
-from pydantic import BaseModel, ConfigDict, Field
+from fastapi.responses import StreamingResponse
+from pydantic import BaseModel, ConfigDict, Field, JsonValue
 from starlette.background import BackgroundTask
 from starlette.exceptions import HTTPException
 
+from app.comparison import NewComparison
 from app.jobs.catalog import Catalog, NotFoundError
 from app.jobs.describe import (
     describe_results,
@@ -25,15 +23,15 @@ from app.jobs.describe import (
 from app.jobs.feed import Feed
 from app.jobs.listing import RunQuery, page_of, select_runs
 from app.jobs.log import open_log
+from app.jobs.machine import Machine
+from app.jobs.order import describe_order
 from app.jobs.scheduler import Scheduler
 from app.jobs.streams import News, Streams
 from app.jobs.watch import Watch
-from physhandi.data.exporters import export_run
-from physhandi.errors import RunError
 from physhandi.fitting.profile import load_profile, profile_names
 
 Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
-ExportFormat = Literal["ply", "gltf", "npz", "csv", "yaml"]
+Path = Annotated[str, Field(max_length=200)]
 
 
 class OpenScene(Protocol):
@@ -43,11 +41,15 @@ class OpenScene(Protocol):
         """Follow the browser's color scheme."""
         ...
 
+    def go(self, frame: int) -> None:
+        """Stop at a frame."""
+        ...
+
 
 class SessionOpener(Protocol):
     """The part of the live viewer that the API needs."""
 
-    def open(self, kind: Literal["run", "sequence"], target: str, owner: str) -> str:
+    def open(self, kind: Literal["run", "sequence", "comparison"], target: str, owner: str) -> str:
         """Open a live scene and return its id."""
         ...
 
@@ -68,6 +70,10 @@ class NewRun(BaseModel):
     sequences: Annotated[list[Id], Field(min_length=1, max_length=64)]
     profile: Id = "quick"
     name: Annotated[str, Field(max_length=120)] = ""
+    overrides: Annotated[dict[Path, JsonValue], Field(max_length=200)] = {}
+    """New values of settings by their paths; `GET /api/v1/settings` lists them."""
+    parent: Id | None = None
+    """The run that it was made from."""
 
 
 class NewSession(BaseModel):
@@ -79,16 +85,26 @@ class NewSession(BaseModel):
     id: Id
 
 
+NewScene = Annotated[NewSession | NewComparison, Field(discriminator="kind")]
+
+
 class SessionWishes(BaseModel):
     """What a browser asks of a live scene."""
 
     model_config = ConfigDict(extra="forbid")
 
-    dark: bool
+    dark: bool | None = None
+    """Whether the browser asks for a dark background."""
+    frame: Annotated[int | None, Field(ge=0, le=10_000_000)] = None
+    """Frame to stop at."""
 
 
 def create_api(
-    catalog: Catalog, scheduler: Scheduler, feed: Feed, sessions: SessionOpener
+    catalog: Catalog,
+    scheduler: Scheduler,
+    feed: Feed,
+    sessions: SessionOpener,
+    machine: Machine,
 ) -> APIRouter:
     """Make the routes.
 
@@ -97,12 +113,13 @@ def create_api(
         scheduler: Launches and cancels fits.
         feed: Tells what changed.
         sessions: Opens live scenes.
+        machine: Tells how busy the machine is.
     """
     router = APIRouter(prefix="/api/v1")
     _add_listings(router, catalog, scheduler)
     _add_jobs(router, catalog, scheduler)
     _add_sessions(router, sessions)
-    _add_streams(router, catalog, scheduler, feed)
+    _add_streams(router, catalog, scheduler, feed, machine)
     return router
 
 
@@ -124,7 +141,8 @@ def _add_listings(router: APIRouter, catalog: Catalog, scheduler: Scheduler) -> 
     def show_run(run_id: Id) -> dict[str, Any]:
         item = catalog.run_item(run_id)
         results = describe_results(item.run) if item.run else {}
-        return follow_run(item, scheduler) | {"results": results}
+        order = describe_order(item.run) if item.run else {}
+        return follow_run(item, scheduler) | order | {"results": results}
 
     @router.get("/runs/{run_id}/losses")
     def show_losses(run_id: Id) -> dict[str, Any]:
@@ -160,7 +178,9 @@ def _add_listings(router: APIRouter, catalog: Catalog, scheduler: Scheduler) -> 
 def _add_jobs(router: APIRouter, catalog: Catalog, scheduler: Scheduler) -> None:
     @router.post("/runs", status_code=201)
     def launch(new: NewRun) -> dict[str, Any]:
-        run = scheduler.launch(new.sequences, new.profile, new.name)
+        run = scheduler.launch(
+            new.sequences, new.profile, new.name, overrides=new.overrides, parent=new.parent
+        )
         return describe_run(catalog.run_item(run.id), scheduler)
 
     @router.post("/runs/{run_id}/cancel")
@@ -178,19 +198,12 @@ def _add_jobs(router: APIRouter, catalog: Catalog, scheduler: Scheduler) -> None
         scheduler.delete(run_id)
         return Response(status_code=204)
 
-    @router.get("/runs/{run_id}/export")
-    def export(
-        run_id: Id,
-        kind: Annotated[ExportFormat, Query(alias="format")],
-        sequence: Annotated[str | None, Query(max_length=200)] = None,
-    ) -> FileResponse:
-        return _export(catalog, run_id, kind, sequence)
-
 
 def _add_sessions(router: APIRouter, sessions: SessionOpener) -> None:
     @router.post("/sessions", status_code=201)
-    def open_session(new: NewSession, request: Request) -> dict[str, str]:
-        session_id = sessions.open(new.kind, new.id, request.state.owner)
+    def open_session(new: NewScene, request: Request) -> dict[str, str]:
+        target = new.query if isinstance(new, NewComparison) else new.id
+        session_id = sessions.open(new.kind, target, request.state.owner)
         return {"id": session_id, "url": f"/live/{session_id}"}
 
     def find(session_id: str, request: Request) -> OpenScene:
@@ -206,7 +219,11 @@ def _add_sessions(router: APIRouter, sessions: SessionOpener) -> None:
 
     @router.patch("/sessions/{session_id}", status_code=204)
     def change_session(session_id: Id, wishes: SessionWishes, request: Request) -> Response:
-        find(session_id, request).prefer_dark(on=wishes.dark)
+        scene = find(session_id, request)
+        if wishes.dark is not None:
+            scene.prefer_dark(on=wishes.dark)
+        if wishes.frame is not None:
+            scene.go(wishes.frame)
         return Response(status_code=204)
 
     @router.delete("/sessions/{session_id}", status_code=204)
@@ -216,7 +233,13 @@ def _add_sessions(router: APIRouter, sessions: SessionOpener) -> None:
         return Response(status_code=204)
 
 
-def _add_streams(router: APIRouter, catalog: Catalog, scheduler: Scheduler, feed: Feed) -> None:
+def _add_streams(
+    router: APIRouter,
+    catalog: Catalog,
+    scheduler: Scheduler,
+    feed: Feed,
+    machine: Machine,
+) -> None:
     streams = Streams()
 
     @router.get("/events")
@@ -243,26 +266,10 @@ def _add_streams(router: APIRouter, catalog: Catalog, scheduler: Scheduler, feed
         last_event_id: Annotated[str | None, Header(max_length=64)] = None,
     ) -> StreamingResponse:
         item = await asyncio.to_thread(catalog.run_item, run_id)
-        watch = Watch(item.folder, lambda: follow_run(item, scheduler), last_event_id or since)
+        watch = Watch(
+            item.folder,
+            lambda: follow_run(item, scheduler),
+            last_event_id or since,
+            lambda: {"machine": machine.load(), "run": machine.of_run(item.folder)},
+        )
         return streams.answer(request, watch.news)
-
-
-def _export(
-    catalog: Catalog, run_id: str, kind: ExportFormat, sequence: str | None
-) -> FileResponse:
-    run = catalog.run(run_id)
-    if not run.is_published:
-        raise RunError(f"Run '{run_id}' is {run.state}: there is nothing to export yet.")
-    run.verify(allows_more=True)
-    folder = Path(tempfile.mkdtemp(prefix="physhandi-export-"))
-    try:
-        suffix = "glb" if kind == "gltf" else kind
-        name = f"{run_id}_{kind}" if kind == "ply" else f"{run_id}.{suffix}"
-        path = export_run(run, kind, folder / name, sequence=sequence)
-        if path.is_dir():
-            path = Path(shutil.make_archive(str(path), "zip", path))
-    except BaseException:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise
-    clean_up = BackgroundTask(shutil.rmtree, folder, ignore_errors=True)
-    return FileResponse(path, filename=path.name, background=clean_up)

@@ -17,6 +17,7 @@ from fastapi.staticfiles import StaticFiles
 from starlette.exceptions import HTTPException
 
 from app.api import create_api
+from app.comparing import create_comparing
 from app.exports.routes import create_exports
 from app.exports.workshop import TooManyFilesError, Workshop
 from app.jobs.catalog import Catalog, NotFoundError
@@ -122,6 +123,7 @@ def create_app(
     app.include_router(create_monitor(catalog, scheduler, overview, pages))
     app.include_router(create_pages(catalog, scheduler, feed, sessions, pages, previews=previews))
     app.include_router(create_exports(catalog, sessions, pages, workshop))
+    app.include_router(create_comparing(catalog, scheduler, pages))
     app.include_router(create_gate(sessions))
     app.mount("/assets", StaticFiles(directory=WEB_ASSETS), name="assets")
 

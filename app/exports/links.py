@@ -61,9 +61,9 @@ def create_links(sessions: Sessions) -> APIRouter:
     def show_link(session_id: Id, request: Request) -> Link:
         """Tell the address that opens another scene in the state of this one."""
         session = sessions.find(session_id, request.state.owner)
-        if not isinstance(session, Session):
+        if session is None:
             raise HTTPException(404, CLOSED)
-        link = link_of(session)
+        link = link_of(session) if isinstance(session, Session) else session.link
         return Link(url=link, query=link.partition("?")[2])
 
     return router

@@ -239,9 +239,10 @@ def _lay(to: ndarray, corner: ndarray, image: ndarray) -> None:
     """Draw an image between four corners."""
     rows, columns = image.shape[:2]
     source = np.array([[0, 0], [columns, 0], [columns, rows], [0, rows]], np.float32)
-    turn = cv2.getPerspectiveTransform(source, corner.astype(np.float32))
+    # A pixel's middle has whole coordinates, so that the image begins half a pixel before 0.
+    turn = cv2.getPerspectiveTransform(source - np.float32(0.5), corner.astype(np.float32))
     size = (to.shape[1], to.shape[0])
-    laid = cv2.warpPerspective(image, turn, size, flags=cv2.INTER_AREA)
+    laid = cv2.warpPerspective(image, turn, size, borderMode=cv2.BORDER_REPLICATE)
     mask = np.zeros(to.shape[:2], np.uint8)
     cv2.fillConvexPoly(mask, np.round(corner * 2**_BITS).astype(np.int32), (255,), 8, _BITS)
     np.copyto(to, laid, where=mask[..., None] > 0)

@@ -5,7 +5,6 @@ from typing import Any
 
 from app.viewer.content import Content
 from app.viewer.layers import default_layers
-from app.viewer.physics_panel import PhysicsPanel
 from app.viewer.session_state import SessionState
 from physhandi.errors import UsageError
 from physhandi.simulation.model import SimulationParameters
@@ -48,15 +47,7 @@ def complete_state(state: SessionState, content: Content) -> SessionState:
     return replace(state, layers=layers, parameters=parameters)
 
 
-def differences(panel: PhysicsPanel | None) -> dict[str, Any]:
-    """Find the parameters of a panel that are not as fitted."""
-    if panel is None:
-        return {}
-    start, now = panel.history.start, panel.history.current
-    return parameter_differences(start, now)
-
-
-def parameter_differences(start: SimulationParameters, now: SimulationParameters) -> dict[str, Any]:
+def differences(start: SimulationParameters, now: SimulationParameters) -> dict[str, Any]:
     """Find the parameters that differ, with their new values."""
     return {
         item.name: getattr(now, item.name)

@@ -4,9 +4,11 @@ import logging
 import secrets
 import threading
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, get_args
 
+from app.viewer.compare_session import CompareSession
 from app.viewer.content import Catalog
 from app.viewer.keep_panel import Keeping
 from app.viewer.live import LiveSimulation
@@ -19,6 +21,9 @@ logger = logging.getLogger(__name__)
 _REAP_INTERVAL = 20.0
 _MAKES_ROOM_AFTER = 30.0
 _REMEMBERED = 200
+
+
+AnySession = Session | CompareSession
 
 
 class TooManySessionsError(PhysHandiError):
@@ -49,9 +54,9 @@ class Farewell:
     """What is remembered of a session that was closed."""
 
     kind: Kind
-    """Whether it showed a run or a sequence."""
+    """Whether it showed a run, a sequence or two runs together."""
     target: str
-    """Id of the run or the sequence."""
+    """Id of the run or the sequence; of a comparison the query after ``/compare?``."""
     title: str
     """Name of what it showed."""
     owner: str
@@ -83,9 +88,10 @@ class Sessions:
         self._settings = settings
         self._catalog = catalog
         self._lock = threading.Lock()
-        self._sessions: dict[str, Session] = {}
+        self._sessions: dict[str, AnySession] = {}
         self._farewells: OrderedDict[str, Farewell] = OrderedDict()
         self._opening = 0
+        self.link_of: Callable[[Session], str] = lambda _: ""
         self.live = LiveSimulation(settings.device)
         self._closed = threading.Event()
         self._reaper: threading.Thread | None = None
@@ -97,7 +103,7 @@ class Sessions:
 
         Args:
             kind: What `target` is the id of.
-            target: Id of a run or a sequence.
+            target: Id of a run or a sequence, or the query of two runs to compare.
             owner: Who asks.
             state: What to begin with; None for what suits the content.
 
@@ -108,21 +114,14 @@ class Sessions:
             TooManySessionsError: If as many sessions as allowed are open.
             PhysHandiError: If the run or sequence cannot be shown.
         """
-        if kind not in {"run", "sequence"}:
-            raise UsageError(f"A session shows a run or a sequence, not {kind!r}.")
+        if kind not in get_args(Kind):
+            raise UsageError(f"A session shows a run, a sequence or a comparison, not {kind!r}.")
         self._reserve(owner)
         try:
             session_id = secrets.token_urlsafe(18)
-            session = Session(
-                session_id,
-                kind=kind,
-                target=target,
-                owner=owner,
-                catalog=self._catalog,
-                live=self.live,
-                state=state,
-                keeping=self._keeping,
-            )
+            session = self._make(session_id, kind, target, owner, state)
+            if isinstance(session, Session):
+                session.link_of = self.link_of
             with self._lock:
                 self._sessions[session_id] = session
         finally:
@@ -131,7 +130,7 @@ class Sessions:
         logger.info("session opened for %s %s by %s", kind, target, owner)
         return session_id
 
-    def copy(self, session: Session) -> str:
+    def copy(self, session: AnySession) -> str:
         """Open another session of the same owner that begins where a session stands.
 
         Raises:
@@ -139,12 +138,12 @@ class Sessions:
         """
         return self.open(session.kind, session.target, session.owner, state=session.state)
 
-    def get(self, session_id: str) -> Session | None:
+    def get(self, session_id: str) -> AnySession | None:
         """Find a session; None if there is none of that id."""
         with self._lock:
             return self._sessions.get(session_id)
 
-    def find(self, session_id: str, owner: str) -> Session | None:
+    def find(self, session_id: str, owner: str) -> AnySession | None:
         """Find a session of an owner; None if there is none, or if it is somebody else's."""
         session = self.get(session_id)
         return session if session is not None and session.owner == owner else None
@@ -198,6 +197,24 @@ class Sessions:
         reason = f"Nobody looked at it for {time}."
         idle = [info.id for info in self.list() if info.idle >= most]
         return sum(self.close(session_id, reason) for session_id in idle)
+
+    def _make(
+        self, session_id: str, kind: Kind, target: str, owner: str, state: SessionState | None
+    ) -> AnySession:
+        if kind == "comparison":
+            return CompareSession(
+                session_id, target=target, owner=owner, catalog=self._catalog, state=state
+            )
+        return Session(
+            session_id,
+            kind=kind,
+            target=target,
+            owner=owner,
+            catalog=self._catalog,
+            live=self.live,
+            state=state,
+            keeping=self._keeping,
+        )
 
     def _reserve(self, owner: str) -> None:
         self._make_room(owner)
