@@ -1,0 +1,221 @@
+"""Colors, legend, clicks and keys of a live session, as a client sees them."""
+
+import numpy as np
+import pytest
+from viewer_client import ViewerClient
+from viewer_world import PARAMETERS
+
+from app.keys import KEYS, LAYER_KEYS, Key
+from app.viewer.colormaps import table
+from app.viewer.inspector import MARK
+from app.viewer.layers import COLORINGS, Layers
+
+FRAME = 12
+
+
+@pytest.fixture
+def paused(sessions):
+    """A session of the sheet that rests at one frame, and its client."""
+    session = sessions.get(sessions.open("run", "sheet", "me"))
+    with ViewerClient(f"ws://127.0.0.1:{session.port}") as client:
+        client.until(lambda: "/object/nodes" in client.nodes)
+        client.set("Frame", FRAME)
+        client.until(lambda: session._playback.frame == FRAME and not session._playback.is_playing)
+        yield session, client
+
+
+def texts(client) -> str:
+    return "\n".join(str(p["content"]) for p in client.gui.values() if "content" in p)
+
+
+def press(client, hotkey: str, modifier: str | None = None) -> None:
+    commands = {
+        (m["props"]["hotkey"], m["props"]["modifier"]): m["uuid"]
+        for m in client.messages
+        if m["type"] == "RegisterCommandMessage"
+    }
+    client.send("CommandTriggerMessage", uuid=commands[hotkey, modifier])
+
+
+def click(client, target, *, shift: bool = False) -> None:
+    """Click at a point of the scene, from above."""
+    client.send(
+        "ScenePointerMessage",
+        event_type="click",
+        ray_origin=(float(target[0]), float(target[1]), 3.0),
+        ray_direction=(0.0, 0.0, -1.0),
+        screen_pos=((0.5, 0.5),),
+        modifier="shift" if shift else None,
+    )
+
+
+def test_colors_follow_the_choice_and_the_legend_says_what_they_mean(paused, run) -> None:
+    _, client = paused
+    plain = client.nodes["/object/nodes"]["colors"]
+    assert len(plain) == 3
+    client.set("Color by", "speed")
+    client.until(lambda: len(client.nodes["/object/nodes"]["colors"]) == 3 * 81)
+    client.until(lambda: "<b>Speed</b><span>m/s</span>" in texts(client))
+    position = run.array("sequences/lift/rollout.npy")
+    speed = 30.0 * np.linalg.norm(position[FRAME] - position[FRAME - 1], axis=1)
+    low, high = client.value("Range")
+    assert low == 0
+    assert 0.5 * speed.max() < high < 5 * speed.max()
+    color = client.array("/object/nodes", "colors")
+    ramp = table("sequential").astype(int)
+    step = np.array([np.abs(ramp - c).sum(axis=1).argmin() for c in color.astype(int)])
+    np.testing.assert_allclose(step / 255, np.clip(speed / high, 0, 1), atol=0.01)
+    # The springs have the colors of both ends, and the plain ones are hidden.
+    assert client.visible["/springs/object"] is False
+    assert len(client.nodes["/springs/object_painted"]["colors"]) > 3
+
+    client.set("Range", (0.0, 2.0 * high))
+    client.until(lambda: client.value("Hold range") is True)
+    client.until(lambda: client.array("/object/nodes", "colors").tolist() != color.tolist())
+    client.set("Hold range", False)
+    client.until(lambda: client.array("/object/nodes", "colors").tolist() == color.tolist())
+    client.set("Color by", "plain")
+    client.until(lambda: len(client.nodes["/object/nodes"]["colors"]) == 3)
+
+
+def test_colors_are_sent_only_when_they_change(paused) -> None:
+    session, client = paused
+    client.set("Color by", "stiffness")
+    client.until(lambda: len(client.nodes["/object/nodes"]["colors"]) == 3 * 81)
+
+    def sent(field: str) -> int:
+        return sum(
+            m["type"] == "SceneNodeUpdateMessage" and field in m["updates"] for m in client.messages
+        )
+
+    before, moved = sent("colors"), sent("points")
+    session._playback.seek(FRAME + 3)
+    client.until(lambda: sent("points") > moved)
+    assert sent("colors") == before
+    client.set("Color by", "speed")
+    client.until(lambda: sent("colors") > before)
+
+
+def test_a_surface_is_drawn_plain_and_in_colors(paused) -> None:
+    _, client = paused
+    press(client, "3")
+    client.until(lambda: "/object/surface/plain" in client.nodes)
+    faces = client.array("/object/surface/plain", "faces")
+    assert len(faces) == 2 * 8 * 8
+    client.set("Color by", "strain")
+
+    def parts() -> list[str]:
+        return [
+            n for n in client.nodes if "surface/step" in n and client.visible.get(n) is not False
+        ]
+
+    client.until(lambda: client.visible["/object/surface/plain"] is False and len(parts()) > 1)
+    client.until(lambda: sum(len(client.array(n, "faces")) for n in parts()) == 128)
+    assert all(client.nodes[name]["flat_shading"] for name in parts())
+    press(client, "3")
+    client.until(lambda: not parts())
+
+
+def test_a_click_reads_a_node_and_its_history_until_escape(paused, run) -> None:
+    _, client = paused
+    position = run.array("sequences/lift/rollout.npy")
+    # Only nodes can be hit from above: what holds the sheet is hidden.
+    press(client, "6"), press(client, "5")
+    client.until(lambda: client.visible.get("/springs/virtual") is False)
+    click(client, position[FRAME][40])
+    client.until(lambda: "object node 40" in texts(client))
+    client.until(lambda: "/picked/point" in client.nodes)
+    np.testing.assert_allclose(client.array("/picked/point", "points")[0], position[FRAME][40])
+    assert tuple(client.nodes["/picked/point"]["colors"]) == MARK
+    assert client.nodes["/picked/name"]["text"] == "object node 40"
+    said = texts(client)
+    for name in ("position", "velocity", "stiffness", "damping", "strain", "held by"):
+        assert name in said
+    client.set("History of", "height")
+    client.until(lambda: any("height" in str(p.get("series")) for p in client.gui.values()))
+    plot = next(p for p in client.gui.values() if "height" in str(p.get("series")))
+    np.testing.assert_allclose(plot["data"][1], 1e3 * position[:, 40, 2], rtol=1e-6)
+    # The frame on the screen is marked.
+    assert int(np.argmax(plot["data"][2])) == FRAME
+
+    press(client, "escape")
+    client.until(lambda: "object node 40" not in texts(client))
+    assert not any("height" in str(p.get("series")) for p in client.gui.values())
+
+
+def test_a_click_beside_everything_keeps_what_was_read(paused, run) -> None:
+    session, client = paused
+    position = run.array("sequences/lift/rollout.npy")
+    press(client, "6"), press(client, "5")
+    client.until(lambda: client.visible.get("/springs/virtual") is False)
+    click(client, position[FRAME][40])
+    client.until(lambda: "object node 40" in texts(client))
+    click(client, (9.0, 9.0, 0.0))
+    press(client, "arrowright")
+    client.until(lambda: session._playback.frame == FRAME + 1)
+    assert "object node 40" in texts(client)
+
+
+def test_keys_move_the_clock_switch_layers_and_turn_colors_over(paused) -> None:
+    session, client = paused
+    press(client, "home")
+    client.until(lambda: session._playback.frame == 0)
+    press(client, "end")
+    client.until(lambda: session._playback.frame == 19)
+    press(client, "arrowleft", "shift")
+    client.until(lambda: session._playback.frame == 9)
+    press(client, "J")
+    client.until(lambda: client.value("Speed") == pytest.approx(0.7))
+    client.until(lambda: session._playback.is_playing)
+    press(client, "L")
+    client.until(lambda: client.value("Speed") == pytest.approx(1.0))
+    press(client, "K")
+    client.until(lambda: not session._playback.is_playing)
+    layers = session._stage.scene.layers
+    press(client, "2")
+    client.until(lambda: not layers.nodes and client.visible["/object/nodes"] is False)
+    # The run has no hand: its key does nothing.
+    press(client, "1")
+    press(client, "C")
+    client.until(lambda: client.value("Color by") == "error")
+    assert layers.hands
+    press(client, "C", "shift")
+    client.until(lambda: client.value("Color by") == "plain")
+    press(client, "C", "shift")
+    client.until(lambda: client.value("Color by") == COLORINGS[-1])
+    press(client, "T")
+    client.until(lambda: layers.dark)
+    client.tell_camera(position=(9.0, 9.0, 9.0))
+    press(client, "R")
+    client.until(lambda: abs(client.camera["position"][0]) < 2.0)
+
+
+def test_a_re_simulated_rollout_has_the_same_colors(paused) -> None:
+    session, client = paused
+    client.set("Color by", "difference")
+    client.until(lambda: "<b>Difference</b>" in texts(client))
+    client.set("drag [1/s]", 15.0)
+    client.until(lambda: session._object.at(FRAME)[0].parameters.drag == 15.0)
+    client.until(lambda: client.value("Range")[1] > 1.5)
+    take, at = session._object.at(FRAME)
+    assert take.parameters.drag != PARAMETERS.drag
+    distance = 1e3 * take.frame_distance(session._content.fitted, at)
+    assert 0 < distance < client.value("Range")[1] * 2
+    assert len(client.nodes["/object/nodes"]["colors"]) == 3 * 81
+
+
+def test_every_hot_key_is_bound_once_and_listed(paused) -> None:
+    _, client = paused
+    bound = [
+        (m["props"]["hotkey"], m["props"]["modifier"])
+        for m in client.messages
+        if m["type"] == "RegisterCommandMessage" and m["props"]["hotkey"] is not None
+    ]
+    keys: list[Key] = [key for group in KEYS for key in group.keys if key.action is not None]
+    listed = [(hotkey, key.modifier) for key in keys for hotkey in key.hotkeys]
+    assert len(set(listed)) == len(listed)
+    assert len(set(bound)) == len(bound)
+    groups = {group.title: group.keys for group in KEYS}
+    elsewhere = {(hotkey, key.modifier) for key in groups["Compare"] for hotkey in key.hotkeys}
+    assert set(listed) - elsewhere <= set(bound) <= set(listed)
+    assert {field for field, _ in LAYER_KEYS} <= set(vars(Layers()))
