@@ -88,6 +88,11 @@ class Settings(BaseSettings):
         return self.data_dir / "sequences"
 
     @property
+    def index_path(self) -> Path:
+        """Where it is kept what was read of runs; it is made again when it is deleted."""
+        return self.data_dir / "cache" / "runs.json"
+
+    @property
     def preview_dir(self) -> Path:
         """Where small pictures are kept; they are made again when they are deleted."""
         return self.data_dir / "cache" / "previews"

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, TypeVar
 
+from app.jobs.run_index import RunIndex, Stamp
 from app.settings import BUNDLED, Settings
 from physhandi.data.run import Run
 from physhandi.data.run_files import JOB, RUN
@@ -78,7 +79,8 @@ class Catalog:
         self._sequence_dirs = ((settings.sequence_dir, False), (bundled, True))
         self._run_dirs = ((settings.run_dir, False), (bundled / "runs", True))
         self._sequences = _Folders(_open_sequence, (FILE, "views"))
-        self._runs = _Folders(_open_run, (JOB, RUN))
+        self._index = RunIndex(settings.index_path)
+        self._runs = _Folders(self._index.open, (JOB, RUN))
 
     def sequences(self) -> list[SequenceItem]:
         """List the data folder's sequences, then the bundled ones, each by name."""
@@ -100,6 +102,7 @@ class Catalog:
             found.sort(key=lambda item: item.run.created if item.run else "", reverse=True)
             for item in found:
                 items.setdefault(item.id, item)
+        self._index.save(lambda: self._runs.paths)
         return list(items.values())
 
     def sequence_item(self, sequence_id: str) -> SequenceItem:
@@ -171,11 +174,17 @@ class Catalog:
 class _Folders(Generic[T]):
     """Opened folders, kept until one of the watched entries changes."""
 
-    def __init__(self, load: Callable[[Path], T], watched: tuple[str, ...]) -> None:
+    def __init__(self, load: Callable[[Path, Stamp], T], watched: tuple[str, ...]) -> None:
         self._load = load
         self._watched = watched
         self._lock = threading.Lock()
         self._known: dict[str, tuple[object, Path, tuple[T | None, str | None]]] = {}
+
+    @property
+    def paths(self) -> set[str]:
+        """Folders that were opened."""
+        with self._lock:
+            return set(self._known)
 
     def list(self, root: Path) -> list[tuple[Path, tuple[T | None, str | None]]]:
         """Open all folders directly below a root; what cannot be opened says why."""
@@ -203,12 +212,12 @@ class _Folders(Generic[T]):
         known = self._known.get(path)
         if known is None or known[0] != stamp:
             folder = Path(path)
-            known = (stamp, folder, self._open(folder))
+            known = (stamp, folder, self._open(folder, stamp))
             with self._lock:
                 self._known[path] = known
         return known[1], known[2]
 
-    def _stamp(self, path: str) -> tuple[int, ...] | None:
+    def _stamp(self, path: str) -> Stamp | None:
         """Summarise what would change with the folder; None if it is not one of the kind."""
         stamps: list[int] = []
         for name in self._watched:
@@ -219,9 +228,9 @@ class _Folders(Generic[T]):
                 stamps += (0, 0)
         return tuple(stamps) if any(stamps) else None
 
-    def _open(self, folder: Path) -> tuple[T | None, str | None]:
+    def _open(self, folder: Path, stamp: Stamp) -> tuple[T | None, str | None]:
         try:
-            return self._load(folder), None
+            return self._load(folder, stamp), None
         except (PhysHandiError, OSError) as error:
             return None, str(error)
 
@@ -235,9 +244,5 @@ def _names_in(root: Path) -> Iterator[str]:
     yield from sorted(name for name in names if not name.startswith("."))
 
 
-def _open_sequence(folder: Path) -> Sequence:
+def _open_sequence(folder: Path, _stamp: Stamp) -> Sequence:
     return Sequence.load(folder)
-
-
-def _open_run(folder: Path) -> Run:
-    return Run.open(folder)

@@ -10,6 +10,7 @@ from typing import Any
 
 _KEPT = 1000
 _INTERVAL_S = 0.3
+_SHARE = 0.1
 
 
 @dataclass(frozen=True)
@@ -39,13 +40,20 @@ class Feed:
         self._number = 0
         self._changes: deque[tuple[int, str, dict[str, Any]]] = deque(maxlen=_KEPT)
         self._known: dict[str, dict[str, Any]] | None = None
-        self._time = 0.0
+        self._next_look = 0.0
 
     def cursor(self) -> str:
         """Name the latest change, so that a page can follow from what it shows."""
         with self._lock:
             self._refresh()
             return self._id(self._number)
+
+    def snapshot(self) -> tuple[str, list[dict[str, Any]]]:
+        """Give all runs as they are at this moment, and the name of the latest change to them."""
+        with self._lock:
+            self._next_look = 0.0
+            self._refresh()
+            return self._id(self._number), list((self._known or {}).values())
 
     def since(self, last: str | None) -> list[Change]:
         """Give all changes after the one named; one ``reset`` if they are not known any more."""
@@ -69,10 +77,13 @@ class Feed:
         return int(number) if oldest - 1 <= int(number) <= self._number else None
 
     def _refresh(self) -> None:
-        if self._known is not None and time.monotonic() - self._time < _INTERVAL_S:
+        started = time.monotonic()
+        if self._known is not None and started < self._next_look:
             return
-        self._time = time.monotonic()
         runs = {run["id"]: run for run in self._look()}
+        # Of thousands of runs a look takes long; it may not take all of the server's time.
+        ended = time.monotonic()
+        self._next_look = started + max(_INTERVAL_S, (ended - started) / _SHARE)
         if self._known is not None:
             for run_id, run in runs.items():
                 if self._known.get(run_id) != run:

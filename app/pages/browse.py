@@ -8,10 +8,10 @@ from fastapi import APIRouter, Header, Query, Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from app.jobs.catalog import Catalog
-from app.jobs.describe import describe_run, describe_sequence
+from app.jobs.describe import describe_sequence
 from app.jobs.feed import Feed
 from app.jobs.listing import STATES, RunQuery, page_of, select_runs
-from app.jobs.scheduler import ENDED, Scheduler
+from app.jobs.scheduler import ENDED
 from app.pages.render import Pages
 from app.previews.store import Kind, Previews
 from physhandi.errors import UsageError
@@ -69,7 +69,6 @@ class SequenceQuery(BaseModel):
 def add_lists(
     router: APIRouter,
     catalog: Catalog,
-    scheduler: Scheduler,
     feed: Feed,
     pages: Pages,
     *,
@@ -80,14 +79,10 @@ def add_lists(
     Args:
         router: Gets the routes.
         catalog: Finds sequences and runs.
-        scheduler: Tells how far runs are.
-        feed: Names the state that a page shows.
+        feed: Tells how far runs are.
         pages: Renders.
         previews: Tells which pictures there are, and makes them.
     """
-
-    def described_runs() -> list[dict[str, Any]]:
-        return [describe_run(item, scheduler) for item in catalog.runs()]
 
     def described_sequences(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
         counts = Counter(name for run in runs for name in run["sequences"])
@@ -105,7 +100,7 @@ def add_lists(
 
     @router.get("/")
     def home() -> Response:
-        cursor, runs = feed.cursor(), described_runs()
+        cursor, runs = feed.snapshot()
         shown = runs[:_RECENT_RUNS] + [r for r in runs[_RECENT_RUNS:] if _is_kept(r)]
         sequences = described_sequences(runs)
         return pages.render(
@@ -125,7 +120,7 @@ def add_lists(
         query: Annotated[RunQuery, Query()],
         hx_trigger: Annotated[str | None, Header(max_length=64)] = None,
     ) -> Response:
-        cursor, runs = feed.cursor(), described_runs()
+        cursor, runs = feed.snapshot()
         query = query if query.limit else query.model_copy(update={"limit": _PAGE})
         chosen, problem = _chosen(runs, query)
         page = pages.render(
@@ -150,7 +145,8 @@ def add_lists(
 
     @router.get("/sequences")
     def list_sequences(query: Annotated[SequenceQuery, Query()]) -> Response:
-        cursor, sequences = feed.cursor(), described_sequences(described_runs())
+        cursor, runs = feed.snapshot()
+        sequences = described_sequences(runs)
         chosen = _chosen_sequences(sequences, query)
         return pages.render(
             "sequences.html",

@@ -1,3 +1,4 @@
+import time
 from typing import Any
 
 import pytest
@@ -9,6 +10,7 @@ from app.jobs.feed import Feed
 @pytest.fixture
 def runs(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     monkeypatch.setattr(feed_module, "_INTERVAL_S", 0.0)
+    monkeypatch.setattr(feed_module, "_SHARE", float("inf"))
     return [{"id": "a", "state": "queued"}]
 
 
@@ -67,3 +69,29 @@ def test_many_readers_cost_one_look(monkeypatch: pytest.MonkeyPatch) -> None:
     for _ in range(100):
         feed.since(start)
     assert len(looks) == 1
+
+
+def test_a_slow_look_is_not_repeated_at_once_but_a_page_sees_what_is_there(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(feed_module, "_INTERVAL_S", 0.0)
+    monkeypatch.setattr(feed_module, "_SHARE", 1e-4)
+    runs = [{"id": "a", "state": "queued"}]
+    looks: list[int] = []
+
+    def look() -> list[dict[str, Any]]:
+        looks.append(1)
+        time.sleep(0.01)
+        return [dict(run) for run in runs]
+
+    feed = Feed(look)
+    start, shown = feed.snapshot()
+    assert shown == runs
+    runs[0]["state"] = "running"
+    assert feed.since(start) == []
+    assert len(looks) == 1
+    changed, shown = feed.snapshot()
+    assert shown == runs
+    assert changed != start
+    assert seen(feed, start) == [("run", {"id": "a", "state": "running"})]
+    assert len(looks) == 2

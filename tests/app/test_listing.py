@@ -9,9 +9,11 @@ import pytest
 from pydantic import ValidationError
 from server_world import World
 
-from app.jobs.catalog import UnknownRunError
+from app.jobs import run_index
+from app.jobs.catalog import Catalog, UnknownRunError
 from app.jobs.listing import SORTS, RunQuery, page_of, select_runs, tags_of
 from app.jobs.summary import summarize
+from app.settings import Settings
 from physhandi.data.run import Run
 from physhandi.errors import UsageError
 
@@ -211,3 +213,49 @@ def test_a_run_that_changed_is_described_anew(world: World) -> None:
     again = client.get("/api/v1/runs?q=is:mine").json()["runs"][0]
     assert (again["name"], again["tags"]) == ("another", ["best", "of all"])
     assert client.get("/api/v1/runs?q=tag:best").json()["total"] == 1
+
+
+def test_runs_are_remembered_until_their_files_change(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_index, "_WORTH_SAVING", 2)
+    opened: list[str] = []
+
+    def open_run(folder: Path) -> Run:
+        opened.append(folder.name)
+        return real_open(folder)
+
+    real_open = Run.open
+    monkeypatch.setattr(Run, "open", open_run)
+    settings = Settings(data_dir=tmp_path / "data")
+    for name in ("one", "two"):
+        config = {"profile": {"profile": "quick", "node_spacing": 0.014}}
+        folder = settings.run_dir / name
+        Run.create(
+            folder, name=name, kind="reconstruction", sequences=[str(tmp_path / "s")], config=config
+        )
+
+    def listed() -> dict[str, tuple[Any, ...]]:
+        opened.clear()
+        runs = [item.run for item in Catalog(settings, bundled=tmp_path / "none").runs()]
+        assert None not in runs
+        return {
+            run.id: (run.name, run.sequences, run.config, run.kind, run.created) for run in runs
+        }
+
+    first = listed()
+    assert sorted(opened) == ["one", "two"]
+    assert first["one"][:2] == ("one", [str(tmp_path / "s")])
+    assert settings.index_path.is_file()
+    assert listed() == first
+    assert opened == []
+    (settings.run_dir / "two" / "run.yaml").write_text(
+        (settings.run_dir / "two" / "run.yaml").read_text().replace("name: two", "name: second")
+    )
+    assert listed()["two"][0] == "second"
+    assert opened == ["two"]
+    for damage in ("{", "[]", json.dumps({"format": "physhandi-run-index/1", "runs": {"a": 3}})):
+        settings.index_path.write_text(damage)
+        assert listed()["two"][0] == "second"
+        assert sorted(opened) == ["one", "two"]
+        settings.index_path.unlink()
