@@ -76,6 +76,7 @@ class CompareDrawing:
         self._eye = Eye(right=np.array([1.0, 0.0, 0.0]), up=np.array([0.0, 0.0, 1.0]))
         self._lock = threading.RLock()
         self._captions = dict.fromkeys(SIDES, "")
+        self._shown: Float[ndarray, "node 3"] = np.zeros((0, 3))
         self._look = Look()
         self._way: Way | None = None
         known = [float(np.quantile(s, 0.9)) for s in map(strengths, takes) if len(s)]
@@ -122,6 +123,7 @@ class CompareDrawing:
         has_one_hand = look.mode != "side" and _have_same_hands(halves)
         with self._lock, self._server.atomic():
             self._look, self._way = replace(look), way
+            self._remember(halves)
             self._captions = {name: half.side.caption for name, half in halves.items()}
             if not self._is_ground_laid:
                 self._is_ground_laid = True
@@ -145,7 +147,7 @@ class CompareDrawing:
         if take is None or take.ready == 0:
             return
         # Springs would hide the other side long before they have faded.
-        is_strong = strength > 0.5
+        is_strong = strength > 0.5 and not self._look.is_ghost(name)
         shown = replace(
             layers,
             nodes=False,
@@ -171,7 +173,7 @@ class CompareDrawing:
         )
         point = np.asarray(take.position[half.side.frame], dtype=np.float32)
         color = self._colors(name, half.side, other, is_dark=layers.dark)
-        size = STYLES[name].node_size * self._framing.spacing
+        size = self._look.node_size(name) * self._framing.spacing
         is_visible = layers.nodes and strength > 0.0
         path = f"{_ROOT}/{name}/object/compared"
         self._nodes.points(path, point, color, size, is_visible=is_visible)
@@ -184,8 +186,7 @@ class CompareDrawing:
         color: Color = STYLES[name].node
         can = take is not None and other.take is not None and other.take.ready > 0
         if look.tint == "difference" and self._way is not None and can and take and other.take:
-            # Over each other B tells the difference, and A stays as a shadow of itself.
-            if name == "b" or look.mode != "overlay" or look.fade == 0.0:
+            if not look.is_ghost(name):
                 distance = take_difference(take, side.frame, other.take, other.frame, self._way)
                 return difference_colors(distance, look.scale, strength, is_dark=is_dark)
             color = GHOST
@@ -229,13 +230,24 @@ class CompareDrawing:
             return None
         sign = 1.0 if (name == "a") != self._look.is_swapped else -1.0
         return Plane(
-            direction=(sign * self._eye.right).astype(np.float32), limit=sign * self._border()
+            direction=(sign * self._eye.right).astype(np.float32),
+            limit=sign * self._border(),
+            has_border=name == "a",
         )
 
     def _border(self) -> float:
         """Find where the line of the wipe is along the camera's right hand."""
-        middle, wide, _ = self._extents.seen(self._eye)
-        return float(middle @ self._eye.right) + (self._look.wipe - 0.5) * 1.04 * wide
+        along = self._shown @ self._eye.right
+        if len(along) == 0:
+            return 0.0
+        low, high = float(along.min()), float(along.max())
+        return low + (1.02 * self._look.wipe - 0.01) * (high - low)
+
+    def _remember(self, halves: Halves) -> None:
+        """Keep the nodes of a moment, over which the line of the wipe moves."""
+        sides = [half.side for half in halves.values()]
+        shown = [s.take.position[s.frame] for s in sides if s.take is not None and s.take.ready]
+        self._shown = np.concatenate([np.zeros((0, 3)), *map(np.asarray, shown)])
 
     def _place(self) -> None:
         """Put sides, captions and the line of the wipe where the camera sees them."""

@@ -1,21 +1,17 @@
 """How two rollouts are shown together: side by side, one over the other, and in which colors."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
+from app.comparison import Mode, Tint
 from app.viewer.colormaps import paint
 from app.viewer.object_drawing import Color, Style
 
-Mode = Literal["side", "overlay", "wipe"]
-"""Beside each other, one over the other, or A on one side of a line and B on the other."""
 MODES: dict[Mode, str] = {"side": "side by side", "overlay": "overlay", "wipe": "wipe"}
 """What the modes are called on the panel."""
-Tint = Literal["side", "difference"]
-"""Whether nodes have the color of their side, or that of their difference."""
 SIDES = ("a", "b")
 STYLES = {
     "a": Style(
@@ -24,7 +20,6 @@ STYLES = {
         spring=(152, 182, 236),
         virtual=(92, 178, 236),
         arrow=(24, 70, 170),
-        node_size=0.44,
     ),
     "b": Style(
         node=(232, 118, 24),
@@ -32,11 +27,9 @@ STYLES = {
         spring=(243, 196, 150),
         virtual=(244, 176, 40),
         arrow=(196, 78, 6),
-        node_size=0.34,
     ),
 }
-"""Colors of both sides, told apart by people who confuse red and green too; the nodes of B are
-smaller, so that both are seen where they agree."""
+"""Colors of both sides, told apart by people who confuse red and green too."""
 GHOST: Color = (140, 148, 160)
 """Color of A's nodes where B shows the difference from them."""
 _BACKGROUND = {False: (255, 255, 255), True: (24, 25, 28)}
@@ -58,6 +51,17 @@ class Look:
     """Whether B is on the left."""
     scale: float = 0.0
     """Difference that the end of the color scale means [m]; 0 if it is not known yet."""
+
+    def is_ghost(self, side: str) -> bool:
+        """Tell whether a side is only the shadow from which the other one's difference counts."""
+        is_over = self.mode == "overlay" and self.fade > 0.0
+        return side == "a" and self.tint == "difference" and is_over
+
+    def node_size(self, side: str) -> float:
+        """Diameter of nodes, as a part of their spacing: over each other both must be seen."""
+        if self.is_ghost(side):
+            return 0.14
+        return 0.22 if self.mode == "overlay" and self.tint == "side" else 0.36
 
     def strength(self, side: str) -> float:
         """Tell how strongly a side is drawn: 0 for not at all, 1 for in its own colors."""

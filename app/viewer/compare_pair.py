@@ -1,83 +1,13 @@
 """Which two runs are compared, and what has to be said of the pair."""
 
-import re
 from dataclasses import dataclass
-from urllib.parse import parse_qsl, urlencode
 
+from app.comparison import CompareAsk
 from app.viewer.compare_clock import CompareClock
-from app.viewer.compare_look import MODES, Look, Mode, Tint
+from app.viewer.compare_curve import Pairing
 from app.viewer.content import Catalog, Content, open_run
 from physhandi.data.run import Run
 from physhandi.errors import UsageError
-
-_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
-_TINTS: tuple[Tint, ...] = ("side", "difference")
-_LAST_FRAME = 10_000_000
-
-
-@dataclass(frozen=True, kw_only=True)
-class CompareAsk:
-    """What a comparison is to show; its query is the part of an address after ``/compare?``."""
-
-    a: str
-    """Id of run A."""
-    b: str
-    """Id of run B."""
-    sequence: str | None = None
-    """A sequence of both; None for the first that both have."""
-    mode: Mode = "side"
-    """How both are placed."""
-    color: Tint = "side"
-    """What the colors of the nodes mean."""
-    f: int = 0
-    """Tick of the common clock, the frame if both have one rate."""
-
-    def __post_init__(self) -> None:
-        for name, value in (("a", self.a), ("b", self.b)):
-            if not _ID.fullmatch(value):
-                raise UsageError(f"{name}: {value[:64]!r} is no id of a run.")
-        if self.a == self.b:
-            raise UsageError(
-                f"b: A and B are both run '{self.a}'. To compare two parameter sets of one run, "
-                "open it and pin one of them."
-            )
-        if self.mode not in MODES:
-            raise UsageError(f"mode: {self.mode!r} is not one of {', '.join(MODES)}.")
-        if self.color not in _TINTS:
-            raise UsageError(f"color: {self.color!r} is not one of {', '.join(_TINTS)}.")
-        if not 0 <= self.f <= _LAST_FRAME:
-            raise UsageError(f"f: {self.f} is not between 0 and {_LAST_FRAME}.")
-
-    @property
-    def query(self) -> str:
-        """The address' query; what is as usual is left out."""
-        usual = {"sequence": None, "mode": "side", "color": "side", "f": 0}
-        fields = {"a": self.a, "b": self.b, "sequence": self.sequence, "mode": self.mode}
-        fields |= {"color": self.color, "f": self.f}
-        return urlencode({k: v for k, v in fields.items() if k not in usual or v != usual[k]})
-
-    @classmethod
-    def parse(cls, query: str) -> "CompareAsk":
-        """Read an address' query.
-
-        Raises:
-            UsageError: If a field is missing, unknown or makes no sense; names the field.
-        """
-        fields = dict(parse_qsl(query))
-        unknown = set(fields) - {"a", "b", "sequence", "mode", "color", "f"}
-        if unknown or not {"a", "b"} <= set(fields):
-            wrong = min(unknown, default="a" if "a" not in fields else "b")
-            raise UsageError(f"{wrong[:40]!r}: a comparison has a, b, sequence, mode, color and f.")
-        number = fields.pop("f", "0")
-        if not (number.isascii() and number.isdigit() and len(number) < 10):
-            raise UsageError(f"f: {number[:40]!r} is no frame.")
-        values: dict[str, str] = fields
-        return cls(**values, f=int(number))  # pyright: ignore[reportArgumentType]  # checked there
-
-    @property
-    def look(self) -> Look:
-        """How the comparison begins."""
-        return Look(mode=self.mode, tint=self.color)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -134,6 +64,15 @@ def open_pair(catalog: Catalog, ask: CompareAsk) -> Pair:
         notes=tuple(notes),
         can_measure=not lacking and units[0] == units[1],
     )
+
+
+def pairing_of(pair: Pair) -> Pairing | None:
+    """Tell which rollouts and frames are measured against each other; None if none can be."""
+    first, second = (content.fitted for content in pair.contents)
+    if not pair.can_measure or first is None or second is None:
+        return None
+    frames = tuple(pair.clock.frames(tick) for tick in range(pair.clock.tick_count))
+    return Pairing(first=first, second=second, frames=frames)
 
 
 def chosen_sequences(first: Run, second: Run, wanted: str | None) -> tuple[str, str]:

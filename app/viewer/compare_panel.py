@@ -7,11 +7,13 @@ import numpy as np
 import viser
 from viser import uplot
 
+from app.comparison import Mode
 from app.viewer.colormaps import table
 from app.viewer.compare_curve import DifferenceCurve
-from app.viewer.compare_look import MODES, SIDES, STYLES, Look, Mode, scale_end
+from app.viewer.compare_look import MODES, SIDES, STYLES, Look, scale_end
 from app.viewer.error_panel import plot_look
 from app.viewer.guard import Guard, plain
+from app.viewer.keyboard import bind
 
 _STYLE = "font-size:0.8em;line-height:1.5;padding:0 0.6em"
 _MEAN, _LARGEST = "rgb(132,94,194)", "rgb(200,70,120)"
@@ -52,6 +54,7 @@ class ComparePanel:
         self._notes: tuple[str, ...] = ()
         self._unit, self._factor = "mm", 1e3
         self._tick, self._tick_count = 0, 1
+        self._scales = (0.0, 0.0)
         gui = server.gui
         self.folder = gui.add_folder("A and B")
         with self.folder:
@@ -82,15 +85,10 @@ class ComparePanel:
         self._fade.on_update(guard.by_user(lambda _: self._choose()))
         self._wipe.on_update(guard.by_user(lambda _: self._choose()))
         self._swap.on_click(guard(lambda _: self.swap()))
-        self._commands = [gui.add_command("Swap A and B", hotkey="X")]
-        self._commands[0].on_trigger(guard(lambda _: self.swap()))
-        next_mode = gui.add_command("Next way to compare", hotkey="M")
-        next_mode.on_trigger(guard(lambda _: self.next_mode()))
-        self._commands.append(next_mode)
+        self._commands = bind(server, guard, "swap", lambda _, __: self.swap())
+        self._commands += bind(server, guard, "compare_mode", lambda _, __: self.next_mode())
         if has_keys:
-            colors = gui.add_command("Difference colors", hotkey="C")
-            colors.on_trigger(guard(lambda _: self.toggle_tint()))
-            self._commands.append(colors)
+            self._commands += bind(server, guard, "color", lambda _, __: self.toggle_tint())
         self._dress()
 
     def remove(self) -> None:
@@ -113,8 +111,7 @@ class ComparePanel:
         self._names, self._notes = names, notes
         self._unit, self._factor = ("mm", 1e3) if unit == "m" else (unit, 1.0)
         self._tick_count = tick_count
-        options = plot_look(self._unit, max(tick_count - 1, 1))
-        self._plot.scales, self._plot.axes = options["scales"], options["axes"]
+        self._plot.axes = plot_look(self._unit, 1)["axes"]
         self._dress()
         self.follow()
 
@@ -122,6 +119,7 @@ class ComparePanel:
         """Show what is measured by now; for any thread."""
         self._look.scale = scale_end(self._curve.strong * self._factor) / self._factor
         self._plot.data = self._data()
+        self._fit_scales()
         self._write()
 
     def show(self, tick: int, *, is_playing: bool) -> None:
@@ -209,6 +207,16 @@ class ComparePanel:
     def _set(place: Any, content: str) -> None:
         if place.content != content:
             place.content = content
+
+    def _fit_scales(self) -> None:
+        """Let the plot show all curves; it finds no scale of its own after it was empty."""
+        _, largest = self._curve.columns()
+        top = scale_end(float(np.nan_to_num(largest).max(initial=0.0)) * self._factor) or 1.0
+        last = float(max(self._tick_count - 1, 1))
+        if (last, top) != self._scales:
+            self._scales = (last, top)
+            y = uplot.Scale(range=(0.0, top))
+            self._plot.scales = {"x": uplot.Scale(time=False, range=(0.0, last)), "y": y}
 
     def _data(self) -> tuple[np.ndarray, ...]:
         """Collect the curves; the plot needs two points at least, and knows no gaps."""

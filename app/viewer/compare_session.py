@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import viser
 
-from app.viewer.compare_curve import Pairing
+from app.comparison import CompareAsk
 from app.viewer.compare_drawing import CompareDrawing, Half, Halves
-from app.viewer.compare_look import SIDES
-from app.viewer.compare_pair import CompareAsk, open_pair
+from app.viewer.compare_look import SIDES, Look
+from app.viewer.compare_pair import open_pair, pairing_of
 from app.viewer.compare_view import CompareView
 from app.viewer.content import Catalog, Content
 from app.viewer.dress import set_theme
@@ -80,8 +80,8 @@ class CompareSession:
     def target(self) -> str:
         """Query of what is shown now, for ``/compare?…``."""
         look = self._view.look
-        now = replace(self._ask, mode=look.mode, color=look.tint, f=self._playback.frame)
-        return now.query
+        now = {"mode": look.mode, "color": look.tint, "f": self._playback.frame}
+        return self._ask.model_copy(update=now).query
 
     @property
     def info(self) -> SessionInfo:
@@ -129,6 +129,10 @@ class CompareSession:
         """Address on this server that shows the same."""
         return f"/compare?{self.target}"
 
+    def go(self, frame: int) -> None:
+        """Stop at a frame."""
+        self._timeline.go(frame)
+
     def prefer_dark(self, *, on: bool) -> None:
         """Follow the browser's color scheme, unless the user has chosen a background."""
         self._layers_panel.prefer_dark(on=on)
@@ -149,6 +153,11 @@ class CompareSession:
                 layers=replace(self._layers),
                 link=self.link,
             )
+
+    def seek(self, frame: int) -> None:
+        """Stop at a tick of the clock."""
+        self._playback.play(on=False)
+        self._playback.seek(frame)
 
     def close(self) -> None:
         """Stop clock, measuring and server."""
@@ -174,7 +183,7 @@ class CompareSession:
             guard,
             drawing,
             self._cameras,
-            look=self._ask.look,
+            look=Look(mode=self._ask.mode, tint=self._ask.color),
             redraw=self._playback.redraw,
             has_keys=True,
         )
@@ -184,10 +193,7 @@ class CompareSession:
         names = {side: c.title for side, c in zip(SIDES, pair.contents, strict=True)}
         unit = pair.contents[0].length_unit
         self._view.panel.name(names, pair.notes, unit=unit, tick_count=pair.clock.tick_count)
-        if pair.can_measure:
-            ticks = range(pair.clock.tick_count)
-            frames = tuple(pair.clock.frames(tick) for tick in ticks)
-            self._view.follow(Pairing(first=takes[0], second=takes[1], frames=frames))
+        self._view.follow(pairing_of(pair))
         server.on_client_connect(guard(self._welcome))
         server.on_client_disconnect(guard(self._part))
 

@@ -1,0 +1,67 @@
+"""Which two runs are to be compared and how: one model for addresses, orders and live scenes."""
+
+from typing import Annotated, Literal, Self
+from urllib.parse import parse_qsl, urlencode
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from physhandi.errors import UsageError
+
+Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
+Mode = Literal["side", "overlay", "wipe"]
+"""Beside each other, one over the other, or A on one side of a line and B on the other."""
+Tint = Literal["side", "difference"]
+"""Whether nodes have the color of their side, or that of their difference."""
+
+
+class CompareAsk(BaseModel):
+    """What a comparison is to show; the fields are those of an address ``/compare?…``."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    a: Id
+    """Id of run A."""
+    b: Id
+    """Id of run B."""
+    sequence: Annotated[str | None, Field(min_length=1, max_length=200)] = None
+    """A sequence of both; None for the first that both have."""
+    mode: Mode = "side"
+    """How both are placed."""
+    color: Tint = "side"
+    """What the colors of the nodes mean."""
+    f: Annotated[int, Field(ge=0, le=10_000_000)] = 0
+    """Tick of the common clock: the frame, if both have one frame rate."""
+
+    @model_validator(mode="after")
+    def _differ(self) -> Self:
+        if self.a == self.b:
+            raise ValueError(
+                f"A and B are both run '{self.a}'; to compare two parameter sets of one run, open "
+                "it and pin one of them"
+            )
+        return self
+
+    @property
+    def query(self) -> str:
+        """What stands behind ``/compare?``; what is as usual is left out."""
+        return urlencode(self.model_dump(exclude_defaults=True, exclude={"kind"}))
+
+    @classmethod
+    def parse(cls, query: str) -> Self:
+        """Read what stands behind ``/compare?``.
+
+        Raises:
+            UsageError: If a field is missing, unknown or makes no sense; names the field.
+        """
+        try:
+            return cls.model_validate(dict(parse_qsl(query, keep_blank_values=True)))
+        except ValidationError as error:
+            first = error.errors()[0]
+            place = ".".join(map(str, first["loc"])) or "a, b"
+            raise UsageError(f"{place}: {first['msg']}") from None
+
+
+class NewComparison(CompareAsk):
+    """A live scene to open that shows two runs together."""
+
+    kind: Literal["comparison"]

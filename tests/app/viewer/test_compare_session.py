@@ -1,0 +1,226 @@
+"""Two runs in one session, as a client without a browser sees them."""
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from viewer_client import ViewerClient
+from viewer_world import FRAMES, PARAMETERS, FakeSettings, FolderCatalog, make_run
+
+from app.comparison import CompareAsk
+from app.viewer.compare_pair import open_pair
+from app.viewer.figure_export import write_figure_npz
+from app.viewer.session import Sessions
+from physhandi.data.run import Run
+from physhandi.errors import MissingInputError, PhysHandiError, UsageError
+
+OFFSET = np.array([0.0, 0.003, 0.004])
+"""By how much B's nodes are elsewhere: 5 mm."""
+TURNED = (0.5**0.5, 0.0, 0.0, 0.5**0.5)
+"""A camera whose right hand is the world's y axis."""
+
+
+def another_run(
+    source: Run, folder: Path, *, step: int = 1, rate: float = 30.0, has_object: bool = True
+) -> Run:
+    """Copy a run with its nodes moved by `OFFSET` a frame, or every `step`-th node and no more."""
+    run = Run.create(folder, name=folder.name, kind="reconstruction", sequences=["lift"], config={})
+    at = "sequences/lift"
+    with run.begin_attempt() as attempt:
+        attempt.save_yaml("object/parameters.yaml", PARAMETERS.to_dict())
+        meta = source.yaml(f"{at}/meta.yaml") | {"frame_rate": rate}
+        position = source.array(f"{at}/rollout.npy")
+        attempt.save_array(f"{at}/control.npy", source.array(f"{at}/control.npy"))
+        tensors = source.tensors(f"{at}/model.safetensors")
+        if step == 1:
+            position = position + (np.arange(FRAMES)[:, None, None] * OFFSET).astype(np.float32)
+        else:
+            position = position[: FRAMES // 2, ::step]
+            meta["frame_count"] = len(position)
+            for name in ("object_node", "initial_velocity"):
+                tensors[name] = tensors[name][::step]
+            for name in ("rest_length", "stiffness", "damping"):
+                tensors[name] = tensors[name][:0]
+            tensors["spring_nodes"] = tensors["spring_nodes"][:0]
+            tensors["object_spring_count"] = np.zeros(1, np.int32)
+        if has_object:
+            attempt.save_array(f"{at}/rollout.npy", position)
+            attempt.save_tensors(f"{at}/model.safetensors", tensors)
+        attempt.save_yaml(f"{at}/meta.yaml", meta)
+        attempt.publish()
+    return Run.open(folder)
+
+
+@pytest.fixture(scope="module")
+def catalog(tmp_path_factory: pytest.TempPathFactory) -> FolderCatalog:
+    root = tmp_path_factory.mktemp("compare")
+    source = make_run(root / "runs" / "sheet")
+    another_run(source, root / "runs" / "moved")
+    another_run(source, root / "runs" / "coarse", step=2)
+    another_run(source, root / "runs" / "slow", rate=15.0)
+    another_run(source, root / "runs" / "hands", has_object=False)
+    return FolderCatalog(root)
+
+
+@pytest.fixture
+def sessions(catalog: FolderCatalog) -> Iterator[Sessions]:
+    sessions = Sessions(FakeSettings(), catalog)
+    yield sessions
+    sessions.shutdown()
+
+
+def watch(sessions: Sessions, query: str) -> ViewerClient:
+    session = sessions.get(sessions.open("comparison", query, "me"))
+    assert session is not None
+    return ViewerClient(f"ws://127.0.0.1:{session.port}")
+
+
+def said(client: ViewerClient) -> str:
+    return "\n".join(str(p["content"]) for p in client.gui.values() if "content" in p)
+
+
+def nodes(client: ViewerClient, side: str) -> np.ndarray:
+    return client.array(f"/compare/{side}/object/compared", "points")
+
+
+def across(client: ViewerClient) -> np.ndarray:
+    """The way from A to B."""
+    a, b = (np.array(client.positions.get(f"/compare/{side}", (0, 0, 0))) for side in "ab")
+    return b - a
+
+
+def direction(client: ViewerClient) -> np.ndarray:
+    return across(client) / max(float(np.linalg.norm(across(client))), 1e-9)
+
+
+def test_both_sides_follow_one_clock_beside_each_other(
+    sessions: Sessions, catalog: FolderCatalog
+) -> None:
+    rollout = catalog.run("sheet").array("sequences/lift/rollout.npy")
+    with watch(sessions, "a=sheet&b=moved&f=11") as client:
+        client.until(lambda: "/compare/b/object/compared" in client.nodes)
+        client.until(lambda: "mean 55 mm" in said(client))
+        assert "Each node of A from the same node of B" in said(client)
+        np.testing.assert_allclose(nodes(client, "a"), rollout[11], atol=1e-6)
+        np.testing.assert_allclose(nodes(client, "b"), rollout[11] + 11 * OFFSET, atol=1e-6)
+        # B stands to the right of the camera, wherever it looks, and the button exchanges them.
+        client.tell_camera(wxyz=TURNED)
+        client.until(lambda: np.allclose(direction(client), [0.0, 1.0, 0.0], atol=1e-6))
+        assert np.linalg.norm(across(client)) > 0.2
+        client.set("Swap sides", True)
+        client.until(lambda: np.allclose(direction(client), [0.0, -1.0, 0.0], atol=1e-6))
+        # One clock: another frame moves both.
+        client.set("Frame", 4)
+        client.until(lambda: "mean 20 mm" in said(client))
+        client.until(lambda: np.allclose(nodes(client, "a"), rollout[4], atol=1e-6))
+        client.until(lambda: np.allclose(nodes(client, "b"), rollout[4] + 4 * OFFSET, atol=1e-6))
+        plot = next(p for p in client.gui.values() if "data" in p and "series" in p)
+        _, mean, largest, now = (np.asarray(column) for column in plot["data"])
+        np.testing.assert_allclose(mean, 5.0 * np.arange(FRAMES), atol=1e-3)
+        np.testing.assert_allclose(largest, mean, atol=1e-3)
+        assert now[4] > 0
+        assert np.count_nonzero(now) == 1
+
+
+def test_an_overlay_colors_the_difference_with_numbers(sessions: Sessions) -> None:
+    with watch(sessions, "a=sheet&b=moved&f=11&mode=overlay&color=difference") as client:
+        client.until(lambda: "≥100 mm" in said(client) and "mean 55 mm" in said(client))
+        # Neither is moved aside, which viser need not say.
+        assert np.allclose(client.positions.get("/compare/a", 0.0), 0.0)
+        path = "/compare/b/object/compared"
+        client.until(lambda: path in client.nodes and len(np.unique(colors(client, "b"))) <= 3)
+        # 55 of 100 mm is the middle of the scale: green, more than red and blue.
+        red, green, blue = colors(client, "b")[0]
+        assert green > max(int(red), int(blue))
+        client.set("Frame", 0)
+        client.until(lambda: int(colors(client, "b")[0][1]) < 60)
+        # B fades into the white background, and A comes back in its own colors.
+        client.set("A ↔ B", 0.0)
+        client.until(lambda: client.visible["/compare/b/object/compared"] is False)
+        client.set("Difference colors", False)
+        client.until(lambda: tuple(colors(client, "a")[0]) == (47, 111, 222))
+
+
+def colors(client: ViewerClient, side: str) -> np.ndarray:
+    return client.array(f"/compare/{side}/object/compared", "colors")
+
+
+def test_a_wipe_cuts_both_at_one_line(sessions: Sessions, catalog: FolderCatalog) -> None:
+    count = catalog.run("sheet").array("sequences/lift/rollout.npy").shape[1]
+    with watch(sessions, "a=sheet&b=moved&f=0&mode=wipe") as client:
+        client.until(lambda: "/compare/b/object/compared" in client.nodes)
+        client.until(lambda: "Line" in {p.get("label") for p in client.gui.values()})
+        a, b = nodes(client, "a"), nodes(client, "b")
+        # At frame 0 both are one sheet: the parts together are the whole.
+        assert len(a) + len(b) == count
+        assert min(len(a), len(b)) > 10
+        client.set("Line", 0.2)
+        client.until(lambda: len(nodes(client, "a")) < len(a))
+        assert len(nodes(client, "a")) + len(nodes(client, "b")) == count
+
+
+def test_other_nodes_and_lengths_say_so(sessions: Sessions) -> None:
+    with watch(sessions, "a=sheet&b=coarse&f=2") as client:
+        client.until(lambda: "the common 0.3 s play" in said(client).replace("  ", " "))
+        client.until(lambda: "made of different nodes" in said(client))
+        frame = client.gui[client.find("Frame")]
+        assert frame["max"] == FRAMES // 2 - 1
+
+
+def test_what_cannot_be_compared_is_refused_or_told(catalog: FolderCatalog) -> None:
+    for query, field in (
+        ("a=sheet&b=sheet", "both run 'sheet'"),
+        ("a=../x&b=sheet", "a"),
+        ("a=sheet", "b"),
+        ("b=sheet", "a"),
+        ("a=sheet&b=moved&x=1", "x"),
+        ("a=sheet&b=moved&f=-1", "f"),
+        ("a=sheet&b=moved&mode=round", "mode"),
+        ("a=sheet&b=moved&color=red", "color"),
+    ):
+        with pytest.raises(UsageError, match=f"(^|: .*){field}"):
+            CompareAsk.parse(query)
+    with pytest.raises(UsageError, match="In both: lift"):
+        open_pair(catalog, CompareAsk(a="sheet", b="moved", sequence="drag"))
+    with pytest.raises((PhysHandiError, MissingInputError)):
+        open_pair(catalog, CompareAsk(a="sheet", b="nowhere"))
+    told = open_pair(catalog, CompareAsk(a="sheet", b="hands"))
+    assert not told.can_measure
+    assert "B has no fitted object" in told.notes[0]
+    slow = open_pair(catalog, CompareAsk(a="sheet", b="slow"))
+    assert slow.clock.frames(10) == (10, 5)
+    assert "A has 30 and B 15 frames/s" in slow.notes[0]
+
+
+def test_an_ask_survives_its_query() -> None:
+    ask = CompareAsk(a="x", b="y-1", sequence="a b&c", mode="wipe", color="difference", f=12)
+    assert CompareAsk.parse(ask.query) == ask
+    assert CompareAsk(a="x", b="y").query == "a=x&b=y"
+
+
+def test_a_copy_and_a_farewell_know_the_pair(sessions: Sessions) -> None:
+    first = sessions.open("comparison", "a=sheet&b=moved&mode=overlay&f=7", "me")
+    session = sessions.get(first)
+    assert session is not None
+    copied = sessions.get(sessions.copy(session))
+    assert copied is not None
+    assert copied.target == session.target == "a=sheet&b=moved&mode=overlay&f=7"
+    assert sessions.find(first, "somebody else") is None
+    sessions.close(first, "Enough.")
+    farewell = sessions.farewell(first, "me")
+    assert farewell is not None
+    assert (farewell.kind, farewell.target) == ("comparison", session.target)
+
+
+def test_the_numbers_of_both_sides_can_be_saved(sessions: Sessions) -> None:
+    with watch(sessions, "a=sheet&b=moved&f=3") as client:
+        client.until(lambda: client.find("Motion") != "")
+        session = sessions.get(sessions.list()[0].id)
+        assert session is not None
+        sides = session.snapshot().sides
+        assert sides is not None
+        with np.load(io.BytesIO(write_figure_npz(sides))) as data:
+            moved = data["b_position"] - data["a_position"]
+        np.testing.assert_allclose(moved[3], np.tile(3 * OFFSET, (moved.shape[1], 1)), atol=1e-6)
