@@ -17,7 +17,6 @@ from app.exports.recording import record
 from app.exports.take_store import load_take
 from app.viewer.bundle import Picture, bundle
 from app.viewer.content import Content, open_run, open_sequence
-from app.viewer.fitted_object import FittedObject
 from app.viewer.restoring import complete_state
 from app.viewer.session_state import Pose, SessionState
 from app.viewer.snapshot import Snapshot, scene_data
@@ -28,7 +27,6 @@ from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.errors import UsageError
 from physhandi.simulation.model import SimulationParameters
-from physhandi.simulation.stability import with_stable_substeps
 
 Report = Callable[[int, int], None]
 
@@ -112,6 +110,10 @@ def _simulate(
     *,
     is_automatic: bool,
 ) -> Take:
+    # These load the simulator, which takes longer than most files that need none.
+    from app.viewer.fitted_object import FittedObject
+    from physhandi.simulation.stability import with_stable_substeps
+
     fitted = FittedObject(order.folder, content.sequence_name)
     control = fitted.choose_controls(None)
     model = fitted.model(parameters)

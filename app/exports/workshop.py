@@ -233,6 +233,9 @@ class Workshop:
             timer.cancel()
             process.kill()
             process.wait()
+            for stream in (process.stdout, process.stderr):
+                if stream is not None:
+                    stream.close()
             with self._lock:
                 self._processes.discard(process)
             sweep_temporary(work.path.parent.glob(".*.tmp"))

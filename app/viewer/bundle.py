@@ -207,7 +207,7 @@ def _readme(snapshot: Snapshot, files: dict[str, bytes]) -> str:
     unit = content.length_unit
     layers = {} if snapshot.layers is None else vars(snapshot.layers)
     shown = ", ".join(name for name, on in layers.items() if on is True and name != "dark")
-    about = [line for name, line in _ABOUT if name in files or name.endswith("/")]
+    about = [line for name, line in _ABOUT if any(file.startswith(name) for file in files)]
     return "\n".join(
         [
             f"{content.title}: sequence {content.sequence_name}, frame {snapshot.frame}",

@@ -1,0 +1,152 @@
+"""The workshop: processes, cache, limits and errors."""
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import psutil
+import pytest
+from server_world import World
+
+from app.exports import workshop as workshop_module
+from app.exports.files import order_of
+from app.exports.order import Order
+from app.exports.workshop import TooManyFilesError, Work, Workshop
+from physhandi.data.run import Run
+from physhandi.errors import RunError, UsageError
+
+
+@pytest.fixture
+def order(world: World) -> Order:
+    return order_of(world.catalog, "run", "fitted", "png", {"f": "2"})
+
+
+def pretend(
+    monkeypatch: pytest.MonkeyPatch, work: Callable[[Order, Work], None] | None = None
+) -> list[Order]:
+    """Write 100 bytes instead of starting a process."""
+    orders: list[Order] = []
+
+    def run(_: Workshop, order: Order, made: Work) -> None:
+        orders.append(order)
+        if work is not None:
+            work(order, made)
+        made.path.write_bytes(b"x" * 100)
+
+    monkeypatch.setattr(Workshop, "_run", run)
+    return orders
+
+
+def test_a_process_makes_the_file_and_tells_how_far_it_is(workshop: Workshop, order: Order) -> None:
+    picture = workshop.begin(replace(order, width=64, height=48))
+    recording = workshop.begin(replace(order, format="viser"))
+    wrong = workshop.begin(replace(order, query={"f": "77"}))
+    assert recording.state == "making"
+    image = cv2.imread(str(picture.future.result()))
+    assert image is not None
+    assert image.shape == (48, 64, 3)
+    recording.future.result()
+    assert (recording.state, recording.done, recording.of) == ("ready", 10, 10)
+    with pytest.raises(UsageError, match="f: 'sheet' has frames 0 to 9, not 77"):
+        wrong.future.result()
+    assert not [c for c in psutil.Process().children() if "app.exports.process" in c.cmdline()]
+
+
+def test_the_same_order_is_made_once_and_again_when_the_run_changed(
+    workshop: Workshop, order: Order, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = pretend(monkeypatch)
+    first = workshop.make(order)
+    assert workshop.make(replace(order)) == first
+    assert len(made) == 1
+    other = workshop.make(replace(order, query={"f": "3"}))
+    assert other != first
+    first.unlink()
+    assert workshop.make(order).is_file()
+    assert len(made) == 3
+    current = run.folder / "current"
+    current.write_text(current.read_text() + "\n")
+    assert workshop.make(order) != first
+    again = Workshop(first.parent)
+    assert again.make(order) == workshop.make(order)
+    assert len(made) == 4
+    again.close()
+
+
+def test_the_cache_forgets_what_was_not_used_for_longest(
+    tmp_path: Path, order: Order, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pretend(monkeypatch)
+    workshop = Workshop(tmp_path / "cache", most_bytes=350)
+    paths = []
+    for frame in range(3):
+        paths.append(workshop.make(replace(order, query={"f": str(frame)})))
+        time.sleep(0.02)
+    Workshop(tmp_path / "cache").make(replace(order, query={"f": "0"}))  # Used again.
+    time.sleep(0.02)
+    paths.append(workshop.make(replace(order, query={"f": "3"})))
+    assert [path.exists() for path in paths] == [True, False, True, True]
+    workshop.close()
+
+
+def test_there_is_an_end_to_files_that_wait(
+    tmp_path: Path, order: Order, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go = threading.Event()
+    made = pretend(monkeypatch, lambda _order, _work: go.wait(20) and None)
+    monkeypatch.setattr(workshop_module, "MOST_WAITING", 3)
+    workshop = Workshop(tmp_path / "cache", at_once=1)
+    works = [workshop.begin(replace(order, query={"f": str(frame)})) for frame in range(3)]
+    assert workshop.begin(replace(order, query={"f": "0"})) is works[0]
+    with pytest.raises(TooManyFilesError, match="3 files are being made already"):
+        workshop.begin(replace(order, query={"f": "9"}))
+    assert len(made) <= 1
+    go.set()
+    assert [work.future.result(5).name for work in works] == [work.path.name for work in works]
+    workshop.begin(replace(order, query={"f": "9"})).future.result(5)
+    workshop.close()
+
+
+def test_a_process_that_takes_too_long_is_ended(tmp_path: Path, order: Order) -> None:
+    workshop = Workshop(tmp_path / "cache", seconds=0.05)
+    with pytest.raises(RunError, match="took longer than"):
+        workshop.make(order)
+    assert list((tmp_path / "cache").iterdir()) == []
+    workshop.close()
+
+
+def test_a_failure_is_told_and_the_next_order_tries_again(
+    workshop: Workshop, order: Order, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    troubles = [RunError("a file is damaged")]
+
+    def fail(_order: Order, _work: Work) -> None:
+        if troubles:
+            raise troubles.pop()
+
+    pretend(monkeypatch, fail)
+    work = workshop.begin(order)
+    with pytest.raises(RunError, match="a file is damaged"):
+        work.future.result(5)
+    assert work.state == "failed"
+    assert workshop.make(order).read_bytes() == b"x" * 100
+
+
+def test_what_is_made_once_leaves_nothing_behind(
+    workshop: Workshop, order: Order, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = pretend(monkeypatch)
+    with workshop.once(order, lambda folder: (folder / "take.npz").touch()) as path:
+        assert path.is_file()
+        assert (Path(made[0].take) / "take.npz").is_file()
+        folder = path.parent
+    assert not folder.exists()
+    with (
+        pytest.raises(UsageError, match="width"),
+        workshop.once(replace(order, width=9_999), lambda _folder: None),
+    ):
+        pass
+    assert list(folder.parent.iterdir()) == []
