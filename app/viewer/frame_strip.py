@@ -63,7 +63,7 @@ def strip_html(readout: Readout) -> str:
     )
     track = "margin:-0.3em 6.6em 0.2em 11.7em"
     style = "font-size:0.7em;line-height:1.4;opacity:0.85"
-    caption = f"<div style='text-align:right'>{_caption(readout)}</div>"
+    caption = f"<div style='text-align:right;padding-right:1.2em'>{_caption(readout)}</div>"
     return f"<div style='{style}'><div style='{track}'>{bar}</div>{caption}</div>"
 
 

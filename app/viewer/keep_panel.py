@@ -56,6 +56,7 @@ class PresetChoice:
         self._store = store
         self._moved = moved
         self._presets: dict[str, Preset] = {}
+        self._wanted = self._written = AS_FITTED
         self.problems: tuple[str, ...] = ()
         """What is wrong with files among the users' presets."""
         self._list: Any = gui.add_dropdown(
@@ -75,27 +76,36 @@ class PresetChoice:
         options = (*self._presets, BY_HAND)
         if tuple(self._list.options) != options:
             self._list.options = options
+            self._written = self._list.value
         self.show()
 
     def show(self) -> None:
         """Name the preset in force."""
         chosen = self.chosen
         label = BY_HAND if chosen is None else chosen.label
-        if self._list.value != label:
-            self._list.value = label
+        # Another value than the last one that was written here is a user's, about to be heard.
+        if self._list.value == self._written != label:
+            self._list.value = self._written = label
 
     @property
     def chosen(self) -> Preset | None:
-        """The preset whose parameters are in force, if there is one."""
+        """The preset whose parameters are in force, if there is one; of several that was chosen."""
         now = (self._history.current, self._history.is_automatic)
-        fits = (p for p in self._presets.values() if p.apply(self._history.start) == now)
-        return next(fits, None)
+        fits = {n: p for n, p in self._presets.items() if p.apply(self._history.start) == now}
+        return fits.get(self._wanted, next(iter(fits.values()), None))
+
+    def want(self, label: str) -> None:
+        """Name this preset as long as its parameters are in force."""
+        self._wanted = label
+        self.show()
 
     def _choose(self) -> None:
-        preset = self._presets.get(self._list.value)
+        self._written = self._list.value
+        preset = self._presets.get(self._written)
         if preset is None:
             self.show()  # "By hand" is what the list says, nothing to choose.
             return
+        self._wanted = preset.label
         parameters, is_automatic = preset.apply(self._history.start)
         self._history.replace(parameters, is_automatic=is_automatic)
         self._moved()
@@ -189,6 +199,8 @@ class KeepPanel:
         history = self._history
         changes = changes_of(history.start, history.current, is_automatic=history.is_automatic)
         preset = self._store.save(self._name.value, changes, self._unit)
+        self._choice.want(preset.label)
+        self.show()
         notify(event.client, "Preset saved", preset.name, color="blue")
 
     def _remove(self, event: Any) -> None:
@@ -201,5 +213,6 @@ class KeepPanel:
 
 def _say(place: Any, content: str) -> None:
     """Write small print; without content it takes no room."""
-    place.content = f"<div style='font-size:0.8em;line-height:1.4'>{content}</div>"
+    style = "font-size:0.8em;line-height:1.4;padding:0 0.5em"
+    place.content = f"<div style='{style}'>{content}</div>"
     place.visible = bool(content)

@@ -182,31 +182,38 @@ class LiveSimulator:
         )
         yield 0
         simulator = fitted.simulator(model, parameters, self._device)
-        clock = time.perf_counter()
-        for frame, position, velocity in simulator.frames(control):
-            now = time.perf_counter()
-            send(
-                self._connection,
-                Message(
-                    "frame",
-                    {
-                        **about,
-                        "frame": int(frame),
-                        "duration": now - clock,
-                        "elapsed": now - request["arrived"],
-                    },
-                    {
-                        "position": np.asarray(position, dtype=np.float32),
-                        "velocity": np.asarray(velocity, dtype=np.float32),
-                    },
-                ),
-            )
-            if frame == 1:  # Not before the user sees the first frame that moves.
-                needed = fitted.needed_substeps(model, parameters)
-                send(self._connection, Message("stability", {**about, "needed": needed}))
-            yield int(frame) + 1
-            clock = time.perf_counter()
+        clock, frame = time.perf_counter(), 0
+        try:
+            for frame, position, velocity in simulator.frames(control):
+                now = time.perf_counter()
+                send(
+                    self._connection,
+                    Message(
+                        "frame",
+                        {
+                            **about,
+                            "frame": int(frame),
+                            "duration": now - clock,
+                            "elapsed": now - request["arrived"],
+                        },
+                        {
+                            "position": np.asarray(position, dtype=np.float32),
+                            "velocity": np.asarray(velocity, dtype=np.float32),
+                        },
+                    ),
+                )
+                if frame == 1:  # Not before the user sees the first frame that moves.
+                    self._tell_needed(about, fitted.needed_substeps(model, parameters))
+                yield int(frame) + 1
+                clock = time.perf_counter()
+        except SimulationDivergedError:
+            if frame == 0:
+                self._tell_needed(about, fitted.needed_substeps(model, parameters))
+            raise
         send(self._connection, Message("finished", about))
+
+    def _tell_needed(self, about: dict[str, object], substeps: int) -> None:
+        send(self._connection, Message("stability", {**about, "needed": substeps}))
 
     def _object(self, request: Message) -> FittedObject:
         key = (str(request["run"]), str(request["sequence"]))

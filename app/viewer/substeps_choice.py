@@ -30,6 +30,7 @@ class SubstepsChoice:
         """
         self._history = history
         self._moved = moved
+        self._written = AS_FITTED
         self._in_use = history.start.substeps_per_frame
         self._choice: Any = gui.add_dropdown(
             "substeps",
@@ -37,7 +38,7 @@ class SubstepsChoice:
             hint="Integration steps a frame. Automatic takes as few as are stable at frame 0",
         )
         self._number: Any = gui.add_number(
-            "a frame",
+            "number",
             self._in_use,
             min=1,
             max=_MOST,
@@ -54,8 +55,9 @@ class SubstepsChoice:
         number = history.current.substeps_per_frame
         is_other = number != history.start.substeps_per_frame
         choice = AUTOMATIC if history.is_automatic else BY_HAND if is_other else AS_FITTED
-        if self._choice.value != choice:
-            self._choice.value = choice
+        # Another value than the last one that was written here is a user's, about to be heard.
+        if self._choice.value == self._written != choice:
+            self._choice.value = self._written = choice
         if choice == BY_HAND and self._number.value != number:
             self._number.value = number
         self._number.visible = choice == BY_HAND
@@ -66,6 +68,7 @@ class SubstepsChoice:
 
     def _choose(self) -> None:
         history, choice = self._history, self._choice.value
+        self._written = choice
         if choice == BY_HAND:
             # Nothing is simulated anew before another number is typed.
             self._number.value, self._number.visible = self._in_use, True
@@ -91,6 +94,6 @@ def warning(readout: Readout) -> str:
     if needed is None or readout.substeps_per_frame >= needed:
         return ""
     return (
-        f"**⚠ Unstable: {readout.substeps_per_frame} substeps a frame, "
-        f"at least {needed} are needed.** Choose automatic substeps, or less stiffness or damping."
+        f"**⚠ Too few substeps: {readout.substeps_per_frame} a frame, at least {needed} are needed "
+        "to be stable.** Choose automatic ones, or less stiffness or damping."
     )

@@ -1,0 +1,246 @@
+"""The physics panel as its users work it, and what they keep of it."""
+
+import re
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from viewer_client import ViewerClient
+from viewer_world import FRAMES, PARAMETERS, FakeSettings, FolderCatalog
+
+from app.viewer.keep_panel import Keeping
+from app.viewer.preset_store import PresetStore
+from app.viewer.save_run import RunSaver, SavedRun, run_changes
+from app.viewer.session import Sessions
+from physhandi.data.run import Run
+from physhandi.data.sequence import Sequence
+from physhandi.errors import UsageError
+from physhandi.simulation.model import SimulationParameters
+
+
+class RecordedCatalog(FolderCatalog):
+    """Knows the recording behind every sequence of a run."""
+
+    def sequences_of(self, run: Run) -> list[Sequence]:
+        return [self.sequence("gesture") for _ in run.sequence_names]
+
+
+@pytest.fixture
+def begun() -> list[Run]:
+    """Runs that a worker would work on."""
+    return []
+
+
+@pytest.fixture
+def kept(root: Path, recording, tmp_path: Path, begun: list[Run]) -> Keeping:
+    saver = RunSaver(RecordedCatalog(root), tmp_path / "runs", begun.append)
+    return Keeping(PresetStore(tmp_path / "presets"), saver)
+
+
+@pytest.fixture
+def sessions(catalog, kept: Keeping) -> Iterator[Sessions]:
+    sessions = Sessions(FakeSettings(), catalog, kept)
+    yield sessions
+    sessions.shutdown()
+
+
+def watch(sessions: Sessions) -> ViewerClient:
+    session = sessions.get(sessions.open("run", "sheet", "me"))
+    return ViewerClient(f"ws://127.0.0.1:{session.port}")
+
+
+def drawn(client: ViewerClient) -> str:
+    """All HTML of the panel that takes room."""
+    return "\n".join(
+        str(props["content"])
+        for props in client.gui.values()
+        if "content" in props and props.get("visible", True)
+    )
+
+
+def finish(client: ViewerClient) -> None:
+    client.until(
+        lambda: f"simulated {FRAMES}/{FRAMES}" in client.texts() and "ms a frame" in client.texts()
+    )
+
+
+def type_substeps(client: ViewerClient, number: int) -> None:
+    client.set("substeps", "by hand")
+    client.until(lambda: client.gui[client.find("number")].get("visible") is True)
+    client.set("number", number)
+
+
+def test_a_held_simulation_is_stepped_and_the_strip_shows_what_is_new(sessions) -> None:
+    with watch(sessions) as client:
+        session = sessions.get(sessions.list()[0].id)
+        client.set("Simulation", "Hold")
+        client.until(lambda: "Held: the next simulation waits" in client.texts())
+        assert "new" not in drawn(client)
+        client.set("drag [1/s]", 9.0)
+        client.until(lambda: f"frame 0 of {FRAMES - 1} is new" in drawn(client))
+        for _ in range(4):
+            client.set("Simulation", "1 frame")
+        client.until(lambda: "Held at frame 4" in client.texts())
+        client.until(lambda: f"frames 0 to 4 of {FRAMES - 1} are new" in drawn(client))
+        assert f"{100 * 4 / (FRAMES - 1):.1f}%" in drawn(client)
+        client.until(lambda: client.value("Frame") == 4)
+        take, frame = session._object.at(4)
+        assert (take.parameters.drag, frame) == (9.0, 4)
+        assert session._object.at(5)[0].parameters.drag == PARAMETERS.drag
+        client.set("Simulation", "Go")
+        client.until(lambda: "every frame is new" in drawn(client))
+        client.set("History", "Reset")
+        client.until(lambda: "is new" not in drawn(client))
+
+
+def test_stepping_begins_a_simulation_even_of_the_fitted_parameters(sessions) -> None:
+    with watch(sessions) as client:
+        client.set("Simulation", "1 frame")
+        client.until(lambda: "Held at frame 1" in client.texts())
+        client.set("Simulation", "Go")
+        finish(client)
+        assert "0 mm from the fitted rollout" in client.texts()
+
+
+def test_presets_are_chosen_and_one_parameter_is_put_back(sessions) -> None:
+    with watch(sessions) as client:
+        client.set("Preset", "limp")
+        finish(client)
+        changed = "stiffness x1 → x0.1, damping [N·s/m] 2 → 0, drag [1/s] 3 → 0.5"
+        client.until(lambda: changed in client.texts())
+        client.until(lambda: client.value("drag [1/s]") == 0.5)
+        client.set("Put back", "damping [N·s/m]")
+        client.until(lambda: "stiffness x1 → x0.1, drag [1/s] 3 → 0.5" in client.texts())
+        client.until(lambda: client.value("damping [N·s/m]") == 2.0)
+        client.until(lambda: client.value("Preset") == "by hand")
+        client.set("History", "Undo")
+        client.until(lambda: client.value("Preset") == "limp")
+        client.set("Preset", "as fitted")
+        client.until(lambda: "nothing: parameters as fitted" in client.texts())
+        assert client.value("stiffness 10^") == 0.0
+
+
+def test_own_presets_are_shared_by_all_scenes_and_deleted(sessions, kept) -> None:
+    with watch(sessions) as client, watch(sessions) as other:
+        client.set("drag [1/s]", 11.0)
+        client.set("substeps", "automatic")
+        client.set("name", "Wet sheet")
+        client.set("Save as", "Preset")
+        client.until(lambda: client.value("Preset") == "★ Wet sheet")
+        other.until(lambda: other.find("Preset"))
+        other.until(lambda: "★ Wet sheet" in other.gui[other.find("Preset")]["options"])
+        other.set("Preset", "★ Wet sheet")
+        other.until(lambda: "substeps 30 → automatic" in other.texts())
+        other.until(lambda: other.value("drag [1/s]") == 11.0)
+        kept.presets.folder.joinpath("bad.yaml").write_text("format: <i>nothing</i>")
+        other.until(lambda: other.find("Delete preset “Wet sheet”"))
+        other.set("Delete preset “Wet sheet”", True)
+        client.until(lambda: client.value("Preset") == "by hand")
+        client.until(lambda: "presets/bad.yaml: format is missing" in drawn(client))
+        assert [path.name for path in kept.presets.folder.iterdir()] == ["bad.yaml"]
+
+
+def test_the_ground_is_lowered_and_taken_away(sessions) -> None:
+    with watch(sessions) as client:
+        session = sessions.get(sessions.list()[0].id)
+        client.until(lambda: "/ground" in client.positions)
+        before = client.positions["/ground"][2]
+        client.set("height [mm]", -40.0)
+        finish(client)
+        client.until(lambda: client.positions["/ground"][2] < before - 0.03)
+        assert client.positions["/ground"][2] == pytest.approx(before - 0.04, abs=1e-6)
+        assert session._object.at(0)[0].parameters.ground_height == pytest.approx(-0.04)
+        client.set("ground", False)
+        client.until(lambda: "ground on → off" in client.texts())
+        client.until(lambda: session._object.at(FRAMES - 1)[0].parameters.ground_height is None)
+        client.until(lambda: client.visible.get("/ground") is False)
+        finish(client)
+        client.set("ground", True)
+        client.until(lambda: "ground" not in client.texts().partition("Changed")[2])
+
+
+def test_too_few_substeps_are_warned_of_with_the_number_that_is_needed(sessions) -> None:
+    with watch(sessions) as client:
+        type_substeps(client, 4)
+        client.until(lambda: "Too few substeps: 4 a frame" in client.texts())
+        found = re.search(r"at least (\d+) are needed", client.texts())
+        assert found is not None
+        assert 4 < int(found[1]) <= PARAMETERS.substeps_per_frame
+        client.set("number", int(found[1]))
+        client.until(lambda: f"substeps {found[1]}" in client.texts())
+        finish(client)
+        assert "Too few" not in client.texts()
+        client.set("δ virtual [mm]", 0.5)
+        client.until(lambda: "No virtual spring: nothing holds the object" in client.texts())
+
+
+def test_a_run_is_saved_with_what_the_sliders_changed(sessions, kept, begun) -> None:
+    with watch(sessions) as client:
+        client.set("drag [1/s]", 11.0)
+        client.set("gravity [m/s²]", 1.5)
+        client.set("Save as", "Run")
+        client.until(lambda: any("Type a name" in str(m) for m in client.messages))
+        assert begun == []
+        client.set("name", "Moon <b>sheet</b>")
+        client.set("Save as", "Run")
+        client.until(lambda: begun)
+        (run,) = begun
+        opened = Run.open(run.folder)
+        assert (opened.kind, opened.name) == ("simulation", "Moon <b>sheet</b>")
+        assert opened.config["parameters"] == {
+            "drag": 11.0,
+            "gravity": 1.5,
+            "uses_sequence_gravity": False,
+        }
+        assert Run.open(Path(opened.config["source"])).id == "sheet"
+        link = f"<a href='/runs/{run.id}' target='_blank' rel='noopener'>"
+        client.until(lambda: f"Saving run {link}Moon &lt;b&gt;sheet&lt;/b&gt;</a>" in drawn(client))
+        with run.begin_attempt() as attempt:
+            attempt.fail("the disk is full")
+        client.until(lambda: "failed: the disk is full" in drawn(client))
+
+
+def test_a_simulation_that_diverged_is_not_saved(sessions, begun) -> None:
+    with watch(sessions) as client:
+        client.set("stiffness 10^", 1.0)
+        type_substeps(client, 2)
+        client.until(lambda: "Stopped at frame" in client.texts())
+        client.until(lambda: "then it stopped" in drawn(client))
+        client.set("name", "Broken")
+        client.set("Save as", "Run")
+        client.until(lambda: any("as a run it would" in str(m) for m in client.messages))
+        assert begun == []
+
+
+def test_what_a_run_is_told_gives_the_parameters_of_the_scene(run) -> None:
+    stored = SimulationParameters.from_dict(run.yaml("object/parameters.yaml"))
+    world = {"frame_rate": 60.0, "ground_height": 0.1, "gravity": 9.7}
+    fitted = stored.in_world(**world)
+    now = replace(fitted, ground_height=None, gravity=3.0, friction=1.5)
+    changes = run_changes(run, fitted, now, is_automatic=False)
+    assert "frame_rate" not in changes
+    again = SimulationParameters.from_dict(stored.to_dict() | changes).in_world(**world)
+    shown = {"uses_sequence_ground": False, "uses_sequence_gravity": False}
+    assert again == replace(now, **shown)
+    assert run_changes(run, fitted, fitted, is_automatic=True) == {"substeps_per_frame": "auto"}
+
+
+def test_a_saved_run_is_followed_until_it_ends(kept, begun) -> None:
+    run = kept.saver.save("sheet", "lift", "  A   name ", {"drag": 1.0})
+    assert (run.name, begun) == ("A name", [run])
+    told: list[SavedRun] = []
+    thread = kept.saver.follow(run, told.append, threading.Event())
+    with run.begin_attempt() as attempt:
+        while len(told) < 2:
+            time.sleep(0.01)
+        attempt.save_array("x.npy", np.zeros(3))
+        attempt.publish()
+    thread.join(timeout=5)
+    assert [saved.state for saved in told] == ["queued", "running", "succeeded"]
+    for name in ("", "x" * 81):
+        with pytest.raises(UsageError, match="Type a name"):
+            kept.saver.save("sheet", "lift", name, {})
