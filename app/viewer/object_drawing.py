@@ -18,6 +18,7 @@ Color = tuple[int, int, int]
 QUIET_FORCE = 1e-6
 """Weaker forces are no forces [N]."""
 _SAMPLED_FRAMES = 8
+_LEAST_ARROWS = 60
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,6 +29,8 @@ class Budget:
     """Most virtual springs."""
     springs: int | None = None
     """Most object springs."""
+    nodes: int | None = None
+    """Most object nodes."""
     arrows: int = 800
     """Most force arrows; the weakest are left out."""
 
@@ -42,6 +45,7 @@ def share_bytes(left: int, take: Take, layers: Layers, arrows: int) -> Budget:
         arrows: Most force arrows.
     """
     each = 24 if layers.color == "plain" else 30
+    arrows = min(arrows, max(left // (2 * 24), _LEAST_ARROWS))
     count = left // each - (arrows if layers.forces else 0)
     count = min(max(count, PLAYING_SPRINGS // 10), PLAYING_SPRINGS)
     virtual = min(take.model.virtual_spring_count, count)
@@ -154,8 +158,10 @@ class ObjectDrawing:
         control = np.asarray(take.control[frame], dtype=np.float32)
         style = self._style
         size = style.node_size * self._framing.spacing
-        color = style.node if painted is None else painted.node
-        self._balls(f"{root}/object/nodes", position, color, size, is_visible=layers.nodes)
+        shown = _thinned(0, len(position), budget.nodes)
+        color = style.node if painted is None else painted.node[shown]
+        is_visible = layers.nodes
+        self._balls(f"{root}/object/nodes", position[shown], color, size, is_visible=is_visible)
         self._surface.draw(
             position,
             np.zeros((0, 3), np.int32) if faces is None else faces,

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import viser
@@ -24,6 +25,8 @@ FRAME_BYTES = 92_000
 _ARROWS = 800
 _PLAYING_ARROWS = 400
 _PLAYING_OBSERVED = 2_000
+_LEAST_BYTES = 12_000
+"""Springs and arrows get at least this much of a playing frame."""
 _MANY_NODES = 2_500
 """The surface of more nodes is not laid before somebody asks for it."""
 
@@ -189,7 +192,8 @@ class Scene:
         """Share what the points of a playing frame leave of its bytes."""
         layers = self.layers
         point_count = len(self._object.attached(take))
-        point_count += take.model.node_count if layers.nodes else 0
+        colored = 0 if layers.color == "plain" else take.model.node_count // 4
+        point_count += take.model.node_count + colored if layers.nodes else 0
         point_count += take.model.control_count if layers.all_controls else 0
         point_count += _PLAYING_OBSERVED if layers.observed else 0
         if layers.hands:
@@ -199,7 +203,13 @@ class Scene:
             node_count = len(np.unique(self.faces))
             is_plain = layers.color == "plain"
             point_count += node_count if is_plain else 2 * node_count + len(self.faces)
-        return share_bytes(self._frame_bytes - 12 * point_count, take, layers, _PLAYING_ARROWS)
+        left = self._frame_bytes - 12 * point_count
+        budget = share_bytes(left, take, layers, _PLAYING_ARROWS)
+        if left >= _LEAST_BYTES or not layers.surface:
+            return budget
+        # Nodes on a surface are seen by its color anyway.
+        most = max(take.model.node_count - (_LEAST_BYTES - left) // 12, 1)
+        return replace(budget, nodes=most)
 
 
 def add_ground(nodes: SceneNodes, content: Content, framing: Framing) -> None:

@@ -54,16 +54,21 @@ def server() -> Iterator[viser.ViserServer]:
     server.stop()
 
 
-def test_a_large_scene_is_thinned_while_it_plays_and_whole_when_it_rests(server) -> None:
+@pytest.mark.parametrize(("color", "surface"), [("plain", False), ("speed", True)])
+def test_a_large_scene_is_thinned_while_it_plays_and_whole_when_it_rests(
+    server, color, surface
+) -> None:
     content = large_content()
     take = content.fitted
     assert take is not None
     assert take.model.object_spring_count > 10 * PLAYING_SPRINGS
     scene = Scene(server, content, frame_content(content))
     scene.layers.object_springs = True
+    scene.layers.color, scene.layers.surface = color, surface
+    springs = "/springs/object" if color == "plain" else "/springs/object_painted"
     scene.draw(0, take, 0, is_playing=True)
     with ViewerClient(f"ws://127.0.0.1:{server.get_port()}") as client:
-        client.until(lambda: "/springs/object" in client.nodes)
+        client.until(lambda: springs in client.nodes)
         before = client.bytes_received
         for frame in range(1, FRAMES):
             drawn = len(client.messages)
