@@ -132,7 +132,8 @@ function duration(seconds) {
 function about(seconds) {
   if (seconds < 5) return "a few seconds";
   const step = seconds < 60 ? 5 : seconds < 600 ? 10 : 60;
-  return `about ${duration(Math.max(step, Math.round(seconds / step) * step))}`;
+  const rounded = Math.max(step, Math.round(seconds / step) * step);
+  return `about ${rounded < 60 ? `${rounded} s` : duration(rounded)}`;
 }
 
 function describe(report, estimate) {

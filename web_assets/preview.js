@@ -14,6 +14,7 @@ const KINDS = {
   control: { color: "--control", size: 1.8, label: "control nodes" },
   joints: { color: "--control", size: 3.2, label: "joints of the hand" },
 };
+const DEPTH = 0.2; // how much smaller what is farther away looks
 const START = { turn: -0.6, tilt: 0.35 };
 
 function readPreview(buffer) {
@@ -62,6 +63,7 @@ class Preview {
 
   show(preview) {
     this.waits.hidden = true;
+    this.fit(preview);
     this.shown = preview;
     const { stage, sequence, loss, groups } = preview;
     const kinds = Object.keys(KINDS).filter((kind) => groups[kind]);
@@ -75,6 +77,25 @@ class Preview {
     }));
     this.title = [stage.replaceAll("_", " "), Number.isFinite(loss) ? `loss ${loss.toPrecision(4)}` : ""].filter(Boolean).join(" · ");
     this.start();
+  }
+
+  /** Find the ball that holds all points of all frames; within a stage it only grows. */
+  fit(preview) {
+    const [low, high] = [[Infinity, Infinity, Infinity], [-Infinity, -Infinity, -Infinity]];
+    for (const { at } of Object.values(preview.groups)) {
+      for (let i = 0; i < at.length; i++) {
+        if (at[i] === UNKNOWN) continue;
+        low[i % 3] = Math.min(low[i % 3], at[i]);
+        high[i % 3] = Math.max(high[i % 3], at[i]);
+      }
+    }
+    const metres = (value, axis) => preview.low[axis] + (value / STEPS) * preview.side;
+    const corner = low.map(metres);
+    const far = high.map(metres);
+    const centre = corner.map((value, axis) => (value + far[axis]) / 2);
+    const radius = Math.max(Math.hypot(...far.map((value, axis) => value - centre[axis])), 0.01);
+    const isSame = this.shown?.stage === preview.stage && this.ball?.radius > 0.8 * radius;
+    if (!isSame || radius > this.ball.radius) this.ball = { centre, radius };
   }
 
   start() {
@@ -127,7 +148,10 @@ class Preview {
   project({ count, at }, width, height) {
     const { turn, tilt } = this.view;
     const [ct, st, cp, sp] = [Math.cos(turn), Math.sin(turn), Math.cos(tilt), Math.sin(tilt)];
-    const scale = 1.15 * Math.min(width, height);
+    const { low, side } = this.shown;
+    const { centre, radius } = this.ball;
+    const scale = 0.6 * Math.min(width, height);
+    const along = (value, axis) => (low[axis] + (value / STEPS) * side - centre[axis]) / radius;
     const placed = new Float32Array(3 * count);
     const begin = 3 * count * this.frame;
     for (let i = 0; i < count; i++) {
@@ -136,10 +160,10 @@ class Preview {
         placed.fill(NaN, 3 * i, 3 * i + 3);
         continue;
       }
-      const [x, y, z] = [at[j] / STEPS - 0.5, at[j + 1] / STEPS - 0.5, at[j + 2] / STEPS - 0.5];
+      const [x, y, z] = [along(at[j], 0), along(at[j + 1], 1), along(at[j + 2], 2)];
       const [right, away] = [ct * x - st * y, st * x + ct * y];
-      const [up, depth] = [cp * z - sp * away * -1, cp * away + sp * z * -1];
-      const near = scale / (1 + 0.35 * depth);
+      const [up, depth] = [cp * z + sp * away, cp * away - sp * z];
+      const near = scale / (1 + DEPTH * depth);
       placed.set([width / 2 + right * near, height / 2 - up * near, depth], 3 * i);
     }
     return placed;
@@ -161,7 +185,7 @@ class Preview {
       if (kind === "joints") this.drawBones(pen, placed, ratio);
       for (let i = 0; i < placed.length; i += 3) {
         if (Number.isNaN(placed[i])) continue;
-        const radius = (size * ratio) / (1 + 0.35 * placed[i + 2]);
+        const radius = (size * ratio) / (1 + DEPTH * placed[i + 2]);
         pen.beginPath();
         pen.arc(placed[i], placed[i + 1], radius, 0, 7);
         pen.fill();

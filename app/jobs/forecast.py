@@ -3,13 +3,13 @@
 import threading
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
 from app.jobs.catalog import Catalog, RunItem
-from app.jobs.effort import Extent, effort_of
+from app.jobs.effort import Extent
 from app.jobs.estimate import Estimate, Plan, estimate, plan_from
+from app.jobs.reference import Reference, scaled_plan
 from app.jobs.timeline import Timeline
 from physhandi.data.atomic import named_fields
 from physhandi.data.environment import ENVIRONMENT
@@ -24,17 +24,6 @@ _CLOSE = 0.1
 _KEPT_S = 10.0
 """How long the list of earlier fits is used before the folders are looked at again."""
 _MACHINE = ("device", "device_name", "cpu_count")
-
-
-@dataclass(frozen=True)
-class _Reference:
-    """A finished fit, and when it was how far."""
-
-    profile: Mapping[str, Any]
-    extent: Extent
-    machine: tuple[Any, ...]
-    timeline: Timeline
-    end: float
 
 
 class Forecast:
@@ -54,8 +43,8 @@ class Forecast:
         self._catalog = catalog
         self._device = device
         self._lock = threading.Lock()
-        self._references: dict[str, tuple[object, _Reference | None]] = {}
-        self._listed: list[_Reference] = []
+        self._references: dict[str, tuple[object, Reference | None]] = {}
+        self._listed: list[Reference] = []
         self._listed_at = -_KEPT_S
         self._followed: dict[str, tuple[int, int, Timeline]] = {}
         self._plans: dict[tuple[str, object], Plan | None] = {}
@@ -122,13 +111,13 @@ class Forecast:
         ]
         if same:
             return plan_from([(r.timeline, r.end) for r in same[:_REFERENCES]], "same")
-        return _scaled_plan(references, profile, extent, machine)
+        return scaled_plan(references, profile, extent, machine)
 
-    def _known(self) -> list[_Reference]:
+    def _known(self) -> list[Reference]:
         """List earlier fits, the newest first."""
         if time.monotonic() - self._listed_at < _KEPT_S:
             return self._listed
-        found: dict[str, tuple[object, _Reference | None]] = {}
+        found: dict[str, tuple[object, Reference | None]] = {}
         for item in self._catalog.runs():
             stamp = _stamp_of(item)
             if stamp is None:
@@ -144,7 +133,7 @@ class Forecast:
         self._listed_at = time.monotonic()
         return self._listed
 
-    def _read(self, item: RunItem) -> _Reference | None:
+    def _read(self, item: RunItem) -> Reference | None:
         """Read when a finished fit was how far; none if it was interrupted or is damaged."""
         run = item.run
         profile = named_fields(run.config.get("profile")) if run else None
@@ -162,7 +151,7 @@ class Forecast:
         if begun is None or extent is None or attempts != {number}:
             return None
         timeline = Timeline(begun[0]).add_all(events)
-        return _Reference(profile, extent, begun[1], timeline, end) if timeline.parts else None
+        return Reference(profile, extent, begun[1], timeline, end) if timeline.parts else None
 
     def _extent_of(self, run: Run) -> Extent | None:
         """Count the frames of a run's sequences; none if one of them is gone."""
@@ -189,36 +178,6 @@ class Forecast:
         if len(self._followed) > 256:
             del self._followed[next(iter(self._followed))]
         return timeline
-
-
-def _scaled_plan(
-    references: Sequence[_Reference],
-    profile: Mapping[str, Any],
-    extent: Extent,
-    machine: tuple[Any, ...],
-) -> Plan:
-    """Stretch the stages of the fit that is most alike by how much more work they are."""
-
-    def likeness(reference: _Reference) -> tuple[bool, bool, bool]:
-        return (
-            reference.machine == machine,
-            reference.profile.get("profile") == profile.get("profile"),
-            reference.extent.sequences == extent.sequences,
-        )
-
-    nearest = max(references, key=likeness)
-    plan = plan_from([(nearest.timeline, nearest.end)], "scaled")
-    before, after = effort_of(nearest.profile, nearest.extent), effort_of(profile, extent)
-    frames = extent.frames / max(1, nearest.extent.frames)
-    parts = [
-        part.stretched(
-            after[part.stage] / before[part.stage]
-            if after.get(part.stage) is not None and before.get(part.stage, 0.0) > 0.0
-            else frames
-        )
-        for part in plan.parts
-    ]
-    return Plan(tuple(parts), plan.closing_s * frames, plan.kind, plan.count)
 
 
 def _settings(profile: Mapping[str, Any]) -> dict[str, Any]:

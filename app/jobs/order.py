@@ -87,7 +87,7 @@ def describe_order(run: Run) -> dict[str, Any]:
 
     Returns:
         ``parent`` (id of the run that it was made from, else none), ``overrides`` (values by
-        their paths) and ``changes``: rows of ``path name group about unit base value``.
+        their paths) and ``changes``: rows of ``path title group about unit base value``.
     """
     parent = run.config.get("parent")
     overrides = named_fields(run.config.get("overrides")) or {}
@@ -126,7 +126,7 @@ def _row(setting: Setting, base: Any, value: Any) -> dict[str, Any]:
     )
     return {
         "path": setting.path,
-        "name": setting.name,
+        "title": setting.title,
         "group": GROUPS[setting.group],
         "about": setting.about,
         "unit": setting.unit,

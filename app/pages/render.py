@@ -113,4 +113,5 @@ def about(seconds: float) -> str:
     if seconds < 5:
         return "a few seconds"
     step = 5 if seconds < 60 else 10 if seconds < 600 else 60
-    return f"about {duration(max(step, round(seconds / step) * step))}"
+    rounded = max(step, round(seconds / step) * step)
+    return f"about {rounded} s" if rounded < 60 else f"about {duration(rounded)}"

@@ -29,8 +29,8 @@ MOST_POINTS = {"object": 400, "control": 120, "seen": 120, "joints": 42}
 """Points of each kind in a frame."""
 INTERVAL_S = 1.5
 """Least time between two previews."""
-SHARE = 0.005
-"""Most of a fit's time that previews may take."""
+SHARE = 0.008
+"""Most of a fit's time that previews may take; what is not used is saved up for dear ones."""
 _UNKNOWN = 65535
 _STEPS = 65534
 
@@ -41,6 +41,7 @@ class PreviewFile:
     def __init__(self, run_folder: Path) -> None:
         """Prepare; the first preview is due at once."""
         self._path = run_folder / PREVIEW
+        self._begin = time.monotonic()
         self._due = 0.0
         self._number = 0
         self.spent_s = 0.0
@@ -51,14 +52,13 @@ class PreviewFile:
         return time.monotonic() >= self._due
 
     def write(self, make: Callable[[], Preview]) -> None:
-        """Replace the file, and put the next one off so long that all take at most `SHARE`."""
+        """Replace the file, and put the next one off until all took at most `SHARE` of the time."""
         begin = time.monotonic()
         self._number += 1
         content = encode(make(), self._number)
         write_atomically(self._path, lambda stream: stream.write(content), is_durable=False)
-        took = time.monotonic() - begin
-        self.spent_s += took
-        self._due = begin + max(INTERVAL_S, took / SHARE)
+        self.spent_s += time.monotonic() - begin
+        self._due = max(begin + INTERVAL_S, self._begin + self.spent_s / SHARE)
 
 
 def encode(preview: Preview, number: int) -> bytes:

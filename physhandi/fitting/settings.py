@@ -2,7 +2,7 @@
 
 import types
 import typing
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, Literal
 
 from physhandi.fitting.field_notes import notes_of
@@ -108,6 +108,8 @@ class Setting:
     """Path that it shares with those that belong to it; see `GROUPS`."""
     name: str
     """Its own name."""
+    title: str
+    """Its name in words, with where it belongs if others have the same name."""
     about: str
     """What it means, in a sentence."""
     unit: str
@@ -127,8 +129,17 @@ class Setting:
 def all_settings() -> tuple[Setting, ...]:
     """List all settings, those that belong together in a row."""
     found = [*_settings_of(PipelineConfig, ""), *_intervals()]
-    order = list(GROUPS)
-    return tuple(sorted(found, key=lambda setting: order.index(setting.group)))
+    order, names = list(GROUPS), [s.name for s in found if s.kind != "interval"]
+    shared = {name for name in names if names.count(name) > 1}
+    titled = [replace(s, title=_title(s, is_shared=s.name in shared)) for s in found]
+    return tuple(sorted(titled, key=lambda setting: order.index(setting.group)))
+
+
+def _title(setting: Setting, *, is_shared: bool) -> str:
+    if setting.kind == "interval":
+        return f"search of {setting.name}".replace("_", " ")
+    owner = f"{setting.group.rpartition('.')[2].strip('_')} " if is_shared else ""
+    return f"{owner}{setting.name}".replace("_", " ")
 
 
 def _settings_of(kind: Any, path: str) -> list[Setting]:
@@ -153,6 +164,7 @@ def _settings_of(kind: Any, path: str) -> list[Setting]:
                 path=own,
                 group=path,
                 name=entry.name,
+                title="",
                 about=about,
                 unit=unit,
                 kind="choice" if is_choice else _KINDS[hint],
@@ -179,6 +191,7 @@ def _intervals() -> list[Setting]:
             path=f"{INTERVALS}.{name}",
             group=INTERVALS,
             name=name,
+            title="",
             about=notes[name][0],
             unit=notes[name][1],
             kind="interval",

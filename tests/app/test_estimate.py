@@ -1,13 +1,17 @@
 """How long fits still take: oracles with a known end, and recordings of real fits."""
 
+import json
 import random
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
 from app.jobs.effort import Extent, effort_of
 from app.jobs.estimate import Plan, estimate, plan_from
+from app.jobs.reference import Reference, scaled_plan
 from app.jobs.timeline import Timeline
+from physhandi.fitting.overrides import apply_overrides
 from physhandi.fitting.profile import config_to_dict, load_profile
 
 Report = dict[str, float | str]
@@ -145,3 +149,57 @@ def test_effort_follows_the_settings_that_make_work() -> None:
     paper = effort_of(config_to_dict(load_profile("paper")), Extent(60, 1))
     assert paper["zeroth_order"] > 100 * base["zeroth_order"]
     assert effort_of({"nonsense": 1}, Extent(60, 1)) == {}
+
+
+RECORDINGS = json.loads(Path(__file__).with_name("fit_recordings.json").read_text())
+"""Quick fits of the bundled sequence on two shared cores: three alone, two beside each other, and
+one with other settings. The reports as stage, iteration, total and second."""
+QUIET = ("quick1", "quick2", "quick3")
+
+
+def recorded(name: str, until: float = 1e9) -> tuple[Timeline, float]:
+    found = RECORDINGS[name]
+    told = [
+        {"stage": found["stages"][stage], "iteration": i, "total": total, "time": second}
+        for stage, i, total, second in found["reports"]
+        if second <= until
+    ]
+    return Timeline(0.0).add_all(told), found["end"]
+
+
+def recorded_error(of: Plan, name: str, share: float) -> float:
+    end = RECORDINGS[name]["end"]
+    left = estimate(of, recorded(name, share * end)[0], share * end).left_s
+    return left / (end - share * end) - 1.0
+
+
+@pytest.mark.parametrize("share", [0.1, 0.25, 0.5])
+def test_real_fits_are_foreseen_within_a_third_after_the_first_tenth(share: float) -> None:
+    for name in QUIET:
+        others = [recorded(other) for other in QUIET if other != name]
+        assert abs(recorded_error(plan_from(others, "same"), name, share)) < 0.3
+        assert abs(recorded_error(plan_from(others, "scaled"), name, share)) < 0.3
+    for name, other in (("beside1", "beside2"), ("beside2", "beside1")):
+        assert abs(recorded_error(plan_from([recorded(other)], "same"), name, share)) < 0.3
+        # Two fits side by side take half as long again as one that was alone: it is noticed late.
+        alone = plan_from([recorded(quiet) for quiet in QUIET], "same")
+        assert abs(recorded_error(alone, name, share)) < 0.45
+
+
+@pytest.mark.parametrize("share", [0.1, 0.25, 0.5])
+def test_a_real_fit_with_other_settings_is_foreseen_from_one_of_the_profile(share: float) -> None:
+    quick = load_profile("quick")
+    overrides = {
+        "hand.iterations": 300,
+        "object_.search.generations": 14,
+        "object_.first_order.iterations": 30,
+        "refinement.iterations": 0,
+    }
+    changed = config_to_dict(apply_overrides(quick, overrides))
+    extent, machine = Extent(60, 1), ("cpu", "", 2)
+    timeline, end = recorded("quick1")
+    reference = Reference(config_to_dict(quick), extent, machine, timeline, end)
+    of = scaled_plan([reference], changed, extent, machine)
+    assert of.seconds == pytest.approx(RECORDINGS["changed"]["end"], rel=0.3)
+    assert of.seconds > 1.1 * end
+    assert abs(recorded_error(of, "changed", share)) < 0.3

@@ -79,7 +79,7 @@ def test_one_that_runs_away_neither_hides_the_rest_nor_breaks_the_file(tmp_path:
     assert np.abs(points["object"][:3] - node[:3, :300]).max() < 1e-5
 
 
-def test_previews_are_seldom_and_the_rarer_the_longer_they_take(
+def test_previews_are_seldom_and_together_take_a_small_share_of_the_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = [100.0]
@@ -93,16 +93,31 @@ def test_previews_are_seldom_and_the_rarer_the_longer_they_take(
     due: Callable[[], bool] = file.is_due
     assert due()
     file.write(lambda: make(count=3))
-    clock[0] += 1.4
+    clock[0] = 101.4
     assert not due()
-    clock[0] += 0.2
+    clock[0] = 102.0
     assert due()
+    # 0.05 s are 0.8 % of 6.25 s since the begin.
     file.write(slow)
-    clock[0] += 0.05 / preview_module.SHARE - 0.1
+    clock[0] = 106.2
     assert not due()
-    clock[0] += 0.1
+    clock[0] = 106.3
     assert due()
-    assert file.spent_s == pytest.approx(0.05)
+    # In a minute enough is saved up for several of them, but not at once.
+    clock[0] = 160.0
+    for _ in range(5):
+        assert due()
+        file.write(slow)
+        assert not due()
+        clock[0] += 1.5
+    assert file.spent_s == pytest.approx(0.3)
+    # Then the share is used up: 0.6 s of previews are allowed after 75 s and not before.
+    for _ in range(6):
+        file.write(slow)
+    clock[0] = 174.9
+    assert not due()
+    clock[0] = 175.1
+    assert due()
 
 
 def test_a_run_takes_previews_and_nobody_else_wants_any(tmp_path: Path) -> None:

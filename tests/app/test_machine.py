@@ -1,0 +1,135 @@
+"""The load of the machine against what the kernel tells, and graphics cards that are made up."""
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from app.jobs import cards as cards_module
+from app.jobs.cards import Cards, ask_driver
+from app.jobs.machine import Machine
+from app.jobs.processes import end_processes
+
+BUSY = """
+import subprocess, sys, time
+from pathlib import Path
+from app.jobs.processes import claim_supervision
+claim = claim_supervision(Path(sys.argv[1]))
+child = subprocess.Popen([sys.executable, "-c", "x = bytearray(80 * 2**20)\\nwhile True: pass"])
+print(child.pid, flush=True)
+child.wait()
+"""
+TWO_CARDS = {
+    "--query-gpu": "0, NVIDIA H200, 50, 1024, 143771, 41\n1, NVIDIA H200, [N/A], 0, 9, [N/A]\n",
+    "--query-compute-apps": "4711, 900\n4712, 100\n4711, 24\n",
+}
+
+
+def made_up(arguments: list[str]) -> str:
+    assert arguments[1] == "--format=csv,noheader,nounits"
+    return TWO_CARDS[arguments[0].partition("=")[0]]
+
+
+def test_the_load_is_what_the_kernel_tells(tmp_path: Path) -> None:
+    load = Machine(tmp_path, Cards(made_up)).load()
+    lines = Path("/proc/meminfo").read_text().splitlines()
+    kibibytes = {line.split(":")[0]: int(line.split()[1]) for line in lines}
+    assert load["memory"]["total"] == kibibytes["MemTotal"] * 1024
+    used = (kibibytes["MemTotal"] - kibibytes["MemAvailable"]) * 1024
+    assert load["memory"]["used"] == pytest.approx(used, rel=0.2)
+    assert load["memory"]["share"] == pytest.approx(used / load["memory"]["total"], abs=0.05)
+    disk = shutil.disk_usage(tmp_path)
+    assert load["disk"]["total"] == disk.total
+    assert load["disk"]["free"] == pytest.approx(disk.free, rel=0.05)
+    assert load["processor"]["count"] == os.cpu_count()
+    assert 0.0 <= load["processor"]["share"] <= 1.0
+
+
+def test_a_folder_that_is_not_made_yet_has_a_disk_all_the_same(tmp_path: Path) -> None:
+    assert Machine(tmp_path / "later").load()["disk"]["total"] > 0
+
+
+def test_a_run_takes_what_all_its_processes_take(tmp_path: Path) -> None:
+    machine = Machine(tmp_path, Cards(made_up))
+    assert machine.of_run(tmp_path) is None
+    environment = os.environ | {"PHYSHANDI_RUN": f"{tmp_path}:1"}
+    command = [sys.executable, "-c", BUSY, str(tmp_path)]
+    supervisor = subprocess.Popen(
+        command, stdout=subprocess.PIPE, env=environment, cwd=Path(__file__).parents[2]
+    )
+    try:
+        assert supervisor.stdout is not None
+        supervisor.stdout.readline()
+        end = time.monotonic() + 10.0
+        first = machine.of_run(tmp_path)
+        assert first is not None
+        assert first["processes"] == 2
+        while (taken := machine.of_run(tmp_path)) and taken["processors"] < 0.02:
+            assert time.monotonic() < end
+            time.sleep(0.2)
+        assert taken is not None
+        assert taken["memory"] > 85 * 2**20
+        assert taken["processors"] < 1.5
+        assert taken["card_memory"] is None
+    finally:
+        end_processes(tmp_path, grace_s=0.0)
+        supervisor.communicate()
+    assert machine.of_run(tmp_path) is None
+
+
+def test_cards_are_read_as_their_driver_tells_and_held_by_process() -> None:
+    cards = Cards(made_up)
+    assert cards.memory_of([4711]) is None
+    cards.refresh()
+    first, second = cards.read()
+    assert first == {
+        "index": 0,
+        "name": "NVIDIA H200",
+        "share": 0.5,
+        "memory": 1024 * 2**20,
+        "memory_total": 143771 * 2**20,
+        "temperature": 41.0,
+    }
+    assert (second["share"], second["temperature"]) == (None, None)
+    assert cards.memory_of([4711, 1]) == 924 * 2**20
+    assert cards.memory_of([1]) == 0
+
+
+def test_without_a_card_or_an_answer_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(_: list[str]) -> str:
+        raise OSError("Unable to determine the device handle")
+
+    for ask in (broken, lambda _: "No devices were found\n", lambda _: "x, y, 1, 2, 3, 4\n"):
+        cards = Cards(ask)
+        cards.refresh()
+        assert cards.read() == []
+        assert cards.memory_of([1]) is None
+    monkeypatch.setattr(cards_module.shutil, "which", lambda _: None)
+    with pytest.raises(FileNotFoundError):
+        ask_driver(["--version"])
+    monkeypatch.setattr(cards_module.shutil, "which", lambda _: "/bin/false")
+    with pytest.raises(OSError, match="non-zero"):
+        ask_driver(["--version"])
+
+
+def test_nobody_waits_for_a_slow_driver() -> None:
+    asked: list[float] = []
+
+    def slow(arguments: list[str]) -> str:
+        asked.append(time.monotonic())
+        time.sleep(0.3)
+        return made_up(arguments)
+
+    cards = Cards(slow)
+    begin = time.monotonic()
+    assert [cards.read() for _ in range(50)] == [[]] * 50
+    assert time.monotonic() - begin < 0.2
+    end = time.monotonic() + 5.0
+    while not cards.read():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    assert len(asked) == 2
