@@ -14,6 +14,7 @@ from physhandi.simulation.kernels.dataflow_adjoint import (
     make_adjoint_kernel,
     sum_controls,
 )
+from physhandi.simulation.large_frames import LargeFrames, most_large_locals
 from physhandi.simulation.partition import Partition, partition_model
 from physhandi.simulation.stage import Stage
 from physhandi.simulation.trajectory import Layout as TapeLayout
@@ -74,16 +75,23 @@ class Dataflow:
         self._relay = wp.zeros(4 * count, dtype=wp.vec4, device=simulator.device)
         self._no_tape = wp.zeros((0, 0), dtype=wp.vec4, device=simulator.device)
         self._tag = 1
+        is_large = partition.most_locals > FORWARD_LOCALS
+        self.large = LargeFrames(simulator, partition) if is_large else None
 
     @staticmethod
     def of(simulator: Stage) -> "Dataflow | None":
-        """Make one for a simulator; none on a CPU, or if the model's blocks do not fit."""
+        """Make one for a simulator; none on a CPU, or if the model's blocks do not fit.
+
+        Blocks that fit static shared memory are moved by the kernel that keeps all in registers,
+        others by the one of `LargeFrames`, as far as the device has shared memory for them.
+        """
         model, device = simulator.model, simulator.device
         if not device.is_cuda or model.node_count == 0:
             return None
         blocks = max(1, min(int(device.sm_count), model.node_count // LEAST_OWN))
         partition = partition_model(model, blocks)
-        return Dataflow(simulator, partition) if partition.most_locals <= FORWARD_LOCALS else None
+        fits = partition.most_locals <= max(FORWARD_LOCALS, most_large_locals(device))
+        return Dataflow(simulator, partition) if fits else None
 
     def next_tags(self, count: int) -> int:
         """Reserve tags that no value in the relay bears."""
@@ -105,9 +113,18 @@ class Dataflow:
             before: State at its start.
             after: Where the state at its end goes; may be the same arrays.
             tape: Where each substep's position, velocity and velocity before contact go.
+
+        Raises:
+            ValueError: If a tape is wanted of blocks whose adjoint does not fit.
         """
         simulator = self._simulator
         substeps = simulator.parameters.substeps_per_frame
+        if self.large is not None:
+            if tape is not None:
+                raise ValueError("Blocks in dynamic shared memory keep no tape.")
+            tag = self.next_tags(substeps + 1)
+            self.large.advance(self._map[:4], self._relay, tag, before, after)
+            return
         self._launch(
             frame_kernel(self.layout.lanes, self.layout.kept),
             [self.layout.threads, substeps, self.next_tags(substeps + 1), simulator.world],

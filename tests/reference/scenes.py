@@ -72,6 +72,36 @@ def star_scene():
     )
 
 
+def tiny_scene():
+    """Let a tangle of nodes move whose springs are a tenth of a millimetre long."""
+    rng = np.random.default_rng(4)
+    node = np.cumsum(rng.normal(0, 6e-5, (40, 3)), axis=0)
+    return bare_scene(
+        node,
+        velocity=rng.normal(0, 1e-3, node.shape),
+        springs=[(i, i + 1) for i in range(39)] + [(i, i + 2) for i in range(38)],
+        rest=np.full(77, 1e-4),
+        stiffness=np.full(77, 1e-3),
+        damping=np.full(77, 0.01),
+        frames=3,
+        substeps=200,
+    )
+
+
+def loose_scene(count):
+    """Let nodes without springs fall to the ground and slide; there is nothing else."""
+    rng = np.random.default_rng(count)
+    return bare_scene(
+        rng.uniform(0, 0.02, (count, 3)) * [1.0, 1.0, 0.1] + [0.0, 0.0, 0.006],
+        velocity=rng.normal(0, 0.02, (count, 3)) + np.array([0.3, -0.2, -0.4]),
+        frames=4,
+        substeps=80,
+        drag=2.0,
+        gravity=9.81,
+        ground=0.0,
+    )
+
+
 def crossing_scene(**changes):
     """Let two springy sheets of nine nodes fly through each other at an angle, above the ground.
 

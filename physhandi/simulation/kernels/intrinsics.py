@@ -25,6 +25,23 @@ _SHARED = """
 #endif
 """.replace("COUNT", str(SHARED_SLOTS))
 
+# A kernel asks for dynamic shared memory by its tiles; the first one begins where this does.
+_LARGE_READ = """
+#if defined(__CUDA_ARCH__)
+    extern __shared__ float4 large_slots[];
+    const float4 found = large_slots[slot];
+    return wp::vec3(found.x, found.y, found.z);
+#else
+    return wp::vec3();
+#endif
+"""
+_LARGE_WRITE = """
+#if defined(__CUDA_ARCH__)
+    extern __shared__ float4 large_slots[];
+    large_slots[slot] = make_float4(value[0], value[1], value[2], 0.0f);
+#endif
+"""
+
 # A 16-byte access is one transaction: whoever sees the tag sees the three floats before it too,
 # so blocks can wait for each other's values without a barrier or a fence.
 _PUBLISH = """
@@ -49,6 +66,45 @@ _AWAIT = """
         __uint_as_float((unsigned int)high));
 #else
     return wp::vec3();
+#endif
+"""
+
+# Both loads are under way before the first is looked at.
+_AWAIT_BOTH = """
+#if defined(__CUDA_ARCH__)
+    unsigned long long low, high, next_low, next_high;
+    do {
+        asm volatile("{ .reg .b128 t, u; ld.relaxed.gpu.global.b128 t, [%4];"
+            " ld.relaxed.gpu.global.b128 u, [%4+16]; mov.b128 {%0, %1}, t; mov.b128 {%2, %3}, u; }"
+            : "=l"(low), "=l"(high), "=l"(next_low), "=l"(next_high)
+            : "l"((const float4*)relay.data + index) : "memory");
+    } while ((unsigned int)(high >> 32) != (unsigned int)tag
+        || (unsigned int)(next_high >> 32) != (unsigned int)tag);
+    wp::spatial_vector both;
+    both[0] = __uint_as_float((unsigned int)low);
+    both[1] = __uint_as_float((unsigned int)(low >> 32));
+    both[2] = __uint_as_float((unsigned int)high);
+    both[3] = __uint_as_float((unsigned int)next_low);
+    both[4] = __uint_as_float((unsigned int)(next_low >> 32));
+    both[5] = __uint_as_float((unsigned int)next_high);
+    return both;
+#else
+    return wp::spatial_vector();
+#endif
+"""
+
+_BITS_TO_FLOAT = """
+#if defined(__CUDA_ARCH__)
+    return __int_as_float(bits);
+#else
+    return 0.0f;
+#endif
+"""
+_FLOAT_TO_BITS = """
+#if defined(__CUDA_ARCH__)
+    return __float_as_int(value);
+#else
+    return 0;
 #endif
 """
 
@@ -107,6 +163,16 @@ def shared_write(slot: int, value: wp.vec3):
     shared(slot, wp.vec4(value[0], value[1], value[2], 0.0), True)
 
 
+@wp.func_native(snippet=_LARGE_READ)
+def large_read(slot: int) -> wp.vec3:
+    """Read a vector from the block's dynamic shared memory."""
+
+
+@wp.func_native(snippet=_LARGE_WRITE)
+def large_write(slot: int, value: wp.vec3):
+    """Write a vector to the block's dynamic shared memory."""
+
+
 @wp.func_native(snippet=_PUBLISH)
 def publish(relay: wp.array[wp.vec4], index: int, value: wp.vec3, tag: int):
     """Let other blocks see a value, under a tag that was never used for this index before."""
@@ -115,6 +181,21 @@ def publish(relay: wp.array[wp.vec4], index: int, value: wp.vec3, tag: int):
 @wp.func_native(snippet=_AWAIT)
 def wait_for(relay: wp.array[wp.vec4], index: int, tag: int) -> wp.vec3:
     """Wait until a value is there under a tag; all blocks of the launch must be resident."""
+
+
+@wp.func_native(snippet=_AWAIT_BOTH)
+def wait_for_both(relay: wp.array[wp.vec4], index: int, tag: int) -> wp.spatial_vector:
+    """Wait for two values that lie side by side; see `wait_for`."""
+
+
+@wp.func_native(snippet=_BITS_TO_FLOAT)
+def bits_to_float(bits: int) -> float:
+    """Return a float of the same bits, to be stored only."""
+
+
+@wp.func_native(snippet=_FLOAT_TO_BITS)
+def float_to_bits(value: float) -> int:
+    """Return the bits that `bits_to_float` was given."""
 
 
 @wp.func_native(snippet=_LANE_SUM)

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 from reference.blocks import PARAMETERS, as_scene, block_gradients, recorded, thrown_block
 from reference.gradients import directional_difference, gradients, loss_weights
-from reference.scenes import as_model, bare_scene, star_scene
+from reference.scenes import as_model, bare_scene, star_scene, tiny_scene
 from reference.spring_mass import simulate
 
 from physhandi.errors import SimulationDivergedError
@@ -110,19 +110,7 @@ def test_a_node_with_five_hundred_springs_agrees_with_the_oracle(threads):
 
 
 def test_rest_lengths_of_a_tenth_of_a_millimetre_agree_with_the_oracle():
-    rng = np.random.default_rng(4)
-    node = np.cumsum(rng.normal(0, 6e-5, (40, 3)), axis=0)
-    springs = [(i, i + 1) for i in range(39)] + [(i, i + 2) for i in range(38)]
-    scene = bare_scene(
-        node,
-        velocity=rng.normal(0, 1e-3, node.shape),
-        springs=springs,
-        rest=np.full(77, 1e-4),
-        stiffness=np.full(77, 1e-3),
-        damping=np.full(77, 0.01),
-        frames=3,
-        substeps=200,
-    )
+    scene = tiny_scene()
     position, _ = simulate(scene)
     rollout = simulator_of(*as_model(scene)).rollout(scene.control)
     assert np.abs(position[-1] - position[0]).max() > 2e-5

@@ -1,0 +1,73 @@
+"""Half-edges in reading order, against threads that read them one by one."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+from reference.scenes import as_model, star_scene
+
+from physhandi.simulation.columns import arrange_columns
+from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.partition import partition_model
+from physhandi.simulation.topology import build_model
+
+
+def block_model(count):
+    rng = np.random.default_rng(count)
+    node, control = rng.uniform(0, 0.1, (count, 3)), rng.uniform(0, 0.1, (12, 3))
+    parameters = SimulationParameters(virtual_connection_radius=0.03)
+    return build_model(node.astype(np.float32), control.astype(np.float32), parameters)
+
+
+MODELS = {"block": block_model(300), "star": as_model(star_scene())[0]}
+
+
+@pytest.mark.parametrize("lanes", [1, 2, 4, 8])
+@pytest.mark.parametrize("threads", [32, 96, 768])
+@pytest.mark.parametrize("name", MODELS)
+def test_threads_find_each_half_edge_of_their_nodes_once(name, threads, lanes):
+    model = MODELS[name]
+    partition = partition_model(model, 3)
+    columns = arrange_columns(partition, lanes, threads)
+    rows = threads // lanes
+    assert columns.chunk_count == -(-partition.most_own // rows)
+    read, padding = Counter(), 0
+    for block in range(partition.block_count):
+        first, last = partition.own_start[block : block + 2]
+        for chunk in range(columns.chunk_count):
+            for thread in range(threads):
+                group = (block * columns.chunk_count + chunk) * (threads // 32) + thread // 32
+                node = chunk * rows + thread // lanes
+                for slot in range(columns.start[group] + thread % 32, columns.start[group + 1], 32):
+                    if columns.spring[slot] == -1:
+                        assert columns.place[slot] == min(node, last - first - 1)
+                        padding += 1
+                    else:
+                        half_edge = columns.place[slot], columns.spring[slot]
+                        read[first + node, *half_edge] += 1
+    wanted = Counter(
+        (node, *half_edge)
+        for node in range(model.node_count)
+        for half_edge in map(tuple, partition.entry[slice(*partition.entry_start[node : node + 2])])
+    )
+    assert len(wanted) > 0
+    assert read == wanted
+    assert padding + len(wanted) == len(columns.place) == columns.start[-1]
+
+
+def test_threads_of_a_node_read_its_half_edges_in_turn():
+    partition = partition_model(MODELS["block"], 1)
+    columns = arrange_columns(partition, 4, 96)
+    read = [columns.place[k * 32 + lane] for k in range(20) for lane in range(4)]
+    degree = partition.entry_start[1]
+    assert degree > 8
+    assert np.array_equal(read[:degree], partition.entry[:degree, 0])
+
+
+def test_a_model_without_springs_has_no_columns():
+    parameters = SimulationParameters(connection_radius=0.001)
+    model = build_model(np.eye(3, dtype=np.float32), np.zeros((0, 3), np.float32), parameters)
+    columns = arrange_columns(partition_model(model, 2), 8, 768)
+    assert len(columns.place) == 0
+    assert np.all(columns.start == 0)
+    assert len(columns.start) == 2 * 24 + 1
