@@ -1,0 +1,160 @@
+"""What is read of a thing, against numbers that were computed by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from spring_world import content_of, two_springs
+from viewer_world import content_of as sheet_with_hands
+from viewer_world import controls
+
+from app.viewer.coloring import Legend, Painter
+from app.viewer.legend import legend_html, number, tick_values
+from app.viewer.over_time import HISTORIES, follow, unit_of
+from app.viewer.picking import Pick
+from app.viewer.quantities import QUANTITIES
+from app.viewer.readings import Readings
+
+
+@pytest.fixture
+def world():
+    take = two_springs()
+    content = content_of(take)
+    painter = Painter(content)
+    return take, content, painter, Readings(content, painter)
+
+
+def test_a_node_tells_its_state_and_what_holds_it(world):
+    take, _, _, readings = world
+    node = Pick(kind="node", index=0)
+    assert readings.title(node, take) == "object node 0"
+    rows = dict(readings.rows(node, take, 2, 2))
+    assert rows["position"] == "0, 0, 0 m"
+    assert rows["velocity"] == "0 m/s (0, 0, 0)"
+    # 2 · 40 · (1 / 0.5 - 1) = 80 N upwards, by the control above.
+    assert rows["force of the hand"] == "80 N (0, 0, 80)"
+    assert rows["held by"] == "control 0 (80 N)"
+    assert rows["stiffness"] == "20 N"
+    assert rows["damping"] == "2 N·s/m"
+    assert rows["strain"] == "20 %"
+    assert rows["difference"] == "0 mm"
+    assert rows["object springs"] == "1"
+    lonely = dict(readings.rows(Pick(kind="node", index=2), take, 2, 2))
+    assert lonely["held by"] == "nothing"
+    assert lonely["strain"] == "not known"
+    moving = dict(readings.rows(Pick(kind="node", index=1), take, 2, 2))
+    assert moving["velocity"].startswith("3 m/s (3, 0, 0)")
+
+
+def test_a_spring_tells_its_length_and_pull(world):
+    take, _, _, readings = world
+    own, virtual = (Pick(kind="spring", index=i) for i in (0, 1))
+    assert readings.title(own, take) == "object spring 0"
+    assert readings.title(virtual, take) == "virtual spring 1"
+    rows = dict(readings.rows(own, take, 2, 2))
+    assert rows["joins"] == "node 0 and node 1"
+    assert rows["length"] == "1200 mm, at rest 1000 mm"
+    assert rows["strain"] == "20 %"
+    # 2 · 10 · 0.2 + 2 · 3 as node 1 runs away.
+    assert rows["pull"] == "10 N"
+    rows = dict(readings.rows(virtual, take, 2, 2))
+    assert rows["joins"] == "control node 0 and node 0"
+    assert rows["pull"] == "80 N"
+    np.testing.assert_allclose(readings.place(virtual, take, 2, 2), [[0, 0, 1], [0, 0, 0]])
+
+
+def test_a_control_node_tells_what_it_holds(world):
+    take, _, _, readings = world
+    rows = dict(readings.rows(Pick(kind="control", index=0), take, 2, 2))
+    assert rows["position"] == "0, 0, 1 m"
+    assert rows["force on the object"] == "80 N (0, 0, 80)"
+    assert rows["holds"] == "node 0 (80 N)"
+    assert len(readings.links(Pick(kind="control", index=0), take, 2)) == 1
+
+
+def test_what_is_gone_after_a_change_of_springs_exists_no_more(world):
+    take, _, _, readings = world
+    assert readings.exists(Pick(kind="spring", index=1), take)
+    fewer = replace(
+        take.model,
+        spring_nodes=take.model.spring_nodes[:1],
+        rest_length=take.model.rest_length[:1],
+        stiffness=take.model.stiffness[:1],
+        damping=take.model.damping[:1],
+    )
+    assert not readings.exists(Pick(kind="spring", index=1), replace(take, model=fewer))
+    assert not readings.exists(Pick(kind="node", index=0), None)
+
+
+def test_histories_follow_one_thing_over_all_frames(world):
+    take, content, painter, _ = world
+
+    def of(kind, index, history):
+        unit, factor = unit_of(history, content, painter)
+        curve = follow(Pick(kind=kind, index=index), history, take, content, painter)
+        return unit, (factor * curve).tolist()
+
+    assert of("node", 1, "speed") == ("m/s", pytest.approx([3.0] * 4, rel=1e-5))
+    assert of("node", 1, "strain") == ("%", pytest.approx([0, 10, 20, 30], abs=1e-4))
+    assert of("spring", 0, "length") == ("mm", pytest.approx([1000, 1100, 1200, 1300]))
+    # 20 · strain + 2 · 3.
+    assert of("spring", 0, "force") == ("N", pytest.approx([6, 8, 10, 12], rel=1e-5))
+    assert of("node", 0, "force") == ("N", pytest.approx([80] * 4))
+    assert of("control", 0, "force") == ("N", pytest.approx([80] * 4))
+    assert of("control", 0, "height") == ("mm", pytest.approx([1000] * 4))
+    painter.reference = replace(take, position=take.position + np.float32([0, 0.3, 0.4]))
+    assert of("node", 1, "difference") == ("mm", pytest.approx([500] * 4))
+    for kind, histories in HISTORIES.items():
+        for history in histories:
+            if kind != "hand":
+                assert len(of(kind, 0, history)[1]) == 4
+
+
+def test_a_hand_s_vertex_is_the_control_node_that_it_is():
+    control = controls((0, 0, 1))
+    face = np.array([[0, 1, 2]], np.int32)
+    content = sheet_with_hands({"right": (control[0], face)}, control)
+    painter = Painter(content)
+    readings = Readings(content, painter)
+    vertex = Pick(kind="hand", index=7, side="right")
+    assert readings.settle(vertex) == Pick(kind="control", index=7)
+    title = readings.title(readings.settle(vertex), content.fitted)
+    assert title == "control node 7 (right hand, vertex 7)"
+    # Other points than the hand's vertices hold this one.
+    apart = sheet_with_hands({"right": (control[0] + 0.01, face)}, control)
+    readings = Readings(apart, Painter(apart))
+    assert readings.settle(vertex) == vertex
+    assert readings.title(vertex, apart.fitted) == "right hand, vertex 7"
+    assert dict(readings.rows(vertex, apart.fitted, 0, 0))["position"].endswith(" m")
+    speed = follow(vertex, "speed", apart.fitted, apart, painter)
+    np.testing.assert_array_equal(speed, np.zeros(len(control)))
+
+
+def legend(coloring, limits, **fields):
+    values = {"is_fixed": False, "unknown": 0, "is_known": True, "highest": 0.0, **fields}
+    return Legend(quantity=QUANTITIES[coloring], limits=limits, **values)
+
+
+def test_the_legend_has_even_ticks_in_the_quantity_s_unit():
+    assert tick_values(legend("error", (0.0, 0.02))) == pytest.approx([0, 5, 10, 15, 20])
+    assert tick_values(legend("strain", (-0.1, 0.1))) == pytest.approx([-10, -5, 0, 5, 10])
+    logarithmic = tick_values(legend("stiffness", (10.0, 1e5)))
+    assert logarithmic == pytest.approx([10, 100, 1000, 1e4, 1e5])
+
+
+def test_the_legend_says_what_is_not_known_and_what_is_highest():
+    said = legend_html(legend("error", (0.0, 0.02), unknown=3, highest=0.0123), highest=True)
+    assert "<b>Error</b><span>mm</span>" in said
+    assert "<span>15</span>" in said
+    assert "highest node now 12.3&nbsp;mm" in said
+    assert "3 nodes not known" in said
+    assert "rgb(72,23,105)" in said
+    nothing = legend_html(legend("error", (0.0, 0.02), is_known=False), highest=True)
+    assert "not known in this frame" in nothing
+    assert "highest" not in legend_html(legend("speed", (0.0, 1.0)), highest=False)
+    assert "color:black" not in said  # It takes the panel's own color of text.
+
+
+def test_numbers_are_short():
+    shown = [number(v) for v in (0.0, -1e-15, 1234.5, 12.345, 0.001234, 1.5e7, -2.5, 3e-9)]
+    assert shown == ["0", "0", "1230", "12.3", "0.00123", "1.5e7", "-2.5", "3e-9"]
