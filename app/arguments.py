@@ -191,17 +191,27 @@ class Export:
 
     run: Positional[str]
     """Folder or id of a finished run."""
-    format: Literal["ply", "gltf", "npz", "csv", "yaml"]
+    format: Literal["ply", "gltf", "npz", "csv", "yaml", "png", "zip", "viser", "html"]
     """ply: meshes and points per frame; gltf: one .glb that moves, hands skinned; npz and csv:
-    trajectories; yaml: parameters and metrics."""
+    trajectories; yaml: parameters and metrics; png: a picture; zip: a picture with all its data;
+    viser: a recording for viser's player; html: one file that plays in any browser."""
     out: Path
     """File or folder to write."""
     sequence: str | None = None
     """Which sequence of the run; none takes the first one."""
     frame: int | None = None
-    """Only this frame (ply)."""
+    """Only this frame (ply), or which one (png, zip)."""
+    link: str = ""
+    """Link of the viewer, or its part after "?": camera, layers, colors; parameters of the
+    simulation that it changes have the object simulated anew."""
+    width: int = 1280
+    """Width of a picture in pixels, 16 to 4096."""
+    height: int = 720
+    """Height of a picture in pixels, 16 to 4096."""
     overwrite: bool = False
     """Replace what is there."""
+    device: str = "auto"
+    """Warp device for simulating anew: auto, cpu, cuda or cuda:0."""
     data_dir: DataDir = None
 
 

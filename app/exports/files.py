@@ -83,7 +83,7 @@ def create_files(catalog: Catalog, sessions: Sessions, workshop: Workshop) -> AP
             return _simple(catalog, run_id, kind, sequence, f)
         if kind == "yaml":
             raise UsageError("format: yaml describes the run itself; leave changed parameters out.")
-        order = order_of(catalog, "run", run_id, kind, query)
+        order = order_of(catalog, catalog.run(run_id), kind, query)
         path = workshop.make(replace(order, width=width, height=height))
         return _answer(path, run_id, kind, query)
 
@@ -109,7 +109,7 @@ def create_files(catalog: Catalog, sessions: Sessions, workshop: Workshop) -> AP
         query = state_to_query(state)
         if "theme" not in query and state.prefers_dark:
             query["theme"] = "dark"
-        order = order_of(catalog, session.kind, session.target, kind, query)
+        order = _order_of_scene(catalog, session, kind, query)
         order = replace(order, width=width, height=height, link=snapshot.link)
         take = snapshot.take
         if take is None:
@@ -122,44 +122,51 @@ def create_files(catalog: Catalog, sessions: Sessions, workshop: Workshop) -> AP
 
 def order_of(
     catalog: Catalog,
-    kind: str,
-    target: str,
+    run: Run,
     format: Any,  # noqa: A002
     query: Mapping[str, str],
 ) -> Order:
-    """Describe a file of a run or a sequence.
+    """Describe a file of a run.
 
     Args:
-        catalog: Finds it.
-        kind: What `target` is the id of, ``run`` or ``sequence``.
-        target: Id of the run or the sequence.
+        catalog: Finds recordings that have moved.
+        run: The run.
         format: Which kind of file.
         query: What a link would say of it.
 
     Raises:
-        PhysHandiError: If there is no such run, or it is not finished.
+        RunError: If the run is not finished.
+        UsageError: If it has no such sequence or frame; names the field.
     """
-    if kind == "sequence":
-        folder = catalog.sequence_item(target).folder
-        return Order(kind="sequence", folder=str(folder), format=format, query=query)
-    run = catalog.run(target)
     if not run.is_published:
-        raise RunError(f"Run '{target}' is {run.state}: there is nothing to export yet.")
+        raise RunError(f"Run '{run.id}' is {run.state}: there is nothing to export yet.")
+    _check_frame(run, query)
     recordings: dict[str, str] = {}
     for name in run.sequence_names:
         try:
             recordings[name] = str(catalog.sequence_item(name).folder)
         except PhysHandiError:
             continue  # A run can be looked at without its recording.
-    _check_frame(run, query)
     return Order(
         kind="run",
         folder=str(run.folder),
         format=format,
         query=query,
         recordings=recordings,
-        link=address("run", target, query),
+        link=address("run", run.id, query),
     )
+
+
+def _order_of_scene(
+    catalog: Catalog,
+    session: Session,
+    format: Any,  # noqa: A002
+    query: Mapping[str, str],
+) -> Order:
+    if session.kind == "run":
+        return order_of(catalog, catalog.run(session.target), format, query)
+    folder = catalog.sequence_item(session.target).folder
+    return Order(kind="sequence", folder=str(folder), format=format, query=query)
 
 
 def _check_frame(run: Run, query: Mapping[str, str]) -> None:

@@ -62,7 +62,7 @@ def create_replays(catalog: Catalog, workshop: Workshop, pages: Pages) -> APIRou
 
     def order(run_id: str, sequence: str | None, theme: str) -> Order:
         query = {"sequence": sequence} if sequence else {}
-        return order_of(catalog, "run", run_id, "viser", query | {"theme": theme})
+        return order_of(catalog, catalog.run(run_id), "viser", query | {"theme": theme})
 
     @router.get("/runs/{run_id}/replay", include_in_schema=False)
     def show_page(run_id: Id, request: Request) -> HTMLResponse:

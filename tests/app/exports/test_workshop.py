@@ -21,7 +21,7 @@ from physhandi.errors import RunError, UsageError
 
 @pytest.fixture
 def order(world: World) -> Order:
-    return order_of(world.catalog, "run", "fitted", "png", {"f": "2"})
+    return order_of(world.catalog, world.catalog.run("fitted"), "png", {"f": "2"})
 
 
 def pretend(

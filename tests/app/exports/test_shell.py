@@ -1,0 +1,87 @@
+"""Exports as the command line makes them."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from server_world import World
+from viser_file import Recording
+
+from app.cli import main
+from app.exports.shell import Wish, export, read_link
+from physhandi.data.run import Run
+from physhandi.errors import UsageError
+
+
+def test_the_command_paints_what_a_link_shows(world: World, tmp_path: Path) -> None:
+    out, data = tmp_path / "new" / "view.png", str(world.settings.data_dir)
+    link = "http://127.0.0.1:8080/runs/fitted/view?f=3&show=nodes&theme=dark"
+    size = ["--width", "160", "--height", "120"]
+    order = ["export", "fitted", "--format", "png", "--out", str(out), "--data-dir", data]
+    with pytest.raises(SystemExit) as end:
+        main([*order, "--link", link, *size])
+    assert end.value.code in {0, None}
+    image = cv2.imread(str(out))
+    assert image is not None
+    assert image.shape == (120, 160, 3)
+    assert image[0, 0].max() < 40
+    assert ((image[..., 0].astype(int) - image[..., 2]) > 100).any()
+
+
+def test_a_link_that_changes_parameters_is_simulated(
+    world: World, run: Run, tmp_path: Path
+) -> None:
+    wish = Wish(format="npz", out=tmp_path / "a.npz", link="drag=9&f=3")
+    with np.load(export(run, wish, world.catalog)) as arrays:
+        changed = arrays["rollout"]
+    plain = replace(wish, link="f=3", out=tmp_path / "b.npz")
+    with np.load(export(run, plain, world.catalog)) as arrays:
+        fitted = arrays["rollout"]
+    np.testing.assert_array_equal(fitted, run.array("sequences/sheet/rollout.npy"))
+    assert np.abs(changed - fitted).max() > 1e-3
+    replay = replace(wish, format="viser", out=tmp_path / "a.viser")
+    recording = Recording.read(export(run, replay, world.catalog).read_bytes())
+    shown = recording.at(9)["/object/nodes"]["points"].reshape(-1, 3)
+    np.testing.assert_allclose(shown, changed[-1], atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("changes", "word"),
+    [
+        ({"link": "drag=-1"}, "drag"),
+        ({"link": "f=1&f=2"}, "f: the link has this field twice"),
+        ({"format": "yaml", "link": "drag=1"}, "yaml describes the run"),
+        ({"format": "html", "frame": 1}, "not as html"),
+        ({"format": "png", "frame": 10}, "frames 0 to 9"),
+        ({"format": "png", "width": 5_000}, "width"),
+        ({"format": "png", "out": "x.jpg"}, "does not end in '.png'"),
+        ({"format": "png", "sequence": "walk"}, "walk"),
+    ],
+)
+def test_what_cannot_be_made_is_refused_and_writes_nothing(
+    world: World, run: Run, tmp_path: Path, changes: dict[str, object], word: str
+) -> None:
+    named = {"format": "png", "out": tmp_path / "x.png"} | changes
+    named["out"] = tmp_path / str(named["out"])
+    with pytest.raises(UsageError, match=word):
+        export(run, Wish(**named), world.catalog)
+    assert [path.name for path in tmp_path.iterdir()] == ["data"]
+
+
+def test_nothing_is_overwritten_unasked(world: World, run: Run, tmp_path: Path) -> None:
+    wish = Wish(format="png", out=tmp_path / "x.png", width=32, height=32)
+    wish.out.write_text("precious")
+    with pytest.raises(UsageError, match="exists already"):
+        export(run, wish, world.catalog)
+    assert wish.out.read_text() == "precious"
+    export(run, replace(wish, overwrite=True), world.catalog)
+    assert wish.out.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_token_in_a_link_is_dropped() -> None:
+    link = "https://host/runs/x/view?token=secret&f=3&show="
+    assert dict(read_link(link)) == {"f": "3", "show": ""}
+    assert dict(read_link("f=3")) == {"f": "3"}
+    assert dict(read_link("")) == {}
