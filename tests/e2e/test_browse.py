@@ -1,0 +1,125 @@
+"""Finding runs among others and laying them side by side, in a real browser."""
+
+import re
+import shutil
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from playwright.sync_api import Page, expect
+
+pytestmark = pytest.mark.e2e
+BUNDLED = Path(__file__).parents[2] / "sequences"
+NAMES = ("Soft towel", "Stiff towel")
+
+
+@pytest.fixture
+def base(home: Page, served) -> str:
+    """The server's address; two copies of the bundled run lie in its data folder."""
+    source = BUNDLED / "runs" / "towel_fold_quick"
+    for number, name in enumerate(NAMES):
+        folder = served.data_dir / "runs" / f"copy{number}"
+        if not folder.exists():
+            shutil.copytree(source, folder)
+            job, about = folder / "job.yaml", folder / "run.yaml"
+            job.write_text(job.read_text().replace("../../towel_fold", str(BUNDLED / "towel_fold")))
+            about.write_text(about.read_text().replace("Towel fold, fitted", name))
+    parameters = served.data_dir / "runs" / "copy1" / "attempts/1/out/object/parameters.yaml"
+    parameters.write_text(re.sub(r"(?m)^drag: .*", "drag: 1.25", parameters.read_text()))
+    return re.match(r"https?://[^/]+", home.url)[0]
+
+
+def rows(page: Page) -> list[str]:
+    return page.locator("#runs tbody .name strong").all_inner_texts()
+
+
+def test_runs_are_filtered_sorted_chosen_and_compared(home: Page, base: str) -> None:
+    home.goto(f"{base}/runs")
+    expect(home.locator("#runs tbody tr")).to_have_count(3)
+    home.keyboard.press("/")
+    expect(home.locator("#q")).to_be_focused()
+    home.keyboard.type("towel -is:bundled")
+    expect(home.locator("#runs tbody tr")).to_have_count(2)
+    expect(home).to_have_url(f"{base}/runs?q=towel+-is%3Abundled")
+    expect(home.get_by_role("status").first).to_contain_text("2 of 3 runs")
+    home.get_by_role("columnheader", name="Run").get_by_role("link").click()
+    expect(home.locator(".col-name")).to_have_attribute("aria-sort", "ascending")
+    assert rows(home) == ["Soft towel", "Stiff towel"]
+    home.get_by_label("Sort").select_option("-created")
+    expect(home).to_have_url(re.compile(r"sort=-created"))
+    home.get_by_role("columnheader", name="Run").get_by_role("link").click()
+    expect(home.locator(".col-name")).to_have_attribute("aria-sort", "ascending")
+    home.get_by_role("columnheader", name="Run").get_by_role("link").click()
+    expect(home.locator(".col-name")).to_have_attribute("aria-sort", "descending")
+    assert rows(home) == ["Stiff towel", "Soft towel"]
+    home.go_back()
+    expect(home.locator(".col-name")).to_have_attribute("aria-sort", "ascending")
+    expect(home.locator("#q")).to_have_value("towel -is:bundled")
+
+    # What is chosen stays chosen while the list changes around it.
+    home.get_by_label("Choose Stiff towel").check()
+    home.locator("#q").fill("soft")
+    expect(home.locator("#runs tbody tr")).to_have_count(1)
+    home.get_by_label("Choose Soft towel").check()
+    expect(home.locator("[data-chosen-text]")).to_have_text("2 runs chosen")
+    home.get_by_role("button", name="Compare parameters and scores").click()
+    expect(home).to_have_url(f"{base}/diff?run=copy1&run=copy0")
+    table = home.locator("table.diff")
+    expect(table.locator("thead strong")).to_have_text(["Stiff towel", "Soft towel"])
+    drag = table.locator("tbody tr", has=home.get_by_text("drag", exact=True))
+    expect(drag.locator("td").first).to_have_text("1.25")
+    expect(table.get_by_text("max neighbors", exact=True)).to_have_count(0)
+    home.get_by_role("link", name=re.compile("^Everything")).click()
+    expect(table.get_by_text("max neighbors", exact=True)).not_to_have_count(0)
+    expect(drag).to_have_class("changed")
+
+
+def test_a_picture_appears_when_it_is_made_and_moves_while_it_is_pointed_at(
+    home: Page, base: str
+) -> None:
+    home.goto(f"{base}/sequences")
+    card = home.locator("article[data-sequence=towel_fold]")
+    moving = card.locator("img.moving")
+    expect(card.locator("img.still")).to_be_visible()
+    expect(moving).to_have_count(1)
+    expect(moving).to_be_hidden()
+    card.hover()
+    expect(moving).to_be_visible()
+    expect(card.locator(".shot")).to_have_class(re.compile("is-loaded"))
+    shown = []
+    for _ in range(2):
+        shown.append(card.locator(".shot").screenshot())
+        time.sleep(0.4)
+    assert shown[0] != shown[1]
+    home.emulate_media(reduced_motion="reduce")
+    expect(moving).to_be_hidden()
+    assert np.frombuffer(shown[0][:8], np.uint8)[0] == 0x89
+    home.mouse.move(0, 0)
+    home.emulate_media(reduced_motion="no-preference")
+    expect(moving).to_be_hidden()
+    card.get_by_role("button", name="Launch fit").focus()
+    expect(moving).to_be_visible()
+
+
+def test_lists_work_without_scripts_and_on_a_phone(home: Page, base: str, browser) -> None:
+    cookies = home.context.cookies()
+    plain = browser.new_context(java_script_enabled=False, viewport={"width": 390, "height": 800})
+    try:
+        plain.add_cookies(cookies)
+        page = plain.new_page()
+        page.goto(f"{base}/runs")
+        page.get_by_placeholder("Filter by name").fill("stiff")
+        page.get_by_role("button", name="Filter", exact=True).click()
+        expect(page.locator("#runs tbody tr")).to_have_count(1)
+        page.get_by_role("link", name="clear the filter").click()
+        page.get_by_label("Choose Stiff towel").check()
+        page.get_by_label("Choose Soft towel").check()
+        page.get_by_role("button", name="Compare parameters and scores").click()
+        expect(page.locator("table.diff thead th")).to_have_count(3)
+        for path in ("/", "/runs", "/sequences", "/diff?run=copy0&run=copy1"):
+            page.goto(f"{base}{path}")
+            width = page.locator("body").bounding_box()["width"]
+            assert page.locator("main").bounding_box()["width"] <= width <= 390
+    finally:
+        plain.close()
