@@ -15,8 +15,8 @@ from physhandi.simulation.kernels.dataflow_large import (
 from physhandi.simulation.partition import Partition
 from physhandi.simulation.stage import Stage
 
-BLOCK_SIZES = {512: 16, 768: 6}
-"""Threads of a block, and the most half-edges for which each has registers (80 of 65,536 / 768)."""
+BLOCK_SIZES = {512: 14, 768: 6}
+"""Threads of a block, and the most half-edges for which each has registers."""
 LANES = (8, 4, 2, 1)
 """Threads that may sum one node's springs."""
 LOCALS_STEP = 512

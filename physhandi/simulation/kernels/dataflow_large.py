@@ -20,6 +20,7 @@ from physhandi.simulation.kernels.intrinsics import (
     large_read,
     large_write,
     publish,
+    read_four,
     wait_for_both,
 )
 from physhandi.simulation.kernels.world import World
@@ -118,7 +119,7 @@ def make_large_frame_kernel(lanes: int, kept: int, threads: int, locals_: int) -
         for k in range(wp.static(kept)):
             index[k] = wp.min(row, own - 1)
             if kept_first + 32 * k < kept_last:
-                half_edge = packed[kept_first + 32 * k + warp_lane]
+                half_edge = read_four(packed, kept_first + 32 * k + warp_lane)
                 index[k] = float_to_bits(half_edge[0])
                 rest[k] = half_edge[1]
                 hooke[k] = half_edge[2]
@@ -169,7 +170,7 @@ def make_large_frame_kernel(lanes: int, kept: int, threads: int, locals_: int) -
                         stretch = large_read(now + wp.static(locals_) + index[k]) - v
                         force += pull(offset, stretch, rest[k], hooke[k], dashpot[k])
                 for slot in range(begin + warp_lane, end, 32):
-                    half_edge = packed[slot]
+                    half_edge = read_four(packed, slot)
                     other = float_to_bits(half_edge[0])
                     offset = large_read(now + other) - x
                     stretch = large_read(now + wp.static(locals_) + other) - v

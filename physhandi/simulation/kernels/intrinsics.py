@@ -93,6 +93,16 @@ _AWAIT_BOTH = """
 #endif
 """
 
+# Warp's own load of four floats is four loads: it does not know that they are aligned.
+_READ_FOUR = """
+#if defined(__CUDA_ARCH__)
+    const float4 found = ((const float4*)values.data)[index];
+    return wp::vec4(found.x, found.y, found.z, found.w);
+#else
+    return values.data[index];
+#endif
+"""
+
 _BITS_TO_FLOAT = """
 #if defined(__CUDA_ARCH__)
     return __int_as_float(bits);
@@ -186,6 +196,11 @@ def wait_for(relay: wp.array[wp.vec4], index: int, tag: int) -> wp.vec3:
 @wp.func_native(snippet=_AWAIT_BOTH)
 def wait_for_both(relay: wp.array[wp.vec4], index: int, tag: int) -> wp.spatial_vector:
     """Wait for two values that lie side by side; see `wait_for`."""
+
+
+@wp.func_native(snippet=_READ_FOUR)
+def read_four(values: wp.array[wp.vec4], index: int) -> wp.vec4:
+    """Read four floats at once from an array that begins at a multiple of 16 bytes."""
 
 
 @wp.func_native(snippet=_BITS_TO_FLOAT)

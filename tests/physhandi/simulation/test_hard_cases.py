@@ -82,7 +82,7 @@ def test_every_adjoint_agrees_with_central_differences_of_the_oracle(
         monkeypatch.setattr(DataflowAdjoint, "of", lambda *_: None)
         monkeypatch.setattr(ThreadedAdjoint, "of", lambda *_: None)
     scene = SCENES[case][0]()
-    scene = replace(scene, control=scene.control[:2], substeps=min(scene.substeps, 80))
+    scene = replace(scene, control=scene.control[:2], substeps=min(scene.substeps, 30))
     weights = loss_weights(scene)
     found = gradients(scene, device, weights)
     rng = np.random.default_rng(2)
