@@ -54,6 +54,14 @@ class ScenePage:
         field.fill(f"{value:g}")
         field.press("Enter")
 
+    def write(self, label: str, text: str) -> None:
+        """Type into a field for text."""
+        row = self.panel.locator("label", has_text=re.compile(f"^{re.escape(label)}$"))
+        row = row.locator("xpath=ancestor::div[contains(@class, 'mantine-Flex-root')][1]")
+        field = row.locator("input")
+        field.fill(text)
+        field.press("Enter")
+
     def press(self, name: str) -> None:
         self.panel.get_by_role("button", name=name, exact=True).click()
 
