@@ -29,6 +29,7 @@ _SAME_HAND = 1e-5
 _HAND_OPACITY = 0.4
 _PLAYING_OBSERVED = 1_000
 _ROOT = "/compare"
+_GROUND = f"{_ROOT}/ground"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -127,9 +128,9 @@ class CompareDrawing:
             self._captions = {name: half.side.caption for name, half in halves.items()}
             if not self._is_ground_laid:
                 self._is_ground_laid = True
-                add_ground(self._nodes, self._content, self._framing)
-            self._nodes.show("/ground", is_visible=layers.ground)
-            self._nodes.color_ground("/ground", is_dark=layers.dark)
+                add_ground(self._nodes, self._content, self._framing, _GROUND)
+            self._nodes.show(_GROUND, is_visible=layers.ground)
+            self._nodes.color_ground(_GROUND, is_dark=layers.dark)
             self._place()
             for name, half in halves.items():
                 is_shown = look.strength(name) > 0.0
@@ -151,6 +152,8 @@ class CompareDrawing:
         shown = replace(
             layers,
             nodes=False,
+            surface=False,
+            color="plain",
             all_controls=False,
             controls=layers.controls and is_strong,
             virtual_springs=layers.virtual_springs and is_strong,

@@ -1,6 +1,7 @@
 """The panel of a comparison: how both are shown, what the colors mean, and the difference."""
 
 from collections.abc import Callable
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -188,7 +189,7 @@ class ComparePanel:
         elif self._curve.way is not None:
             said.append("measuring the difference …")
         said += [plain(_COMPARED[self._curve.way])] if self._curve.way else []
-        return said + [f"<em>{plain_sentence(note)}</em>" for note in self._notes]
+        return said + [f"<em>{escape(note)}</em>" for note in self._notes]
 
     def _ramp(self) -> str:
         """Draw the color scale with numbers below it."""
@@ -229,11 +230,6 @@ class ComparePanel:
         at = min(self._tick, count - 1)
         now[at] = max(padded[1][at], float(padded[1].max(initial=0.0)) * 0.5)
         return tuple(curve[:shown] for curve in (tick, *padded, now))
-
-
-def plain_sentence(text: str) -> str:
-    """Strip a sentence of ours, which may hold a name, of what HTML could give a meaning."""
-    return " ".join(plain(part) for part in text.split(" "))
 
 
 def _mark(color: str) -> str:

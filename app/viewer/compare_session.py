@@ -154,11 +154,6 @@ class CompareSession:
                 link=self.link,
             )
 
-    def seek(self, frame: int) -> None:
-        """Stop at a tick of the clock."""
-        self._playback.play(on=False)
-        self._playback.seek(frame)
-
     def close(self) -> None:
         """Stop clock, measuring and server."""
         self._playback.close()

@@ -50,7 +50,10 @@ class FigureMode:
         self._mailbox = f"{session}/figure"
         self._redraw = redraw
         self._lock = threading.RLock()
-        self._cameras = FigureCameras()
+        self.cameras = FigureCameras()
+        """Where the clients' cameras stood before they were moved."""
+        self.before_entering: Callable[[], None] = lambda: None
+        """Called before the figure is shown; another mode that moves cameras leaves then."""
         self._is_on = False
         self._content: Content | None = None
         self._figure: Figure | None = None
@@ -99,6 +102,7 @@ class FigureMode:
             if self._is_on:
                 self._leave()
             elif self._figure is not None:
+                self.before_entering()
                 self._enter()
         self._redraw()
 
@@ -140,12 +144,12 @@ class FigureMode:
     def part(self, client: viser.ClientHandle) -> Pose:
         """Forget a client; returns where its camera stands in the scene."""
         with self._lock:
-            return self._cameras.forget(client)
+            return self.cameras.forget(client)
 
     def pose(self) -> Pose | None:
         """Where the first client's camera stands in the scene; None without clients."""
         clients = list(self._server.get_clients().values())
-        return self._cameras.before(clients[0]) if clients else None
+        return self.cameras.before(clients[0]) if clients else None
 
     def turn(self, client: viser.ClientHandle) -> None:
         """Let the halves follow a client's camera."""
@@ -170,6 +174,11 @@ class FigureMode:
         if figure is None:
             raise MissingInputError("There is no figure to save; this run has no fitted object.")
         return picture_of_figure(client, figure.box(Eye.of(client.camera.wxyz)))
+
+    @property
+    def framed_picture(self) -> Callable[[viser.ClientHandle], dict[str, Any]] | None:
+        """Finds the picture's camera; the figure always has one of its own."""
+        return self.picture
 
     def _caption(self, name: str, take: Take) -> str:
         parameters, content = take.parameters, self._content
@@ -214,14 +223,14 @@ class FigureMode:
         self._is_on = False
         self._button.label = _OFF
         self._text.visible = False
-        self._cameras.restore(self._server)
+        self.cameras.restore(self._server)
 
     def _aim(self, client: viser.ClientHandle, pose: Pose) -> None:
         """Show the whole figure to a client."""
         figure = self._figure
         if figure is not None:
             eye = Eye.at(pose)
-            self._cameras.aim(client, pose, figure.box(eye))
+            self.cameras.aim(client, pose, figure.box(eye))
             figure.turn(eye)
 
     def _hear(self, kind: str, _: int) -> None:

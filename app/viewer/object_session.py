@@ -91,6 +91,11 @@ class ObjectSession:
         """Find the rollout to show in a frame, and which of its frames."""
         return self._resimulation.at(frame)
 
+    @property
+    def newest(self) -> Take:
+        """The rollout that was asked for last, as far as it is there."""
+        return self._resimulation.newest
+
     def show(self, frame: int, *, is_playing: bool) -> None:
         """Tell the panel which frame is on the screen."""
         self._errors.show(frame, is_playing=is_playing)

@@ -212,8 +212,10 @@ class Scene:
         return replace(budget, nodes=most)
 
 
-def add_ground(nodes: SceneNodes, content: Content, framing: Framing) -> None:
-    """Draw the grid of ``/ground``; below everything if the ground is not known."""
+def add_ground(
+    nodes: SceneNodes, content: Content, framing: Framing, name: str = "/ground"
+) -> None:
+    """Draw a grid on the ground; below everything if the ground is not known."""
     height, extent = content.ground_height, framing.extent
     if height is None:
         height = framing.low - 0.02 * extent
@@ -221,4 +223,4 @@ def add_ground(nodes: SceneNodes, content: Content, framing: Framing) -> None:
     cell = max(step * power for step in (1, 2, 5) if step * power <= extent / 3)
     x, y = (round(float(framing.center[axis]) / cell) * cell for axis in (0, 1))
     count = int(np.ceil(4 * extent / cell))
-    nodes.ground("/ground", (x, y, float(height) - 0.001 * extent), cell, count)
+    nodes.ground(name, (x, y, float(height) - 0.001 * extent), cell, count)

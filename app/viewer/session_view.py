@@ -20,6 +20,7 @@ from app.viewer.keep_panel import Keeping
 from app.viewer.live import LiveSimulation
 from app.viewer.object_session import ObjectSession
 from app.viewer.panels import LayersPanel, TimelinePanel
+from app.viewer.pin_mode import PinMode
 from app.viewer.playback import Playback
 from app.viewer.restoring import complete_state, differences
 from app.viewer.scene import Scene
@@ -163,6 +164,7 @@ class Session:
         if self._object is not None:
             self._object.close()
         self._figure.close()
+        self._pin.close()
         self._server.stop()
         for view in self._content.views:
             view.close()
@@ -183,6 +185,7 @@ class Session:
         self._timeline = TimelinePanel(server, self._playback, guard)
         self._strip = FrameStrip(server, self._timeline.behind_slider)
         self._figure = FigureMode(server, guard, self._live, self.id, self._playback.redraw)
+        self._pin = PinMode(server, guard, self._figure, self._newest, self._playback.redraw)
         self._inspection = Inspection(
             server,
             guard,
@@ -202,10 +205,11 @@ class Session:
         content = self._content
         framing = frame_content(content)
         scene = Scene(self._server, content, framing)
-        self._stage = Stage(scene, self._figure)
+        self._stage = Stage(scene, self._figure, self._pin)
         self._layers.replace(content, scene.layers, framing, has_surface=scene.may_have_surface)
         self._inspection.replace(content, scene, framing)
         run = self._catalog.run(self.target) if self.kind == "run" else None
+        self._pin.offer(content, framing)
         self._figure.offer(content, framing, run.folder if run is not None else None)
         if content.fitted is None or run is None:
             return
@@ -256,8 +260,9 @@ class Session:
     def _welcome(self, client: viser.ClientHandle) -> None:
         """Start playing when the first client is there, and follow its camera."""
         self._seen = time.monotonic()
-        self._figure.welcome(client)
-        client.camera.on_update(self._guard(lambda _: self._figure.turn(client)))
+        for mode in (self._figure, self._pin):
+            mode.welcome(client)
+            client.camera.on_update(self._guard(lambda _, turn=mode.turn: turn(client)))
         if not self._has_played:
             self._has_played = True
             self._playback.play()
@@ -283,11 +288,15 @@ class Session:
                 frame,
                 take_frame,
                 is_playing=is_playing,
-                is_hidden=self._figure.is_on and take is not None,
+                is_hidden=(self._figure.is_on or self._pin.is_on) and take is not None,
             )
             if self._object is not None:
                 self._object.show(frame, is_playing=is_playing)
         self._server.flush()  # viser would wait for more, up to 17 ms.
+
+    def _newest(self) -> Take | None:
+        """Find the rollout that was asked for last, as far as it is there."""
+        return self._object.newest if self._object is not None else self._content.fitted
 
     def _take(self, frame: int) -> tuple[Take | None, int]:
         """Find the rollout to show in a frame, and which of its frames."""
