@@ -1,0 +1,125 @@
+"""Links, pictures, archives and replays in a real browser."""
+
+import io
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import cv2
+import numpy as np
+import pytest
+from gltf_player import Player
+from playwright.sync_api import BrowserContext, Page, expect
+from scene_page import ScenePage
+
+pytestmark = pytest.mark.e2e
+BUNDLED = Path(__file__).parents[2] / "sequences/runs/towel_fold_quick"
+FRAME = 30
+CAMERA = "0.45,-0.7,0.55,0.02,0.01,0.08"
+# Large blue disks, so that the two painters can be compared.
+LINK = f"f={FRAME}&cam={CAMERA}&fov=40&show=nodes&theme=light&stiffness_scale=0.5"
+
+
+def blue(image: np.ndarray) -> np.ndarray:
+    return (image[..., 0].astype(int) - image[..., 2]) > 70
+
+
+def places(position: np.ndarray, camera: dict[str, Any], shape: Any) -> tuple[Any, Any]:
+    """Rows and columns where a camera sees points, as far as they are in the picture."""
+    local = np.linalg.inv(camera["T_world_camera"]) @ np.c_[position, np.ones(len(position))].T
+    pixel = (np.array(camera["K"]) @ local[:3] / local[2])[:2].T
+    inside = ((pixel > 5) & (pixel < np.array(shape[1::-1]) - 5)).all(axis=1)
+    column, row = np.round(pixel[inside]).astype(int).T
+    return row, column
+
+
+@pytest.fixture
+def base(home: Page) -> str:
+    place = urlsplit(home.url)
+    return f"{place.scheme}://{place.netloc}"
+
+
+def test_a_link_opens_a_scene_whose_files_agree_with_the_server_s(
+    home: Page, base: str, context: BrowserContext, tmp_path: Path
+) -> None:
+    context.grant_permissions(["clipboard-read", "clipboard-write"])
+    home.goto(f"{base}/runs/towel_fold_quick/view?{LINK}")
+    scene = ScenePage(home)
+    scene.until(lambda: scene.difference() is not None, "the simulation of the link")
+    assert scene.value("Frame") == FRAME
+    assert scene.value("stiffness 10^") == pytest.approx(np.log10(0.5), abs=0.01)
+
+    home.get_by_role("button", name="Copy link").click()
+    expect(home.locator("#toast")).to_contain_text("Link copied")
+    copied = urlsplit(home.evaluate("navigator.clipboard.readText()"))
+    assert copied.path == "/runs/towel_fold_quick/view"
+    told, asked = parse_qs(copied.query), parse_qs(LINK)
+    assert told["cam"] == asked["cam"]
+    assert told["stiffness_scale"] == ["0.5"]
+    home.wait_for_function("location.search.includes('cam=')")
+    assert parse_qs(urlsplit(home.url).query) == told
+
+    scene.unfold("Export")
+    with zipfile.ZipFile(scene.download("ZIP", tmp_path)) as archive:
+        names = set(archive.namelist())
+        seen = cv2.imdecode(np.frombuffer(archive.read("picture.png"), np.uint8), 1)
+        camera = json.loads(archive.read("camera.json"))["picture"]
+        with np.load(io.BytesIO(archive.read("frame.npz"))) as arrays:
+            position = arrays["position"]
+        link = archive.read("permalink.txt").decode().strip()
+    assert {"README.txt", "nodes.csv", "springs.csv", "forces.csv"} <= names
+    assert any(name.startswith("views/") for name in names)
+    assert parse_qs(urlsplit(link).query)["f"] == [str(FRAME)]
+    played = Player(scene.download("GLB", tmp_path)).vertices("object", FRAME)
+    np.testing.assert_allclose(played, position, atol=1e-6)
+    fitted = np.load(next(BUNDLED.rglob("rollout.npy")))[FRAME]
+    assert np.abs(position - fitted).max() > 1e-3
+
+    size = f"width={seen.shape[1]}&height={seen.shape[0]}"
+    session = urlsplit(home.url).path.removeprefix("/live/")
+    answer = context.request.get(f"{base}/api/v1/sessions/{session}/export?format=png&{size}")
+    painted = cv2.imdecode(np.frombuffer(answer.body(), np.uint8), 1)
+    ours, theirs = blue(painted), blue(seen)
+    assert theirs.sum() > 2_000
+    assert (ours & theirs).sum() / (ours | theirs).sum() > 0.85
+    assert theirs[*places(position, camera, seen.shape)].mean() > 0.97
+
+
+def test_a_replay_plays_without_a_session_and_from_one_file(
+    home: Page, base: str, context: BrowserContext, served: Any, tmp_path: Path
+) -> None:
+    home.goto(f"{base}/runs/towel_fold_quick/replay")
+    player = home.frame_locator("#scene")
+    time = player.locator("input.mantine-NumberInput-input")
+    time.wait_for()
+    first = time.input_value()
+    home.wait_for_function(
+        "first => document.getElementById('scene').contentDocument"
+        ".querySelector('input.mantine-NumberInput-input').value !== first",
+        arg=first,
+    )
+    home.keyboard.press("Space")
+    home.wait_for_timeout(300)
+    paused = time.input_value()
+    home.wait_for_timeout(500)
+    assert time.input_value() == paused
+    image = cv2.imdecode(np.frombuffer(home.screenshot(), np.uint8), 1)
+    assert blue(image).sum() > 1_000
+    (cached,) = (served.data_dir / "cache" / "exports").glob("towel_fold_quick-*.viser")
+    assert cached.stat().st_size < 60 / 300 * 20e6
+
+    home.locator("summary", has_text="Save").click()
+    with home.expect_download() as download:
+        home.get_by_role("link", name="One HTML file").click()
+    page = tmp_path / "replay.html"
+    download.value.save_as(page)
+    context.set_offline(True)
+    alone = context.new_page()
+    alone.goto(page.as_uri())
+    alone.locator("input.mantine-NumberInput-input").wait_for()
+    alone.wait_for_timeout(1_500)
+    image = cv2.imdecode(np.frombuffer(alone.screenshot(), np.uint8), 1)
+    assert blue(image).sum() > 1_000
+    context.set_offline(False)
