@@ -10,13 +10,12 @@ from pydantic import ValidationError
 from app.arguments import ImportMano, ImportMocap, ImportPhystwin, ImportStereo
 from app.jobs.catalog import Catalog
 from app.settings import Settings
-from physhandi import pipeline
 from physhandi.data.atomic import plain, without_non_finite
 from physhandi.data.run import Run, RunKind
 from physhandi.data.sequence import Sequence
 from physhandi.errors import RunError, UsageError
+from physhandi.fitting.parameter_changes import changed_parameters
 from physhandi.fitting.profile import config_to_dict, load_profile
-from physhandi.fitting.simulate import changed_parameters
 from physhandi.progress import Progress
 from physhandi.simulation.model import SimulationParameters
 
@@ -169,6 +168,8 @@ def _run_at(folder: Path, kind: RunKind, sequences: list[str], config: dict[str,
 
 
 def _execute(run: Run, device: str, progress: Progress) -> dict[str, Any]:
+    from physhandi import pipeline
+
     pipeline.run_job(run, progress, device=device)
     return summary(Run.open(run.folder))
 
@@ -190,6 +191,8 @@ def summary(run: Run) -> dict[str, Any]:
 
 def evaluate_run(command: Any) -> dict[str, Any]:
     """Measure a run again from its stored motion."""
+    from physhandi import pipeline
+
     run = find_result(command.run, command.data_dir)
     catalog = open_catalog(command.data_dir)
     return pipeline.evaluate(run, catalog.sequences_of(run))
