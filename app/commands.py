@@ -64,6 +64,7 @@ def pick_device(name: str) -> str:
     """
     import warp as wp
 
+    wp.config.log_level = wp.LOG_WARNING  # Its greeting would come before what is printed here.
     if name == "auto":
         return "cuda:0" if wp.is_cuda_available() else "cpu"
     if name == "cuda":
