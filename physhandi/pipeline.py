@@ -30,20 +30,19 @@ from physhandi.fitting.rollouts import (
 )
 from physhandi.fitting.simulate import simulate_again
 from physhandi.fitting.spring_optimisation import optimise_springs
+from physhandi.fitting.stage_names import (
+    EVALUATION,
+    HANDS,
+    OBSERVATION,
+    REFINEMENT,
+    SEARCH,
+    SIMULATION,
+    SPRINGS,
+)
+from physhandi.fitting.stage_names import STAGES as STAGES
 from physhandi.metrics.report import measure_run, score_run
 from physhandi.perception.lifting import observe_object
 from physhandi.progress import Progress
-
-HANDS, OBSERVATION, SEARCH, SPRINGS, REFINEMENT, EVALUATION = (
-    "hand_reconstruction",
-    "observation",
-    "zeroth_order",
-    "first_order",
-    "hand_refinement",
-    "evaluation",
-)
-SIMULATION = "simulation"
-STAGES = (HANDS, OBSERVATION, SEARCH, SPRINGS, REFINEMENT, EVALUATION)
 
 
 def reconstruct(

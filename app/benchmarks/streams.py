@@ -15,7 +15,7 @@ from app.benchmarks.viewer_client import ViewerClient
 
 _NODES = "/object/nodes"
 _ARROWS = "/forces"
-_SETTLING_S = 1.5
+_SETTLING_S = 3.0
 _PATIENCE = 60.0
 
 

@@ -7,7 +7,14 @@ from typing import Any
 
 from physhandi.errors import UsageError
 from physhandi.fitting.profile import PipelineConfig, config_from_dict
-from physhandi.pipeline import EVALUATION, HANDS, OBSERVATION, REFINEMENT, SEARCH, SPRINGS
+from physhandi.fitting.stage_names import (
+    EVALUATION,
+    HANDS,
+    OBSERVATION,
+    REFINEMENT,
+    SEARCH,
+    SPRINGS,
+)
 
 _NODE_COST = 6.0
 """What a node costs in a substep, in springs."""

@@ -9,7 +9,7 @@ from app.jobs.scheduler import AT_WORK
 from physhandi.data.atomic import named_fields
 from physhandi.data.environment import ENVIRONMENT
 from physhandi.data.run import Run
-from physhandi.pipeline import SIMULATION, STAGES
+from physhandi.fitting.stage_names import SIMULATION, STAGES
 
 
 @dataclass(frozen=True)

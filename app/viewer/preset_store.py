@@ -11,7 +11,7 @@ from app.viewer.presets import BY_HAND, IN_LENGTHS, RECORDED, Preset, builtin_pr
 from physhandi.data.atomic import named_fields, write_json, write_yaml
 from physhandi.data.plain_yaml import parse_yaml
 from physhandi.errors import PhysHandiError, UsageError, describe
-from physhandi.fitting.simulate import changed_parameters
+from physhandi.fitting.parameter_changes import changed_parameters
 from physhandi.simulation.model import SimulationParameters
 
 PRESET_FORMAT = "physhandi-preset/1"

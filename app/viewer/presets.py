@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
+from physhandi.fitting.parameter_changes import AUTOMATIC, changed_parameters
 from physhandi.fitting.profile import load_profile
-from physhandi.fitting.simulate import AUTOMATIC, changed_parameters
 from physhandi.simulation.model import SimulationParameters
 
 AS_FITTED = "as fitted"

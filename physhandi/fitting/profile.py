@@ -9,9 +9,9 @@ from typing import Any, Literal
 import yaml
 
 from physhandi.errors import UsageError
-from physhandi.fitting.hand_reconstruction import HandFitConfig
-from physhandi.fitting.hand_refinement import RefinementConfig
+from physhandi.fitting.hand_config import HandFitConfig
 from physhandi.fitting.object_config import ObjectFitConfig
+from physhandi.fitting.refinement_config import RefinementConfig
 from physhandi.simulation.model import SimulationParameters
 
 FOLDER = Path(__file__).parent / "profiles"

@@ -14,17 +14,14 @@ from physhandi.errors import RunError
 from physhandi.fitting import artefacts
 from physhandi.fitting.hand_reconstruction import reconstruct_hands
 from physhandi.fitting.object_problem import initial_velocity
+from physhandi.fitting.parameter_changes import changed_parameters
 from physhandi.fitting.profile import config_from_dict
 from physhandi.fitting.reach import check_springs
 from physhandi.fitting.rollouts import control_trajectory_of, object_nodes_of, simulate_sequence
 from physhandi.perception.lifting import observe_object
 from physhandi.progress import Progress
-from physhandi.simulation.model import SimulationParameters
 from physhandi.simulation.stability import with_stable_substeps
 from physhandi.simulation.topology import retopologize
-
-AUTOMATIC = "auto"
-"""Instead of a number of substeps: as few as are stable and fine enough."""
 
 
 def simulate_again(
@@ -44,7 +41,7 @@ def simulate_again(
     Args:
         source: A finished run with an object.
         sequence: One of the run's sequences, or another one of the same object.
-        changes: New values of simulation parameters; `substeps_per_frame` may be `AUTOMATIC`, and
+        changes: New values of simulation parameters; `substeps_per_frame` may be ``auto``, and
             the number that was chosen is stored with the other parameters.
         output: Where the motion goes.
         progress: Told about every frame.
@@ -95,24 +92,6 @@ def simulate_again(
     artefacts.save_model(output, sequence.name, model)
     artefacts.save_object(output, parameters, model, rest_node)
     simulate_sequence(output, sequence, device=device, progress=progress)
-
-
-def changed_parameters(
-    fitted: SimulationParameters, changes: Mapping[str, Any]
-) -> tuple[SimulationParameters, bool]:
-    """Apply changes to fitted parameters.
-
-    Returns:
-        The new parameters, and whether their substeps are yet to be chosen automatically.
-
-    Raises:
-        UsageError: If a parameter is unknown or out of bounds.
-    """
-    given = dict(changes)
-    is_automatic = given.get("substeps_per_frame") == AUTOMATIC
-    if is_automatic:
-        del given["substeps_per_frame"]
-    return SimulationParameters.from_dict(fitted.to_dict() | given), is_automatic
 
 
 def _copy_known(source: Run, name: str, output: Attempt) -> np.ndarray:

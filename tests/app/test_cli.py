@@ -11,6 +11,7 @@ from server_world import tiny_config
 from sheet_sequence import FRAMES, NODE
 
 from app import cli, commands
+from physhandi import pipeline
 from physhandi.data.run import Run
 from physhandi.fitting.artefacts import load_model, load_parameters
 from physhandi.fitting.profile import PipelineConfig
@@ -138,17 +139,17 @@ def test_a_fit_is_made_told_and_not_made_twice(terminal: Terminal, quick: Pipeli
 
 def test_an_interrupted_fit_goes_on(terminal: Terminal, quick: PipelineConfig) -> None:
     order = ("reconstruct", "sheet", "--out", "mine", "--device", "cpu")
-    original = commands.pipeline.optimise_springs
+    original = pipeline.optimise_springs
 
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(commands.pipeline, "optimise_springs", interrupt)
+        patch.setattr(pipeline, "optimise_springs", interrupt)
         assert terminal(*order) == 130
     assert terminal.error.splitlines()[-1] == "physhandi: interrupted"
     assert Run.open("mine").state == "cancelled"
-    assert commands.pipeline.optimise_springs is original
+    assert pipeline.optimise_springs is original
     assert terminal(*order) == 0
     assert "first_order" in terminal.error
     assert "zeroth_order" not in terminal.error

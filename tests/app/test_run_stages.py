@@ -9,7 +9,7 @@ from app.jobs.failures import explain
 from app.jobs.stages import stage_views, stages_of
 from physhandi.data.atomic import write_json
 from physhandi.data.run import Run
-from physhandi.pipeline import STAGES
+from physhandi.fitting.stage_names import STAGES
 
 NAMES = ["hands", "observation", "search", "springs", "evaluation"]
 DONE = [{"name": "hands", "seconds": 3.5, "summary": {"before": 2.0, "after": 1.0}}]

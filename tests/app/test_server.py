@@ -3,6 +3,8 @@
 import logging
 import re
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -188,3 +190,13 @@ def test_an_empty_server_tells_how_to_begin(tmp_path: Path) -> None:
     assert "No sequences." in page.text
     assert "physhandi import" in page.text
     assert "No runs yet." in page.text
+
+
+def test_a_server_starts_without_what_only_fits_need() -> None:
+    heavy = ["torch", "open3d", "ai_edge_litert", "mujoco", "matplotlib"]
+    code = f"import sys; sys.modules.update(dict.fromkeys({heavy!r})); import app.cli, app.server"
+    root = Path(__file__).parents[2]
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr

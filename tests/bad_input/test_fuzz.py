@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from server_world import make_world
 from starlette.testclient import TestClient
 
-from app import commands
 from app.commands import OVERRIDES
+from physhandi import pipeline
 from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.errors import FitError, RunError, SequenceError, UsageError
@@ -55,7 +55,7 @@ def gate(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> Terminal:
         shutil.rmtree(run.folder)
         raise PassedError("passed")
 
-    monkeypatch.setattr(commands.pipeline, "run_job", stop)
+    monkeypatch.setattr(pipeline, "run_job", stop)
     return terminal
 
 

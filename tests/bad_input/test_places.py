@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from bad_input_world import Terminal, table, tree
 
-from app import commands
+from physhandi import pipeline
 from physhandi.data.run import Run
 
 ROOT = Path(__file__).parents[2]
@@ -184,7 +184,7 @@ def test_an_interrupted_fit_with_a_torn_list_of_stages_begins_anew(
         raise KeyboardInterrupt
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(commands.pipeline, "optimise_springs", interrupt)
+        patch.setattr(pipeline, "optimise_springs", interrupt)
         assert here(*RECONSTRUCT, "out")[0] == 130
     stages = here.folder / "out/attempts/1/stages.json"
     stages.write_text(stages.read_text()[:40])
