@@ -1,0 +1,99 @@
+"""Colors, clicks and keys of the bundled run, in a real browser."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scene_page import ScenePage
+from viewer_world import FolderCatalog
+
+from app.viewer.content import open_run
+from app.viewer.framing import frame_content
+
+pytestmark = pytest.mark.e2e
+BUNDLED = Path(__file__).parents[2] / "sequences"
+FRAME, NODE = 30, 0
+
+
+@pytest.fixture
+def scene(home):
+    scene = ScenePage.opened_from(home)
+    scene.pause()
+    return scene
+
+
+def place_on_page(scene: ScenePage, point: np.ndarray) -> tuple[float, float]:
+    """Where a point of the scene is seen, with the camera where it stands at first."""
+    framing = frame_content(open_run(FolderCatalog(BUNDLED), "towel_fold_quick"))
+    ahead = framing.look_at - framing.camera
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    offset = point - framing.camera
+    box = scene.page.locator("#scene").bounding_box()
+    scale = 0.5 * box["height"] / np.tan(0.5 * framing.fov) / (offset @ ahead)
+    x, y = scale * (offset @ right), -scale * (offset @ np.cross(right, ahead))
+    return box["x"] + 0.5 * box["width"] + float(x), box["y"] + 0.5 * box["height"] + float(y)
+
+
+def picture(scene: ScenePage) -> np.ndarray:
+    """What the scene shows left of the panel."""
+    scene.page.wait_for_timeout(600)
+    shot = scene.page.screenshot(clip={"x": 330, "y": 60, "width": 600, "height": 700})
+    return cv2.imdecode(np.frombuffer(shot, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)
+
+
+def blue(image: np.ndarray) -> int:
+    """Count the pixels that have the color of plain nodes."""
+    return int(((image[..., 2] > 180) & (image[..., 2] - image[..., 0] > 110)).sum())
+
+
+def test_keys_colors_and_clicks_work_in_the_scene_and_around_it(scene):
+    page = scene.page
+    # The page around has the focus; the keys reach the scene all the same.
+    page.locator(".hints").click()
+    page.keyboard.press("Home")
+    scene.until(lambda: scene.value("Frame") == 0, "the first frame")
+    for count in (10, 20, 30):
+        page.keyboard.press("Shift+ArrowRight")
+        scene.until(lambda count=count: scene.value("Frame") == count, f"frame {count}")
+    for layer in "156":
+        page.keyboard.press(layer)
+
+    before = picture(scene)
+    for _ in range(5):
+        page.keyboard.press("c")
+    scene.until(lambda: scene.has("Speed"), "the legend")
+    scene.until(lambda: blue(picture(scene)) < 0.1 * blue(before), "other colors than plain blue")
+    colored = picture(scene)
+    yellow = (colored[..., 0] > 120) & (colored[..., 1] > 180) & (colored[..., 2] < 100)
+    assert yellow.sum() > 50  # The fastest nodes.
+
+    rollout = np.load(
+        next(BUNDLED.glob("runs/towel_fold_quick/attempts/1/out/sequences/*/rollout.npy"))
+    )
+    page.mouse.click(*place_on_page(scene, rollout[FRAME, NODE].astype(np.float64)))
+    scene.until(lambda: scene.has("object node "), "the reading of a node")
+    named = int(scene.number("object node "))
+    shown = np.linalg.norm(rollout[FRAME, named] - rollout[FRAME, NODE])
+    assert shown < 0.02  # It, or one in front of it.
+    speed = 30 * np.linalg.norm(rollout[FRAME, named] - rollout[FRAME - 1, named])
+    assert scene.number("velocity") == pytest.approx(speed, rel=0.01)
+
+    chart = scene.panel.locator(".u-over").first
+    chart.scroll_into_view_if_needed()
+    box = chart.bounding_box()
+    page.mouse.click(box["x"] + 0.75 * box["width"], box["y"] + 0.5 * box["height"])
+    scene.until(lambda: abs(scene.value("Frame") - 0.75 * 59) <= 1, "the frame in the chart")
+
+    page.keyboard.press("?")
+    help_overlay = page.locator("dialog#help")
+    help_overlay.get_by_text("show or hide a layer").wait_for()
+    page.keyboard.press("Escape")
+    help_overlay.wait_for(state="hidden")
+    page.keyboard.press("Escape")
+    scene.until(lambda: not scene.has("object node "), "the reading is gone")
+    with page.expect_download() as download:
+        page.keyboard.press("s")
+    assert download.value.suggested_filename.endswith(".png")
