@@ -3,7 +3,6 @@
 import shutil
 import tempfile
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,6 +13,7 @@ from app.exports.order import SUFFIXES, Order
 from app.exports.painter import paint, visible_from
 from app.exports.primitives import parts_of
 from app.exports.recording import record
+from app.exports.scale_bar import draw_scale
 from app.exports.take_store import load_take
 from app.viewer.bundle import Picture, bundle
 from app.viewer.content import Content, open_run, open_sequence
@@ -47,7 +47,6 @@ def make(order: Order, out: Path, report: Report = lambda _done, _of: None) -> N
     content, run = _open(order, state)
     state = complete_state(state, content)
     take = _take(order, state, content, report)
-    content = replace(content, fitted=take)
     if order.format in {"viser", "html"}:
         as_html = order.format == "html"
         write_bytes(out, record(content, take, state, report, as_html=as_html))
@@ -136,6 +135,8 @@ def _picture(order: Order, snapshot: Snapshot, state: SessionState) -> Picture:
         pose: Pose = scene.pose
         parts = visible_from(parts_of(scene.server), pose)
         image = paint(parts, pose, order.width, order.height, is_dark=scene.is_dark)
+        if scene.legend is not None:
+            image = draw_scale(image, scene.legend, is_dark=scene.is_dark)
     is_written, content = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))
     if not is_written:
         raise UsageError("The picture could not be encoded; choose a smaller size.")

@@ -9,6 +9,7 @@ import viser
 from jaxtyping import Float
 from numpy import ndarray
 
+from app.viewer.coloring import Legend
 from app.viewer.content import Content
 from app.viewer.framing import frame_content
 from app.viewer.guard import plain
@@ -89,6 +90,11 @@ class Offscreen:
     def is_dark(self) -> bool:
         """Whether the background is dark."""
         return self._scene.layers.dark
+
+    @property
+    def legend(self) -> Legend | None:
+        """What colors tell in the frame that was drawn; None if they are plain."""
+        return self._scene.painter.legend
 
     @property
     def pose(self) -> Pose:

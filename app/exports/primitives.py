@@ -110,6 +110,11 @@ def _points(node: Any, rotation: ndarray, position: ndarray) -> Iterator[Part]:
 def _segments(node: Any, rotation: ndarray, position: ndarray) -> Iterator[Part]:
     point = _in_world(node.points, rotation, position)
     color = _colors(node.colors, len(point))
+    if np.ndim(node.colors) > 1:
+        # viser takes colors of single line ends for amounts of light.
+        light = color / 255
+        bright = 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055
+        color = 255 * np.where(light <= 0.0031308, 12.92 * light, bright)
     yield Part(kind="line", point=point, color=color, size=float(node.thickness))
 
 

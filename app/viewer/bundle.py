@@ -207,6 +207,7 @@ def _readme(snapshot: Snapshot, files: dict[str, bytes]) -> str:
     unit = content.length_unit
     layers = {} if snapshot.layers is None else vars(snapshot.layers)
     shown = ", ".join(name for name, on in layers.items() if on is True and name != "dark")
+    color = layers.get("color", "plain")
     about = [line for name, line in _ABOUT if any(file.startswith(name) for file in files)]
     return "\n".join(
         [
@@ -216,6 +217,7 @@ def _readme(snapshot: Snapshot, files: dict[str, bytes]) -> str:
             f"Lengths are in {unit}, forces in newtons (a node's unit mass is 1 kg), times in",
             "seconds. The world has z up. Cameras have x right, y down, z ahead.",
             *([f"Shown were: {shown}."] if shown else []),
+            *([f"Colors tell: {color}."] if color != "plain" else []),
             "",
             *about,
             "",

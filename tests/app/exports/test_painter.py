@@ -117,6 +117,8 @@ def test_the_parts_of_a_scene_are_found_where_their_nodes_are() -> None:
             "/turned/points", np.array([[0.5, 0.0, 0.2]], np.float32), (1, 2, 3), point_size=0.1
         )
         scene.add_line_segments("/lines", np.ones((4, 2, 3), np.float32), (9, 9, 9), thickness=2.0)
+        ends = np.full((4, 2, 3), 55, np.uint8)
+        scene.add_line_segments("/painted", np.ones((4, 2, 3), np.float32), ends, thickness=2.0)
         hidden = scene.add_frame("/hidden")
         scene.add_point_cloud("/hidden/points", np.zeros((2, 3), np.float32), (0, 0, 0))
         hidden.visible = False
@@ -126,15 +128,16 @@ def test_the_parts_of_a_scene_are_found_where_their_nodes_are() -> None:
         parts = list(parts_of(server))
     finally:
         server.stop()
-    assert [part.kind for part in parts] == ["disk", "line", "picture", "line"]
+    assert [part.kind for part in parts] == ["disk", "line", "line", "picture", "line"]
     np.testing.assert_allclose(parts[0].point, [[[1.0, 0.5, 0.2]]], atol=1e-3)
     assert parts[0].size == pytest.approx(0.2)
     np.testing.assert_array_equal(parts[0].color, [[1, 2, 3]])
-    volume = np.abs(np.linalg.det(parts[2].point[0][[0, 1, 2]])) / 6
-    assert volume > 0
-    corners = parts[2].point[0]
+    np.testing.assert_array_equal(parts[1].color, np.full((4, 3), 9))
+    # An amount of light of 0.2158 is shown as sRGB 128: what viser does to ends with colors.
+    np.testing.assert_allclose(parts[2].color, 128, atol=1)
+    corners = parts[3].point[0]
     wide, high = corners[1] - corners[0], corners[3] - corners[0]
     assert np.linalg.norm(wide) / np.linalg.norm(high) == pytest.approx(1.5)
     assert np.linalg.norm(high) / corners[0][2] == pytest.approx(2 * math.tan(0.5))
     at_camera = Pose(position=np.zeros(3), look_at=UP, up=np.array([0, 1.0, 0]), fov=1.0)
-    assert len(visible_from(parts, at_camera)[3].point) == 4  # Of eight edges, four end there.
+    assert len(visible_from(parts, at_camera)[4].point) == 4  # Of eight edges, four end there.

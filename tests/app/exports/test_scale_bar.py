@@ -1,0 +1,46 @@
+"""The color scale in the corner of a picture."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from viewer_world import content_of, controls
+
+from app.exports.scale_bar import draw_scale
+from app.viewer.coloring import Legend, Painter
+from app.viewer.colormaps import table
+from app.viewer.layers import Layers
+
+
+@pytest.fixture
+def legend() -> Legend:
+    content = content_of({}, controls((0.0, 0.0, 1.0)))
+    painter = Painter(content)
+    assert content.fitted is not None
+    painter.paint(content.fitted, 3, Layers(color="strain", color_range=(-0.1, 0.1)))
+    assert painter.legend is not None
+    return painter.legend
+
+
+def test_the_scale_runs_from_its_low_to_its_high_color(legend: Legend) -> None:
+    image = np.full((360, 640, 3), 255, np.uint8)
+    drawn = draw_scale(image, legend, is_dark=False)
+    assert (image == 255).all()
+    ramp = table(legend.quantity.scale)
+    bar = drawn[np.flatnonzero((drawn == ramp[0]).all(axis=-1).any(axis=1))[2]]
+    colored = np.flatnonzero((bar != 255).any(axis=1))
+    np.testing.assert_array_equal(bar[colored[0]], ramp[0])
+    np.testing.assert_array_equal(bar[colored[-1]], ramp[-1])
+    middle = bar[(colored[0] + colored[-1]) // 2].astype(int)
+    assert np.abs(middle - ramp[len(ramp) // 2]).max() <= 6
+    below = drawn[300:, :200]
+    assert (below.max(axis=-1) < 120).sum() > 50  # The numbers, in ink.
+    assert (drawn[:200] == 255).all()
+
+
+def test_a_small_picture_keeps_its_room(legend: Legend) -> None:
+    image = np.zeros((100, 640, 3), np.uint8)
+    assert draw_scale(image, legend, is_dark=True) is image
+    other = replace(legend, limits=(0.0, 1.0))
+    big = np.zeros((400, 400, 3), np.uint8)
+    assert (draw_scale(big, legend, is_dark=True) != draw_scale(big, other, is_dark=True)).any()
