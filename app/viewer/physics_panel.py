@@ -76,12 +76,6 @@ class PhysicsPanel:
         self._folder = gui.add_folder("Physics")
         with self._folder:
             self._status = gui.add_markdown("")
-            pace = gui.add_button_group(
-                "Simulation",
-                (HOLD, STEP, GO),
-                hint="Hold it, compute one frame (N), or let it go on (H)",
-            )
-            pace.on_click(guard(lambda event: set_pace(event.target.value)))
             self._presets = PresetChoice(
                 gui, guard, self.history, length_unit=unit, store=store, moved=self._run
             )
@@ -91,6 +85,12 @@ class PhysicsPanel:
                 "History", (_UNDO, _REDO, _RESET), hint="Ctrl+Z and Ctrl+Shift+Z"
             )
             buttons.on_click(guard(lambda event: self._press(event.target.value)))
+            pace = gui.add_button_group(
+                "Simulation",
+                (HOLD, STEP, GO),
+                hint="Hold it, compute one frame (N), or let it go on (H)",
+            )
+            pace.on_click(guard(lambda event: set_pace(event.target.value)))
             self._changes = gui.add_markdown("")
             self._put_back: Any = gui.add_dropdown(
                 "Put back",

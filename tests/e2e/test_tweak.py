@@ -13,7 +13,7 @@ from physhandi.data.run import Run
 pytestmark = [pytest.mark.e2e, pytest.mark.slow]
 
 
-def test_a_change_is_undone_by_keys_and_kept_as_preset_and_run(home, served, tmp_path):
+def test_a_change_is_undone_by_keys_and_simulated_frame_by_frame(home):
     scene = ScenePage.opened_from(home)
     scene.pause()
     fitted = scene.value("stiffness 10^")
@@ -39,6 +39,11 @@ def test_a_change_is_undone_by_keys_and_kept_as_preset_and_run(home, served, tmp
     home.keyboard.press("h")
     scene.until(lambda: scene.difference() == soft, "all frames")
 
+
+def test_a_change_is_kept_as_preset_and_run(home, served, tmp_path):
+    scene = ScenePage.opened_from(home)
+    scene.set("stiffness 10^", -0.7)
+    scene.until(lambda: (scene.difference() or 0) > 0, "a softer object")
     scene.unfold("Keep")
     scene.write("name", "Soft <b>towel")
     scene.press("Run")

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import pytest
 
-from app.viewer.contact_knobs import self_collision_knobs
+from app.viewer.contact_knobs import ground_knobs, self_collision_knobs
 from app.viewer.history import History
 from app.viewer.parameters import changes_in, knobs
 from physhandi.simulation.model import SimulationParameters
@@ -71,6 +71,23 @@ def test_undo_redo_and_reset() -> None:
     assert not history.can_redo
 
 
+def test_one_parameter_is_put_back_and_automatic_substeps_are_undone() -> None:
+    history = History(START, Clock())
+    history.set("drag", 5.0)
+    history.replace(history.current, is_automatic=True)
+    history.set("gravity", 1.0)
+    assert (history.is_automatic, history.is_changed) == (True, True)
+    history.put_back("drag")
+    assert (history.current.drag, history.current.gravity) == (START.drag, 1.0)
+    assert history.is_automatic
+    history.put_back("substeps_per_frame")
+    assert not history.is_automatic
+    assert history.undo().drag == START.drag
+    assert history.is_automatic
+    history.reset()
+    assert not history.is_changed
+
+
 def test_one_drag_of_a_slider_is_one_step_of_the_history() -> None:
     clock = Clock()
     history = History(START, clock)
@@ -109,6 +126,32 @@ def test_self_collision_is_a_box_and_its_sliders() -> None:
     assert history.set("self_collision", box.from_slider(True)).self_collision is True
     text = what_changed(tuple(controls.values()), SimulationParameters(), on)
     assert text == "nodes collide off → on, distance [mm] 5 → 8, friction of nodes 0.3 → 1"
+
+
+def test_the_ground_is_a_box_and_its_height() -> None:
+    box, height, *_ = ground_knobs(START, length_unit="m", low=0.01, high=0.2)
+    none = replace(START, ground_height=None)
+    assert (box.to_slider(START), box.to_slider(none), box.to_slider(START)) == (True, False, True)
+    assert (box.from_slider(False), box.from_slider(True)) == (None, 0.0)
+    lower = replace(START, ground_height=height.from_slider(-120.0))
+    assert lower.ground_height == pytest.approx(-0.12)
+    assert height.to_slider(lower) == -120.0
+    # No higher than the lowest node, which would be thrown out of the ground.
+    assert height.from_slider(500.0) == pytest.approx(0.01)
+    knobs_ = (box, height)
+    assert what_changed(knobs_, START, lower) == "ground height [mm] 0 → -120"
+    assert what_changed(knobs_, START, none) == "ground on → off"
+    floating = ground_knobs(none, length_unit="m", low=0.3, high=0.5)
+    assert floating[0].from_slider(True) == pytest.approx(0.3)
+
+
+def test_stiffness_of_both_kinds_of_springs_is_moved_apart() -> None:
+    by_field = {knob.field: knob for knob in knobs(START, length_unit="m")}
+    for field in ("stiffness", "virtual_stiffness"):
+        assert by_field[field].to_slider(START) == 0.0
+        assert by_field[field].from_slider(-1.0) == pytest.approx(0.1 * getattr(START, field))
+    off = replace(START, stiffness=0.0)
+    assert "stiffness" not in {knob.field for knob in knobs(off, length_unit="m")}
 
 
 def test_a_wider_collision_distance_widens_its_slider() -> None:
