@@ -248,13 +248,13 @@ class Population:
     def _springs(
         self, master: MasterTopology, rest_length: ndarray, other: ndarray, spring: ndarray
     ) -> list[wp.array]:
-        rest = rest_length[spring]
-        rows = [master.length[spring], rest, 1.0 / rest, np.zeros(len(spring))]
-        pair = np.stack([other, master.rank[spring]], axis=1)
-        return [
-            self._array(pair.astype(np.int32), wp.vec2i),
-            self._array(np.stack(rows, axis=1).astype(np.float32), wp.vec4),
-        ]
+        """List length, rest length, its inverse and the bits of the other end; then ranks."""
+        rows = np.empty((len(spring), 4), dtype=np.float32)
+        rows[:, 0] = master.length[spring]
+        rows[:, 1] = rest_length[spring]
+        rows[:, 2] = 1.0 / rest_length[spring]
+        rows[:, 3] = other.astype(np.int32).view(np.float32)
+        return [self._array(rows, wp.vec4), self._array(master.rank[spring], wp.int32)]
 
     def _array(self, value: ndarray, dtype: Any) -> wp.array:
         return wp.array(np.ascontiguousarray(value), dtype=dtype, device=self._device)

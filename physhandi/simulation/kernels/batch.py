@@ -46,11 +46,8 @@ _SUM_SPRINGS = """
     typedef WIDE wide;
     const wide* states = (const wide*)state.data + group_first;
     const float4* lengths = (const float4*)entry_length.data;
-    const int2* others = (const int2*)entry.data;
-    const auto pull = [&](const int e, const bool is_certain) {
-        const float4 length = __ldg(lengths + e);
-        const int2 other = __ldg(others + e);
-        const wide* place = states + 192 * other.x;
+    const auto pull = [&](const float4 length, const int rank, const bool is_certain) {
+        const wide* place = states + 192 * __float_as_int(length.w);
         wide found[6];
         #pragma unroll
         for (int k = 0; k < 6; ++k) found[k] = __ldg(place + 32 * k);
@@ -71,17 +68,24 @@ _SUM_SPRINGS = """
             const float strain = fmaf(now, length.z, -1.0f);
             const float tension = fmaf(material.data[0][i], strain, material.data[1][i] * rate);
             const bool exists = is_certain
-                || (length.x < material.data[2][i] && other.y < material.data[3][i]);
+                || (length.x < material.data[2][i] && rank < material.data[3][i]);
             const float scale = exists ? tension * inverse : 0.0f;
             force.data[0][i] = fmaf(scale, dx, force.data[0][i]);
             force.data[1][i] = fmaf(scale, dy, force.data[1][i]);
             force.data[2][i] = fmaf(scale, dz, force.data[2][i]);
         }
     };
-    #pragma unroll 3
-    for (int e = begin + part; e < certain_end; e += PARTS) pull(e, true);
+    // The next spring is read while this one pulls.
+    int e = begin + part;
+    float4 next = e < certain_end ? __ldg(lengths + e) : float4();
+    #pragma unroll 4
+    for (; e < certain_end; e += PARTS) {
+        const float4 length = next;
+        if (e + PARTS < certain_end) next = __ldg(lengths + e + PARTS);
+        pull(length, 0, true);
+    }
     #pragma unroll 1
-    for (int e = certain_end + part; e < end; e += PARTS) pull(e, false);
+    for (; e < end; e += PARTS) pull(__ldg(lengths + e), __ldg(entry_rank.data + e), false);
 #endif
     return force;
 """
@@ -147,8 +151,8 @@ def make_batch_kernel(count: int, parts: int) -> wp.Kernel:
     def sum_springs(
         state: wp.array[float],
         group_first: int,
-        entry: wp.array[wp.vec2i],
         entry_length: wp.array[wp.vec4],
+        entry_rank: wp.array[int],
         begin: int,
         certain_end: int,
         end: int,
@@ -185,11 +189,11 @@ def make_batch_kernel(count: int, parts: int) -> wp.Kernel:
         entry_start: wp.array[int],
         entry_certain: wp.array2d[int],
         entry_end: wp.array2d[int],
-        entry: wp.array[wp.vec2i],
         entry_length: wp.array[wp.vec4],
+        entry_rank: wp.array[int],
         held_start: wp.array[int],
-        held: wp.array[wp.vec2i],
         held_length: wp.array[wp.vec4],
+        held_rank: wp.array[int],
         # State in:
         control_start: wp.array[wp.vec3],
         control_end: wp.array[wp.vec3],
@@ -222,8 +226,8 @@ def make_batch_kernel(count: int, parts: int) -> wp.Kernel:
         force = sum_springs(
             state,
             192 * group * nodes + lane,
-            entry,
             entry_length,
+            entry_rank,
             entry_start[node],
             entry_certain[group, node],
             entry_end[group, node],
@@ -247,18 +251,17 @@ def make_batch_kernel(count: int, parts: int) -> wp.Kernel:
             # The nearest control comes first, so no later one is in reach either.
             if length[0] >= reach[1, group]:
                 break
-            control = held[e]
-            at = control_position(control[0], fraction, control_start, control_end)
+            control = wp.cast(length[3], wp.int32)
+            rank = held_rank[e]
+            at = control_position(control, fraction, control_start, control_end)
             tie = materials()
             for k in range(4):
                 tie[k] = load(
                     number, numbers + 32 * (wp.static(FIELDS.index("virtual_stiffness")) + k)
                 )
             for i in range(wp.static(count)):
-                if length[0] < tie[2, i] and float(control[1]) < tie[3, i]:
-                    speed = control_velocity(
-                        control[0], control_rate[i], control_start, control_end
-                    )
+                if length[0] < tie[2, i] and float(rank) < tie[3, i]:
+                    speed = control_velocity(control, control_rate[i], control_start, control_end)
                     tension = pull(
                         at - wp.vec3(x[0, i], x[1, i], x[2, i]),
                         speed - wp.vec3(v[0, i], v[1, i], v[2, i]),
