@@ -4,6 +4,7 @@ Parsing the YAML of a run takes milliseconds, which a thousand runs make seconds
 repeats what the runs' own files say, and only while those are unchanged; it can be deleted.
 """
 
+import hashlib
 import json
 import logging
 import threading
@@ -34,6 +35,7 @@ class RunIndex:
         self._path = path
         self._lock = threading.Lock()
         self._entries: dict[str, dict[str, Any]] | None = None
+        self._configs: dict[str, Any] = {}
         self._unsaved = 0
 
     def open(self, folder: Path, stamp: Stamp) -> Run:
@@ -52,7 +54,8 @@ class RunIndex:
             entry = self._entries.get(str(folder))
         if entry is not None and entry.get("stamp") == list(stamp):
             try:
-                return Run(folder, entry["job"], entry["about"])
+                job = entry["job"] | {"config": self._configs[entry["config"]]}
+                return Run(folder, job, entry["about"])
             except (KeyError, TypeError):
                 logger.warning("%s is damaged at run %s; it is read anew", self._path, folder.name)
         run = Run.open(folder)
@@ -60,11 +63,18 @@ class RunIndex:
             "kind": run.kind,
             "sequences": run.sequences,
             "sequence_names": run.sequence_names,
-            "config": run.config,
         }
         about = {"name": run.name, "label": run.label, "created": run.created}
+        try:
+            text = json.dumps(run.config, sort_keys=True)
+        except TypeError:
+            return run  # Its settings hold what JSON has not, such as a date: nothing to keep.
+        # Most runs of many have the settings of another one, and settings are most of a run.
+        key = hashlib.sha256(text.encode()).hexdigest()
         with self._lock:
-            self._entries[str(folder)] = {"stamp": list(stamp), "job": job, "about": about}
+            run.config = self._configs.setdefault(key, run.config)
+            entry = {"stamp": list(stamp), "job": job, "config": key, "about": about}
+            self._entries[str(folder)] = entry
             self._unsaved += 1
         return run
 
@@ -80,8 +90,11 @@ class RunIndex:
             self._unsaved = 0
             folders = present()
             self._entries = {k: v for k, v in self._entries.items() if k in folders}
+            used = {entry["config"] for entry in self._entries.values()}
+            self._configs = {k: v for k, v in self._configs.items() if k in used}
+            known = {"format": _FORMAT, "configs": self._configs, "runs": self._entries}
             try:
-                content = json.dumps({"format": _FORMAT, "runs": self._entries}).encode()
+                content = json.dumps(known).encode()
                 self._path.parent.mkdir(parents=True, exist_ok=True)
                 write_atomically(self._path, lambda file: file.write(content), is_durable=False)
             except (OSError, TypeError, ValueError) as error:
@@ -95,6 +108,13 @@ class RunIndex:
         except (OSError, ValueError, RecursionError) as error:
             logger.warning("%s cannot be read, so runs are read anew: %s", self._path, error)
             return {}
-        runs = named_fields(content.get("runs")) if content.get("format") == _FORMAT else None
-        found = {folder: named_fields(entry) for folder, entry in (runs or {}).items()}
-        return {folder: entry for folder, entry in found.items() if entry is not None}
+        if content.get("format") != _FORMAT:
+            return {}
+        runs = named_fields(content.get("runs"))
+        self._configs = named_fields(content.get("configs")) or {}
+        found: dict[str, dict[str, Any]] = {}
+        for folder, content_of_run in (runs or {}).items():
+            entry = named_fields(content_of_run)
+            if entry is not None and isinstance(entry.get("config"), str):
+                found[folder] = entry
+        return found

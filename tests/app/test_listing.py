@@ -246,7 +246,9 @@ def test_runs_are_remembered_until_their_files_change(
     first = listed()
     assert sorted(opened) == ["one", "two"]
     assert first["one"][:2] == ("one", [str(tmp_path / "s")])
-    assert settings.index_path.is_file()
+    kept = json.loads(settings.index_path.read_text())
+    assert len(kept["runs"]) == 2
+    assert list(kept["configs"].values()) == [config]
     assert listed() == first
     assert opened == []
     (settings.run_dir / "two" / "run.yaml").write_text(
@@ -254,7 +256,17 @@ def test_runs_are_remembered_until_their_files_change(
     )
     assert listed()["two"][0] == "second"
     assert opened == ["two"]
-    for damage in ("{", "[]", json.dumps({"format": "physhandi-run-index/1", "runs": {"a": 3}})):
+    for damage in (
+        "{",
+        "[]",
+        json.dumps(
+            {
+                "format": "physhandi-run-index/1",
+                "configs": [],
+                "runs": {"a": 3, "b": {"config": []}},
+            }
+        ),
+    ):
         settings.index_path.write_text(damage)
         assert listed()["two"][0] == "second"
         assert sorted(opened) == ["one", "two"]
