@@ -59,6 +59,20 @@ function draft() {
   return { sequences, profile: order.dataset.profile, overrides: changed() };
 }
 
+/** Suggest an interval around the value that the search starts from. */
+function suggest(row) {
+  const [low, high] = ["[data-low]", "[data-high]"].map((end) => row.querySelector(end));
+  if (low.value !== "" || high.value !== "") return;
+  const start = rows.find((other) => other.dataset.setting === `simulation.${row.dataset.setting.split(".").at(-1)}`);
+  const value = start ? valueOf(start) : null;
+  if (!(value > 0)) return;
+  const scale = row.querySelector("[data-scale]");
+  const tidy = (number) => (scale.value === "integer" ? Math.round(number) : Number(number.toPrecision(2)));
+  low.value = Math.max(tidy(value / 3), low.min === "" ? -Infinity : Number(low.min));
+  high.value = Math.min(tidy(value * 3), high.max === "" ? Infinity : Number(high.max));
+  if (scale.value !== "integer") scale.value = "log";
+}
+
 function mark(row, isChanged) {
   const isInterval = row.dataset.kind === "interval";
   row.classList.toggle("changed", isChanged);
@@ -164,7 +178,11 @@ function find(words) {
   }
 }
 
-order.addEventListener("input", (event) => ("find" in event.target.dataset ? find(event.target.value) : onChange()));
+order.addEventListener("input", ({ target }) => {
+  if ("on" in target.dataset && target.checked) suggest(target.closest("[data-setting]"));
+  if ("find" in target.dataset) find(target.value);
+  else onChange();
+});
 order.addEventListener("change", (event) => {
   if (!("profileChoice" in event.target.dataset)) return;
   const address = new URL(location.href);

@@ -68,7 +68,7 @@ class Watch:
         yield from self._reports()
         yield from self._lines(is_ended=run["state"] in ENDED)
         if run["state"] in AT_WORK:
-            yield from self._shown()
+            yield from self._shown(has_begun=run["state"] != "starting")
         if run != self._known:
             self._known = run
             yield self._name, "run", run
@@ -92,8 +92,8 @@ class Watch:
                 self._seen = number
                 yield self._name, "progress", event
 
-    def _shown(self) -> Iterator[News]:
-        number = preview_number(self._folder)
+    def _shown(self, *, has_begun: bool) -> Iterator[News]:
+        number = preview_number(self._folder) if has_begun else 0
         if number not in {0, self._preview}:
             self._preview = number
             yield self._name, "preview", {"number": number}

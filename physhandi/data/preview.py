@@ -39,8 +39,9 @@ class PreviewFile:
     """Writes previews of a run, so seldom that the fit does not feel it."""
 
     def __init__(self, run_folder: Path) -> None:
-        """Prepare; the first preview is due at once."""
+        """Prepare; the first preview is due at once, and what an earlier attempt showed goes."""
         self._path = run_folder / PREVIEW
+        self._path.unlink(missing_ok=True)
         self._begin = time.monotonic()
         self._due = 0.0
         self._number = 0

@@ -135,6 +135,10 @@ def test_a_run_takes_previews_and_nobody_else_wants_any(tmp_path: Path) -> None:
         attempt.publish()
     assert read_preview(run.folder)[0]["number"] == 1
     run.verify()
+    with run.begin_attempt() as attempt:
+        attempt.progress()
+        assert not (run.folder / PREVIEW).exists()
+        attempt.publish()
     (run.folder / PREVIEW).write_bytes(b"\x00" * 40)
     with pytest.raises(RunError, match="cannot be read"):
         read_preview(run.folder)
