@@ -85,10 +85,10 @@ class ColorPanel:
             at = options.index(self._layers.color)
             self.choose(options[(at + step) % len(options)])
 
-    def show(self, *, is_playing: bool) -> None:
-        """Follow what was painted last."""
+    def show(self, *, is_playing: bool, is_hidden: bool) -> None:
+        """Follow what was painted last, or say nothing while something else is shown."""
         painter = self._painter
-        legend = painter.legend if painter is not None else None
+        legend = painter.legend if painter is not None and not is_hidden else None
         said = "" if legend is None else legend_html(legend, highest=not is_playing)
         if is_playing and self._legend_head(said) == self._legend_head(self._said):
             return

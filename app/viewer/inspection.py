@@ -52,7 +52,7 @@ class Inspection:
         self, take: Take | None, frame: int, take_frame: int, *, is_playing: bool, is_hidden: bool
     ) -> None:
         """Follow the clock; see `Inspector.show`."""
-        self.colors.show(is_playing=is_playing)
+        self.colors.show(is_playing=is_playing, is_hidden=is_hidden)
         self.inspector.show(take, frame, take_frame, is_playing=is_playing, is_hidden=is_hidden)
 
     def _clear(self) -> None:

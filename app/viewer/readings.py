@@ -165,15 +165,17 @@ class Readings:
         """Find the control node that is the first vertex of a hand; None if they are others."""
         control = self._content.control
         total = sum(hand.vertex.shape[1] for hand in self._content.hands)
-        if control is None or control.shape[1] != total:
+        if control is None or total == 0 or control.shape[1] != total:
             return None
-        sides = [hand.side for hand in self._content.hands]
         for order in (self._content.hands, self._content.hands[::-1]):
             vertex = np.concatenate([np.asarray(hand.vertex[0]) for hand in order])
-            if np.allclose(vertex, control[0], rtol=0.0, atol=1e-5) and side in sides:
-                counts = [h.vertex.shape[1] for h in order]
-                at = [h.side for h in order].index(side)  # pyright: ignore[reportArgumentType]
-                return sum(counts[:at])
+            if not np.allclose(vertex, control[0], rtol=0.0, atol=1e-5):
+                continue
+            first = 0
+            for hand in order:
+                if hand.side == side:
+                    return first
+                first += hand.vertex.shape[1]
         return None
 
     @staticmethod
