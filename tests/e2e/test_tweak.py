@@ -42,12 +42,13 @@ def test_a_change_is_undone_by_keys_and_simulated_frame_by_frame(home):
 
 def test_a_change_is_kept_as_preset_and_run(home, served, tmp_path):
     scene = ScenePage.opened_from(home)
+    scene.pause()
     scene.set("stiffness 10^", -0.7)
     scene.until(lambda: (scene.difference() or 0) > 0, "a softer object")
     scene.unfold("Keep")
     scene.write("name", "Soft <b>towel")
     scene.press("Run")
-    scene.until(lambda: scene.has("Saved as run"), "a published run")
+    scene.until(lambda: scene.has("Saved as run"), "a published run", seconds=90)
     scene.write("name", "Soft towel")
     scene.press("Preset")
     scene.until(lambda: scene.has("Delete preset “Soft towel”"), "a preset")
