@@ -5,7 +5,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query
 from fastapi.responses import HTMLResponse
 
-from app.comparison import CompareAsk
+from app.comparison import CompareAsk, Id
 from app.jobs.catalog import Catalog, RunItem
 from app.jobs.describe import describe_results, describe_run, frame_errors
 from app.jobs.scheduler import Scheduler
@@ -50,6 +50,20 @@ def create_comparing(catalog: Catalog, scheduler: Scheduler, pages: Pages) -> AP
                 [first.config, second.config],
                 [describe_results(first), describe_results(second)],
             ),
+        )
+
+    @router.get("/runs/{run_id}/compare", include_in_schema=False)
+    def choose_other(run_id: Id) -> HTMLResponse:
+        """Offer the runs that one can be compared with, those of the same recordings first."""
+        run = describe_run(catalog.run_item(run_id), scheduler)
+        others = [describe_run(item, scheduler) for item in catalog.runs() if item.id != run_id]
+        others = [other for other in others if other["is_published"]]
+        shared = set(run["sequences"])
+        return pages.render(
+            "compare_with.html",
+            run=run,
+            near=[other for other in others if shared & set(other["sequences"])],
+            far=[other for other in others if not shared & set(other["sequences"])],
         )
 
     @router.get("/api/v1/comparison")
