@@ -62,6 +62,11 @@ def drawn(client: ViewerClient) -> str:
     )
 
 
+def is_told(client: ViewerClient, text: str) -> bool:
+    """Whether a notification said something."""
+    return any("Notification" in m["type"] and text in str(m) for m in client.messages)
+
+
 def finish(client: ViewerClient) -> None:
     client.until(
         lambda: f"simulated {FRAMES}/{FRAMES}" in client.texts() and "ms a frame" in client.texts()
@@ -183,7 +188,7 @@ def test_a_run_is_saved_with_what_the_sliders_changed(sessions, kept, begun) -> 
         client.set("drag [1/s]", 11.0)
         client.set("gravity [m/s²]", 1.5)
         client.set("Save as", "Run")
-        client.until(lambda: any("Type a name" in str(m) for m in client.messages))
+        client.until(lambda: is_told(client, "Type a name"))
         assert begun == []
         client.set("name", "Moon <b>sheet</b>")
         client.set("Save as", "Run")
@@ -212,7 +217,7 @@ def test_a_simulation_that_diverged_is_not_saved(sessions, begun) -> None:
         client.until(lambda: "then it stopped" in drawn(client))
         client.set("name", "Broken")
         client.set("Save as", "Run")
-        client.until(lambda: any("as a run it would" in str(m) for m in client.messages))
+        client.until(lambda: is_told(client, "as a run it would"))
         assert begun == []
 
 
