@@ -5,8 +5,6 @@ half-edges are packed in the order in which threads read them: the same column o
 threads lies side by side, 16 bytes each, and the first columns stay in registers.
 """
 
-from typing import Any
-
 import warp as wp
 
 from physhandi.simulation.kernels.contacts import advance
@@ -65,7 +63,7 @@ def make_large_frame_kernel(lanes: int, kept: int, threads: int, locals_: int) -
     """
     kept_float = wp.types.vector(length=kept, dtype=wp.float32)
     kept_int = wp.types.vector(length=kept, dtype=wp.int32)
-    room: Any = FLOATS_OF_A_LOCAL * locals_
+    room = FLOATS_OF_A_LOCAL * locals_
 
     @wp.kernel(enable_backward=False, module="unique", launch_bounds=threads)
     def advance_large_frame(
