@@ -21,6 +21,7 @@ _FLAGS = ("--no-sandbox", "--use-angle=gl-egl", "--ignore-gpu-blocklist")
 _SIZE = (1280, 800)
 _PATIENCE_MS = 60_000
 _NOTICED_S = 5.0
+_COUNTED_MS = 3000.0
 _PAINTED = """() => {
   const paint = performance.getEntriesByName("first-contentful-paint")[0];
   const page = performance.getEntriesByType("navigation")[0];
@@ -214,6 +215,6 @@ def _rate(page: "Page", scene: "Frame") -> float:
     """Count the frames that arrive in a second."""
     start = time.perf_counter()
     count = scene.evaluate("() => window.physhandiWatch.frames")
-    page.wait_for_timeout(3000)
+    page.wait_for_timeout(_COUNTED_MS)
     count = scene.evaluate("() => window.physhandiWatch.frames") - count
     return float(count / (time.perf_counter() - start))

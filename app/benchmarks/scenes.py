@@ -2,6 +2,7 @@
 
 import shutil
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy import ndarray
@@ -21,6 +22,10 @@ HEAVY_FRAMES = 60
 _SHAPE = (30, 10, 10)
 _SPACING = 0.006
 _SWING = 0.05
+_HANDS: tuple[tuple[Literal["right", "left"], float], ...] = (
+    ("right", -0.05),
+    ("left", 0.05 + _SPACING * _SHAPE[0]),
+)
 
 
 def make_heavy_run(folder: Path) -> Run:
@@ -61,8 +66,10 @@ def make_heavy_run(folder: Path) -> Run:
         attempt.save_array(f"{at}/rollout.npy", (node + 0.5 * way).astype(np.float32))
         attempt.save_array(f"{at}/control.npy", (top + way).astype(np.float32))
         attempt.save_tensors(f"{at}/model.safetensors", model.to_tensors())
-        for side, offset in (("right", -0.05), ("left", 0.05 + _SPACING * _SHAPE[0])):
-            attempt.save_array(f"{at}/hand_{side}_vertex.npy", _hand(side, offset) + way)
+        for side, offset in _HANDS:
+            vertex, face = _hand(side, offset)
+            attempt.save_array(f"{at}/hand_{side}_vertex.npy", vertex + way)
+            attempt.save_array(f"{at}/hand_{side}_face.npy", face)
         about = {"frame_rate": 30.0, "frame_count": HEAVY_FRAMES, "ground_height": 0.0}
         attempt.save_yaml(f"{at}/meta.yaml", about)
         attempt.publish()
@@ -91,8 +98,8 @@ def make_many_runs(folder: Path, count: int) -> None:
         (copied / "run.yaml").write_text(about.replace("Run 0", f"Run {number}"))
 
 
-def _hand(side: str, offset: float) -> ndarray:
-    """Place a hand beside the block."""
-    template = load_hand_model("right" if side == "right" else "left").template
-    place = np.array([offset, 0.03, 0.1]) - template.mean(axis=0)
-    return (template + place).astype(np.float32)[None]
+def _hand(side: Literal["right", "left"], offset: float) -> tuple[ndarray, ndarray]:
+    """Place a hand beside the block; gives its vertices and triangles."""
+    hand = load_hand_model(side)
+    place = np.array([offset, 0.03, 0.1]) - hand.template.mean(axis=0)
+    return (hand.template + place).astype(np.float32)[None], np.asarray(hand.faces, np.int32)

@@ -34,6 +34,7 @@ from physhandi.errors import MissingInputError
 
 _RATE = 30.0
 _SESSIONS = 10
+_LISTS = ("/", "/runs", "/api/v1/runs")
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ GOALS: Mapping[str, Goal] = {
     "frame_bytes": Goal("bytes", ("frame_bytes", "p95"), 100_000.0),
     "ten_sessions_frames_per_s": Goal("sessions", ("worst_frames_per_s",), 29.0, is_least=True),
     "ten_sessions_skipped_per_s": Goal("sessions", ("worst_skipped_per_s",), 1.0),
-    "list_of_1000_runs_p95_ms": Goal("runs", ("p95_ms",), 300.0),
+    "list_of_1000_runs_p95_ms": Goal("runs", ("worst_p95_ms",), 300.0),
     "live_frames_per_s": Goal("live", ("frames_per_s",), _RATE, is_least=True),
 }
 """The figures that are asked of the viewer."""
@@ -252,14 +253,15 @@ class _Bench:
         data = self._data("many")
         make_many_runs(data / "runs", self._effort.runs)
         found: dict[str, Any] = {"runs": self._effort.runs}
-        times: list[float] = []
         with Served(data) as served:
-            found["first_ms"] = 1e3 * served.get("/")[0]
-            for path in ("/", "/api/v1/runs"):
+            found["first_ms"] = 1e3 * served.get(_LISTS[0])[0]
+            for path in _LISTS:
+                busy = served.cpu_seconds()
                 seconds = [served.get(path)[0] for _ in range(2 * self._effort.visits)]
-                found[path] = {**percentiles(seconds), "bytes": len(served.get(path)[1])}
-                times += seconds
-        return {**found, **percentiles(times)}
+                busy = (served.cpu_seconds() - busy) / len(seconds)
+                size = len(served.get(path)[1])
+                found[path] = {**percentiles(seconds), "server_cpu_ms": 1e3 * busy, "bytes": size}
+        return {**found, "worst_p95_ms": max(found[path]["p95_ms"] for path in _LISTS)}
 
     def _live(self) -> dict[str, Any]:
         from app.viewer.latency import measure_latency
