@@ -68,6 +68,27 @@ def effort_of(profile: Mapping[str, Any], extent: Extent) -> dict[str, float]:
     }
 
 
+def hand_halves(profile: Mapping[str, Any], extent: Extent) -> tuple[float, float, float] | None:
+    """Weigh the two loops of stage 1 one by one.
+
+    Returns:
+        The share of the stage's iterations that the first loop has, then the weights of the loop
+        without depth and of that with depth; none if there is only one.
+    """
+    try:
+        hand = config_from_dict(dict(profile)).hand
+    except UsageError:
+        return None
+    if not hand.depth_iterations:
+        return None
+    share = hand.iterations / (hand.iterations + hand.depth_iterations)
+    return (
+        share,
+        float(extent.frames * hand.iterations),
+        float(extent.frames * hand.depth_iterations),
+    )
+
+
 def _rollout_cost(config: PipelineConfig) -> float:
     """Weigh the simulation of one frame: springs and nodes of a surface, times substeps."""
     parameters = config.simulation

@@ -92,8 +92,9 @@ def estimate(plan: Plan, timeline: Timeline, now: float) -> Estimate:
     spent = planned = 0.0
     for part, index in zip(timeline.parts, seen, strict=True):
         if index is not None:
-            spent += part.seconds
-            planned += plan.parts[index].time_at(part.shares[-1])
+            took, expected = _since_set_up(part, plan.parts[index])
+            spent += took
+            planned += expected
     trust = _TRUST[plan.kind] * plan.seconds
     pace = (spent + trust) / (planned + trust) if planned + trust > 0 else 1.0
     stage_left, pause = _left_in_part(plan, timeline, seen, pace)
@@ -127,5 +128,17 @@ def _left_in_part(
     known = plan.parts[index]
     done = known.time_at(share)
     trust = _PART_TRUST[plan.kind] * known.seconds
-    own = (part.seconds + trust * pace) / (done + trust) if done + trust > 0 else pace
+    took, expected = _since_set_up(part, known)
+    own = (took + trust * pace) / (expected + trust) if expected + trust > 0 else pace
     return own * (known.seconds - done), own * (known.time_at(following) - done)
+
+
+def _since_set_up(part: Part, known: Part) -> tuple[float, float]:
+    """Give how long a part took from its first report to its last, and was expected to [s].
+
+    What goes before (reading files, the first compilation) does not tell how fast the rest goes.
+    """
+    if len(part.shares) < 3:
+        return 0.0, 0.0
+    took = part.times[-1] - part.times[1]
+    return took, known.time_at(part.shares[-1]) - known.time_at(part.shares[1])

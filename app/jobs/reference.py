@@ -4,9 +4,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from app.jobs.effort import Extent, effort_of
+from app.jobs.effort import Extent, effort_of, hand_halves
 from app.jobs.estimate import Plan, plan_from
-from app.jobs.timeline import Timeline
+from app.jobs.timeline import Part, Timeline
+from physhandi.pipeline import HANDS
 
 
 @dataclass(frozen=True)
@@ -51,12 +52,15 @@ def scaled_plan(
     plan = plan_from([(nearest.timeline, nearest.end)], "scaled")
     before, after = effort_of(nearest.profile, nearest.extent), effort_of(profile, extent)
     frames = extent.frames / max(1, nearest.extent.frames)
-    parts = [
-        part.stretched(
-            after[part.stage] / before[part.stage]
-            if after.get(part.stage) is not None and before.get(part.stage, 0.0) > 0.0
-            else frames
-        )
-        for part in plan.parts
-    ]
+    halves = hand_halves(nearest.profile, nearest.extent)
+    own_halves = hand_halves(profile, extent)
+    parts: list[Part] = []
+    for part in plan.parts:
+        old, new = before.get(part.stage, 0.0), after.get(part.stage)
+        if part.stage == HANDS and halves and own_halves:
+            factors = own_halves[1] / halves[1], own_halves[2] / halves[2]
+            parts.append(part.bent(halves[0], own_halves[0], factors))
+        else:
+            factor = new / old if new is not None and old > 0.0 else frames
+            parts.append(part.stretched(factor, set_up=frames))
     return Plan(tuple(parts), plan.closing_s * frames, plan.kind, plan.count)

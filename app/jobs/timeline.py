@@ -37,10 +37,46 @@ class Part:
         way = (share - first) / (last - first)
         return self.times[after - 1] + way * (self.times[after] - self.times[after - 1])
 
-    def stretched(self, factor: float) -> "Part":
-        """Give the part as if everything in it took so many times as long."""
-        times = [factor * time for time in self.times]
+    def stretched(self, factor: float, *, set_up: float | None = None) -> "Part":
+        """Give the part as if everything in it took so many times as long.
+
+        Args:
+            factor: How many times as long.
+            set_up: How many times as long what goes before the first report takes; none if that
+                is no exception.
+        """
+        set_up = factor if set_up is None else set_up
+        first = self._set_up()
+        times = [factor * max(0.0, time - first) + set_up * min(time, first) for time in self.times]
         return Part(stage=self.stage, visit=self.visit, shares=self.shares, times=times)
+
+    def _set_up(self) -> float:
+        """Tell how long it took before the work of the first report began [s]."""
+        if len(self.times) < 3:
+            return 0.0
+        pace = (self.times[-1] - self.times[1]) / max(self.shares[-1] - self.shares[1], 1e-9)
+        return max(0.0, self.times[1] - pace * self.shares[1])
+
+    def bent(self, knee: float, to: float, factors: tuple[float, float]) -> "Part":
+        """Give a part of two halves that each take another time, as a stage with two loops has.
+
+        Args:
+            knee: Share at which the first half ended.
+            to: Share at which it is going to end.
+            factors: How many times as long each half is going to take.
+        """
+        bend = self.time_at(knee)
+        shares, times = [0.0], [0.0]
+        for share, time in [*zip(self.shares, self.times, strict=True), (knee, bend)]:
+            if share <= knee:
+                shares.append(share / knee * to)
+                times.append(factors[0] * min(time, bend))
+            else:
+                shares.append(to + (share - knee) / (1.0 - knee) * (1.0 - to))
+                times.append(factors[0] * bend + factors[1] * (time - bend))
+        return Part(
+            stage=self.stage, visit=self.visit, shares=sorted(shares[1:]), times=sorted(times[1:])
+        )
 
 
 class Timeline:

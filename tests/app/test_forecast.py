@@ -99,7 +99,7 @@ def test_another_machine_or_other_settings_are_told_to_be_rough(
     assert elsewhere.basis.startswith("roughly")
     assert elsewhere.left_s == pytest.approx(end - now, rel=0.1)
     job = yaml.safe_load((run.folder / "job.yaml").read_text())
-    job["config"]["profile"]["object_"]["first_order"]["iterations"] *= 20
+    job["config"]["profile"]["object_"]["first_order"]["iterations"] *= 400
     (run.folder / "job.yaml").write_text(yaml.safe_dump(job))
     longer = forecast(world).of_run(Run.open(run.folder), now)
     assert longer is not None
