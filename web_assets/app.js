@@ -100,7 +100,7 @@ document.addEventListener("click", (event) => {
 });
 
 document.addEventListener("submit", (event) => {
-  if (event.target.id !== "launch") return;
+  if (event.target.id !== "launch" || event.submitter?.matches("[data-more]")) return;
   event.preventDefault();
   busy(event.target.querySelector("[type=submit]"), () => launch(event.target));
 });

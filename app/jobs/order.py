@@ -129,7 +129,7 @@ def _row(setting: Setting, base: Any, value: Any) -> dict[str, Any]:
         "title": setting.title,
         "group": GROUPS[setting.group],
         "about": setting.about,
-        "unit": setting.unit,
+        "unit": setting.unit if any(c.isdigit() for c in after) else "",
         "base": before,
         "value": after,
     }
