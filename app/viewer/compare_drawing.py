@@ -1,23 +1,25 @@
 """The scene of a comparison: two rollouts beside each other, or one over the other."""
 
 import threading
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import viser
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from app.viewer.clipped_nodes import ClippedNodes, Plane
-from app.viewer.compare_look import GHOST, SIDES, STYLES, Look, difference_colors, shade
+from app.viewer.coloring import Painted
+from app.viewer.compare_look import GHOST, SIDES, STYLES, Look, difference_paint, shade
+from app.viewer.compare_recorded import PLAYING_OBSERVED, Halves, RecordedDrawing, have_same_hands
 from app.viewer.content import Content
 from app.viewer.difference import Way, take_difference
 from app.viewer.figure import ARROWS, FIGURE_BYTES, Side
 from app.viewer.figure_camera import Box, Eye
 from app.viewer.framing import Framing
 from app.viewer.halves import GAP, Extents
-from app.viewer.layers import GREEN, SKIN, Layers
-from app.viewer.object_drawing import Color, ObjectDrawing, share_bytes, strengths
+from app.viewer.layers import Layers
+from app.viewer.object_drawing import ObjectDrawing, share_bytes, strengths
 from app.viewer.scene import add_ground
 from app.viewer.take import Take
 
@@ -25,27 +27,8 @@ _NARROWEST = 13.0
 _ABOVE, _BELOW = 4.0, 0.6
 _LINE = 0.034
 _LONGEST = 0.22
-_SAME_HAND = 1e-5
-_HAND_OPACITY = 0.4
-_PLAYING_OBSERVED = 1_000
 _ROOT = "/compare"
 _GROUND = f"{_ROOT}/ground"
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Half:
-    """One side of the comparison at a moment."""
-
-    side: Side
-    """Rollout, its frame and caption."""
-    content: Content
-    """Hands and observation."""
-    frame: int
-    """Frame of hands and observation."""
-
-
-Halves = dict[str, Half]
-"""Both sides by their names, ``a`` and ``b``."""
 
 
 class CompareDrawing:
@@ -72,6 +55,9 @@ class CompareDrawing:
         self._drawings = {
             name: ObjectDrawing(self._nodes, framing, root=f"{_ROOT}/{name}", style=STYLES[name])
             for name in SIDES
+        }
+        self._recorded = {
+            name: RecordedDrawing(self._nodes, framing, f"{_ROOT}/{name}") for name in SIDES
         }
         self._extents = _measure(content, framing, takes)
         self._eye = Eye(right=np.array([1.0, 0.0, 0.0]), up=np.array([0.0, 0.0, 1.0]))
@@ -121,7 +107,7 @@ class CompareDrawing:
             way: How the rollouts are compared; None if they cannot be.
             is_playing: Whether the clock is running, so that less may be sent.
         """
-        has_one_hand = look.mode != "side" and _have_same_hands(halves)
+        has_one_hand = look.mode != "side" and have_same_hands(halves)
         with self._lock, self._server.atomic():
             self._look, self._way = replace(look), way
             self._remember(halves)
@@ -135,10 +121,13 @@ class CompareDrawing:
             for name, half in halves.items():
                 is_shown = look.strength(name) > 0.0
                 is_lone = not (has_one_hand and name == "b")
-                self._draw_hands(name, half, is_visible=layers.hands and is_shown and is_lone)
+                is_seen = layers.hands and is_shown and is_lone
+                self._recorded[name].draw_hands(half, is_visible=is_seen)
                 is_observed = layers.observed and is_shown and is_lone
                 self._nodes.plane = self._plane(name)
-                self._draw_observed(name, half, is_playing, is_visible=is_observed)
+                self._recorded[name].draw_observed(
+                    half, is_playing=is_playing, is_visible=is_observed
+                )
                 self._draw_object(name, halves, layers, is_playing=is_playing)
                 self._nodes.plane = None
 
@@ -161,11 +150,12 @@ class CompareDrawing:
             forces=layers.forces and is_strong,
         )
         hands = sum(hand.vertex.shape[1] for hand in half.content.hands) if layers.hands else 0
-        observed = _PLAYING_OBSERVED if layers.observed else 0
+        observed = PLAYING_OBSERVED if layers.observed else 0
         points = take.model.node_count + len(drawing.attached(take)) + hands + observed
         budget = share_bytes(FIGURE_BYTES // 2 - 15 * points, take, layers, ARROWS)
         if not is_playing:
             budget = replace(budget, virtual=None, springs=None)
+        painted = self._painted(name, half.side, other)
         drawing.draw(
             take,
             half.side.frame,
@@ -173,54 +163,35 @@ class CompareDrawing:
             budget,
             force_unit=self._force_unit,
             longest=_LONGEST * self._framing.extent,
+            painted=painted,
         )
         point = np.asarray(take.position[half.side.frame], dtype=np.float32)
-        color = self._colors(name, half.side, other, is_dark=layers.dark)
+        color = self._colors(name, half.side, painted, is_dark=layers.dark)
         size = self._look.node_size(name) * self._framing.spacing
         is_visible = layers.nodes and strength > 0.0
         path = f"{_ROOT}/{name}/object/compared"
         self._nodes.points(path, point, color, size, is_visible=is_visible)
 
-    def _colors(self, name: str, side: Side, other: Side, *, is_dark: bool) -> ndarray:
+    def _painted(self, name: str, side: Side, other: Side) -> Painted | None:
+        """Choose the colors that tell the difference; None for those of the side."""
+        take, look, way = side.take, self._look, self._way
+        if take is None or other.take is None or other.take.ready == 0 or way is None:
+            return None
+        if look.tint != "difference" or look.is_ghost(name):
+            return None
+        distance = take_difference(take, side.frame, other.take, other.frame, way)
+        return difference_paint(take, distance, look.scale)
+
+    def _colors(
+        self, name: str, side: Side, painted: Painted | None, *, is_dark: bool
+    ) -> UInt8[ndarray, "node 3"]:
         """Choose the color of every node."""
-        take, look = side.take, self._look
-        count = 0 if take is None else take.model.node_count
-        strength = look.strength(name)
-        color: Color = STYLES[name].node
-        can = take is not None and other.take is not None and other.take.ready > 0
-        if look.tint == "difference" and self._way is not None and can and take and other.take:
-            if not look.is_ghost(name):
-                distance = take_difference(take, side.frame, other.take, other.frame, self._way)
-                return difference_colors(distance, look.scale, strength, is_dark=is_dark)
-            color = GHOST
-        return np.tile(np.array(shade(color, strength, is_dark=is_dark), np.uint8), (count, 1))
-
-    def _draw_hands(self, name: str, half: Half, *, is_visible: bool) -> None:
-        for hand in half.content.hands:
-            path = f"{_ROOT}/{name}/hand/{hand.side}"
-            vertex = np.asarray(hand.vertex[min(half.frame, len(hand.vertex) - 1)], np.float32)
-            if hand.face is None:
-                size = 0.006 * self._framing.extent
-                self._nodes.points(path, vertex, SKIN[hand.side], size, is_visible=is_visible)
-            else:
-                self._nodes.mesh(
-                    path,
-                    vertex,
-                    hand.face,
-                    SKIN[hand.side],
-                    is_visible=is_visible,
-                    opacity=_HAND_OPACITY,
-                )
-
-    def _draw_observed(self, name: str, half: Half, is_playing: bool, *, is_visible: bool) -> None:
-        observed, path = half.content.observed, f"{_ROOT}/{name}/observed"
-        if observed is None or not is_visible:
-            self._nodes.show(path, is_visible=False)
-            return
-        point = observed.points(half.frame)
-        every = max(1, -(-len(point) // _PLAYING_OBSERVED)) if is_playing else 1
-        size = 0.4 * self._framing.spacing
-        self._nodes.points(path, point[::every], GREEN, size, is_visible=True)
+        strength = self._look.strength(name)
+        if painted is not None:
+            return shade(painted.node, strength, is_dark=is_dark)
+        color = GHOST if self._look.is_ghost(name) else STYLES[name].node
+        count = 0 if side.take is None else side.take.model.node_count
+        return shade(np.tile(np.array(color, np.uint8), (count, 1)), strength, is_dark=is_dark)
 
     @property
     def _line(self) -> float:
@@ -290,17 +261,3 @@ def _measure(content: Content, framing: Framing, takes: list[Take]) -> Extents:
         corners = framing.center + 0.35 * framing.extent * np.array([[-1.0] * 3, [1.0] * 3])
         return Extents([corners[None]], 1)
     return Extents(tracks, count)
-
-
-def _have_same_hands(halves: Halves) -> bool:
-    """Tell whether both sides show the same hands, so that one is enough where they overlap."""
-    first, second = (
-        {h.side: np.asarray(h.vertex[min(half.frame, len(h.vertex) - 1)]) for h in hands}
-        for half in halves.values()
-        for hands in (half.content.hands,)
-    )
-    return first.keys() == second.keys() and all(
-        first[side].shape == second[side].shape
-        and np.allclose(first[side], second[side], rtol=0.0, atol=_SAME_HAND)
-        for side in first
-    )

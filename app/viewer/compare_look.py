@@ -7,8 +7,11 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from app.comparison import Mode, Tint
-from app.viewer.colormaps import paint
+from app.viewer.coloring import Painted
+from app.viewer.colormaps import levels, paint
 from app.viewer.object_drawing import Color, Style
+from app.viewer.quantities import QUANTITIES, Values, from_nodes
+from app.viewer.take import Take
 
 MODES: dict[Mode, str] = {"side": "side by side", "overlay": "overlay", "wipe": "wipe"}
 """What the modes are called on the panel."""
@@ -20,6 +23,7 @@ STYLES = {
         spring=(152, 182, 236),
         virtual=(92, 178, 236),
         arrow=(24, 70, 170),
+        spring_width=1.0,
     ),
     "b": Style(
         node=(232, 118, 24),
@@ -27,6 +31,7 @@ STYLES = {
         spring=(243, 196, 150),
         virtual=(244, 176, 40),
         arrow=(196, 78, 6),
+        spring_width=1.0,
     ),
 }
 """Colors of both sides, told apart by people who confuse red and green too."""
@@ -71,11 +76,12 @@ class Look:
         return min(1.0, 2.0 * part)
 
 
-def shade(color: Color, strength: float, *, is_dark: bool) -> Color:
-    """Let a color fade into the background."""
-    mixed = strength * np.array(color) + (1.0 - strength) * np.array(_BACKGROUND[is_dark])
-    red, green, blue = (round(float(part)) for part in mixed)
-    return red, green, blue
+def shade(
+    color: UInt8[ndarray, "node 3"], strength: float, *, is_dark: bool
+) -> UInt8[ndarray, "node 3"]:
+    """Let colors fade into the background."""
+    mixed = strength * color + (1.0 - strength) * np.array(_BACKGROUND[is_dark])
+    return np.round(mixed).astype(np.uint8)
 
 
 def scale_end(value: float) -> float:
@@ -86,10 +92,19 @@ def scale_end(value: float) -> float:
     return float(next(step * power for step in (1, 2, 5, 10) if step * power >= 0.999999 * value))
 
 
-def difference_colors(
-    distance: Float[ndarray, " node"], end: float, strength: float = 1.0, *, is_dark: bool = False
-) -> UInt8[ndarray, "node 3"]:
-    """Color distances from dark blue (none) to yellow (`end` and more)."""
-    color = paint(distance, (0.0, end)).astype(np.float64)
-    mixed = strength * color + (1.0 - strength) * np.array(_BACKGROUND[is_dark])
-    return np.round(mixed).astype(np.uint8)
+def difference_paint(take: Take, distance: Float[ndarray, " node"], end: float) -> Painted:
+    """Color nodes and springs by distances, from dark blue (none) to yellow (`end` and more).
+
+    Args:
+        take: Whose nodes and springs.
+        distance: How far each node is from the other side [m].
+        end: Distance at the end of the scale [m].
+    """
+    limits = (0.0, end)
+    return Painted(
+        values=Values(node=distance, spring=from_nodes(take, distance)),
+        node=paint(distance, limits),
+        level=levels(distance, limits),
+        quantity=QUANTITIES["difference"],
+        limits=limits,
+    )

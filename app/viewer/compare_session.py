@@ -8,9 +8,10 @@ import numpy as np
 import viser
 
 from app.comparison import CompareAsk
-from app.viewer.compare_drawing import CompareDrawing, Half, Halves
+from app.viewer.compare_drawing import CompareDrawing
 from app.viewer.compare_look import SIDES, Look
 from app.viewer.compare_pair import open_pair, pairing_of
+from app.viewer.compare_recorded import Half, Halves
 from app.viewer.compare_view import CompareView
 from app.viewer.content import Catalog, Content
 from app.viewer.dress import set_theme

@@ -6,9 +6,10 @@ from typing import Any
 import viser
 
 from app.viewer.compare_curve import DifferenceCurve, Pairing
-from app.viewer.compare_drawing import CompareDrawing, Halves
+from app.viewer.compare_drawing import CompareDrawing
 from app.viewer.compare_look import Look
 from app.viewer.compare_panel import ComparePanel
+from app.viewer.compare_recorded import Halves
 from app.viewer.figure_camera import Eye, FigureCameras, picture_of_figure
 from app.viewer.guard import Guard
 from app.viewer.layers import Layers

@@ -7,8 +7,9 @@ from typing import Any
 import viser
 
 from app.viewer.compare_curve import Pairing
-from app.viewer.compare_drawing import CompareDrawing, Half, Halves
+from app.viewer.compare_drawing import CompareDrawing
 from app.viewer.compare_look import Look
+from app.viewer.compare_recorded import Half, Halves
 from app.viewer.compare_view import CompareView
 from app.viewer.content import Content
 from app.viewer.figure import Side

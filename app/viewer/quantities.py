@@ -129,7 +129,7 @@ def measure(
             return Values(node=node, spring=np.concatenate([node, control])[model.spring_nodes])
         case "error" | "difference":
             node = _distance(coloring, take, frame, error_of, reference)
-            return Values(node=node, spring=_from_nodes(take, node))
+            return Values(node=node, spring=from_nodes(take, node))
         case "plain":
             raise ValueError("plain colors tell nothing that could be measured")
 
@@ -153,7 +153,7 @@ def _both_ends(value: Float[ndarray, " spring"]) -> Float[ndarray, "spring 2"]:
     return np.repeat(value[:, None], 2, axis=1)
 
 
-def _from_nodes(take: Take, node: Float[ndarray, " node"]) -> Float[ndarray, "spring 2"]:
+def from_nodes(take: Take, node: Float[ndarray, " node"]) -> Float[ndarray, "spring 2"]:
     """Give spring ends their node's value; a control node has none, so it gets the other end's."""
     ends = np.sort(take.model.spring_nodes, axis=1)
     swapped = take.model.spring_nodes[:, 0] > take.model.spring_nodes[:, 1]
