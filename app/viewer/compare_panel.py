@@ -104,7 +104,7 @@ class ComparePanel:
         """Tell who A and B are.
 
         Args:
-            names: Name of each side.
+            names: Name of each side; of a user's text only what `plain` leaves of it.
             notes: What a user should know of the pair, as sentences.
             unit: Unit of lengths.
             tick_count: Number of ticks of the clock.
@@ -168,7 +168,7 @@ class ComparePanel:
     def _write(self) -> None:
         """Write the legend and the difference of the tick on the screen."""
         lines = [
-            _dot(STYLES[name].node, f"{name.upper()} {plain(self._names[name])}") for name in SIDES
+            _dot(STYLES[name].node, f"{name.upper()} {escape(self._names[name])}") for name in SIDES
         ]
         if self._look.is_swapped:
             lines.reverse()

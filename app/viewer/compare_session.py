@@ -186,7 +186,7 @@ class CompareSession:
         self._layers_panel = LayersPanel(server, shown, guard, self._playback.redraw)
         self._layers_panel.replace(shown, self._layers, framing)
         ExportPanel(server, guard, self.snapshot)
-        names = {side: c.title for side, c in zip(SIDES, pair.contents, strict=True)}
+        names = {side: plain(c.title) for side, c in zip(SIDES, pair.contents, strict=True)}
         unit = pair.contents[0].length_unit
         self._view.panel.name(names, pair.notes, unit=unit, tick_count=pair.clock.tick_count)
         self._view.follow(pairing_of(pair))
