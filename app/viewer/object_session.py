@@ -12,7 +12,7 @@ from app.viewer.keep_panel import Keeping
 from app.viewer.live import LiveSimulation
 from app.viewer.physics_panel import GO, STEP, PhysicsPanel
 from app.viewer.playback import Playback
-from app.viewer.resimulation import Resimulation
+from app.viewer.resimulation import Readout, Resimulation
 from app.viewer.save_run import run_changes
 from app.viewer.take import Take
 from physhandi.data.run import Run
@@ -59,6 +59,8 @@ class ObjectSession:
         self._strip = strip
         self._keeping = keeping
         self._closed = threading.Event()
+        # Sliders, buttons and the simulation are heard in threads of their own.
+        self._lock = threading.RLock()
         self._panel: PhysicsPanel | None = None
         self._resimulation = Resimulation(
             session,
@@ -80,7 +82,7 @@ class ObjectSession:
         )
         error = load_track_error(run, content.sequence_name, fitted.frame_count)
         self._errors = ErrorPanel(server, content, fitted, error)
-        self._panel.show(self._resimulation.readout, at_once=True)
+        self._show_readout(at_once=True)
 
     @property
     def panel(self) -> PhysicsPanel | None:
@@ -134,15 +136,16 @@ class ObjectSession:
     def _set_pace(self, pace: str) -> None:
         """Hold the simulation, compute one frame of it or let it run."""
         resimulation = self._resimulation
-        readout = resimulation.readout
-        if pace != GO and not readout.is_held:
-            resimulation.hold(on=True)
-        if pace == GO:
-            resimulation.hold(on=False)
-        elif pace == STEP:
-            if not readout.is_busy:
-                self._request()
-            resimulation.step()
+        with self._lock:
+            readout = resimulation.readout
+            if pace != GO and not readout.is_held:
+                resimulation.hold(on=True)
+            if pace == GO:
+                resimulation.hold(on=False)
+            elif pace == STEP:
+                if not readout.is_busy:
+                    self._request()
+                resimulation.step()
         self._show_readout(at_once=True)
 
     def _save(self, name: str) -> None:
@@ -161,20 +164,20 @@ class ObjectSession:
         run = keeping.saver.save(self._run.id, self._sequence, name, changes)
         keeping.saver.follow(run, panel.keep.tell, self._closed)
 
-    def _show_readout(self, *, at_once: bool) -> None:
-        readout = self._resimulation.readout
-        if self._panel is not None:
-            self._panel.show(readout, at_once=at_once)
-            self._strip.show(readout, at_once=at_once)
+    def _show_readout(self, *, at_once: bool) -> Readout:
+        with self._lock:  # What is shown last must be what was read last.
+            readout = self._resimulation.readout
+            if self._panel is not None:
+                self._panel.show(readout, at_once=at_once or readout.is_held)
+                self._strip.show(readout, at_once=at_once or readout.is_held)
+        return readout
 
     def _hear(self, kind: str, ready: int) -> None:
         """Follow the live simulation; runs in its thread."""
         panel = self._panel
         if panel is None:
             return
-        readout = self._resimulation.readout
-        panel.show(readout, at_once=kind != "frame" or readout.is_held)
-        self._strip.show(readout, at_once=kind != "frame" or readout.is_held)
+        readout = self._show_readout(at_once=kind != "frame")
         self._errors.follow(self._resimulation.newest, at_once=kind != "frame")
         if kind == "frame":
             self._follow(ready, is_held=readout.is_held)

@@ -214,13 +214,13 @@ class PhysicsPanel:
     def _run(self) -> None:
         """Show the parameters in force and simulate them."""
         self._sliders.show()
+        self._substeps.show()
         self._moved()
 
     def _moved(self) -> None:
         """Simulate what is in force, leaving the sliders to the user who moves them."""
         history = self.history
         self._sliders.mark()
-        self._substeps.show()
         self._presets.show()
         if self.keep is not None:
             self.keep.show()
@@ -234,7 +234,7 @@ class PhysicsPanel:
         )
         self._changed = {change.name: change.fields for change in changes}
         text = ", ".join(change.text for change in changes)
-        self._changes.content = f"Changed: {text or 'nothing: parameters as fitted'}"
         self._put_back.options = (_PUT_BACK, *self._changed)
         self._put_back.value = _PUT_BACK
         self._put_back.visible = bool(changes)
+        self._changes.content = f"Changed: {text or 'nothing: parameters as fitted'}"
