@@ -3,6 +3,7 @@
 import threading
 import time
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import viser
@@ -20,9 +21,10 @@ from app.viewer.figure import Side
 from app.viewer.figure_camera import FigureCameras
 from app.viewer.framing import Framing, frame_content
 from app.viewer.guard import Guard, plain
+from app.viewer.keyboard import bind
 from app.viewer.layers import Layers, default_layers
 from app.viewer.panels import LayersPanel, TimelinePanel
-from app.viewer.playback import Playback
+from app.viewer.playback import TURN, Playback
 from app.viewer.session_state import Kind, Pose, SessionInfo, SessionState
 from app.viewer.snapshot import Snapshot
 from app.viewer.viser_server import start_viser
@@ -58,6 +60,7 @@ class CompareSession:
         self._pair = open_pair(catalog, self._ask)
         self._seen = time.monotonic()
         self._has_played = False
+        self._is_closed = False
         self._lock = threading.RLock()
         self._cameras = FigureCameras()
         self._server = start_viser(plain(self._pair.title))
@@ -157,6 +160,7 @@ class CompareSession:
 
     def close(self) -> None:
         """Stop clock, measuring and server."""
+        self._is_closed = True
         self._playback.close()
         self._view.curve.close()
         self._server.stop()
@@ -185,7 +189,9 @@ class CompareSession:
         )
         self._layers_panel = LayersPanel(server, shown, guard, self._playback.redraw)
         self._layers_panel.replace(shown, self._layers, framing)
-        ExportPanel(server, guard, self.snapshot)
+        export = ExportPanel(server, guard, self.snapshot)
+        bind(server, guard, "reset", lambda event, _: self._reset_view(event))
+        bind(server, guard, "snapshot", lambda event, _: export.save("PNG", event.client))
         names = {side: plain(c.title) for side, c in zip(SIDES, pair.contents, strict=True)}
         unit = pair.contents[0].length_unit
         self._view.panel.name(names, pair.notes, unit=unit, tick_count=pair.clock.tick_count)
@@ -216,15 +222,21 @@ class CompareSession:
             self._has_played = True
             self._playback.play()
 
+    def _reset_view(self, event: Any) -> None:
+        if not self._view.reset_view(event.client):
+            self._layers_panel.reset_view(event)
+
     def _part(self, client: viser.ClientHandle) -> None:
         """Keep the camera of a client that leaves, for the tab that is being reloaded."""
         self._seen = time.monotonic()
-        self._cameras.forget(client).give_first(self._server.initial_camera)
+        pose = self._cameras.forget(client)
+        if not self._is_closed:
+            pose.give_first(self._server.initial_camera)
 
     def _draw(self, tick: int, is_playing: bool) -> None:
-        with self._lock:
+        with self._lock, TURN:
             self._view.draw(tick, self._halves(tick), self._layers, is_playing=is_playing)
-            self._timeline.show(tick, is_playing=is_playing)
+            self._timeline.show(is_playing=is_playing)
 
     def _halves(self, tick: int) -> Halves:
         frames = self._pair.clock.frames(tick)

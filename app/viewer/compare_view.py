@@ -89,6 +89,12 @@ class CompareView:
         if self.look.mode == "wipe":
             self._redraw()
 
+    def reset_view(self, client: viser.ClientHandle) -> bool:
+        """Show both sides whole to a client that looked elsewhere; False if one has its own way."""
+        if self.look.mode == "side":
+            self._aim(client, Pose.of(client.camera))
+        return self.look.mode == "side"
+
     def picture(self) -> Callable[[viser.ClientHandle], dict[str, Any]] | None:
         """Find camera and size of a picture of both sides; None if the client's own will do."""
         return self._picture if self.look.mode == "side" else None

@@ -178,11 +178,11 @@ class ObjectSession:
         if panel is None:
             return
         readout = self._show_readout(at_once=kind != "frame")
+        if kind in {"stability", "ready"}:
+            return
         self._errors.follow(self._resimulation.newest, at_once=kind != "frame")
         if kind == "frame":
             self._follow(ready, is_held=readout.is_held)
-            return
-        if kind in {"stability", "ready"}:
             return
         self._playback.limit(self._playback.frame_count)
         if kind == "diverged":

@@ -67,6 +67,8 @@ class PhysicsPanel:
         self._unit = "mm" if content.is_metric else content.length_unit
         self._refreshed = -math.inf
         self._lock = threading.Lock()
+        # Each slider is heard in a thread of its own.
+        self._turn = threading.Lock()
         self.keep: KeepPanel | None = None
         gui, unit, parameters = server.gui, content.length_unit, fitted.parameters
         height = np.asarray(fitted.position[0])[:, 2]
@@ -155,7 +157,9 @@ class PhysicsPanel:
             self._refreshed = now
         self._is_held = readout.is_held
         self._substeps.hear(readout)
-        self._status.content = self._text(readout)
+        text = self._text(readout)
+        if self._status.content != text:
+            self._status.content = text
 
     def _text(self, readout: Readout) -> str:
         pace = ""
@@ -220,12 +224,13 @@ class PhysicsPanel:
     def _moved(self) -> None:
         """Simulate what is in force, leaving the sliders to the user who moves them."""
         history = self.history
-        self._sliders.mark()
-        self._presets.show()
-        if self.keep is not None:
-            self.keep.show()
-        self._show_changes()
-        self._simulate(history.current, history.is_automatic)
+        with self._turn:  # What is asked for last must be what was read last.
+            self._sliders.mark()
+            self._presets.show()
+            if self.keep is not None:
+                self.keep.show()
+            self._show_changes()
+            self._simulate(history.current, history.is_automatic)
 
     def _show_changes(self) -> None:
         history = self.history

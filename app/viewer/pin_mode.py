@@ -192,6 +192,10 @@ class PinMode:
         if self._view is not None:
             self._view.turn(client)
 
+    def reset_view(self, client: viser.ClientHandle) -> bool:
+        """Show both sides whole to a client; False if they are not beside each other."""
+        return self._view is not None and self._view.reset_view(client)
+
     def _enter(self, content: Content, framing: Framing, take: Take) -> None:
         drawing = CompareDrawing(self._server, content, framing, [take])
         with self._place:

@@ -9,6 +9,9 @@ from collections.abc import Callable
 logger = logging.getLogger(__name__)
 
 _MAX_RATE = 30.0
+TURN = threading.Lock()
+"""Held by the session that draws, of all sessions: Python runs one of them at a time, and many that
+wait for it at once hold each other up until hardly a frame is drawn."""
 _SHORT_OF = 1e-3
 """The clock stops so much before a frame that is not ready, which is then due at once."""
 

@@ -21,7 +21,7 @@ from app.viewer.live import LiveSimulation
 from app.viewer.object_session import ObjectSession
 from app.viewer.panels import LayersPanel, TimelinePanel
 from app.viewer.pin_mode import PinMode
-from app.viewer.playback import Playback
+from app.viewer.playback import TURN, Playback
 from app.viewer.restoring import complete_state, differences
 from app.viewer.scene import Scene
 from app.viewer.session_state import Kind as Kind
@@ -71,6 +71,7 @@ class Session:
         self._keeping = keeping
         self._seen = time.monotonic()
         self._has_played = False
+        self._is_closed = False
         self._names: tuple[str, ...] = ()
         if kind == "run":
             self._names = tuple(catalog.run(target).sequence_names)
@@ -160,6 +161,7 @@ class Session:
 
     def close(self) -> None:
         """Stop clock, simulation and server."""
+        self._is_closed = True
         self._playback.close()
         if self._object is not None:
             self._object.close()
@@ -270,19 +272,21 @@ class Session:
     def _reset_view(self, event: Any) -> None:
         if self._figure.is_on:
             self._figure.reset_view(event.client)
-        else:
+        elif not self._pin.reset_view(event.client):
             self._layers.reset_view(event)
 
     def _part(self, client: viser.ClientHandle) -> None:
         """Keep the camera of a client that leaves, for the tab that is being reloaded."""
         self._seen = time.monotonic()
-        self._figure.part(client).give_first(self._server.initial_camera)
+        pose = self._figure.part(client)
+        if not self._is_closed:
+            pose.give_first(self._server.initial_camera)
 
     def _draw(self, frame: int, is_playing: bool) -> None:
-        with self._lock:
+        with self._lock, TURN:
             take, take_frame = self._take(frame)
             self._stage.draw(frame, take, take_frame, is_playing=is_playing)
-            self._timeline.show(frame, is_playing=is_playing)
+            self._timeline.show(is_playing=is_playing)
             self._inspection.show(
                 take,
                 frame,

@@ -21,12 +21,12 @@ class TimelinePanel:
 
     def __init__(self, server: viser.ViserServer, playback: Playback, guard: Guard) -> None:
         self._playback = playback
+        self._loop_of_events = server.get_event_loop()
         gui = server.gui
         self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY, hint="Space")
         self._frame = gui.add_slider(
             "Frame", 0, max(playback.frame_count - 1, 1), 1, 0, hint="Arrow keys step by one frame"
         )
-        self._written = 0
         step = gui.add_button_group("Step", ("◀ 1", "1 ▶"), hint="Left and right arrow keys")
         speed = gui.add_slider("Speed", *_SPEEDS, 0.1, 1.0, hint="Sequence seconds per second")
         loop = gui.add_checkbox("Loop", initial_value=True)
@@ -57,11 +57,9 @@ class TimelinePanel:
         """Order of what stands directly below the frame slider."""
         return self._frame.order + 0.1
 
-    def show(self, frame: int, *, is_playing: bool) -> None:
+    def show(self, *, is_playing: bool) -> None:
         """Follow the clock."""
-        # Another value than the last one that was written here is a user's, about to be heard.
-        if self._frame.value == self._written:
-            self._frame.value = self._written = frame
+        self._loop_of_events.call_soon_threadsafe(self._follow)
         label = "Pause" if is_playing else "Play"
         if self._play.label != label:
             self._play.label = label
@@ -69,7 +67,7 @@ class TimelinePanel:
 
     def replace(self, frame_count: int) -> None:
         """Fit the slider to another sequence."""
-        self._frame.value = self._written = 0
+        self._frame.value = 0
         self._frame.max = max(frame_count - 1, 1)
 
     def restore(self, speed: float, *, does_loop: bool) -> None:
@@ -82,6 +80,14 @@ class TimelinePanel:
         """Stop at a frame."""
         self._playback.play(on=False)
         self._playback.seek(frame)
+
+    def _follow(self) -> None:
+        """Move the slider to where the clock is.
+
+        Runs in viser's own thread, between two messages of users: written from another one, a frame
+        could take the place of the value that a user has just chosen and nobody has heard of yet.
+        """
+        self._frame.value = self._playback.frame
 
     def _hurry(self, steps: int) -> None:
         """Play slower or faster, and start if the clock stands."""
@@ -99,6 +105,5 @@ class TimelinePanel:
         # At once, in viser's own thread, so that the running clock has no time to interfere.
         frame = event.target.value
         if event.client is not None:
-            self._written = frame
             self._playback.play(on=False)
             self._playback.seek(frame)

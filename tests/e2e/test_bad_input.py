@@ -48,10 +48,10 @@ def test_what_is_broken_is_told_where_the_user_meets_it(page: Page) -> None:
 
     # A fit of wrong values fails with its reason, and with what to do.
     page.locator("article[data-sequence=lost]").get_by_role("button", name="Launch fit").click()
-    page.locator("#launch button[type=submit]").click()
+    page.locator("#launch").get_by_role("button", name="Launch", exact=True).click()
     row = page.locator("#runs tr", has_text="lost")
     expect(row.locator(".state")).to_have_text("failed")
-    row.locator("a").click()
+    row.get_by_role("link", name="lost").click()
     failure = page.locator(".failure")
     expect(failure).to_contain_text("control.npy is nan at frame 4, control 1")
     expect(failure.locator(".advice")).to_contain_text("Repair the named file of the sequence")

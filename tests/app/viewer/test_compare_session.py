@@ -81,6 +81,21 @@ def said(client: ViewerClient) -> str:
     return "\n".join(str(p["content"]) for p in client.gui.values() if "content" in p)
 
 
+def press(client: ViewerClient, hotkey: str) -> None:
+    """Press a key, as the browser tells it."""
+    client.until(lambda: hotkey in commands(client))
+    client.send("CommandTriggerMessage", uuid=commands(client)[hotkey])
+
+
+def commands(client: ViewerClient) -> dict[str, str]:
+    """The ids of the commands that are heard, by their keys."""
+    return {
+        message["props"]["hotkey"]: message["uuid"]
+        for message in client.messages
+        if message["type"] == "RegisterCommandMessage" and message["props"]["modifier"] is None
+    }
+
+
 def nodes(client: ViewerClient, side: str) -> np.ndarray:
     return client.array(f"/compare/{side}/object/compared", "points")
 
@@ -89,6 +104,12 @@ def across(client: ViewerClient) -> np.ndarray:
     """The way from A to B."""
     a, b = (np.array(client.positions.get(f"/compare/{side}", (0, 0, 0))) for side in "ab")
     return b - a
+
+
+def looks_along_y(client: ViewerClient) -> bool:
+    """Turn the camera, again and again as a browser does, until the sides have followed."""
+    client.tell_camera(wxyz=TURNED)
+    return np.allclose(direction(client), [0.0, 1.0, 0.0], atol=1e-6)
 
 
 def direction(client: ViewerClient) -> np.ndarray:
@@ -106,8 +127,7 @@ def test_both_sides_follow_one_clock_beside_each_other(
         np.testing.assert_allclose(nodes(client, "a"), rollout[11], atol=1e-6)
         np.testing.assert_allclose(nodes(client, "b"), rollout[11] + 11 * OFFSET, atol=1e-6)
         # B stands to the right of the camera, wherever it looks, and the button exchanges them.
-        client.tell_camera(wxyz=TURNED)
-        client.until(lambda: np.allclose(direction(client), [0.0, 1.0, 0.0], atol=1e-6))
+        client.until(lambda: looks_along_y(client))
         assert np.linalg.norm(across(client)) > 0.2
         client.set("Swap sides", True)
         client.until(lambda: np.allclose(direction(client), [0.0, -1.0, 0.0], atol=1e-6))
@@ -227,3 +247,13 @@ def test_the_numbers_of_both_sides_can_be_saved(sessions: Sessions) -> None:
         with np.load(io.BytesIO(write_figure_npz(sides))) as data:
             moved = data["b_position"] - data["a_position"]
         np.testing.assert_allclose(moved[3], np.tile(3 * OFFSET, (moved.shape[1], 1)), atol=1e-6)
+
+
+def test_the_camera_comes_back_by_a_key(sessions: Sessions) -> None:
+    with watch(sessions, "a=sheet&b=moved&f=3") as client:
+        client.until(lambda: client.camera["fov"] < 0.3)
+        first = np.array(client.camera["look_at"])
+        away = np.add(first, 0.5)
+        client.tell_camera(look_at=away.tolist(), position=np.add(away, (1.0, 0.0, 0.0)).tolist())
+        press(client, "R")
+        client.until(lambda: np.linalg.norm(np.array(client.camera["look_at"]) - first) < 0.15)

@@ -3,7 +3,7 @@
 import re
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -234,14 +234,21 @@ def test_what_a_run_is_told_gives_the_parameters_of_the_scene(run) -> None:
     assert run_changes(run, fitted, fitted, is_automatic=True) == {"substeps_per_frame": "auto"}
 
 
+def wait_for(condition: Callable[[], bool], seconds: float = 20.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
 def test_a_saved_run_is_followed_until_it_ends(kept, begun) -> None:
     run = kept.saver.save("sheet", "lift", "  A   name ", {"drag": 1.0})
     assert (run.name, begun) == ("A name", [run])
     told: list[SavedRun] = []
     thread = kept.saver.follow(run, told.append, threading.Event())
+    wait_for(lambda: len(told) == 1)
     with run.begin_attempt() as attempt:
-        while len(told) < 2:
-            time.sleep(0.01)
+        wait_for(lambda: len(told) == 2)
         attempt.save_array("x.npy", np.zeros(3))
         attempt.publish()
     thread.join(timeout=5)
