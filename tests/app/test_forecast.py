@@ -4,7 +4,7 @@ import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,18 @@ def times(run: Run) -> tuple[float, float]:
 
 def change(path: Path, **values: Any) -> None:
     path.write_text(json.dumps(json.loads(path.read_text()) | values))
+
+
+@pytest.fixture(autouse=True)
+def _steady(world: World) -> None:
+    """Let the finished run have reported once a second, however busy this machine was."""
+    run = world.catalog.run("fitted")
+    begin, _ = times(run)
+    lines = (run.folder / "events.jsonl").read_text().splitlines()
+    events = [json.loads(line) | {"time": begin + i} for i, line in enumerate(lines, start=1)]
+    (run.folder / "events.jsonl").write_text("".join(f"{json.dumps(e)}\n" for e in events))
+    end = datetime.fromtimestamp(begin + len(lines) + 1, UTC)
+    change(run.folder / "exit.json", time=end.isoformat())
 
 
 @pytest.fixture
