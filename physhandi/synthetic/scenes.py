@@ -16,6 +16,7 @@ from physhandi.hand.motion import HandMotion
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
 from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.topology import build_model
+from physhandi.synthetic.hand_script import minimum_jerk
 
 FINGERTIPS = (4, 8, 12, 16, 20)
 """Keypoints at the ends of the fingers."""
@@ -168,14 +169,6 @@ def simulate_sheet(
     model = uneven_material(model, random)
     rollout = Simulator(model, parameters).rollout(control)
     return model, rollout.position.astype(np.float64)
-
-
-def minimum_jerk(
-    time: Float[ndarray, " frame"], start: float, end: float
-) -> Float[ndarray, " frame"]:
-    """Move from 0 to 1 between two times as smoothly as a reaching hand does."""
-    phase = np.clip((time - start) / (end - start), 0.0, 1.0)
-    return phase**3 * (10 - 15 * phase + 6 * phase**2)
 
 
 def _tremor(shape: tuple[int, ...], frame_rate: float, random: Generator) -> ndarray:

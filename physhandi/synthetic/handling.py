@@ -1,0 +1,277 @@
+"""Where a hand takes hold of an object that lies on the ground, and how it gets there."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from numpy.random import Generator
+from scipy.spatial.transform import Rotation
+
+from physhandi.synthetic.grasp import (
+    FLAT,
+    INDEX,
+    LITTLE,
+    MIDDLE,
+    POINTING,
+    RELAXED,
+    RING,
+    THUMB,
+    bend_of,
+    fingertip,
+    orientation_towards,
+    reach,
+)
+from physhandi.synthetic.hand_script import HandScript, Move, Tremor
+from physhandi.synthetic.places import Place, grasp_places, height_range, rim_place
+from physhandi.synthetic.true_hand import HandPose, TrueHand
+
+Carry = Callable[[float], tuple[Float[ndarray, " 3"], Float[ndarray, " 3"]]]
+"""Where a grasp has gone after a share of a move: shift [m] and rotation vector [rad]."""
+
+_UP = np.array([0.0, 0.0, 1.0])
+# Times of reaching, touching and closing, before the recording starts [s].
+_BEGIN, _TOUCH, _CLOSED = -1.4, -0.9, -0.15
+_HOVER = 0.06
+_POSES_PER_MOVE = 9
+_FINGER_SPACING = 0.020
+_PITCH = 0.75
+_TWO_FINGERS = (INDEX, MIDDLE)
+_FOUR_FINGERS = (INDEX, MIDDLE, RING, LITTLE)
+
+
+class Graspable(Protocol):
+    """What hands must know of an object."""
+
+    @property
+    def name(self) -> str:
+        """What kind of object it is."""
+        ...
+
+    @property
+    def node(self) -> Float[ndarray, "node 3"]:
+        """Nodes of the object lying on the ground, which is z = 0 [m]."""
+        ...
+
+    @property
+    def radius(self) -> float:
+        """Distance at which others touch it, about its nodes [m]."""
+        ...
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Grasp:
+    """A hand at an object: its way from open to closed."""
+
+    poses: Sequence[HandPose]
+    """Poses from the one that first touches the object to the one that holds it."""
+    place: Place
+    """Where the object is grasped, and which way the hand faces."""
+
+    @property
+    def forward(self) -> Float[ndarray, " 3"]:
+        """Horizontal direction in which the fingers reach."""
+        return self.place.forward
+
+    @property
+    def across(self) -> Float[ndarray, " 3"]:
+        """Horizontal direction to the left of `forward`."""
+        return np.cross(_UP, self.place.forward)
+
+
+class Handler:
+    """One hand that is about to do something with one object."""
+
+    def __init__(self, hand: TrueHand, body: Graspable, random: Generator) -> None:
+        """Remember who does what.
+
+        Args:
+            hand: The hand.
+            body: The object as it lies on the ground.
+            random: Decides places, directions and the tremor.
+        """
+        self._hand = hand
+        self._body = body
+        self._random = random
+
+    def pinch_near_rim(self) -> Grasp:
+        """Take the object between thumb and two fingers, far from its middle."""
+        return self._pinch(self._find_place(prefers_narrow=True), _TWO_FINGERS)
+
+    def pinch_end(self, sign: float) -> Grasp:
+        """Take one end of the object's longest direction: that towards +x (1) or -x (-1)."""
+        return self._pinch(self._find_place(prefers_narrow=True, end=sign), _TWO_FINGERS)
+
+    def embrace(self) -> Grasp:
+        """Close all fingers around a part of the object, or around a handful of it."""
+        return self._pinch(self._find_place(prefers_narrow=False), _FOUR_FINGERS)
+
+    def lay_flat(self) -> Grasp:
+        """Press the flat hand on the middle of the object."""
+        angle = np.pi / 2 + self._random.uniform(-0.4, 0.4)
+        forward = np.array([np.cos(angle), np.sin(angle), 0.0])
+        middle = self._body.node.mean(axis=0)
+        _, top = height_range(self._body, middle, 0.06)
+        place = Place(point=np.array([*middle[:2], top]), forward=forward, inwards=forward)
+        pose = HandPose(
+            orientation=orientation_towards(forward, pitch=0.06),
+            position=np.zeros(3),
+            bend=bend_of(FLAT),
+        )
+        low, center = self._lowest(pose)
+        is_soft = height_range(self._body, middle, 0.06)[1] > 0.02
+        press = 0.010 if is_soft else 0.003
+        shift = np.array([*(place.point - center)[:2], top - press - low])
+        above = _moved(pose, shift + (press + 0.004) * _UP)
+        return Grasp(poses=(above, _moved(pose, shift)), place=place)
+
+    def point_at(self) -> Grasp:
+        """Put the index finger beside the object, or on it where it is flat."""
+        body, tip = self._body, fingertip(self._hand, INDEX)
+        angle = np.pi / 2 + self._random.uniform(-0.35, 0.35)
+        forward = np.array([np.cos(angle), np.sin(angle), 0.0])
+        middle = body.node.mean(axis=0)
+        across = np.cross(_UP, forward)
+        aside = self._random.uniform(-0.03, 0.03)
+        beside = np.abs((body.node - middle) @ across - aside) < 0.02
+        nodes = body.node[beside]
+        near = nodes[((nodes - middle) @ forward).argmin()]
+        bottom, top = height_range(body, middle, 0.05)
+        is_flat = top - bottom < 0.008 + 2 * body.radius and top < 0.009
+        if is_flat:
+            inside = near + 0.05 * forward
+            target = np.array([*inside[:2], top + tip.radius - 0.002])
+        else:
+            outside = near - (tip.radius + body.radius - 0.001) * forward
+            height = max(tip.radius + 0.002, 0.45 * (bottom + top))
+            target = np.array([*outside[:2], height])
+        place = Place(point=target, forward=forward, inwards=forward)
+        orientation = orientation_towards(forward, pitch=_PITCH)
+        touch = reach(self._hand, {INDEX: target}, orientation=orientation, joints=POINTING)
+        back = 0.01 * _UP if is_flat else -0.01 * forward
+        return Grasp(poses=(_moved(touch, back), touch), place=place)
+
+    def script(self, grasp: Grasp, moves: Sequence[tuple[float, float, Carry]]) -> HandScript:
+        """Reach for the object, close the hand, and carry what it holds.
+
+        Args:
+            grasp: Where and how to take hold.
+            moves: Start, end [s] and way of each move after that.
+        """
+        held = grasp.poses[-1]
+        chain = self._approach(grasp)
+        for start, end, carry in moves:
+            phases = np.linspace(0.0, 1.0, _POSES_PER_MOVE)
+            poses = [_turned(held, grasp.place.point, *carry(float(p))) for p in phases]
+            chain.append(Move(start, end, poses))
+        return HandScript(self._hand.side, chain, Tremor(self._random))
+
+    def squeeze_script(
+        self, grasp: Grasp, times: Float[ndarray, " 4"], *, ease: float
+    ) -> HandScript:
+        """Close the hand further, ease it, and close it again.
+
+        Args:
+            grasp: Where and how to take hold.
+            times: Begin and end of closing, end of easing and of closing again [s].
+            ease: Share of the way to the open hand by which the grip is eased.
+        """
+        poses = list(grasp.poses)
+        half = len(poses) // 2
+        eased = poses[max(round((1 - ease) * (len(poses) - 1)), 0) :]
+        chain = self._approach(Grasp(poses=poses[: half + 1], place=grasp.place))
+        chain.append(Move(times[0], times[1], poses[half:]))
+        chain.append(Move(times[1], times[2], eased[::-1]))
+        chain.append(Move(times[2], times[3], eased))
+        return HandScript(self._hand.side, chain, Tremor(self._random))
+
+    def distance_to_middle(self, grasp: Grasp) -> float:
+        """How far the grasp is from the object's middle along the way the hand faces [m]."""
+        return abs(float((self._body.node.mean(axis=0) - grasp.place.point) @ grasp.place.inwards))
+
+    def _find_place(self, *, prefers_narrow: bool, end: float = 0.0) -> Place:
+        places = grasp_places(self._body, self._random, end=end)
+        if not places:
+            return rim_place(self._body, self._random, end=end)
+        places.sort(key=lambda place: place.score(prefers_narrow=prefers_narrow))
+        best = places[: max(len(places) // 5, 1)]
+        return best[self._random.integers(len(best))]
+
+    def _pinch(self, place: Place, fingers: Sequence[int]) -> Grasp:
+        """Close thumb and fingers about a place, in steps."""
+        if place.width is None:
+            # A sheet is raked together until its fold is between the fingers.
+            gaps = np.linspace(place.open_gap, place.closed_gap, 7)
+        else:
+            gaps = np.linspace(place.width + 0.012, place.closed_gap, 5)
+        first = self._claw(place, float(gaps[0]), fingers, None)
+        poses = [first]
+        for gap in gaps[1:]:
+            poses.append(self._claw(place, float(gap), fingers, poses[-1]))
+        return Grasp(poses=poses, place=place)
+
+    def _claw(
+        self, place: Place, gap: float, fingers: Sequence[int], start: HandPose | None
+    ) -> HandPose:
+        """Put thumb and fingers on opposite sides of a place, tips down."""
+        side = np.cross(_UP, place.forward) * (1.0 if self._hand.side == "right" else -1.0)
+        targets: Mapping[int, ndarray] = {
+            finger: self._opposite(place, finger, gap, side, fingers)
+            for finger in (THUMB, *fingers)
+        }
+        return reach(
+            self._hand,
+            targets,
+            orientation=orientation_towards(place.forward, pitch=_PITCH),
+            joints=RELAXED,
+            start=start,
+        )
+
+    def _opposite(
+        self, place: Place, finger: int, gap: float, side: ndarray, fingers: Sequence[int]
+    ) -> Float[ndarray, " 3"]:
+        radius = fingertip(self._hand, finger).radius
+        sign = -1.0 if finger == THUMB else 1.0
+        order = 0.0 if finger == THUMB else (len(fingers) - 1) / 2 - fingers.index(finger)
+        target = place.point + sign * (gap / 2 + radius) * place.forward
+        target = target + order * _FINGER_SPACING * side
+        return np.array([*target[:2], max(place.depth, 0.001) + radius])
+
+    def _approach(self, grasp: Grasp) -> list[Move]:
+        hover = _moved(grasp.poses[0], _HOVER * _UP - 0.01 * grasp.forward)
+        return [
+            Move(_BEGIN, _TOUCH, (hover, grasp.poses[0])),
+            Move(_TOUCH, _CLOSED, grasp.poses),
+        ]
+
+    def _lowest(self, pose: HandPose) -> tuple[float, Float[ndarray, " 3"]]:
+        """Find the lowest skin of a pose, and the middle of its palm."""
+        transform = self._hand.bone_transforms(pose)
+        lowest = np.inf
+        for capsule in self._hand.capsules:
+            turn, shift = transform[capsule.bone, :3, :3], transform[capsule.bone, :3, 3]
+            for end in (capsule.start, capsule.end):
+                lowest = min(lowest, float((turn @ end + shift)[2]) - capsule.radius)
+        keypoint = self._hand.pose(pose).keypoint
+        return lowest, (keypoint[0] + keypoint[9]) / 2
+
+
+def _moved(pose: HandPose, shift: Float[ndarray, " 3"]) -> HandPose:
+    return HandPose(orientation=pose.orientation, position=pose.position + shift, bend=pose.bend)
+
+
+def _turned(
+    pose: HandPose,
+    point: Float[ndarray, " 3"],
+    shift: Float[ndarray, " 3"],
+    turn: Float[ndarray, " 3"],
+) -> HandPose:
+    """Turn a pose about a point, then shift it."""
+    rotation = Rotation.from_rotvec(turn)
+    return HandPose(
+        orientation=(rotation * Rotation.from_rotvec(pose.orientation)).as_rotvec(),
+        position=point + rotation.apply(pose.position - point) + shift,
+        bend=pose.bend,
+    )
