@@ -8,7 +8,7 @@ DATA ?= data
 # Without an NVIDIA GPU install torch's CPU build first (README, "Installing torch"); this variable is passed to pip.
 TORCH ?= torch==2.13.0
 
-.PHONY: install demo test check fmt bench test-gpu browser clean
+.PHONY: install demo test check fmt bench test-gpu pictures browser clean
 
 install: $(STAMP)
 
@@ -35,6 +35,10 @@ fmt: install
 test: install browser
 	rm -f .coverage .coverage.*
 	$(BIN)/python -m pytest -n 2 --dist loadfile --cov --cov-report=term
+
+# The README's pictures, made by the browser tests.
+pictures: install browser
+	PHYSHANDI_PICTURES=docs/images $(BIN)/python -m pytest -q tests/e2e
 
 test-gpu: install
 	$(BIN)/python -m pytest -m gpu

@@ -1,5 +1,6 @@
 """A real server, a real browser, and a watch over what the browser complains about."""
 
+import io
 import os
 import shutil
 import subprocess
@@ -10,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from PIL import Image
 from playwright.sync_api import (
     Browser,
     BrowserContext,
@@ -26,6 +28,10 @@ START = "from app.cli import main; main()"
 _CHROMIUM = ["--no-sandbox", "--use-angle=gl-egl", "--ignore-gpu-blocklist"]
 _START_SECONDS = 60.0
 _TIMEOUT_MS = 45_000
+_PICTURES = "PHYSHANDI_PICTURES"
+"""Names the folder of the README's pictures, which are made anew if it is set (`make pictures`)."""
+_SETTLE_MS = 2_000
+"""Time that software rendering takes to catch up with the scene."""
 _REPORT_VIOLATIONS = (
     "document.addEventListener('securitypolicyviolation', (event) => console.error("
     "'policy violated', event.violatedDirective, event.blockedURI));"
@@ -116,3 +122,27 @@ def open_home(context: BrowserContext, served: Served) -> Callable[[], Page]:
 def home(open_home: Callable[[], Page]) -> Page:
     """The start page."""
     return open_home()
+
+
+@pytest.fixture(scope="session")
+def picture() -> Callable[[Page, str], None]:
+    """Keep a picture of a page for the README, if somebody wants pictures.
+
+    Tests call it where they have just shown that the page is what the picture claims.
+    """
+    folder = os.environ.get(_PICTURES, "")
+
+    def keep(page: Page, name: str) -> None:
+        if not folder:
+            return
+        if page.locator("#scene").count():  # Notices of this machine's slow graphics.
+            notices = page.frame_locator("#scene").locator(".mantine-Notification-closeButton")
+            for _ in range(notices.count()):
+                notices.first.click()
+        page.mouse.move(640, 790)
+        expect(page.locator(".shot.pending:not(:has(img))")).to_have_count(0)
+        page.wait_for_timeout(_SETTLE_MS)
+        image = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
+        image.quantize(160).save(Path(folder) / f"{name}.png", optimize=True)
+
+    return keep

@@ -34,7 +34,7 @@ def rows(page: Page) -> list[str]:
     return page.locator("#runs tbody .name strong").all_inner_texts()
 
 
-def test_runs_are_filtered_sorted_chosen_and_compared(home: Page, base: str) -> None:
+def test_runs_are_filtered_sorted_chosen_and_compared(home: Page, base: str, picture) -> None:
     home.goto(f"{base}/runs")
     expect(home.locator("#runs tbody tr")).to_have_count(3)
     home.keyboard.press("/")
@@ -63,6 +63,9 @@ def test_runs_are_filtered_sorted_chosen_and_compared(home: Page, base: str) -> 
     expect(home.locator("#runs tbody tr")).to_have_count(1)
     home.get_by_label("Choose Soft towel").check()
     expect(home.locator("[data-chosen-text]")).to_have_text("2 runs chosen")
+    home.locator("#q").fill("towel")
+    expect(home.locator("#runs tbody tr")).to_have_count(3)
+    picture(home, "runs")
     home.get_by_role("button", name="Compare parameters and scores").click()
     expect(home).to_have_url(f"{base}/diff?run=copy1&run=copy0")
     table = home.locator("table.diff")

@@ -67,16 +67,17 @@ def scene(home: Page) -> ScenePage:
     return scene
 
 
-def test_the_printed_address_shows_sequences_and_finished_runs(home, fitted):
+def test_the_printed_address_shows_sequences_and_finished_runs(home, fitted, picture):
     expect(home.locator("[data-sequence=towel_fold] h3")).to_contain_text("towel_fold")
     row = home.locator(f"#runs [data-run={fitted.id}]")
     expect(row).to_contain_text(fitted.name)
     expect(row).to_contain_text("succeeded")
     # The token has left the address, so that nobody copies it from there.
     assert "token" not in home.url
+    picture(home, "home")
 
 
-def test_a_scene_opens_and_plays(home):
+def test_a_scene_opens_and_plays(home, picture):
     scene = ScenePage.opened_from(home)
 
     frames = {scene.value("Frame")}
@@ -85,9 +86,12 @@ def test_a_scene_opens_and_plays(home):
     before = scene.value("Frame")
     scene.press("1 ▶")
     scene.until(lambda: scene.value("Frame") == (before + 1) % 60, "a step by one frame")
+    scene.set("Frame", 40)
+    scene.until(lambda: scene.value("Frame") == 40, "a frame in which much happens")
+    picture(home, "viewer")
 
 
-def test_sliders_simulate_again_and_reset_returns(scene, fitted, tmp_path):
+def test_sliders_simulate_again_and_reset_returns(scene, fitted, tmp_path, picture):
     radius = fitted.parameters["connection_radius"]
     virtual_radius = fitted.parameters["virtual_connection_radius"]
     as_fitted = len(fitted.object_springs(radius)), len(fitted.virtual_springs(virtual_radius))
@@ -101,6 +105,8 @@ def test_sliders_simulate_again_and_reset_returns(scene, fitted, tmp_path):
     scene.until(lambda: (scene.difference() or 0) > 0, "another rollout")
     by_radius = scene.difference()
     assert scene.springs()[1] == as_fitted[1]
+    scene.set("Frame", 40)
+    picture(scene.page, "tweak")
 
     scene.set("stiffness 10^", -1)
     scene.until(lambda: scene.difference() not in {None, by_radius}, "a third rollout")
@@ -161,10 +167,11 @@ def test_the_viewer_saves_what_it_shows(scene, fitted, tmp_path):
     assert np.count_nonzero((red > 120) & (red - blue > 80) & (red - green > 80)) > 100
 
 
-def test_a_run_page_exports_the_rollout(home, fitted, tmp_path):
+def test_a_run_page_exports_the_rollout(home, fitted, tmp_path, picture):
     home.locator(f"#runs [data-run={fitted.id}] a").first.click()
     expect(home.locator("h1")).to_have_text(fitted.name)
     expect(home.locator("#losses .uplot").first).to_be_visible()
+    picture(home, "run")
 
     with home.expect_download() as download:
         home.locator(".exports").get_by_text("PLY", exact=True).click()

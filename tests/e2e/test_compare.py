@@ -28,7 +28,7 @@ def lifted(served) -> str:
     source = Run.open(BUNDLED / "runs" / "towel_fold_quick")
     run = Run.create(
         served.data_dir / "runs" / "lifted",
-        name="lifted <b>bold</b>",
+        name="12 mm <i>higher</i>",
         kind="simulation",
         sequences=["towel_fold"],
         config={},
@@ -43,7 +43,7 @@ def lifted(served) -> str:
     return run.id
 
 
-def test_two_runs_are_compared_in_one_scene(home: Page, lifted: str) -> None:
+def test_two_runs_are_compared_in_one_scene(home: Page, lifted: str, picture) -> None:
     home.goto(home.url.split("?")[0].rstrip("/") + "/runs")
     for run in ("towel_fold_quick", lifted):
         home.locator(f"tr[data-run={run}] [data-choose]").check()
@@ -56,8 +56,8 @@ def test_two_runs_are_compared_in_one_scene(home: Page, lifted: str) -> None:
     expected = 12.0 * FRAME / 59
     scene.until(lambda: scene.has(f"mean {expected:.3g} mm"), "the difference is told")
     # The table knows both, and the name of a user is text.
-    expect(home.locator("h1 .b")).to_contain_text("lifted <b>bold</b>")
-    expect(home.locator(".diff.only").first).to_contain_text("lifted <b>bold</b>")
+    expect(home.locator("h1 .b")).to_contain_text("12 mm <i>higher</i>")
+    expect(home.locator(".diff.only").first).to_contain_text("12 mm <i>higher</i>")
     # Charts of the difference and of both errors; a click goes to a frame.
     expect(home.locator("figure.chart")).to_have_count(3)
     chart = home.locator("figure.chart", has_text="Difference of A and B")
@@ -71,6 +71,7 @@ def test_two_runs_are_compared_in_one_scene(home: Page, lifted: str) -> None:
     assert halves[0].size > 120
     assert halves[1].size > 120
     assert halves[0].max() < halves[1].min()
+    picture(home, "compare")
     home.keyboard.press("m")
     scene.until(lambda: scene.has("A ↔ B"), "the overlay")
     scene.until(

@@ -25,10 +25,13 @@ def hue(image: np.ndarray, low: int, high: int) -> np.ndarray:
     return (hsv[..., 0] >= low) & (hsv[..., 0] <= high) & (hsv[..., 1] > 110)
 
 
-def test_the_figure_shows_both_topologies_in_one_picture(scene: ScenePage, tmp_path: Path) -> None:
+def test_the_figure_shows_both_topologies_in_one_picture(
+    scene: ScenePage, tmp_path: Path, picture
+) -> None:
     scene.page.keyboard.press("f")
     scene.until(lambda: scene.has("PhysTwin-style: simulated 60/60 frames"), "the figure")
     scene.set("Frame", FRAME)
+    picture(scene.page, "figure_view")
     scene.unfold("Export")
     with np.load(scene.download("NPZ", tmp_path)) as data:
         assert data["ours_frame"] == data["phystwin_frame"] == FRAME

@@ -37,7 +37,7 @@ def place_on_page(scene: ScenePage, point: np.ndarray) -> tuple[float, float]:
     return box["x"] + 0.5 * box["width"] + float(x), box["y"] + 0.5 * box["height"] + float(y)
 
 
-def picture(scene: ScenePage) -> np.ndarray:
+def shot_of(scene: ScenePage) -> np.ndarray:
     """What the scene shows left of the panel."""
     scene.page.wait_for_timeout(600)
     shot = scene.page.screenshot(clip={"x": 330, "y": 60, "width": 600, "height": 700})
@@ -49,7 +49,7 @@ def blue(image: np.ndarray) -> int:
     return int(((image[..., 2] > 180) & (image[..., 2] - image[..., 0] > 110)).sum())
 
 
-def test_keys_colors_and_clicks_work_in_the_scene_and_around_it(scene):
+def test_keys_colors_and_clicks_work_in_the_scene_and_around_it(scene, picture):
     page = scene.page
     # The page around has the focus; the keys reach the scene all the same.
     page.locator(".hints").click()
@@ -61,12 +61,12 @@ def test_keys_colors_and_clicks_work_in_the_scene_and_around_it(scene):
     for layer in "156":
         page.keyboard.press(layer)
 
-    before = picture(scene)
+    before = shot_of(scene)
     for _ in range(5):
         page.keyboard.press("c")
     scene.until(lambda: scene.has("Speed"), "the legend")
-    scene.until(lambda: blue(picture(scene)) < 0.1 * blue(before), "other colors than plain blue")
-    colored = picture(scene)
+    scene.until(lambda: blue(shot_of(scene)) < 0.1 * blue(before), "other colors than plain blue")
+    colored = shot_of(scene)
     yellow = (colored[..., 0] > 120) & (colored[..., 1] > 180) & (colored[..., 2] < 100)
     assert yellow.sum() > 50  # The fastest nodes.
 
@@ -87,6 +87,7 @@ def test_keys_colors_and_clicks_work_in_the_scene_and_around_it(scene):
     page.mouse.click(box["x"] + 0.75 * box["width"], box["y"] + 0.5 * box["height"])
     scene.until(lambda: abs(scene.value("Frame") - 0.75 * 59) <= 1, "the frame in the chart")
 
+    picture(page, "inspect")
     page.keyboard.press("?")
     help_overlay = page.locator("dialog#help")
     help_overlay.get_by_text("show or hide a layer").wait_for()
