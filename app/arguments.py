@@ -110,12 +110,40 @@ class EvaluateHands:
 
 
 @dataclass(frozen=True, kw_only=True)
+class EvaluateSuite:
+    """Compare methods on a suite of sequences, and write its tables (docs/evaluation.md)."""
+
+    suite: Literal["tiny", "dev", "full"] = "tiny"
+    """Which suite; sequences that are not there yet are made."""
+    methods: tuple[str, ...] = ()
+    """Methods: static, rigid_follow, phystwin, paper, ours, quick, oracle_hand, oracle_parameters,
+    each also as NAME+last_residual or NAME@SETTING=VALUE; none takes the suite's."""
+    seeds: tuple[int, ...] = ()
+    """Seeds of every scene; none takes the suite's. From 1000 on they are reserved."""
+    protocols: tuple[
+        Literal["main", "single_view", "unseen", "robustness", "sensitivity"], ...
+    ] = ()
+    """main is reconstruction and future prediction; none takes the suite's."""
+    sequences: tuple[str, ...] = ()
+    """Folders or names of sequences to evaluate in place of the suite's scenes."""
+    out: Path | None = None
+    """Folder to fill, and to go on with; none takes `suites/` in the data folder, whose suites the
+    server shows."""
+    device: str = "auto"
+    """Warp device: auto, cpu or cuda:0."""
+    json: bool = False
+    """Print JSON instead of lines."""
+    data_dir: DataDir = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class Evaluate:
     """Measure results."""
 
     what: (
         Annotated[EvaluateRun, subcommand("run", prefix_name=False)]
         | Annotated[EvaluateHands, subcommand("hands", prefix_name=False)]
+        | Annotated[EvaluateSuite, subcommand("suite", prefix_name=False)]
     )
     """What to measure."""
 

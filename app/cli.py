@@ -15,6 +15,7 @@ from app.arguments import (
     Command,
     Evaluate,
     EvaluateHands,
+    EvaluateSuite,
     Export,
     Import,
     Reconstruct,
@@ -84,6 +85,9 @@ def _dispatch(command: Any) -> int:
             _show(_watched(lambda progress: commands.simulate(command, progress)))
         case Evaluate(what=EvaluateHands() as what):
             _show(commands.evaluate_hands(what), as_json=what.json)
+        case Evaluate(what=EvaluateSuite() as what):
+            found = _watched(lambda progress: commands.evaluate_suite(what, progress))
+            _show(found, as_json=what.json)
         case Evaluate(what=what):
             _show(commands.evaluate_run(what), as_json=what.json)
         case Import(source=source):

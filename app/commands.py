@@ -215,6 +215,39 @@ def evaluate_hands(command: Any) -> dict[str, Any]:
     return hands
 
 
+def evaluate_suite(command: Any, progress: Progress) -> dict[str, Any]:
+    """Compare methods on the sequences of a suite, or on named ones.
+
+    Raises:
+        UsageError: If a method, seed or sequence makes no sense.
+    """
+    from physhandi.synthetic.evaluation import Order, evaluate
+    from physhandi.synthetic.suite import find_suite, make_recordings
+
+    suite = find_suite(command.suite)
+    settings = read_settings(data_dir=command.data_dir)
+    name = "named" if command.sequences else suite.name
+    out = command.out or settings.data_dir / "suites" / name
+    if command.sequences and command.seeds:
+        raise UsageError("--seeds belongs to a suite's scenes; leave it out with --sequences.")
+    recordings = (
+        tuple(find_sequence(sequence, command.data_dir) for sequence in command.sequences)
+        if command.sequences
+        else make_recordings(suite, command.seeds or suite.seeds, out / "sequences", progress)
+    )
+    for recording in recordings:
+        recording.validate(reads_color=False)
+    order = Order(
+        title=f"Suite {suite.name}" if not command.sequences else "Named sequences",
+        recordings=recordings,
+        methods=command.methods or suite.methods,
+        protocols=command.protocols or suite.protocols,
+        settings=suite.settings,
+        device=pick_device(command.device),
+    )
+    return evaluate(order, out, progress)
+
+
 def import_foreign(source: Any, progress: Progress) -> dict[str, Any]:
     """Convert what other programs wrote; returns what was written, and what was noticed."""
     match source:

@@ -4,12 +4,15 @@ Each stage reads what earlier stages stored and stores what it found, so that an
 goes on after its last finished stage.
 """
 
+from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Many
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import warp as wp
+from jaxtyping import Float
+from numpy import ndarray
 
 from physhandi.data.attempt import Attempt
 from physhandi.data.environment import ENVIRONMENT, describe_environment
@@ -20,7 +23,8 @@ from physhandi.fitting import artefacts
 from physhandi.fitting.hand_reconstruction import reconstruct_hands
 from physhandi.fitting.object_problem import ObjectProblem, build_problem
 from physhandi.fitting.object_reconstruction import search_object
-from physhandi.fitting.profile import PipelineConfig, config_from_dict
+from physhandi.fitting.overrides import apply_overrides
+from physhandi.fitting.profile import PipelineConfig, config_from_dict, config_to_dict, load_profile
 from physhandi.fitting.rollouts import (
     control_trajectory_of,
     object_nodes_of,
@@ -43,6 +47,20 @@ from physhandi.fitting.stage_names import STAGES as STAGES
 from physhandi.metrics.report import measure_run, score_run
 from physhandi.perception.lifting import observe_object
 from physhandi.progress import Progress
+
+Rule = Callable[
+    [Float[ndarray, "node 3"], Float[ndarray, "frame control 3"]], Float[ndarray, "frame node 3"]
+]
+"""Moves the object's nodes of frame 0 with the control nodes of all frames [m]."""
+
+
+def settings_of(profile: str, overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """Give the settings of a profile with some of them changed, in plain data.
+
+    Raises:
+        UsageError: If there is no such profile, or a setting is unknown or out of bounds.
+    """
+    return config_to_dict(apply_overrides(load_profile(profile), overrides))
 
 
 def reconstruct(
@@ -67,18 +85,41 @@ def reconstruct(
         FitError: If an optimisation has no usable result.
         CancelledError: If the user asked to stop.
     """
-    has_object = not any(_missing_for_object(sequence) for sequence in sequences)
-    if not has_object and not all(sequence.hands for sequence in sequences):
-        raise MissingInputError(_nothing_to_fit(sequences))
-    for sequence in sequences:
-        artefacts.save_sequence_meta(attempt, sequence)
-    _stage_hands(sequences, config, attempt, progress)
+    has_object = _prepare(sequences, config, attempt, progress)
     if has_object:
-        _stage_observation(sequences, config, attempt, progress)
         _stage_search(sequences, config, attempt, progress, device)
         _stage_springs(sequences, config, attempt, progress, device)
         _stage_refinement(sequences, config, attempt, progress, device)
     _stage_evaluation(sequences, attempt, progress, device, has_object=has_object)
+
+
+def predict(
+    sequence: Sequence, config: PipelineConfig, rule: Rule, attempt: Attempt, progress: Progress
+) -> None:
+    """Reconstruct the hands alone, move the object by a rule, and measure: what fits must beat.
+
+    Args:
+        sequence: The recording.
+        config: Settings of the hands and of the nodes.
+        rule: Moves the nodes.
+        attempt: Where results go; finished stages in it are not computed again.
+        progress: Told about every iteration.
+
+    Raises:
+        MissingInputError: If the sequence has no object, or nothing that moves it.
+        CancelledError: If the user asked to stop.
+    """
+    if not _prepare([sequence], config, attempt, progress):
+        raise MissingInputError(_nothing_to_fit([sequence]))
+    if attempt.stage_done(EVALUATION):
+        return
+    artefacts.save_hand_vertices(attempt, sequence.name)
+    folder = artefacts.sequence_folder(sequence.name)
+    node = artefacts.load_array(attempt.out / folder / "object_node.npy")
+    rollout = rule(node, artefacts.load_control(attempt.out, sequence.name))
+    attempt.save_array(f"{folder}/rollout.npy", np.asarray(rollout, np.float32))
+    attempt.save_json("metrics.json", {sequence.name: _measure(sequence, attempt)})
+    _finish(attempt, EVALUATION, [], [], [])
 
 
 def simulate(
@@ -115,6 +156,21 @@ def evaluate(run: Run, sequences: Many[Sequence]) -> dict[str, Any]:
             points = artefacts.lifted_hand_points(sequence)
         scores[sequence.name] = score_run(run.out, sequence, hand_points=points)
     return scores
+
+
+def _prepare(
+    sequences: Many[Sequence], config: PipelineConfig, attempt: Attempt, progress: Progress
+) -> bool:
+    """Reconstruct hands and collect what was seen; tell whether there is an object to fit."""
+    has_object = not any(_missing_for_object(sequence) for sequence in sequences)
+    if not has_object and not all(sequence.hands for sequence in sequences):
+        raise MissingInputError(_nothing_to_fit(sequences))
+    for sequence in sequences:
+        artefacts.save_sequence_meta(attempt, sequence)
+    _stage_hands(sequences, config, attempt, progress)
+    if has_object:
+        _stage_observation(sequences, config, attempt, progress)
+    return has_object
 
 
 def _stage_hands(

@@ -1,0 +1,187 @@
+"""What the suites hold: scenes, seeds, effort and methods.
+
+Difficulty is set here and in the scenes, once, before any method is tuned. Seeds from
+`RESERVED_SEED` on are kept for verification; nothing may be tuned on them.
+"""
+
+from collections.abc import Mapping
+from collections.abc import Sequence as Many
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from physhandi.data.sequence import Sequence
+from physhandi.errors import UsageError
+from physhandi.progress import Progress
+
+SuiteName = Literal["tiny", "dev", "full"]
+Protocol = Literal["main", "single_view", "unseen", "robustness", "sensitivity"]
+RESERVED_SEED = 1000
+"""Seeds from here on are reserved for verification."""
+BASELINES = ("static", "rigid_follow", "phystwin")
+"""Methods that every table carries."""
+ORACLES = ("oracle_hand", "oracle_parameters")
+"""Methods that are given what no real method can have."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """One scene of a suite; with a seed it becomes a sequence."""
+
+    object_: str
+    """What is handled: cloth, towel, rope, plush or pouch."""
+    action: str
+    """What is done with it: lift, fold, stretch, squeeze, wipe or push."""
+
+    def name(self, seed: int) -> str:
+        """Name the sequence of a seed."""
+        return f"{self.object_}_{self.action}_{seed}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Suite:
+    """A list of scenes, and how much effort every method may take."""
+
+    name: SuiteName
+    """What it is called."""
+    about: str
+    """What it is for, in one sentence."""
+    scenes: tuple[Scene, ...]
+    """Scenes, in order."""
+    seeds: tuple[int, ...]
+    """Seeds of each scene."""
+    methods: tuple[str, ...]
+    """Methods that are compared if none are named."""
+    protocols: tuple[Protocol, ...] = ("main",)
+    """Protocols that are run if none are named."""
+    settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    """Settings that all methods share: one node spacing, so that Chamfer distances compare."""
+    recording: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    """What the generator is told of every sequence: preset, frames, images, resolution."""
+
+
+def _scenes(*pairs: str) -> tuple[Scene, ...]:
+    split = [pair.split() for pair in pairs]
+    return tuple(Scene(object_=object_, action=action) for object_, action in split)
+
+
+SUITES: dict[str, Suite] = {
+    suite.name: suite
+    for suite in (
+        Suite(
+            name="tiny",
+            about="One small sequence and little effort: shows that everything works.",
+            scenes=_scenes("cloth lift"),
+            seeds=(0,),
+            methods=("static", "rigid_follow", "phystwin", "quick", "quick+last_residual"),
+            settings={
+                "node_spacing": 0.02,
+                "hand.iterations": 60,
+                "hand.depth_iterations": 0,
+                "object_.search.generations": 2,
+                "object_.search.population": 4,
+                "object_.first_order.iterations": 2,
+                "refinement.iterations": 0,
+            },
+            recording={"preset": "clean", "resolution": "tiny", "images": "none", "frames": 20},
+        ),
+        Suite(
+            name="dev",
+            about="Six sequences without images: for daily work on methods.",
+            scenes=_scenes(
+                "cloth lift", "cloth fold", "rope lift", "rope push", "plush squeeze", "pouch lift"
+            ),
+            seeds=(0,),
+            methods=(
+                *BASELINES,
+                "phystwin+last_residual",
+                *("paper", "quick", "ours", "ours+last_residual"),
+                *ORACLES,
+            ),
+            protocols=("main", "unseen"),
+            settings={"node_spacing": 0.012},
+            recording={"preset": "default", "images": "none", "frames": 60},
+        ),
+        Suite(
+            name="full",
+            about="Five objects, four actions each, five seeds, with images: the paper's tables.",
+            scenes=_scenes(
+                *("cloth lift", "cloth fold", "cloth stretch", "cloth wipe"),
+                *("towel lift", "towel fold", "towel wipe", "towel push"),
+                *("rope lift", "rope stretch", "rope fold", "rope push"),
+                *("plush lift", "plush squeeze", "plush stretch", "plush push"),
+                *("pouch lift", "pouch squeeze", "pouch wipe", "pouch push"),
+            ),
+            seeds=(0, 1, 2, 3, 4),
+            methods=(
+                *BASELINES,
+                "phystwin+last_residual",
+                *("paper", "ours", "ours+last_residual"),
+                *("ours@refinement.iterations=0", *ORACLES),
+            ),
+            protocols=("main", "single_view", "unseen", "robustness", "sensitivity"),
+            settings={"node_spacing": 0.01},
+            recording={"preset": "default"},
+        ),
+    )
+}
+"""All suites by name."""
+
+
+def find_suite(name: str) -> Suite:
+    """Find a suite by name.
+
+    Raises:
+        UsageError: If there is no such suite.
+    """
+    if name not in SUITES:
+        raise UsageError(f"There is no suite '{name}'. Choose from: {', '.join(SUITES)}.")
+    return SUITES[name]
+
+
+def check_seeds(seeds: Many[int]) -> None:
+    """Refuse seeds that no sequence can have, or that come twice.
+
+    Raises:
+        UsageError: If a seed is negative or named twice.
+    """
+    for seed in seeds:
+        if seed < 0:
+            raise UsageError(f"Seed {seed} is negative; seeds count from 0.")
+        if list(seeds).count(seed) > 1:
+            raise UsageError(f"Seed {seed} is named twice.")
+
+
+def make_recordings(
+    suite: Suite, seeds: Many[int], folder: Path, progress: Progress
+) -> tuple[Sequence, ...]:
+    """Make the sequences of a suite; those that are there already are opened.
+
+    Args:
+        suite: The suite.
+        seeds: Seeds of every scene.
+        folder: Where the sequences lie.
+        progress: Told about every frame.
+
+    Raises:
+        UsageError: If a seed makes no sense.
+        SequenceError: If a sequence that is there is damaged; delete its folder to make it anew.
+    """
+    from physhandi.synthetic.synthesize import synthesize
+
+    check_seeds(seeds)
+    found: list[Sequence] = []
+    for scene in suite.scenes:
+        for seed in seeds:
+            target = folder / scene.name(seed)
+            if not target.is_dir():
+                synthesize(
+                    scene.object_,
+                    scene.action,
+                    seed=seed,
+                    out=target,
+                    progress=progress,
+                    **suite.recording,
+                )
+            found.append(Sequence.load(target))
+    return tuple(found)

@@ -1,0 +1,76 @@
+"""Tables as people read them."""
+
+import re
+
+from physhandi.metrics.suite_layout import Column, laid_out, latex_table, markdown_table
+from physhandi.metrics.suite_plots import bar_chart, line_chart
+from physhandi.metrics.suite_tables import Row
+
+SHOWN = (
+    Column(split="future", metric="track_error", title="Track [mm]", factor=1000.0),
+    Column(split="future", metric="iou", title="IoU ↑", digits=3),
+    Column(split="future", metric="psnr", title="PSNR ↑"),
+)
+
+
+def row(method: str, metric: str, mean: float, n: int = 3) -> Row:
+    return Row(
+        method=method, split="future", metric=metric, mean=mean, low=mean / 2, high=2 * mean, n=n
+    )
+
+
+ROWS = [
+    row("static", "track_error", 0.02),
+    row("last_residual", "track_error", 0.01, n=1),
+    row("static", "iou", 0.5),
+    row("last_residual", "iou", 0.75),
+    row("elsewhere", "rrd_object", 0.1),
+]
+
+
+def test_lines_hold_figures_in_the_units_of_their_column() -> None:
+    assert laid_out(ROWS, SHOWN, "<{}>") == [
+        ["method", "Track [mm]", "IoU ↑"],
+        ["static", "20.00 [10.00, 40.00]", "0.500 [0.250, 1.000]"],
+        ["last_residual", "<10.00>", "<0.750> [0.375, 1.500]"],
+    ]
+
+
+def test_a_missing_figure_is_a_dash_and_one_method_alone_is_not_best() -> None:
+    lines = laid_out([row("a", "iou", 0.5), row("b", "track_error", 0.1)], SHOWN, "<{}>")
+    assert lines[1][1] == lines[2][2] == "\N{EN DASH}"
+    assert "<" not in str(lines)
+
+
+def test_markdown_has_as_many_cells_in_every_line() -> None:
+    lines = markdown_table(ROWS, SHOWN).splitlines()
+    assert len(lines) == 4
+    assert {line.count("|") for line in lines} == {4}
+    assert "**10.00**" in lines[3]
+
+
+def test_latex_escapes_names_and_counts_its_columns() -> None:
+    text = latex_table(ROWS, SHOWN)
+    assert text.startswith("\\begin{tabular}{lrr}\n")
+    assert "last\\_residual & \\textbf{10.00} & \\textbf{0.750} [0.375, 1.500] \\\\\n" in text
+    assert "IoU $\\uparrow$" in text
+
+
+def test_bars_are_as_long_as_their_figures() -> None:
+    chart = bar_chart("CD <b>", [("a", 2.0, 1.0, 4.0), ("b", 4.0, 3.0, 4.0)])
+    first, second = (float(width) for width in re.findall(r'<rect [^>]*width="([\d.]+)"', chart))
+    assert 0 < first < second
+    assert abs(second / first - 2) < 0.01
+    assert "CD &lt;b&gt;" in chart
+    assert "<b>" not in chart
+
+
+def test_a_line_is_broken_where_nothing_is_known() -> None:
+    chart = line_chart("error", {"a": [0.0, 1.0, None, 2.0, 1.0], "b": [0.5]})
+    first, second = re.findall(r'<path d="([^"]*)"', chart)
+    assert first.count("M") == 2
+    assert first.count("L") == 2
+    assert second.count("M") == 1
+    heights = [float(y) for y in re.findall(r"[ML][\d.]+ ([\d.]+)", first)]
+    assert heights[0] == 240.0  # zero is the lowest
+    assert heights[2] == 40.0 < heights[1]

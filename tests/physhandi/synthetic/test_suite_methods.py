@@ -1,0 +1,72 @@
+"""The names of methods, and what the suites hold."""
+
+import pytest
+
+from physhandi.errors import UsageError
+from physhandi.synthetic.baselines import METHODS, parse_method, settings_of, shared_stages
+from physhandi.synthetic.suite import SUITES, check_seeds, find_suite
+
+
+def test_a_name_says_base_settings_and_correction() -> None:
+    method = parse_method("quick@node_spacing=0.03,object_.search.generations=2+last_residual")
+    assert (method.profile, method.rule, method.is_corrected) == ("quick", None, True)
+    assert method.base.name == "quick@node_spacing=0.03,object_.search.generations=2"
+    settings = settings_of(method, {"node_spacing": 0.5, "refinement.iterations": 3})
+    assert settings["node_spacing"] == 0.03
+    assert settings["object_"]["search"]["generations"] == 2
+    assert settings["refinement"]["iterations"] == 3
+    assert "last residual" in method.about
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("statik", "no method 'statik'"),
+        ("quick+last", r"only '\+last_residual'"),
+        ("quick@node_spacing", "SETTING=VALUE"),
+        ("quick@node_spacin=1", "node_spacing"),
+        ("quick@node_spacing=-1", "node_spacing is -1"),
+    ],
+)
+def test_a_wrong_name_is_refused(name: str, told: str) -> None:
+    with pytest.raises(UsageError, match=told):
+        parse_method(name)
+
+
+def test_stages_are_shared_as_far_as_settings_agree() -> None:
+    common = {"node_spacing": 0.02, "hand.iterations": 7}
+    one, other, sparse = (
+        settings_of(METHODS[name], common) for name in ("static", "quick", "phystwin")
+    )
+    assert len(shared_stages(one, other)) == 2
+    assert shared_stages(one, sparse) == shared_stages(one, other)[:1]
+    assert shared_stages(one, settings_of(METHODS["quick"], {"hand.iterations": 8})) == ()
+
+
+@pytest.mark.parametrize("suite", SUITES.values(), ids=list(SUITES))
+def test_every_suite_holds_methods_that_exist_and_reserved_seeds_are_not_in_it(suite) -> None:
+    assert all(settings_of(parse_method(name), suite.settings) for name in suite.methods)
+    assert {"static", "phystwin"} <= set(suite.methods)
+    assert len(set(suite.scenes)) == len(suite.scenes)
+    assert max(suite.seeds) < 1000
+    assert "node_spacing" in suite.settings
+
+
+def test_the_full_suite_has_five_objects_of_four_actions() -> None:
+    scenes = find_suite("full").scenes
+    objects = [scene.object_ for scene in scenes]
+    assert len(scenes) == 20
+    assert {objects.count(name) for name in objects} == {4}
+    assert len({scene.action for scene in scenes}) == 6
+    assert len(find_suite("dev").scenes) == 6
+    assert len(find_suite("tiny").scenes) <= 2
+    assert len(find_suite("tiny").methods) >= 4
+
+
+def test_wrong_suites_and_seeds_are_refused() -> None:
+    with pytest.raises(UsageError, match="no suite 'huge'"):
+        find_suite("huge")
+    with pytest.raises(UsageError, match="twice"):
+        check_seeds((1, 2, 1))
+    with pytest.raises(UsageError, match="negative"):
+        check_seeds((-1,))
