@@ -1,6 +1,5 @@
 """A live session that shows two runs together, on one clock and for one camera."""
 
-import threading
 import time
 from dataclasses import replace
 from typing import Any
@@ -20,17 +19,17 @@ from app.viewer.export_panel import ExportPanel
 from app.viewer.figure import Side
 from app.viewer.figure_camera import FigureCameras
 from app.viewer.framing import Framing, frame_content
-from app.viewer.guard import Guard, plain
+from app.viewer.guard import plain
 from app.viewer.keyboard import bind
 from app.viewer.layers import Layers, default_layers
 from app.viewer.panels import LayersPanel, TimelinePanel
 from app.viewer.playback import TURN, Playback
-from app.viewer.session_state import Kind, Pose, SessionInfo, SessionState
+from app.viewer.scene_server import SceneServer
+from app.viewer.session_state import Kind, Pose, SessionState
 from app.viewer.snapshot import Snapshot
-from app.viewer.viser_server import start_viser
 
 
-class CompareSession:
+class CompareSession(SceneServer):
     """What one browser tab looks at: two runs in one viser server, with one panel and clock."""
 
     kind: Kind = "comparison"
@@ -53,18 +52,11 @@ class CompareSession:
             catalog: Finds the runs.
             state: What to begin with, as `state` of another session told it.
         """
-        self.id = session_id
-        self.owner = owner
-        self.created = time.time()
         self._ask = CompareAsk.parse(target)
         self._pair = open_pair(catalog, self._ask)
-        self._seen = time.monotonic()
         self._has_played = False
-        self._is_closed = False
-        self._lock = threading.RLock()
         self._cameras = FigureCameras()
-        self._server = start_viser(plain(self._pair.title))
-        self._guard = Guard(self._server)
+        super().__init__(session_id, owner=owner, title=self._pair.title)
         clock = self._pair.clock
         self._playback = Playback(clock.tick_count, clock.rate, self._draw)
         try:
@@ -76,11 +68,6 @@ class CompareSession:
         self._playback.start()
 
     @property
-    def port(self) -> int:
-        """Loopback port of the viser server."""
-        return self._server.get_port()
-
-    @property
     def target(self) -> str:
         """Query of what is shown now, for ``/compare?…``."""
         look = self._view.look
@@ -88,25 +75,9 @@ class CompareSession:
         return self._ask.model_copy(update=now).query
 
     @property
-    def info(self) -> SessionInfo:
-        """What a listing says about it."""
-        return SessionInfo(
-            id=self.id,
-            kind=self.kind,
-            target=self.target,
-            owner=self.owner,
-            title=self._pair.title,
-            client_count=len(self._server.get_clients()),
-            created=self.created,
-            idle=self.idle,
-        )
-
-    @property
-    def idle(self) -> float:
-        """How long nobody has looked at it [s]."""
-        if self._server.get_clients():
-            self._seen = time.monotonic()
-        return time.monotonic() - self._seen
+    def title(self) -> str:
+        """The names of both runs."""
+        return self._pair.title
 
     @property
     def state(self) -> SessionState:
@@ -226,12 +197,8 @@ class CompareSession:
         if not self._view.reset_view(event.client):
             self._layers_panel.reset_view(event)
 
-    def _part(self, client: viser.ClientHandle) -> None:
-        """Keep the camera of a client that leaves, for the tab that is being reloaded."""
-        self._seen = time.monotonic()
-        pose = self._cameras.forget(client)
-        if not self._is_closed:
-            pose.give_first(self._server.initial_camera)
+    def _forget(self, client: viser.ClientHandle) -> Pose:
+        return self._cameras.forget(client)
 
     def _draw(self, tick: int, is_playing: bool) -> None:
         with self._lock, TURN:

@@ -1,6 +1,5 @@
 """One live session: a viser server with scene, panel and clock."""
 
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,7 +13,6 @@ from app.viewer.export_panel import ExportPanel
 from app.viewer.figure_mode import FigureMode
 from app.viewer.frame_strip import FrameStrip
 from app.viewer.framing import frame_content
-from app.viewer.guard import Guard, plain
 from app.viewer.inspection import Inspection
 from app.viewer.keep_panel import Keeping
 from app.viewer.live import LiveSimulation
@@ -24,16 +22,14 @@ from app.viewer.pin_mode import PinMode
 from app.viewer.playback import TURN, Playback
 from app.viewer.restoring import complete_state, differences
 from app.viewer.scene import Scene
-from app.viewer.session_state import Kind as Kind
-from app.viewer.session_state import SessionInfo as SessionInfo
-from app.viewer.session_state import SessionState
+from app.viewer.scene_server import SceneServer
+from app.viewer.session_state import Kind, Pose, SessionState
 from app.viewer.snapshot import Snapshot
 from app.viewer.stage import Stage
 from app.viewer.take import Take
-from app.viewer.viser_server import start_viser
 
 
-class Session:
+class Session(SceneServer):
     """What one browser tab looks at: a viser server with scene, panel and clock."""
 
     def __init__(
@@ -60,26 +56,19 @@ class Session:
             state: What to begin with, as `state` of another session told it.
             keeping: Where presets and runs are kept.
         """
-        self.id = session_id
         self.kind: Kind = kind
-        self.target = target
-        self.owner = owner
-        self.created = time.time()
+        self._target = target
         self.link_of: Callable[[Session], str] = lambda _: ""
         self._catalog = catalog
         self._live = live
         self._keeping = keeping
-        self._seen = time.monotonic()
         self._has_played = False
-        self._is_closed = False
         self._names: tuple[str, ...] = ()
         if kind == "run":
             self._names = tuple(catalog.run(target).sequence_names)
         self._content = self._load(state.sequence_name if state is not None else None)
         state = None if state is None else complete_state(state, self._content)
-        self._lock = threading.RLock()
-        self._server = start_viser(plain(self._content.title))
-        self._guard = Guard(self._server)
+        super().__init__(session_id, owner=owner, title=self._content.title)
         self._playback = Playback(self._content.frame_count, self._content.frame_rate, self._draw)
         self._object: ObjectSession | None = None
         try:
@@ -92,30 +81,14 @@ class Session:
         self._playback.start()
 
     @property
-    def port(self) -> int:
-        """Loopback port of the viser server."""
-        return self._server.get_port()
+    def target(self) -> str:
+        """Id of the run or the sequence."""
+        return self._target
 
     @property
-    def info(self) -> SessionInfo:
-        """What a listing says about it."""
-        return SessionInfo(
-            id=self.id,
-            kind=self.kind,
-            target=self.target,
-            owner=self.owner,
-            title=self._content.title,
-            client_count=len(self._server.get_clients()),
-            created=self.created,
-            idle=self.idle,
-        )
-
-    @property
-    def idle(self) -> float:
-        """How long nobody has looked at it [s]."""
-        if self._server.get_clients():
-            self._seen = time.monotonic()
-        return time.monotonic() - self._seen
+    def title(self) -> str:
+        """Its name."""
+        return self._content.title
 
     @property
     def state(self) -> SessionState:
@@ -143,7 +116,7 @@ class Session:
 
     def snapshot(self) -> Snapshot:
         """Collect what is on the screen, to be saved."""
-        run = self._catalog.run(self.target) if self.kind == "run" else None
+        run = self._catalog.run(self._target) if self.kind == "run" else None
         with self._lock:
             frame = self._playback.frame
             take, take_frame = self._take(frame)
@@ -173,8 +146,8 @@ class Session:
 
     def _load(self, sequence_name: str | None) -> Content:
         if self.kind == "run":
-            return open_run(self._catalog, self.target, sequence_name)
-        return open_sequence(self._catalog, self.target)
+            return open_run(self._catalog, self._target, sequence_name)
+        return open_sequence(self._catalog, self._target)
 
     def _build(self) -> None:
         server, guard = self._server, self._guard
@@ -210,7 +183,7 @@ class Session:
         self._stage = Stage(scene, self._figure, self._pin)
         self._layers.replace(content, scene.layers, framing, has_surface=scene.may_have_surface)
         self._inspection.replace(content, scene, framing)
-        run = self._catalog.run(self.target) if self.kind == "run" else None
+        run = self._catalog.run(self._target) if self.kind == "run" else None
         self._pin.offer(content, framing)
         self._figure.offer(content, framing, run.folder if run is not None else None)
         if content.fitted is None or run is None:
@@ -275,12 +248,8 @@ class Session:
         elif not self._pin.reset_view(event.client):
             self._layers.reset_view(event)
 
-    def _part(self, client: viser.ClientHandle) -> None:
-        """Keep the camera of a client that leaves, for the tab that is being reloaded."""
-        self._seen = time.monotonic()
-        pose = self._figure.part(client)
-        if not self._is_closed:
-            pose.give_first(self._server.initial_camera)
+    def _forget(self, client: viser.ClientHandle) -> Pose:
+        return self._figure.part(client)
 
     def _draw(self, frame: int, is_playing: bool) -> None:
         with self._lock, TURN:

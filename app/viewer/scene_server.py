@@ -1,0 +1,82 @@
+"""What all live scenes share: a viser server of their own, an owner, and who is looking."""
+
+import threading
+import time
+from abc import ABC, abstractmethod
+
+import viser
+
+from app.viewer.guard import Guard, plain
+from app.viewer.session_state import Kind, Pose, SessionInfo
+from app.viewer.viser_server import start_viser
+
+
+class SceneServer(ABC):
+    """A viser server for one browser tab, which closes when nobody looks for long."""
+
+    kind: Kind
+    """What `target` names."""
+
+    def __init__(self, session_id: str, *, owner: str, title: str) -> None:
+        """Start the server; scene and panel are built by the caller.
+
+        Args:
+            session_id: Unguessable id.
+            owner: Whose session it is.
+            title: Of the panel; may be any user's text.
+        """
+        self.id = session_id
+        self.owner = owner
+        self.created = time.time()
+        self._seen = time.monotonic()
+        self._is_closed = False
+        self._lock = threading.RLock()
+        self._server = start_viser(plain(title))
+        self._guard = Guard(self._server)
+
+    @property
+    @abstractmethod
+    def target(self) -> str:
+        """What is shown: an id, or a query."""
+
+    @property
+    @abstractmethod
+    def title(self) -> str:
+        """What is shown, for people."""
+
+    @property
+    def port(self) -> int:
+        """Loopback port of the viser server."""
+        return self._server.get_port()
+
+    @property
+    def info(self) -> SessionInfo:
+        """What a listing says about it."""
+        return SessionInfo(
+            id=self.id,
+            kind=self.kind,
+            target=self.target,
+            owner=self.owner,
+            title=self.title,
+            client_count=len(self._server.get_clients()),
+            created=self.created,
+            idle=self.idle,
+        )
+
+    @property
+    def idle(self) -> float:
+        """How long nobody has looked at it [s]."""
+        if self._server.get_clients():
+            self._seen = time.monotonic()
+        return time.monotonic() - self._seen
+
+    @abstractmethod
+    def _forget(self, client: viser.ClientHandle) -> Pose:
+        """Forget a client; returns where its camera stood in the scene."""
+
+    def _part(self, client: viser.ClientHandle) -> None:
+        """Keep the camera of a client that leaves, for the tab that is being reloaded."""
+        self._seen = time.monotonic()
+        pose = self._forget(client)
+        if not self._is_closed:
+            pose.give_first(self._server.initial_camera)
