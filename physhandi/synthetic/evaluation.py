@@ -8,7 +8,7 @@ from typing import Any
 
 import warp as wp
 
-from physhandi.data.atomic import write_bytes, write_json
+from physhandi.data.atomic import named_fields, write_bytes, write_json
 from physhandi.data.environment import describe_environment
 from physhandi.data.sequence import Sequence
 from physhandi.errors import PhysHandiError, UsageError
@@ -172,16 +172,19 @@ def _started(task: _Task, radius: float, most: int) -> _Task:
 
 def _other_of_same_object(recording: Sequence, others: Many[Sequence]) -> Sequence | None:
     """Find the next recording of the same body in another action; around the end of the list."""
-    own = recording.provenance
-    fields = ("object", "seed")
-    if any(own.get(name) is None for name in fields):
-        return None
+    own = _body(recording)
     order = list(others)
     place = order.index(recording)
-    for other in order[place + 1 :] + order[:place]:
-        if all(other.provenance.get(name) == own[name] for name in fields):
-            return other
-    return None
+    rest = order[place + 1 :] + order[:place]
+    return next((other for other in rest if own is not None and _body(other) == own), None)
+
+
+def _body(recording: Sequence) -> tuple[Any, ...] | None:
+    """Identify the made body of a recording: seed and object decide its size and material."""
+    made = named_fields(recording.provenance.get("synthesize"))
+    if made is None:
+        return None
+    return tuple(made.get(name) for name in ("object", "seed", "resolution"))
 
 
 def _outcome(bench: Bench, task: _Task) -> Outcome:

@@ -47,7 +47,7 @@ def write_told(folder: Path, lift: float) -> Sequence:
     held[:, [0, 4]] = True
     arrays |= {"truth/contact_point.npy": NODE.astype(np.float32), "truth/contact.npy": held}
     meta: SequenceMeta = replace(
-        plain.meta, name=folder.name, provenance={"object": "sheet", "seed": 0}
+        plain.meta, name=folder.name, provenance={"synthesize": {"object": "sheet", "seed": 0}}
     )
     return write_sequence(folder / folder.name, meta, arrays)
 
