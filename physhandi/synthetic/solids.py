@@ -150,7 +150,7 @@ def _without_bare_edges(inside: Bool[ndarray, "x y z"]) -> Bool[ndarray, "x y z"
             a, b, c, d = grid[:-1, :-1], grid[1:, :-1], grid[:-1, 1:], grid[1:, 1:]
             bare = (a & d & ~b & ~c) | (b & c & ~a & ~d)
             for part in (a, b, c, d):
-                part |= bare
+                np.logical_or(part, bare, out=part)
         if np.count_nonzero(filled) == before:
             return filled
 

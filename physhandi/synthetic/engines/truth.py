@@ -1,0 +1,71 @@
+"""What a physics engine says has happened, and what it needs to know of a hand."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+from jaxtyping import Bool, Float, Float32
+from numpy import ndarray
+
+from physhandi.data.sequence_schema import Side
+from physhandi.synthetic.bodies import Body
+from physhandi.synthetic.true_hand import Capsule, HandPose
+
+FRAME_RATE = 30.0
+"""Frames per second [Hz]."""
+Hold = Literal["friction", "attachment"]
+"""Whether hands hold a body by friction alone, or what they touch for a while sticks to them."""
+
+
+class CapsuleHand(Protocol):
+    """What an engine needs of a hand; `TrueHand` has it."""
+
+    @property
+    def capsules(self) -> Sequence[Capsule]:
+        """Its shape for touching."""
+        ...
+
+    def bone_transforms(self, pose: HandPose, /) -> Float[ndarray, "bone 4 4"]:
+        """Compute where each bone takes the points of the resting hand."""
+        ...
+
+
+class MovingHand(Protocol):
+    """What an engine needs of a motion; `HandScript` has it."""
+
+    @property
+    def side(self) -> Side:
+        """Which hand moves."""
+        ...
+
+    @property
+    def begin(self) -> float:
+        """When the hand starts to move [s]; 0 is frame 0, so this is not positive."""
+        ...
+
+    def at(self, time: float, /) -> HandPose:
+        """Give the pose at any time [s]."""
+        ...
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PhysicalTruth:
+    """A body and the hands that moved it, in every frame."""
+
+    body: Body
+    """What was moved."""
+    position: Float32[ndarray, "frame node 3"]
+    """Nodes of the body in each frame [m]."""
+    contact: Bool[ndarray, "frame node"]
+    """Whether a hand touches or holds the node."""
+    hold: Hold
+    """How the hands hold."""
+    hands: Mapping[Side, tuple[HandPose, ...]]
+    """Pose of each hand in each frame."""
+    frame_rate: float = FRAME_RATE
+    """Frames per second [Hz]."""
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames."""
+        return len(self.position)
