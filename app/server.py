@@ -121,7 +121,17 @@ def create_app(
     app.include_router(create_api(catalog, scheduler, feed, sessions, machine))
     overview = Overview(settings, catalog, scheduler, machine)
     app.include_router(create_monitor(catalog, scheduler, overview, pages))
-    app.include_router(create_pages(catalog, scheduler, feed, sessions, pages, previews=previews))
+    app.include_router(
+        create_pages(
+            catalog,
+            scheduler,
+            feed,
+            sessions,
+            pages,
+            previews=previews,
+            suites=settings.suite_dir,
+        )
+    )
     app.include_router(create_exports(catalog, sessions, pages, workshop))
     app.include_router(create_comparing(catalog, scheduler, pages))
     app.include_router(create_gate(sessions))

@@ -88,6 +88,11 @@ class Settings(BaseSettings):
         return self.data_dir / "sequences"
 
     @property
+    def suite_dir(self) -> Path:
+        """Where suites are; the runs of their cells are found by id, but not listed."""
+        return self.data_dir / "suites"
+
+    @property
     def index_path(self) -> Path:
         """Where it is kept what was read of runs; it is made again when it is deleted."""
         return self.data_dir / "cache" / "runs.json"

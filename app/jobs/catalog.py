@@ -78,6 +78,7 @@ class Catalog:
         """
         self._sequence_dirs = ((settings.sequence_dir, False), (bundled, True))
         self._run_dirs = ((settings.run_dir, False), (bundled / "runs", True))
+        self._suite_dir = settings.suite_dir
         self._sequences = _Folders(_open_sequence, (FILE, "views"))
         self._index = RunIndex(settings.index_path)
         self._runs = _Folders(self._index.open, (JOB, RUN))
@@ -130,12 +131,13 @@ class Catalog:
         return Sequence.load(item.folder)
 
     def run_item(self, run_id: str) -> RunItem:
-        """Find a run by id, usable or not.
+        """Find a run by id, usable or not; those of suites too, which are not listed.
 
         Raises:
             UnknownRunError: If there is no such run.
         """
-        for root, is_bundled in self._run_dirs:
+        cells = ((folder, False) for folder in sorted(self._suite_dir.glob("*/cells")))
+        for root, is_bundled in (*self._run_dirs, *cells):
             found = self._runs.find(root, run_id)
             if found is not None:
                 return RunItem(run_id, root / run_id, is_bundled, *found)

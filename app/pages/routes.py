@@ -22,6 +22,7 @@ from app.pages.metrics import METHODS, tabulate
 from app.pages.parameters import parameter_rows
 from app.pages.pictures import add_pictures
 from app.pages.render import Pages
+from app.pages.suites import add_suites
 from app.previews.store import Previews
 from physhandi.data.sequence import Sequence
 from physhandi.errors import UsageError
@@ -87,6 +88,7 @@ def create_pages(
     pages: Pages,
     *,
     previews: Previews,
+    suites: Path,
 ) -> APIRouter:
     """Make the routes of the pages.
 
@@ -97,10 +99,12 @@ def create_pages(
         scenes: Finds live scenes.
         pages: Renders.
         previews: Keeps small pictures.
+        suites: Folder of suites.
     """
     router = APIRouter(include_in_schema=False)
     add_lists(router, catalog, feed, pages, previews=previews)
     add_pictures(router, previews)
+    add_suites(router, suites, pages)
 
     @router.get("/runs/{run_id}")
     def run(run_id: Id) -> HTMLResponse:

@@ -68,7 +68,7 @@ def write_report(
     Returns:
         Content by file name: ``report.md``, ``tables.tex``, ``per_sequence.csv`` and charts.
     """
-    tables = _tables(rows)
+    tables = tables_of(rows)
     charts = _charts(rows, cells)
     parts = [f"# {about['title']}", "", _intro(about), _NOTE]
     for title, columns in tables.items():
@@ -91,7 +91,7 @@ def write_report(
     }
 
 
-def _tables(rows: Sequence[Row]) -> dict[str, list[Column]]:
+def tables_of(rows: Sequence[Row]) -> dict[str, list[Column]]:
     """Choose the tables for which there are figures, in the order of the paper."""
     splits = list(dict.fromkeys(row.split for row in rows))
     wanted: dict[str, list[Column]] = {
