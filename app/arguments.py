@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg, subcommand
 
 from app.benchmarks.parts import Part
+from app.sequence_arguments import Import, Synthesize
 
 DataDir = Annotated[
     Path | None,
@@ -146,71 +147,6 @@ class Evaluate:
         | Annotated[EvaluateSuite, subcommand("suite", prefix_name=False)]
     )
     """What to measure."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ImportStereo:
-    """Two calibrated videos of a hand (cam0_test.mp4, c0.dat, rot_trans_c0.dat, …)."""
-
-    source: Positional[Path]
-    """Folder of the recording."""
-    out: Path
-    """Sequence folder to write."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ImportMocap:
-    """Motion capture of a rope held by two grippers (one .npy per trajectory)."""
-
-    source: Positional[Path]
-    """A trajectory, or a folder of them."""
-    out: Path
-    """Folder to write one sequence per trajectory into."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ImportPhystwin:
-    """A case of the PhysTwin data set, and what PhysTwin made of it."""
-
-    source: Positional[Path]
-    """Case folder (calibrate.pkl, metadata.json, final_data.pkl, color/, depth/, mask/, …)."""
-    out: Path
-    """Sequence folder to write."""
-    optimal_params: Path | None = None
-    """optimal_params.pkl of PhysTwin's search; makes a run of it."""
-    checkpoint: Path | None = None
-    """best_*.pth of PhysTwin's training, with per-spring stiffness; needs --optimal-params."""
-    inference: Path | None = None
-    """inference.pkl, PhysTwin's own rollout; the report says how far ours is from it."""
-    keep_decimals: bool = False
-    """Keep the decimals of dashpot and drag, which PhysTwin drops after its search."""
-    run: Path | None = None
-    """Run folder to write; none takes the sequence folder's name with _phystwin after it."""
-    device: str = "auto"
-    """Warp device that rolls the imported run out: auto, cpu or cuda:0."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ImportMano:
-    """MANO hand models that you have downloaded under their own licence."""
-
-    sources: Positional[tuple[Path, ...]]
-    """MANO_LEFT.pkl, MANO_RIGHT.pkl or both."""
-    out: Path | None = None
-    """Folder of hand models (PHYSHANDI_HANDS, else ~/.local/share/physhandi/hands)."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Import:
-    """Turn a recording, a result or a hand model of another format into ours."""
-
-    source: (
-        Annotated[ImportStereo, subcommand("stereo", prefix_name=False)]
-        | Annotated[ImportMocap, subcommand("mocap", prefix_name=False)]
-        | Annotated[ImportPhystwin, subcommand("phystwin", prefix_name=False)]
-        | Annotated[ImportMano, subcommand("mano", prefix_name=False)]
-    )
-    """What to import."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -380,6 +316,7 @@ Command = (
     | Annotated[Reconstruct, subcommand("reconstruct")]
     | Annotated[Simulate, subcommand("simulate")]
     | Annotated[Evaluate, subcommand("evaluate")]
+    | Annotated[Synthesize, subcommand("synthesize")]
     | Annotated[Import, subcommand("import")]
     | Annotated[Export, subcommand("export")]
     | Annotated[Benchmark, subcommand("benchmark")]

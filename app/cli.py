@@ -17,11 +17,11 @@ from app.arguments import (
     EvaluateHands,
     EvaluateSuite,
     Export,
-    Import,
     Reconstruct,
     Serve,
     Simulate,
 )
+from app.sequence_arguments import Import, Synthesize
 from physhandi.errors import PhysHandiError, UsageError, describe
 from physhandi.progress import Progress
 
@@ -75,14 +75,20 @@ def _show(result: Any, *, as_json: bool = False) -> None:
         print(line)
 
 
+_WATCHED: dict[type, Callable[[Any, Progress], dict[str, Any]]] = {
+    Reconstruct: commands.reconstruct,
+    Simulate: commands.simulate,
+    Synthesize: commands.make_sequence,
+}
+
+
 def _dispatch(command: Any) -> int:
     match command:
         case Serve():
             commands.serve(command, on_ready=lambda url: print(url, flush=True))
-        case Reconstruct():
-            _show(_watched(lambda progress: commands.reconstruct(command, progress)))
-        case Simulate():
-            _show(_watched(lambda progress: commands.simulate(command, progress)))
+        case Reconstruct() | Simulate() | Synthesize():
+            work = _WATCHED[type(command)]
+            _show(_watched(lambda progress: work(command, progress)))
         case Evaluate(what=EvaluateHands() as what):
             _show(commands.evaluate_hands(what), as_json=what.json)
         case Evaluate(what=EvaluateSuite() as what):

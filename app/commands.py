@@ -7,8 +7,8 @@ from typing import Any, cast
 
 from pydantic import ValidationError
 
-from app.arguments import ImportMano, ImportMocap, ImportPhystwin, ImportStereo
 from app.jobs.catalog import Catalog
+from app.sequence_arguments import ImportMano, ImportMocap, ImportPhystwin, ImportStereo
 from app.settings import Settings
 from physhandi.data.atomic import plain, without_non_finite
 from physhandi.data.run import Run, RunKind
@@ -227,7 +227,7 @@ def evaluate_suite(command: Any, progress: Progress) -> dict[str, Any]:
     suite = find_suite(command.suite)
     settings = read_settings(data_dir=command.data_dir)
     name = "named" if command.sequences else suite.name
-    out = command.out or settings.data_dir / "suites" / name
+    out = command.out or settings.suite_dir / name
     if command.sequences and command.seeds:
         raise UsageError("--seeds belongs to a suite's scenes; leave it out with --sequences.")
     recordings = (
@@ -246,6 +246,34 @@ def evaluate_suite(command: Any, progress: Progress) -> dict[str, Any]:
         device=pick_device(command.device),
     )
     return evaluate(order, out, progress)
+
+
+def make_sequence(command: Any, progress: Progress) -> dict[str, Any]:
+    """Simulate and film a sequence with another physics engine; returns where it is.
+
+    Raises:
+        UsageError: If what is asked for makes no sense, or MuJoCo is not installed.
+    """
+    from physhandi.synthetic.synthesize import synthesize
+
+    named = ("action", "out", "seed", "preset", "cameras", "frames", "hold", "images")
+    sequence = synthesize(
+        command.object,
+        **{name: getattr(command, name) for name in (*named, "resolution", "overwrite")},
+        changes=dict(_level(text) for text in command.change),
+        progress=progress,
+    )
+    return {"sequence": str(sequence.folder), "description": sequence.description}
+
+
+def _level(text: str) -> tuple[str, float]:
+    name, equals, value = text.partition("=")
+    try:
+        return name.strip(), float(value if equals else "")
+    except ValueError:
+        raise UsageError(
+            f"--change {text!r} does not set a level; write it like depth_noise=0.1."
+        ) from None
 
 
 def import_foreign(source: Any, progress: Progress) -> dict[str, Any]:

@@ -47,6 +47,8 @@ TRUTH_ARRAYS: _Table = {
     **{f"hand_{side}_vertex.npy": (("frame", f"{side} vertex", 3), _F, False) for side in _SIDES},
     "contact_point.npy": (("point", 3), _F, False),
     "contact.npy": (("frame", "point"), _B, False),
+    "object_point.npy": (("frame", "point", 3), _F, False),
+    "object_face.npy": (("object face", 3), _I, False),
 }
 
 

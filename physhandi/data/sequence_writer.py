@@ -2,7 +2,8 @@
 
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from types import TracebackType
 
@@ -67,16 +68,38 @@ class SequenceWriter:
         """Store an array, for example as ``control.npy``."""
         write_array(self._path(rel), array)
 
-    def save_image(self, rel: str, image: Integer[ndarray, "row column *channel"]) -> None:
-        """Store an image (RGB if it has three channels), for example ``views/a/mask/00000.png``."""
+    def save_image(
+        self,
+        rel: str,
+        image: Integer[ndarray, "row column *channel"],
+        *,
+        compression: int | None = None,
+    ) -> None:
+        """Store an image (RGB if it has three channels), for example ``views/a/mask/00000.png``.
+
+        Args:
+            rel: File inside of the sequence; its ending tells the format.
+            image: The image.
+            compression: Effort that goes into a small PNG, 0 to 9; None takes OpenCV's own.
+
+        Raises:
+            SequenceError: If such an image cannot be stored in that format.
+            OSError: If the disk does not take it.
+        """
         path = self._path(rel)
         pixels = image[..., ::-1] if image.ndim == 3 else image
-        if not cv2.imwrite(str(path), np.ascontiguousarray(pixels)):
+        options = [] if compression is None else [cv2.IMWRITE_PNG_COMPRESSION, compression]
+        is_encoded, code = cv2.imencode(path.suffix, np.ascontiguousarray(pixels), options)
+        if not is_encoded:
             raise SequenceError(f"Sequence '{self.folder.name}': {rel} could not be written.")
+        with _naming(path):
+            path.write_bytes(code.tobytes())
 
     def copy(self, rel: str, path: Path | str) -> None:
         """Take over a file as it is, for example a video."""
-        shutil.copyfile(path, self._path(rel))
+        target = self._path(rel)
+        with _naming(target):
+            shutil.copyfile(path, target)
 
     def make_folder(self, rel: str) -> None:
         """Make a folder, for example ``views/a`` of a camera that recorded nothing."""
@@ -148,6 +171,17 @@ def write_sequence(
         for rel, image in (images or {}).items():
             writer.save_image(rel, image)
         return writer.finish(meta)
+
+
+@contextmanager
+def _naming(path: Path) -> Generator[None, None, None]:
+    """Name what is being written, which a full disk does not."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is not None:
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def _recover(folder: Path) -> None:

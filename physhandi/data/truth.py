@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from physhandi.data.atomic import read_array
@@ -21,7 +21,7 @@ _SIDES: tuple[Side, Side] = ("right", "left")
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Truth:
-    """True hands and contact of one sequence; any part may be absent."""
+    """True hands, object and contact of one sequence; any part may be absent."""
 
     hand_keypoint: Mapping[Side, Float[ndarray, "frame 21 3"]]
     """Keypoints of each hand whose truth is known [m]."""
@@ -31,6 +31,10 @@ class Truth:
     """Places on the object in frame 0 whose contact is known [m]."""
     contact: Bool[ndarray, "frame point"] | None = None
     """Whether a hand touches that place in a frame."""
+    object_point: Float[ndarray, "frame point 3"] | None = None
+    """Where the same places are in every frame [m]."""
+    object_face: Int[ndarray, "face 3"] | None = None
+    """Triangles of the true surface between these places."""
 
 
 def read_truth(folder: Path) -> Truth:
@@ -53,4 +57,6 @@ def read_truth(folder: Path) -> Truth:
         hand_vertex=of_hands("vertex"),
         contact_point=read("contact_point.npy"),
         contact=read("contact.npy"),
+        object_point=read("object_point.npy"),
+        object_face=read("object_face.npy"),
     )

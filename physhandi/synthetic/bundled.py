@@ -3,7 +3,6 @@
 Everything in it is simulated. What made it (springs, noise and seed) is nowhere in its folder.
 """
 
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +20,13 @@ from physhandi.hand.model import load_hand_model
 from physhandi.hand.motion import HandMotion
 from physhandi.progress import NullProgress, Progress
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.synthetic.filming import (
+    SurfacePoints,
+    is_covered,
+    is_shown,
+    sample_image,
+    save_video,
+)
 from physhandi.synthetic.rendering import Picture, Scene, compose, look_at, paint, photograph
 from physhandi.synthetic.scenes import Sheet, fold_motion, make_sheet, simulate_sheet
 from physhandi.synthetic.sensors import DepthSensor, detect_keypoints, segment, track
@@ -34,8 +40,7 @@ _EYES = {
 }
 _TARGET = np.array([-0.030, 0.0, 0.080])
 _KEPT_AROUND = 4
-_COVERED = 0.018
-_SAME_SURFACE = 0.004
+_BODY, _HAND = 1, 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,7 +199,7 @@ def _scenes(truth: Truth) -> list[Scene]:
     faces = load_hand_model("right").faces
     pattern = truth.sheet.node[:, :2]
     return [
-        compose(position, truth.sheet.faces, pattern, hand.astype(np.float64), faces)
+        compose(position, truth.sheet.faces, pattern, [(_HAND, hand.astype(np.float64), faces)])
         for position, hand in zip(truth.position, truth.control, strict=True)
     ]
 
@@ -214,33 +219,14 @@ def _film(shot: _Shot, scenes: list[Scene], progress: Progress) -> list[Picture]
         depth = sensor.measure(picture.depth, picture.cosine, random, offset=offset)
         mask = segment(picture.label, random)
         depth[cv2.dilate((mask > 0).astype(np.uint8), around) == 0] = 0
-        _save_image(shot, f"depth/{frame:05d}.png", depth)
-        _save_image(shot, f"mask/{frame:05d}.png", mask)
+        for kind, image in (("depth", depth), ("mask", mask)):
+            rel = f"{shot.folder}/{kind}/{frame:05d}.png"
+            shot.writer.save_image(rel, image, compression=9)
         colors.append(paint(shot.camera, scene))
         pictures.append(picture)
         progress.report("synthesize", frame + 1, len(scenes), message=shot.folder)
-    _save_video(shot, "color.mp4", colors)
+    save_video(shot.writer, f"{shot.folder}/color.mp4", colors, FRAME_RATE)
     return pictures
-
-
-def _save_image(shot: _Shot, rel: str, image: ndarray) -> None:
-    """Write a PNG as small as it gets."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "image.png"
-        cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 9])
-        shot.writer.copy(f"{shot.folder}/{rel}", path)
-
-
-def _save_video(shot: _Shot, rel: str, colors: list[ndarray]) -> None:
-    height, width = colors[0].shape[:2]
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "color.mp4"
-        codec = cv2.VideoWriter.fourcc(*"mp4v")
-        video = cv2.VideoWriter(str(path), codec, FRAME_RATE, (width, height))
-        for color in colors:
-            video.write(np.ascontiguousarray(color[..., ::-1]))
-        video.release()
-        shot.writer.copy(f"{shot.folder}/{rel}", path)
 
 
 def _annotate(shot: _Shot, truth: Truth, pictures: list[Picture], track_count: int) -> None:
@@ -248,48 +234,27 @@ def _annotate(shot: _Shot, truth: Truth, pictures: list[Picture], track_count: i
     camera, random = shot.camera, shot.random
     size = (camera.width, camera.height)
     joint = truth.motion.keypoints(load_hand_model("right")).astype(np.float64)
-    pixel = camera.project(joint)
-    seen = np.stack([_depth_at(p.depth, q) for p, q in zip(pictures, pixel, strict=True)])
-    is_hidden = seen < camera.camera_depth(joint) - _COVERED
-    keypoint = detect_keypoints(pixel, is_hidden, size, random)
+    is_hidden = np.stack([is_covered(camera, *p) for p in zip(pictures, joint, strict=True)])
+    keypoint = detect_keypoints(camera.project(joint), is_hidden, size, random)
     shot.writer.save_array(f"{shot.folder}/keypoint.npy", keypoint[:, None])
 
-    point, facing = _surface_points(truth, camera, pictures[0], track_count, random)
-    pixel = camera.project(point)
-    depth = np.stack([_depth_at(p.depth, q) for p, q in zip(pictures, pixel, strict=True)])
-    is_seen = np.abs(depth - camera.camera_depth(point)) < _SAME_SURFACE
-    is_seen &= facing
-    reported, visible = track(pixel, is_seen, random)
+    surface = _surface_points(truth, camera, pictures[0], track_count, random)
+    point = surface.at(truth.position)
+    is_seen = np.stack([is_shown(camera, *p) for p in zip(pictures, point, strict=True)])
+    is_seen &= surface.face_camera(truth.position, camera)
+    reported, visible = track(camera.project(point), is_seen, random)
     shot.writer.save_array(f"{shot.folder}/track.npy", reported)
     shot.writer.save_array(f"{shot.folder}/track_visible.npy", visible)
 
 
 def _surface_points(
     truth: Truth, camera: PinholeCamera, first: Picture, count: int, random: Generator
-) -> tuple[Float[ndarray, "frame track 3"], ndarray]:
-    """Choose sheet points that frame 0 shows, and follow them; also whether their top is seen."""
+) -> SurfacePoints:
+    """Choose sheet points that frame 0 shows."""
     faces = truth.sheet.faces
     drawn = 8 * count
     face = faces[random.integers(len(faces), size=drawn)]
-    weight = random.dirichlet(np.ones(3), size=drawn)
-    point = np.einsum("tk,ftkd->ftd", weight, truth.position[:, face])
-    pixel = camera.project(point[0])
-    label = _depth_at(first.label, pixel)
-    near = np.abs(_depth_at(first.depth, pixel) - camera.camera_depth(point[0])) < _SAME_SURFACE
-    chosen = np.flatnonzero((label == 1) & near)[:count]
-    corner = truth.position[:, face[chosen]]
-    normal = np.cross(corner[:, :, 1] - corner[:, :, 0], corner[:, :, 2] - corner[:, :, 0])
-    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-    sight = camera.T_world_camera[:3, 3] - point[:, chosen]
-    sight /= np.linalg.norm(sight, axis=-1, keepdims=True)
-    return point[:, chosen], np.einsum("ftd,ftd->ft", normal, sight) > 0.15
-
-
-def _depth_at(image: ndarray, pixel: Float[ndarray, "point 2"]) -> ndarray:
-    """Read an image at the nearest pixels; 0 outside of it."""
-    row_count, column_count = image.shape
-    place = np.nan_to_num(pixel, nan=-10).round().astype(np.int64)
-    inside = (place >= 0).all(axis=1)
-    inside &= (place[:, 0] < column_count) & (place[:, 1] < row_count)
-    place[~inside] = 0
-    return np.where(inside, image[place[:, 1], place[:, 0]], 0)
+    surface = SurfacePoints(face, random.dirichlet(np.ones(3), size=drawn))
+    point = surface.at(truth.position[0])
+    is_body = sample_image(first.label, camera.project(point)) == _BODY
+    return surface.pick(np.flatnonzero(is_body & is_shown(camera, first, point))[:count])

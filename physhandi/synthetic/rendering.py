@@ -1,6 +1,7 @@
-"""Perfect pictures of a hand and a sheet on a table: depth, labels and shaded color."""
+"""Perfect pictures of hands and a soft body on a table: depth, labels and shaded color."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -14,10 +15,34 @@ _LIGHT_DISTANCE = 2.5
 _SHADOW_BIAS = 0.007
 _AMBIENT = 0.42
 _SKIN = np.array([0.86, 0.66, 0.54])
-_TOP = np.array([0.13, 0.45, 0.52])
-_BACK = np.array([0.30, 0.62, 0.66])
-_STRIPE = np.array([0.93, 0.90, 0.80])
 _WOOD = np.array([0.70, 0.62, 0.53])
+_BODY = 1
+
+Color = tuple[float, float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dye:
+    """Colors of a body: red, green and blue from 0 to 1."""
+
+    top: Color = (0.13, 0.45, 0.52)
+    """The outside, or the side that lies up in frame 0."""
+    back: Color = (0.30, 0.62, 0.66)
+    """The other side of a sheet."""
+    stripe: Color = (0.93, 0.90, 0.80)
+    """Stripes on the outside."""
+
+
+def light_camera(size: int = 400, focal_length: float = 2200.0) -> PinholeCamera:
+    """Look at the world's origin from where the light is; shadows are cast within this picture.
+
+    Args:
+        size: Width and height [px].
+        focal_length: Focal length [px].
+    """
+    return look_at(
+        _LIGHT * _LIGHT_DISTANCE, np.zeros(3), focal_length=focal_length, size=(size, size)
+    )
 
 
 @dataclass(frozen=True)
@@ -25,18 +50,24 @@ class Scene:
     """Everything that is in front of the cameras in one frame."""
 
     vertex: Float[ndarray, "vertex 3"]
-    """Vertices of the sheet, then of the hand [m]."""
+    """Vertices of the body, then of the hands [m]."""
     faces: Int[ndarray, "face 3"]
-    """Triangles of the sheet, then of the hand."""
-    sheet_face_count: int
-    """How many of the triangles belong to the sheet."""
+    """Triangles of the body, then of the hands."""
+    face_label: UInt8[ndarray, " face"]
+    """What each triangle belongs to, as masks name it: 1 the body, 2 and 3 the hands."""
     pattern: Float[ndarray, "vertex 2"]
-    """Where each vertex lies on the sheet's pattern [m]; unused for the hand."""
+    """Where each vertex lies on the body's pattern [m]; unused for hands."""
+    dye: Dye = field(default_factory=Dye)
+    """Colors of the body."""
+    light: PinholeCamera = field(default_factory=light_camera)
+    """What the light sees; see `light_camera`."""
 
     def labels(self, raster: Raster) -> UInt8[ndarray, "row column"]:
-        """Name what each pixel shows as masks do: 0 the table, 1 the sheet, 2 the hand."""
-        hand = np.where(raster.face >= self.sheet_face_count, 2, 1)
-        return np.where(raster.face < 0, 0, hand).astype(np.uint8)
+        """Name what each pixel shows as masks do: 0 the table, 1 the body, 2 and 3 the hands."""
+        if not len(self.faces):
+            return np.zeros(raster.face.shape, dtype=np.uint8)
+        label = self.face_label[np.maximum(raster.face, 0)]
+        return np.where(raster.face < 0, 0, label).astype(np.uint8)
 
 
 @dataclass(frozen=True)
@@ -52,18 +83,38 @@ class Picture:
 
 
 def compose(
-    sheet: Float[ndarray, "sheet_vertex 3"],
-    sheet_faces: Int[ndarray, "sheet_face 3"],
-    pattern: Float[ndarray, "sheet_vertex 2"],
-    hand: Float[ndarray, "hand_vertex 3"],
-    hand_faces: Int[ndarray, "hand_face 3"],
+    body: Float[ndarray, "body_vertex 3"],
+    faces: Int[ndarray, "body_face 3"],
+    pattern: Float[ndarray, "body_vertex 2"],
+    hands: Sequence[tuple[int, Float[ndarray, "_ 3"], Int[ndarray, "_ 3"]]],
+    *,
+    dye: Dye | None = None,
+    light: PinholeCamera | None = None,
 ) -> Scene:
-    """Put sheet and hand into one scene."""
+    """Put a body and hands into one scene.
+
+    Args:
+        body: Vertices of the body [m].
+        faces: Its triangles.
+        pattern: Where its vertices lie on its pattern [m].
+        hands: Mask value, vertices [m] and triangles of each hand.
+        dye: Colors of the body.
+        light: What the light sees.
+    """
+    vertex, triangles = [body], [faces]
+    label = [np.full(len(faces), _BODY, dtype=np.uint8)]
+    for value, hand, hand_faces in hands:
+        triangles.append(hand_faces + sum(len(part) for part in vertex))
+        vertex.append(hand)
+        label.append(np.full(len(hand_faces), value, dtype=np.uint8))
+    unused = np.zeros((sum(len(part) for part in vertex[1:]), 2))
     return Scene(
-        np.concatenate([sheet, hand]),
-        np.concatenate([sheet_faces, hand_faces + len(sheet)]),
-        len(sheet_faces),
-        np.concatenate([pattern, np.zeros((len(hand), 2))]),
+        np.concatenate(vertex),
+        np.concatenate(triangles),
+        np.concatenate(label),
+        np.concatenate([pattern, unused]),
+        dye or Dye(),
+        light or light_camera(),
     )
 
 
@@ -79,17 +130,17 @@ def photograph(camera: PinholeCamera, scene: Scene) -> Picture:
     )
 
 
-def paint(camera: PinholeCamera, scene: Scene) -> UInt8[ndarray, "row column 3"]:
-    """Render a shaded color image, every pixel averaged over four."""
-    K = camera.K.copy()
-    K[:2] *= 2.0
-    K[:2, 2] += 0.5
-    fine = PinholeCamera(
-        K=K,
-        T_world_camera=camera.T_world_camera,
-        width=2 * camera.width,
-        height=2 * camera.height,
-    )
+def paint(
+    camera: PinholeCamera, scene: Scene, *, samples: int = 2
+) -> UInt8[ndarray, "row column 3"]:
+    """Render a shaded color image.
+
+    Args:
+        camera: Where the picture is taken from; without distortion.
+        scene: What is there.
+        samples: Each pixel is averaged over this many rows and columns.
+    """
+    fine = resized(camera, samples)
     raster = rasterize(fine, scene.vertex, scene.faces)
     point, sight = _points(fine, raster)
     normal = _normals(scene, raster)
@@ -100,7 +151,7 @@ def paint(camera: PinholeCamera, scene: Scene) -> UInt8[ndarray, "row column 3"]
     soft = 0.5 + 0.5 * normal[..., 2]
     bright = (_AMBIENT * (0.55 + 0.45 * soft) + (1 - _AMBIENT) * diffuse)[..., None]
     image = np.clip(albedo * 1.08 * bright, 0.0, 1.0) ** (1 / 1.25)
-    image = image.reshape(camera.height, 2, camera.width, 2, 3).mean(axis=(1, 3))
+    image = image.reshape(camera.height, samples, camera.width, samples, 3).mean(axis=(1, 3))
     return np.round(255 * image).astype(np.uint8)
 
 
@@ -118,6 +169,8 @@ def _points(camera: PinholeCamera, raster: Raster) -> tuple[ndarray, ndarray]:
 
 
 def _normals(scene: Scene, raster: Raster) -> Float[ndarray, "row column 3"]:
+    if not len(scene.faces):
+        return np.broadcast_to([0.0, 0.0, 1.0], (*raster.face.shape, 3))
     normal = raster.interpolate(scene.faces, vertex_normals(scene.vertex, scene.faces))
     normal[raster.face < 0] = [0.0, 0.0, 1.0]
     return normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
@@ -129,21 +182,23 @@ def _albedo(scene: Scene, raster: Raster, point: ndarray, facing: ndarray) -> nd
     grain = np.sin(90 * y + 6 * np.sin(9 * x + 2.0)) + 0.5 * np.sin(230 * y + 3 * np.sin(14 * x))
     seam = np.abs((y / 0.09) % 1.0 - 0.5) > 0.488
     color = _WOOD * (1.0 + 0.018 * grain - 0.16 * seam)[..., None]
+    if not len(scene.faces):
+        return color
     u, v = np.moveaxis(raster.interpolate(scene.faces, scene.pattern), -1, 0)
     is_back = facing > 0
-    cloth = np.where(is_back[..., None], _BACK, _TOP)
+    cloth = np.where(is_back[..., None], scene.dye.back, scene.dye.top)
     weave = np.sin(u * 900) * np.sin(v * 900)
     cloth = cloth * (1.0 + 0.10 * weave)[..., None]
     stripe = (np.abs(np.abs(u) - 0.066) < 0.007) | (np.abs(np.abs(u) - 0.083) < 0.003)
-    cloth = np.where((stripe & ~is_back)[..., None], _STRIPE, cloth)
-    is_sheet = (raster.face >= 0) & (raster.face < scene.sheet_face_count)
-    color = np.where(is_sheet[..., None], cloth, color)
-    return np.where((raster.face >= scene.sheet_face_count)[..., None], _SKIN, color)
+    cloth = np.where((stripe & ~is_back)[..., None], scene.dye.stripe, cloth)
+    label = scene.labels(raster)[..., None]
+    return np.where(label == 0, color, np.where(label == _BODY, cloth, _SKIN))
 
 
 def _lit(scene: Scene, point: Float[ndarray, "row column 3"]) -> Float[ndarray, "row column"]:
-    """Tell how much of the light reaches each point past sheet and hand."""
-    light = look_at(_LIGHT * _LIGHT_DISTANCE, np.zeros(3), focal_length=2200.0, size=(400, 400))
+    """Tell how much of the light reaches each point past body and hands."""
+    light = scene.light
+    last = (light.width - 1, light.height - 1)
     reach = rasterize(light, scene.vertex, scene.faces).depth
     reach = np.where(reach > 0, reach, np.inf)
     where = np.nan_to_num(point)
@@ -151,7 +206,7 @@ def _lit(scene: Scene, point: Float[ndarray, "row column 3"]) -> Float[ndarray, 
     amount = np.zeros(depth.shape)
     offsets = [(a, b) for a in (-1.2, 0.0, 1.2) for b in (-1.2, 0.0, 1.2)]
     for offset in offsets:
-        place = np.clip(np.round(pixel + offset), 0, 399).astype(np.int64)
+        place = np.clip(np.round(pixel + offset), 0, last).astype(np.int64)
         amount += depth < reach[place[..., 1], place[..., 0]] + _SHADOW_BIAS
     return amount / len(offsets)
 
@@ -186,3 +241,27 @@ def look_at(
         ]
     )
     return PinholeCamera(K=K, T_world_camera=pose, width=width, height=height)
+
+
+def resized(camera: PinholeCamera, factor: float) -> PinholeCamera:
+    """Give a camera that sees the same with so many times the rows and columns.
+
+    Args:
+        camera: A camera without distortion.
+        factor: How many times as many.
+    """
+    K = camera.K.copy()
+    K[:2] *= factor
+    K[:2, 2] += (factor - 1) / 2
+    return PinholeCamera(
+        K=K,
+        T_world_camera=camera.T_world_camera,
+        width=round(factor * camera.width),
+        height=round(factor * camera.height),
+    )
+
+
+def shadow_points(point: Float[ndarray, "point 3"]) -> Float[ndarray, "point 3"]:
+    """Find where the shadows of points fall on the table [m]."""
+    lamp = _LIGHT * _LIGHT_DISTANCE
+    return lamp + (point - lamp) * (lamp[2] / (lamp[2] - point[:, 2:]))

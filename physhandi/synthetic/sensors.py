@@ -12,6 +12,11 @@ from jaxtyping import Bool, Float, UInt8, UInt16
 from numpy import ndarray
 from numpy.random import Generator
 
+IMAGER_WIDTH = 848.0
+"""Width of the infrared images that depth is computed from [px]."""
+# Wider steps of disparity are taken for these: in this image's pixels, and in the imagers'.
+_WIDEST_SHADOW = 16, 42
+
 
 @dataclass(frozen=True, kw_only=True)
 class DepthSensor:
@@ -24,17 +29,25 @@ class DepthSensor:
     disparity_noise: float = 0.08
     """Standard deviation of the disparity [px]."""
     disparity_step: float = 1 / 32
-    """Resolution of the disparity [px]."""
+    """Resolution of the disparity; 0 is exact [px]."""
     correlation: float = 1.2
     """Standard deviation of the blur that makes neighbouring errors alike [px]."""
     hole_rate: float = 0.02
     """Part of the pixels lost to speckle."""
     flying_rate: float = 0.4
     """Part of the pixels at depth edges that mix fore- and background."""
+    edge_reach: int = 1
+    """How far from a depth edge such pixels lie at most [px]."""
     edge_step: float = 0.025
     """Depth step that makes an edge [m]."""
     grazing_cosine: float = 0.34
     """Cosine of the angle to the normal below which a surface often gives no depth."""
+    grazing_rate: float = 0.5
+    """Part of the pixels lost on such a surface."""
+    shadow: float = 1.0
+    """Width of the blind band beside near things, as a part of what the stereo pair causes."""
+    even_noise: float = 0.0
+    """Standard deviation of a further error of each pixel, alike at all distances [m]."""
     bias: float = 0.001
     """Largest slowly varying offset of a whole image [m]."""
 
@@ -49,6 +62,7 @@ class DepthSensor:
         random: Generator,
         *,
         offset: float = 0.0,
+        scale: float | None = None,
     ) -> UInt16[ndarray, "row column"]:
         """Turn true depth into a depth image.
 
@@ -57,39 +71,64 @@ class DepthSensor:
             cosine: Cosine between the line of sight and the surface normal.
             random: Source of all errors.
             offset: Slow offset of this image, as a part of `bias` from -1 to 1.
+            scale: Pixels of this image in one of the imagers'; None if it is as wide as they see.
 
         Returns:
             Depth [mm]; 0 where nothing was measured.
         """
         there = depth > 0
         mixed = self._fly(depth, random)
-        scale = self.focal_length * self.baseline
-        disparity = scale / np.maximum(np.where(mixed > 0, mixed + offset * self.bias, 1.0), 0.05)
-        disparity += self.disparity_noise * smooth_noise(depth.shape, self.correlation, random)
-        disparity = np.round(disparity / self.disparity_step) * self.disparity_step
-        measured = 1000.0 * scale / np.maximum(disparity, 1e-3)
+        measured = self._read(mixed, smooth_noise(depth.shape, self.correlation, random), offset)
         lost = random.random(depth.shape) < self.hole_rate
-        lost |= (cosine < self.grazing_cosine) & (random.random(depth.shape) < 0.5)
-        lost |= self._shadow(depth)
+        lost |= (cosine < self.grazing_cosine) & (random.random(depth.shape) < self.grazing_rate)
+        lost |= self._shadow(depth, depth.shape[1] / IMAGER_WIDTH if scale is None else scale)
+        if self.even_noise > 0:
+            measured = measured + 1000.0 * self.even_noise * random.standard_normal(depth.shape)
         kept = there & ~lost
         return np.where(kept, np.clip(np.round(measured), 0, 65535), 0).astype(np.uint16)
 
+    def measure_points(
+        self, depth: Float[ndarray, " point"], random: Generator, *, offset: float = 0.0
+    ) -> Float[ndarray, " point"]:
+        """Measure single points that are far from each other and from edges.
+
+        Args:
+            depth: True depth [m].
+            random: Source of all errors.
+            offset: Slow offset, as a part of `bias` from -1 to 1.
+
+        Returns:
+            Depth [m]; NaN where speckle left none.
+        """
+        measured = self._read(depth, random.standard_normal(depth.shape), offset) / 1000.0
+        measured += self.even_noise * random.standard_normal(depth.shape)
+        return np.where(random.random(depth.shape) < self.hole_rate, np.nan, measured)
+
+    def _read(self, depth: ndarray, noise: ndarray, offset: float) -> ndarray:
+        """Err in disparity by normal noise of unit variance, and quantise; gives depth [mm]."""
+        reach = self.focal_length * self.baseline
+        disparity = reach / np.maximum(np.where(depth > 0, depth + offset * self.bias, 1.0), 0.05)
+        disparity += self.disparity_noise * noise
+        if self.disparity_step > 0:
+            disparity = np.round(disparity / self.disparity_step) * self.disparity_step
+        return 1000.0 * reach / np.maximum(disparity, 1e-3)
+
     def _fly(self, depth: ndarray, random: Generator) -> Float[ndarray, "row column"]:
         """Mix fore- and background in some of the pixels beside depth edges."""
-        kernel = np.ones((3, 3), dtype=np.uint8)
+        kernel = np.ones((2 * self.edge_reach + 1,) * 2, dtype=np.uint8)
         near, far = cv2.erode(depth, kernel), cv2.dilate(depth, kernel)
         is_edge = (far - near > self.edge_step) & (near > 0)
         is_edge &= random.random(depth.shape) < self.flying_rate
         blend = random.random(depth.shape)
         return np.where(is_edge, near + blend * (far - near), depth)
 
-    def _shadow(self, depth: ndarray) -> Bool[ndarray, "row column"]:
+    def _shadow(self, depth: ndarray, scale: float) -> Bool[ndarray, "row column"]:
         """Find background that the left imager sees but the right one does not."""
-        width = depth.shape[1]
         disparity = np.where(depth > 0, self.focal_length * self.baseline, 0.0)
-        disparity = disparity / np.maximum(depth, 0.05) * (width / 848.0)
+        disparity = disparity / np.maximum(depth, 0.05) * (scale * self.shadow)
         hidden = np.zeros(depth.shape, dtype=bool)
-        for shift in range(1, 17):
+        widest = max(_WIDEST_SHADOW[0], round(_WIDEST_SHADOW[1] * scale))
+        for shift in range(1, widest + 1):
             jump = disparity[:, shift:] - disparity[:, :-shift]
             hidden[:, :-shift] |= (jump >= shift) & (depth[:, :-shift] > 0)
         return hidden
@@ -104,18 +143,25 @@ def smooth_noise(
 
 
 def segment(
-    label: UInt8[ndarray, "row column"], random: Generator, *, error: float = 0.7
+    label: UInt8[ndarray, "row column"],
+    random: Generator,
+    *,
+    error: float = 0.7,
+    largest: float = 1.4,
 ) -> UInt8[ndarray, "row column"]:
-    """Shift the outlines of a label image by up to about one pixel here and there.
+    """Shift the outlines of a label image here and there.
 
     Args:
         label: True labels.
         random: Source of the errors.
-        error: Standard deviation of the shift [px]; it is cut at 1.4 px.
+        error: Standard deviation of the shift [px].
+        largest: No shift is larger than this [px].
     """
     height, width = label.shape
     columns, rows = np.meshgrid(np.arange(width), np.arange(height))
-    shift = [np.clip(error * smooth_noise(label.shape, 4.0, random), -1.4, 1.4) for _ in range(2)]
+    shift = [
+        np.clip(error * smooth_noise(label.shape, 4.0, random), -largest, largest) for _ in range(2)
+    ]
     across = np.clip(np.round(columns + shift[0]), 0, width - 1).astype(np.int64)
     down = np.clip(np.round(rows + shift[1]), 0, height - 1).astype(np.int64)
     return label[down, across]
@@ -127,6 +173,7 @@ def track(
     random: Generator,
     *,
     error: float = 0.5,
+    wander: float = 0.0,
     dropout_rate: float = 0.01,
     dropout_frames: int = 3,
 ) -> tuple[Float[ndarray, "frame track 2"], Bool[ndarray, "frame track"]]:
@@ -137,6 +184,8 @@ def track(
         is_seen: Whether the point is seen.
         random: Source of the errors.
         error: Standard deviation of each coordinate [px].
+        wander: How far each coordinate has drifted for good after 30 frames, standard deviation
+            [px].
         dropout_rate: Probability per frame that a track is lost for a while.
         dropout_frames: Frames that such a loss lasts.
 
@@ -158,6 +207,10 @@ def track(
     for delay in range(1, dropout_frames):
         reach[delay:] |= lost[:-delay]
     visible = is_seen & ~reach
+    if wander > 0:
+        steps = random.standard_normal(pixel.shape) * (wander / np.sqrt(30.0))
+        steps[0] = 0.0
+        reported = reported + np.cumsum(steps, axis=0)
     for frame in range(1, frame_count):
         reported[frame] = np.where(visible[frame, :, None], reported[frame], reported[frame - 1])
     return reported.astype(np.float32), visible
@@ -170,6 +223,8 @@ def detect_keypoints(
     random: Generator,
     *,
     error: float = 1.5,
+    hidden_factor: float = 2.0,
+    loss_rate: float = 0.01,
 ) -> Float[ndarray, "frame keypoint 3"]:
     """Report keypoints as a detector would: less exact and less sure where they are hidden.
 
@@ -178,16 +233,18 @@ def detect_keypoints(
         is_hidden: Whether something covers the keypoint.
         size: Width and height of the image [px].
         random: Source of the errors.
-        error: Standard deviation of each coordinate of a seen keypoint [px]; twice that if hidden.
+        error: Standard deviation of each coordinate of a seen keypoint [px].
+        hidden_factor: How much larger it is for a hidden one.
+        loss_rate: Part of the keypoints that are not found at all.
 
     Returns:
-        Pixel x, pixel y and confidence; NaN outside of the image and for 1 % of the keypoints.
+        Pixel x, pixel y and confidence; NaN outside of the image and where nothing was found.
     """
-    spread = error * np.where(is_hidden, 2.0, 1.0)[..., None]
+    spread = error * np.where(is_hidden, hidden_factor, 1.0)[..., None]
     found = pixel + spread * random.standard_normal(pixel.shape)
     low, high = np.where(is_hidden, 0.35, 0.85), np.where(is_hidden, 0.6, 0.98)
     confidence = low + (high - low) * random.random(is_hidden.shape)
     keypoint = np.concatenate([found, confidence[..., None]], axis=-1)
     outside = ((found < 0) | (found > np.array(size) - 1)).any(axis=-1)
-    keypoint[outside | (random.random(is_hidden.shape) < 0.01)] = np.nan
+    keypoint[outside | (random.random(is_hidden.shape) < loss_rate)] = np.nan
     return keypoint.astype(np.float32)

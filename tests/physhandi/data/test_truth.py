@@ -18,6 +18,8 @@ WHOLE = {
     "truth/hand_left_vertex.npy": np.ones((3, 7, 3)),
     "truth/contact_point.npy": np.eye(3),
     "truth/contact.npy": np.eye(3, dtype=bool),
+    "truth/object_point.npy": np.arange(27.0).reshape(3, 3, 3),
+    "truth/object_face.npy": np.array([[0, 1, 2]]),
 }
 
 
@@ -30,6 +32,10 @@ def test_truth_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert {side: v.shape[1] for side, v in truth.hand_vertex.items()} == {"right": 5, "left": 7}
     assert truth.contact is not None
     assert truth.contact.tolist() == np.eye(3).astype(bool).tolist()
+    assert truth.object_point is not None
+    assert truth.object_point[2].tolist() == [[18, 19, 20], [21, 22, 23], [24, 25, 26]]
+    assert truth.object_face is not None
+    assert truth.object_face.tolist() == [[0, 1, 2]]
 
 
 def test_most_sequences_have_none(tmp_path: Path) -> None:
@@ -37,6 +43,7 @@ def test_most_sequences_have_none(tmp_path: Path) -> None:
     assert not truth.hand_keypoint
     assert not truth.hand_vertex
     assert truth.contact is truth.contact_point is None
+    assert truth.object_point is truth.object_face is None
 
 
 @pytest.mark.parametrize(
@@ -46,6 +53,8 @@ def test_most_sequences_have_none(tmp_path: Path) -> None:
         ("hand_right_keypoint", np.zeros((3, 20, 3)), "expected axes"),
         ("contact", np.zeros((3, 4), bool), "expected point = 3"),
         ("contact", np.zeros((3, 3)), "expected boolean"),
+        ("object_point", np.zeros((3, 4, 3)), "expected point = 3"),
+        ("object_face", np.zeros((1, 3)), "expected integer"),
     ],
 )
 def test_wrong_truth_is_refused(tmp_path: Path, file: str, array: np.ndarray, reason: str) -> None:

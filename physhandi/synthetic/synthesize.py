@@ -1,0 +1,162 @@
+"""SynthHDI's generator: another physics engine, another hand and honest sensors make a sequence."""
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import cast, get_args
+
+import numpy as np
+
+from physhandi.data.sequence import Sequence, ViewMeta
+from physhandi.data.sequence_schema import SequenceMeta, Side
+from physhandi.data.sequence_writer import SequenceWriter
+from physhandi.errors import UsageError
+from physhandi.progress import NullProgress, Progress
+from physhandi.synthetic.actions import ACTIONS, script_action
+from physhandi.synthetic.bodies import BodyName, Resolution, make_body
+from physhandi.synthetic.cameras import MOST, make_viewpoints
+from physhandi.synthetic.engines.mujoco_flex import simulate_truth
+from physhandi.synthetic.engines.truth import FRAME_RATE, CapsuleHand, Hold, PhysicalTruth
+from physhandi.synthetic.presets import changed, find_preset
+from physhandi.synthetic.recording import Images, record
+from physhandi.synthetic.stage import SIDES, make_stage
+from physhandi.synthetic.true_hand import TrueHand, load_true_hand
+
+FRAMES = 90
+"""Frames of a sequence if nothing else is asked for: three seconds."""
+LEAST_FRAMES, MOST_FRAMES = 2, 1000
+"""A sequence has at least and at most so many frames."""
+LABEL = "SynthHDI"
+"""Label of the sequences."""
+
+
+def synthesize(
+    object_: str,
+    action: str,
+    *,
+    out: Path | str,
+    seed: int = 0,
+    preset: str = "default",
+    cameras: int = 3,
+    frames: int = FRAMES,
+    hold: Hold = "friction",
+    images: Images = "all",
+    resolution: Resolution = "fine",
+    changes: Mapping[str, float] | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Sequence:
+    """Simulate hands that handle a soft body, film it, and write the sequence with its truth.
+
+    The same arguments give the same sequence. Body, motion, cameras and errors are drawn apart
+    from each other: the physics of a seed does not depend on preset or cameras.
+
+    Args:
+        object_: What is handled: cloth, towel, rope, plush or pouch.
+        action: What is done: lift, fold, stretch, squeeze, wipe or push.
+        out: Folder of the sequence; it must not be there yet. Its name becomes the sequence's.
+        seed: Decides size and material of the body, the motion, the cameras and all errors.
+        preset: Levels of all degradations: clean, default, hard or paper.
+        cameras: Number of cameras, 1 to 4.
+        frames: Number of frames, 30 a second.
+        hold: Whether hands hold by friction, or what they have touched for 0.1 s sticks to them.
+        images: ``none`` leaves color, depth and masks out; see `record`.
+        resolution: How many nodes the body gets; ``tiny`` is for tests.
+        changes: Levels that differ from the preset's, by name.
+        overwrite: Whether to replace a sequence that is there.
+        progress: Told after every frame; may ask to stop.
+
+    Returns:
+        The finished, validated sequence.
+
+    Raises:
+        UsageError: If an argument makes no sense, or MuJoCo is not installed.
+        SequenceError: If the folder is there already and `overwrite` is false.
+        SimulationDivergedError: If the body left the range of sane motion.
+        CancelledError: If the user asked to stop.
+        OSError: If the disk does not take it.
+    """
+    progress = progress or NullProgress()
+    level = changed(find_preset(preset), changes or {})
+    _check(action=action, seed=seed, cameras=cameras, frames=frames, hold=hold, images=images)
+    name = cast("BodyName", object_)  # An unknown one is refused by `make_body`.
+    body = make_body(name, np.random.default_rng([seed, 0]), resolution=resolution)
+    with SequenceWriter(out, overwrite=overwrite) as writer:
+        script_random = np.random.default_rng([seed, 1, ACTIONS.index(action)])
+        scripts = script_action(action, body, script_random, duration=(frames - 1) / FRAME_RATE)
+        hands: dict[Side, TrueHand] = {one.side: load_true_hand(one.side) for one in scripts}
+        capsules = cast("Mapping[Side, CapsuleHand]", hands)
+        truth = simulate_truth(
+            body, scripts, capsules, frame_count=frames, hold=hold, progress=progress
+        )
+        stage = make_stage(truth, hands, level, seed)
+        views = make_viewpoints(stage.extent(), cameras, level, seed)
+        record(writer, stage, views, level, seed=seed, images=images, progress=progress)
+        settings = {
+            "object": object_,
+            "action": action,
+            "seed": seed,
+            "preset": preset,
+            "cameras": cameras,
+            "frames": frames,
+            "hold": hold,
+            "images": images,
+            "resolution": resolution,
+            "changes": dict(changes or {}),
+        }
+        meta = SequenceMeta(
+            name=writer.folder.name,
+            description=_describe(truth, action, hands),
+            label=LABEL,
+            frame_rate=truth.frame_rate,
+            frame_count=frames,
+            ground_height=0.0,
+            hands=tuple(hand.side for hand in stage.hands),
+            views=tuple(ViewMeta(name=view.name, camera=view.told) for view in views),
+            reconstruction=round(0.7 * frames),
+            provenance={
+                "origin": "simulated by MuJoCo",
+                "mujoco": version("mujoco"),
+                "license": "CC0-1.0",
+                "synthesize": settings,
+                "degradations": asdict(level),
+            },
+        )
+        return writer.finish(meta)
+
+
+def _check(
+    *, action: str, seed: int, cameras: int, frames: int, hold: Hold, images: Images
+) -> None:
+    """Refuse what makes no sense before anything is computed or written."""
+    if action not in ACTIONS:
+        raise UsageError(f"There is no action {action!r}. Choose one of: {', '.join(ACTIONS)}.")
+    if not 0 <= seed < 2**32:
+        raise UsageError(f"seed is {seed}; expected a whole number from 0 to 4294967295.")
+    if not 1 <= cameras <= MOST:
+        raise UsageError(f"cameras is {cameras}; expected 1 to {MOST}.")
+    if not LEAST_FRAMES <= frames <= MOST_FRAMES:
+        raise UsageError(f"frames is {frames}; expected {LEAST_FRAMES} to {MOST_FRAMES}.")
+    for name, value, known in (
+        ("hold", hold, get_args(Hold)),
+        ("images", images, get_args(Images)),
+    ):
+        if value not in known:
+            raise UsageError(f"{name} is {value!r}; expected one of: {', '.join(known)}.")
+    if find_spec("mujoco") is None:
+        raise UsageError(
+            "Making sequences needs MuJoCo, which is not installed: pip install 'physhandi[synth]'."
+        )
+
+
+def _describe(truth: PhysicalTruth, action: str, hands: Mapping[Side, TrueHand]) -> str:
+    """Tell in two sentences what is to be seen."""
+    size = " x ".join(f"{100 * side:.0f}" for side in truth.body.size[:2])
+    who = " and ".join(f"a {side} hand" for side in SIDES if side in hands)
+    how = "friction" if truth.hold == "friction" else "attachment"
+    return (
+        f"{action.capitalize()}: {who}, and a {truth.body.name} of {size} cm held by {how}. "
+        "Simulated by MuJoCo, filmed by made-up cameras."
+    )
