@@ -73,7 +73,7 @@ class _Task:
 def _lift(task: _Task) -> tuple[HandScript, ...]:
     """Pinch the object near its rim and raise it, a little sideways and turned."""
     handler, random, duration = task.handler(), task.random, task.duration
-    grasp = handler.pinch_near_rim()
+    grasp = handler.pinch_rim()
     height = random.uniform(0.12, 0.18)
     aside = random.uniform(-0.04, 0.04) * grasp.across + random.uniform(0.0, 0.05) * grasp.forward
     turn = random.uniform(-0.3, 0.3)
@@ -88,7 +88,7 @@ def _lift(task: _Task) -> tuple[HandScript, ...]:
 def _fold(task: _Task) -> tuple[HandScript, ...]:
     """Pinch the object near its rim and lay it over towards the other side."""
     handler, random, duration = task.handler(), task.random, task.duration
-    grasp = handler.pinch_near_rim()
+    grasp = handler.pinch_rim()
     radius = handler.distance_to_middle(grasp) * random.uniform(0.75, 0.95)
     angle = random.uniform(2.3, 2.7)
 
@@ -110,7 +110,7 @@ def _stretch(task: _Task) -> tuple[HandScript, ...]:
     sides: tuple[Side, Side] = ("right", "left")
     for hand_side in sides:
         handler = task.handler(hand_side)
-        grasp = handler.pinch_end(1.0 if hand_side == "right" else -1.0)
+        grasp = handler.pinch_rim(end=1.0 if hand_side == "right" else -1.0)
 
         def carry(
             phase: float, outwards: ndarray = -grasp.place.inwards

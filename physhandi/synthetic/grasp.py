@@ -26,14 +26,17 @@ _FINGER_HIGH = np.array([1.5, 0.3, 1.8])
 _TURN_RANGE = 1.2
 _REACH_RANGE = 0.5
 # How far each freedom may stray from its guess before it costs as much as a fingertip that is
-# 1 cm off: orientation [rad], position [m], joints [rad].
+# 1 mm off: orientation [rad], position [m], joints [rad].
 _STRAY_TURN, _STRAY_POSITION, _STRAY_JOINT = 0.5, 0.5, 0.6
-_TIP_SCALE = 0.0005
+_TIP_SCALE = 0.001
+_SLANT = 0.15
 _TIP_ERROR = 0.006
 
 RELAXED = np.array([0.0, 0.0, 0.0, 0.15, 0.2] + [0.45, 0.0, 0.5] * 4)
 """Joints of a hand about to grasp: the thumb's five freedoms, then three of each finger [rad]."""
-FLAT = np.array([0.0, 0.15, 0.0, 0.0, 0.0] + [0.02, 0.0, 0.05] * 4)
+PINCHING = np.array([0.1, 0.3, 0.0, 0.1, 0.0] + [0.8, 0.0, 0.25] * 2 + [0.6, 0.0, 0.4] * 2)
+"""Joints of a hand whose finger pads face the thumb's [rad]."""
+FLAT = np.array([-0.41, -0.33, -0.18, 0.33, 0.36] + [-0.06, 0.0, -0.05] * 4)
 """Joints of an open hand with straight fingers [rad]."""
 POINTING = np.array([0.3, 0.0, 0.0, 0.3, 0.5, 0.5, 0.0, 0.25] + [1.2, 0.0, 1.5] * 3)
 """Joints of a hand whose index finger points while the others are curled [rad]."""
@@ -84,6 +87,7 @@ def reach(
     orientation: Float[ndarray, " 3"],
     joints: Float[ndarray, " 17"],
     start: HandPose | None = None,
+    along: Float[ndarray, " 3"] | None = None,
 ) -> HandPose:
     """Bend and place a hand so that the middles of its fingertips are in given places.
 
@@ -95,6 +99,7 @@ def reach(
         orientation: How the hand should be held if the targets let it [rad].
         joints: How the fingers should be bent if the targets let them (see `bend_of`).
         start: A pose to stay near, as while fingers close; the wrist then hardly moves.
+        along: Direction in which the last bones of thumb, index and middle finger should point.
 
     Raises:
         SequenceError: Thumb, index or middle finger stays more than 6 mm away from its target.
@@ -127,8 +132,17 @@ def reach(
             ]
         )
 
+    def slants(value: ndarray) -> ndarray:
+        if along is None:
+            return np.zeros(0)
+        transform = hand.bone_transforms(pose_of(value))
+        pointing = [tips[finger] for finger in (THUMB, INDEX, MIDDLE)]
+        lines = [transform[tip.bone, :3, :3] @ (tip.end - tip.start) for tip in pointing]
+        return np.concatenate([line / np.linalg.norm(line) - along for line in lines])
+
     def cost(value: ndarray) -> ndarray:
-        return np.concatenate([misses(value).ravel() / _TIP_SCALE * 0.05, (value - guess) / scale])
+        parts = misses(value).ravel() / _TIP_SCALE, slants(value) / _SLANT, (value - guess) / scale
+        return np.concatenate(parts)
 
     found = least_squares(cost, np.clip(guess, low, high), bounds=(low, high), xtol=1e-6)
     # Ring and little finger help; they may end where they can.

@@ -1,7 +1,7 @@
 """Where a hand takes hold of an object that lies on the ground, and how it gets there."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -15,6 +15,7 @@ from physhandi.synthetic.grasp import (
     INDEX,
     LITTLE,
     MIDDLE,
+    PINCHING,
     POINTING,
     RELAXED,
     RING,
@@ -25,21 +26,29 @@ from physhandi.synthetic.grasp import (
     reach,
 )
 from physhandi.synthetic.hand_script import HandScript, Move, Tremor
-from physhandi.synthetic.places import Place, grasp_places, height_range, rim_place
+from physhandi.synthetic.places import (
+    Place,
+    handful_place,
+    height_range,
+    narrow_places,
+    rim_place,
+)
 from physhandi.synthetic.true_hand import HandPose, TrueHand
 
 Carry = Callable[[float], tuple[Float[ndarray, " 3"], Float[ndarray, " 3"]]]
 """Where a grasp has gone after a share of a move: shift [m] and rotation vector [rad]."""
 
 _UP = np.array([0.0, 0.0, 1.0])
-# Times of reaching, touching and closing, before the recording starts [s].
-_BEGIN, _TOUCH, _CLOSED = -1.4, -0.9, -0.15
-_HOVER = 0.06
+# Times of reaching, touching, closing and being ready, before the recording starts [s].
+_BEGIN, _TOUCH, _CLOSED, _READY = -1.5, -1.1, -0.6, -0.15
+_HOVER, _ASIDE = 0.06, 0.08
+_CLEARANCE = 0.004
+_CLEAR_OF = 0.02
 _POSES_PER_MOVE = 9
-_FINGER_SPACING = 0.020
-_PITCH = 0.75
-_TWO_FINGERS = (INDEX, MIDDLE)
-_FOUR_FINGERS = (INDEX, MIDDLE, RING, LITTLE)
+_FINGER_SPACING, _PINCH_SPACING = 0.020, 0.016
+_PITCH, _PINCH_PITCH = 0.75, 0.0
+# How far below the horizon pinching fingers point, and how much of them is beyond the pinch.
+_TILT, _PAD = 0.7, 0.006
 
 
 class Graspable(Protocol):
@@ -69,6 +78,8 @@ class Grasp:
     """Poses from the one that first touches the object to the one that holds it."""
     place: Place
     """Where the object is grasped, and which way the hand faces."""
+    approach: Sequence[Move]
+    """How the hand gets there before the recording starts, from far away to the last pose."""
 
     @property
     def forward(self) -> Float[ndarray, " 3"]:
@@ -96,17 +107,45 @@ class Handler:
         self._body = body
         self._random = random
 
-    def pinch_near_rim(self) -> Grasp:
-        """Take the object between thumb and two fingers, far from its middle."""
-        return self._pinch(self._find_place(prefers_narrow=True), _TWO_FINGERS)
+    def pinch_rim(self, *, end: float = 0.0) -> Grasp:
+        """Take the rim between the thumb below and two fingers above, a little off the ground.
 
-    def pinch_end(self, sign: float) -> Grasp:
-        """Take one end of the object's longest direction: that towards +x (1) or -x (-1)."""
-        return self._pinch(self._find_place(prefers_narrow=True, end=sign), _TWO_FINGERS)
+        Args:
+            end: 1 or -1 for the rim towards +x or -x; 0 for any.
+        """
+        place = rim_place(self._body, self._random, end=end)
+        closed = self._pinch(place, place.closed_gap, None)
+        raised = max(_CLEARANCE - self._lowest(closed)[0], 0.0) * _UP
+        lower = [closed]
+        for gap in np.linspace(place.closed_gap, place.open_gap, 4)[1:]:
+            lower.append(self._pinch(place, float(gap), lower[-1]))
+        lower.reverse()
+        held = replace(place, point=place.point + raised)
+        outside = _moved(lower[0], -_ASIDE * place.forward)
+        return Grasp(
+            place=held,
+            poses=(_moved(closed, raised),),
+            approach=(
+                Move(_BEGIN, _TOUCH, (outside, lower[0])),
+                Move(_TOUCH, _CLOSED, lower),
+                Move(_CLOSED, _READY, (closed, _moved(closed, raised))),
+            ),
+        )
 
     def embrace(self) -> Grasp:
         """Close all fingers around a part of the object, or around a handful of it."""
-        return self._pinch(self._find_place(prefers_narrow=False), _FOUR_FINGERS)
+        places = narrow_places(self._body, self._random)
+        if places:
+            places.sort(key=lambda place: -(place.width or 0.0))
+            place = places[self._random.integers(max(len(places) // 5, 1))]
+            gaps = np.linspace((place.width or 0.0) + 0.012, place.closed_gap, 5)
+        else:
+            place = handful_place(self._body, self._random)
+            gaps = np.linspace(place.open_gap, place.closed_gap, 7)
+        poses = [self._claw(place, float(gaps[0]), None)]
+        for gap in gaps[1:]:
+            poses.append(self._claw(place, float(gap), poses[-1]))
+        return Grasp(poses=poses, place=place, approach=_from_above(poses[0], poses))
 
     def lay_flat(self) -> Grasp:
         """Press the flat hand on the middle of the object."""
@@ -125,7 +164,8 @@ class Handler:
         press = 0.010 if is_soft else 0.003
         shift = np.array([*(place.point - center)[:2], top - press - low])
         above = _moved(pose, shift + (press + 0.004) * _UP)
-        return Grasp(poses=(above, _moved(pose, shift)), place=place)
+        poses = (above, _moved(pose, shift))
+        return Grasp(poses=poses, place=place, approach=_from_above(above, poses))
 
     def point_at(self) -> Grasp:
         """Put the index finger beside the object, or on it where it is flat."""
@@ -151,7 +191,8 @@ class Handler:
         orientation = orientation_towards(forward, pitch=_PITCH)
         touch = reach(self._hand, {INDEX: target}, orientation=orientation, joints=POINTING)
         back = 0.01 * _UP if is_flat else -0.01 * forward
-        return Grasp(poses=(_moved(touch, back), touch), place=place)
+        poses = (_moved(touch, back), touch)
+        return Grasp(poses=poses, place=place, approach=_from_above(poses[0], poses))
 
     def script(self, grasp: Grasp, moves: Sequence[tuple[float, float, Carry]]) -> HandScript:
         """Reach for the object, close the hand, and carry what it holds.
@@ -161,7 +202,7 @@ class Handler:
             moves: Start, end [s] and way of each move after that.
         """
         held = grasp.poses[-1]
-        chain = self._approach(grasp)
+        chain = list(grasp.approach)
         for start, end, carry in moves:
             phases = np.linspace(0.0, 1.0, _POSES_PER_MOVE)
             poses = [_turned(held, grasp.place.point, *carry(float(p))) for p in phases]
@@ -181,7 +222,7 @@ class Handler:
         poses = list(grasp.poses)
         half = len(poses) // 2
         eased = poses[max(round((1 - ease) * (len(poses) - 1)), 0) :]
-        chain = self._approach(Grasp(poses=poses[: half + 1], place=grasp.place))
+        chain = _from_above(poses[0], poses[: half + 1])
         chain.append(Move(times[0], times[1], poses[half:]))
         chain.append(Move(times[1], times[2], eased[::-1]))
         chain.append(Move(times[2], times[3], eased))
@@ -191,36 +232,35 @@ class Handler:
         """How far the grasp is from the object's middle along the way the hand faces [m]."""
         return abs(float((self._body.node.mean(axis=0) - grasp.place.point) @ grasp.place.inwards))
 
-    def _find_place(self, *, prefers_narrow: bool, end: float = 0.0) -> Place:
-        places = grasp_places(self._body, self._random, end=end)
-        if not places:
-            return rim_place(self._body, self._random, end=end)
-        places.sort(key=lambda place: place.score(prefers_narrow=prefers_narrow))
-        best = places[: max(len(places) // 5, 1)]
-        return best[self._random.integers(len(best))]
+    def _pinch(self, place: Place, gap: float, start: HandPose | None) -> HandPose:
+        """Put the thumb below a place and two fingers above it; the others stay clear of it."""
+        along = np.cos(_TILT) * place.forward - np.sin(_TILT) * _UP
+        above = np.sin(_TILT) * place.forward + np.cos(_TILT) * _UP
+        point = place.point + _PAD * along
+        targets = {THUMB: point - (gap / 2 + self._radius(THUMB)) * above}
+        clear = place.thickness / 2 + _CLEAR_OF
+        for finger in (INDEX, MIDDLE, RING, LITTLE):
+            height = gap / 2 if finger <= MIDDLE else clear
+            aside = (INDEX + 0.5 - finger) * _PINCH_SPACING * self._thumb_side(place)
+            targets[finger] = point + (height + self._radius(finger)) * above + aside
+        return reach(
+            self._hand,
+            targets,
+            orientation=orientation_towards(place.forward, pitch=_PINCH_PITCH),
+            joints=PINCHING,
+            start=start,
+            along=along,
+        )
 
-    def _pinch(self, place: Place, fingers: Sequence[int]) -> Grasp:
-        """Close thumb and fingers about a place, in steps."""
-        if place.width is None:
-            # A sheet is raked together until its fold is between the fingers.
-            gaps = np.linspace(place.open_gap, place.closed_gap, 7)
-        else:
-            gaps = np.linspace(place.width + 0.012, place.closed_gap, 5)
-        first = self._claw(place, float(gaps[0]), fingers, None)
-        poses = [first]
-        for gap in gaps[1:]:
-            poses.append(self._claw(place, float(gap), fingers, poses[-1]))
-        return Grasp(poses=poses, place=place)
-
-    def _claw(
-        self, place: Place, gap: float, fingers: Sequence[int], start: HandPose | None
-    ) -> HandPose:
-        """Put thumb and fingers on opposite sides of a place, tips down."""
-        side = np.cross(_UP, place.forward) * (1.0 if self._hand.side == "right" else -1.0)
-        targets: Mapping[int, ndarray] = {
-            finger: self._opposite(place, finger, gap, side, fingers)
-            for finger in (THUMB, *fingers)
-        }
+    def _claw(self, place: Place, gap: float, start: HandPose | None) -> HandPose:
+        """Put the thumb and all fingers on opposite sides of a place, tips down."""
+        targets: dict[int, ndarray] = {}
+        for finger in (THUMB, INDEX, MIDDLE, RING, LITTLE):
+            radius = self._radius(finger)
+            sign, order = (-1.0, 0.0) if finger == THUMB else (1.0, 2.5 - finger)
+            target = place.point + sign * (gap / 2 + radius) * place.forward
+            target = target + order * _FINGER_SPACING * self._thumb_side(place)
+            targets[finger] = np.array([*target[:2], max(place.depth, 0.001) + radius])
         return reach(
             self._hand,
             targets,
@@ -229,22 +269,13 @@ class Handler:
             start=start,
         )
 
-    def _opposite(
-        self, place: Place, finger: int, gap: float, side: ndarray, fingers: Sequence[int]
-    ) -> Float[ndarray, " 3"]:
-        radius = fingertip(self._hand, finger).radius
-        sign = -1.0 if finger == THUMB else 1.0
-        order = 0.0 if finger == THUMB else (len(fingers) - 1) / 2 - fingers.index(finger)
-        target = place.point + sign * (gap / 2 + radius) * place.forward
-        target = target + order * _FINGER_SPACING * side
-        return np.array([*target[:2], max(place.depth, 0.001) + radius])
+    def _radius(self, finger: int) -> float:
+        return fingertip(self._hand, finger).radius
 
-    def _approach(self, grasp: Grasp) -> list[Move]:
-        hover = _moved(grasp.poses[0], _HOVER * _UP - 0.01 * grasp.forward)
-        return [
-            Move(_BEGIN, _TOUCH, (hover, grasp.poses[0])),
-            Move(_TOUCH, _CLOSED, grasp.poses),
-        ]
+    def _thumb_side(self, place: Place) -> Float[ndarray, " 3"]:
+        """Tell the horizontal direction from the little finger to the index finger."""
+        side = 1.0 if self._hand.side == "right" else -1.0
+        return side * np.cross(_UP, place.forward)
 
     def _lowest(self, pose: HandPose) -> tuple[float, Float[ndarray, " 3"]]:
         """Find the lowest skin of a pose, and the middle of its palm."""
@@ -256,6 +287,14 @@ class Handler:
                 lowest = min(lowest, float((turn @ end + shift)[2]) - capsule.radius)
         keypoint = self._hand.pose(pose).keypoint
         return lowest, (keypoint[0] + keypoint[9]) / 2
+
+
+def _from_above(first: HandPose, closing: Sequence[HandPose]) -> list[Move]:
+    """Come down to where a hand touches first, then close it."""
+    return [
+        Move(_BEGIN, _TOUCH, (_moved(first, _HOVER * _UP), first)),
+        Move(_TOUCH, _READY, closing),
+    ]
 
 
 def _moved(pose: HandPose, shift: Float[ndarray, " 3"]) -> HandPose:

@@ -13,8 +13,11 @@ _ROOM = 0.024
 _STRIP = 0.012
 _DIRECTIONS = 12
 _CANDIDATES = 120
-_INSET = 0.05
+_INSET = 0.03
 _FLAT = 0.010
+_LINE = 0.06
+_THIN = 0.01
+_THICKER = 0.015
 
 
 class Lying(Protocol):
@@ -43,6 +46,8 @@ class Place:
     """Horizontal direction from there to the object's middle."""
     width: float | None = None
     """How wide the object is between thumb and fingers; None if they rake it together [m]."""
+    thickness: float = 0.0
+    """How thick it is between bottom and top; 0 where that does not matter [m]."""
     depth: float = 0.0
     """Height of the lowest skin of the fingertips [m]."""
     open_gap: float = 0.0
@@ -52,11 +57,6 @@ class Place:
     remoteness: float = 0.0
     """Distance from the object's middle [m]."""
 
-    def score(self, *, prefers_narrow: bool) -> float:
-        """Rate the place; less is better: far out and narrow, or wide and in the middle [m]."""
-        width = self.width or 0.0
-        return 0.5 * width - self.remoteness if prefers_narrow else -width
-
 
 def height_range(body: Lying, point: Float[ndarray, " 3"], reach: float) -> tuple[float, float]:
     """Find the lowest and highest skin near a point, seen from above [m]."""
@@ -65,13 +65,12 @@ def height_range(body: Lying, point: Float[ndarray, " 3"], reach: float) -> tupl
     return float(near.min()) - body.radius, float(near.max()) + body.radius
 
 
-def grasp_places(body: Lying, random: Generator, *, end: float = 0.0) -> list[Place]:
+def narrow_places(body: Lying, random: Generator) -> list[Place]:
     """List places where the object is narrow enough to be taken between thumb and fingers.
 
     Args:
         body: The object.
         random: Decides which places are tried.
-        end: 1 or -1 to keep those in the last third towards +x or -x; 0 for all.
 
     Returns:
         Places with room for the fingers on both sides; none if the object is flat or too wide.
@@ -82,44 +81,92 @@ def grasp_places(body: Lying, random: Generator, *, end: float = 0.0) -> list[Pl
     found = []
     count = min(_CANDIDATES, len(body.node))
     for node in body.node[random.choice(len(body.node), count, replace=False)]:
-        reach = np.abs(body.node[:, 0] - middle[0]).max()
-        if end and end * (node[0] - middle[0]) < 0.5 * reach:
-            continue
-        for angle in np.arange(_DIRECTIONS) * 2 * np.pi / _DIRECTIONS:
-            place = _across(body, node, np.array([np.cos(angle), np.sin(angle), 0.0]), middle)
-            if place is not None:
-                found.append(place)
+        angles = np.arange(_DIRECTIONS) * 2 * np.pi / _DIRECTIONS
+        lines = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(_DIRECTIONS)])
+        places = [_across(body, node, forward, middle) for forward in lines]
+        fitting = [place for place in places if place is not None]
+        if fitting:
+            found.append(min(fitting, key=lambda place: place.width or 0.0))
     return found
 
 
 def rim_place(body: Lying, random: Generator, *, end: float = 0.0) -> Place:
-    """Choose a place near the rim where the object is raked together, facing its middle.
+    """Choose a place near the rim, to be taken between a thumb below and fingers above.
 
     Args:
         body: The object.
-        random: Decides which part of the rim, among those that face -y and +-x.
+        random: Decides which part of the rim, among those that stick out and are thin.
         end: 1 or -1 for the rim towards +x or -x; 0 for any.
     """
+    if np.ptp(body.node[:, 1]) < _LINE:
+        return _beside_line(body, random, end)
     middle = body.node.mean(axis=0)
     if end:
-        angle = (0.0 if end > 0 else np.pi) + random.uniform(-0.15, 0.15)
+        angles = (0.0 if end > 0 else np.pi) + np.linspace(-0.5, 0.5, 9)
     else:
-        angle = -np.pi / 2 + random.uniform(-0.9, 0.9)
-    outwards = np.array([np.cos(angle), np.sin(angle), 0.0])
-    beside = np.linalg.norm(np.cross(body.node - middle, outwards)[:, 2:], axis=1) < 0.02
-    rim = float(((body.node - middle) @ outwards)[beside].max())
-    point = middle + max(rim - _INSET, 0.35 * rim) * outwards
+        angles = -np.pi / 2 + np.linspace(-1.8, 1.8, 19)
+    places = [_rim_along(body, middle, float(angle)) for angle in angles]
+    thickest = min(place.thickness for place in places) + _THICKER
+    places = [place for place in places if place.thickness <= max(thickest, _THIN)]
+    places.sort(key=lambda place: -place.remoteness)
+    return places[random.integers(max(len(places) // 3, 1))]
+
+
+def handful_place(body: Lying, random: Generator) -> Place:
+    """Choose a place about the middle of a flat object, where it is raked together."""
+    middle = body.node.mean(axis=0)
+    angle = np.pi / 2 + random.uniform(-0.5, 0.5)
+    forward = np.array([np.cos(angle), np.sin(angle), 0.0])
+    point = middle + np.array([*random.uniform(-0.03, 0.03, 2), 0.0])
     bottom, top = height_range(body, point, 0.025)
     is_flat = top - bottom < _FLAT
     return Place(
         point=np.array([*point[:2], top]),
-        forward=-outwards,
-        inwards=-outwards,
-        width=None,
+        forward=forward,
+        inwards=forward,
         depth=top - (0.002 if is_flat else 0.45 * (top - bottom)),
-        open_gap=0.045,
-        closed_gap=4 * body.radius - 0.004,
-        remoteness=float(np.linalg.norm((point - middle)[:2])),
+        open_gap=0.085,
+        closed_gap=0.03,
+    )
+
+
+def _rim_along(body: Lying, middle: ndarray, angle: float) -> Place:
+    """Find the rim in one direction from the middle, and go a fingertip's length back."""
+    outwards = np.array([np.cos(angle), np.sin(angle), 0.0])
+    offset = body.node - middle
+    in_strip = (np.abs(np.cross(offset, outwards)[:, 2]) < 0.02) & (offset @ outwards > 0)
+    rim = float((offset @ outwards)[in_strip].max(initial=0.0))
+    point = middle + max(rim - _INSET, 0.5 * rim) * outwards
+    return _between(body, point, -outwards, -outwards, rim)
+
+
+def _beside_line(body: Lying, random: Generator, end: float) -> Place:
+    """Choose a place some centimetres from the end of a rope, across it."""
+    along = body.node[:, 0] - body.node[:, 0].mean()
+    sign = end or float(random.choice([-1.0, 1.0]))
+    want = sign * (np.abs(along).max() - random.uniform(0.06, 0.14))
+    number = int(np.abs(along - want).argmin())
+    near = np.argsort(np.abs(along - along[number]))[:5]
+    slope = np.polyfit(body.node[near, 0], body.node[near, 1], 1)[0]
+    forward = np.array([-slope, 1.0, 0.0]) / np.hypot(slope, 1.0)
+    inwards = np.array([-sign, 0.0, 0.0])
+    return _between(body, body.node[number], forward, inwards, float(abs(along[number])))
+
+
+def _between(
+    body: Lying, point: ndarray, forward: ndarray, inwards: ndarray, remoteness: float
+) -> Place:
+    """Describe a place between a thumb below and fingers above."""
+    bottom, top = height_range(body, point, 0.015)
+    thickness = top - bottom
+    return Place(
+        point=np.array([*point[:2], (bottom + top) / 2]),
+        forward=forward,
+        inwards=inwards,
+        thickness=thickness,
+        open_gap=thickness + 0.02,
+        closed_gap=max(thickness - 0.004, 0.001) if thickness < 0.015 else 0.55 * thickness,
+        remoteness=remoteness,
     )
 
 
@@ -143,7 +190,7 @@ def _across(body: Lying, node: ndarray, forward: ndarray, middle: ndarray) -> Pl
         forward=forward,
         inwards=inwards / max(remoteness, 1e-9),
         width=width,
-        depth=bottom + max(0.25 * (top - bottom) - 0.004, 0.001),
+        depth=bottom + max(0.25 * (top - bottom) - 0.008, 0.001),
         open_gap=width + 0.012,
         closed_gap=max(0.55 * width, width - 0.02) - 0.002,
         remoteness=remoteness,
