@@ -171,7 +171,11 @@ class _World:
         return touched
 
     def _targets(self, time: float) -> tuple[Float[ndarray, "bone 3"], Rotation]:
-        """Say where all bones should be at a time."""
+        """Say where the targets are, so that the bones are where they should be at a time.
+
+        A weld damps all motion and knows no speed of its target, so bones trail behind.
+        """
+        time += 2 * self._parameters.weld_time
         transform: dict[Side, ndarray] = {}
         for script in self._scripts:
             hand = self._hands[script.side]
