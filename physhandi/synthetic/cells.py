@@ -14,6 +14,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import physhandi
 from physhandi.data.atomic import write_array, write_json
 from physhandi.data.run import Run
@@ -27,6 +29,7 @@ from physhandi.errors import (
     SimulationDivergedError,
     SimulationError,
 )
+from physhandi.metrics.photometric import photometric_curves
 from physhandi.metrics.report import measure_run
 from physhandi.progress import Progress
 from physhandi.synthetic.baselines import (
@@ -224,6 +227,7 @@ class Bench:
             with tempfile.TemporaryDirectory() as folder:
                 _assemble(Path(folder), run, reference, recording)
                 report, frames = measure_run(Path(folder), recording)
+            _add_photometric(report, frames, run, reference, recording)
             path.parent.mkdir(parents=True, exist_ok=True)
             write_json(path, {"report": report, "curves": frames.get("rollout", {})})
         known = read_json(path)
@@ -321,6 +325,35 @@ def _raise_again(folder: Path) -> None:
     kind = kinds.get(str(found.get("error_type", "")))
     if found.get("state") == "failed" and kind is not None:
         raise FitError(str(found.get("error")))
+
+
+def _add_photometric(
+    report: dict[str, Any],
+    frames: dict[str, Any],
+    run: Run | None,
+    reference: Run,
+    recording: Sequence,
+) -> None:
+    """Put IoU and PSNR beside the other figures of the rollout; where it is missing, it stands."""
+    name = f"sequences/{recording.name}/rollout.npy"
+    rollout = reference.array(name).copy()  # The reference is the static object.
+    if run is not None and run.array(name).shape == rollout.shape:
+        found = run.array(name)
+        is_usable = np.isfinite(found).all(axis=(1, 2))
+        rollout[is_usable] = found[is_usable]
+    curves = photometric_curves(recording.views, rollout[:, : recording.surface_node_count])
+    splits = {
+        "reconstruction": recording.reconstruction_frames,
+        "future": recording.future_frames,
+    }
+    for metric, curve in curves.items():
+        frames.setdefault("rollout", {})[metric] = [
+            float(value) if np.isfinite(value) else None for value in curve
+        ]
+        for split, scored in splits.items():
+            known = [float(curve[f]) for f in scored if f > 0 and np.isfinite(curve[f])]
+            if known and split in report:
+                report[split]["rollout"][metric] = sum(known) / len(known)
 
 
 def _given(method: Method, variant: str) -> str:

@@ -15,6 +15,7 @@ the frames in which it touches any."""
 BREAKDOWN = ("/dense", "/point")
 """Ends of the splits that repeat the figures of others for one kind of contact."""
 _HANDS = {"chamfer_symmetric": "hand_chamfer", "mpjpe": "mpjpe", "surface_error": "hand_surface"}
+_SHADED = ("iou", "psnr")
 _TOPOLOGY = ("rrd_object", "rrd_virtual")
 
 
@@ -71,7 +72,7 @@ def _object_figures(
     kind = contact_kind(recording) if protocol == "main" else None
     for split in ("reconstruction", "future"):
         found = report.get(split, {}).get("rollout", {})
-        figures = {metric: found.get(metric) for metric in METRICS}
+        figures = {metric: found.get(metric) for metric in (*METRICS, *_SHADED)}
         yield ("unseen" if protocol == "unseen" else named(split)), figures
         if protocol == "unseen":
             return  # All its frames are in the first split.
