@@ -17,6 +17,9 @@ from physhandi.synthetic.true_hand import TrueHand, load_true_hand
 Action = Literal["lift", "fold", "stretch", "squeeze", "wipe", "push"]
 ACTIONS: tuple[Action, ...] = ("lift", "fold", "stretch", "squeeze", "wipe", "push")
 """What hands can do."""
+_UP = np.array([0.0, 0.0, 1.0])
+# How far hands pull each body beyond its length: as far as friction holds it.
+_STRETCH = {"cloth": 0.02, "towel": 0.05, "rope": -0.01, "plush": 0.08, "pouch": 0.05}
 DURATION = 3.0
 """How long an action is recorded if nothing else is asked for [s]."""
 
@@ -95,39 +98,46 @@ def _fold(task: _Task) -> tuple[HandScript, ...]:
     def carry(phase: float) -> tuple[ndarray, ndarray]:
         along = radius * (1 - np.cos(angle * phase))
         up = radius * np.sin(angle * phase)
-        tilt = 0.35 * phase * np.cross([0.0, 0.0, 1.0], grasp.place.inwards)
+        tilt = 0.35 * phase * np.cross(_UP, grasp.place.inwards)
         return along * grasp.place.inwards + np.array([0.0, 0.0, up]), tilt
 
     return (handler.script(grasp, [(0.0, duration, carry)]),)
 
 
 def _stretch(task: _Task) -> tuple[HandScript, ...]:
-    """Pinch the object at both ends, raise it and pull it apart."""
+    """Pinch the object at both ends, raise it with some slack, and pull it apart."""
     random, duration = task.random, task.duration
-    pull = random.uniform(0.03, 0.06)
-    height = random.uniform(0.04, 0.08)
+    slack, height = random.uniform(0.025, 0.04), random.uniform(0.04, 0.08)
+    slacken = random.uniform(0.3, 0.4) * duration
+    strain = _STRETCH[task.body.name] * random.uniform(0.7, 1.3)
     scripts = []
     sides: tuple[Side, Side] = ("right", "left")
     for hand_side in sides:
         handler = task.handler(hand_side)
         grasp = handler.pinch_rim(end=1.0 if hand_side == "right" else -1.0)
+        outwards = -grasp.place.inwards
+        pull = slack + strain * handler.distance_to_middle(grasp)
 
-        def carry(
-            phase: float, outwards: ndarray = -grasp.place.inwards
+        def gather(phase: float, outwards: ndarray = outwards) -> tuple[ndarray, ndarray]:
+            return phase * (height * _UP - slack * outwards), np.zeros(3)
+
+        def part(
+            phase: float, outwards: ndarray = outwards, pull: float = pull
         ) -> tuple[ndarray, ndarray]:
-            up = height * min(2 * phase, 1.0)
-            return pull * phase * outwards + np.array([0.0, 0.0, up]), np.zeros(3)
+            return height * _UP + (phase * pull - slack) * outwards, np.zeros(3)
 
-        scripts.append(handler.script(grasp, [(0.0, duration, carry)]))
+        moves = [(0.0, slacken, gather), (slacken, duration, part)]
+        scripts.append(handler.script(grasp, moves))
     return tuple(scripts)
 
 
 def _squeeze(task: _Task) -> tuple[HandScript, ...]:
-    """Close all fingers around the object, let go by half, and close them again."""
-    handler, random, duration = task.handler(), task.random, task.duration
+    """Close all fingers, let go by half, and close them again, while the hand drifts aside."""
+    handler, random = task.handler(), task.random
     grasp = handler.embrace()
-    times = np.array([0.0, 0.4, 0.6, 1.0]) * duration
-    return (handler.squeeze_script(grasp, times, ease=random.uniform(0.4, 0.6)),)
+    drift = random.uniform(0.03, 0.06) * grasp.forward + random.uniform(-0.03, 0.03) * grasp.across
+    times = np.array([0.0, 0.4, 0.6, 1.0]) * task.duration
+    return (handler.squeeze_script(grasp, times, ease=random.uniform(0.4, 0.6), drift=drift),)
 
 
 def _wipe(task: _Task) -> tuple[HandScript, ...]:

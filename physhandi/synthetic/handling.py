@@ -210,7 +210,12 @@ class Handler:
         return HandScript(self._hand.side, chain, Tremor(self._random))
 
     def squeeze_script(
-        self, grasp: Grasp, times: Float[ndarray, " 4"], *, ease: float
+        self,
+        grasp: Grasp,
+        times: Float[ndarray, " 4"],
+        *,
+        ease: float,
+        drift: Float[ndarray, " 3"],
     ) -> HandScript:
         """Close the hand further, ease it, and close it again.
 
@@ -218,14 +223,17 @@ class Handler:
             grasp: Where and how to take hold.
             times: Begin and end of closing, end of easing and of closing again [s].
             ease: Share of the way to the open hand by which the grip is eased.
+            drift: How far the hand moves aside in the end [m].
         """
         poses = list(grasp.poses)
         half = len(poses) // 2
         eased = poses[max(round((1 - ease) * (len(poses) - 1)), 0) :]
         chain = _from_above(poses[0], poses[: half + 1])
-        chain.append(Move(times[0], times[1], poses[half:]))
-        chain.append(Move(times[1], times[2], eased[::-1]))
-        chain.append(Move(times[2], times[3], eased))
+        legs = (poses[half:], 0.0, 0.2), (eased[::-1], 0.2, 0.4), (eased, 0.4, 1.0)
+        for number, (leg, first, last) in enumerate(legs):
+            shares = np.linspace(first, last, len(leg))
+            drifting = [_moved(p, share * drift) for p, share in zip(leg, shares, strict=True)]
+            chain.append(Move(times[number], times[number + 1], drifting))
         return HandScript(self._hand.side, chain, Tremor(self._random))
 
     def distance_to_middle(self, grasp: Grasp) -> float:

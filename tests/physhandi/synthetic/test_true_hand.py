@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from physhandi.data.sequence_schema import Side
 from physhandi.hand.model import load_hand_model
 from physhandi.synthetic.rasterizer import vertex_normals
 from physhandi.synthetic.true_hand import (
@@ -48,7 +49,7 @@ def test_the_asset_is_the_one_that_is_vouched_for():
 
 
 @pytest.mark.parametrize("side", ["right", "left"])
-def test_it_is_a_closed_adult_hand_that_looks_outwards(side: str):
+def test_it_is_a_closed_adult_hand_that_looks_outwards(side: Side):
     hand = load_true_hand(side)
     edges = Counter((a, b) for f in hand.faces for a, b in zip(f, np.roll(f, -1), strict=True))
     assert max(edges.values()) == 1
