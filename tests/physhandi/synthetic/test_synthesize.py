@@ -1,0 +1,165 @@
+"""The generator from end to end, and what it refuses."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from app import cli
+from physhandi.data.sequence import Sequence
+from physhandi.data.truth import read_truth
+from physhandi.errors import CancelledError, SequenceError, UsageError
+from physhandi.perception.lifting import observe_object
+from physhandi.perception.shape import object_nodes_from_observation
+from physhandi.progress import Progress
+from physhandi.synthetic import synthesize as generator
+from physhandi.synthetic.synthesize import synthesize
+
+pytest.importorskip("mujoco")
+
+
+@pytest.fixture(scope="module")
+def rope(tmp_path_factory: pytest.TempPathFactory) -> Sequence:
+    """A rope that is pushed, the quickest to simulate."""
+    out = tmp_path_factory.mktemp("synthesize") / "rope"
+    return synthesize("rope", "push", out=out, seed=4, frames=8, images="none", resolution="tiny")
+
+
+def test_a_sequence_is_whole_and_says_how_to_make_it_again(rope):
+    rope.validate()
+    assert rope.label == "SynthHDI"
+    assert rope.description.startswith("Push: a right hand, and a rope of ")
+    assert (rope.frame_count, rope.reconstruction_frames) == (8, range(6))
+    assert rope.provenance["synthesize"]["seed"] == 4
+    assert rope.provenance["synthesize"]["preset"] == "default"
+    assert rope.provenance["degradations"]["depth_noise"] == 0.08
+    assert len(rope.views) == 3
+    assert rope.missing("object", "keypoint", "validation_track") == []
+
+
+def test_what_is_seen_is_near_what_happened(rope):
+    known, observation = read_truth(rope.folder), observe_object(rope)
+    for frame in (0, 7):
+        near = cKDTree(known.object_point[frame]).query(observation.cloud[frame])[0]
+        # Default errors: 1 mm and 0.1° of calibration, 10 ms, 1 mm of depth; the skin is coarse.
+        assert 0.0005 < np.median(near) < 0.012
+    node = object_nodes_from_observation(observation, 0.012, rope)
+    assert 30 < len(node) < 400
+
+
+def test_the_same_call_makes_the_same_sequence(rope, tmp_path):
+    again = synthesize(
+        "rope",
+        "push",
+        out=tmp_path / "rope",
+        seed=4,
+        frames=8,
+        images="none",
+        resolution="tiny",
+    )
+    assert again.fingerprint() == rope.fingerprint()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"object_": "anvil"}, "no object named 'anvil'. Choose one of: cloth"),
+        ({"action": "juggle"}, "no action 'juggle'. Choose one of: lift"),
+        ({"cameras": 0}, "cameras is 0; expected 1 to 4"),
+        ({"cameras": 5}, "cameras is 5"),
+        ({"frames": 1}, "frames is 1; expected 2 to 1000"),
+        ({"seed": -1}, "seed is -1"),
+        ({"preset": "foggy"}, "no preset named 'foggy'"),
+        ({"changes": {"fog": 1.0}}, "no degradation named 'fog'"),
+        ({"hold": "glue"}, "hold is 'glue'; expected one of: friction, attachment"),
+        ({"images": "some"}, "images is 'some'; expected one of: all, none"),
+        ({"resolution": "coarse"}, "no resolution named 'coarse'"),
+    ],
+)
+def test_bad_input_is_named_and_leaves_nothing(tmp_path, arguments, message):
+    whole = {"object_": "rope", "action": "push"} | arguments
+    with pytest.raises(UsageError, match=message):
+        synthesize(whole.pop("object_"), whole.pop("action"), out=tmp_path / "bad", **whole)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_sequence_that_is_there_is_kept(rope):
+    before = rope.fingerprint()
+    with pytest.raises(SequenceError, match="exists already"):
+        synthesize("cloth", "lift", out=rope.folder)
+    assert Sequence.load(rope.folder).fingerprint() == before
+
+
+def test_without_mujoco_it_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setattr(generator, "find_spec", lambda _: None)
+    with pytest.raises(UsageError, match=r"pip install 'physhandi\[synth\]'"):
+        synthesize("rope", "push", out=tmp_path / "none")
+
+
+class StopsWhileFilming(Progress):
+    def __init__(self) -> None:
+        self.stage = ""
+
+    def report(self, stage: str, *_told: object, **_more: object) -> None:
+        self.stage = stage
+
+    def check_cancelled(self) -> None:
+        if self.stage == "filming":
+            raise CancelledError("stopped")
+
+
+def test_stopping_leaves_nothing_behind(tmp_path):
+    with pytest.raises(CancelledError):
+        synthesize(
+            "rope",
+            "push",
+            out=tmp_path / "half",
+            frames=2,
+            images="none",
+            resolution="tiny",
+            progress=StopsWhileFilming(),
+        )
+    assert list(tmp_path.iterdir()) == []
+
+
+def call(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as end:
+        cli.main(["synthesize", *arguments])
+    return int(end.value.code or 0)
+
+
+def test_the_command_writes_a_sequence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "rope"
+    fixed = ("--object", "rope", "--action", "push", "--seed", "4", "--preset", "clean")
+    quick = ("--frames", "3", "--images", "none", "--resolution", "tiny", "--cameras", "1")
+    change = ("--change", "depth_noise=0.05", "track_noise=0.5")
+    assert call(*fixed, *quick, *change, "--out", str(out)) == 0
+    assert str(out) in capsys.readouterr().out
+    sequence = Sequence.load(out)
+    assert sequence.provenance["synthesize"]["changes"] == {
+        "depth_noise": 0.05,
+        "track_noise": 0.5,
+    }
+    assert len(sequence.views) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--object", "anvil", "--action", "lift"), "no object named 'anvil'"),
+        (("--object", "rope", "--action", "push", "--cameras", "0"), "cameras is 0"),
+        (("--object", "rope", "--action", "push", "--change", "holes"), "write it like"),
+    ],
+)
+def test_the_command_refuses_in_one_line(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    arguments: tuple[str, ...],
+    message: str,
+) -> None:
+    assert call(*arguments, "--out", str(tmp_path / "bad")) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert "Traceback" not in error
+    assert list(tmp_path.iterdir()) == []
