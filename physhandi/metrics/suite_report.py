@@ -101,17 +101,17 @@ def tables_of(rows: Sequence[Row]) -> dict[str, list[Column]]:
     }
     for kind, title in (("dense", "Dense contact"), ("point", "Point contact")):
         wanted[title] = _both(_PAPER[:3] + _CONTACT[:1], f"/{kind}")
+    for split, figures in _OTHER.items():
+        wanted[split.capitalize()] = _columns(split, "", figures)
     wanted["Unseen interaction"] = _columns("unseen", "", _PAPER)
     for split in splits:
         name, slash, last = split.rpartition("/")
         if slash and last == "future":
-            wanted[name.replace("_", " ").capitalize()] = _both(_PAPER[:3], before=f"{name}/")
-        elif slash and last in _OTHER:
-            wanted[f"{name.replace('_', ' ').capitalize()}: {last}"] = _columns(
-                split, "", _OTHER[last]
-            )
-    for split, figures in _OTHER.items():
-        wanted[split.capitalize()] = _columns(split, "", figures)
+            hands = _columns(f"{name}/hands", "", _OTHER["hands"])
+            wanted[name.replace("_", " ").capitalize()] = [
+                *_both(_PAPER, before=f"{name}/"),
+                *hands,
+            ]
     times = [row.metric for row in rows if row.split == "runtime"]
     wanted["Seconds for a video frame"] = [
         Column(

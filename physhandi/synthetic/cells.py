@@ -368,13 +368,12 @@ def _as_one_split(recording: Sequence) -> Sequence:
 def _assemble(folder: Path, run: Run | None, reference: Run, recording: Sequence) -> None:
     """Lay out what is scored: the run's motion beside the reference's observations."""
     inside = f"sequences/{recording.name}"
-    seen = [p for p in artefacts(reference.out) if p[0].startswith(f"{inside}/observation/")]
-    own = artefacts((reference if run is None else run).out)
+    observed = (f"{inside}/observation/", f"{inside}/keypoint.npy")
     left_out = ("rollout.npy", "control.npy") if run is None else ()
-    chosen = dict(seen) | {
+    chosen = {r: path for r, path in artefacts(reference.out) if r.startswith(observed)} | {
         rel: path
-        for rel, path in own
-        if not rel.startswith(f"{inside}/observation/") and not rel.endswith(left_out)
+        for rel, path in artefacts((reference if run is None else run).out)
+        if not rel.startswith(observed) and not rel.endswith(left_out)
     }
     for rel, path in chosen.items():
         target = folder / rel

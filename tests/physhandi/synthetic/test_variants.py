@@ -1,0 +1,153 @@
+"""What methods are given in place of a recording, against the recording's own files."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from physhandi.data.camera import PinholeCamera
+from physhandi.data.sequence import Sequence, ViewMeta
+from physhandi.data.sequence_schema import SequenceMeta
+from physhandi.data.sequence_writer import write_sequence
+from physhandi.errors import MissingInputError
+from physhandi.hand.model import load_hand_model
+from physhandi.synthetic.hand_noise import disturbed
+from physhandi.synthetic.scenes import fold_motion
+from physhandi.synthetic.variants import VARIANTS, make_variant
+
+FRAMES = 3
+SIZE = (60, 80)
+
+
+def camera(x: float) -> PinholeCamera:
+    pose = np.array([[1.0, 0, 0, x], [0, -1, 0, 0], [0, 0, -1, 1], [0, 0, 0, 1]])
+    K = np.array([[100.0, 0, 40], [0, 100.0, 30], [0, 0, 1]])
+    return PinholeCamera(K=K, T_world_camera=pose, width=SIZE[1], height=SIZE[0])
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Sequence:
+    """Two cameras that look down on a flat object and a hand."""
+    depth = np.full(SIZE, 1000, dtype=np.uint16)
+    depth[:10] = 0
+    mask = np.zeros(SIZE, dtype=np.uint8)
+    mask[20:40, 20:40], mask[20:40, 45:60] = 1, 2
+    views = tuple(ViewMeta(name=name, camera=camera(x)) for name, x in (("a", 0.0), ("b", 0.1)))
+    arrays: dict[str, np.ndarray] = {}
+    images: dict[str, np.ndarray] = {}
+    for view in views:
+        arrays[f"views/{view.name}/track.npy"] = np.full((FRAMES, 500, 2), 30.0, np.float32)
+        arrays[f"views/{view.name}/track_visible.npy"] = np.ones((FRAMES, 500), bool)
+        arrays[f"views/{view.name}/keypoint.npy"] = np.ones((FRAMES, 1, 21, 3), np.float32) * (
+            np.array([25.0, 30.0, 0.9], np.float32)
+        )
+        for frame in range(FRAMES):
+            images[f"views/{view.name}/depth/{frame:05d}.png"] = depth
+            images[f"views/{view.name}/mask/{frame:05d}.png"] = mask
+    rise = np.arange(FRAMES, dtype=np.float32)[:, None, None] / 100
+    arrays["truth/hand_right_vertex.npy"] = np.ones((FRAMES, 7, 3), np.float32) * 0.1 + rise
+    meta = SequenceMeta(
+        name="scene", frame_rate=30.0, frame_count=FRAMES, hands=("right",), views=views
+    )
+    return write_sequence(tmp_path / "scene", meta, arrays, images=images)
+
+
+def test_nothing_but_the_truth_is_kept_back(recording: Sequence, tmp_path: Path) -> None:
+    made = make_variant(recording, "recording", tmp_path / "inputs")
+
+    def files(sequence: Sequence) -> dict[str, bytes]:
+        paths = [path for path in sequence.folder.rglob("*") if path.is_file()]
+        return {p.relative_to(sequence.folder).as_posix(): p.read_bytes() for p in paths}
+
+    whole, given = files(recording), files(made)
+    assert set(whole) - set(given) == {"truth/hand_right_vertex.npy"}
+    assert {name: whole[name] for name in given} == given
+    assert made.name == recording.name
+
+
+def test_a_variant_is_made_once_and_anew_for_another_recording(
+    recording: Sequence, tmp_path: Path
+) -> None:
+    first = make_variant(recording, "noisy_tracks", tmp_path / "inputs")
+    stamp = first.folder.stat().st_mtime_ns
+    again = make_variant(recording, "noisy_tracks", tmp_path / "inputs")
+    assert (again.folder, again.folder.stat().st_mtime_ns) == (first.folder, stamp)
+    np.save(recording.folder / "views/a/track.npy", np.zeros((FRAMES, 500, 2), np.float32))
+    changed = Sequence.load(recording.folder)
+    assert make_variant(changed, "noisy_tracks", tmp_path / "inputs").folder != first.folder
+
+
+def test_the_true_hand_takes_the_place_of_the_hand_that_is_seen(
+    recording: Sequence, tmp_path: Path
+) -> None:
+    made = make_variant(recording, "true_hand", tmp_path)
+    truth = np.load(recording.folder / "truth/hand_right_vertex.npy")
+    np.testing.assert_array_equal(made.control, truth)
+    assert made.hands == ()
+    assert made.views[0].keypoint is None
+    assert made.views[1].has_depth
+
+
+def test_all_frames_may_be_fitted(recording: Sequence, tmp_path: Path) -> None:
+    assert len(recording.future_frames) == 1
+    assert len(make_variant(recording, "all_frames", tmp_path).future_frames) == 0
+
+
+def test_one_view_is_the_first_one(recording: Sequence, tmp_path: Path) -> None:
+    made = make_variant(recording, "one_view", tmp_path)
+    assert [view.name for view in made.views] == ["a"]
+    assert not (made.folder / "views/b").exists()
+    with pytest.raises(MissingInputError, match="has 1 views"):
+        make_variant(made, "one_view", tmp_path / "again")
+
+
+def test_noise_has_the_size_that_the_paper_names(recording: Sequence, tmp_path: Path) -> None:
+    deep = make_variant(recording, "noisy_depth", tmp_path)
+    for view in deep.views:
+        depth = np.stack([view.depth(frame) for frame in range(FRAMES)])
+        assert (depth[:, :10] == 0).all()
+        measured = depth[:, 10:]
+        # Whole millimetres add a twelfth to the variance.
+        assert measured.std() == pytest.approx(np.hypot(0.001, 0.001 / 12**0.5), rel=0.03)
+        assert measured.mean() == pytest.approx(1.0, abs=1e-4)
+    tracked = make_variant(recording, "noisy_tracks", tmp_path)
+    noise = np.stack([view.track for view in tracked.views]) - 30.0
+    assert noise.std() == pytest.approx(1.0, rel=0.03)
+    assert abs(np.corrcoef(noise[0].ravel(), noise[1].ravel())[0, 1]) < 0.1
+    np.testing.assert_array_equal(tracked.views[0].depth(0), recording.views[0].depth(0))
+
+
+@pytest.mark.parametrize("name", ["true_hand", "noisy_hand", "noisy_tracks"])
+def test_what_a_recording_lacks_is_named(name: str, tmp_path: Path) -> None:
+    bare = write_sequence(
+        tmp_path / "bare", SequenceMeta(name="bare", frame_rate=30.0, frame_count=FRAMES)
+    )
+    assert name in VARIANTS
+    with pytest.raises(MissingInputError, match="'bare' has no"):
+        make_variant(bare, name, tmp_path / "inputs")
+
+
+def test_markers_are_disturbed_by_as_much_as_a_pixel_is_wide(
+    recording: Sequence, tmp_path: Path
+) -> None:
+    marker = np.zeros((FRAMES, 400, 3), np.float32)
+    marker[:, :5] = np.nan
+    np.save(recording.folder / "marker.npy", marker)
+    made = make_variant(Sequence.load(recording.folder), "noisy_tracks", tmp_path)
+    moved = np.asarray(made.marker)
+    assert np.isnan(moved[:, :5]).all()
+    # The camera is 1 m away, and 100 px wide there.
+    assert moved[:, 5:].std() == pytest.approx(0.01, rel=0.05)
+    deep = make_variant(Sequence.load(recording.folder), "noisy_depth", tmp_path)
+    assert np.asarray(deep.marker)[:, 5:].std() == pytest.approx(0.001, rel=0.05)
+
+
+def test_a_disturbed_hand_is_wrong_by_exactly_10_mm() -> None:
+    model = load_hand_model("right")
+    motion = fold_motion(model, 12, 30.0, np.random.default_rng(0))
+    wrong = disturbed(motion, 0.010, seed=0)
+    gap = np.linalg.norm(wrong.keypoints(model) - motion.keypoints(model), axis=2)
+    assert gap.mean() == pytest.approx(0.010, rel=1e-4)
+    assert gap.mean(axis=1).min() > 0.002
+    other = disturbed(motion, 0.010, seed=1)
+    assert np.abs(other.wrist_translation - wrong.wrist_translation).max() > 0.002
