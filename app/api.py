@@ -11,6 +11,7 @@ from starlette.background import BackgroundTask
 from starlette.exceptions import HTTPException
 
 from app.comparison import NewComparison
+from app.jobs.about import RunChanges, change_about
 from app.jobs.catalog import Catalog, NotFoundError
 from app.jobs.describe import (
     describe_results,
@@ -182,6 +183,12 @@ def _add_jobs(router: APIRouter, catalog: Catalog, scheduler: Scheduler) -> None
             new.sequences, new.profile, new.name, overrides=new.overrides, parent=new.parent
         )
         return describe_run(catalog.run_item(run.id), scheduler)
+
+    @router.patch("/runs/{run_id}")
+    def change(run_id: Id, changes: RunChanges) -> dict[str, Any]:
+        """Change what a run is called, its tags or its note; what is left out stays."""
+        change_about(catalog, run_id, changes)
+        return describe_run(catalog.run_item(run_id), scheduler)
 
     @router.post("/runs/{run_id}/cancel")
     def cancel(run_id: Id) -> dict[str, Any]:

@@ -82,6 +82,7 @@ def _describe(item: RunItem, view: JobView) -> dict[str, Any]:
         "sequences": [],
         "profile": "",
         "tags": [],
+        "note": "",
     }
     run = item.run
     if run is None:
@@ -96,6 +97,7 @@ def _describe(item: RunItem, view: JobView) -> dict[str, Any]:
             "sequences": run.sequence_names,
             "profile": str(profile.get("profile", "")),
             "tags": tags_of(run.label),
+            "note": run.note,
             "error": view.reason if view.state == "failed" else None,
         }
         | asdict(summarize(run) if view.is_published else RunSummary())

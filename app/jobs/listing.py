@@ -156,7 +156,8 @@ def _fits(run: Mapping[str, Any], key: str, value: str, is_not: bool) -> bool:
 
 
 def _text_of(run: Mapping[str, Any]) -> str:
-    parts = (run["name"], run["id"], run["profile"], *run["sequences"], *run["tags"])
+    told = (run["name"], run["id"], run["profile"], run.get("note", ""))
+    parts = (*told, *run["sequences"], *run["tags"])
     return "\n".join(parts).lower()
 
 

@@ -64,7 +64,7 @@ class RunIndex:
             "sequences": run.sequences,
             "sequence_names": run.sequence_names,
         }
-        about = {"name": run.name, "label": run.label, "created": run.created}
+        about = {"name": run.name, "label": run.label, "note": run.note, "created": run.created}
         try:
             text = json.dumps(run.config, sort_keys=True)
         except TypeError:

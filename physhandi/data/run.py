@@ -51,6 +51,7 @@ class Run(RunOutputs):
         self.config: dict[str, Any] = dict(job["config"])
         self.name: str = about["name"]
         self.label: str = about.get("label", "")
+        self.note: str = about.get("note", "")
         self.created: str = about["created"]
 
     def __repr__(self) -> str:
@@ -174,12 +175,15 @@ class Run(RunOutputs):
         """Withdraw a request to stop, before the run is started again."""
         (self.folder / CANCEL).unlink(missing_ok=True)
 
-    def rename(self, name: str | None = None, *, label: str | None = None) -> None:
-        """Change what the user calls the run, or its label."""
+    def rename(
+        self, name: str | None = None, *, label: str | None = None, note: str | None = None
+    ) -> None:
+        """Change what the user calls the run, its label (tags with commas between), or its note."""
         self.name = self.name if name is None else name
         self.label = self.label if label is None else label
-        about = {"name": self.name, "label": self.label, "created": self.created}
-        write_yaml(self.folder / RUN, {"format": RUN_FORMAT} | about)
+        self.note = self.note if note is None else note
+        about = {"name": self.name, "label": self.label, "note": self.note}
+        write_yaml(self.folder / RUN, {"format": RUN_FORMAT} | about | {"created": self.created})
 
     def delete(self) -> None:
         """Remove the run from disk.
