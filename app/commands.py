@@ -221,6 +221,7 @@ def evaluate_suite(command: Any, progress: Progress) -> dict[str, Any]:
     Raises:
         UsageError: If a method, seed or sequence makes no sense.
     """
+    from physhandi.synthetic.baselines import parse_method, settings_of
     from physhandi.synthetic.evaluation import Order, evaluate
     from physhandi.synthetic.suite import find_suite, make_recordings
 
@@ -230,6 +231,10 @@ def evaluate_suite(command: Any, progress: Progress) -> dict[str, Any]:
     out = command.out or settings.suite_dir / name
     if command.sequences and command.seeds:
         raise UsageError("--seeds belongs to a suite's scenes; leave it out with --sequences.")
+    methods = command.methods or suite.methods
+    for method in methods:  # Tells a wrong one before a sequence is made, which takes long.
+        settings_of(parse_method(method), suite.settings)
+    device = pick_device(command.device)
     recordings = (
         tuple(find_sequence(sequence, command.data_dir) for sequence in command.sequences)
         if command.sequences
@@ -240,10 +245,10 @@ def evaluate_suite(command: Any, progress: Progress) -> dict[str, Any]:
     order = Order(
         title=f"Suite {suite.name}" if not command.sequences else "Named sequences",
         recordings=recordings,
-        methods=command.methods or suite.methods,
+        methods=methods,
         protocols=command.protocols or suite.protocols,
         settings=suite.settings,
-        device=pick_device(command.device),
+        device=device,
     )
     return evaluate(order, out, progress)
 
