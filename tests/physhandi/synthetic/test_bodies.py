@@ -27,7 +27,7 @@ def test_a_body_lies_on_the_ground_about_the_origin(name, resolution):
     assert np.abs((body.node.min(axis=0) + body.node.max(axis=0))[:2]).max() < 0.03
     assert body.size[0] >= body.size[1]
     np.testing.assert_allclose(np.ptp(body.node, axis=0), body.size)
-    low, high = (80, 1000) if resolution == "fine" else (30, 441)
+    low, high = (40, 1000) if resolution == "fine" else (30, 441)
     assert low < body.node_count <= high
     assert set(np.unique(body.elements)) == set(range(body.node_count))
     assert len(body.element_stiffness) == len(body.elements)
@@ -83,6 +83,7 @@ def test_a_rope_is_as_long_as_it_is_made_of_equal_pieces():
     piece = np.linalg.norm(np.diff(rope.node, axis=0), axis=1)
     assert 0.55 < piece.sum() < 0.65
     assert piece.max() / piece.min() < 1.01
+    assert piece.min() > rope.thickness
     assert rope.size[1] > 0.015
 
 
