@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -97,3 +99,78 @@ def test_hidden_keypoints_are_less_exact_and_less_sure():
     assert np.nanstd(keypoint[:, :10, :2] - 50) == pytest.approx(1.5, rel=0.05)
     assert np.nanstd(keypoint[:, 10:20, :2] - 50) == pytest.approx(3.0, rel=0.05)
     assert np.nanmax(keypoint[:, 10:20, 2]) < np.nanmin(keypoint[:, :10, 2])
+
+
+def test_an_even_error_does_not_grow_with_the_distance():
+    for depth in (0.5, 1.0):
+        sensor = DepthSensor(
+            hole_rate=0.0, disparity_noise=0.0, disparity_step=0.0, even_noise=0.003
+        )
+        flat = np.full((200, 200), depth)
+        measured = sensor.measure(flat, np.ones_like(flat), rng()) / 1000.0
+        assert np.std(measured) == pytest.approx(0.003, rel=0.03)
+        # Neighbours err apart from each other.
+        error = measured - depth
+        assert abs(np.corrcoef(error[:, 1:].ravel(), error[:, :-1].ravel())[0, 1]) < 0.02
+
+
+def test_a_cut_out_of_a_wide_image_has_shadows_as_wide_as_in_the_whole():
+    depth = np.full((20, 300), 0.9)
+    depth[:, 150:] = 0.5
+    exact = DepthSensor(hole_rate=0.0, disparity_noise=0.0, disparity_step=0.0, flying_rate=0.0)
+    expected = int(447 * 0.095 * (1 / 0.5 - 1 / 0.9))
+    assert expected == 37
+    for shadow, width in ((1.0, expected), (0.5, expected // 2), (0.0, 0)):
+        sensor = replace(exact, shadow=shadow)
+        measured = sensor.measure(depth, np.ones_like(depth), rng(), scale=1.0)
+        assert (measured == 0).sum(axis=1).tolist() == [width] * 20
+        assert (measured[:, 150 - width : 150] == 0).all()
+
+
+def test_mixed_pixels_reach_as_far_from_an_edge_as_told():
+    depth = np.full((400, 100), 0.8)
+    depth[:, 50:] = 0.6
+    for reach, columns in ((1, [49, 50]), (2, [48, 49, 50, 51])):
+        sensor = DepthSensor(hole_rate=0.0, shadow=0.0, disparity_noise=0.0, edge_reach=reach)
+        measured = sensor.measure(depth, np.ones_like(depth), rng()) / 1000.0
+        mixed = (measured > 0.605) & (measured < 0.795)
+        assert np.flatnonzero(mixed.any(axis=0)).tolist() == columns
+        assert mixed[:, columns].mean() == pytest.approx(0.4 * 0.95, abs=0.04)
+
+
+def test_outlines_move_by_up_to_two_pixels_if_told_so():
+    label = np.zeros((600, 600), dtype=np.uint8)
+    label[50:550, 50:550] = 3
+    found = segment(label, rng(), error=1.0, largest=2.0)
+    wrong = found != label
+    assert set(np.unique(found)) == {0, 3}
+    assert not wrong[52:548, 52:548].any()
+    assert not wrong[:48].any()
+    assert 0 < wrong[48].mean() < 0.2 < wrong[49:51].mean()
+    assert not (segment(label, rng(), error=0.0, largest=0.0) != label).any()
+
+
+def test_a_wandering_track_is_lost_for_good():
+    pixel = np.full((121, 2000, 2), 40.0)
+    seen = np.ones(pixel.shape[:2], dtype=bool)
+    reported, _ = track(pixel, seen, rng(), error=0.0, wander=0.5, dropout_rate=0.0)
+    assert (reported[0] == 40.0).all()
+    # As of a random walk, the variance grows with time: 0.5 px after 30 frames, 1 px after 120.
+    assert np.std(reported[30]) == pytest.approx(0.5, rel=0.05)
+    assert np.std(reported[120]) == pytest.approx(1.0, rel=0.05)
+
+
+def test_perfect_detectors_find_every_keypoint_where_it_is():
+    pixel = np.full((5, 21, 2), 30.0)
+    hidden = np.ones((5, 21), dtype=bool)
+    keypoint = detect_keypoints(pixel, hidden, (100, 100), rng(), error=0.0, loss_rate=0.0)
+    assert (keypoint[..., :2] == 30.0).all()
+    assert (keypoint[..., 2] < 0.61).all()
+    worse = detect_keypoints(
+        np.full((3000, 21, 2), 500.0),
+        np.ones((3000, 21), bool),
+        (1000, 1000),
+        rng(),
+        hidden_factor=4.0,
+    )
+    assert np.nanstd(worse[..., :2]) == pytest.approx(6.0, rel=0.05)
