@@ -2,12 +2,13 @@
 
 /* ---- talking to the server ---- */
 
-function toast(text, isBad) {
+function toast(text, isBad, link) {
   const line = document.createElement("p");
   line.textContent = text;
   if (isBad) line.className = "bad";
+  if (link) line.append(" · ", Object.assign(document.createElement("a"), link));
   document.getElementById("toast").append(line);
-  setTimeout(() => line.remove(), isBad ? 9000 : 4000);
+  setTimeout(() => line.remove(), isBad || link ? 9000 : 4000);
 }
 
 async function send(method, url, body) {
@@ -79,7 +80,7 @@ async function launch(form) {
   });
   form.closest("dialog").close();
   form.reset();
-  toast(`“${run.name}” is in line`);
+  toast(`“${run.name}” is in line`, false, { href: `/runs/${run.id}`, textContent: "Watch it" });
   refresh("runs");
   const heading = document.getElementById("runs-heading");
   if (heading) heading.scrollIntoView({ behavior: "smooth" });
@@ -234,6 +235,9 @@ document.addEventListener("error", (event) => {
 }, true);
 
 document.addEventListener("DOMContentLoaded", () => {
+  for (const link of document.querySelectorAll(".bar nav a")) {
+    if (`${location.pathname}/`.startsWith(`${link.pathname}/`)) link.setAttribute("aria-current", "page");
+  }
   cursor = document.body.dataset.since ?? null;
   showLocalTimes();
   follow();

@@ -6,7 +6,9 @@ const order = document.getElementById("order");
 const rows = [...order.querySelectorAll("[data-setting]")];
 const CHECK_MS = 350;
 
-const numberOf = (input) => (input.value === "" ? null : Number(input.value));
+/* A number that nobody touched is the exact one, of which the field shows six digits. */
+const isUntouched = (input) => input.dataset.exact !== undefined && input.value === input.defaultValue;
+const numberOf = (input) => (input.value === "" ? null : Number(isUntouched(input) ? input.dataset.exact : input.value));
 
 function valueOf(row) {
   const kind = row.dataset.kind;
@@ -29,7 +31,7 @@ function setValue(row, value) {
   }
   const input = row.querySelector(".field input, .field select");
   if (row.dataset.kind === "switch") input.checked = value;
-  else input.value = value ?? "";
+  else input.value = Number(input.dataset.exact) === value ? input.defaultValue : (value ?? "");
 }
 
 function isSame(a, b) {

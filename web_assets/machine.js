@@ -11,13 +11,13 @@ function bytes(value) {
 
 const percent = (share) => `${Math.round(100 * share)} %`;
 
-function showMeter(place, share, text) {
+function showMeter(place, share, text, canRunOut = true) {
   const rail = place.querySelector(".rail");
   const value = Number.isFinite(share) ? Math.min(Math.max(share, 0), 1) : 0;
   rail.setAttribute("aria-valuenow", value);
   rail.setAttribute("aria-valuetext", text);
   rail.firstElementChild.style.width = `${100 * value}%`;
-  place.classList.toggle("full", share > 0.9);
+  place.classList.toggle("full", canRunOut && share > 0.9);
   place.querySelector("small").textContent = text;
 }
 
@@ -26,9 +26,9 @@ function showMachine(root, machine) {
   const place = root.querySelector("[data-machine]");
   const meter = (name) => place.querySelector(`[data-meter="${name}"]`);
   const { processor, memory, disk, cards } = machine;
-  showMeter(meter("processor"), processor.share, `${percent(processor.share)} of ${processor.count}`);
+  showMeter(meter("processor"), processor.share, `${percent(processor.share)} of ${processor.count}`, false); // A fit shall use all of them.
   showMeter(meter("memory"), memory.share, `${bytes(memory.used)} of ${bytes(memory.total)}`);
-  showMeter(meter("disk"), disk.share, `${bytes(disk.free)} free`);
+  showMeter(meter("disk"), disk.share, `${bytes(disk.free)} of ${bytes(disk.total)} free`);
   for (const card of cards) {
     const marks = [["work", card.share, `${Number.isFinite(card.share) ? percent(card.share) : "–"}${card.temperature ? ` · ${card.temperature} °C` : ""}`, card.name],
       ["memory", card.memory / card.memory_total, `${bytes(card.memory)} of ${bytes(card.memory_total)}`, `GPU ${card.index} memory`]];
@@ -41,7 +41,7 @@ function showMachine(root, machine) {
         made.querySelector(".rail").setAttribute("aria-label", title);
         place.append(made);
       }
-      showMeter(meter(name), share, text);
+      showMeter(meter(name), share, text, kind === "memory");
     }
   }
 }

@@ -143,7 +143,8 @@ async function loadFrames() {
   const { sequences } = await send("GET", page.frames.dataset.url);
   if (JSON.stringify(sequences) === JSON.stringify(frameErrors)) return;
   frameErrors = sequences;
-  const names = Object.keys(sequences);
+  const isTold = (errors) => QUANTITIES.some(([quantity]) => METHODS.some(({ key }) => errors[key]?.[quantity]?.some(Number.isFinite)));
+  const names = Object.keys(sequences).filter((name) => isTold(sequences[name]));
   page.frames.hidden = names.length === 0;
   if (!names.length) return;
   const select = page.frames.querySelector("select");
@@ -195,7 +196,17 @@ function onLoad({ machine, run }) {
   takes.textContent = run ? `This fit takes ${bytes(run.memory)} of memory${card} and keeps ${run.processors.toFixed(1)} of ${machine.processor.count} processors busy.` : "";
 }
 
+/** Tell in the tab how far the fit is, for whoever works in another one. */
+function showInTab(run) {
+  const share = run.state === "running" && run.estimate ? `${Math.round(100 * run.estimate.share)} % · ` : "";
+  const isOver = document.body.dataset.wasAtWork && !["queued", "starting", "running", "stopping"].includes(run.state);
+  if (run.state === "running") document.body.dataset.wasAtWork = "yes";
+  const mark = isOver ? (run.state === "succeeded" ? "✓ " : "✕ ") : "";
+  document.title = `${share}${mark}${run.name} · PhysHanDI`;
+}
+
 function onRun(run) {
+  showInTab(run);
   page.now.hidden = !["starting", "running", "stopping"].includes(run.state);
   if (page.now.hidden) page.preview.stop();
   showEstimate(run.state === "running" ? run.estimate : null);

@@ -48,6 +48,7 @@ def describe_sequence(item: SequenceItem) -> dict[str, Any]:
         "duration_s": sequence.frame_count / sequence.frame_rate,
         "view_count": len(sequence.views),
         "hands": list(sequence.hands),
+        "marker_count": 0 if sequence.marker is None else sequence.marker.shape[1],
         "parts": [part for part in PARTS if part not in missing],
         "metric": sequence.metric,
         "length_unit": sequence.length_unit,

@@ -19,7 +19,7 @@ class StageView:
     name: str
     """Name of the stage."""
     state: str
-    """``done``, ``at-work``, ``failed``, ``stopped`` (by the user) or ``to-come``."""
+    """``done``, ``passed`` (nothing to do), ``at-work``, ``failed``, ``stopped`` or ``to-come``."""
     seconds: float | None = None
     """How long it took, or has taken so far."""
     before: float | None = None
@@ -83,7 +83,7 @@ def stage_views(
             views.append(
                 StageView(
                     name,
-                    "done",
+                    "done" if _has_worked(name, done[name]) else "passed",
                     done[name].get("seconds"),
                     summary.get("before"),
                     summary.get("after"),
@@ -94,6 +94,16 @@ def stage_views(
         elif state != "succeeded" and position > last_done:
             views.append(StageView(name, "to-come"))
     return views
+
+
+def _has_worked(name: str, finished: Mapping[str, Any]) -> bool:
+    """Tell whether a stage had anything to do: those of hands write nothing of hands if not."""
+    files = named_fields(finished.get("files"))
+    if files is None or not name.startswith("hand_"):
+        return True
+    if not files:  # Stage 1 notes at least which sequences there are.
+        return name != "hand_refinement"
+    return any("/hand_" in file for file in files)
 
 
 def _names(kind: str) -> list[str]:

@@ -21,6 +21,8 @@ class RunSummary:
     """Track error of the rollout in the frames that were fitted [m]."""
     track_error_predicted: float | None = None
     """Track error of the rollout in the frames that were not fitted [m]."""
+    reprojection: float | None = None
+    """Median distance of the hands' joints from their keypoints in the images [px]."""
 
 
 def summarize(run: Run) -> RunSummary:
@@ -31,9 +33,10 @@ def summarize(run: Run) -> RunSummary:
     """
     try:
         fitted, predicted = _track_errors(run)
+        reprojection = _reprojection(run)
     except (PhysHandiError, OSError):
-        fitted = predicted = None
-    return RunSummary(_duration(run), fitted, predicted)
+        fitted = predicted = reprojection = None
+    return RunSummary(_duration(run), fitted, predicted, reprojection)
 
 
 def _duration(run: Run) -> float | None:
@@ -60,6 +63,20 @@ def _track_errors(run: Run) -> tuple[float | None, float | None]:
         fitted_frames += _error_and_weight(of_sequence.get("reconstruction"))
         predicted += _error_and_weight(of_sequence.get("future"))
     return _mean(fitted), _mean(predicted)
+
+
+def _reprojection(run: Run) -> float | None:
+    """Give the median reprojection error, weighted by the keypoints of each hand."""
+    metrics = (named_fields(run.json(_METRICS)) if run.has(_METRICS) else None) or {}
+    found: list[tuple[float, float]] = []
+    for scores in metrics.values():
+        hands = named_fields((named_fields(scores) or {}).get("hands")) or {}
+        for score in hands.values():
+            fields = named_fields(score) or {}
+            error, count = fields.get("reprojection_median"), fields.get("scored_keypoints")
+            if isinstance(error, int | float) and isinstance(count, int | float) and count > 0:
+                found.append((float(error), float(count)))
+    return _mean(found)
 
 
 def _unseen_sequences(run: Run) -> set[str]:

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from app.previews.draw import HEIGHT, WIDTH, Motion, draw_motion
+from app.previews.links import marker_links
 from physhandi.data.atomic import named_fields, temporary_name
 from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
@@ -155,20 +156,8 @@ def _recorded_motion(sequence: Sequence) -> Motion:
     marker, control = sequence.marker, sequence.control
     if marker is None and control is None and sequence.object_node is not None:
         return Motion(node=np.repeat(sequence.object_node[None], sequence.frame_count, axis=0))
-    return Motion(marker=marker, control=control, spring=_links(sequence))
-
-
-def _links(sequence: Sequence) -> Int[ndarray, "link 2"]:
-    """Join each marker with its nearest ones, so that a rope looks like one."""
-    marker = sequence.marker
-    if marker is None or marker.shape[1] > 200:
-        return np.empty((0, 2), dtype=int)
-    distance = np.linalg.norm(marker[0][:, None] - marker[0][None], axis=-1)
-    np.fill_diagonal(distance, np.inf)
-    distance[~np.isfinite(distance)] = np.inf
-    nearest = distance.min(axis=1, initial=np.inf)
-    close = distance <= 1.35 * np.maximum(nearest[:, None], nearest[None])
-    return np.argwhere(np.triu(close & np.isfinite(distance)))
+    links = np.empty((0, 2), dtype=int) if marker is None else marker_links(marker[0])
+    return Motion(marker=marker, control=control, spring=links)
 
 
 def _image(view: View, kind: str, frame: int) -> UInt8[ndarray, "row column 3"]:

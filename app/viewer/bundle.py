@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import yaml
 
+from app.viewer.content import Content
 from app.viewer.figure import Side
 from app.viewer.session_state import Pose
 from app.viewer.snapshot import Snapshot
@@ -206,7 +207,12 @@ def _readme(snapshot: Snapshot, files: dict[str, bytes]) -> str:
     content, run = snapshot.content, snapshot.run
     unit = content.length_unit
     layers = {} if snapshot.layers is None else vars(snapshot.layers)
-    shown = ", ".join(name for name, on in layers.items() if on is True and name != "dark")
+    there = _layers_there(content)
+    shown = ", ".join(name for name, on in layers.items() if on is True and name in there)
+    named = "metres" if content.is_metric else f"{unit}s, which have no metric scale"
+    units = [f"Lengths are in {named}, times in seconds."]
+    if content.fitted is not None:
+        units.append("Forces are in newtons (a node's unit mass is 1 kg).")
     color = layers.get("color", "plain")
     about = [line for name, line in _ABOUT if any(file.startswith(name) for file in files)]
     return "\n".join(
@@ -214,26 +220,43 @@ def _readme(snapshot: Snapshot, files: dict[str, bytes]) -> str:
             f"{content.title}: sequence {content.sequence_name}, frame {snapshot.frame}",
             f"Saved by PhysHanDI {__version__}" + (f" from run {run.id}." if run else "."),
             "",
-            f"Lengths are in {unit}, forces in newtons (a node's unit mass is 1 kg), times in",
-            "seconds. The world has z up. Cameras have x right, y down, z ahead.",
+            *units,
+            "The world has z up. Cameras have x right, y down, z ahead.",
             *([f"Shown were: {shown}."] if shown else []),
             *([f"Colors tell: {color}."] if color != "plain" else []),
             "",
             *about,
             "",
-            "Column 'side': 'shown', or, of the figure that compares topologies, 'ours' and",
-            "'phystwin'. Numbers of nodes, controls and springs start at 0.",
-            "",
+            *(_COLUMNS if content.fitted is not None else ()),
         ]
     )
 
 
+def _layers_there(content: Content) -> set[str]:
+    """Name the layers that have anything in them."""
+    there = {"ground"}
+    if content.hands or content.skeletons:
+        there.add("hands")
+    if content.fitted is not None:
+        there |= {"nodes", "surface", "virtual_springs", "object_springs", "forces", "all_controls"}
+    if content.control is not None:
+        there.add("controls")
+    if content.observed is not None:
+        there.add("observed")
+    return there | ({"cameras"} if content.views else set())
+
+
+_COLUMNS = (
+    "Column 'side': 'shown', or, of the figure that compares topologies, 'ours' and",
+    "'phystwin'. Numbers of nodes, controls and springs start at 0.",
+    "",
+)
 _ABOUT = (
     ("picture.png", "picture.png      the view"),
     ("views/", "views/*.png      what the recording's cameras saw in this frame, if there are any"),
     ("frame.ply", "frame.ply        nodes, hands and virtual springs (edges) of this frame"),
     ("nodes.csv", "nodes.csv        object nodes: place, and sum of the virtual springs' forces"),
-    ("controls.csv", "controls.csv     control nodes on the hands: place, springs that they hold"),
+    ("controls.csv", "controls.csv     control nodes: place, springs that they hold"),
     ("springs.csv", "springs.csv      all springs: ends, length, rest length, strain, stiffness"),
     ("forces.csv", "forces.csv       force of each virtual spring on its object node"),
     (

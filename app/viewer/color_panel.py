@@ -2,25 +2,42 @@
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 import viser
 
-from app.viewer.coloring import Painter, Range
+from app.viewer.coloring import Legend, Range
 from app.viewer.content import Content
 from app.viewer.guard import Guard
 from app.viewer.keyboard import bind
-from app.viewer.layers import COLORINGS, Coloring, Layers
+from app.viewer.layers import Coloring, Layers
 from app.viewer.legend import legend_html
+from app.viewer.quantities import Quantity
 
-_NOT_PLAIN = COLORINGS[1:]
+
+class Paints(Protocol):
+    """Paints an object, or the hands where there is no object."""
+
+    @property
+    def legend(self) -> Legend | None:
+        """What the colors painted last mean; None if they are plain."""
+        ...
+
+    @property
+    def offered(self) -> tuple[Coloring, ...]:
+        """What can be told."""
+        ...
+
+    def quantity(self, coloring: Coloring, /) -> Quantity:
+        """Describe one of the offered colorings."""
+        ...
 
 
 class ColorPanel:
     """A choice, a legend and a range that follows the sequence or is held."""
 
     def __init__(self, server: viser.ViserServer, guard: Guard, redraw: Callable[[], None]) -> None:
-        """Add the panel, hidden until there is an object.
+        """Add the panel, hidden until there is something to color.
 
         Args:
             server: Where to.
@@ -29,7 +46,7 @@ class ColorPanel:
         """
         self._redraw = redraw
         self._layers = Layers()
-        self._painter: Painter | None = None
+        self._painter: Paints | None = None
         self._is_metric = True
         self._written: tuple[float, float] | None = None
         self._said = ""
@@ -53,17 +70,21 @@ class ColorPanel:
         bind(server, guard, "color_back", lambda _, __: self.next(-1))
         self._show_range_fields()
 
-    def replace(self, content: Content, layers: Layers, painter: Painter) -> None:
+    def replace(self, content: Content, layers: Layers, painter: Paints) -> None:
         """Offer what a content can tell."""
         before = self._layers
         self._layers, self._painter = layers, painter
         self._is_metric = content.is_metric
-        has_object = content.fitted is not None
-        self._folder.visible = has_object
-        self._choice.options = ("plain", *self._offered())
+        self._folder.visible = bool(painter.offered)
+        self._choice.options = ("plain", *painter.offered)
         layers.color = before.color if before.color in self._choice.options else "plain"
         layers.color_range = before.color_range if layers.color == before.color else None
         self._follow()
+
+    @property
+    def is_there(self) -> bool:
+        """Whether there is something to color."""
+        return bool(self._folder.visible)
 
     def restore(self) -> None:
         """Show what the layers say now."""
@@ -100,15 +121,10 @@ class ColorPanel:
         factor = painter.quantity(self._layers.color).factor
         self._write((legend.limits[0] * factor, legend.limits[1] * factor))
 
-    def _offered(self) -> tuple[Coloring, ...]:
-        painter = self._painter
-        can_tell_error = painter is not None and painter.errors.is_known
-        return tuple(c for c in _NOT_PLAIN if c != "error" or can_tell_error)
-
     @staticmethod
     def _legend_head(said: str) -> str:
         """Cut off what changes with every frame."""
-        return said.partition("highest node")[0]
+        return said.partition(" · highest ")[0]
 
     def _follow(self) -> None:
         self._choice.value = self._layers.color

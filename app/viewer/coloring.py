@@ -8,7 +8,7 @@ from numpy import ndarray
 
 from app.viewer.colormaps import levels, paint
 from app.viewer.content import Content
-from app.viewer.layers import Coloring, Layers
+from app.viewer.layers import COLORINGS, Coloring, Layers
 from app.viewer.observed_error import ObservedError
 from app.viewer.quantities import QUANTITIES, Quantity, Values, measure
 from app.viewer.take import Take
@@ -37,6 +37,8 @@ class Legend:
     """Whether any value is known in this frame."""
     highest: float
     """Highest value on the screen, in SI units."""
+    thing: str = "node"
+    """What has the values."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -56,11 +58,11 @@ class Painted:
 
     def springs(self, chosen: slice | ndarray) -> UInt8[ndarray, "segment 2 3"]:
         """Give the colors of both ends of some springs."""
-        return _paint(self.values.spring[chosen], self.quantity, self.limits)
+        return paint_values(self.values.spring[chosen], self.quantity, self.limits)
 
     def points(self, value: Float[ndarray, " point"]) -> UInt8[ndarray, "point 3"]:
         """Give the colors of other points that have this quantity."""
-        return _paint(value, self.quantity, self.limits)
+        return paint_values(value, self.quantity, self.limits)
 
 
 class Painter:
@@ -76,6 +78,8 @@ class Painter:
     def __init__(self, content: Content) -> None:
         self.reference: Take | None = content.fitted
         self.errors = ObservedError(content)
+        self._has_object = content.fitted is not None
+        self._has_hands = bool(content.hands)
         self._is_metric = content.is_metric
         self._length_unit = content.length_unit
         self._ranges: dict[Coloring, tuple[Take, Take | None, int, Range]] = {}
@@ -86,12 +90,26 @@ class Painter:
         """What the colors painted last mean; None if they are plain."""
         return self._legend
 
+    @property
+    def offered(self) -> tuple[Coloring, ...]:
+        """What can be told of the content's object; nothing without one."""
+        if not self._has_object:
+            return ()
+        return tuple(c for c in COLORINGS[1:] if c != "error" or self.errors.is_known)
+
     def quantity(self, coloring: Coloring) -> Quantity:
         """Describe a coloring in the units of the content."""
         quantity = QUANTITIES[coloring]
         if coloring == "error":
             about = f"Distance from {self.errors.source} in this frame"
             quantity = replace(quantity, about=about)
+        if coloring == "force" and not self._has_hands:
+            quantity = replace(
+                quantity,
+                about=quantity.about.replace(
+                    "by which the hand holds it", "that hold it from outside"
+                ),
+            )
         if self._is_metric:
             return quantity
         length = self._length_unit
@@ -124,7 +142,7 @@ class Painter:
         )
         return Painted(
             values=values,
-            node=_paint(values.node, quantity, limits),
+            node=paint_values(values.node, quantity, limits),
             level=levels(values.node, limits, is_logarithmic=quantity.is_logarithmic),
             quantity=quantity,
             limits=limits,
@@ -163,7 +181,7 @@ class Painter:
             values = self.measure(coloring, take, int(frame))
             for part, value in zip(parts, (values.node, values.spring[springs]), strict=True):
                 part.append(value[np.isfinite(value)])
-        ends = [_ends(np.concatenate(part), quantity) for part in parts]
+        ends = [nearly_all(np.concatenate(part), quantity) for part in parts]
         found = [end for end in ends if end is not None]
         if not found:
             return (0.0, 1.0 / quantity.factor)
@@ -171,7 +189,7 @@ class Painter:
         return (low, high) if high > low else (low, low + (abs(low) or 1.0 / quantity.factor))
 
 
-def _ends(value: Float[ndarray, " value"], quantity: Quantity) -> Range | None:
+def nearly_all(value: Float[ndarray, " value"], quantity: Quantity) -> Range | None:
     """Find a range that nearly all values lie in; None if there are none."""
     if len(value) == 0:
         return None
@@ -193,7 +211,8 @@ def _rounded_up(value: float) -> float:
     return float(np.ceil(value / step - 1e-9) * step)
 
 
-def _paint(
+def paint_values(
     value: Float[ndarray, "*item"], quantity: Quantity, limits: Range
 ) -> UInt8[ndarray, "*item 3"]:
+    """Give values the colors of a quantity's scale."""
     return paint(value, limits, quantity.scale, is_logarithmic=quantity.is_logarithmic)

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from app.viewer.markers import Markers
 from app.viewer.observed import CloudSet, DepthCloud, Observed, PointSet, Tracks
 from app.viewer.skeleton import lift_keypoints
 from app.viewer.take import Take
@@ -44,6 +45,10 @@ class HandSurface:
     """Vertex positions [m]."""
     face: Int[ndarray, "face 3"] | None
     """Triangles, or None if they are not known (points are shown)."""
+    joint: Float[ndarray, "frame joint 3"] | None = None
+    """Its 21 joints [m], if the run holds them."""
+    keypoint: Float[ndarray, "view frame joint 3"] | None = None
+    """Where the views saw the joints (x, y [px], confidence), NaN where they did not."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -76,6 +81,8 @@ class Content:
     """What the cameras or markers saw."""
     tracks: Tracks | None = None
     """Points that were followed over the frames."""
+    markers: Markers | None = None
+    """Identified markers of a recording, if they are shown without an object."""
     views: Listing[View] = field(default_factory=tuple)
     """The recording's views."""
 
@@ -120,7 +127,7 @@ def open_run(catalog: Catalog, run_id: str, sequence_name: str | None = None) ->
         reconstruction_count=int(meta.get("reconstruction_frames", meta["frame_count"])),
         length_unit="m" if meta.get("metric", True) else str(meta.get("length_unit", "units")),
         ground_height=meta.get("ground_height"),
-        hands=_hands(run, folder),
+        hands=_hands(run, folder, [str(side) for side in meta.get("hands", [])]),
         control=control,
         fitted=load_fitted(run, name),
         observed=_run_observation(run, folder) or (_observation(sequence) if sequence else None),
@@ -143,6 +150,7 @@ def open_sequence(catalog: Catalog, sequence_id: str) -> Content:
         skeletons=lift_keypoints(sequence.views),
         control=sequence.control,
         observed=_observation(sequence),
+        markers=Markers.of(sequence),
         views=sequence.views,
     )
 
@@ -182,7 +190,9 @@ def _recording(catalog: Catalog, run: Run, name: str) -> Sequence | None:
         return None
 
 
-def _hands(run: Run, folder: str) -> tuple[HandSurface, ...]:
+def _hands(run: Run, folder: str, recorded: Listing[str]) -> tuple[HandSurface, ...]:
+    """Load the hands; `recorded` are the sides in the order of the keypoints."""
+    seen = run.array(f"{folder}/keypoint.npy") if run.has(f"{folder}/keypoint.npy") else None
     hands: list[HandSurface] = []
     sides: tuple[Literal["right", "left"], ...] = ("right", "left")
     for side in sides:
@@ -190,7 +200,14 @@ def _hands(run: Run, folder: str) -> tuple[HandSurface, ...]:
             vertex = run.array(f"{folder}/hand_{side}_vertex.npy")
             stored = f"{folder}/hand_{side}_face.npy"
             face = run.array(stored) if run.has(stored) else _faces(side, vertex.shape[1])
-            hands.append(HandSurface(side=side, vertex=vertex, face=face))
+            stored = f"{folder}/hand_{side}_keypoint.npy"
+            joint = run.array(stored) if run.has(stored) else None
+            at = recorded.index(side) if side in recorded else -1
+            is_seen = seen is not None and 0 <= at < seen.shape[2]
+            keypoint = seen[:, :, at] if seen is not None and is_seen else None
+            hands.append(
+                HandSurface(side=side, vertex=vertex, face=face, joint=joint, keypoint=keypoint)
+            )
     return tuple(hands)
 
 
@@ -227,7 +244,9 @@ def _run_tracks(run: Run, folder: str) -> Tracks | None:
 
 def _observation(sequence: Sequence) -> Observed | None:
     if sequence.marker is not None:
-        return PointSet(sequence.marker, np.asarray(np.isfinite(sequence.marker).all(axis=-1)))
+        is_seen = np.array(np.isfinite(sequence.marker).all(axis=-1))
+        is_seen[:, list(sequence.controlled_markers)] = False  # Control points are drawn there.
+        return PointSet(sequence.marker, is_seen)
     if any(view.has_depth for view in sequence.views):
         return DepthCloud(sequence.views)
     return None

@@ -19,12 +19,16 @@ def add_legend(server: viser.ViserServer, content: Content) -> None:
     entries: list[tuple[tuple[int, int, int], str]] = []
     if content.hands or content.skeletons:
         entries.append((SKIN["right"], "hand"))
+    controls = "control points" if content.hands or content.markers is None else "grippers"
     if content.fitted is not None:
         entries += [(BLUE, "object"), (RED, "controls, forces"), (YELLOW, "virtual springs")]
     elif content.control is not None:
-        entries.append((RED, "controls"))
+        entries.append((RED, controls))
     if content.observed is not None and not isinstance(content.observed, DepthCloud):
-        entries.append((GREEN, "observed"))
+        is_marked = content.markers is not None or (
+            content.tracks is not None and content.tracks.node is not None
+        )
+        entries.append((GREEN, "markers" if is_marked else "observed"))
     if content.views:
         entries.append((GREY, "cameras"))
     dots = "".join(

@@ -80,6 +80,7 @@ class ErrorPanel:
         self._unit = "mm" if content.is_metric else content.length_unit
         count = fitted.frame_count
         self._frames = np.arange(count, dtype=np.float64)
+        self._source = "the tracks" if content.tracks is None else content.tracks.name
         self._track = np.full(count, np.nan) if track_error is None else track_error[:count]
         self._again = np.zeros(count)
         self._take: Take = fitted
@@ -135,7 +136,7 @@ class ErrorPanel:
             return
         self._refreshed = now
         track, again = self.errors
-        fit = self._words(_FIT, "fit", track, "from the tracks")
+        fit = self._words(_FIT, "fit", track, f"from {self._source}")
         new = ""
         if self._take is not self._fitted:
             new = self._words(_AGAIN, "re-simulated", again, "from the fit")

@@ -8,6 +8,7 @@ import cv2
 import viser
 
 from app.viewer.bundle import Picture, bundle
+from app.viewer.content import Content
 from app.viewer.figure_export import write_figure_csv, write_figure_npz
 from app.viewer.guard import Guard, notify
 from app.viewer.session_state import Pose
@@ -56,6 +57,7 @@ class ExportPanel:
             snapshot: Tells what is on the screen now.
         """
         self._snapshot = snapshot
+        self._groups: dict[str, viser.GuiButtonGroupHandle] = {}
         gui = server.gui
         with gui.add_folder("Export", expand_by_default=False):
             for label, options, hint in (
@@ -65,12 +67,19 @@ class ExportPanel:
             ):
                 buttons = gui.add_button_group(label, options, hint=hint)
                 buttons.on_click(guard(self._press))
+                self._groups[label] = buttons
             self._size = gui.add_dropdown("Picture", tuple(_SIZES), hint="Size of PNG and ZIP")
             side = (_SMALLEST_SIDE, LARGEST_SIDE, 1)
             self._width = gui.add_number("Width", 1600, min=side[0], max=side[1], step=side[2])
             self._height = gui.add_number("Height", 1200, min=side[0], max=side[1], step=side[2])
             self._size.on_update(guard.by_user(lambda _: self._show_sides()))
             self._show_sides()
+
+    def offer(self, content: Content) -> None:
+        """Show the files that a content can be saved as: motion and tables need a result."""
+        has_object = content.fitted is not None
+        self._groups["Motion"].visible = has_object or bool(content.hands)
+        self._groups["Tables"].visible = has_object
 
     def _show_sides(self) -> None:
         self._width.visible = self._height.visible = self._size.value == _OWN

@@ -75,15 +75,20 @@ class FigureMode:
         return self._is_on
 
     def offer(self, content: Content, framing: Framing, run: Path | None) -> None:
-        """Get ready for a content; without an object there is no figure."""
+        """Get ready for a content; without an object and hands there is no figure."""
         with self._lock:
             self.close()
             self._content = content
             self._run = run
-            can = content.fitted is not None and run is not None
+            can = run is not None and Rival.is_offered(content)
             self._button.visible = can
             if content.fitted is not None and can:
                 self._figure = Figure(self._server, content, content.fitted, framing)
+
+    @property
+    def is_offered(self) -> bool:
+        """Whether there is a figure of the content."""
+        return self._figure is not None
 
     def close(self) -> None:
         """Leave the figure and forget the rival."""

@@ -15,6 +15,8 @@ _AZIMUTH = float(np.deg2rad(-61.0))
 _ELEVATION = float(np.deg2rad(26.0))
 _MARGIN = 1.1
 _FARTHEST = 2.6
+_FARTHEST_OF_HANDS = 1.3
+"""Reconstructed hands are what is looked at; cameras may reach out of the picture."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -120,7 +122,8 @@ def _around_cameras(
     taken = np.arctan2(offset[:, 1], offset[:, 0])
     azimuth = _AZIMUTH + np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
     gap = np.abs(np.angle(np.exp(1j * (azimuth[:, None] - taken)))).min(axis=1)
-    reach = min(2 * float(np.linalg.norm(offset, axis=1).max()), _FARTHEST * extent)
+    farthest = _FARTHEST_OF_HANDS if content.hands else _FARTHEST
+    reach = min(2 * float(np.linalg.norm(offset, axis=1).max()), farthest * extent)
     return {"azimuth": float(azimuth[np.argmax(gap)]), "reach": reach}
 
 

@@ -45,7 +45,8 @@ class Inspection:
 
     def replace(self, content: Content, scene: Scene, framing: Framing) -> None:
         """Get ready for another content."""
-        self.colors.replace(content, scene.layers, scene.painter)
+        painter = scene.painter if content.fitted is not None else scene.hand_painter
+        self.colors.replace(content, scene.layers, painter)
         self.inspector.replace(content, scene, framing)
 
     def show(

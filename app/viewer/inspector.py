@@ -26,10 +26,20 @@ MARK = (233, 30, 180)
 """Color of what was clicked, which no scale has."""
 _REFRESH = 0.25
 _AXIS, _LINE, _NOW = "rgb(120,130,145)", "rgb(47,111,222)", "rgba(233,30,180,0.9)"
-_NONE = (
-    '<div style="font-size:0.8em;padding:0 0.9em 0.4em;opacity:0.8">Click a node, a spring or the '
-    "hand to read it.</div>"
-)
+_NONE = '<div style="font-size:0.8em;padding:0 0.9em 0.4em;opacity:0.8">Click {} to read it.</div>'
+
+
+def clickable(content: Content) -> str:
+    """Name what can be clicked in a content; empty if there is nothing."""
+    has_object = content.fitted is not None
+    found = ["a node", "a spring"] if has_object else []
+    if not has_object and content.control is not None:
+        found.append("a control point" if content.markers is None else "a gripper")
+    if content.markers is not None:
+        found.append("a marker")
+    if content.hands:
+        found.append("the hand")
+    return " or ".join([", ".join(found[:-1]), found[-1]] if len(found) > 1 else found)
 
 
 class Inspector:
@@ -56,10 +66,11 @@ class Inspector:
         self._measured: tuple[Any, ...] | None = None
         self._curve: Float[ndarray, " frame"] = np.zeros(0)
         self._refreshed = 0.0
+        self._invitation = ""
         gui = server.gui
         self._folder = gui.add_folder("Inspect", expand_by_default=True)
         with self._folder:
-            self._text = gui.add_html(_NONE)
+            self._text = gui.add_html("")
             self._kind: Any = gui.add_dropdown("History of", ("speed",), visible=False)
             self._plot: Any = None
             self._clear = gui.add_button("Clear", color="gray", hint="Esc", visible=False)
@@ -78,6 +89,9 @@ class Inspector:
     def replace(self, content: Content, scene: Scene, framing: Framing) -> None:
         """Get ready for another content."""
         with self._lock:
+            things = clickable(content)
+            self._folder.visible = bool(things)
+            self._invitation = _NONE.format(things)
             self.clear()
             self._content, self._scene, self._framing = content, scene, framing
             self._readings = Readings(content, scene.painter)
@@ -87,7 +101,7 @@ class Inspector:
         with self._lock:
             self._pick = None
             self._nodes.clear()
-            self._text.content = _NONE
+            self._text.content = self._invitation
             self._kind.visible = self._clear.visible = False
             self._remove_plot()
 

@@ -69,7 +69,7 @@ def default_layers(content: Content) -> Layers:
     """Choose what is shown at first: the result if there is one, else the recording."""
     has_object = content.fitted is not None
     return Layers(
-        observed=not has_object,
+        observed=not has_object or (content.tracks is not None and content.tracks.node is not None),
         cameras=not has_object and bool(content.views),
         object_springs=content.fitted is not None and _has_few_springs(content.fitted),
     )

@@ -52,10 +52,11 @@ def legend_html(legend: Legend, *, highest: bool) -> str:
         notes.append("<b>not known in this frame</b>")
     elif highest:
         top = number(legend.highest * quantity.factor)
-        notes.append(f"highest node now {top}&nbsp;{html.escape(quantity.unit)}")
+        notes.append(f"highest {legend.thing} now {top}&nbsp;{html.escape(quantity.unit)}")
         if legend.unknown:
+            plural = {"vertex": "vertices"}.get(legend.thing, f"{legend.thing}s")
             gray = "rgb({},{},{})".format(*UNKNOWN)
-            notes.append(f'<span style="color:{gray}">■</span> {legend.unknown} nodes not known')
+            notes.append(f'<span style="color:{gray}">■</span> {legend.unknown} {plural} not known')
     return (
         '<div style="padding:0.1em 0.9em 0.5em;font-size:0.8em" data-legend>'
         '<div style="display:flex;justify-content:space-between;margin-bottom:0.2em">'

@@ -19,6 +19,8 @@ QUIET_FORCE = 1e-6
 """Weaker forces are no forces [N]."""
 _SAMPLED_FRAMES = 8
 _LEAST_ARROWS = 60
+_OF_RECORDING = 1.4
+"""Diameter of control points where there is no object, as a part of the spacing."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,7 +203,7 @@ class ObjectDrawing:
         """Draw the control nodes, those that hold the object larger than the others."""
         spacing, root, style = self._framing.spacing, self._root, self._style
         held = control if attached is None else control[attached]
-        size = style.control_size * spacing
+        size = (style.control_size if attached is not None else _OF_RECORDING) * spacing
         name = f"{root}/controls/attached"
         self._balls(name, held, style.control, size, is_visible=layers.controls)
         is_shown = layers.all_controls and attached is not None

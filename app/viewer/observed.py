@@ -37,6 +37,11 @@ class Tracks:
     node: Int[ndarray, " track"] | None = None
     """Node that each track observes; None if the nodes around it carry it."""
 
+    @property
+    def name(self) -> str:
+        """What they are called: whoever knows their nodes has markers."""
+        return "the tracks" if self.node is None else "the markers"
+
 
 class PointSet:
     """Tracked points, of which each frame shows those that are visible."""

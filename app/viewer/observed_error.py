@@ -55,7 +55,9 @@ class ObservedError:
     @property
     def source(self) -> str:
         """What it is a distance from."""
-        return "the tracks" if self._tracks is not None else "the nearest observed point"
+        if self._tracks is None:
+            return "the nearest observed point"
+        return self._tracks.name
 
     def nodes(self, take: Take, frame: int) -> Float[ndarray, " node"]:
         """Measure the error of each node [m]; NaN where nothing was observed."""

@@ -19,6 +19,7 @@ HISTORIES: dict[Kind, tuple[History, ...]] = {
     "spring": ("strain", "force", "length"),
     "control": ("speed", "force", "height"),
     "hand": ("speed", "height"),
+    "marker": ("speed", "height"),
 }
 """What a chart can show of each kind of thing."""
 
@@ -35,7 +36,7 @@ def follow(
         content: Hands and control nodes.
         painter: Measures what colors tell as well.
     """
-    if pick.kind == "hand" or take is None:
+    if pick.kind in {"hand", "marker"} or take is None:
         return _of_track(track_of(pick, content), kind, content.frame_rate)
     if kind == "height":
         of = take.position if pick.kind == "node" else take.control
@@ -70,6 +71,8 @@ def track_of(pick: Pick, content: Content) -> Float[ndarray, "frame 3"]:
     """Find where a vertex of a hand, or a control node without an object, is in every frame [m]."""
     if pick.kind == "control" and content.control is not None:
         return np.asarray(content.control[:, pick.index], dtype=np.float64)
+    if pick.kind == "marker" and content.markers is not None:
+        return np.asarray(content.markers.point[:, pick.index], dtype=np.float64)
     hand = next(hand for hand in content.hands if hand.side == pick.side)
     return np.asarray(hand.vertex[:, pick.index], dtype=np.float64)
 

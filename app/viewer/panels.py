@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import fields
 from typing import Any
 
-import numpy as np
 import viser
 
 from app.keys import LAYER_KEYS
@@ -14,10 +13,20 @@ from app.viewer.framing import Framing
 from app.viewer.guard import Guard
 from app.viewer.keyboard import bind
 from app.viewer.layers import THEMES, Layers, Theme
+from app.viewer.scene import grid_cell
 from app.viewer.timeline_panel import TimelinePanel as TimelinePanel
+from app.viewer.view_pose import pose_of_view
 from physhandi.data.view import View
 
 _OVERVIEW = "Overview"
+
+
+def _grid_label(content: Content, framing: Framing) -> str:
+    """Name the grid by the distance of its lines, which is the scale of the scene."""
+    cell = grid_cell(framing.extent)
+    if not content.is_metric:
+        return f"Grid, {cell:g} {content.length_unit}{'' if cell == 1 else 's'}"
+    return f"Grid, {cell:g} m" if cell >= 1 else f"Grid, {1e3 * cell:g} mm"
 
 
 class LayersPanel:
@@ -87,6 +96,11 @@ class LayersPanel:
         for field, switch in self._switches.items():
             switch.visible = is_there[field]
             switch.value = getattr(layers, field)
+        is_marked = content.markers is not None
+        self._switches["controls"].label = "Grippers" if is_marked else "Control nodes"
+        has_names = is_marked or (content.tracks is not None and content.tracks.node is not None)
+        self._switches["observed"].label = "Markers" if has_names else "Observed points"
+        self._switches["ground"].label = _grid_label(content, framing)
         self._scale.visible = has_object
         self._views = {view.name: view for view in content.views}
         self._place.options = (_OVERVIEW, *self._views)
@@ -164,9 +178,6 @@ class LayersPanel:
                 eye.fov = framing.fov
                 eye.position, eye.look_at = framing.camera, framing.look_at
                 return
-            camera = view.camera
-            _, down, ahead, origin = camera.T_world_camera[:3].T
-            distance = max(float((framing.center - origin) @ ahead), 0.1 * framing.extent)
-            eye.fov = float(2 * np.arctan2(camera.height / 2, camera.K[1, 1]))
-            eye.up_direction = -down
-            eye.position, eye.look_at = origin, origin + distance * ahead
+            pose = pose_of_view(view, framing)
+            eye.fov, eye.up_direction = pose.fov, pose.up
+            eye.position, eye.look_at = pose.position, pose.look_at

@@ -11,7 +11,7 @@ from app.viewer.content import Content
 from app.viewer.layers import Layers
 from app.viewer.take import Take
 
-Kind = Literal["node", "spring", "control", "hand"]
+Kind = Literal["node", "spring", "control", "hand", "marker"]
 
 NEAR_PIXELS = 9.0
 """Farther from a click than this, nothing is meant."""
@@ -27,8 +27,8 @@ class Pick:
     kind: Kind
     """What it is."""
     index: int
-    """Number of the object node, of the spring in the model's order, of the control node, or of
-    the hand's vertex."""
+    """Number of the object node, of the spring in the model's order, of the control node, of
+    the hand's vertex or of the marker."""
     side: Literal["right", "left"] | None = None
     """Which hand, for a vertex that is no control node."""
 
@@ -99,7 +99,17 @@ def pick(ray: Ray, target: Target, *, prefers_hand: bool = False) -> Pick | None
     elif content.control is not None and layers.controls:
         at = _nearest(ray, np.asarray(content.control[frame]), target.spacing)
         found = None if at is None else Pick(kind="control", index=at[0])
-    return found or hand
+    return found or _pick_marker(ray, target) or hand
+
+
+def _pick_marker(ray: Ray, target: Target) -> Pick | None:
+    """Find a marker of a recording; those that are held are under their control points."""
+    markers = target.content.markers
+    if markers is None or not target.layers.observed:
+        return None
+    point = np.asarray(markers.point[target.frame], dtype=np.float64)
+    at = _nearest(ray, np.where(np.isfinite(point), point, np.inf), target.spacing)
+    return None if at is None else Pick(kind="marker", index=at[0])
 
 
 def _pick_object(ray: Ray, target: Target, take: Take) -> Pick | None:

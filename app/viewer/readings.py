@@ -6,6 +6,7 @@ from numpy import ndarray
 
 from app.viewer.coloring import Painter
 from app.viewer.content import Content
+from app.viewer.hand_coloring import HandPainter
 from app.viewer.layers import Coloring
 from app.viewer.legend import number
 from app.viewer.over_time import length_unit, springs_at, track_of
@@ -23,6 +24,8 @@ class Readings:
         self._content = content
         self._painter = painter
         self._unit = "m" if content.is_metric else content.length_unit
+        self._units = self._unit if content.is_metric else f"{self._unit}s"
+        self._hands = HandPainter(content)
 
     def settle(self, pick: Pick) -> Pick:
         """Take a hand's vertex for the control node that it is, if it is one."""
@@ -34,21 +37,31 @@ class Readings:
         if pick.kind == "spring" and take is not None:
             is_own = pick.index < take.model.object_spring_count
             return f"{'object' if is_own else 'virtual'} spring {pick.index}"
+        if pick.kind == "marker":
+            return f"marker {pick.index}"
         if pick.kind == "hand":
             return f"{pick.side} hand, vertex {pick.index}"
         if pick.kind == "control":
-            for hand in self._content.hands:
-                first = self._first_control(hand.side)
-                if first is not None and 0 <= pick.index - first < hand.vertex.shape[1]:
-                    vertex = pick.index - first
-                    return f"control node {pick.index} ({hand.side} hand, vertex {vertex})"
-            return f"control node {pick.index}"
+            return self._name_of_control(pick)
         return f"object node {pick.index}"
+
+    def _name_of_control(self, pick: Pick) -> str:
+        for hand in self._content.hands:
+            first = self._first_control(hand.side)
+            if first is not None and 0 <= pick.index - first < hand.vertex.shape[1]:
+                vertex = pick.index - first
+                return f"control node {pick.index} ({hand.side} hand, vertex {vertex})"
+        markers = self._content.markers
+        if markers is not None and pick.index < len(markers.held):
+            return f"gripper, marker {markers.held[pick.index]}"
+        return f"control node {pick.index}"
 
     def exists(self, pick: Pick, take: Take | None) -> bool:
         """Tell whether a thing is there still, when the springs may be others."""
         if pick.kind == "hand":
             return True
+        if pick.kind == "marker":
+            return self._content.markers is not None
         if take is None:
             return pick.kind == "control"
         model = take.model
@@ -57,13 +70,13 @@ class Readings:
             "spring": len(model.spring_nodes),
             "control": model.control_count,
         }
-        return pick.index < count[pick.kind]
+        return pick.index < count.get(pick.kind, 0)
 
     def place(
         self, pick: Pick, take: Take | None, frame: int, take_frame: int
     ) -> Float[ndarray, "end 3"]:
         """Find where a thing is: one point, or both ends of a spring [m]."""
-        if pick.kind == "hand":
+        if pick.kind in {"hand", "marker"}:
             return track_of(pick, self._content)[[min(frame, self._content.frame_count - 1)]]
         if take is None:
             control = self._content.control
@@ -78,7 +91,7 @@ class Readings:
         self, pick: Pick, take: Take | None, take_frame: int
     ) -> Float[ndarray, "segment 2 3"]:
         """Find the spring itself, or the virtual springs that end at a thing [m]."""
-        if take is None or pick.kind == "hand":
+        if take is None or pick.kind in {"hand", "marker"}:
             return np.zeros((0, 2, 3), np.float32)
         point = np.concatenate([take.position[take_frame], take.control[take_frame]])
         if pick.kind == "spring":
@@ -90,8 +103,9 @@ class Readings:
     def rows(self, pick: Pick, take: Take | None, frame: int, take_frame: int) -> Rows:
         """List names and values of everything that is known of a thing now."""
         place = self.place(pick, take, frame, take_frame)
-        if pick.kind == "hand" or take is None:
-            return [("position", self._vector(place[0], self._unit))] if len(place) else []
+        if pick.kind in {"hand", "marker"} or take is None:
+            where = [("position", self._vector(place[0], self._units))] if len(place) else []
+            return where + self._recorded_rows(pick, frame)
         if pick.kind == "spring":
             return self._spring_rows(pick.index, take, take_frame)
         rows = [("position", self._vector(place[0], self._unit))]
@@ -104,12 +118,42 @@ class Readings:
         held = joined[joined >= own]
         force = take.spring_forces(take_frame)[held - own].sum(axis=0)
         if pick.kind == "node":
-            rows.append(("force of the hand", self._vector(force, "N", size=True)))
+            rows.append(
+                (
+                    f"force of the {'hand' if self._content.hands else 'controls'}",
+                    self._vector(force, "N", size=True),
+                )
+            )
             rows += self._node_rows(pick.index, take, take_frame, int((joined < own).sum()))
             rows.append(("held by", self._partners(take, take_frame, held, is_control=True)))
         else:
             rows.append(("force on the object", self._vector(force, "N", size=True)))
             rows.append(("holds", self._partners(take, take_frame, held, is_control=False)))
+        return rows
+
+    def _recorded_rows(self, pick: Pick, frame: int) -> Rows:
+        """Read what needs no simulation: speeds, lengths to neighbors, errors in the images."""
+        track = track_of(pick, self._content)
+        at = min(frame, len(track) - 1)
+        speed = self._content.frame_rate * np.linalg.norm(track[at] - track[max(at - 1, 0)])
+        rows: Rows = [("speed", f"{number(float(speed))} {self._unit}/s")]
+        hand = next((h for h in self._content.hands if h.side == pick.side), None)
+        if hand is not None:
+            error = float(self._hands.measure("error", hand, at)[pick.index])
+            if np.isfinite(error):
+                rows.append(("reprojection error", f"{number(error)} px"))
+        markers = self._content.markers
+        if markers is None:
+            return rows
+        marker = pick.index
+        if pick.kind == "control":
+            if pick.index >= len(markers.held):
+                return rows
+            marker = markers.held[pick.index]
+        unit, factor = length_unit(self._content)
+        for other in markers.neighbors(marker):
+            length = float(np.linalg.norm(markers.point[at, other] - markers.point[at, marker]))
+            rows.append((f"to marker {other}", f"{number(factor * length)} {unit}"))
         return rows
 
     def _spring_rows(self, spring: int, take: Take, frame: int) -> Rows:

@@ -4,21 +4,24 @@ from dataclasses import fields, replace
 from typing import Any
 
 from app.viewer.content import Content
+from app.viewer.framing import frame_content
 from app.viewer.layers import default_layers
 from app.viewer.session_state import SessionState
+from app.viewer.view_pose import pose_of_view
 from physhandi.errors import UsageError
 from physhandi.simulation.model import SimulationParameters
 
 
 def complete_state(state: SessionState, content: Content) -> SessionState:
-    """Fill in what a state leaves open: layers that suit the content and fitted parameters.
+    """Fill in what a state leaves open: layers, fitted parameters and where a view stands.
 
     Args:
         state: What is asked for.
         content: What there is.
 
     Returns:
-        The state with its layers and, if there is an object, its parameters.
+        The state with its layers, if there is an object its parameters, and if it looks from a
+        view the pose of that.
 
     Raises:
         UsageError: If the content has no such frame, view, object or figure; names the field.
@@ -44,7 +47,11 @@ def complete_state(state: SessionState, content: Content) -> SessionState:
     parameters = state.parameters
     if parameters is None and content.fitted is not None:
         parameters = replace(content.fitted.parameters, **state.parameter_changes)
-    return replace(state, layers=layers, parameters=parameters)
+    pose = state.pose
+    if pose is None and layers.looks_from is not None:
+        view = content.views[views.index(layers.looks_from)]
+        pose = pose_of_view(view, frame_content(content))
+    return replace(state, layers=layers, parameters=parameters, pose=pose)
 
 
 def differences(start: SimulationParameters, now: SimulationParameters) -> dict[str, Any]:

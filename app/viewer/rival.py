@@ -31,6 +31,14 @@ class Rival:
     note: str = ""
     """What is not as in PhysTwin, or why there is little to compare; empty if all is."""
 
+    @staticmethod
+    def is_offered(content: Content) -> bool:
+        """Tell whether there is something to compare: fewer points than PhysTwin's are no rival."""
+        if content.fitted is None:
+            return False
+        count = load_profile(PROFILE).control_count
+        return bool(content.hands) or content.fitted.model.control_count >= count
+
     @classmethod
     def of(cls, content: Content, fitted: Take) -> "Rival":
         """Choose control nodes and parameters for a run.

@@ -13,10 +13,12 @@ from app.viewer.cameras import CameraNodes
 from app.viewer.coloring import Painted, Painter
 from app.viewer.content import Content
 from app.viewer.framing import Framing
-from app.viewer.layers import SKIN, default_layers
+from app.viewer.hand_coloring import HandPainter
+from app.viewer.layers import GREEN, GREY, SKIN, default_layers
 from app.viewer.nodes import SceneNodes
 from app.viewer.object_drawing import Budget, ObjectDrawing, automatic_force_unit, share_bytes
 from app.viewer.skeleton import BONES
+from app.viewer.surface_drawing import SurfaceDrawing
 from app.viewer.take import Take
 from physhandi.simulation.surface import triangulate_nodes
 
@@ -27,6 +29,8 @@ _PLAYING_ARROWS = 400
 _PLAYING_OBSERVED = 2_000
 _LEAST_BYTES = 12_000
 """Springs and arrows get at least this much of a playing frame."""
+_FEW_POINTS = 100
+"""So few observed points are markers, and drawn larger."""
 _MANY_NODES = 2_500
 """The surface of more nodes is not laid before somebody asks for it."""
 
@@ -61,6 +65,10 @@ class Scene:
         self._object = ObjectDrawing(self._nodes, framing)
         self._force_unit = automatic_force_unit(content.fitted, framing)
         self.painter = Painter(content)
+        self.hand_painter = HandPainter(content)
+        self._skins = {
+            h.side: SurfaceDrawing(self._nodes, f"/skin/{h.side}") for h in content.hands
+        }
         self._faces: Int[ndarray, "face 3"] | None = None
         self._cameras = CameraNodes(server, content.views, framing, clock)
         self._aim()
@@ -150,6 +158,7 @@ class Scene:
 
     def _draw_hands(self, frame: int) -> None:
         is_visible = self.layers.hands
+        painted = self.hand_painter.paint(frame, self.layers)
         for hand in self._content.hands:
             vertex = np.asarray(hand.vertex[min(frame, len(hand.vertex) - 1)], dtype=np.float32)
             name, color = f"/hand/{hand.side}", SKIN[hand.side]
@@ -157,7 +166,11 @@ class Scene:
                 size = 0.006 * self._framing.extent
                 self._nodes.points(name, vertex, color, size, is_visible=is_visible)
             else:
-                self._nodes.mesh(name, vertex, hand.face, color, is_visible=is_visible)
+                of_hand = painted.get(hand.side)
+                is_plain = is_visible and of_hand is None
+                self._nodes.mesh(name, vertex, hand.face, color, is_visible=is_plain)
+                is_painted = is_visible and of_hand is not None
+                self._skins[hand.side].draw(vertex, hand.face, of_hand, is_visible=is_painted)
         for index, skeleton in enumerate(self._content.skeletons):
             bones = skeleton[frame][BONES]
             bones = bones[np.isfinite(bones).all(axis=(1, 2))]
@@ -175,6 +188,7 @@ class Scene:
     ) -> None:
         """Draw what was seen; colored by error, its points tell their own."""
         observed = self._content.observed
+        self._draw_lines_of_markers(frame, take, take_frame)
         if observed is None or not self.layers.observed:
             self._nodes.show("/observed", is_visible=False)
             return
@@ -185,8 +199,25 @@ class Scene:
         if painted is not None and take is not None and self.layers.color == "error":
             distance = self.painter.errors.points(point[::every], take, take_frame)
             color = painted.points(distance)
-        size = 0.4 * self._framing.spacing
+        is_few = len(point) <= _FEW_POINTS
+        size = 0.012 * self._framing.extent if is_few else 0.4 * self._framing.spacing
         self._nodes.points("/observed", point[::every], color, size, is_visible=True)
+
+    def _draw_lines_of_markers(self, frame: int, take: Take | None, take_frame: int) -> None:
+        """Join the markers of a recording, or each one with the node that should be there."""
+        markers, tracks = self._content.markers, self._content.tracks
+        is_visible = self.layers.observed
+        if markers is not None:
+            line = markers.segments(frame)
+            self._nodes.segments("/markers/line", line, GREY, 2.5, is_visible=is_visible)
+        if take is None or tracks is None or tracks.node is None or frame >= len(tracks.point):
+            self._nodes.show("/markers/offset", is_visible=False)
+            return
+        marker = np.asarray(tracks.point[frame], dtype=np.float32)
+        node = np.asarray(take.position[take_frame], dtype=np.float32)[tracks.node]
+        is_seen = np.asarray(tracks.is_visible[frame]) & np.isfinite(marker).all(axis=-1)
+        line = np.stack([marker, node], axis=1)[is_seen]
+        self._nodes.segments("/markers/offset", line, GREEN, 2.0, is_visible=is_visible)
 
     def _budget(self, take: Take) -> Budget:
         """Share what the points of a playing frame leave of its bytes."""
@@ -212,6 +243,12 @@ class Scene:
         return replace(budget, nodes=most)
 
 
+def grid_cell(extent: float) -> float:
+    """Choose the distance of the grid's lines: a round number below a third of the scene."""
+    power = 10.0 ** float(np.floor(np.log10(extent / 3)))
+    return max(step * power for step in (1, 2, 5) if step * power <= extent / 3)
+
+
 def add_ground(
     nodes: SceneNodes, content: Content, framing: Framing, name: str = "/ground"
 ) -> None:
@@ -219,8 +256,7 @@ def add_ground(
     height, extent = content.ground_height, framing.extent
     if height is None:
         height = framing.low - 0.02 * extent
-    power = 10.0 ** float(np.floor(np.log10(extent / 3)))
-    cell = max(step * power for step in (1, 2, 5) if step * power <= extent / 3)
+    cell = grid_cell(extent)
     x, y = (round(float(framing.center[axis]) / cell) * cell for axis in (0, 1))
     count = int(np.ceil(4 * extent / cell))
     nodes.ground(name, (x, y, float(height) - 0.001 * extent), cell, count)

@@ -61,7 +61,13 @@ class SceneServer(ABC):
             client_count=len(self._server.get_clients()),
             created=self.created,
             idle=self.idle,
+            offers=self.offers,
         )
+
+    @property
+    def offers(self) -> tuple[str, ...]:
+        """What can be done with it; see `SessionInfo`."""
+        return ()
 
     @property
     def idle(self) -> float:

@@ -35,6 +35,8 @@ class SessionInfo:
     """When it was opened [s since 1970]."""
     idle: float
     """How long nobody has looked at it [s]."""
+    offers: tuple[str, ...] = ()
+    """What can be done with it: ``object`` is simulated, ``colors`` and the ``figure`` exist."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

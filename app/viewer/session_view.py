@@ -114,6 +114,16 @@ class Session(SceneServer):
                 else {},
             )
 
+    @property
+    def offers(self) -> tuple[str, ...]:
+        """What can be done with it; see `SessionInfo`."""
+        there = {
+            "object": self._content.fitted is not None,
+            "colors": self._inspection.colors.is_there,
+            "figure": self._figure.is_offered,
+        }
+        return tuple(name for name, is_there in there.items() if is_there)
+
     def snapshot(self) -> Snapshot:
         """Collect what is on the screen, to be saved."""
         run = self._catalog.run(self._target) if self.kind == "run" else None
@@ -170,7 +180,7 @@ class Session(SceneServer):
         )
         self._physics_place = server.gui.add_folder(None)
         self._layers = LayersPanel(server, self._content, guard, self._playback.redraw)
-        export = ExportPanel(server, guard, self.snapshot)
+        export = self._export = ExportPanel(server, guard, self.snapshot)
         self._fill()
         server.on_client_connect(guard(self._welcome))
         server.on_client_disconnect(guard(self._part))
@@ -184,6 +194,7 @@ class Session(SceneServer):
         self._layers.replace(content, scene.layers, framing, has_surface=scene.may_have_surface)
         self._inspection.replace(content, scene, framing)
         run = self._catalog.run(self._target) if self.kind == "run" else None
+        self._export.offer(content)
         self._pin.offer(content, framing)
         self._figure.offer(content, framing, run.folder if run is not None else None)
         if content.fitted is None or run is None:

@@ -67,6 +67,7 @@ def scene_data(snapshot: Snapshot) -> SceneData:
             hand.side: HandSurface(vertex=hand.vertex[:count], face=hand.face)
             for hand in content.hands
         },
+        joints={hand.side: hand.joint[:count] for hand in content.hands if hand.joint is not None},
         run="" if run is None else run.id,
         model={} if take is None else take.model.to_tensors(),
         skins={} if run is None else read_skins(run, content.sequence_name),

@@ -46,6 +46,8 @@ class SceneData:
     """Surface of each hand by its side."""
     run: str = ""
     """Id of the run."""
+    joints: Mapping[str, ndarray] = field(default_factory=dict[str, ndarray])
+    """The 21 joints of each hand by its side (frame joint 3) [m], of runs that hold them."""
     model: Mapping[str, ndarray] = field(default_factory=dict[str, ndarray])
     """The springs' tensors, as a run stores them; none without an object."""
     skins: Mapping[str, Mapping[str, ndarray]] = field(
@@ -118,7 +120,14 @@ def read_scene(
         run=run.id,
         model=model,
         skins=read_skins(run, name),
+        joints=read_joints(run, name),
     )
+
+
+def read_joints(run: Run, sequence: str) -> dict[str, ndarray]:
+    """Read where the joints of the hands are, by side (frame joint 3) [m]."""
+    stored = {side: f"sequences/{sequence}/hand_{side}_keypoint.npy" for side in SIDES}
+    return {side: run.array(rel) for side, rel in stored.items() if run.has(rel)}
 
 
 def read_skins(run: Run, sequence: str) -> dict[str, Mapping[str, ndarray]]:

@@ -47,7 +47,7 @@ def write_npz(path: Path, scene: SceneData) -> None:
 
 
 def write_trajectories(path: Path, scene: SceneData) -> None:
-    """Write every node in every frame as one row of a CSV file."""
+    """Write every node, and every joint of a hand, in every frame as one row of a CSV file."""
     write_csv(path, TRAJECTORY_COLUMNS, _trajectory_rows(scene))
 
 
@@ -105,7 +105,8 @@ def flat(content: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _trajectory_rows(scene: SceneData) -> Iterator[tuple[Any, ...]]:
-    kinds: tuple[tuple[str, ndarray], ...] = (("object", scene.rollout), ("control", scene.control))
+    kinds = [("object", scene.rollout), ("control", scene.control)]
+    kinds += [(f"hand_{side}", joint) for side, joint in scene.joints.items()]
     for frame in range(scene.frame_count):
         time = round(frame / scene.frame_rate, 6)
         for kind, position in kinds:

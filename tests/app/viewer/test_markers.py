@@ -1,0 +1,68 @@
+"""Markers of a rope: neighbors, lengths, and what a recording of it offers."""
+
+import numpy as np
+import pytest
+
+from app.previews.links import marker_links
+from app.viewer.coloring import Painter
+from app.viewer.content import Content
+from app.viewer.inspector import clickable
+from app.viewer.layers import Layers
+from app.viewer.markers import Markers
+from app.viewer.picking import Pick, Ray, Target, pick
+from app.viewer.readings import Readings
+
+_ROPE = np.array([0.0, 0.02, 0.1, 0.18, 0.26])
+
+
+@pytest.fixture
+def content() -> Content:
+    point = np.zeros((4, 5, 3), np.float32)
+    point[..., 0] = _ROPE
+    point[..., 2] = 0.3 + 0.1 * np.arange(4)[:, None]
+    point[3, 3] = np.nan
+    markers = Markers(point=point, held=(0, 1), links=marker_links(point[0]))
+    return Content(
+        title="t",
+        sequence_name="s",
+        frame_count=4,
+        frame_rate=30.0,
+        reconstruction_count=4,
+        length_unit="m",
+        ground_height=None,
+        control=point[:, :2],
+        markers=markers,
+    )
+
+
+def test_neighbors_along_a_rope_are_joined_while_both_are_seen(content):
+    assert content.markers.links.tolist() == [[0, 1], [1, 2], [2, 3], [3, 4]]
+    assert len(content.markers.segments(0)) == 4
+    assert len(content.markers.segments(3)) == 2
+
+
+def test_a_click_tells_a_marker_and_how_far_its_neighbors_are(content):
+    ray = Ray(origin=np.array([0.1, -2.0, 0.3]), direction=np.array([0.0, 1.0, 0.0]), pixel=1e-3)
+    target = Target(
+        content=content,
+        take=None,
+        frame=0,
+        take_frame=0,
+        layers=Layers(observed=True),
+        spacing=0.02,
+        faces=np.zeros((0, 3), np.int32),
+    )
+    found = pick(ray, target)
+    assert found == Pick(kind="marker", index=2)
+    readings = Readings(content, Painter(content))
+    rows = dict(readings.rows(found, None, 1, 1))
+    assert rows["speed"] == "3 m/s"
+    assert rows["to marker 1"] == "80 mm"
+    assert rows["to marker 3"] == "80 mm"
+    held = Pick(kind="control", index=1)
+    assert readings.title(held, None) == "gripper, marker 1"
+    assert dict(readings.rows(held, None, 1, 1))["to marker 0"] == "20 mm"
+
+
+def test_only_what_is_there_can_be_clicked_and_is_named(content):
+    assert clickable(content) == "a gripper or a marker"
