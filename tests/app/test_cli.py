@@ -93,6 +93,7 @@ def test_help_names_every_command_and_exits_with_0(terminal: Terminal) -> None:
         "reconstruct",
         "simulate",
         "evaluate",
+        "synthesize",
         "import",
         "export",
         "benchmark",
