@@ -33,6 +33,11 @@ class Scene:
     action: str
     """What is done with it: lift, fold, stretch, squeeze, wipe or push."""
 
+    @property
+    def hold(self) -> Literal["friction", "attachment"]:
+        """How hands hold it: by friction, but by attachment where two of them pull."""
+        return "attachment" if self.action == "stretch" else "friction"
+
     def name(self, seed: int) -> str:
         """Name the sequence of a seed."""
         return f"{self.object_}_{self.action}_{seed}"
@@ -75,7 +80,8 @@ SUITES: dict[str, Suite] = {
             seeds=(0,),
             methods=("static", "rigid_follow", "phystwin", "quick", "quick+last_residual"),
             settings={
-                "node_spacing": 0.02,
+                "node_spacing": 0.022,
+                "simulation.connection_radius": 0.03,
                 "hand.iterations": 60,
                 "hand.depth_iterations": 0,
                 "object_.search.generations": 2,
@@ -179,6 +185,7 @@ def make_recordings(
                     scene.object_,
                     scene.action,
                     seed=seed,
+                    hold=scene.hold,
                     out=target,
                     progress=progress,
                     **suite.recording,

@@ -202,6 +202,24 @@ def test_what_a_recording_cannot_give_is_not_asked_for(
     assert "true hand" in found["skipped"][0]
 
 
+def test_starts_and_disturbances_have_splits_of_their_own(
+    tmp_path: Path, recordings: tuple[Sequence, ...]
+) -> None:
+    order = order_of(
+        recordings, methods=("static", "quick"), protocols=("sensitivity", "robustness")
+    )
+    found = evaluate(order, tmp_path)
+    # Seven starts of the first sequence; depth noise of both; no view to tell pixels, no hand.
+    assert (found["cells"], len(found["skipped"])) == (7 + 4, 8)
+    splits = {split for _, split, _ in table(tmp_path)}
+    assert "start δ=2 mm d_max=50/reconstruction" in splits
+    assert "noisy_depth/future" in splits
+    cells = json.loads((tmp_path / "cells.json").read_text())["cells"]
+    starts = [cell for cell in cells if cell["protocol"] == "sensitivity"]
+    assert {(cell["case"], cell["method"]) for cell in starts} == {("low", "quick")}
+    assert len({cell["run"] for cell in starts}) == 7
+
+
 def test_contact_is_dense_where_much_is_held(recordings: tuple[Sequence, ...]) -> None:
     assert contact_kind(recordings[0]) == "dense"  # 2 of 25 nodes
     path = recordings[0].folder / "truth/contact.npy"

@@ -58,6 +58,7 @@ def test_the_full_suite_has_five_objects_of_four_actions() -> None:
     assert len(scenes) == 20
     assert {objects.count(name) for name in objects} == {4}
     assert len({scene.action for scene in scenes}) == 6
+    assert sum(scene.hold == "friction" for scene in scenes) >= 10
     assert len(find_suite("dev").scenes) == 6
     assert len(find_suite("tiny").scenes) <= 2
     assert len(find_suite("tiny").methods) >= 4
