@@ -124,7 +124,7 @@ class _World:
     @property
     def node(self) -> Float[ndarray, "node 3"]:
         """Where the nodes are now [m]."""
-        return self._data.flexvert_xpos
+        return self._data.xpos[self._model.flex_vertbodyid]
 
     def frames(self, frame_count: int) -> Iterator[ndarray]:
         """Settle, let the hands begin, then go from frame to frame; give what they touch in each.
@@ -166,6 +166,8 @@ class _World:
             node, bone = self._touches()
             count[np.unique(node)] += 1
             self._touching_bone[node] = bone
+        # A step leaves behind where everything was at its begin.
+        self._mujoco.mj_kinematics(self._model, self._data)
         touched = 2 * count >= substeps
         self._touched_frames = np.where(touched, self._touched_frames + 1, 0)
         return touched
@@ -215,7 +217,7 @@ class _World:
         vertex, element = contact.vert[index].max(axis=1), contact.elem[index].max(axis=1)
         is_vertex = vertex >= 0
         corner = self._body_elements[element[~is_vertex]]
-        weight = _weights(self.node[corner], contact.pos[index[~is_vertex]])
+        weight = _weights(self._data.flexvert_xpos[corner], contact.pos[index[~is_vertex]])
         row, column = np.nonzero(weight >= _LEAST_WEIGHT)
         node = np.concatenate([vertex[is_vertex], corner[row, column]])
         return node, np.concatenate([place[is_vertex], place[~is_vertex][row]])

@@ -44,6 +44,7 @@ class PinchAndLift:
     height: float
     end: float = 1.0
     side: str = "right"
+    begin: float = 0.0
 
     def at(self, time):
         closed = self.squeeze * smooth(time / 0.2)
