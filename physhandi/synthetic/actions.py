@@ -76,7 +76,7 @@ class _Task:
 def _lift(task: _Task) -> tuple[HandScript, ...]:
     """Pinch the object near its rim and raise it, a little sideways and turned."""
     handler, random, duration = task.handler(), task.random, task.duration
-    grasp = handler.pinch_rim()
+    grasp = handler.take()
     height = random.uniform(0.12, 0.18)
     aside = random.uniform(-0.04, 0.04) * grasp.across + random.uniform(0.0, 0.05) * grasp.forward
     turn = random.uniform(-0.3, 0.3)
@@ -91,9 +91,9 @@ def _lift(task: _Task) -> tuple[HandScript, ...]:
 def _fold(task: _Task) -> tuple[HandScript, ...]:
     """Pinch the object near its rim and lay it over towards the other side."""
     handler, random, duration = task.handler(), task.random, task.duration
-    grasp = handler.pinch_rim()
+    grasp = handler.take()
     radius = handler.distance_to_middle(grasp) * random.uniform(0.75, 0.95)
-    angle = random.uniform(2.3, 2.7)
+    angle = random.uniform(2.45, 2.8)
 
     def carry(phase: float) -> tuple[ndarray, ndarray]:
         along = radius * (1 - np.cos(angle * phase))
@@ -114,7 +114,7 @@ def _stretch(task: _Task) -> tuple[HandScript, ...]:
     sides: tuple[Side, Side] = ("right", "left")
     for hand_side in sides:
         handler = task.handler(hand_side)
-        grasp = handler.pinch_rim(end=1.0 if hand_side == "right" else -1.0)
+        grasp = handler.take(end=1.0 if hand_side == "right" else -1.0)
         outwards = -grasp.place.inwards
         pull = slack + strain * handler.distance_to_middle(grasp)
 

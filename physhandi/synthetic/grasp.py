@@ -123,30 +123,28 @@ def reach(
             orientation=turn.as_rotvec(), position=value[3:6].copy(), bend=bend_of(value[6:])
         )
 
-    def misses(value: ndarray) -> ndarray:
-        transform = hand.bone_transforms(pose_of(value))
-        return np.array(
-            [
-                transform[tip.bone, :3, :3] @ tip.end + transform[tip.bone, :3, 3] - targets[finger]
-                for finger, tip in tips.items()
-            ]
-        )
+    bones = [tip.bone for tip in tips.values()]
+    ends = np.array([tip.end for tip in tips.values()])[..., None]
+    lines = np.array([(tip.end - tip.start) for tip in tips.values()])
+    lines = (lines / np.linalg.norm(lines, axis=1, keepdims=True))[..., None]
+    wanted = np.array(list(targets.values()))
+    pads = np.array([finger <= MIDDLE for finger in tips])
 
-    def slants(value: ndarray) -> ndarray:
+    def residuals(value: ndarray) -> tuple[ndarray, ndarray]:
+        transform = hand.bone_transforms(pose_of(value))[bones]
+        misses = (transform[:, :3, :3] @ ends)[..., 0] + transform[:, :3, 3] - wanted
         if along is None:
-            return np.zeros(0)
-        transform = hand.bone_transforms(pose_of(value))
-        pointing = [tips[finger] for finger in (THUMB, INDEX, MIDDLE)]
-        lines = [transform[tip.bone, :3, :3] @ (tip.end - tip.start) for tip in pointing]
-        return np.concatenate([line / np.linalg.norm(line) - along for line in lines])
+            return misses, np.zeros((0, 3))
+        return misses, (transform[pads, :3, :3] @ lines[pads])[..., 0] - along
 
     def cost(value: ndarray) -> ndarray:
-        parts = misses(value).ravel() / _TIP_SCALE, slants(value) / _SLANT, (value - guess) / scale
-        return np.concatenate(parts)
+        misses, slants = residuals(value)
+        stray = (value - guess) / scale
+        return np.concatenate([misses.ravel() / _TIP_SCALE, slants.ravel() / _SLANT, stray])
 
-    found = least_squares(cost, np.clip(guess, low, high), bounds=(low, high), xtol=1e-6)
-    # Ring and little finger help; they may end where they can.
-    error = np.linalg.norm(misses(found.x), axis=1)[[finger <= MIDDLE for finger in tips]]
+    first = np.clip(guess, low, high)
+    found = least_squares(cost, first, bounds=(low, high), ftol=1e-4, xtol=1e-4, max_nfev=60)
+    error = np.linalg.norm(residuals(found.x)[0], axis=1)[pads]
     worst = int(error.argmax())
     if error[worst] > _TIP_ERROR:
         finger = FINGER_NAMES[[finger for finger in tips if finger <= MIDDLE][worst]]

@@ -10,6 +10,7 @@ from numpy import ndarray
 from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
+from physhandi.errors import SequenceError
 from physhandi.synthetic.grasp import (
     FLAT,
     INDEX,
@@ -69,6 +70,11 @@ class Graspable(Protocol):
         """Distance at which others touch it, about its nodes [m]."""
         ...
 
+    @property
+    def dimension(self) -> int:
+        """1 for a rod, 2 for a shell, 3 for a solid."""
+        ...
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Grasp:
@@ -107,12 +113,17 @@ class Handler:
         self._body = body
         self._random = random
 
-    def pinch_rim(self, *, end: float = 0.0) -> Grasp:
-        """Take the rim between the thumb below and two fingers above, a little off the ground.
+    def take(self, *, end: float = 0.0) -> Grasp:
+        """Take hold of the object so that it can be carried.
 
         Args:
-            end: 1 or -1 for the rim towards +x or -x; 0 for any.
+            end: 1 or -1 for a place on that side of the object; 0 for any.
         """
+        # What is heavy hangs down: it must be able to turn about the line between the fingers.
+        return self._take_limb(end) if self._body.dimension == 3 else self._pinch_rim(end)
+
+    def _pinch_rim(self, end: float) -> Grasp:
+        """Take the rim between the thumb below and two fingers above, a little off the ground."""
         place = rim_place(self._body, self._random, end=end)
         closed = self._pinch(place, place.closed_gap, None)
         raised = max(_CLEARANCE - self._lowest(closed)[0], 0.0) * _UP
@@ -132,6 +143,20 @@ class Handler:
             ),
         )
 
+    def _take_limb(self, end: float) -> Grasp:
+        """Take a limb between the thumb on one side and all fingers on the other."""
+        places = narrow_places(self._body, self._random, end=end)
+        if not places:
+            raise SequenceError(
+                f"The {self._body.name} has no part that a hand can span. Choose another seed."
+            )
+        places.sort(key=lambda place: 0.5 * (place.width or 0.0) - place.remoteness)
+        place = places[self._random.integers(max(len(places) // 6, 1))]
+        place = replace(place, closed_gap=0.5 * (place.width or 0.0))
+        gaps = np.linspace((place.width or 0.0) + 0.012, place.closed_gap, 5)
+        poses = self._close(place, gaps)
+        return Grasp(poses=poses, place=place, approach=_from_above(poses[0], poses))
+
     def embrace(self) -> Grasp:
         """Close all fingers around a part of the object, or around a handful of it."""
         places = narrow_places(self._body, self._random)
@@ -142,9 +167,7 @@ class Handler:
         else:
             place = handful_place(self._body, self._random)
             gaps = np.linspace(place.open_gap, place.closed_gap, 7)
-        poses = [self._claw(place, float(gaps[0]), None)]
-        for gap in gaps[1:]:
-            poses.append(self._claw(place, float(gap), poses[-1]))
+        poses = self._close(place, gaps)
         return Grasp(poses=poses, place=place, approach=_from_above(poses[0], poses))
 
     def lay_flat(self) -> Grasp:
@@ -260,6 +283,13 @@ class Handler:
             along=along,
         )
 
+    def _close(self, place: Place, gaps: Float[ndarray, " step"]) -> list[HandPose]:
+        """Close thumb and fingers in steps, the wrist almost at rest."""
+        poses: list[HandPose] = []
+        for gap in gaps:
+            poses.append(self._claw(place, float(gap), poses[-1] if poses else None))
+        return poses
+
     def _claw(self, place: Place, gap: float, start: HandPose | None) -> HandPose:
         """Put the thumb and all fingers on opposite sides of a place, tips down."""
         targets: dict[int, ndarray] = {}
@@ -275,6 +305,7 @@ class Handler:
             orientation=orientation_towards(place.forward, pitch=_PITCH),
             joints=RELAXED,
             start=start,
+            along=0.3 * place.forward - 0.95 * _UP,
         )
 
     def _radius(self, finger: int) -> float:

@@ -16,8 +16,7 @@ _CANDIDATES = 120
 _INSET = 0.03
 _FLAT = 0.010
 _LINE = 0.06
-_THIN = 0.01
-_THICKER = 0.015
+_THICKER = 0.01
 
 
 class Lying(Protocol):
@@ -65,12 +64,13 @@ def height_range(body: Lying, point: Float[ndarray, " 3"], reach: float) -> tupl
     return float(near.min()) - body.radius, float(near.max()) + body.radius
 
 
-def narrow_places(body: Lying, random: Generator) -> list[Place]:
+def narrow_places(body: Lying, random: Generator, *, end: float = 0.0) -> list[Place]:
     """List places where the object is narrow enough to be taken between thumb and fingers.
 
     Args:
         body: The object.
         random: Decides which places are tried.
+        end: 1 or -1 to keep those that stick out towards +y or -y, as limbs do; 0 for all.
 
     Returns:
         Places with room for the fingers on both sides; none if the object is flat or too wide.
@@ -81,6 +81,8 @@ def narrow_places(body: Lying, random: Generator) -> list[Place]:
     found = []
     count = min(_CANDIDATES, len(body.node))
     for node in body.node[random.choice(len(body.node), count, replace=False)]:
+        if end and end * (node[1] - middle[1]) < 0.6 * np.abs(body.node[:, 1] - middle[1]).max():
+            continue
         angles = np.arange(_DIRECTIONS) * 2 * np.pi / _DIRECTIONS
         lines = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(_DIRECTIONS)])
         places = [_across(body, node, forward, middle) for forward in lines]
@@ -102,14 +104,14 @@ def rim_place(body: Lying, random: Generator, *, end: float = 0.0) -> Place:
         return _beside_line(body, random, end)
     middle = body.node.mean(axis=0)
     if end:
-        angles = (0.0 if end > 0 else np.pi) + np.linspace(-0.5, 0.5, 9)
+        angles = (0.0 if end > 0 else np.pi) + np.linspace(-0.3, 0.3, 9)
     else:
         angles = -np.pi / 2 + np.linspace(-1.8, 1.8, 19)
+    angles = angles + random.uniform(-0.05, 0.05)
     places = [_rim_along(body, middle, float(angle)) for angle in angles]
-    thickest = min(place.thickness for place in places) + _THICKER
-    places = [place for place in places if place.thickness <= max(thickest, _THIN)]
-    places.sort(key=lambda place: -place.remoteness)
-    return places[random.integers(max(len(places) // 3, 1))]
+    thinnest = min(place.thickness for place in places)
+    places = [place for place in places if place.thickness <= thinnest + _THICKER]
+    return places[random.integers(len(places))]
 
 
 def handful_place(body: Lying, random: Generator) -> Place:

@@ -143,11 +143,14 @@ class TrueHand:
         transform = np.tile(np.eye(4), (BONE_COUNT, 1, 1))
         transform[0, :3, :3] = Rotation.from_rotvec(pose.orientation).as_matrix()
         transform[0, :3, 3] = pose.position
-        for bone in range(1, BONE_COUNT):
-            above, origin = transform[self.bone_parent[bone]], self.bone_origin[bone]
-            rotation = above[:3, :3] @ own[bone]
-            transform[bone, :3, :3] = rotation
-            transform[bone, :3, 3] = above[:3, :3] @ origin + above[:3, 3] - rotation @ origin
+        for link in (1, 2, 3):  # of all five fingers at once
+            bones = slice(link, BONE_COUNT, 3)
+            above = transform[list(self.bone_parent[bones])]
+            origin = self.bone_origin[bones, :, None]
+            rotation = above[:, :3, :3] @ own[bones]
+            place = above[:, :3, :3] @ origin + above[:, :3, 3:]
+            transform[bones, :3, :3] = rotation
+            transform[bones, :3, 3:] = place - rotation @ origin
         return transform
 
     def pose(self, pose: HandPose) -> PosedHand:

@@ -41,10 +41,10 @@ def random_pose(seed: int) -> HandPose:
 
 
 def test_the_asset_is_the_one_that_is_vouched_for():
-    sums = dict(
-        reversed(line.split()) for line in (ASSET.parent / "SHA256SUMS").read_text().splitlines()
-    )
-    assert hashlib.sha256(ASSET.read_bytes()).hexdigest() == sums[ASSET.name]
+    lines = (ASSET.parent / "SHA256SUMS").read_text().splitlines()
+    sums = {name: digest for digest, name in (line.split() for line in lines)}
+    for path in (ASSET, ASSET.parent / "LICENSE-makehuman.md"):
+        assert hashlib.sha256(path.read_bytes()).hexdigest() == sums[path.name]
     assert "CC0 1.0 Universal" in (ASSET.parent / "LICENSE-makehuman.md").read_text()
 
 
