@@ -202,7 +202,8 @@ def _lit(scene: Scene, point: Float[ndarray, "row column 3"]) -> Float[ndarray, 
     reach = rasterize(light, scene.vertex, scene.faces).depth
     reach = np.where(reach > 0, reach, np.inf)
     where = np.nan_to_num(point)
-    depth, pixel = light.camera_depth(where), light.project(where)
+    # Far away the table is behind the light; nothing casts a shadow there.
+    depth, pixel = light.camera_depth(where), np.nan_to_num(light.project(where))
     amount = np.zeros(depth.shape)
     offsets = [(a, b) for a in (-1.2, 0.0, 1.2) for b in (-1.2, 0.0, 1.2)]
     for offset in offsets:

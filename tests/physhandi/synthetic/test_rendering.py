@@ -87,3 +87,18 @@ def test_shadows_fall_where_the_line_from_the_lamp_meets_the_table():
     away, beyond = point[0] - lamp, shadow[0] - lamp
     assert np.linalg.norm(np.cross(away, beyond)) < 1e-12
     assert np.linalg.norm(beyond) > np.linalg.norm(away)
+
+
+def test_a_camera_may_see_the_table_up_to_the_horizon():
+    camera = look_at(
+        np.array([-0.8, 0.0, 0.3]), np.array([0.0, 0.0, 0.2]), focal_length=60.0, size=(80, 60)
+    )
+    scene = compose(raised(0.1), FACES, SQUARE[:, :2], [])
+    image, picture = paint(camera, scene), photograph(camera, scene)
+    above_horizon = picture.depth == 0
+    assert above_horizon[0].all()
+    assert not above_horizon[30:].any()
+    assert image.min() > 0
+    far = image[~above_horizon & (picture.depth > 3)]
+    # Unshadowed wood, as bright as at the feet of the camera.
+    assert far.mean() == pytest.approx(image[-1].mean(), rel=0.05)
