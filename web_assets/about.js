@@ -2,21 +2,21 @@
 
 /* Name, tags and note of a run, changed in place. */
 
-const about = document.getElementById("about");
+const aboutForm = document.getElementById("about");
 
 function edit(isOn) {
-  about.hidden = !isOn;
+  aboutForm.hidden = !isOn;
   document.body.classList.toggle("is-editing", isOn);
-  if (isOn) about.elements.name.select();
+  if (isOn) aboutForm.elements.name.select();
   else {
-    about.reset();
+    aboutForm.reset();
     document.querySelector("[data-edit-about]")?.focus();
   }
 }
 
 async function saveAbout() {
-  const { name, tags, note } = about.elements;
-  const run = await send("PATCH", `/api/v1/runs/${about.dataset.run}`, {
+  const { name, tags, note } = aboutForm.elements;
+  const run = await send("PATCH", `/api/v1/runs/${aboutForm.dataset.run}`, {
     name: name.value, tags: tags.value.split(/[\s,]+/).filter(Boolean), note: note.value,
   });
   // What was saved is what the form begins with the next time.
@@ -29,17 +29,17 @@ async function saveAbout() {
   edit(false);
 }
 
-if (about) {
+if (aboutForm) {
   document.addEventListener("click", (event) => {
     if (event.target.closest("[data-edit-about]")) edit(true);
     else if (event.target.closest("[data-about-cancel]")) edit(false);
   });
-  about.addEventListener("submit", (event) => {
+  aboutForm.addEventListener("submit", (event) => {
     event.preventDefault();
-    busy(about.querySelector("[type=submit]"), saveAbout);
+    busy(aboutForm.querySelector("[type=submit]"), saveAbout);
   });
-  about.addEventListener("keydown", (event) => {
+  aboutForm.addEventListener("keydown", (event) => {
     if (event.key === "Escape") edit(false);
-    else if (event.key === "Enter" && event.ctrlKey) about.requestSubmit();
+    else if (event.key === "Enter" && event.ctrlKey) aboutForm.requestSubmit();
   });
 }

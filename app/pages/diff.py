@@ -113,7 +113,7 @@ def _plain_rows(columns: Sequence[Mapping[str, Any]]) -> list[Row]:
     for name in _names(columns):
         values = [column.get(name) for column in columns]
         if any(value is not None for value in values):
-            cells = [Cell(_text(column, name)) for column in columns]
+            cells = [Cell(text) for text in _texts(columns, name)]
             shown = " / ".join(words(part.rstrip("_")) for part in name.split("."))
             rows.append(Row(shown, cells, _differ(values)))
     return rows
@@ -127,7 +127,7 @@ def _parameter_rows(columns: Sequence[Mapping[str, Any]]) -> list[Row]:
         scaled_columns = [
             {name: scaled(column[name], unit)[0]} if name in column else {} for column in columns
         ]
-        cells = [Cell(_text(column, name)) for column in scaled_columns]
+        cells = [Cell(text) for text in _texts(scaled_columns, name)]
         rows.append(Row(words(name), cells, _differ(values), about, scaled(None, unit)[1]))
     return rows
 
@@ -208,6 +208,21 @@ def _surroundings_of(environment: Mapping[str, Any]) -> dict[str, Any]:
 
 def _names(columns: Iterable[Mapping[str, Any]]) -> list[str]:
     return list(dict.fromkeys(name for column in columns for name in column))
+
+
+def _texts(columns: Sequence[Mapping[str, Any]], name: str) -> list[str]:
+    """Write a value of all runs; numbers that differ get the digits by which they do."""
+    texts = [_text(column, name) for column in columns]
+    numbers = [float(column[name]) for column in columns if _is_number(column.get(name))]
+    if len(set(texts)) > 1 or len(numbers) < len(texts) or not _differ(numbers):
+        return texts
+    for digits in range(5, 18):
+        is_small = max(map(abs, numbers)) < 1e-3
+        kind = f".{digits - 1}e" if is_small else f".{digits}g"
+        texts = [f"{number:{kind}}".replace("e-0", "e-") for number in numbers]
+        if len(set(texts)) > 1:
+            break
+    return texts
 
 
 def _text(column: Mapping[str, Any], name: str) -> str:

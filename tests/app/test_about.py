@@ -116,3 +116,11 @@ def test_a_full_disk_leaves_what_was_there(
         Run.open(folder).rename(note="second")
     assert (folder / "run.yaml").read_bytes() == before
     assert [path.name for path in folder.iterdir() if ".tmp" in path.name] == []
+
+
+def test_a_page_begins_with_the_errors_of_the_run(world: World, client: TestClient) -> None:
+    error = client.get(ADDRESS).json()["track_error_fitted"]
+    assert error > 0
+    page = world.browser().get("/runs/fitted").text
+    assert f"<dd>{1000 * error:.2f} mm</dd>" in page
+    assert '<li><a href="/runs">Runs</a></li>' in page

@@ -182,3 +182,15 @@ def test_a_damaged_run_can_be_compared_too(world: World) -> None:
     page = world.browser().get("/diff?run=fitted&run=broken&run=towel_fold_quick")
     assert page.status_code == 200
     assert "leave out" in page.text
+
+
+def test_numbers_that_differ_never_read_the_same() -> None:
+    results = [
+        {"losses": {"first_order": {"after": after}}, "parameters": {"drag": drag}}
+        for after, drag in ((1.31002e-4, 3.0), (1.31049e-4, 3.0))
+    ]
+    sections = compare_runs([described(), described()], [{}, {}], results)
+    loss = row_of(sections, "Loss at the end of each stage", "first order")
+    assert [cell.text for cell in loss.cells] == ["1.3100e-4", "1.3105e-4"]
+    drag = row_of(sections, "Parameters that the simulation ended with", "drag")
+    assert [cell.text for cell in drag.cells] == ["3", "3"]

@@ -4,7 +4,7 @@ import json
 import re
 
 from app.jobs.describe import thin
-from app.pages.render import duration, short, words
+from app.pages.render import Pages, duration, short, words
 from app.settings import WEB_ASSETS
 
 
@@ -54,3 +54,9 @@ def test_numbers_keep_four_digits_and_names_become_words() -> None:
     shown = [short(v) for v in (None, 7, "x", 2230.745, 0.0316404, 1e4, 9.47015e-5, 0.0, 2.5e9)]
     assert shown == ["none", "7", "x", "2231", "0.03164", "10000", "9.470e-5", "0", "2.5e+09"]
     assert words("chamfer_dynamic_l1") == "chamfer dynamic L1"
+
+
+def test_a_page_that_is_missing_leads_to_the_lists() -> None:
+    page = bytes(Pages().error(404, "There is no run '<b>'.").body).decode()
+    assert all(f'href="{address}"' in page for address in ("/", "/runs", "/sequences"))
+    assert "&#39;&lt;b&gt;&#39;" in page
