@@ -20,6 +20,8 @@ ACTIONS: tuple[Action, ...] = ("lift", "fold", "stretch", "squeeze", "wipe", "pu
 _UP = np.array([0.0, 0.0, 1.0])
 # How far hands pull each body beyond its length: as far as friction holds it.
 _STRETCH = {"cloth": 0.02, "towel": 0.05, "rope": -0.01, "plush": 0.08, "pouch": 0.05}
+# Shortest recording in which hands go the whole way [s].
+_WHOLE_WAY = 1.5
 DURATION = 3.0
 """How long an action is recorded if nothing else is asked for [s]."""
 
@@ -69,6 +71,11 @@ class _Task:
     side: Side
     hands: Mapping[Side, TrueHand]
 
+    @property
+    def extent(self) -> float:
+        """Share of the whole way that there is time for; hands move no faster in short ones."""
+        return min(self.duration / _WHOLE_WAY, 1.0)
+
     def handler(self, side: Side | None = None) -> Handler:
         return Handler(self.hands[side or self.side], self.body, self.random)
 
@@ -77,8 +84,9 @@ def _lift(task: _Task) -> tuple[HandScript, ...]:
     """Pinch the object near its rim and raise it, a little sideways and turned."""
     handler, random, duration = task.handler(), task.random, task.duration
     grasp = handler.take()
-    height = random.uniform(0.12, 0.18)
+    height = task.extent * random.uniform(0.12, 0.18)
     aside = random.uniform(-0.04, 0.04) * grasp.across + random.uniform(0.0, 0.05) * grasp.forward
+    aside = task.extent * aside
     turn = random.uniform(-0.3, 0.3)
 
     def carry(phase: float) -> tuple[ndarray, ndarray]:
@@ -93,7 +101,7 @@ def _fold(task: _Task) -> tuple[HandScript, ...]:
     handler, random, duration = task.handler(), task.random, task.duration
     grasp = handler.take()
     radius = handler.distance_to_middle(grasp) * random.uniform(0.75, 0.95)
-    angle = random.uniform(2.45, 2.8)
+    angle = task.extent * random.uniform(2.45, 2.8)
 
     def carry(phase: float) -> tuple[ndarray, ndarray]:
         along = radius * (1 - np.cos(angle * phase))
@@ -107,9 +115,10 @@ def _fold(task: _Task) -> tuple[HandScript, ...]:
 def _stretch(task: _Task) -> tuple[HandScript, ...]:
     """Pinch the object at both ends, raise it with some slack, and pull it apart."""
     random, duration = task.random, task.duration
-    slack, height = random.uniform(0.025, 0.04), random.uniform(0.04, 0.08)
+    slack = task.extent * random.uniform(0.025, 0.04)
+    height = task.extent * random.uniform(0.04, 0.08)
     slacken = random.uniform(0.3, 0.4) * duration
-    strain = _STRETCH[task.body.name] * random.uniform(0.7, 1.3)
+    strain = task.extent * _STRETCH[task.body.name] * random.uniform(0.7, 1.3)
     scripts = []
     sides: tuple[Side, Side] = ("right", "left")
     for hand_side in sides:
@@ -136,6 +145,7 @@ def _squeeze(task: _Task) -> tuple[HandScript, ...]:
     handler, random = task.handler(), task.random
     grasp = handler.embrace()
     drift = random.uniform(0.03, 0.06) * grasp.forward + random.uniform(-0.03, 0.03) * grasp.across
+    drift = task.extent * drift
     times = np.array([0.0, 0.4, 0.6, 1.0]) * task.duration
     return (handler.squeeze_script(grasp, times, ease=random.uniform(0.4, 0.6), drift=drift),)
 
@@ -144,14 +154,16 @@ def _wipe(task: _Task) -> tuple[HandScript, ...]:
     """Press the flat hand on the object and rub it to and fro."""
     handler, random, duration = task.handler(), task.random, task.duration
     grasp = handler.lay_flat()
-    reach = random.uniform(0.05, 0.08)
+    reach = task.extent * random.uniform(0.05, 0.08)
+    # A rope is rolled, anything else rubbed from side to side.
+    way = grasp.forward if task.body.dimension == 1 else grasp.across
     turn = random.uniform(-0.25, 0.25)
     legs = [(0.0, 0.3, 0.0, 1.0), (0.3, 0.7, 1.0, -0.6), (0.7, 1.0, -0.6, 0.7)]
 
     def rub(first: float, last: float) -> Callable[[float], tuple[ndarray, ndarray]]:
         def carry(phase: float) -> tuple[ndarray, ndarray]:
             share = first + phase * (last - first)
-            return reach * share * grasp.across, np.array([0.0, 0.0, turn * share])
+            return reach * share * way, np.array([0.0, 0.0, turn * share])
 
         return carry
 
@@ -163,8 +175,8 @@ def _push(task: _Task) -> tuple[HandScript, ...]:
     """Push the object over the ground with the index finger."""
     handler, random, duration = task.handler(), task.random, task.duration
     grasp = handler.point_at()
-    distance = random.uniform(0.08, 0.12)
-    bow = random.uniform(-0.02, 0.02)
+    distance = task.extent * random.uniform(0.08, 0.12)
+    bow = task.extent * random.uniform(-0.02, 0.02)
 
     def carry(phase: float) -> tuple[ndarray, ndarray]:
         return phase * distance * grasp.forward + bow * phase**2 * grasp.across, np.zeros(3)

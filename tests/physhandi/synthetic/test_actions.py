@@ -168,10 +168,14 @@ def test_the_seed_decides_everything():
 
 
 def test_a_left_hand_and_a_shorter_recording_can_be_asked_for():
-    (one,) = script_action(
-        "lift", body("rope"), np.random.default_rng(1), duration=1.0, side="left", hands=HANDS
-    )
-    assert (one.side, one.end) == ("left", 1.0)
+    def lift(duration: float) -> HandScript:
+        random = np.random.default_rng(1)
+        return script_action("lift", body("rope"), random, duration=duration, side="left")[0]
+
+    short, long = lift(0.5), lift(2.0)
+    assert (short.side, short.end) == ("left", 0.5)
+    rise = [grip(one, one.end)[2] - grip(one, 0.0)[2] for one in (short, long)]
+    assert rise[0] == pytest.approx(rise[1] / 3, abs=0.002)
 
 
 def test_an_unknown_action_is_refused_by_name():
