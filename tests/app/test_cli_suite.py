@@ -58,6 +58,7 @@ def test_an_order_that_makes_no_sense_writes_nothing(
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(300)
 def test_the_tiny_suite_is_made_and_evaluated_by_one_command(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
