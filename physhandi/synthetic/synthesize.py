@@ -1,7 +1,10 @@
 """SynthHDI's generator: another physics engine, another hand and honest sensors make a sequence."""
 
-from collections.abc import Mapping
+import logging
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict
+from importlib import import_module
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
@@ -23,6 +26,8 @@ from physhandi.synthetic.presets import changed, find_preset
 from physhandi.synthetic.recording import Images, record
 from physhandi.synthetic.stage import SIDES, make_stage
 from physhandi.synthetic.true_hand import TrueHand, load_true_hand
+
+_LOG = logging.getLogger(__name__)
 
 FRAMES = 90
 """Frames of a sequence if nothing else is asked for: three seconds."""
@@ -88,9 +93,10 @@ def synthesize(
         scripts = script_action(action, body, script_random, duration=(frames - 1) / FRAME_RATE)
         hands: dict[Side, TrueHand] = {one.side: load_true_hand(one.side) for one in scripts}
         capsules = cast("Mapping[Side, CapsuleHand]", hands)
-        truth = simulate_truth(
-            body, scripts, capsules, frame_count=frames, hold=hold, progress=progress
-        )
+        with engine_warnings_logged():
+            truth = simulate_truth(
+                body, scripts, capsules, frame_count=frames, hold=hold, progress=progress
+            )
         stage = make_stage(truth, hands, level, seed)
         views = make_viewpoints(stage.extent(), cameras, level, seed)
         record(writer, stage, views, level, seed=seed, images=images, progress=progress)
@@ -125,6 +131,21 @@ def synthesize(
             },
         )
         return writer.finish(meta)
+
+
+@contextmanager
+def engine_warnings_logged() -> Generator[None, None, None]:
+    """Take MuJoCo's warnings into the log; it would write a file where the user happens to be.
+
+    What goes wrong for good is found by the engine's own checks.
+    """
+    mujoco = import_module("mujoco")
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda text: _LOG.info("MuJoCo: %s", text))
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
 
 
 def _check(

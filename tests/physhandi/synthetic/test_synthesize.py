@@ -97,6 +97,22 @@ def test_without_mujoco_it_says_what_to_install(tmp_path, monkeypatch):
         synthesize("rope", "push", out=tmp_path / "none")
 
 
+def test_warnings_of_the_engine_go_to_the_log_and_into_no_file(tmp_path, monkeypatch, caplog):
+    import mujoco
+
+    monkeypatch.chdir(tmp_path)
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
+    )
+    data = mujoco.MjData(model)
+    data.qvel[0] = 1e12
+    with caplog.at_level("INFO"), generator.engine_warnings_logged():
+        mujoco.mj_step(model, data)
+    assert "huge value in QVEL" in caplog.text
+    assert list(tmp_path.iterdir()) == []
+    assert mujoco.get_mju_user_warning() is None
+
+
 class StopsWhileFilming(Progress):
     def __init__(self) -> None:
         self.stage = ""
