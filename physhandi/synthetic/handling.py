@@ -8,25 +8,19 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 from numpy.random import Generator
-from scipy.spatial.transform import Rotation
 
 from physhandi.errors import SequenceError
 from physhandi.synthetic.grasp import (
     FLAT,
     INDEX,
-    LITTLE,
-    MIDDLE,
-    PINCHING,
     POINTING,
-    RELAXED,
-    RING,
-    THUMB,
     bend_of,
     fingertip,
     orientation_towards,
     reach,
 )
 from physhandi.synthetic.hand_script import HandScript, Move, Tremor
+from physhandi.synthetic.hand_shapes import claw, lowest_skin, moved, pinch, turned
 from physhandi.synthetic.places import (
     Place,
     handful_place,
@@ -44,12 +38,8 @@ _UP = np.array([0.0, 0.0, 1.0])
 _BEGIN, _TOUCH, _CLOSED, _READY = -1.5, -1.1, -0.6, -0.15
 _HOVER, _ASIDE = 0.06, 0.08
 _CLEARANCE = 0.004
-_CLEAR_OF = 0.02
 _POSES_PER_MOVE = 9
-_FINGER_SPACING, _PINCH_SPACING = 0.020, 0.016
-_PITCH, _PINCH_PITCH = 0.75, 0.0
-# How far below the horizon pinching fingers point, and how much of them is beyond the pinch.
-_TILT, _PAD = 0.7, 0.006
+_POINT_PITCH = 0.75
 
 
 class Graspable(Protocol):
@@ -125,21 +115,21 @@ class Handler:
     def _pinch_rim(self, end: float) -> Grasp:
         """Take the rim between the thumb below and two fingers above, a little off the ground."""
         place = rim_place(self._body, self._random, end=end)
-        closed = self._pinch(place, place.closed_gap, None)
-        raised = max(_CLEARANCE - self._lowest(closed)[0], 0.0) * _UP
+        closed = pinch(self._hand, place, place.closed_gap, None)
+        raised = max(_CLEARANCE - lowest_skin(self._hand, closed)[0], 0.0) * _UP
         lower = [closed]
         for gap in np.linspace(place.closed_gap, place.open_gap, 4)[1:]:
-            lower.append(self._pinch(place, float(gap), lower[-1]))
+            lower.append(pinch(self._hand, place, float(gap), lower[-1]))
         lower.reverse()
         held = replace(place, point=place.point + raised)
-        outside = _moved(lower[0], -_ASIDE * place.forward)
+        outside = moved(lower[0], -_ASIDE * place.forward)
         return Grasp(
             place=held,
-            poses=(_moved(closed, raised),),
+            poses=(moved(closed, raised),),
             approach=(
                 Move(_BEGIN, _TOUCH, (outside, lower[0])),
                 Move(_TOUCH, _CLOSED, lower),
-                Move(_CLOSED, _READY, (closed, _moved(closed, raised))),
+                Move(_CLOSED, _READY, (closed, moved(closed, raised))),
             ),
         )
 
@@ -182,12 +172,12 @@ class Handler:
             position=np.zeros(3),
             bend=bend_of(FLAT),
         )
-        low, center = self._lowest(pose)
+        low, center = lowest_skin(self._hand, pose)
         is_soft = height_range(self._body, middle, 0.06)[1] > 0.02
         press = 0.010 if is_soft else 0.003
         shift = np.array([*(place.point - center)[:2], top - press - low])
-        above = _moved(pose, shift + (press + 0.004) * _UP)
-        poses = (above, _moved(pose, shift))
+        above = moved(pose, shift + (press + 0.004) * _UP)
+        poses = (above, moved(pose, shift))
         return Grasp(poses=poses, place=place, approach=_from_above(above, poses))
 
     def point_at(self) -> Grasp:
@@ -211,10 +201,10 @@ class Handler:
             height = max(tip.radius + 0.002, 0.45 * (bottom + top))
             target = np.array([*outside[:2], height])
         place = Place(point=target, forward=forward, inwards=forward)
-        orientation = orientation_towards(forward, pitch=_PITCH)
+        orientation = orientation_towards(forward, pitch=_POINT_PITCH)
         touch = reach(self._hand, {INDEX: target}, orientation=orientation, joints=POINTING)
         back = 0.01 * _UP if is_flat else -0.01 * forward
-        poses = (_moved(touch, back), touch)
+        poses = (moved(touch, back), touch)
         return Grasp(poses=poses, place=place, approach=_from_above(poses[0], poses))
 
     def script(self, grasp: Grasp, moves: Sequence[tuple[float, float, Carry]]) -> HandScript:
@@ -228,7 +218,7 @@ class Handler:
         chain = list(grasp.approach)
         for start, end, carry in moves:
             phases = np.linspace(0.0, 1.0, _POSES_PER_MOVE)
-            poses = [_turned(held, grasp.place.point, *carry(float(p))) for p in phases]
+            poses = [turned(held, grasp.place.point, *carry(float(p))) for p in phases]
             chain.append(Move(start, end, poses))
         return HandScript(self._hand.side, chain, Tremor(self._random))
 
@@ -255,7 +245,7 @@ class Handler:
         legs = (poses[half:], 0.0, 0.2), (eased[::-1], 0.2, 0.4), (eased, 0.4, 1.0)
         for number, (leg, first, last) in enumerate(legs):
             shares = np.linspace(first, last, len(leg))
-            drifting = [_moved(p, share * drift) for p, share in zip(leg, shares, strict=True)]
+            drifting = [moved(p, share * drift) for p, share in zip(leg, shares, strict=True)]
             chain.append(Move(times[number], times[number + 1], drifting))
         return HandScript(self._hand.side, chain, Tremor(self._random))
 
@@ -263,93 +253,17 @@ class Handler:
         """How far the grasp is from the object's middle along the way the hand faces [m]."""
         return abs(float((self._body.node.mean(axis=0) - grasp.place.point) @ grasp.place.inwards))
 
-    def _pinch(self, place: Place, gap: float, start: HandPose | None) -> HandPose:
-        """Put the thumb below a place and two fingers above it; the others stay clear of it."""
-        along = np.cos(_TILT) * place.forward - np.sin(_TILT) * _UP
-        above = np.sin(_TILT) * place.forward + np.cos(_TILT) * _UP
-        point = place.point + _PAD * along
-        targets = {THUMB: point - (gap / 2 + self._radius(THUMB)) * above}
-        clear = place.thickness / 2 + _CLEAR_OF
-        for finger in (INDEX, MIDDLE, RING, LITTLE):
-            height = gap / 2 if finger <= MIDDLE else clear
-            aside = (INDEX + 0.5 - finger) * _PINCH_SPACING * self._thumb_side(place)
-            targets[finger] = point + (height + self._radius(finger)) * above + aside
-        return reach(
-            self._hand,
-            targets,
-            orientation=orientation_towards(place.forward, pitch=_PINCH_PITCH),
-            joints=PINCHING,
-            start=start,
-            along=along,
-        )
-
     def _close(self, place: Place, gaps: Float[ndarray, " step"]) -> list[HandPose]:
         """Close thumb and fingers in steps, the wrist almost at rest."""
         poses: list[HandPose] = []
         for gap in gaps:
-            poses.append(self._claw(place, float(gap), poses[-1] if poses else None))
+            poses.append(claw(self._hand, place, float(gap), poses[-1] if poses else None))
         return poses
-
-    def _claw(self, place: Place, gap: float, start: HandPose | None) -> HandPose:
-        """Put the thumb and all fingers on opposite sides of a place, tips down."""
-        targets: dict[int, ndarray] = {}
-        for finger in (THUMB, INDEX, MIDDLE, RING, LITTLE):
-            radius = self._radius(finger)
-            sign, order = (-1.0, 0.0) if finger == THUMB else (1.0, 2.5 - finger)
-            target = place.point + sign * (gap / 2 + radius) * place.forward
-            target = target + order * _FINGER_SPACING * self._thumb_side(place)
-            targets[finger] = np.array([*target[:2], max(place.depth, 0.001) + radius])
-        return reach(
-            self._hand,
-            targets,
-            orientation=orientation_towards(place.forward, pitch=_PITCH),
-            joints=RELAXED,
-            start=start,
-            along=0.3 * place.forward - 0.95 * _UP,
-        )
-
-    def _radius(self, finger: int) -> float:
-        return fingertip(self._hand, finger).radius
-
-    def _thumb_side(self, place: Place) -> Float[ndarray, " 3"]:
-        """Tell the horizontal direction from the little finger to the index finger."""
-        side = 1.0 if self._hand.side == "right" else -1.0
-        return side * np.cross(_UP, place.forward)
-
-    def _lowest(self, pose: HandPose) -> tuple[float, Float[ndarray, " 3"]]:
-        """Find the lowest skin of a pose, and the middle of its palm."""
-        transform = self._hand.bone_transforms(pose)
-        lowest = np.inf
-        for capsule in self._hand.capsules:
-            turn, shift = transform[capsule.bone, :3, :3], transform[capsule.bone, :3, 3]
-            for end in (capsule.start, capsule.end):
-                lowest = min(lowest, float((turn @ end + shift)[2]) - capsule.radius)
-        keypoint = self._hand.pose(pose).keypoint
-        return lowest, (keypoint[0] + keypoint[9]) / 2
 
 
 def _from_above(first: HandPose, closing: Sequence[HandPose]) -> list[Move]:
     """Come down to where a hand touches first, then close it."""
     return [
-        Move(_BEGIN, _TOUCH, (_moved(first, _HOVER * _UP), first)),
+        Move(_BEGIN, _TOUCH, (moved(first, _HOVER * _UP), first)),
         Move(_TOUCH, _READY, closing),
     ]
-
-
-def _moved(pose: HandPose, shift: Float[ndarray, " 3"]) -> HandPose:
-    return HandPose(orientation=pose.orientation, position=pose.position + shift, bend=pose.bend)
-
-
-def _turned(
-    pose: HandPose,
-    point: Float[ndarray, " 3"],
-    shift: Float[ndarray, " 3"],
-    turn: Float[ndarray, " 3"],
-) -> HandPose:
-    """Turn a pose about a point, then shift it."""
-    rotation = Rotation.from_rotvec(turn)
-    return HandPose(
-        orientation=(rotation * Rotation.from_rotvec(pose.orientation)).as_rotvec(),
-        position=point + rotation.apply(pose.position - point) + shift,
-        bend=pose.bend,
-    )
