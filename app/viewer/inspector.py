@@ -25,6 +25,7 @@ from app.viewer.take import Take
 MARK = (233, 30, 180)
 """Color of what was clicked, which no scale has."""
 _REFRESH = 0.25
+_LONGEST_UNIT = 8
 _AXIS, _LINE, _NOW = "rgb(120,130,145)", "rgb(47,111,222)", "rgba(233,30,180,0.9)"
 _NONE = '<div style="font-size:0.8em;padding:0 0.9em 0.4em;opacity:0.8">Click {} to read it.</div>'
 
@@ -194,9 +195,10 @@ class Inspector:
             return
         place = readings.place(chosen, take, frame, take_frame)
         links = readings.links(chosen, take, take_frame)
+        size = 1.6 if take is None and chosen.kind != "hand" else 0.46
         with self._server.atomic():
             self._nodes.points(
-                "/picked/point", place, MARK, 0.46 * framing.spacing, is_visible=not is_hidden
+                "/picked/point", place, MARK, size * framing.spacing, is_visible=not is_hidden
             )
             self._nodes.segments("/picked/links", links, MARK, 3.0, is_visible=not is_hidden)
             name = readings.title(chosen, take).partition(" (")[0]
@@ -243,6 +245,8 @@ class Inspector:
             self._plot.data = data
 
     def _add_plot(self, data: tuple[ndarray, ...], kind: str, unit: str, count: int) -> None:
+        # The choice above names the quantity; along the axis there is no room for long units too.
+        label = f"{kind} [{unit}]" if len(unit) <= _LONGEST_UNIT else unit
         grid: Any = {"show": True, "stroke": "rgba(120,130,145,0.2)"}
         points: Any = {"show": False}
         with self._folder:
@@ -256,9 +260,7 @@ class Inspector:
                 scales={"x": uplot.Scale(time=False, range=(0.0, float(max(count - 1, 1))))},
                 axes=(
                     uplot.Axis(stroke=_AXIS, grid=grid, size=26),
-                    uplot.Axis(
-                        stroke=_AXIS, grid=grid, size=44, label=f"{kind} [{unit}]", labelSize=14
-                    ),
+                    uplot.Axis(stroke=_AXIS, grid=grid, size=44, label=label, labelSize=14),
                 ),
                 legend=uplot.Legend(show=False),
                 height=130,

@@ -153,12 +153,14 @@ def test_a_summary_is_the_mean_over_frames_and_the_sum_over_stages(world: World)
             "one": {"reconstruction": scores(0.002, 1, 11), "future": scores(0.5, 11, 12)},
             "two": {"reconstruction": scores(0.005, 1, 21)},
             "unitless": {"unit": "board square", "reconstruction": scores(7.0, 1, 9)},
-            "hand": {"hands": {"right": {}}},
+            "hand": {"hands": {"right": {"reprojection_median": 4.0, "scored_keypoints": 30}}},
+            "other": {"hands": {"left": {"reprojection_median": 2.0, "scored_keypoints": 10}}},
         },
     )
     summary = summarize(run)
     assert summary.track_error_fitted == pytest.approx((10 * 0.002 + 20 * 0.005) / 30)
     assert summary.track_error_predicted == 0.5
+    assert summary.reprojection == pytest.approx(3.5)
     assert len(seconds) > 2
     assert summary.duration_s == pytest.approx(sum(seconds))
     (run.out / "metrics.json").write_text("{")

@@ -101,3 +101,17 @@ def test_a_failure_is_told_in_words_with_what_to_do(
 
 def test_a_damaged_run_says_which_file_to_repair() -> None:
     assert explain(None, "run.yaml cannot be read.").message == "run.yaml cannot be read."
+
+
+@pytest.mark.parametrize(
+    ("name", "files", "state"),
+    [
+        ("hand_reconstruction", {"sequences/rope/meta.yaml": {}}, "passed"),
+        ("hand_reconstruction", {"sequences/a/hand_left_vertex.npy": {}}, "done"),
+        ("hand_refinement", {}, "passed"),
+        ("observation", {}, "done"),
+    ],
+)
+def test_a_stage_of_the_hand_that_found_no_hand_is_not_called_done(name, files, state) -> None:
+    finished = [{"name": name, "seconds": 0.0, "summary": {}, "files": files}]
+    assert stage_views([name], finished, "succeeded", None)[0].state == state

@@ -9,7 +9,8 @@ import pytest
 import yaml
 
 from physhandi.data.exporters import export_run
-from physhandi.data.exporters.table import flat, safe_cell, write_csv
+from physhandi.data.exporters.scene_data import SceneData
+from physhandi.data.exporters.table import flat, safe_cell, write_csv, write_trajectories
 from physhandi.data.run import Run
 from physhandi.errors import RunError, UsageError
 
@@ -140,6 +141,26 @@ def test_csv_rows_bring_every_number_back(tmp_path: Path) -> None:
         position.reshape(FRAMES, NODES, 3), run.array("sequences/lift/rollout.npy")
     )
     assert (rows[-1]["frame"], rows[-1]["time_s"], rows[-1]["index"]) == ("2", "0.066667", "4")
+
+
+def test_csv_of_a_run_without_an_object_holds_the_hands_joints(tmp_path: Path) -> None:
+    joint = np.arange(2 * 21 * 3, dtype=np.float32).reshape(2, 21, 3)
+    nothing = np.zeros((2, 0, 3), np.float32)
+    scene = SceneData(
+        sequence="wave",
+        frame_rate=30.0,
+        length_unit="board square",
+        rollout=nothing,
+        control=nothing,
+        spring_nodes=np.zeros((0, 2), np.int32),
+        object_spring_count=0,
+        hands={},
+        joints={"left": joint},
+    )
+    write_trajectories(tmp_path / "hand.csv", scene)
+    lines = (tmp_path / "hand.csv").read_text().splitlines()
+    assert len(lines) == 1 + 2 * 21
+    assert lines[22] == "wave,1,0.033333,hand_left,0,63.0,64.0,65.0"
 
 
 def test_csv_folder_holds_parameters_and_metrics(tmp_path: Path) -> None:
