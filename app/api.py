@@ -275,7 +275,7 @@ def _add_streams(
         item = await asyncio.to_thread(catalog.run_item, run_id)
         watch = Watch(
             item.folder,
-            lambda: follow_run(item, scheduler),
+            lambda: follow_run(catalog.run_item(run_id), scheduler),  # Its name may change.
             last_event_id or since,
             lambda: {"machine": machine.load(), "run": machine.of_run(item.folder)},
         )

@@ -1,6 +1,7 @@
 """The page of a run, live: a worker that does what the test says, watched in a real browser."""
 
 import json
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -231,3 +232,25 @@ def frame_errors(step: float) -> dict:
     return json.loads(
         json.dumps({"unit": "m", "frames": list(range(10)), "rollout": curves, "static": twice})
     )
+
+
+def test_name_tags_and_note_are_changed_in_place(world, open_run):
+    run_id = world.launch("script")
+    world.until(run_id, "running")
+    page = open_run(run_id)
+    page.get_by_role("button", name="Edit").click()
+    page.locator("#about [name=name]").fill("Wider <i>δ</i>")
+    page.locator("#about [name=tags]").fill("paper, wide")
+    note = page.locator("#about [name=note]")
+    note.fill("First line\n<b>second</b>")
+    world.tell(run_id, *reports("hand_reconstruction", range(1, 3), lambda i: 100.0 / i))
+    world.tell(run_id, ["finish", "hand_reconstruction", {"before": 100.0, "after": 50.0}])
+    expect(page.locator("[data-stage=hand_reconstruction] .mark")).to_have_text("done")
+    expect(note).to_have_value("First line\n<b>second</b>")
+    note.press("Control+Enter")
+    expect(page.locator("[data-note]")).to_have_text("First line\n<b>second</b>")
+    expect(page.locator("#about")).to_be_hidden()
+    expect(page.locator("h1")).to_contain_text("Wider <i>δ</i>")
+    assert page.locator(".tags a").all_inner_texts() == ["paper", "wide"]
+    expect(page).to_have_title(re.compile("Wider <i>δ</i>"))
+    assert page.evaluate("window.isTheSamePage")
