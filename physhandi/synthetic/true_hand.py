@@ -119,9 +119,13 @@ class TrueHand:
             axes.append(np.stack([flexion, np.cross(along, flexion), along], axis=1))
         return mirror[:, None] * np.stack(axes)
 
-    @cached_property
+    @property
     def capsules(self) -> tuple[Capsule, ...]:
         """Solids that cover the hand: one for each finger bone, five for the palm."""
+        return self._capsules
+
+    @cached_property
+    def _capsules(self) -> tuple[Capsule, ...]:
         joints = self.rest_keypoint
         lines = [(bone, _KEYPOINT_OF_BONE[bone]) for bone in range(1, BONE_COUNT)]
         capsules = [self._finger_capsule(bone, joints[k], joints[k + 1]) for bone, k in lines]

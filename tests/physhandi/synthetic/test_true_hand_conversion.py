@@ -17,10 +17,10 @@ SHAPES = [
 
 def keypoints() -> np.ndarray:
     """Right hand in MakeHuman's frame [dm]: fingers along -x, the thumb's side +z, the back +y."""
-    point = [[-4.0, 10.0, 0.0]]
-    for finger in range(5):
-        for joint in range(4):
-            point.append([-4.5 - 0.3 * joint, 10.0, 0.4 - 0.2 * finger])
+    fingers = [
+        [-4.5 - 0.3 * joint, 10.0, 0.4 - 0.2 * finger] for finger in range(5) for joint in range(4)
+    ]
+    point = [[-4.0, 10.0, 0.0], *fingers]
     point[9] = [-4.9, 10.0, 0.0]  # the middle finger's knuckle is straight ahead
     return np.array(point)
 
