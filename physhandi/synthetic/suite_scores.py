@@ -3,15 +3,18 @@
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
+from physhandi.data.atomic import named_fields
 from physhandi.data.sequence import Sequence
 from physhandi.data.truth import read_truth
 from physhandi.metrics.report import METRICS
 from physhandi.metrics.suite_tables import Score
 from physhandi.synthetic.cells import Outcome
 
+DENSE_ACTIONS = ("squeeze", "wipe")
+"""Actions of made recordings in which the whole hand is on the body; others use fingertips."""
 DENSE = 0.05
-"""Contact is dense if a hand touches more than this share of the object's places on average, in
-the frames in which it touches any."""
+"""Of other recordings contact is dense if a hand touches more than this share of the object's
+places on average, in the frames in which it touches any."""
 BREAKDOWN = ("/dense", "/point")
 """Ends of the splits that repeat the figures of others for one kind of contact."""
 _HANDS = {"chamfer_symmetric": "hand_chamfer", "mpjpe": "mpjpe", "surface_error": "hand_surface"}
@@ -20,7 +23,10 @@ _TOPOLOGY = ("rrd_object", "rrd_virtual")
 
 
 def contact_kind(recording: Sequence) -> Literal["dense", "point"] | None:
-    """Tell by its true contact whether much or little of the object is held; None if unknown."""
+    """Tell by its action, else by its true contact, how much is held; None if unknown."""
+    made = named_fields(recording.provenance.get("synthesize")) or {}
+    if made.get("action") is not None:
+        return "dense" if made["action"] in DENSE_ACTIONS else "point"
     contact = read_truth(recording.folder).contact
     if contact is None or not contact.any():
         return None

@@ -220,6 +220,15 @@ def test_starts_and_disturbances_have_splits_of_their_own(
     assert len({cell["run"] for cell in starts}) == 7
 
 
+@pytest.mark.parametrize(("action", "kind"), [("squeeze", "dense"), ("lift", "point")])
+def test_a_made_recording_tells_its_kind_of_contact_by_its_action(
+    recordings: tuple[Sequence, ...], action: str, kind: str
+) -> None:
+    made = {"synthesize": {"object": "sheet", "action": action}}
+    low = recordings[0]
+    assert contact_kind(Sequence(low.folder, replace(low.meta, provenance=made))) == kind
+
+
 def test_contact_is_dense_where_much_is_held(recordings: tuple[Sequence, ...]) -> None:
     assert contact_kind(recordings[0]) == "dense"  # 2 of 25 nodes
     path = recordings[0].folder / "truth/contact.npy"
