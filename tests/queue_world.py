@@ -29,6 +29,7 @@ class Scene:
     kind: str
     target: str
     title: str
+    offers: tuple[str, ...] = ("object", "colors", "figure")
 
     @property
     def info(self) -> "Scene":

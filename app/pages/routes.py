@@ -50,11 +50,20 @@ class ShownScene(Protocol):
         ...
 
 
+class LiveScene(ShownScene, Protocol):
+    """What a page says about a live scene that is open."""
+
+    @property
+    def offers(self) -> tuple[str, ...]:
+        """What it has: ``object``, ``colors``, ``figure``."""
+        ...
+
+
 class Scene(Protocol):
     """A live scene of the viewer."""
 
     @property
-    def info(self) -> ShownScene:
+    def info(self) -> LiveScene:
         """What is to be said about it."""
         ...
 
