@@ -28,6 +28,7 @@ from physhandi.errors import (
     PhysHandiError,
     SimulationDivergedError,
     SimulationError,
+    UsageError,
 )
 from physhandi.metrics.photometric import photometric_curves
 from physhandi.metrics.report import measure_run
@@ -44,8 +45,9 @@ from physhandi.synthetic.baselines import (
 from physhandi.synthetic.hand_noise import HAND_NOISE
 from physhandi.synthetic.variants import DISTURBED_HAND, make_variant
 
-FAILURES = (FitError, MissingInputError, SimulationDivergedError, SimulationError)
-"""What a method may fail with; its output then counts as missing. Anything else stops the suite."""
+FAILURES = (FitError, MissingInputError, SimulationDivergedError, SimulationError, UsageError)
+"""What a method may fail with; its output then counts as missing. Anything else stops the suite.
+A fitted radius that reaches nothing in another sequence is told as a wrong use."""
 _FITTING = (
     *("pipeline.py", "data", "hand", "perception", "simulation", "fitting"),
     *("synthetic/baselines.py", "synthetic/variants.py"),

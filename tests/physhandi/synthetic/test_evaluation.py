@@ -190,6 +190,23 @@ def test_a_method_without_output_scores_as_static_and_is_told(
     assert "connection_radius" in report.partition("## Missing output")[2]
 
 
+def test_an_object_that_no_hand_reaches_elsewhere_stays_where_it_is(
+    tmp_path: Path, recordings: tuple[Sequence, ...]
+) -> None:
+    low = recordings[0]
+    far = write_told(tmp_path / "far", 0.15)
+    control = np.load(far.folder / "control.npy")
+    np.save(far.folder / "control.npy", control + np.float32([0.0, 0.0, 0.3]))
+    far = Sequence.load(far.folder)
+    order = order_of((low, far), methods=("static", "quick"), protocols=("unseen",))
+    for _ in range(2):  # What was fitted in `far` is lost as well.
+        assert evaluate(order, tmp_path / "out")["failed"] == 2
+    cells = json.loads((tmp_path / "out" / "cells.json").read_text())["cells"]
+    still, lost = [cell for cell in cells if cell["case"] == "far"]
+    assert "No virtual spring forms in sequence 'far'" in lost["error"]
+    assert lost["figures"]["unseen"] == still["figures"]["unseen"]
+
+
 def test_what_a_recording_cannot_give_is_not_asked_for(
     tmp_path: Path, recordings: tuple[Sequence, ...]
 ) -> None:
