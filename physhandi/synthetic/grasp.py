@@ -30,6 +30,8 @@ _REACH_RANGE = 0.5
 _STRAY_TURN, _STRAY_POSITION, _STRAY_JOINT = 0.5, 0.5, 0.6
 _TIP_SCALE = 0.001
 _SLANT = 0.15
+# Thickness of the hand below its wrist [m].
+_HEEL = 0.017
 _TIP_ERROR = 0.006
 
 RELAXED = np.array([0.0, 0.0, 0.0, 0.15, 0.2] + [0.45, 0.0, 0.5] * 4)
@@ -88,6 +90,7 @@ def reach(
     joints: Float[ndarray, " 17"],
     start: HandPose | None = None,
     along: Float[ndarray, " 3"] | None = None,
+    floor: float = -np.inf,
 ) -> HandPose:
     """Bend and place a hand so that the middles of its fingertips are in given places.
 
@@ -100,6 +103,7 @@ def reach(
         joints: How the fingers should be bent if the targets let them (see `bend_of`).
         start: A pose to stay near, as while fingers close; the wrist then hardly moves.
         along: Direction in which the last bones of thumb, index and middle finger should point.
+        floor: Height under which the heel of the hand should not be [m].
 
     Raises:
         SequenceError: Thumb, index or middle finger stays more than 6 mm away from its target.
@@ -130,17 +134,23 @@ def reach(
     wanted = np.array(list(targets.values()))
     pads = np.array([finger <= MIDDLE for finger in tips])
 
-    def residuals(value: ndarray) -> tuple[ndarray, ndarray]:
-        transform = hand.bone_transforms(pose_of(value))[bones]
+    heel = hand.rest_keypoint[:2]
+
+    def residuals(value: ndarray) -> tuple[ndarray, ndarray, ndarray]:
+        transform = hand.bone_transforms(pose_of(value))
+        height = heel @ transform[0, 2, :3] + transform[0, 2, 3]
+        low = np.maximum(floor + _HEEL - height, 0.0)
+        transform = transform[bones]
         misses = (transform[:, :3, :3] @ ends)[..., 0] + transform[:, :3, 3] - wanted
         if along is None:
-            return misses, np.zeros((0, 3))
-        return misses, (transform[pads, :3, :3] @ lines[pads])[..., 0] - along
+            return misses, low, np.zeros((0, 3))
+        return misses, low, (transform[pads, :3, :3] @ lines[pads])[..., 0] - along
 
     def cost(value: ndarray) -> ndarray:
-        misses, slants = residuals(value)
+        misses, low, slants = residuals(value)
         stray = (value - guess) / scale
-        return np.concatenate([misses.ravel() / _TIP_SCALE, slants.ravel() / _SLANT, stray])
+        off = np.concatenate([misses.ravel(), low]) / _TIP_SCALE
+        return np.concatenate([off, slants.ravel() / _SLANT, stray])
 
     first = np.clip(guess, low, high)
     found = least_squares(cost, first, bounds=(low, high), ftol=1e-4, xtol=1e-4, max_nfev=60)

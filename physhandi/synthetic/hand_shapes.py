@@ -65,6 +65,7 @@ def claw(hand: TrueHand, place: Place, gap: float, start: HandPose | None) -> Ha
         joints=RELAXED,
         start=start,
         along=0.3 * place.forward - 0.95 * _UP,
+        floor=0.0,
     )
 
 
