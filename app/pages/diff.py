@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
 from app.pages.metrics import about_quantity, figure, is_count, is_higher_better, scaled, unit_of
@@ -28,6 +28,8 @@ class Cell:
     """Whether no other run is better."""
     change: str = ""
     """How much it differs from the first run."""
+    moment: str = ""
+    """If the text is a time, what browsers show in their own time zone; ISO 8601."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,7 @@ def compare_runs(
     parameters = [result.get("parameters", {}) for result in results]
     surroundings = [_surroundings_of(result.get("environment", {})) for result in results]
     sections = [
-        Section("The runs", _plain_rows([_facts_of(run) for run in described])),
+        Section("The runs", _fact_rows(described)),
         *_score_sections([_scores_of(result.get("metrics", {})) for result in results]),
         Section("Loss at the end of each stage", _plain_rows([_losses_of(r) for r in results])),
         Section("Parameters that the simulation ended with", _parameter_rows(parameters)),
@@ -106,6 +108,16 @@ def _facts_of(run: Mapping[str, Any]) -> dict[str, Any]:
         "took": duration(run["duration_s"]),
     }
     return {name: fact for name, fact in facts.items() if fact}
+
+
+def _fact_rows(described: Sequence[Mapping[str, Any]]) -> list[Row]:
+    moments = [run["created"] for run in described]
+    return [
+        replace(row, cells=[replace(c, moment=m) for c, m in zip(row.cells, moments, strict=True)])
+        if row.name == "created"
+        else row
+        for row in _plain_rows([_facts_of(run) for run in described])
+    ]
 
 
 def _plain_rows(columns: Sequence[Mapping[str, Any]]) -> list[Row]:

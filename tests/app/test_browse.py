@@ -167,6 +167,8 @@ def test_two_runs_are_compared_by_their_address(world: World) -> None:
     same = '<th scope="row">kind</th>'
     assert same not in page
     assert same in client.get(f"{address}&show=all").text
+    created = client.get("/api/v1/runs/fitted").json()["created"]
+    assert f'<time datetime="{created}">' in page
     assert 'href="/compare?a=fitted&amp;b=towel_fold_quick"' in page
     for run, status in (("", 422), ("&run=fitted", 422), ("&run=gone", 404), ("&run=..", 422)):
         assert client.get(f"/diff?run=fitted{run}").status_code == status
