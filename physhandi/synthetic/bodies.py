@@ -119,7 +119,7 @@ def _extent(node: Float[ndarray, "node 3"]) -> tuple[float, float, float]:
 
 def _make_cloth(random: Generator, columns: int) -> Body:
     """A thin square cloth."""
-    side = random.uniform(0.34, 0.42)
+    side = random.uniform(0.25, 0.30)
     radius = 0.0025
     sheet = make_sheet(side, side, side / columns, random, height=radius)
     return Body(

@@ -105,7 +105,7 @@ SUITES: dict[str, Suite] = {
                 *ORACLES,
             ),
             protocols=("main", "unseen"),
-            settings={"node_spacing": 0.012},
+            settings={"node_spacing": 0.01},
             recording={"preset": "default", "images": "none", "frames": 60},
         ),
         Suite(

@@ -112,7 +112,10 @@ def test_a_lift_grips_the_object_and_raises_it_by_a_hand(name: str):
 def test_a_fold_goes_up_and_over_the_middle():
     (one,) = script("cloth", "fold")
     ways = np.array([grip(one, time) for time in np.linspace(0, 3, 13)])
-    assert ways[:, 2].max() > max(ways[0, 2], ways[-1, 2]) + 0.04
+    begin, top, end = ways[0, 2], ways[:, 2].max(), ways[-1, 2]
+    assert top > begin + 0.05
+    # It goes round by 2.45 to 2.8 rad, whose sines are 0.64 and 0.33.
+    assert 0.3 < (top - end) / (top - begin) < 0.7
     assert ways[0, :2] @ ways[-1, :2] < 0.2 * np.linalg.norm(ways[0, :2]) ** 2
 
 

@@ -31,7 +31,7 @@ def test_a_body_lies_on_the_ground_about_the_origin(name, resolution):
     assert low < body.node_count <= high
     assert set(np.unique(body.elements)) == set(range(body.node_count))
     assert len(body.element_stiffness) == len(body.elements)
-    assert 0.02 < body.mass < 0.5
+    assert 0.009 < body.mass < 0.5
 
 
 @pytest.mark.parametrize("name", NAMES)
