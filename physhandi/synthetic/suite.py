@@ -93,7 +93,8 @@ SUITES: dict[str, Suite] = {
         ),
         Suite(
             name="dev",
-            about="Six sequences without images: for daily work on methods.",
+            about="Six sequences without images and 80 first-order steps a fit, so that all methods "
+            "take 25 minutes on a fast GPU: for daily work on methods.",
             scenes=_scenes(
                 "cloth lift", "cloth fold", "rope lift", "rope push", "plush squeeze", "pouch lift"
             ),
@@ -101,11 +102,11 @@ SUITES: dict[str, Suite] = {
             methods=(
                 *BASELINES,
                 "phystwin+last_residual",
-                *("paper", "quick", "ours", "ours+last_residual"),
+                *("quick", "ours", "ours+last_residual"),
                 *ORACLES,
             ),
             protocols=("main", "unseen"),
-            settings={"node_spacing": 0.01},
+            settings={"node_spacing": 0.01, "object_.first_order.iterations": 80},
             recording={"preset": "default", "images": "none", "frames": 60},
         ),
         Suite(
