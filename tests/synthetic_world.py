@@ -38,8 +38,11 @@ def lifted_sheet(frame_count: int, sides: tuple[str, ...] = ("right",)) -> Physi
     share = np.clip((body.node[:, 0] + 0.1) / 0.2, 0, 1)
     position[:, :, 2] += rise[:, None] * share
     hands = {
-        side: tuple(hand_pose(0.10 if side == "right" else -0.10, height) for height in rise)
-        for side in sides
+        side: np.stack([load_true_hand(side).bone_transforms(pose) for pose in poses])
+        for side, poses in (
+            (side, [hand_pose(0.10 if side == "right" else -0.10, height) for height in rise])
+            for side in sides
+        )
     }
     return PhysicalTruth(
         body=body,

@@ -123,7 +123,7 @@ def make_stage(
         bare = hands[side]
         tissue = level.hand_mismatch * soft_tissue_offset(bare, seed)
         hand = replace(bare, rest_vertex=bare.rest_vertex + tissue)
-        posed = [hand.pose(pose) for pose in truth.hands[side]]
+        posed = [hand.carry(transform) for transform in truth.hands[side]]
         random = np.random.default_rng([seed, 20, MASK_VALUE[side]])
         filmed.append(
             FilmedHand(

@@ -56,7 +56,8 @@ def synthesize(
     """Simulate hands that handle a soft body, film it, and write the sequence with its truth.
 
     The same arguments give the same sequence. Body, motion, cameras and errors are drawn apart
-    from each other: the physics of a seed does not depend on preset or cameras.
+    from each other: the physics of a seed does not depend on preset or cameras. A seed makes the
+    same body for every action; motion, hand, cameras and errors differ by object and action.
 
     Args:
         object_: What is handled: cloth, towel, rope, plush or pouch.
@@ -97,9 +98,12 @@ def synthesize(
             truth = simulate_truth(
                 body, scripts, capsules, frame_count=frames, hold=hold, progress=progress
             )
-        stage = make_stage(truth, hands, level, seed)
-        views = make_viewpoints(stage.extent(), cameras, level, seed)
-        record(writer, stage, views, level, seed=seed, images=images, progress=progress)
+        # Or all sequences of a seed would share the errors of one calibration.
+        place = [seed, 2, get_args(BodyName).index(name), ACTIONS.index(action)]
+        own = int(np.random.default_rng(place).integers(2**32))
+        stage = make_stage(truth, hands, level, own)
+        views = make_viewpoints(stage.extent(), cameras, level, own)
+        record(writer, stage, views, level, seed=own, images=images, progress=progress)
         settings = {
             "object": object_,
             "action": action,

@@ -159,7 +159,15 @@ class TrueHand:
 
     def pose(self, pose: HandPose) -> PosedHand:
         """Put surface and keypoints where a pose has them."""
-        transform = self.bone_transforms(pose)
+        return self.carry(self.bone_transforms(pose))
+
+    def carry(self, transform: Float[ndarray, "bone 4 4"]) -> PosedHand:
+        """Put surface and keypoints where the bones take them.
+
+        Args:
+            transform: Takes points of the resting hand with each bone into the world; bones need
+                not meet where they hang together.
+        """
         blended = np.tensordot(self.weight, transform[:, :3], axes=1)
         vertex = np.einsum("vij,vj->vi", blended[:, :, :3], self.rest_vertex) + blended[:, :, 3]
         bone = transform[list(_BONE_OF_KEYPOINT), :3]

@@ -73,20 +73,22 @@ def simulate_truth(
     world = _World(body, scripts, used, parameters)
     position = np.empty((frame_count, body.node_count, 3), dtype=np.float32)
     contact = np.empty((frame_count, body.node_count), dtype=bool)
+    moved: dict[Side, list[ndarray]] = {side: [] for side in used}
     for frame, touched in enumerate(world.frames(frame_count)):
         progress.check_cancelled()
         if hold == "attachment":
             world.attach_what_was_touched()
         position[frame] = world.node
         contact[frame] = touched | world.is_attached
+        for side, transform in world.bone_transforms(frame / FRAME_RATE).items():
+            moved[side].append(transform)
         progress.report("simulate", frame + 1, frame_count, message=body.name)
-    times = np.arange(frame_count) / FRAME_RATE
     return PhysicalTruth(
         body=body,
         position=position,
         contact=contact,
         hold=hold,
-        hands={script.side: tuple(script.at(float(t)) for t in times) for script in scripts},
+        hands={side: np.stack(transforms) for side, transforms in moved.items()},
     )
 
 
@@ -138,6 +140,23 @@ class _World:
             touched = self._advance(frame)
             if frame + 1 >= 0:
                 yield touched
+
+    def bone_transforms(self, time: float) -> dict[Side, Float[ndarray, "bone 4 4"]]:
+        """Tell where each bone takes the points of the resting hand now.
+
+        Args:
+            time: Now [s]; bones without capsules are where the script has them at this time.
+        """
+        found = {
+            script.side: np.array(self._hands[script.side].bone_transforms(script.at(time)))
+            for script in self._scripts
+        }
+        for bone, number in zip(self._bones, self._bone_body, strict=True):
+            turn = self._data.xmat[number].reshape(3, 3)
+            transform = found[bone.side][bone.index]
+            transform[:3, :3] = turn
+            transform[:3, 3] = self._data.xpos[number] - turn @ bone.center
+        return found
 
     def attach_what_was_touched(self) -> None:
         """Tie nodes of the surface that a bone has touched for some frames to it."""

@@ -60,8 +60,9 @@ class PhysicalTruth:
     """Whether a hand touches or holds the node."""
     hold: Hold
     """How the hands hold."""
-    hands: Mapping[Side, tuple[HandPose, ...]]
-    """Pose of each hand in each frame."""
+    hands: Mapping[Side, Float[ndarray, "frame bone 4 4"]]
+    """Where each bone takes the points of the resting hand in each frame. Bones give way to what
+    they touch, so this is not quite what the script asked for."""
     frame_rate: float = FRAME_RATE
     """Frames per second [Hz]."""
 

@@ -61,6 +61,16 @@ def test_the_same_call_makes_the_same_sequence(rope, tmp_path):
     assert again.fingerprint() == rope.fingerprint()
 
 
+def test_actions_share_a_seed_s_body_but_not_its_cameras(rope, tmp_path):
+    out = tmp_path / "lift"
+    lift = synthesize("rope", "lift", out=out, seed=4, frames=2, images="none", resolution="tiny")
+    assert lift.description.split("rope of")[1] == rope.description.split("rope of")[1]
+    turn = (
+        lift.views[0].camera.T_world_camera[:3, :3].T @ rope.views[0].camera.T_world_camera[:3, :3]
+    )
+    assert np.trace(turn) < 2.99  # 6 degrees
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -137,12 +137,22 @@ def test_what_was_touched_for_a_while_sticks_if_it_shall():
     assert all(truth.contact[b:, node].all() for node, b in enumerate(begin))
 
 
-def test_the_hands_of_the_script_come_along(held):
-    script = grasp()[1]
+def test_hands_are_told_where_they_gave_way_to_what_they_hold(held):
+    gripper, script = grasp()
     assert list(held.hands) == ["right"]
-    assert len(held.hands["right"]) == held.frame_count == 34
-    np.testing.assert_array_equal(held.hands["right"][20].position, script.at(20 / 30).position)
-    assert held.hands["right"][33].position[2] > 0.09
+    assert held.hands["right"].shape == (34, 2, 4, 4)
+    asked = gripper.bone_transforms(script.at(20 / 30))
+    given = held.hands["right"][20]
+    left, right = held.position[20, :4, 0].mean(), held.position[20, 4:, 0].mean()
+    radius = held.body.radius
+    # The script closes the jaws to 5 mm within the block; they stay outside of it.
+    assert asked[0, 0, 3] - gripper.gap / 2 > left - radius + 0.003
+    assert given[0, 0, 3] - gripper.gap / 2 == pytest.approx(left - radius, abs=7e-4)
+    assert given[1, 0, 3] + gripper.gap / 2 == pytest.approx(right + radius, abs=7e-4)
+    # Up and down nothing holds them back.
+    np.testing.assert_allclose(given[:, 2, 3], asked[:, 2, 3], atol=2e-3)
+    np.testing.assert_allclose(np.linalg.det(given[:, :3, :3]), 1.0, atol=1e-9)
+    assert held.hands["right"][33, :, 2, 3].min() > 0.09
 
 
 def test_the_same_input_gives_the_same_bits():
