@@ -147,7 +147,7 @@ class _World:
         Args:
             time: Now [s]; bones without capsules are where the script has them at this time.
         """
-        found = {
+        found: dict[Side, ndarray] = {
             script.side: np.array(self._hands[script.side].bone_transforms(script.at(time)))
             for script in self._scripts
         }
