@@ -4,12 +4,14 @@ Difficulty is set here and in the scenes, once, before any method is tuned. Seed
 `RESERVED_SEED` on are kept for verification; nothing may be tuned on them.
 """
 
+import inspect
 from collections.abc import Mapping
 from collections.abc import Sequence as Many
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from physhandi.data.atomic import named_fields
 from physhandi.data.sequence import Sequence
 from physhandi.errors import UsageError
 from physhandi.progress import Progress
@@ -93,8 +95,8 @@ SUITES: dict[str, Suite] = {
         ),
         Suite(
             name="dev",
-            about="Six sequences without images and 80 first-order steps a fit, so that all methods "
-            "take 25 minutes on a fast GPU: for daily work on methods.",
+            about="Six sequences without images, and 80 first-order steps in every fit so that all "
+            "methods take 25 minutes on a fast GPU: for daily work on methods.",
             scenes=_scenes(
                 "cloth lift", "cloth fold", "rope lift", "rope push", "plush squeeze", "pouch lift"
             ),
@@ -171,25 +173,58 @@ def make_recordings(
         progress: Told about every frame.
 
     Raises:
-        UsageError: If a seed makes no sense.
+        UsageError: If a seed makes no sense, or a sequence that is there was made otherwise; then
+            nothing is made.
         SequenceError: If a sequence that is there is damaged; delete its folder to make it anew.
     """
     from physhandi.synthetic.synthesize import synthesize
 
     check_seeds(seeds)
-    found: list[Sequence] = []
-    for scene in suite.scenes:
-        for seed in seeds:
-            target = folder / scene.name(seed)
-            if not target.is_dir():
-                synthesize(
-                    scene.object_,
-                    scene.action,
-                    seed=seed,
-                    hold=scene.hold,
-                    out=target,
-                    progress=progress,
-                    **suite.recording,
-                )
-            found.append(Sequence.load(target))
-    return tuple(found)
+    orders = {
+        folder / scene.name(seed): _order(suite, scene, seed)
+        for scene in suite.scenes
+        for seed in seeds
+    }
+    found = {target: Sequence.load(target) for target in orders if target.is_dir()}
+    for target, recording in found.items():
+        _check_made(suite, recording, orders[target])
+    for target, order in orders.items():
+        if target not in found:
+            found[target] = synthesize(
+                order["object"],
+                **{name: value for name, value in order.items() if name != "object"},
+                out=target,
+                progress=progress,
+            )
+    return tuple(found[target] for target in orders)
+
+
+def _order(suite: Suite, scene: Scene, seed: int) -> dict[str, Any]:
+    scripted = {"object": scene.object_, "action": scene.action, "seed": seed, "hold": scene.hold}
+    return scripted | dict(suite.recording)
+
+
+def _check_made(suite: Suite, recording: Sequence, order: Mapping[str, Any]) -> None:
+    """Refuse a sequence that is not the one that would be made.
+
+    Raises:
+        UsageError: If it was made with other settings, or by something else.
+    """
+    from physhandi.synthetic.synthesize import synthesize
+
+    known = inspect.signature(synthesize).parameters.values()
+    wanted = {p.name: p.default for p in known if p.default is not inspect.Parameter.empty}
+    wanted |= {"changes": {}} | dict(order)
+    made = named_fields(recording.provenance.get("synthesize"))
+    if made is None or not {"object", "action", "seed"} <= made.keys():
+        differs = "was not made by `physhandi synthesize`"
+    else:
+        # Settings that did not exist yet when it was made belong to another generator.
+        others = [n for n in wanted if n in made and made[n] != wanted[n]]
+        listed = ", ".join(f"{name} {made[name]} in place of {wanted[name]}" for name in others)
+        differs = f"was made with {listed}" if others else ""
+    if differs:
+        raise UsageError(
+            f"{recording.folder} {differs}, so it is no sequence of the suite '{suite.name}'. "
+            "Choose another --out, or delete that folder to have it made anew."
+        )

@@ -22,6 +22,7 @@ from physhandi.synthetic.bodies import BodyName, Resolution, make_body
 from physhandi.synthetic.cameras import MOST, make_viewpoints
 from physhandi.synthetic.engines.mujoco_flex import simulate_truth
 from physhandi.synthetic.engines.truth import FRAME_RATE, CapsuleHand, Hold, PhysicalTruth
+from physhandi.synthetic.generator_version import generator_version
 from physhandi.synthetic.presets import changed, find_preset
 from physhandi.synthetic.recording import Images, record
 from physhandi.synthetic.stage import SIDES, make_stage
@@ -129,6 +130,7 @@ def synthesize(
             provenance={
                 "origin": "simulated by MuJoCo",
                 "mujoco": version("mujoco"),
+                "generator": generator_version(),
                 "license": "CC0-1.0",
                 "synthesize": settings,
                 "degradations": asdict(level),
