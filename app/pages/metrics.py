@@ -17,6 +17,9 @@ _LENGTHS = {"chamfer", "error", "mpjpe", "mpvpe", "distance", "spacing", "resolu
 _COUNTS = {"frames", "count", "scored", "seed", "keypoints"}
 _ABOUT = (
     ("chamfer_dynamic", "Only over observed points that move more than 10 mm from frame 0."),
+    ("chamfer_truth_to_nodes", "From each point of the true surface to the nearest node."),
+    ("chamfer_nodes_to_truth", "From each node of the surface to the true surface."),
+    ("chamfer_truth", "Mean of both ways between the object and the true surface."),
     ("chamfer_symmetric", "Mean of both ways between observed points and the object or hand."),
     ("chamfer_phystwin", "From observed points to the nearest node, as PhysTwin evaluates it."),
     ("chamfer_l1", "From each observed point to its nearest node, in the L1 norm."),

@@ -16,6 +16,7 @@ from physhandi.metrics.geometry import (
     track_error_phystwin,
 )
 from physhandi.metrics.report_inputs import Reference
+from physhandi.metrics.truth_metrics import truth_curves
 
 CURVES = (
     "chamfer_phystwin",
@@ -25,6 +26,9 @@ CURVES = (
     "chamfer_dynamic_l1",
     "chamfer_dynamic_l2",
     "chamfer_dynamic_symmetric",
+    "chamfer_truth",
+    "chamfer_truth_to_nodes",
+    "chamfer_nodes_to_truth",
     "track_error_phystwin",
     "track_error",
     "marker_error",
@@ -39,7 +43,7 @@ def error_curves(nodes: Float[ndarray, "frame node 3"], reference: Reference) ->
 
     Args:
         nodes: Simulated nodes, finite in every frame [m].
-        reference: What was observed.
+        reference: What was observed, and the true surface if it is known.
     """
     surface = nodes[:, : reference.surface_count]
     curves = _shape_curves(surface, reference) | _track_curves(nodes, reference)
@@ -47,6 +51,8 @@ def error_curves(nodes: Float[ndarray, "frame node 3"], reference: Reference) ->
         point = reference.point[: len(nodes)].astype(np.float64)
         if point.shape[1]:
             curves |= _dynamic_curves(surface, point, reference.is_visible[: len(nodes)])
+    if reference.true_surface is not None:
+        curves |= truth_curves(surface, reference.true_surface)
     if reference.marker is not None and reference.marker_node is not None:
         marker = reference.marker[: len(nodes)].astype(np.float64)
         free = [m for m in range(marker.shape[1]) if m not in reference.controlled_markers]

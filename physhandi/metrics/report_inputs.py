@@ -22,6 +22,7 @@ from physhandi.metrics.contact import (
 )
 from physhandi.metrics.hand_shape import held_where_missing
 from physhandi.metrics.topology import radius_deviation, resolution
+from physhandi.metrics.truth_metrics import TrueSurface, true_surface
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -49,6 +50,8 @@ class Reference:
     """Node that each marker observes."""
     controlled_markers: tuple[int, ...] = ()
     """Markers that are not scored because they move with the controls."""
+    true_surface: TrueSurface | None = None
+    """Where the object really was."""
     contact: ContactReference | None = None
     """What contacts are judged by."""
 
@@ -65,6 +68,7 @@ def read_reference(
 
     Raises:
         RunError: If a file of the run is damaged.
+        SequenceError: If the sequence tells a true surface that cannot be one.
     """
     point = read(folder / "observation" / "point.npy")
     is_visible = read(folder / "observation" / "is_visible.npy")
@@ -89,6 +93,7 @@ def read_reference(
         marker=sequence.marker,
         marker_node=sequence.marker_node,
         controlled_markers=sequence.controlled_markers,
+        true_surface=true_surface(read_truth(sequence.folder)),
         contact=_contact(folder, sequence, node, point, is_visible),
     )
 

@@ -20,6 +20,7 @@ _PAPER = (
 _PROPER = (
     ("chamfer_dynamic_symmetric", "CD_dyn sym. [mm]", _MM, 2),
     ("chamfer_symmetric", "CD sym. [mm]", _MM, 2),
+    ("chamfer_truth", "CD to truth [mm]", _MM, 2),
     ("track_error", "Track [mm]", _MM, 2),
     ("marker_error", "Markers [mm]", _MM, 2),
 )

@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
+from physhandi.data.truth import Truth
 from physhandi.metrics.contact import THRESHOLDS, ContactLabels, ContactReference
 from physhandi.metrics.report import CONTACT_METRICS, METRICS, score_rollout
 from physhandi.metrics.report_curves import CURVES, error_curves
 from physhandi.metrics.report_inputs import Reference
+from physhandi.metrics.truth_metrics import true_surface
 
 NODE = np.array([[0.0, 0, 0], [1.0, 0, 0]])
 FRAMES = 4
@@ -31,8 +33,17 @@ def touched() -> ContactReference:
 
 
 def make_reference() -> Reference:
-    """The true motion rises by 0.1 a frame; its nodes are tracked."""
+    """The true motion rises by 0.1 a frame; its nodes are tracked, and its surface is known."""
     truth = rising(0.1)
+    speck = np.array([[0.0, 0, 0], [1e-10, 0, 0], [0, 1e-10, 0]])
+    surface = true_surface(
+        Truth(
+            hand_keypoint={},
+            hand_vertex={},
+            object_point=(truth[:, :, None] + speck).reshape(FRAMES, 6, 3),
+            object_face=np.arange(6).reshape(2, 3),
+        )
+    )
     return Reference(
         object_node=NODE,
         point=truth,
@@ -40,6 +51,7 @@ def make_reference() -> Reference:
         marker=truth,
         marker_node=np.array([0, 1]),
         controlled_markers=(0,),
+        true_surface=surface,
     )
 
 

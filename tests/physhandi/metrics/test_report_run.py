@@ -72,6 +72,26 @@ def test_a_run_is_scored_from_its_files(tmp_path: Path, folder: Path) -> None:
         score_run(tmp_path / "out", sequence)
 
 
+def test_the_true_surface_is_read_and_scored_in_its_own_frames(
+    tmp_path: Path, folder: Path
+) -> None:
+    # Specks of surface at both nodes rise by 0.1 a frame, observations do not rise at all.
+    speck = np.array([[0.0, 0, 0], [1e-5, 0, 0], [0, 1e-5, 0]])
+    np.save(folder / "observation/point.npy", rising(0.0))
+    sequence = make_sequence(
+        tmp_path,
+        object_point=(rising(0.1)[:, :, None] + speck).reshape(FRAMES, 6, 3).astype(np.float32),
+        object_face=np.arange(6).reshape(2, 3),
+    )
+    report, frames = measure_run(tmp_path / "out", sequence)
+    for metric in ("chamfer_truth", "chamfer_truth_to_nodes", "chamfer_nodes_to_truth"):
+        assert frames["rollout"][metric] == pytest.approx([0.0, 0.03, 0.06, 0.09], abs=2e-5)
+        assert report["reconstruction"]["rollout"][metric] == pytest.approx(0.045, abs=2e-5)
+        assert report["future"]["static"][metric] == pytest.approx(0.3, abs=2e-5)
+        assert report["future"]["rigid_follow"][metric] == pytest.approx(0.0, abs=2e-5)
+    assert report["future"]["rollout"]["chamfer_l2"] == pytest.approx(0.21)
+
+
 def test_errors_of_every_frame(tmp_path: Path, folder: Path) -> None:
     sequence = make_sequence(tmp_path)
     errors = frame_errors(tmp_path / "out", sequence)

@@ -1,0 +1,153 @@
+"""Distances between a simulated object and the true surface, which no sensor has blurred.
+
+Everything here is measured in the world of the truth, so that errors of calibration and of the
+clocks, which observations share with a fit, are in it.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+from scipy.spatial import KDTree  # pyright: ignore[reportMissingTypeStubs]  # it has none
+
+from physhandi.data.truth import Truth
+from physhandi.errors import SequenceError
+from physhandi.metrics.geometry import chamfer_one_way
+
+SAMPLE_COUNT = 2000
+"""Points of the true surface that are asked for the nearest node."""
+CANDIDATES = 12
+"""Triangles, those with the nearest centres, that are asked for the point nearest to a node."""
+_SEED = 20260
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TrueSurface:
+    """The true surface of an object in every frame, with points that stick to it."""
+
+    point: Float[ndarray, "frame point 3"]
+    """Corners of its triangles [m]."""
+    face: Int[ndarray, "face 3"]
+    """Triangles."""
+    sample_face: Int[ndarray, " sample"]
+    """Triangle that each sample lies on."""
+    sample_weight: Float[ndarray, "sample 3"]
+    """How much each corner of that triangle counts."""
+
+    def samples(self, frame: int) -> Float[ndarray, "sample 3"]:
+        """Find the samples in a frame [m]."""
+        corner = self.point[frame][self.face[self.sample_face]].astype(np.float64)
+        return np.einsum("sk,skd->sd", self.sample_weight, corner)
+
+
+def true_surface(truth: Truth, count: int = SAMPLE_COUNT) -> TrueSurface | None:
+    """Prepare the true surface; None if the recording tells none or it has no area.
+
+    Samples are spread evenly over the area of frame 0 from a fixed seed, and are the same places of
+    the object in all frames.
+
+    Args:
+        truth: The truth of a recording.
+        count: Number of samples.
+
+    Raises:
+        SequenceError: If a triangle has a corner that is not there.
+    """
+    point, face = truth.object_point, truth.object_face
+    if point is None or face is None or not face.size:
+        return None
+    if face.min() < 0 or face.max() >= point.shape[1]:
+        wrong = int(
+            np.flatnonzero((face < 0).any(axis=1) | (face >= point.shape[1]).any(axis=1))[0]
+        )
+        raise SequenceError(
+            f"truth/object_face.npy: triangle {wrong} joins the points {face[wrong].tolist()}, but "
+            f"truth/object_point.npy has {point.shape[1]}. Repair one of them, or remove both."
+        )
+    a, b, c = (point[0][face[:, corner]].astype(np.float64) for corner in range(3))
+    until = np.cumsum(np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    if until[-1] <= 0.0:
+        return None
+    random = np.random.default_rng(_SEED)
+    # One sample in each of as many strips of equal area: more even than independent draws.
+    place = (np.arange(count) + random.random(count)) / count * until[-1]
+    chosen = np.minimum(np.searchsorted(until, place, side="right"), len(face) - 1)
+    return TrueSurface(
+        point=point,
+        face=face,
+        sample_face=chosen,
+        sample_weight=random.dirichlet(np.ones(3), size=count),
+    )
+
+
+def truth_curves(
+    nodes: Float[ndarray, "frame node 3"], surface: TrueSurface
+) -> dict[str, Float[ndarray, " frame"]]:
+    """Compare the nodes of an object's surface with the true surface of the same frames.
+
+    Args:
+        nodes: Simulated nodes that lie on the surface, finite [m].
+        surface: The true surface, of at least as many frames.
+
+    Returns:
+        For each frame `chamfer_truth_to_nodes`, the mean distance of the samples to the nearest
+        node; `chamfer_nodes_to_truth`, that of the nodes to the nearest point of the surface; and
+        `chamfer_truth`, the mean of both [m].
+    """
+    there = np.array([chamfer_one_way(surface.samples(f), n) for f, n in enumerate(nodes)])
+    back = np.array(
+        [
+            surface_distance(n, surface.point[f][surface.face].astype(np.float64)).mean()
+            for f, n in enumerate(nodes)
+        ]
+    )
+    return {
+        "chamfer_truth": 0.5 * (there + back),
+        "chamfer_truth_to_nodes": there,
+        "chamfer_nodes_to_truth": back,
+    }
+
+
+def surface_distance(
+    point: Float[ndarray, "point 3"], triangle: Float[ndarray, "face 3 3"]
+) -> Float[ndarray, " point"]:
+    """Measure how far each point is from a surface [m].
+
+    Only the `CANDIDATES` triangles with the nearest centres are looked at: that is exact unless a
+    surface has triangles of very different size or shape beside each other; then it is too large
+    by less than a triangle.
+
+    Args:
+        point: Points [m].
+        triangle: Corners of all triangles [m].
+    """
+    count = min(CANDIDATES, len(triangle))
+    tree: Any = KDTree(triangle.mean(axis=1))
+    near = np.reshape(tree.query(point, k=count)[1], (len(point), count))
+    return _triangle_distance(point[:, None], triangle[near]).min(axis=1)
+
+
+def _triangle_distance(
+    point: Float[ndarray, "point 1 3"], triangle: Float[ndarray, "point near 3 3"]
+) -> Float[ndarray, "point near"]:
+    """Measure each point against its triangles: above their inside, or at their edges."""
+    corner = [triangle[:, :, k] for k in range(3)]
+    edge = [corner[(k + 1) % 3] - corner[k] for k in range(3)]
+    offset = [point - corner[k] for k in range(3)]
+    normal = np.cross(edge[0], edge[1])
+    size = np.maximum(np.linalg.norm(normal, axis=-1), 1e-300)
+    height = np.abs(_dot(offset[0], normal)) / size
+    is_inside = np.ones(height.shape, dtype=bool)
+    nearest = np.full(height.shape, np.inf)
+    for e, o in zip(edge, offset, strict=True):
+        is_inside &= _dot(np.cross(normal, e), o) >= 0.0
+        along = np.clip(_dot(o, e) / np.maximum(_dot(e, e), 1e-300), 0.0, 1.0)
+        nearest = np.minimum(nearest, np.linalg.norm(o - along[..., None] * e, axis=-1))
+    # A triangle without area has no inside, but every sign above is zero.
+    return np.where(is_inside & (size > 1e-300), height, nearest)
+
+
+def _dot(first: Float[ndarray, "*item 3"], second: Float[ndarray, "*item 3"]) -> ndarray:
+    return np.einsum("...d,...d->...", first, second)

@@ -1,0 +1,144 @@
+"""Distances to the true surface: closed forms, and Open3D on a surface that moves."""
+
+import numpy as np
+import open3d as o3d
+import pytest
+
+from physhandi.data.truth import Truth
+from physhandi.errors import SequenceError
+from physhandi.metrics.truth_metrics import (
+    SAMPLE_COUNT,
+    TrueSurface,
+    surface_distance,
+    true_surface,
+    truth_curves,
+)
+
+FRAMES = 5
+SQUARE = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+TWO = np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def surface_of(point: np.ndarray, face: np.ndarray) -> TrueSurface:
+    truth = Truth(hand_keypoint={}, hand_vertex={}, object_point=point, object_face=face)
+    found = true_surface(truth)
+    assert found is not None
+    return found
+
+
+def waving(count: int = 14) -> tuple[np.ndarray, np.ndarray]:
+    """A sheet, 0.3 wide, that rises, turns and bends; and its triangles."""
+    x, y = (v.reshape(-1) for v in np.meshgrid(*[np.linspace(-0.15, 0.15, count)] * 2))
+    frames = [
+        np.column_stack(
+            [x * np.cos(0.3 * f) - y * np.sin(0.3 * f), y, 0.02 * f + 0.03 * np.sin(20 * x + f)]
+        )
+        for f in range(FRAMES)
+    ]
+    corner = (np.arange(count - 1)[:, None] * count + np.arange(count - 1)).reshape(-1)
+    lower = np.column_stack([corner, corner + 1, corner + count])
+    upper = np.column_stack([corner + 1, corner + count + 1, corner + count])
+    return np.stack(frames), np.concatenate([lower, upper])
+
+
+def distance_by_open3d(point: np.ndarray, vertex: np.ndarray, face: np.ndarray) -> np.ndarray:
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(
+        o3d.core.Tensor(vertex.astype(np.float32)), o3d.core.Tensor(face.astype(np.uint32))
+    )
+    return scene.compute_distance(o3d.core.Tensor(point.astype(np.float32))).numpy()
+
+
+def test_a_node_above_the_middle_of_a_square() -> None:
+    surface = surface_of(np.stack([SQUARE] * 2), TWO)
+    nodes = np.array([[[0.0, 0, 0]], [[0.0, 0, 0.5]]])
+    curves = truth_curves(nodes, surface)
+    # Mean distance to the middle of a square of side 2: (sqrt(2) + asinh(1)) / 3.
+    mean = (2**0.5 + np.arcsinh(1.0)) / 3
+    assert curves["chamfer_truth_to_nodes"][0] == pytest.approx(mean, rel=0.01)
+    assert curves["chamfer_nodes_to_truth"] == pytest.approx([0.0, 0.5])
+    grid = (np.arange(400) + 0.5) / 200 - 1
+    above = np.sqrt(grid[:, None] ** 2 + grid**2 + 0.25).mean()
+    assert curves["chamfer_truth_to_nodes"][1] == pytest.approx(above, rel=0.01)
+    assert curves["chamfer_truth"][1] == pytest.approx((above + 0.5) / 2, rel=0.01)
+    assert curves["chamfer_truth"][0] == pytest.approx(mean / 2, rel=0.01)
+
+
+def test_samples_are_even_over_the_area_and_stick_to_it() -> None:
+    # Two squares apart, one of nine times the area; the second frame shrinks the large one.
+    large = 3 * SQUARE + np.array([10.0, 0, 0])
+    start = np.concatenate([SQUARE, large])
+    later = np.concatenate([SQUARE, SQUARE + np.array([0.0, 0, 7.0])])
+    surface = surface_of(np.stack([start, later]), np.concatenate([TWO, TWO + 4]))
+    first, second = surface.samples(0), surface.samples(1)
+    assert len(first) == SAMPLE_COUNT
+    on_large = first[:, 0] > 5
+    assert on_large.mean() == pytest.approx(0.9, abs=0.001)
+    assert first[on_large].mean(axis=0) == pytest.approx([10, 0, 0], abs=0.1)
+    assert first[on_large].std(axis=0) == pytest.approx([3**0.5, 3**0.5, 0], rel=0.03)
+    assert second[on_large] == pytest.approx((first[on_large] - [10.0, 0, 0]) / 3 + [0.0, 0, 7.0])
+    assert second[~on_large] == pytest.approx(first[~on_large])
+    again = surface_of(np.stack([start, later]), np.concatenate([TWO, TWO + 4]))
+    assert np.array_equal(again.samples(1), second)
+
+
+def test_both_ways_agree_with_open3d() -> None:
+    point, face = waving()
+    nodes = point[:, ::3] + np.random.default_rng(2).normal(scale=0.01, size=point[:, ::3].shape)
+    curves = truth_curves(nodes, surface_of(point, face))
+    for frame in range(FRAMES):
+        mesh = o3d.geometry.TriangleMesh(
+            o3d.utility.Vector3dVector(point[frame]), o3d.utility.Vector3iVector(face)
+        )
+        o3d.utility.random.seed(3)
+        drawn = mesh.sample_points_uniformly(40_000)
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(nodes[frame]))
+        there = np.asarray(drawn.compute_point_cloud_distance(cloud)).mean()
+        back = distance_by_open3d(nodes[frame], point[frame], face).mean()
+        # Samples are even over the area of frame 0, which bending and turning change a little.
+        assert curves["chamfer_truth_to_nodes"][frame] == pytest.approx(there, rel=0.05)
+        assert curves["chamfer_nodes_to_truth"][frame] == pytest.approx(back, rel=1e-4)
+        assert curves["chamfer_truth"][frame] == pytest.approx((there + back) / 2, rel=0.04)
+        assert 0.003 < back < there < 0.03
+
+
+def test_another_frame_is_another_surface() -> None:
+    point, face = waving()
+    surface = surface_of(point, face)
+    right = truth_curves(point, surface)
+    assert right["chamfer_nodes_to_truth"] == pytest.approx(np.zeros(FRAMES), abs=1e-9)
+    late = truth_curves(point[[0, 0, 1, 2, 3]], surface)
+    assert (late["chamfer_nodes_to_truth"][1:] > 0.005).all()
+    assert (late["chamfer_truth"][1:] > 1.2 * right["chamfer_truth"][1:]).all()
+    assert late["chamfer_truth"][0] == right["chamfer_truth"][0]
+
+
+def test_every_part_of_a_triangle_can_be_nearest() -> None:
+    triangle = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]])
+    point = np.array(
+        [
+            [0.2, 0.3, -0.7],  # below the inside
+            [0.5, -0.3, 0.4],  # beside an edge
+            [1.0, 1.0, 0.0],  # beyond the long edge
+            [-3.0, -4.0, 12.0],  # beyond a corner
+        ]
+    )
+    assert surface_distance(point, triangle) == pytest.approx([0.7, 0.5, 0.5**0.5, 13.0])
+    line = np.array([[[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]])
+    assert surface_distance(np.array([[1.5, 3.0, 4.0]]), line) == pytest.approx([5.0])
+
+
+def test_without_a_surface_there_is_nothing_to_measure() -> None:
+    point = np.stack([SQUARE])
+
+    def prepared(point: np.ndarray | None, face: np.ndarray | None) -> TrueSurface | None:
+        return true_surface(
+            Truth(hand_keypoint={}, hand_vertex={}, object_point=point, object_face=face)
+        )
+
+    assert prepared(point, TWO) is not None
+    assert prepared(point, None) is None
+    assert prepared(None, TWO) is None
+    assert prepared(0 * point, TWO) is None
+    with pytest.raises(SequenceError, match=r"object_face\.npy: triangle 1 joins .*\[0, 2, 4\]"):
+        prepared(point, np.array([[0, 1, 2], [0, 2, 4]]))
