@@ -33,6 +33,8 @@ _ABOUT = (
     ("rrd", "How far connection radius over resolution is from 3: |(δ/Δx)/3 - 1|."),
     ("resolution", "Δx: mean distance of the nodes to their four nearest neighbours."),
     ("mpjpe", "Mean distance of the hand's joints to the true ones."),
+    ("accuracy_proximity", "As accuracy, against what is this near on true hand and surface."),
+    ("f1_proximity", "As F1, against what is this near on true hand and true surface."),
     ("accuracy", "Share of nodes whose contact is told rightly, at this distance to the hand."),
     ("precision", "Of the nodes told to be in contact, the share that is."),
     ("recall", "Of the nodes in contact, the share that is told to be."),

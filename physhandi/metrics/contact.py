@@ -5,19 +5,26 @@ prediction and label agree. As most nodes touch nothing, agreement is cheap; pre
 and both shares of touching nodes stand beside it.
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
+from physhandi.data.sequence_schema import Side
 from physhandi.data.truth import Truth
 from physhandi.metrics.alignment import REACH, carried_points
 from physhandi.metrics.geometry import nearest_distance, nearest_node
+from physhandi.metrics.truth_metrics import true_surface
 
 THRESHOLDS = {"5mm": 0.005, "10mm": 0.010}
 """Nodes nearer to a hand than this count as touched [m]."""
+
+_PLACES = 20_000
+"""Places of the true surface among which each node's own is looked up; on the objects of a table
+they are 1 to 2 mm apart."""
 
 LabelKind = Literal["true", "proximity"]
 
@@ -43,7 +50,9 @@ class ContactReference:
     kind: LabelKind
     """True contact of the sequence, or proximity of what was observed to the fitted hands."""
     labels: dict[str, ContactLabels]
-    """Labels of each threshold."""
+    """Labels of each threshold; the same for all of them if contact is the true one."""
+    true_proximity: dict[str, ContactLabels] = field(default_factory=dict[str, ContactLabels])
+    """Labels of each threshold by the distance of true surface and true hands; empty if unknown."""
 
 
 def joined_nodes(
@@ -72,6 +81,43 @@ def true_labels(truth: Truth, node: Float[ndarray, "node 3"]) -> ContactLabels |
     nearest = nearest_node(node.astype(np.float64), truth.contact_point.astype(np.float64))
     is_contact = truth.contact[:, nearest]
     return ContactLabels(is_contact=is_contact, is_known=np.ones_like(is_contact))
+
+
+def true_proximity_labels(
+    truth: Truth, node: Float[ndarray, "node 3"], sides: Iterable[Side]
+) -> dict[str, ContactLabels]:
+    """Call nodes touched whose place on the true surface is near a vertex of a true hand.
+
+    This is the paper's label, taken where nothing was fitted or observed. A node's place is the
+    point of the true surface that is nearest to it in frame 0.
+
+    Args:
+        truth: The truth of a recording.
+        node: Nodes in frame 0 [m].
+        sides: Hands that the recording shows; all of them must be known.
+
+    Returns:
+        Labels of each of `THRESHOLDS`; empty if surface or hands are not known.
+
+    Raises:
+        SequenceError: If the true surface cannot be one.
+    """
+    hands = [truth.hand_vertex.get(side) for side in sides]
+    known = [hand for hand in hands if hand is not None]
+    surface = true_surface(truth, _PLACES)
+    if surface is None or not known or len(known) < len(hands):
+        return {}
+    place = surface.picked(nearest_node(node.astype(np.float64), surface.samples(0)))
+    distance = hand_distance(
+        np.stack([place.samples(frame) for frame in range(len(place.point))]),
+        np.concatenate(known, axis=1).astype(np.float64),
+    )
+    return {
+        name: ContactLabels(
+            is_contact=distance < threshold, is_known=np.ones(distance.shape, dtype=bool)
+        )
+        for name, threshold in THRESHOLDS.items()
+    }
 
 
 def proximity_labels(

@@ -27,7 +27,13 @@ AGGREGATION = (
     "mean over frames of the mean over points; frame 0 is not scored; "
     "contact F1 over all nodes and frames"
 )
-CONTACT_METRICS = tuple(f"contact_{kind}_{t}" for t in THRESHOLDS for kind in ("accuracy", "f1"))
+_BY_PROXIMITY = "proximity_"
+CONTACT_METRICS = tuple(
+    f"contact_{kind}_{labels}{threshold}"
+    for labels in ("", _BY_PROXIMITY)
+    for threshold in THRESHOLDS
+    for kind in ("accuracy", "f1")
+)
 METRICS = (*CURVES, *CONTACT_METRICS)
 """What every method is scored by: distances [m], then shares from 0 to 1."""
 _DIGITS = 7
@@ -202,16 +208,16 @@ def _predicted(
 def _judged(
     contact: ContactReference | None, predicted: dict[str, ndarray], frames: list[int]
 ) -> dict[str, float | None]:
-    """Score contacts in some frames, by every threshold."""
+    """Score contacts in some frames, by every threshold and all labels that there are."""
     scores: dict[str, float | None] = {}
     if contact is None:
         return scores
-    for name, is_predicted in predicted.items():
-        labels = contact.labels[name]
-        chosen = ContactLabels(
-            is_contact=labels.is_contact[frames], is_known=labels.is_known[frames]
-        )
-        scores |= contact_scores(is_predicted[frames], chosen, name)
+    for prefix, all_labels in (("", contact.labels), (_BY_PROXIMITY, contact.true_proximity)):
+        for name, labels in all_labels.items():
+            chosen = ContactLabels(
+                is_contact=labels.is_contact[frames], is_known=labels.is_known[frames]
+            )
+            scores |= contact_scores(predicted[name][frames], chosen, prefix + name)
     return scores
 
 

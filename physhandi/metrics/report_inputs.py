@@ -19,6 +19,7 @@ from physhandi.metrics.contact import (
     joined_nodes,
     proximity_labels,
     true_labels,
+    true_proximity_labels,
 )
 from physhandi.metrics.hand_shape import held_where_missing
 from physhandi.metrics.topology import radius_deviation, resolution
@@ -171,7 +172,8 @@ def _contact(
         raise RunError(f"{path} is not a readable model: {error}.") from error
     hand = np.concatenate(known, axis=1).astype(np.float64)
     start = node.astype(np.float64)
-    truth = true_labels(read_truth(sequence.folder), start)
+    told = read_truth(sequence.folder)
+    truth = true_labels(told, start)
     if truth is not None:
         labels = dict.fromkeys(THRESHOLDS, truth)
     else:
@@ -182,4 +184,5 @@ def _contact(
         is_joined=joined_nodes(virtual, len(node)),
         kind="proximity" if truth is None else "true",
         labels=labels,
+        true_proximity=true_proximity_labels(told, start, sequence.hands),
     )

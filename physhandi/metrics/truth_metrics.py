@@ -41,6 +41,15 @@ class TrueSurface:
         corner = self.point[frame][self.face[self.sample_face]].astype(np.float64)
         return np.einsum("sk,skd->sd", self.sample_weight, corner)
 
+    def picked(self, chosen: Int[ndarray, " chosen"]) -> "TrueSurface":
+        """Keep the samples with these numbers, in their order."""
+        return TrueSurface(
+            point=self.point,
+            face=self.face,
+            sample_face=self.sample_face[chosen],
+            sample_weight=self.sample_weight[chosen],
+        )
+
 
 def true_surface(truth: Truth, count: int = SAMPLE_COUNT) -> TrueSurface | None:
     """Prepare the true surface; None if the recording tells none or it has no area.
@@ -73,11 +82,11 @@ def true_surface(truth: Truth, count: int = SAMPLE_COUNT) -> TrueSurface | None:
     random = np.random.default_rng(_SEED)
     # One sample in each of as many strips of equal area: more even than independent draws.
     place = (np.arange(count) + random.random(count)) / count * until[-1]
-    chosen = np.minimum(np.searchsorted(until, place, side="right"), len(face) - 1)
+    chosen = np.asarray(np.searchsorted(until, place, side="right"), dtype=np.int64)
     return TrueSurface(
         point=point,
         face=face,
-        sample_face=chosen,
+        sample_face=np.minimum(chosen, len(face) - 1),
         sample_weight=random.dirichlet(np.ones(3), size=count),
     )
 

@@ -16,6 +16,7 @@ from physhandi.metrics.contact import (
     predicted_contacts,
     proximity_labels,
     true_labels,
+    true_proximity_labels,
 )
 
 NODE = np.array([[0.0, 0, 0], [0.02, 0, 0], [0.04, 0, 0], [0.06, 0, 0], [0.05, 0.02, 0]])
@@ -118,6 +119,50 @@ def test_true_contact_goes_to_the_nearest_node() -> None:
     assert found.is_contact.astype(int).tolist() == [[1, 1, 0, 0, 0], [0, 0, 1, 1, 1]]
     assert found.is_known.all()
     assert true_labels(Truth(hand_keypoint={}, hand_vertex={}), NODE) is None
+
+
+def rising_sheet() -> tuple[Truth, np.ndarray]:
+    """A square sheet, 0.1 wide, that rises by 0.1 a frame, and a hand over one of its places.
+
+    In frame 1 the hand is 4 mm above the place (0.03, 0.02), in frame 2 8 mm, else far away.
+    """
+    corner = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]])
+    rise = np.arange(4)[:, None, None] * np.array([0.0, 0.0, 0.1])
+    hand = np.array([0.03, 0.02, 0.0]) + rise + np.array([0.0, 0.0, 0.5])
+    hand[1:3, 0, 2] = [0.104, 0.208]
+    truth = Truth(
+        hand_keypoint={},
+        hand_vertex={"right": hand},
+        object_point=corner + rise,
+        object_face=np.array([[0, 1, 2], [0, 2, 3]]),
+    )
+    return truth, np.array([[0.03, 0.02, 0.003], [0.07, 0.02, 0.003], [0.04, 0.02, -0.003]])
+
+
+def test_true_proximity_is_that_of_true_surface_and_true_hand() -> None:
+    truth, node = rising_sheet()
+    found = true_proximity_labels(truth, node, ("right",))
+    # Node 0 lies 3 mm above its place, which counts; node 2 is 10.8 mm away in frame 1.
+    assert found["5mm"].is_contact.astype(int).tolist() == [[0] * 3, [1, 0, 0], [0] * 3, [0] * 3]
+    assert found["10mm"].is_contact.astype(int).tolist() == [
+        [0] * 3,
+        [1, 0, 0],
+        [1, 0, 0],
+        [0] * 3,
+    ]
+    assert found["5mm"].is_known.all()
+    nearer = np.array([[0.036, 0.02, 0.0], [0.0415, 0.02, 0.0]])  # 7.2 and 12.2 mm in frame 1.
+    by_node = true_proximity_labels(truth, nearer, ("right",))
+    assert by_node["5mm"].is_contact.sum() == 0
+    assert by_node["10mm"].is_contact[1].tolist() == [True, False]
+
+
+def test_true_proximity_needs_the_surface_and_every_hand() -> None:
+    truth, node = rising_sheet()
+    assert true_proximity_labels(truth, node, ("right", "left")) == {}
+    assert true_proximity_labels(truth, node, ()) == {}
+    unknown = Truth(hand_keypoint={}, hand_vertex=truth.hand_vertex)
+    assert true_proximity_labels(unknown, node, ("right",)) == {}
 
 
 def test_proximity_is_that_of_what_was_observed() -> None:

@@ -225,6 +225,39 @@ def test_contact_and_topology_come_from_the_fitted_model(tmp_path: Path, folder:
         score_run(tmp_path / "out", sequence)
 
 
+def test_true_contact_and_true_proximity_are_told_apart(tmp_path: Path, folder: Path) -> None:
+    # The engine calls node 1 touched in frames 0 and 1. The true hand is 4 mm from the true surface
+    # at node 0 in frame 1, 8 mm in frame 2, and far away else. Springs join node 0 to a fitted hand
+    # that stays at it.
+    contact = np.array([[False, True]] * 2 + [[False, False]] * 2)
+    speck = np.array([[0.0, 0, 0], [1e-5, 0, 0], [0, 1e-5, 0]])
+    corner = (rising(0.1)[:, :, None] + speck).reshape(FRAMES, 6, 3)
+    hand = np.array([0.0, 0.0, 5.0]) + 0 * rising(0.1)[:, :1]
+    hand[1:3, 0, 2] = [0.104, 0.208]
+    np.save(folder / "rollout.npy", rising(0.1))
+    np.save(folder / "hand_right_vertex.npy", rising(0.1)[:, :1] + np.array([0.0, 0.0, 0.004]))
+    save_model(folder, [[0, 2]])
+    sequence = make_sequence(
+        tmp_path,
+        contact_point=corner[0],
+        contact=np.repeat(contact, 3, axis=1),
+        hand_right_vertex=hand,
+        object_point=corner,
+        object_face=np.arange(6).reshape(2, 3),
+    )
+    report = score_run(tmp_path / "out", sequence)
+    scores = report["reconstruction"]["rollout"]  # Frames 1 and 2.
+    assert scores["contact_accuracy_5mm"] == scores["contact_accuracy_10mm"] == 0.25
+    assert scores["contact_f1_5mm"] == 0.0
+    assert scores["contact_accuracy_proximity_5mm"] == 0.75
+    assert scores["contact_accuracy_proximity_10mm"] == 1.0
+    assert scores["contact_f1_proximity_5mm"] == pytest.approx(2 / 3)
+    assert report["future"]["rollout"]["contact_accuracy_proximity_10mm"] == 0.5
+    assert report["future"]["static"]["contact_accuracy_proximity_10mm"] == 1.0
+    assert report["contact"]["reconstruction"]["label_share_proximity_5mm"] == 0.25
+    assert report["contact"]["frame_0"]["accuracy_5mm"] == 0.0
+
+
 def test_without_truth_contact_is_what_is_near_the_hand(tmp_path: Path, folder: Path) -> None:
     sequence = make_sequence(tmp_path)
     save_model(folder, [[0, 2]])
@@ -232,7 +265,9 @@ def test_without_truth_contact_is_what_is_near_the_hand(tmp_path: Path, folder: 
         folder / "hand_right_vertex.npy",
         np.tile(NODE[1:] + np.array([0.0, 0, 0.008]), (FRAMES, 1, 1)),
     )
-    contact = score_run(tmp_path / "out", sequence)["contact"]
+    report = score_run(tmp_path / "out", sequence)
+    contact = report["contact"]
     assert contact["labels"] == "proximity"
+    assert report["future"]["rollout"]["contact_accuracy_proximity_5mm"] is None
     assert contact["frame_0"]["accuracy_5mm"] == 0.5  # Node 0 is held, and nothing is near.
     assert contact["frame_0"]["accuracy_10mm"] == 0.0  # Node 0 is held, and node 1 is near.
