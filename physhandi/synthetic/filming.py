@@ -1,7 +1,9 @@
 """What all made-up recordings share: points on surfaces, what a picture shows of them, videos."""
 
-import tempfile
-from collections.abc import Iterable
+import errno
+import shutil
+from collections.abc import Generator, Iterable
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
+from physhandi.data.atomic import temporary_name
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence_writer import SequenceWriter
 from physhandi.errors import SequenceError
@@ -110,20 +113,61 @@ def save_video(
         SequenceError: If this OpenCV cannot write videos.
         OSError: If the disk does not take it.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "color.mp4"
+    with _folder_beside(writer) as folder:
+        path = folder / "color.mp4"
         video: cv2.VideoWriter | None = None
-        for image in images:
-            if video is None:
-                codec = cv2.VideoWriter.fourcc(*"mp4v")
-                size = (image.shape[1], image.shape[0])
-                video = cv2.VideoWriter(str(path), codec, frame_rate, size)
-                if not video.isOpened():
-                    raise SequenceError(
-                        f"Sequence '{writer.folder.name}': {rel} cannot be written, because this "
-                        "OpenCV has no MPEG-4 encoder. Install opencv-python-headless from PyPI."
-                    )
-            video.write(np.ascontiguousarray(image[..., ::-1]))
-        if video is not None:
-            video.release()
-            writer.copy(rel, path)
+        count = 0
+        try:
+            for image in images:
+                if video is None:
+                    video = _opened(path, (image.shape[1], image.shape[0]), frame_rate)
+                    if not video.isOpened():
+                        path.write_bytes(bytes(4096))  # A full disk says so here.
+                        raise SequenceError(
+                            f"Sequence '{writer.folder.name}': {rel} cannot be written, because "
+                            "this OpenCV has no MPEG-4 encoder. Install opencv-python-headless "
+                            "from PyPI."
+                        )
+                video.write(np.ascontiguousarray(image[..., ::-1]))
+                count += 1
+        finally:
+            if video is not None:
+                video.release()
+        if video is None:
+            return
+        found = _frame_count(path)
+        if found != count:  # OpenCV does not tell what the disk refused.
+            raise OSError(
+                errno.EIO,
+                f"The video holds {found} of {count} frames; the disk may be full. Free some space "
+                "on it, or choose another folder",
+                str(writer.folder / rel),
+            )
+        writer.copy(rel, path)
+
+
+@contextmanager
+def _folder_beside(writer: SequenceWriter) -> Generator[Path, None, None]:
+    """Make a folder on the sequence's own disk; if this process dies, the next writer sweeps it."""
+    folder = writer.folder.with_name(temporary_name(writer.folder.name))
+    folder.mkdir()
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _opened(path: Path, size: tuple[int, int], frame_rate: float) -> cv2.VideoWriter:
+    return cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), frame_rate, size)
+
+
+def _frame_count(path: Path) -> int:
+    """Count the frames that can be read; the header tells what was meant to be written."""
+    if not path.is_file():
+        return 0
+    video = cv2.VideoCapture(str(path))
+    count = 0
+    while video.grab():
+        count += 1
+    video.release()
+    return count
