@@ -4,6 +4,7 @@ A method is written ``BASE[@SETTING=VALUE,…][+last_residual]``: `METHODS` has 
 settings are those of a profile.
 """
 
+import re
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -29,11 +30,15 @@ from physhandi.metrics.baselines import (
 )
 from physhandi.metrics.report import measure_run
 from physhandi.progress import Progress
-from physhandi.synthetic.hand_noise import disturb_hands
+from physhandi.synthetic.hand_noise import HandNoise, disturb_hands
 
 Given = Literal["recording", "true_hand", "all_frames"]
 CORRECTION = "last_residual"
 """Ends the name of a method whose predicted frames are shifted by its last residual."""
+_NAME = re.compile(
+    r"(?P<base>[^@+]*)(@(?P<settings>.*?))?(\+(?P<correction>[A-Za-z]\w*))?", re.DOTALL
+)
+_OPENING, _CLOSING = "[{(", "]})"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,8 +93,8 @@ METHODS = {
         Method(
             name="oracle_parameters",
             gets="all_frames",
-            about="The default profile, fitted to the future frames too: what any choice of "
-            "parameters could reach.",
+            about="The default profile, fitted to the future frames too: one optimisation in "
+            "hindsight; other parameters might do better still.",
         ),
     )
 }
@@ -100,21 +105,32 @@ def parse_method(text: str) -> Method:
     """Read the name of a method.
 
     Raises:
-        UsageError: If there is no such base, setting or correction; names it.
+        UsageError: If there is no such base, setting or correction, or nothing to be corrected;
+            names it.
     """
-    core, plus, correction = text.partition("+")
-    base, at, settings = core.partition("@")
+    found = _NAME.fullmatch(text)
+    base, settings, correction = (
+        found.group("base", "settings", "correction") if found else (text,) * 3
+    )
     if base not in METHODS:
         raise UsageError(f"There is no method '{base}'. Choose from: {', '.join(METHODS)}.")
-    if plus and correction != CORRECTION:
+    if correction not in (None, CORRECTION):
         raise UsageError(f"Method '{text}' ends in '+{correction}'; only '+{CORRECTION}' exists.")
     overrides: dict[str, Any] = {}
-    for part in settings.split(",") if at else ():
+    for part in () if settings is None else _split(settings):
         path, equals, value = part.partition("=")
         if not equals:
             raise UsageError(f"Method '{text}': '{part}' is not SETTING=VALUE.")
-        overrides[path] = yaml.safe_load(value)
-    start, is_corrected = METHODS[base], plus == "+"
+        try:
+            overrides[path] = yaml.safe_load(value)
+        except yaml.YAMLError:
+            raise UsageError(f"Method '{text}': '{value}' is not a value of YAML.") from None
+    start, is_corrected = METHODS[base], correction is not None
+    if is_corrected and start.gets == "all_frames":
+        raise UsageError(
+            f"Method '{text}' has no predicted frames, since '{base}' is fitted to all of them: "
+            f"leave '+{CORRECTION}' out."
+        )
     about = f"{start.about} The last residual is added." if is_corrected else start.about
     method = replace(start, name=text, about=about, overrides=overrides, is_corrected=is_corrected)
     settings_of(method, {})
@@ -142,7 +158,7 @@ def execute(
     title: str,
     common: Mapping[str, Any],
     hands: Run | None = None,
-    disturbance: float | None = None,
+    noise: HandNoise | None = None,
     device: str = "cpu",
     progress: Progress,
 ) -> Run:
@@ -156,7 +172,7 @@ def execute(
         common: Settings that all methods of a suite share.
         hands: A finished run on the same recording, whose stages are taken over as far as the
             settings that they depend on are the same.
-        disturbance: Mean error of joints that is added to the hands that are taken over [m].
+        noise: Makes the hands that are taken over wrong, and nothing but hands is taken over.
         device: Warp device.
         progress: Told about every iteration.
 
@@ -170,10 +186,8 @@ def execute(
     with run.begin_attempt() as attempt:
         watched = attempt.progress(progress)
         save_environment(attempt, device)
-        if hands is not None and disturbance is not None:
-            take_stages(hands, attempt, (pipeline.HANDS,))
-            disturb_hands(attempt, f"sequences/{recording.name}", disturbance)
-            attempt.finish_stage(pipeline.HANDS, attempt.stage_summary(pipeline.HANDS))
+        if hands is not None and noise is not None:
+            take_disturbed_hands(hands, attempt, recording.name, noise)
         elif hands is not None:
             take_stages(hands, attempt, shared_stages(hands.config["profile"], settings))
         config = pipeline.config_from_dict(settings)
@@ -279,6 +293,33 @@ def take_stages(source: Run, attempt: Attempt, names: tuple[str, ...]) -> None:
             for rel in stage["files"]:
                 _copy(source.out / rel, attempt.out / rel)
             attempt.finish_stage(stage["name"], stage["summary"])
+
+
+def take_disturbed_hands(source: Run, attempt: Attempt, name: str, noise: HandNoise) -> None:
+    """Take over the hands of another run on the same recording, and make them wrong once.
+
+    The stage counts as finished only when they are wrong: what a kill leaves before that is not
+    taken over by the next attempt, and what is finished is left as it is.
+    """
+    if attempt.stage_done(pipeline.HANDS):
+        return
+    (stage,) = (stage for stage in source.stages() if stage["name"] == pipeline.HANDS)
+    for rel in stage["files"]:
+        _copy(source.out / rel, attempt.out / rel)
+    disturb_hands(attempt, f"sequences/{name}", noise)
+    attempt.finish_stage(pipeline.HANDS, stage["summary"])
+
+
+def _split(settings: str) -> list[str]:
+    """Split at commas, but not inside of brackets."""
+    parts, depth = [""], 0
+    for letter in settings:
+        depth += (letter in _OPENING) - (letter in _CLOSING)
+        if letter == "," and depth == 0:
+            parts.append("")
+        else:
+            parts[-1] += letter
+    return parts
 
 
 def _moved(node: np.ndarray, control: np.ndarray, *, rule: str) -> np.ndarray:

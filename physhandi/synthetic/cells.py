@@ -6,22 +6,18 @@ again goes on where it stopped, and anything that changed is computed anew.
 
 import hashlib
 import json
-import tempfile
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
-from functools import lru_cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import warp as wp
 
-import physhandi
-from physhandi.data.atomic import write_array, write_json
+from physhandi.data.atomic import write_json
+from physhandi.data.environment import processor_name
 from physhandi.data.run import Run
-from physhandi.data.run_files import EXIT, artefacts, read_json, read_mapping
+from physhandi.data.run_files import EXIT, read_json, read_mapping
 from physhandi.data.sequence import Sequence
-from physhandi.data.truth import read_truth
 from physhandi.errors import (
     FitError,
     MissingInputError,
@@ -30,8 +26,6 @@ from physhandi.errors import (
     SimulationError,
     UsageError,
 )
-from physhandi.metrics.photometric import photometric_curves
-from physhandi.metrics.report import measure_run
 from physhandi.progress import Progress
 from physhandi.synthetic.baselines import (
     METHODS,
@@ -42,17 +36,14 @@ from physhandi.synthetic.baselines import (
     shared_stages,
     simulate_in,
 )
-from physhandi.synthetic.hand_noise import HAND_NOISE
-from physhandi.synthetic.variants import DISTURBED_HAND, make_variant
+from physhandi.synthetic.cell_scores import measure_cell
+from physhandi.synthetic.code_hash import PREDICTIONS, SCORES, code_version
+from physhandi.synthetic.hand_noise import HAND_NOISE, HandNoise
+from physhandi.synthetic.variants import DISTURBED_HAND, make_variant, noise_seed
 
-FAILURES = (FitError, MissingInputError, SimulationDivergedError, SimulationError, UsageError)
-"""What a method may fail with; its output then counts as missing. Anything else stops the suite.
-A fitted radius that reaches nothing in another sequence is told as a wrong use."""
-_FITTING = (
-    *("pipeline.py", "data", "hand", "perception", "simulation", "fitting"),
-    *("synthetic/baselines.py", "synthetic/variants.py"),
-)
-_PACKAGES = ("torch", "warp-lang", "numpy", "scipy")
+FAILURES = (FitError, MissingInputError, SimulationDivergedError, SimulationError)
+"""What a method may fail with; its output then counts as missing. Anything else stops the suite,
+a setting that only a fit finds wrong too."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +89,8 @@ class Bench:
         self.out = out
         self.common = dict(common)
         self.device = device
+        name = processor_name() if device == "cpu" else wp.get_device(device).name
+        self.device_name = f"{device} {name}"
         self.progress = progress
         self._settings: dict[str, dict[str, Any]] = {}
         self._finished: dict[Path, Run] = {}
@@ -117,12 +110,18 @@ class Bench:
             method: The method.
             recording: The whole recording, which it is scored against.
             variant: What it is given; an oracle gets what its nature asks for.
+
+        Raises:
+            UsageError: If the fit finds that a setting makes no sense.
         """
         variant = _given(method, variant)
         reference = self.reference(recording)
         folder = self._folder(method, recording, variant)
         try:
             run = self._run(method, recording, variant)
+        except UsageError as error:
+            told = f"Method '{method.name}' on sequence '{recording.name}': {error}"
+            raise UsageError(told) from error
         except FAILURES as error:
             report, curves = self.score(None, reference, recording)
             ran = folder.name if folder.is_dir() else ""
@@ -188,14 +187,11 @@ class Bench:
                 recording.name, f"{method.name}_unseen", [source.folder.name, given], recording
             )
             name = folder.name
-            _raise_again(folder)
-            run = simulate_in(
+            run = self._simulated(
                 source,
                 target,
                 folder,
                 title=f"{method.name}, fitted on {fitted.name}, on {recording.name}",
-                device=self.device,
-                progress=self.progress,
             )
         except FAILURES as failure:
             error = str(failure)
@@ -222,16 +218,13 @@ class Bench:
             The report and the errors frame by frame.
         """
         parts = [reference.folder.name, "" if run is None else run.folder.name]
-        parts += [str(len(recording.reconstruction_frames)), _code_version("metrics")]
+        parts += [str(len(recording.reconstruction_frames)), code_version(SCORES)]
         key = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
         path = self.out / "scores" / f"{key}.json"
         if not path.is_file():
-            with tempfile.TemporaryDirectory() as folder:
-                _assemble(Path(folder), run, reference, recording)
-                report, frames = measure_run(Path(folder), recording)
-            _add_photometric(report, frames, run, reference, recording)
+            report, curves = measure_cell(run, reference, recording)
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_json(path, {"report": report, "curves": frames.get("rollout", {})})
+            write_json(path, {"report": report, "curves": curves})
         known = read_json(path)
         return known["report"], known["curves"]
 
@@ -248,12 +241,12 @@ class Bench:
         if method.is_corrected:
             base = self._run(method.base, recording, variant)
             return correct(base, given, folder, title=title, method=method)
-        static, disturbance = METHODS["static"], None
-        hands = None
-        if method.name != static.name:
-            hands = self._run(static, recording, variant)
+        still, hands, noise = self._still(method), None, None
+        if method.name != still.name:
+            hands = self._run(still, recording, variant)
         elif variant == DISTURBED_HAND:
-            hands, disturbance = self._run(static, recording, "recording"), HAND_NOISE
+            hands = self._run(still, recording, "recording")
+            noise = HandNoise(error=HAND_NOISE, seed=noise_seed(recording, variant))
         return execute(
             method,
             given,
@@ -261,26 +254,52 @@ class Bench:
             title=title,
             common=self.common,
             hands=hands,
-            disturbance=disturbance,
+            noise=noise,
             device=self.device,
             progress=self.progress,
         )
 
+    def _simulated(self, source: Run, target: Sequence, folder: Path, *, title: str) -> Run:
+        """Simulate what was fitted elsewhere; a radius that reaches nothing there is no misuse."""
+        _raise_again(folder, also=UsageError)
+        try:
+            return simulate_in(
+                source, target, folder, title=title, device=self.device, progress=self.progress
+            )
+        except UsageError as error:
+            raise FitError(str(error)) from error
+
+    def _still(self, method: Method) -> Method:
+        """Give the method whose run has the hands of a method: the static one, if they agree."""
+        static, own = METHODS["static"], method.base
+        if shared_stages(self._settings_of(static), self._settings_of(method)):
+            return static
+        if own.rule == "static":
+            return own
+        return replace(own, name=f"static for {own.name}", rule="static", gets="recording")
+
     def _seconds(
         self, method: Method, recording: Sequence, variant: str, run: Run
     ) -> dict[str, float]:
-        """Give the time of each stage; one that was taken over took as long as where it was run."""
+        """Give the time of each stage; one that was taken over took as long as where it was run.
+
+        A run that was stopped and went on does not know how long it took, so it has no times.
+        """
+        if run.attempt != 1:
+            return {}
         seconds = {s["name"]: float(s.get("seconds", 0.0)) for s in run.stages()}
         base = method.base
         if method.is_corrected:
-            before = self._run(base, recording, variant)
-            return {**self._seconds(base, recording, variant, before), **seconds}
-        if base.name != "static":
-            first = self._run(METHODS["static"], recording, variant)
+            before = self._seconds(base, recording, variant, self._run(base, recording, variant))
+            return {**before, **seconds} if before else {}
+        still = self._still(base)
+        if base.name != still.name:
+            first = self._run(still, recording, variant)
+            taken = self._seconds(still, recording, variant, first)
             shared = shared_stages(first.config["profile"], self._settings_of(base))
-            for stage in first.stages():
-                if stage["name"] in shared:
-                    seconds[stage["name"]] = float(stage.get("seconds", 0.0))
+            if not taken:
+                return {}
+            seconds |= {name: taken[name] for name in shared if name in taken}
         return seconds
 
     def _settings_of(self, method: Method) -> dict[str, Any]:
@@ -294,68 +313,24 @@ class Bench:
         return self._cell(recording.name, method.name, about, recording)
 
     def _cell(self, case: str, method: str, about: Any, recording: Sequence) -> Path:
-        parts = [recording.fingerprint(), method, about, self.device, code_version()]
+        parts = [
+            recording.fingerprint(),
+            method,
+            about,
+            self.device_name,
+            code_version(PREDICTIONS),
+        ]
         key = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:12]
         name = "".join(c if c.isalnum() else "_" for c in method)
         return self.out / "cells" / f"{case[:28]}-{name[:20]}-{key}"
 
 
-@lru_cache(maxsize=1)
-def code_version() -> str:
-    """Hash the code that a fit depends on, and the versions of what it computes with."""
-    return "-".join(
-        [_code_version(part) for part in _FITTING] + [version(package) for package in _PACKAGES]
-    )
-
-
-@lru_cache(maxsize=32)
-def _code_version(part: str) -> str:
-    path = Path(physhandi.__file__).parent / part
-    digest = hashlib.sha256()
-    files = [(part, path)] if path.is_file() else list(artefacts(path)) if path.is_dir() else []
-    for rel, file in files:
-        if file.suffix in {".py", ".yaml", ".npz", ".tflite", ".glb"}:
-            digest.update(f"{rel}\0".encode())
-            digest.update(file.read_bytes())
-    return digest.hexdigest()[:12]
-
-
-def _raise_again(folder: Path) -> None:
+def _raise_again(folder: Path, *, also: type[PhysHandiError] | None = None) -> None:
     """Repeat how a cell failed before, rather than failing again for as long."""
     found = read_mapping(folder / EXIT) if (folder / EXIT).is_file() else {}
-    kinds: dict[str, type[PhysHandiError]] = {kind.__name__: kind for kind in FAILURES}
-    kind = kinds.get(str(found.get("error_type", "")))
-    if found.get("state") == "failed" and kind is not None:
+    kinds = {kind.__name__ for kind in (*FAILURES, also) if kind is not None}
+    if found.get("state") == "failed" and str(found.get("error_type", "")) in kinds:
         raise FitError(str(found.get("error")))
-
-
-def _add_photometric(
-    report: dict[str, Any],
-    frames: dict[str, Any],
-    run: Run | None,
-    reference: Run,
-    recording: Sequence,
-) -> None:
-    """Put IoU and PSNR beside the other figures of the rollout; where it is missing, it stands."""
-    name = f"sequences/{recording.name}/rollout.npy"
-    rollout = reference.array(name).copy()  # The reference is the static object.
-    if run is not None and run.array(name).shape == rollout.shape:
-        found = run.array(name)
-        is_usable = np.isfinite(found).all(axis=(1, 2))
-        rollout[is_usable] = found[is_usable]
-    curves = photometric_curves(recording.views, rollout[:, : recording.surface_node_count])
-    splits = {
-        "reconstruction": recording.reconstruction_frames,
-        "future": recording.future_frames,
-    }
-    for metric, curve in curves.items():
-        frames.setdefault("rollout", {})[metric] = [
-            float(value) if np.isfinite(value) else None for value in curve
-        ]
-        for split, scored in splits.items():
-            known = [float(curve[f]) for f in scored if f > 0 and np.isfinite(curve[f])]
-            if known and split in report:
-                report[split]["rollout"][metric] = sum(known) / len(known)
 
 
 def _given(method: Method, variant: str) -> str:
@@ -365,24 +340,3 @@ def _given(method: Method, variant: str) -> str:
 def _as_one_split(recording: Sequence) -> Sequence:
     meta = replace(recording.meta, reconstruction=recording.frame_count)
     return Sequence(recording.folder, meta)
-
-
-def _assemble(folder: Path, run: Run | None, reference: Run, recording: Sequence) -> None:
-    """Lay out what is scored: the run's motion beside the reference's observations."""
-    inside = f"sequences/{recording.name}"
-    observed = (f"{inside}/observation/", f"{inside}/keypoint.npy")
-    left_out = ("rollout.npy", "control.npy") if run is None else ()
-    chosen = {r: path for r, path in artefacts(reference.out) if r.startswith(observed)} | {
-        rel: path
-        for rel, path in artefacts((reference if run is None else run).out)
-        if not rel.startswith(observed) and not rel.endswith(left_out)
-    }
-    for rel, path in chosen.items():
-        target = folder / rel
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.symlink_to(path.resolve())
-    truth = read_truth(recording.folder).hand_vertex
-    if run is not None and not any("_vertex.npy" in rel for rel in chosen):
-        for side in recording.hands:  # An oracle moves the object with the true hand itself.
-            if side in truth:
-                write_array(folder / inside / f"hand_{side}_vertex.npy", truth[side])

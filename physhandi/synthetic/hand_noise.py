@@ -1,6 +1,6 @@
 """Fitted hands made wrong by a known amount: the third disturbance of the robustness table."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from safetensors.numpy import load_file
@@ -18,13 +18,23 @@ _HALVINGS = 30
 _MOST = 8.0
 
 
-def disturb_hands(attempt: Attempt, folder: str, error: float) -> None:
-    """Replace the stored hands of a sequence by ones that are wrong by `error` in the mean [m].
+@dataclass(frozen=True, kw_only=True)
+class HandNoise:
+    """How hands are made wrong."""
+
+    error: float
+    """Mean distance of the joints from where they were [m]."""
+    seed: int
+    """Of the noise; another one for every recording, or all would be wrong in the same way."""
+
+
+def disturb_hands(attempt: Attempt, folder: str, noise: HandNoise) -> None:
+    """Replace the stored hands of a sequence by wrong ones; twice would be too much.
 
     Args:
-        attempt: Holds finished hands.
+        attempt: Holds hands as they were fitted.
         folder: Folder of the sequence in it.
-        error: Mean distance of the joints from where they were [m].
+        noise: How wrong they become.
 
     Raises:
         MissingInputError: If there is no hand.
@@ -34,11 +44,11 @@ def disturb_hands(attempt: Attempt, folder: str, error: float) -> None:
         raise MissingInputError(f"{attempt.out / folder} has no hand to disturb.")
     for number, path in enumerate(paths):
         motion = HandMotion.from_tensors(load_file(path))
-        wrong = disturbed(motion, error, seed=number)
+        wrong = disturbed(motion, noise.error, seed=(noise.seed, number))
         attempt.save_tensors(f"{folder}/{path.name}", wrong.to_tensors())
 
 
-def disturbed(motion: HandMotion, error: float, *, seed: int) -> HandMotion:
+def disturbed(motion: HandMotion, error: float, *, seed: tuple[int, ...]) -> HandMotion:
     """Disturb place, turn and pose of a hand in every frame by itself.
 
     Each wrist coordinate gets normal noise of 10 mm, wrist and joints 0.1 rad about each axis;
@@ -49,7 +59,7 @@ def disturbed(motion: HandMotion, error: float, *, seed: int) -> HandMotion:
         error: Mean distance of its 21 joints from where they were [m].
         seed: Of the noise.
     """
-    random = np.random.default_rng([4, seed])
+    random = np.random.default_rng([4, *seed])
     count = motion.frame_count
     place = _PLACE * random.standard_normal((count, 3))
     turn = _TURN * random.standard_normal((count, 3))

@@ -1,9 +1,11 @@
 """What a method is given in place of a whole recording: less, noisier, or the truth.
 
-A variant is a sequence folder of its own, of the same name, without the recording's truth. Methods
-run on it; scores are always taken against the recording itself.
+A variant is a sequence folder of its own, of the same name. It has nothing of what is kept for
+scoring, and nothing that tells how the recording was made, by which it could be made again with its
+truth. Methods run on it; scores are always taken against the recording itself.
 """
 
+import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,12 +16,14 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.random import Generator
 
+from physhandi.data.atomic import named_fields
 from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_schema import SequenceMeta
+from physhandi.data.sequence_validation import ARRAYS
 from physhandi.data.sequence_writer import SequenceWriter
-from physhandi.data.truth import FOLDER as TRUTH
 from physhandi.data.truth import read_truth
 from physhandi.errors import MissingInputError
+from physhandi.synthetic.code_hash import INPUTS, code_version
 
 DEPTH_NOISE = 0.001
 """Standard deviation of the paper's disturbed depth [m]."""
@@ -27,6 +31,10 @@ TRACK_NOISE = 1.0
 """Standard deviation of the paper's disturbed tracks [px]."""
 DISTURBED_HAND = "noisy_hand"
 """The variant whose fitted hands are disturbed."""
+SCORING_ONLY = "validation_track.npy"
+"""True paths of points, of the future too, that no stage may fit."""
+_GIVEN = ("views/", *(file for file in ARRAYS if file != SCORING_ONLY))
+"""Beginnings of the names of all that a method may be given."""
 _MILLIMETRES = 1000.0
 
 
@@ -35,7 +43,7 @@ class Change:
     """How a variant differs from its recording; everything else is copied."""
 
     meta: SequenceMeta
-    """Content of its ``sequence.yaml``."""
+    """Content of its ``sequence.yaml``; what tells how it was made is taken out of it."""
     arrays: Mapping[str, ndarray] = field(default_factory=dict[str, ndarray])
     """Arrays that are other ones or new, by file."""
     images: Mapping[str, ndarray] = field(default_factory=dict[str, ndarray])
@@ -45,7 +53,7 @@ class Change:
 
 
 def unchanged(recording: Sequence, _random: Generator) -> Change:
-    """Give everything but the truth."""
+    """Give everything that a method may have."""
     return Change(meta=recording.meta)
 
 
@@ -169,16 +177,18 @@ def make_variant(recording: Sequence, name: str, folder: Path) -> Sequence:
     Raises:
         MissingInputError: If the recording lacks what the variant needs.
     """
-    target = folder / f"{recording.fingerprint()[:12]}_{name}" / recording.folder.name
+    key = f"{recording.fingerprint()[:12]}_{name}_{code_version(INPUTS)}"
+    target = folder / key / recording.folder.name
     if target.is_dir():
         return Sequence.load(target)
-    change = VARIANTS[name](recording, np.random.default_rng([1, *name.encode()]))
-    left_out = (f"{TRUTH}/", "sequence.yaml", *change.without, *change.arrays, *change.images)
+    change = VARIANTS[name](recording, np.random.default_rng(noise_seed(recording, name)))
+    left_out = (*change.without, *change.arrays, *change.images)
     with SequenceWriter(target) as writer:
         for path in sorted(recording.folder.rglob("*")):
             rel = path.relative_to(recording.folder).as_posix()
             is_hidden = any(part.startswith(".") for part in rel.split("/"))
-            if path.is_file() and not is_hidden and not rel.startswith(left_out):
+            is_given = rel.startswith(_GIVEN) and not rel.startswith(left_out)
+            if path.is_file() and not is_hidden and is_given:
                 writer.copy(rel, path)
         for view in change.meta.views:  # A view may have held nothing but what is left out.
             writer.make_folder(f"views/{view.name}")
@@ -186,7 +196,18 @@ def make_variant(recording: Sequence, name: str, folder: Path) -> Sequence:
             writer.save_array(rel, array)
         for rel, image in change.images.items():
             writer.save_image(rel, image)
-        return writer.finish(change.meta)
+        # A description tells sizes, a provenance the seed and all levels.
+        return writer.finish(replace(change.meta, description="", provenance={}))
+
+
+def noise_seed(recording: Sequence, variant: str) -> int:
+    """Draw a seed from what a recording is: its name, and the seed that it was made with if any.
+
+    Recordings made wrong by the same noise would not be independent.
+    """
+    made = named_fields(recording.provenance.get("synthesize")) or {}
+    parts = [variant, recording.name, str(made.get("seed", ""))]
+    return int.from_bytes(hashlib.sha256("\0".join(parts).encode()).digest()[:8])
 
 
 def _disturbed(

@@ -26,11 +26,37 @@ def test_a_name_says_base_settings_and_correction() -> None:
         ("quick@node_spacing", "SETTING=VALUE"),
         ("quick@node_spacin=1", "node_spacing"),
         ("quick@node_spacing=-1", "node_spacing is -1"),
+        ("quick@a=[1,2]", "There is no setting 'a'"),
+        ("quick@node_spacing=[1,2", "not a value of YAML"),
+        ("quick@node_spacing=1,b", "'b' is not SETTING=VALUE"),
+        ("quick+5", r"no method 'quick\+5'"),
+        ("oracle_parameters+last_residual", "has no predicted frames"),
+        ("oracle_parameters@node_spacing=0.02+last_residual", "has no predicted frames"),
     ],
 )
 def test_a_wrong_name_is_refused(name: str, told: str) -> None:
     with pytest.raises(UsageError, match=told):
         parse_method(name)
+
+
+def test_a_value_may_hold_commas_and_signs() -> None:
+    radius = "object_.search.variables.connection_radius"
+    interval = "{low: 0.01, high: 0.05, scale: log}"
+    name = f"quick@{radius}={interval},simulation.stiffness=1.0e+4+last_residual"
+    method = parse_method(name)
+    assert method.is_corrected
+    assert method.base.name == name.removesuffix("+last_residual")
+    assert method.overrides == {
+        radius: {"low": 0.01, "high": 0.05, "scale": "log"},
+        "simulation.stiffness": 1e4,
+    }
+    assert not parse_method("quick@simulation.stiffness=1.0e+4").is_corrected
+
+
+def test_hindsight_is_not_told_as_a_bound() -> None:
+    about = METHODS["oracle_parameters"].about
+    assert "one optimisation in hindsight" in about
+    assert "any choice" not in about
 
 
 def test_stages_are_shared_as_far_as_settings_agree() -> None:

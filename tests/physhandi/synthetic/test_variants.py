@@ -1,6 +1,9 @@
 """What methods are given in place of a recording, against the recording's own files."""
 
+import math
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,10 +13,8 @@ from physhandi.data.sequence import Sequence, ViewMeta
 from physhandi.data.sequence_schema import SequenceMeta
 from physhandi.data.sequence_writer import write_sequence
 from physhandi.errors import MissingInputError
-from physhandi.hand.model import load_hand_model
-from physhandi.synthetic.hand_noise import disturbed
-from physhandi.synthetic.scenes import fold_motion
-from physhandi.synthetic.variants import VARIANTS, make_variant
+from physhandi.synthetic import variants
+from physhandi.synthetic.variants import VARIANTS, make_variant, noise_seed
 
 FRAMES = 3
 SIZE = (60, 80)
@@ -46,23 +47,68 @@ def recording(tmp_path: Path) -> Sequence:
             images[f"views/{view.name}/mask/{frame:05d}.png"] = mask
     rise = np.arange(FRAMES, dtype=np.float32)[:, None, None] / 100
     arrays["truth/hand_right_vertex.npy"] = np.ones((FRAMES, 7, 3), np.float32) * 0.1 + rise
+    arrays["validation_track.npy"] = np.zeros((FRAMES, 2, 3), np.float32)
     meta = SequenceMeta(
-        name="scene", frame_rate=30.0, frame_count=FRAMES, hands=("right",), views=views
+        name="scene",
+        frame_rate=30.0,
+        frame_count=FRAMES,
+        ground_height=0.25,
+        description="A towel of 21 x 33 cm.",
+        hands=("right",),
+        views=views,
+        provenance={"synthesize": {"seed": 4711}, "degradations": {"depth_noise": 0.5}},
     )
     return write_sequence(tmp_path / "scene", meta, arrays, images=images)
 
 
-def test_nothing_but_the_truth_is_kept_back(recording: Sequence, tmp_path: Path) -> None:
+def files(sequence: Sequence) -> dict[str, bytes]:
+    paths = [path for path in sequence.folder.rglob("*") if path.is_file()]
+    return {path.relative_to(sequence.folder).as_posix(): path.read_bytes() for path in paths}
+
+
+def test_nothing_but_truth_and_origin_is_kept_back(recording: Sequence, tmp_path: Path) -> None:
+    whole = files(recording)
     made = make_variant(recording, "recording", tmp_path / "inputs")
-
-    def files(sequence: Sequence) -> dict[str, bytes]:
-        paths = [path for path in sequence.folder.rglob("*") if path.is_file()]
-        return {p.relative_to(sequence.folder).as_posix(): p.read_bytes() for p in paths}
-
-    whole, given = files(recording), files(made)
-    assert set(whole) - set(given) == {"truth/hand_right_vertex.npy"}
-    assert {name: whole[name] for name in given} == given
+    given = files(made)
+    kept_back = {"truth/hand_right_vertex.npy", "validation_track.npy"}
+    assert set(whole) - set(given) == kept_back
+    assert [name for name in given if given[name] != whole[name]] == ["sequence.yaml"]
+    assert made.meta.to_dict() == {
+        **recording.meta.to_dict(),
+        "provenance": {},
+        "description": "",
+    }
     assert made.name == recording.name
+    assert files(recording) == whole
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_no_variant_tells_the_future_or_how_it_was_made(
+    recording: Sequence, tmp_path: Path, name: str
+) -> None:
+    (recording.folder / "notes").mkdir()
+    (recording.folder / "notes/validation.npy").write_bytes(b"the same under another name")
+    given = files(make_variant(recording, name, tmp_path / "inputs"))
+    assert not [file for file in given if "truth" in file or "validation" in file]
+    for told in (b"4711", b"synthesize", b"degradations", b"21 x 33"):
+        assert told in files(recording)["sequence.yaml"]
+        assert told not in given["sequence.yaml"]
+    assert b"ground_height: 0.25" in given["sequence.yaml"]
+
+
+def test_what_other_code_made_is_not_used_again(
+    recording: Sequence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = make_variant(recording, "noisy_tracks", tmp_path / "inputs")
+    asked: list[Any] = []
+
+    def other(parts: tuple[str, ...]) -> str:
+        asked.append(parts)
+        return "0123456789abcdef"
+
+    monkeypatch.setattr(variants, "code_version", other)
+    assert make_variant(recording, "noisy_tracks", tmp_path / "inputs").folder != first.folder
+    assert "synthetic/variants.py" in asked[0]
 
 
 def test_a_variant_is_made_once_and_anew_for_another_recording(
@@ -111,7 +157,7 @@ def test_noise_has_the_size_that_the_paper_names(recording: Sequence, tmp_path: 
         assert measured.std() == pytest.approx(np.hypot(0.001, 0.001 / 12**0.5), rel=0.03)
         assert measured.mean() == pytest.approx(1.0, abs=1e-4)
     tracked = make_variant(recording, "noisy_tracks", tmp_path)
-    noise = np.stack([view.track for view in tracked.views]) - 30.0
+    noise = np.stack([np.asarray(view.track) for view in tracked.views]) - 30.0
     assert noise.std() == pytest.approx(1.0, rel=0.03)
     assert abs(np.corrcoef(noise[0].ravel(), noise[1].ravel())[0, 1]) < 0.1
     np.testing.assert_array_equal(tracked.views[0].depth(0), recording.views[0].depth(0))
@@ -142,12 +188,20 @@ def test_markers_are_disturbed_by_as_much_as_a_pixel_is_wide(
     assert np.asarray(deep.marker)[:, 5:].std() == pytest.approx(0.001, rel=0.05)
 
 
-def test_a_disturbed_hand_is_wrong_by_exactly_10_mm() -> None:
-    model = load_hand_model("right")
-    motion = fold_motion(model, 12, 30.0, np.random.default_rng(0))
-    wrong = disturbed(motion, 0.010, seed=0)
-    gap = np.linalg.norm(wrong.keypoints(model) - motion.keypoints(model), axis=2)
-    assert gap.mean() == pytest.approx(0.010, rel=1e-4)
-    assert gap.mean(axis=1).min() > 0.002
-    other = disturbed(motion, 0.010, seed=1)
-    assert np.abs(other.wrist_translation - wrong.wrist_translation).max() > 0.002
+@pytest.mark.parametrize(
+    "change", [{"name": "second"}, {"provenance": {"synthesize": {"seed": 1}}}]
+)
+def test_recordings_are_disturbed_independently(
+    recording: Sequence, tmp_path: Path, change: dict[str, Any]
+) -> None:
+    other = Sequence(recording.folder, replace(recording.meta, **change))
+    tracks = [
+        make_variant(one, "noisy_tracks", tmp_path / str(number)).views[0].track
+        for number, one in enumerate((recording, other, recording))
+    ]
+    first, second, again = (np.asarray(track) - 30.0 for track in tracks)
+    np.testing.assert_array_equal(first, again)
+    correlation = np.corrcoef(first.ravel(), second.ravel())[0, 1]
+    assert abs(correlation) < 4 / math.sqrt(first.size)
+    seeds = {noise_seed(one, name) for one in (recording, other) for name in VARIANTS}
+    assert len(seeds) == 2 * len(VARIANTS)

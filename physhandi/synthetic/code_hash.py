@@ -1,0 +1,54 @@
+"""Hash of the code and libraries that a result depends on.
+
+What is stored under it is found again only as long as they are the same.
+"""
+
+import hashlib
+from functools import lru_cache
+from importlib.metadata import version
+from pathlib import Path
+
+import cv2
+
+import physhandi
+from physhandi.data.run_files import artefacts
+
+INPUTS = ("synthetic/variants.py", "data/sequence_writer.py", "data/truth.py")
+"""Makes what methods are given."""
+PREDICTIONS = (
+    *("pipeline.py", "data", "hand", "perception", "simulation", "fitting"),
+    *("metrics/baselines.py", "metrics/alignment.py", "metrics/geometry.py"),
+    *("synthetic/baselines.py", "synthetic/cells.py", "synthetic/hand_noise.py"),
+    *INPUTS[:1],
+)
+"""Makes what methods predict: fits, rules, corrections and disturbances."""
+SCORES = ("metrics", "synthetic/cell_scores.py", "data", "hand")
+"""Makes figures of predictions."""
+PACKAGES = ("torch", "warp-lang", "numpy", "scipy", "cma", "safetensors")
+"""Libraries that predictions and figures are computed with, beside OpenCV."""
+_KINDS = {".py", ".yaml", ".npz", ".tflite", ".glb"}
+
+
+@lru_cache(maxsize=8)
+def code_version(parts: tuple[str, ...]) -> str:
+    """Hash modules and folders of this library, and the versions of what it computes with.
+
+    Args:
+        parts: Files and folders, relative to the library.
+
+    Raises:
+        FileNotFoundError: If one is not there, for then nothing would tell that it has changed.
+    """
+    digest = hashlib.sha256()
+    for part in parts:
+        path = Path(physhandi.__file__).parent / part
+        if not path.exists():
+            raise FileNotFoundError(f"{path} is not there, so its code cannot be hashed.")
+        for rel, file in [("", path)] if path.is_file() else list(artefacts(path)):
+            if file.suffix in _KINDS:
+                digest.update(f"{part}/{rel}\0".encode())
+                digest.update(hashlib.sha256(file.read_bytes()).digest())
+    # Several distributions carry OpenCV.
+    versions = [f"opencv {cv2.__version__}", *(f"{name} {version(name)}" for name in PACKAGES)]
+    digest.update("\0".join(versions).encode())
+    return digest.hexdigest()[:16]

@@ -1,0 +1,235 @@
+"""Cells: what they are scored on, when they are computed anew, and what is told of them."""
+
+import ast
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from sheet_sequence import FITTED, NODE, write_sheet
+
+import physhandi
+from physhandi import pipeline
+from physhandi.data.camera import PinholeCamera
+from physhandi.data.run import Run
+from physhandi.data.sequence import Sequence, ViewMeta
+from physhandi.data.sequence_schema import SequenceMeta
+from physhandi.data.sequence_writer import write_sequence
+from physhandi.errors import CancelledError, UsageError
+from physhandi.progress import NullProgress, Progress
+from physhandi.synthetic import cells
+from physhandi.synthetic.baselines import METHODS, parse_method
+from physhandi.synthetic.cell_scores import add_photometric
+from physhandi.synthetic.cells import Bench
+from physhandi.synthetic.code_hash import INPUTS, PREDICTIONS, SCORES, code_version
+
+LIBRARY = Path(physhandi.__file__).parent
+FRAMES = 4
+
+
+def bench_of(out: Path, progress: Progress | None = None) -> Bench:
+    return Bench(out, common={}, device="cpu", progress=progress or NullProgress())
+
+
+# IoU and PSNR
+
+
+def square(spacing: float) -> np.ndarray:
+    """Nodes in the middle of every tile of a square of 20 cm."""
+    axis = np.arange(-0.1 + spacing / 2, 0.1, spacing)
+    x, y = np.meshgrid(axis, axis)
+    return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1).astype(np.float32)
+
+
+@pytest.fixture
+def seen(tmp_path: Path) -> Sequence:
+    """A camera 1 m above a square that moves by 5 cm, thus 10 px, a frame."""
+    pose = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 1], [0, 0, 0, 1]])
+    K = np.array([[200.0, 0, 60], [0, 200.0, 40], [0, 0, 1]])
+    camera = PinholeCamera(K=K, T_world_camera=pose, width=120, height=80)
+    images: dict[str, np.ndarray] = {}
+    for frame in range(FRAMES):
+        mask = np.zeros((80, 120), dtype=np.uint8)
+        mask[20:60, 40 + 10 * frame : 80 + 10 * frame] = 1
+        color = np.zeros((80, 120, 3), dtype=np.uint8)
+        color[..., 0] = 200 * mask
+        images[f"views/a/mask/{frame:05d}.png"] = mask
+        images[f"views/a/color/{frame:05d}.png"] = color
+    meta = SequenceMeta(
+        name="square",
+        frame_rate=30.0,
+        frame_count=FRAMES,
+        reconstruction=2,
+        views=(ViewMeta(name="a", camera=camera),),
+    )
+    return write_sequence(tmp_path / "square", meta, images=images)
+
+
+def run_with(folder: Path, recording: Sequence, rollout: np.ndarray) -> Run:
+    run = Run.create(
+        folder, name="test", kind="reconstruction", sequences=[str(recording.folder)], config={}
+    )
+    with run.begin_attempt() as attempt:
+        attempt.save_array("sequences/square/object_node.npy", rollout[0])
+        attempt.save_array("sequences/square/rollout.npy", rollout)
+        attempt.publish()
+    return run
+
+
+@pytest.mark.parametrize("spacing", [0.02, 0.01])
+def test_silhouette_and_color_are_those_of_the_method_whatever_its_nodes(
+    seen: Sequence, tmp_path: Path, spacing: float
+) -> None:
+    still = run_with(tmp_path / "still", seen, np.stack([square(0.02)] * FRAMES))
+    moved = np.arange(FRAMES)[:, None, None] * np.array([0.05, 0, 0]) + square(spacing)
+    moved = moved.astype(np.float32)
+    moved[3] = np.nan
+    run = run_with(tmp_path / "run", seen, moved)
+
+    def measured(what: Run | None) -> tuple[dict[str, Any], dict[str, Any]]:
+        report: dict[str, Any] = {"reconstruction": {"rollout": {}}, "future": {"rollout": {}}}
+        curves: dict[str, Any] = {}
+        add_photometric(report, curves, what, still, seen)
+        return report, curves
+
+    report, curves = measured(run)
+    stood = measured(None)[1]
+    # 30 and 20 of 40 columns are still covered after one and two steps.
+    assert stood["iou"][1:3] == pytest.approx([30 / 50, 20 / 60], abs=0.05)
+    assert min(curves["iou"][:3]) > 0.88
+    assert curves["iou"][3] == pytest.approx(stood["iou"][3], abs=0.03)
+    assert min(curves["psnr"][:3]) > stood["psnr"][1] + 3.0
+    assert curves["psnr"][3] < curves["psnr"][2] - 3.0
+    assert report["reconstruction"]["rollout"]["iou"] == pytest.approx(curves["iou"][1])
+    future = report["future"]["rollout"]["iou"]
+    assert future == pytest.approx((curves["iou"][2] + curves["iou"][3]) / 2)
+
+
+# What a cell is found again by
+
+
+def needed(start: tuple[str, ...], without: tuple[str, ...]) -> set[str]:
+    """Follow the imports of files of the library; some are left out."""
+    found: set[str] = set()
+    waiting = list(start)
+    while waiting:
+        file = waiting.pop()
+        if file in found or file.startswith(without):
+            continue
+        found.add(file)
+        for node in ast.walk(ast.parse((LIBRARY / file).read_text())):
+            names: list[str] = []
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom) and node.module is not None:
+                names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+            for name in names:
+                if name.startswith("physhandi."):
+                    path = name.removeprefix("physhandi.").replace(".", "/") + ".py"
+                    waiting += [path] if (LIBRARY / path).is_file() else []
+    return found
+
+
+# Words and looks, and the metrics that a run notes of itself, which no table takes.
+NO_MATTER = ("errors.py", "progress.py", "synthetic/code_hash.py", "metrics/report.py")
+
+
+@pytest.mark.parametrize(
+    ("parts", "start", "without"),
+    [
+        (PREDICTIONS, ("synthetic/cells.py",), (*NO_MATTER, "synthetic/cell_scores.py")),
+        (SCORES, ("synthetic/cell_scores.py",), NO_MATTER[:3]),
+        (PREDICTIONS, INPUTS, NO_MATTER),
+    ],
+    ids=["predictions", "scores", "inputs"],
+)
+def test_all_code_that_a_result_depends_on_is_in_its_hash(
+    parts: tuple[str, ...], start: tuple[str, ...], without: tuple[str, ...]
+) -> None:
+    files = needed(start, without)
+    assert len(files) > 3
+    kept = {path if path.endswith(".py") else f"{path}/" for path in parts}
+    assert not [file for file in files if not file.startswith(tuple(kept))]
+
+
+def test_the_hash_tells_code_and_libraries(monkeypatch: pytest.MonkeyPatch) -> None:
+    hashes = {code_version(parts) for parts in (INPUTS, PREDICTIONS, SCORES)}
+    assert len(hashes) == 3
+    with pytest.raises(FileNotFoundError, match=r"magic\.py"):
+        code_version(("synthetic/magic.py",))
+    monkeypatch.setattr("cv2.__version__", "0.0")
+    code_version.cache_clear()
+    try:
+        assert not hashes & {code_version(parts) for parts in (INPUTS, PREDICTIONS, SCORES)}
+    finally:
+        code_version.cache_clear()
+
+
+def test_another_processor_computes_a_cell_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = write_sheet(tmp_path / "sheet")
+    first = bench_of(tmp_path / "suite").outcome(METHODS["static"], recording).run
+    assert bench_of(tmp_path / "suite").outcome(METHODS["static"], recording).run == first
+    monkeypatch.setattr(cells, "processor_name", lambda: "Another One 3000")
+    assert bench_of(tmp_path / "suite").outcome(METHODS["static"], recording).run != first
+
+
+# What is scored and told
+
+
+def test_scores_are_taken_against_what_the_method_was_not_given(tmp_path: Path) -> None:
+    plain = write_sheet(tmp_path / "plain")
+    names = ("control", "marker", "marker_node", "object_node", "rest_node")
+    arrays = {f"{name}.npy": np.load(plain.folder / f"{name}.npy") for name in names}
+    # Not where the markers are, so that their error is another one.
+    rise = np.arange(10)[:, None, None] * np.array([0, 0, 0.01])
+    path = (NODE[:4] + rise).astype(np.float32)
+    arrays["validation_track.npy"] = path
+    meta = replace(plain.meta, name="sheet", provenance={"synthesize": {"seed": 3}})
+    recording = write_sequence(tmp_path / "sheet", meta, arrays)
+    outcome = bench_of(tmp_path / "suite").outcome(METHODS["static"], recording)
+    future = range(FITTED, 10)
+    expected = np.mean([0.01 * frame for frame in future])
+    found = outcome.report["future"]["rollout"]
+    assert found["track_error"] == pytest.approx(expected, rel=1e-4)
+    gap = np.linalg.norm(arrays["marker.npy"][FITTED:] - NODE, axis=2).mean()
+    assert found["marker_error"] == pytest.approx(gap, rel=1e-4)
+    assert abs(gap - expected) > 0.003
+    given = list((tmp_path / "suite/inputs").rglob("*"))
+    assert [file for file in given if file.name == "marker.npy"]
+    assert not [file for file in given if file.name == "validation_track.npy"]
+
+
+def test_a_cell_that_was_stopped_has_no_times(tmp_path: Path) -> None:
+    recording = write_sheet(tmp_path / "sheet")
+
+    class Stopper(Progress):
+        def report(self, stage: str, *rest: Any, **more: Any) -> None:
+            raise CancelledError("enough")
+
+    through = bench_of(tmp_path / "through")
+    methods = [parse_method(n) for n in ("static", "rigid_follow", "rigid_follow+last_residual")]
+    for method in methods:
+        assert through.outcome(method, recording).seconds["observation"] >= 0
+    with pytest.raises(CancelledError):
+        bench_of(tmp_path / "stopped", Stopper()).outcome(methods[0], recording)
+    for method in methods:  # The first stages of all of them are those of the static object.
+        outcome = bench_of(tmp_path / "stopped").outcome(method, recording)
+        assert (outcome.error, outcome.seconds) == ("", {})
+
+
+def test_a_setting_that_only_the_fit_refuses_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = write_sheet(tmp_path / "sheet")
+
+    def refuse(*_: Any, **__: Any) -> None:
+        raise UsageError("Self-collision is not simulated in a batch; switch it off.")
+
+    monkeypatch.setattr(pipeline, "search_object", refuse)
+    bench = bench_of(tmp_path / "suite")
+    for _ in range(2):
+        with pytest.raises(UsageError, match="'quick' on sequence 'sheet': Self-collision"):
+            bench.outcome(METHODS["quick"], recording)
