@@ -13,6 +13,7 @@ DataDir = Annotated[
     Path | None,
     arg(help="Folder with `sequences/` and `runs/` (PHYSHANDI_DATA_DIR, else `data`)."),
 ]
+_OF_SUITE = arg(help_behavior_hint="(default: the suite's)")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,20 +117,23 @@ class EvaluateSuite:
 
     suite: Literal["tiny", "dev", "full"] = "tiny"
     """Which suite; sequences that are not there yet are made."""
-    methods: tuple[str, ...] = ()
+    methods: Annotated[tuple[str, ...], _OF_SUITE] = ()
     """Methods: static, rigid_follow, phystwin, paper, ours, quick, oracle_hand, oracle_parameters,
-    each also as NAME+last_residual or NAME@SETTING=VALUE; none takes the suite's."""
-    seeds: tuple[int, ...] = ()
-    """Seeds of every scene; none takes the suite's. From 1000 on they are reserved."""
-    protocols: tuple[
-        Literal["main", "single_view", "unseen", "robustness", "sensitivity"], ...
+    each also as NAME+last_residual or NAME@SETTING=VALUE."""
+    seeds: Annotated[tuple[int, ...], _OF_SUITE] = ()
+    """Seeds of every scene. From 1000 on they are reserved for verification."""
+    protocols: Annotated[
+        tuple[Literal["main", "single_view", "unseen", "robustness", "sensitivity"], ...],
+        _OF_SUITE,
     ] = ()
-    """main is reconstruction and future prediction; none takes the suite's."""
-    sequences: tuple[str, ...] = ()
+    """main is reconstruction and future prediction."""
+    sequences: Annotated[
+        tuple[str, ...], arg(help_behavior_hint="(default: the suite's scenes)")
+    ] = ()
     """Folders or names of sequences to evaluate in place of the suite's scenes."""
     out: Path | None = None
-    """Folder to fill, and to go on with; none takes `suites/` in the data folder, whose suites the
-    server shows."""
+    """Folder to fill, and to go on with; none takes one of its own in `suites/` of the data folder,
+    whose suites the server shows."""
     device: str = "auto"
     """Warp device: auto, cpu or cuda:0."""
     json: bool = False

@@ -22,6 +22,7 @@ from app.arguments import (
     Simulate,
 )
 from app.sequence_arguments import Import, Synthesize
+from app.suite_command import evaluate_suite
 from physhandi.errors import PhysHandiError, UsageError, describe
 from physhandi.progress import Progress
 
@@ -92,7 +93,7 @@ def _dispatch(command: Any) -> int:
         case Evaluate(what=EvaluateHands() as what):
             _show(commands.evaluate_hands(what), as_json=what.json)
         case Evaluate(what=EvaluateSuite() as what):
-            found = _watched(lambda progress: commands.evaluate_suite(what, progress))
+            found = _watched(lambda progress: evaluate_suite(what, progress))
             _show(found, as_json=what.json)
         case Evaluate(what=what):
             _show(commands.evaluate_run(what), as_json=what.json)

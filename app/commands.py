@@ -215,44 +215,6 @@ def evaluate_hands(command: Any) -> dict[str, Any]:
     return hands
 
 
-def evaluate_suite(command: Any, progress: Progress) -> dict[str, Any]:
-    """Compare methods on the sequences of a suite, or on named ones.
-
-    Raises:
-        UsageError: If a method, seed or sequence makes no sense.
-    """
-    from physhandi.synthetic.baselines import parse_method, settings_of
-    from physhandi.synthetic.evaluation import Order, evaluate
-    from physhandi.synthetic.suite import find_suite, make_recordings
-
-    suite = find_suite(command.suite)
-    settings = read_settings(data_dir=command.data_dir)
-    name = "named" if command.sequences else suite.name
-    out = command.out or settings.suite_dir / name
-    if command.sequences and command.seeds:
-        raise UsageError("--seeds belongs to a suite's scenes; leave it out with --sequences.")
-    methods = command.methods or suite.methods
-    for method in methods:  # Tells a wrong one before a sequence is made, which takes long.
-        settings_of(parse_method(method), suite.settings)
-    device = pick_device(command.device)
-    recordings = (
-        tuple(find_sequence(sequence, command.data_dir) for sequence in command.sequences)
-        if command.sequences
-        else make_recordings(suite, command.seeds or suite.seeds, out / "sequences", progress)
-    )
-    for recording in recordings:
-        recording.validate(reads_color=False)
-    order = Order(
-        title=f"Suite {suite.name}" if not command.sequences else "Named sequences",
-        recordings=recordings,
-        methods=methods,
-        protocols=command.protocols or suite.protocols,
-        settings=suite.settings,
-        device=device,
-    )
-    return evaluate(order, out, progress)
-
-
 def make_sequence(command: Any, progress: Progress) -> dict[str, Any]:
     """Simulate and film a sequence with another physics engine; returns where it is.
 

@@ -45,10 +45,12 @@ _NOTE = """\
 Figures are means over sequences of the mean over frames of the mean over points; brackets hold the
 95 % interval of a bootstrap over sequences, for which all methods are resampled together. Frame 0
 is given and not scored. `rec.` are the frames that were fitted, `fut.` those that were held out. A
-method without output scores as the static object. CD_dyn and CD_full are one-way and in the L1
-norm, as PhysTwin computes them; `sym.` is the symmetric mean of Euclidean distances. All data is
-synthetic: these figures do not compare with those published on other data. docs/evaluation.md
-explains the methods and protocols, docs/metrics.md every metric.
+method without output scores as the static object, which touches nothing. The best figure of a
+column is bold, and so is every one that prints the same; oracles do not count, and no figure is
+bold where methods have different numbers of sequences, which `n` then tells. CD_dyn and CD_full are
+one-way and in the L1 norm, as PhysTwin computes them; `sym.` is the symmetric mean of Euclidean
+distances. All data is synthetic: these figures do not compare with those published on other data.
+docs/evaluation.md explains the methods and protocols, docs/metrics.md every metric.
 """
 
 
@@ -61,7 +63,8 @@ def write_report(
     """Put a suite's results into words, tables and charts.
 
     Args:
-        about: Of the suite: ``title methods cases protocols settings skipped environment``.
+        about: Of the suite: ``title command methods oracles cases protocols settings seeds
+            is_verification presets generators notes skipped missing environment``.
         rows: Means over sequences.
         differences: Paired comparisons with one method.
         cells: One entry a cell: ``method case run error figures curves seconds`` and more.
@@ -71,9 +74,11 @@ def write_report(
     """
     tables = tables_of(rows)
     charts = _charts(rows, cells)
-    parts = [f"# {about['title']}", "", _intro(about), _NOTE]
+    oracles = about["oracles"]
+    mark = " (verification)" if about["is_verification"] else ""
+    parts = [f"# {about['title']}{mark}", "", _intro(about), _NOTE]
     for title, columns in tables.items():
-        parts += [f"## {title}", "", markdown_table(rows, columns)]
+        parts += [f"## {title}{mark}", "", markdown_table(rows, columns, oracles)]
     if differences:
         parts += [f"## Compared with {differences[0].against}", "", _compared(differences)]
     if charts:
@@ -82,7 +87,8 @@ def write_report(
     parts += ["## Missing output", "", _missing(about, cells)]
     parts += ["## Computed with", "", _environment(about)]
     latex = "\n".join(
-        f"% {title}\n{latex_table(rows, columns)}" for title, columns in tables.items()
+        f"% {title}{mark}\n{latex_table(rows, columns, oracles)}"
+        for title, columns in tables.items()
     )
     return {
         "report.md": "\n".join(parts),
@@ -159,6 +165,12 @@ def _intro(about: Mapping[str, Any]) -> str:
     lines += [f"* `{name}`: {text}" for name, text in methods.items()]
     if len(cases) == 1:
         lines += ["", "One sequence alone has no interval."]
+    if about["is_verification"]:
+        lines += ["", "**Verification**: seeds from 1000 on; nothing may be tuned on this table."]
+    if about["missing"]:
+        lines += ["", f"**Not finished**: {about['missing']} cells are missing."]
+    for note in about["notes"]:
+        lines += ["", f"**Note**: {note}"]
     return "\n".join([*lines, ""])
 
 
@@ -223,8 +235,16 @@ def _environment(about: Mapping[str, Any]) -> str:
     found = about["environment"]
     packages = ", ".join(f"{name} {version}" for name, version in found["packages"].items())
     settings = ", ".join(f"{name} = {value}" for name, value in about["settings"].items())
+    made = {"command": [about["command"] and f"`{about['command']}`"]} | {
+        name: about[name] for name in ("seeds", "presets", "generators")
+    }
     return "\n".join(
         [
+            *(
+                f"* {name}: {', '.join(str(value) for value in values)}"
+                for name, values in made.items()
+                if any(value != "" for value in values)
+            ),
             f"* device: {found['device']} {found['device_name']}, {found['cpu_count']} processors",
             f"* system: {found['system']}, Python {found['python']}",
             f"* commit: {found['commit'] or 'not run from a checkout'}",
@@ -269,5 +289,6 @@ def _charts(rows: Sequence[Row], cells: Sequence[Mapping[str, Any]]) -> dict[str
             if cell["case"] == case and cell["protocol"] == "main" and _CURVE in cell["curves"]
         }
         if lines:
-            charts[f"charts/{case}.svg"] = line_chart(f"Track error on {case} [mm]", lines)
+            # Split and sequence may have one name.
+            charts[f"charts/sequence_{case}.svg"] = line_chart(f"Track error on {case} [mm]", lines)
     return charts

@@ -1,5 +1,7 @@
-"""Evaluating methods on sequences: which cells a protocol asks for, and what is written of them."""
+"""Evaluating methods on sequences: which cells a protocol asks for, and how they are filled."""
 
+import logging
+import time
 from collections.abc import Iterator, Mapping
 from collections.abc import Sequence as Many
 from dataclasses import dataclass, field, replace
@@ -8,28 +10,32 @@ from typing import Any
 
 import warp as wp
 
-from physhandi.data.atomic import named_fields, write_bytes, write_json
+import physhandi
+from physhandi.data.atomic import named_fields
 from physhandi.data.environment import describe_environment
 from physhandi.data.sequence import Sequence
-from physhandi.errors import PhysHandiError, UsageError
-from physhandi.metrics.suite_report import write_report
-from physhandi.metrics.suite_tables import (
-    PAIRED_COLUMNS,
-    Score,
-    compare,
-    summarise,
-    to_csv,
-)
+from physhandi.errors import MissingInputError, SequenceError, UsageError
 from physhandi.progress import NullProgress, Progress
-from physhandi.synthetic.baselines import Method, parse_method, settings_of
-from physhandi.synthetic.cells import Bench, Outcome
-from physhandi.synthetic.suite import Protocol
-from physhandi.synthetic.suite_scores import BREAKDOWN, contact_kind, scores_of
+from physhandi.synthetic.baselines import METHODS, Method, parse_method, settings_of
+from physhandi.synthetic.cells import FAILURES, Bench, Outcome
+from physhandi.synthetic.generator_version import code_hash, outdated, told_version
+from physhandi.synthetic.suite import RESERVED_SEED, Protocol
+from physhandi.synthetic.suite_folder import SuiteFolder
+from physhandi.synthetic.suite_scores import contact_kind, figures_of
+
+_LOG = logging.getLogger(__name__)
 
 SENSITIVITY = ((0.001, 3), (0.002, 3), (0.02, 3), (0.04, 3), (0.002, 1), (0.002, 10), (0.002, 50))
 """Start values of virtual δ [m] and d_max: the rows of the paper's sensitivity table."""
 ROBUSTNESS = ("noisy_depth", "noisy_tracks", "noisy_hand")
 """The paper's three disturbances."""
+WRITE_EVERY = 600.0
+"""Tables are written after every protocol, and after this time [s]."""
+_CODE = (
+    *("pipeline.py", "data", "hand", "perception", "simulation", "fitting", "metrics"),
+    "synthetic",
+)
+"""What figures depend on."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +54,8 @@ class Order:
     """Settings that all methods share."""
     device: str = "cpu"
     """Warp device."""
+    command: str = ""
+    """The command that asks for it, which the report repeats."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,60 +73,172 @@ class _Task:
 def evaluate(order: Order, out: Path, progress: Progress | None = None) -> dict[str, Any]:
     """Run what is missing of an order, and write its tables.
 
+    Tables are written on the way too, and when the user stops it or something fails. What an
+    earlier order found out about the same sequences with the same code stays in them.
+
     Args:
         order: What is to be evaluated.
         out: Folder of the suite; finished cells in it are not computed again.
         progress: Told about every cell, and about every iteration in it.
 
     Returns:
-        ``out``, ``table`` and ``report`` (paths), ``cells`` and ``failed`` (numbers of cells), and
-        ``skipped`` (why some could not be asked for).
+        ``out``, ``table`` and ``report`` (paths), ``cells`` and ``failed`` (numbers of cells),
+        ``skipped`` (why some could not be asked for) and ``notes`` (what to know of the data).
 
     Raises:
-        UsageError: If a method is unknown, or there is nothing to evaluate.
-        PhysHandiError: If a recording cannot be observed at all.
+        UsageError: If a method is unknown, there is nothing to evaluate, or the folder holds the
+            table of other sequences.
+        MissingInputError: If no recording can be observed at all.
         CancelledError: If the user asked to stop; what is finished stays.
     """
     progress = progress or NullProgress()
     methods = tuple(parse_method(name) for name in dict.fromkeys(order.methods))
+    order = replace(order, protocols=tuple(dict.fromkeys(order.protocols)))
     _check(order, methods)
-    bench = Bench(out, common=order.settings, device=order.device, progress=progress)
+    folder = SuiteFolder(out, _about(order, methods))
+    for note in folder.about["notes"]:
+        _LOG.warning("%s", note)
+    work = _Work(order, Bench(out, common=order.settings, device=order.device, progress=progress))
     tasks = list(_tasks(order, methods))
-    scores: list[Score] = []
-    cells: list[dict[str, Any]] = []
-    skipped: list[str] = []
-    for number, task in enumerate(tasks):
-        progress.check_cancelled()
-        told = f"{task.method.name}, {task.recording.name}"
-        progress.report("suite", number, len(tasks), message=told)
-        try:
-            outcome = _outcome(bench, task)
-        except _ImpossibleError as reason:
-            skipped.append(f"{told}, {task.split}: {reason}")
-            continue
-        found = list(scores_of(outcome, task.recording, task.protocol, task.split))
-        scores += found
-        cells.append(_cell(task, outcome, found))
-    progress.report("suite", len(tasks), len(tasks))
-    environment = describe_environment(order.device, wp.get_device(order.device).name)
-    about = {
+    finished, paths, written = 0, dict[str, Any](), time.monotonic()
+
+    def write() -> dict[str, Any]:
+        return folder.write(_environment(order), work.skipped, len(tasks) - finished)
+
+    try:
+        for number, task in enumerate(tasks):
+            is_other = number > 0 and task.protocol != tasks[number - 1].protocol
+            if folder.done and (is_other or time.monotonic() - written > WRITE_EVERY):
+                paths, written = write(), time.monotonic()
+            progress.check_cancelled()
+            told = f"{task.method.name}, {task.recording.name}"
+            progress.report("suite", number, len(tasks), message=told)
+            cell = work.cell(task)
+            finished += 1
+            if cell is not None:
+                folder.done.append(cell)
+        progress.report("suite", len(tasks), len(tasks))
+    finally:
+        if folder.done:
+            paths = write()
+    work.raise_if_blind()
+    return (paths or write()) | {
+        "cells": len(folder.done),
+        "failed": sum(bool(cell["error"]) for cell in folder.done),
+        "skipped": work.skipped,
+        "notes": [*folder.about["notes"], *folder.notes],
+    }
+
+
+class _Work:
+    """Fills cells, and remembers which could not be asked for."""
+
+    def __init__(self, order: Order, bench: Bench) -> None:
+        self.bench = bench
+        self.recordings = order.recordings
+        self.skipped: list[str] = []
+        self._blind: dict[str, str] = {}
+
+    def cell(self, task: _Task) -> dict[str, Any] | None:
+        """Fill a cell; None if no method could."""
+        for recording in filter(None, (task.recording, task.fitted)):
+            reason = self._why_blind(recording)
+            if reason:
+                self._skip(f"{recording.name}: {reason}")
+                return None
+        if task.protocol == "unseen" and task.fitted is None:
+            self._skip(
+                f"{task.recording.name}, unseen: no other sequence shows the same body in another "
+                "action."
+            )
+            return None
+        for recording in filter(None, (task.recording, task.fitted)):
+            reason = self.bench.lacks(task.method, recording, task.variant)
+            if reason:
+                self._skip(f"{task.method.name}, {task.recording.name}, {task.split}: {reason}")
+                return None
+        return self._described(task, self._outcome(task))
+
+    def raise_if_blind(self) -> None:
+        """Tell that nothing can be scored at all.
+
+        Raises:
+            MissingInputError: If no recording can be observed.
+        """
+        if self._blind and all(self._blind.get(r.name) for r in self.recordings):
+            raise MissingInputError(f"No sequence can be evaluated. {' '.join(self.skipped)}")
+
+    def _why_blind(self, recording: Sequence) -> str:
+        """Say why nothing of a recording can be scored, whatever the method; empty if it can."""
+        if recording.name not in self._blind:
+            reason = ""
+            try:
+                self.bench.outcome(METHODS["static"], recording)
+            except (*FAILURES, SequenceError) as error:
+                reason = str(error)
+            self._blind[recording.name] = reason
+        return self._blind[recording.name]
+
+    def _skip(self, reason: str) -> None:
+        if reason not in self.skipped:
+            self.skipped.append(reason)
+
+    def _outcome(self, task: _Task) -> Outcome:
+        if task.fitted is not None:
+            return self.bench.unseen(task.method, task.fitted, task.recording)
+        return self.bench.outcome(task.method, task.recording, task.variant)
+
+    def _described(self, task: _Task, outcome: Outcome) -> dict[str, Any]:
+        unmoved = None
+        if outcome.error and task.method.rule is None:
+            static = self.bench.reference(task.recording)
+            unmoved = static.array(f"sequences/{task.recording.name}/rollout.npy")[0]
+        figures = figures_of(outcome, task.recording, task.protocol, task.split, unmoved)
+        return {
+            "protocol": task.protocol,
+            "split": task.split,
+            "method": outcome.method,
+            "case": outcome.case,
+            "variant": outcome.variant,
+            "run": outcome.run,
+            "error": outcome.error,
+            "contact": contact_kind(task.recording),
+            "seconds": dict(outcome.seconds),
+            "figures": figures,
+            "curves": dict(outcome.curves),
+        }
+
+
+def _environment(order: Order) -> dict[str, Any]:
+    return describe_environment(order.device, wp.get_device(order.device).name)
+
+
+def _about(order: Order, methods: Many[Method]) -> dict[str, Any]:
+    environment = _environment(order)
+    made = [named_fields(r.provenance.get("synthesize")) or {} for r in order.recordings]
+    seeds = sorted({one["seed"] for one in made if isinstance(one.get("seed"), int)})
+    told = [told_version(recording) for recording in order.recordings]
+    return {
         "title": order.title,
+        "command": order.command,
         "methods": {method.name: method.about for method in methods},
+        "oracles": [method.name for method in methods if method.gets != "recording"],
         "cases": [recording.name for recording in order.recordings],
         "protocols": list(order.protocols),
         "settings": dict(order.settings),
-        "skipped": skipped,
-        "environment": environment,
+        "seeds": seeds,
+        "is_verification": any(seed >= RESERVED_SEED for seed in seeds),
+        "presets": sorted({str(one["preset"]) for one in made if "preset" in one}),
+        "generators": sorted({version for version in told if version}),
+        "notes": [note for recording in order.recordings if (note := outdated(recording))],
+        "made_from": {
+            "code": code_hash(Path(physhandi.__file__).parent, _CODE),
+            "settings": dict(order.settings),
+            "device": [environment["device"], environment["device_name"]],
+            "packages": environment["packages"],
+            "sequences": {r.name: r.fingerprint() for r in order.recordings},
+        },
     }
-    return _write(out, about, scores, cells) | {
-        "cells": len(cells),
-        "failed": sum(bool(cell["error"]) for cell in cells),
-        "skipped": skipped,
-    }
-
-
-class _ImpossibleError(PhysHandiError):
-    """A recording lacks what a protocol or an oracle needs; no method is to blame."""
 
 
 def _check(order: Order, methods: Many[Method]) -> None:
@@ -152,9 +272,7 @@ def _asked(
         for variant in ROBUSTNESS:
             yield replace(task, variant=variant, split=variant)
     elif protocol == "unseen" and not method.is_corrected:
-        fitted = _other_of_same_object(recording, order.recordings)
-        if fitted is not None:
-            yield replace(task, fitted=fitted)
+        yield replace(task, fitted=_other_of_same_object(recording, order.recordings))
     elif protocol == "sensitivity" and is_plain and recording is order.recordings[0]:
         starts = () if method.rule else SENSITIVITY
         yield from (_started(task, *start) for start in starts)
@@ -172,66 +290,25 @@ def _started(task: _Task, radius: float, most: int) -> _Task:
 
 def _other_of_same_object(recording: Sequence, others: Many[Sequence]) -> Sequence | None:
     """Find the next recording of the same body in another action; around the end of the list."""
-    own = _body(recording)
+    own, action = _body(recording)
     order = list(others)
     place = order.index(recording)
-    rest = order[place + 1 :] + order[:place]
-    return next((other for other in rest if own is not None and _body(other) == own), None)
+    if own is None or action is None:
+        return None
+    for other in order[place + 1 :] + order[:place]:
+        body, done = _body(other)
+        if body == own and done is not None and done != action:
+            return other
+    return None
 
 
-def _body(recording: Sequence) -> tuple[Any, ...] | None:
-    """Identify the made body of a recording: seed and object decide its size and material."""
+def _body(recording: Sequence) -> tuple[tuple[Any, ...] | None, Any]:
+    """Identify the made body of a recording, and what is done with it.
+
+    Seed and object decide a body's size and material, for one version of the generator.
+    """
     made = named_fields(recording.provenance.get("synthesize"))
     if made is None:
-        return None
-    return tuple(made.get(name) for name in ("object", "seed", "resolution"))
-
-
-def _outcome(bench: Bench, task: _Task) -> Outcome:
-    for recording in filter(None, (task.recording, task.fitted)):
-        reason = bench.lacks(task.method, recording, task.variant)
-        if reason:
-            raise _ImpossibleError(reason)
-    if task.fitted is not None:
-        return bench.unseen(task.method, task.fitted, task.recording)
-    return bench.outcome(task.method, task.recording, task.variant)
-
-
-def _cell(task: _Task, outcome: Outcome, scores: Many[Score]) -> dict[str, Any]:
-    figures: dict[str, dict[str, float]] = {}
-    for score in scores:
-        if not score.split.endswith(BREAKDOWN):
-            figures.setdefault(score.split, {})[score.metric] = score.value
-    return {
-        "protocol": task.protocol,
-        "split": task.split,
-        "method": outcome.method,
-        "case": outcome.case,
-        "variant": outcome.variant,
-        "run": outcome.run,
-        "error": outcome.error,
-        "contact": contact_kind(task.recording),
-        "seconds": dict(outcome.seconds),
-        "figures": figures,
-        "curves": dict(outcome.curves),
-    }
-
-
-def _write(
-    out: Path, about: Mapping[str, Any], scores: Many[Score], cells: Many[dict[str, Any]]
-) -> dict[str, Any]:
-    rows = summarise(scores)
-    methods = list(about["methods"])
-    against = "phystwin" if "phystwin" in methods else methods[0]
-    differences = compare(scores, against)
-    write_json(out / "cells.json", {"about": about, "cells": list(cells)})
-    write_bytes(out / "table.csv", to_csv(rows).encode())
-    write_bytes(out / "paired.csv", to_csv(differences, PAIRED_COLUMNS).encode())
-    for file, content in write_report(about, rows, differences, cells).items():
-        (out / file).parent.mkdir(exist_ok=True)
-        write_bytes(out / file, content.encode())
-    return {
-        "out": str(out),
-        "table": str(out / "table.csv"),
-        "report": str(out / "report.md"),
-    }
+        return None, None
+    body = tuple(made.get(name) for name in ("object", "seed", "resolution"))
+    return (*body, told_version(recording)), made.get("action")

@@ -14,6 +14,7 @@ _PARTS = (
     *("presets.py", "filming.py", "rendering.py", "rasterizer.py", "recording.py"),
     "synthesize.py",
 )
+_KINDS = {".py", ".npz", ".yaml", ".tflite", ".glb"}
 
 
 @lru_cache(maxsize=1)
@@ -44,7 +45,7 @@ def code_hash(folder: Path, parts: tuple[str, ...]) -> str:
         path = folder / part
         files = sorted(path.rglob("*")) if path.is_dir() else [path]
         for file in files:
-            if file == path or file.suffix in {".py", ".npz"}:
+            if file == path or file.suffix in _KINDS:
                 digest.update(f"{file.relative_to(folder).as_posix()}\0".encode())
                 digest.update(file.read_bytes())
     return digest.hexdigest()[:12]
@@ -65,5 +66,5 @@ def outdated(recording: Sequence) -> str:
     by = f"another version of the generator ({made})" if made else "an unknown generator"
     return (
         f"Sequence '{recording.name}' was made by {by}; the present one ({present}) may make it "
-        f"otherwise. Delete {recording.folder} to have it made anew."
+        f"otherwise. To have it made anew, delete {recording.folder} first."
     )

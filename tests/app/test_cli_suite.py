@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -31,10 +32,44 @@ def test_named_sequences_are_evaluated_where_the_server_finds_them(
     assert code == 0
     found = json.loads(out)
     assert (found["cells"], found["failed"]) == (2, 0)
-    assert Path(found["table"]) == data_dir.resolve() / "suites" / "named" / "table.csv"
+    folder = Path(found["out"])
+    assert folder.parent == data_dir.resolve() / "suites"
+    assert re.fullmatch(r"sheet-[0-9a-f]{8}", folder.name)
+    assert Path(found["table"]) == folder / "table.csv"
     rows = rows_of(Path(found["table"]))
     assert rows["static", "future", "track_error"] > 0.03
-    assert "sheet" in Path(found["report"]).read_text()
+    report = Path(found["report"]).read_text()
+    assert (
+        "* command: `physhandi evaluate suite --suite tiny --methods static rigid_follow "
+        "--sequences sheet --device cpu`" in report
+    )
+
+
+def test_other_sequences_have_a_folder_of_their_own_and_no_other_gets_their_table(
+    data_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = shutil.copytree(data_dir / "sequences/sheet", data_dir / "sequences/other")
+    content = (other / "sequence.yaml").read_text()
+    (other / "sequence.yaml").write_text(content.replace("name: sheet", "name: other"))
+    plain = ("--methods", "static", "--device", "cpu", "--json", "--data-dir", data_dir)
+    folders = set()
+    for names in (("sheet",), ("sheet", "other"), (data_dir / "sequences/sheet",)):
+        code, out, error = call(capsys, "--sequences", *names, *plain)
+        assert code == 0, error
+        folders.add(json.loads(out)["out"])
+    assert len(folders) == 2  # By name or by folder, it is the same sequence.
+    out = next(Path(folder) for folder in folders if "more" not in folder)
+    code, _, error = call(capsys, "--suite", "tiny", *plain, "--out", out)
+    assert code == 2
+    assert "holds the table 'Named sequences' of sheet" in error
+    assert not (out / "sequences").exists()
+
+
+def test_help_tells_what_is_taken_by_default(capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = call(capsys, "--help")
+    assert code == 0
+    assert out.count("(default: the suite's") == 4
+    assert "(default: )" not in out
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ def row(method: str, metric: str, mean: float, n: int = 3) -> Row:
 
 ROWS = [
     row("static", "track_error", 0.02),
-    row("last_residual", "track_error", 0.01, n=1),
+    row("last_residual", "track_error", 0.01),
     row("static", "iou", 0.5),
     row("last_residual", "iou", 0.75),
     row("elsewhere", "rrd_object", 0.1),
@@ -32,8 +32,33 @@ def test_lines_hold_figures_in_the_units_of_their_column() -> None:
     assert laid_out(ROWS, SHOWN, "<{}>") == [
         ["method", "Track [mm]", "IoU ↑"],
         ["static", "20.00 [10.00, 40.00]", "0.500 [0.250, 1.000]"],
-        ["last_residual", "<10.00>", "<0.750> [0.375, 1.500]"],
+        ["last_residual", "<10.00> [5.00, 20.00]", "<0.750> [0.375, 1.500]"],
     ]
+
+
+def test_a_mean_without_the_hard_cases_is_not_best_and_tells_its_number() -> None:
+    rows = [row("a", "iou", 0.9, n=1), row("b", "iou", 0.5), row("c", "iou", 0.4)]
+    lines = laid_out(rows, SHOWN[1:2], "<{}>")
+    assert [line[1] for line in lines[1:]] == [
+        "0.900 (n = 1)",
+        "0.500 [0.250, 1.000] (n = 3)",
+        "0.400 [0.200, 0.800] (n = 3)",
+    ]
+
+
+def test_what_prints_the_best_figure_is_best_too() -> None:
+    rows = [row("a", "iou", 0.70011), row("b", "iou", 0.70012), row("c", "iou", 0.6)]
+    lines = laid_out(rows, SHOWN[1:2], "<{}>")
+    assert [line[1].startswith("<0.700>") for line in lines[1:]] == [True, True, False]
+    assert "<" not in str(laid_out(rows[:2], SHOWN[1:2], "<{}>"))
+
+
+def test_an_oracle_is_never_best_and_need_not_be_beaten() -> None:
+    rows = [row("oracle", "iou", 0.9, n=2), row("a", "iou", 0.5), row("b", "iou", 0.4)]
+    lines = laid_out(rows, SHOWN[1:2], "<{}>", {"oracle"})
+    assert [line[1].startswith("<") for line in lines[1:]] == [False, True, False]
+    assert "**0.500**" in markdown_table(rows, SHOWN[1:2], {"oracle"})
+    assert "textbf{0.500}" in latex_table(rows, SHOWN[1:2], {"oracle"})
 
 
 def test_a_missing_figure_is_a_dash_and_one_method_alone_is_not_best() -> None:
@@ -52,7 +77,10 @@ def test_markdown_has_as_many_cells_in_every_line() -> None:
 def test_latex_escapes_names_and_counts_its_columns() -> None:
     text = latex_table(ROWS, SHOWN)
     assert text.startswith("\\begin{tabular}{lrr}\n")
-    assert "last\\_residual & \\textbf{10.00} & \\textbf{0.750} [0.375, 1.500] \\\\\n" in text
+    assert (
+        "last\\_residual & \\textbf{10.00} [5.00, 20.00] & \\textbf{0.750} [0.375, 1.500] \\\\\n"
+        in text
+    )
     assert "IoU $\\uparrow$" in text
 
 

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,11 @@ from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_schema import SequenceMeta
 from physhandi.data.sequence_writer import write_sequence
-from physhandi.errors import CancelledError, UsageError
+from physhandi.errors import CancelledError, MissingInputError, UsageError
 from physhandi.progress import Progress
+from physhandi.synthetic.cells import Bench
 from physhandi.synthetic.evaluation import Order, evaluate
+from physhandi.synthetic.generator_version import generator_version
 from physhandi.synthetic.suite_scores import contact_kind
 
 SETTINGS = {
@@ -38,7 +41,7 @@ SETTINGS = {
 METHODS = ("static", "rigid_follow", "quick", "quick+last_residual")
 
 
-def write_told(folder: Path, lift: float) -> Sequence:
+def write_told(folder: Path, lift: float, action: str = "squeeze", seed: int = 0) -> Sequence:
     """A sheet that tells its object, and by labels that two of its nodes are held."""
     plain = write_sheet(folder / "plain", lift=lift)
     names = ("control", "marker", "marker_node", "object_node", "rest_node")
@@ -46,16 +49,16 @@ def write_told(folder: Path, lift: float) -> Sequence:
     held = np.zeros((FRAMES, len(NODE)), bool)
     held[:, [0, 4]] = True
     arrays |= {"truth/contact_point.npy": NODE.astype(np.float32), "truth/contact.npy": held}
-    meta: SequenceMeta = replace(
-        plain.meta, name=folder.name, provenance={"synthesize": {"object": "sheet", "seed": 0}}
-    )
+    made = {"object": "sheet", "action": action, "seed": seed, "preset": "clean"}
+    provenance = {"synthesize": made, "generator": generator_version()}
+    meta: SequenceMeta = replace(plain.meta, name=folder.name, provenance=provenance)
     return write_sequence(folder / folder.name, meta, arrays)
 
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> tuple[Sequence, ...]:
     root = tmp_path_factory.mktemp("recordings")
-    return write_told(root / "low", 0.12), write_told(root / "high", 0.2)
+    return write_told(root / "low", 0.12), write_told(root / "high", 0.2, "wipe")
 
 
 def order_of(recordings: tuple[Sequence, ...], **changes: Any) -> Order:
@@ -159,10 +162,12 @@ def test_what_was_cancelled_goes_on(tmp_path: Path, recordings: tuple[Sequence, 
     order = order_of(recordings[:1], methods=("static", "quick"), protocols=("main",))
     with pytest.raises(CancelledError):
         evaluate(order, tmp_path, Stopper())
-    assert not (tmp_path / "table.csv").exists()
+    assert {method for method, *_ in table(tmp_path)} == {"static"}
+    assert "**Not finished**: 1 cells are missing" in (tmp_path / "report.md").read_text()
     (static,) = (tmp_path / "cells").glob("low-static-*")
     published = (static / "current").stat().st_mtime_ns
     assert evaluate(order, tmp_path)["cells"] == 2
+    assert "Not finished" not in (tmp_path / "report.md").read_text()
     assert (static / "current").stat().st_mtime_ns == published
     assert ("quick", "future", "track_error") in table(tmp_path)
 
@@ -185,6 +190,11 @@ def test_a_method_without_output_scores_as_static_and_is_told(
         == rows["static", "future", "track_error"]["mean"]
     )
     assert (lost, "runtime", "seconds_per_frame") not in rows
+    # It touches nothing, where 2 of 25 nodes are held in every frame.
+    for split in ("reconstruction", "future", "future/dense"):
+        assert float(rows[lost, split, "contact_accuracy_5mm"]["mean"]) == pytest.approx(23 / 25)
+        assert float(rows[lost, split, "contact_f1_10mm"]["mean"]) == 0.0
+    assert ("static", "future", "contact_accuracy_5mm") not in rows
     report = (tmp_path / "report.md").read_text()
     assert f"{lost} (static stands in)" in report
     assert "connection_radius" in report.partition("## Missing output")[2]
@@ -194,7 +204,7 @@ def test_an_object_that_no_hand_reaches_elsewhere_stays_where_it_is(
     tmp_path: Path, recordings: tuple[Sequence, ...]
 ) -> None:
     low = recordings[0]
-    far = write_told(tmp_path / "far", 0.15)
+    far = write_told(tmp_path / "far", 0.15, "wipe")
     control = np.load(far.folder / "control.npy")
     np.save(far.folder / "control.npy", control + np.float32([0.0, 0.0, 0.3]))
     far = Sequence.load(far.folder)
@@ -204,7 +214,8 @@ def test_an_object_that_no_hand_reaches_elsewhere_stays_where_it_is(
     cells = json.loads((tmp_path / "out" / "cells.json").read_text())["cells"]
     still, lost = [cell for cell in cells if cell["case"] == "far"]
     assert "No virtual spring forms in sequence 'far'" in lost["error"]
-    assert lost["figures"]["unseen"] == still["figures"]["unseen"]
+    assert lost["figures"]["unseen"].pop("contact_f1_5mm") == 0.0
+    assert still["figures"]["unseen"].items() <= lost["figures"]["unseen"].items()
 
 
 def test_what_a_recording_cannot_give_is_not_asked_for(
@@ -247,15 +258,16 @@ def test_a_made_recording_tells_its_kind_of_contact_by_its_action(
 
 
 def test_contact_is_dense_where_much_is_held(recordings: tuple[Sequence, ...]) -> None:
-    assert contact_kind(recordings[0]) == "dense"  # 2 of 25 nodes
-    path = recordings[0].folder / "truth/contact.npy"
+    low = Sequence(recordings[0].folder, replace(recordings[0].meta, provenance={}))
+    assert contact_kind(low) == "dense"  # 2 of 25 nodes
+    path = low.folder / "truth/contact.npy"
     held = np.load(path)
     held[:, 4] = False
     try:
         np.save(path, held)
-        assert contact_kind(recordings[0]) == "point"  # 1 of 25
+        assert contact_kind(low) == "point"  # 1 of 25
         np.save(path, np.zeros_like(held))
-        assert contact_kind(recordings[0]) is None
+        assert contact_kind(low) is None
     finally:
         held[:, 4] = True
         np.save(path, held)
@@ -274,3 +286,162 @@ def test_an_order_that_makes_no_sense_is_refused(
         with pytest.raises(UsageError, match=told):
             evaluate(wrong, tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def blind(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let nothing be seen in a sequence."""
+    real = Bench.reference
+
+    def reference(self: Bench, recording: Sequence) -> Run:
+        if recording.name == name:
+            raise MissingInputError(f"Sequence '{name}' shows no object.")
+        return real(self, recording)
+
+    monkeypatch.setattr(Bench, "reference", reference)
+
+
+def test_a_recording_that_shows_nothing_is_named_and_the_others_are_scored(
+    tmp_path: Path, recordings: tuple[Sequence, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    blind("low", monkeypatch)
+    order = order_of(recordings, methods=("static", "rigid_follow"), protocols=("main", "unseen"))
+    found = evaluate(order, tmp_path)
+    assert found["skipped"] == ["low: Sequence 'low' shows no object."]
+    assert found["cells"] == 2
+    assert table(tmp_path)["static", "future", "track_error"]["n"] == "1"
+    assert (
+        "Not asked for: low: Sequence 'low' shows no object."
+        in (tmp_path / "report.md").read_text()
+    )
+    with pytest.raises(MissingInputError, match=r"No sequence can be evaluated.*shows no object"):
+        evaluate(replace(order, recordings=recordings[:1]), tmp_path / "blind")
+
+
+def test_tables_are_written_after_each_protocol_and_survive_a_crash(
+    tmp_path: Path, recordings: tuple[Sequence, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[bool] = []
+
+    def crash(*_: Any) -> None:
+        seen.append((tmp_path / "table.csv").is_file())
+        raise RuntimeError("out of luck")
+
+    monkeypatch.setattr(Bench, "unseen", crash)
+    order = order_of(recordings, methods=("static", "rigid_follow"))
+    with pytest.raises(RuntimeError, match="out of luck"):
+        evaluate(order, tmp_path)
+    assert seen == [True]
+    assert table(tmp_path)["rigid_follow", "future", "track_error"]["n"] == "2"
+    assert "**Not finished**: 4 cells" in (tmp_path / "report.md").read_text()
+
+
+def test_an_order_of_fewer_methods_keeps_what_was_known(
+    tmp_path: Path, recordings: tuple[Sequence, ...]
+) -> None:
+    whole = order_of(recordings, methods=("static", "rigid_follow"))
+    evaluate(whole, tmp_path)
+    before = (tmp_path / "table.csv").read_bytes()
+    report = (tmp_path / "report.md").read_text().partition("## Computed with")[0]
+    evaluate(replace(whole, methods=("rigid_follow",), protocols=("main",)), tmp_path)
+    assert (tmp_path / "table.csv").read_bytes() == before
+    assert (tmp_path / "report.md").read_text().partition("## Computed with")[0] == report
+    curves = json.loads((tmp_path / "curves.json").read_text())["curves"]
+    cells = json.loads((tmp_path / "cells.json").read_text())["cells"]
+    assert len(curves) == len(cells) == 8
+    assert all(curve["track_error"] for curve in curves)
+    assert not any("curves" in cell for cell in cells)
+    # A run that was deleted has no place in the table.
+    (gone,) = (tmp_path / "cells").glob("high-rigid_follow-*")
+    shutil.rmtree(gone)
+    evaluate(replace(whole, methods=("static",)), tmp_path)
+    assert table(tmp_path)["rigid_follow", "future", "track_error"]["n"] == "1"
+
+
+def test_methods_that_were_computed_otherwise_are_named_when_they_leave_the_table(
+    tmp_path: Path, recordings: tuple[Sequence, ...]
+) -> None:
+    order = order_of(recordings[:1], methods=("static", "rigid_follow"), protocols=("main",))
+    evaluate(order, tmp_path)
+    found = evaluate(replace(order, methods=("static",), settings={"node_spacing": 0.5}), tmp_path)
+    assert "rigid_follow" in found["notes"][0]
+    assert "rigid_follow. Evaluate them again" in (tmp_path / "report.md").read_text()
+    assert {method for method, *_ in table(tmp_path)} == {"static"}
+
+
+def test_a_folder_with_the_table_of_other_sequences_is_refused(
+    tmp_path: Path, recordings: tuple[Sequence, ...]
+) -> None:
+    order = order_of(recordings[:1], methods=("static",), protocols=("main",))
+    evaluate(order, tmp_path)
+    before = (tmp_path / "cells.json").read_bytes()
+    for other in (replace(order, recordings=recordings), replace(order, title="Suite dev")):
+        with pytest.raises(UsageError, match=r"holds the table 'Two sheets' of low.*another --out"):
+            evaluate(other, tmp_path)
+    assert (tmp_path / "cells.json").read_bytes() == before
+    (tmp_path / "cells.json").write_text('{"about": {}}')
+    with pytest.raises(UsageError, match=r"cells\.json is damaged"):
+        evaluate(order, tmp_path)
+
+
+def test_a_sequence_called_like_a_split_has_a_chart_of_its_own(tmp_path: Path) -> None:
+    order = order_of(
+        (write_told(tmp_path / "future", 0.1),), methods=("static",), protocols=("main",)
+    )
+    evaluate(order, tmp_path / "out")
+    charts = json.loads((tmp_path / "out/cells.json").read_text())["about"]["charts"]
+    assert charts == ["reconstruction.svg", "future.svg", "sequence_future.svg"]
+    bars, lines = ((tmp_path / "out/charts" / name).read_text() for name in charts[1:])
+    assert "CD_full, future" in bars
+    assert "Track error on future" in lines
+
+
+def test_an_unseen_interaction_needs_the_same_body_in_another_action(
+    tmp_path: Path, recordings: tuple[Sequence, ...]
+) -> None:
+    low = recordings[0]
+    again = write_told(tmp_path / "again", 0.2)
+    order = order_of((low, again), methods=("static",), protocols=("unseen",))
+    found = evaluate(order, tmp_path / "same")
+    assert found["cells"] == 0
+    assert found["skipped"] == [
+        f"{name}, unseen: no other sequence shows the same body in another action."
+        for name in ("low", "again")
+    ]
+    assert found["skipped"][0] in (tmp_path / "same/report.md").read_text()
+    other = write_told(tmp_path / "other", 0.2, "wipe", seed=1)
+    order = replace(order, recordings=(low, again, other))
+    assert len(evaluate(order, tmp_path / "seeds")["skipped"]) == 3
+    order = replace(order, recordings=(low, again, recordings[1]))
+    assert evaluate(order, tmp_path / "all")["cells"] == 3
+
+
+def test_the_report_tells_how_to_make_it_again_and_marks_reserved_seeds(tmp_path: Path) -> None:
+    for seed, is_marked in ((3, False), (1000, True)):
+        folder = tmp_path / f"of_{seed}"
+        recording = write_told(folder / "sheet", 0.1, seed=seed)
+        order = order_of((recording,), methods=("static",), protocols=("main", "main"))
+        order = replace(order, command="physhandi evaluate suite --suite dev")
+        assert evaluate(order, folder / "out")["cells"] == 1
+        report = (folder / "out/report.md").read_text()
+        for line in (
+            "* command: `physhandi evaluate suite --suite dev`\n",
+            f"* seeds: {seed}\n",
+            "* presets: clean\n",
+            f"* generators: {generator_version()}\n",
+        ):
+            assert line in report
+        assert report.startswith("# Two sheets (verification)\n") is is_marked
+        assert ("## Reconstruction and future prediction (verification)" in report) is is_marked
+
+
+def test_recordings_of_another_generator_are_told_in_log_and_report(
+    tmp_path: Path, recordings: tuple[Sequence, ...], caplog: pytest.LogCaptureFixture
+) -> None:
+    low = recordings[0]
+    provenance = {**low.provenance, "generator": "0123456789ab-mujoco-1.0"}
+    old = Sequence(low.folder, replace(low.meta, provenance=provenance))
+    order = order_of((old,), methods=("static",), protocols=("main",))
+    (note,) = evaluate(order, tmp_path)["notes"]
+    assert "0123456789ab-mujoco-1.0" in note
+    assert note in caplog.text
+    assert f"**Note**: {note}" in (tmp_path / "report.md").read_text()

@@ -96,7 +96,7 @@ def test_a_sequence_of_another_generator_is_told(
     told = outdated(recording)
     assert "another version" in told
     assert generator_version() in told
-    assert f"Delete {recording.folder}" in told
+    assert f"delete {recording.folder}" in told
     nameless = {"synthesize": recording.provenance["synthesize"]}
     before = Sequence(recording.folder, replace(recording.meta, provenance=nameless))
     assert "unknown generator" in outdated(before)
