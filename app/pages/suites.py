@@ -1,23 +1,24 @@
 """The pages of suites: methods compared on many sequences, and every cell to look into."""
 
+import re
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast, get_args
+from typing import Annotated, Any, Literal, get_args
 
 from fastapi import APIRouter, Query, Response
 from fastapi.responses import HTMLResponse
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from app.jobs.catalog import NotFoundError
 from app.pages.metrics import about_quantity, figure, scaled, unit_of
 from app.pages.render import Pages
-from physhandi.data.atomic import named_fields
 from physhandi.data.run_files import read_json
 from physhandi.errors import PhysHandiError, RunError
 from physhandi.metrics.suite_layout import laid_out
 from physhandi.metrics.suite_report import tables_of
 from physhandi.metrics.suite_tables import Row, is_higher_better, read_rows
 
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
+_NAME = r"^[A-Za-z0-9_-]{1,64}$"
+Name = Annotated[str, Field(pattern=_NAME)]
 Chart = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,80}\.svg$")]
 File = Literal["table.csv", "paired.csv", "per_sequence.csv", "report.md", "tables.tex"]
 _BEST = "\0"
@@ -38,6 +39,47 @@ class CellQuery(BaseModel):
     metric: Annotated[str, Field(max_length=80)] = "track_error"
 
 
+class Environment(BaseModel):
+    """What a suite was computed with, as far as the page shows it."""
+
+    started: str
+    device: str
+    device_name: str
+
+
+class About(BaseModel):
+    """What a suite's ``cells.json`` says of itself, as far as the page shows it."""
+
+    title: str
+    cases: list[str]
+    methods: dict[str, str]
+    oracles: list[str] = []
+    skipped: list[str]
+    notes: list[str] = []
+    missing: int = 0
+    is_verification: bool = False
+    charts: list[Chart] = []
+    environment: Environment
+
+
+class Cell(BaseModel):
+    """One cell in ``cells.json``, as far as the page shows it."""
+
+    method: str
+    case: str
+    split: str
+    run: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{0,128}$")]
+    error: str
+    figures: dict[str, dict[str, float | None]]
+
+
+class Cells(BaseModel):
+    """Content of ``cells.json``."""
+
+    about: About
+    cells: list[Cell]
+
+
 def add_suites(router: APIRouter, folder: Path, pages: Pages) -> None:
     """Add the pages of suites to the routes.
 
@@ -54,19 +96,18 @@ def add_suites(router: APIRouter, folder: Path, pages: Pages) -> None:
     @router.get("/suites/{name}")
     def show_suite(name: Name, query: Annotated[CellQuery, Query()]) -> HTMLResponse:
         path = _found(folder, name)
-        about, cells = _read(path)
-        rows = _rows(path)
-        charts = sorted(chart.name for chart in (path / "charts").glob("*.svg"))
+        content = _read(path)
+        about, cells = content.about, content.cells
         return pages.render(
             "suite.html",
             suite=name,
             about=about,
-            tables=_tables(rows),
-            matrix=_matrix(cells, query),
+            tables=_tables(_rows(path), about.oracles),
+            matrix=_matrix(cells, about.oracles, query),
             choices=_choices(cells),
             query=query,
-            problems=[cell for cell in cells if cell["error"]],
-            charts=charts,
+            problems=[cell for cell in cells if cell.error],
+            charts=[chart for chart in about.charts if (path / "charts" / chart).is_file()],
             files=[file for file in get_args(File) if (path / file).is_file()],
         )
 
@@ -80,8 +121,13 @@ def add_suites(router: APIRouter, folder: Path, pages: Pages) -> None:
 
 
 def _folders(folder: Path) -> list[Path]:
-    found = [path.parent for path in folder.glob("*/cells.json")]
+    found = [path.parent for path in folder.glob("*/cells.json") if _has_page(path.parent)]
     return sorted(found, key=lambda path: (path / "cells.json").stat().st_mtime_ns, reverse=True)
+
+
+def _has_page(path: Path) -> bool:
+    """Tell whether a route leads to a folder of this name."""
+    return re.fullmatch(_NAME, path.name) is not None
 
 
 def _found(folder: Path, name: str) -> Path:
@@ -101,39 +147,39 @@ def _file(path: Path) -> Response:
 
 def _described(path: Path) -> dict[str, Any]:
     try:
-        about, cells = _read(path)
+        content = _read(path)
     except PhysHandiError as error:
         return {"name": path.name, "title": "", "error": str(error)}
+    about = content.about
     return {
         "name": path.name,
         "error": "",
-        "title": about["title"],
-        "cases": len(about["cases"]),
-        "methods": len(about["methods"]),
-        "cells": len(cells),
-        "failed": sum(bool(cell["error"]) for cell in cells),
-        "written": about["environment"]["started"],
-        "device": about["environment"]["device_name"] or about["environment"]["device"],
+        "title": about.title,
+        "cases": len(about.cases),
+        "methods": len(about.methods),
+        "cells": len(content.cells),
+        "failed": sum(bool(cell.error) for cell in content.cells),
+        "written": about.environment.started,
+        "device": about.environment.device_name or about.environment.device,
     }
 
 
-def _read(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+def _read(path: Path) -> Cells:
     """Read what a suite says of itself.
 
     Raises:
         RunError: If it is damaged.
     """
     file = path / "cells.json"
-    content = named_fields(read_json(file)) or {}
-    about, listed = named_fields(content.get("about")), content.get("cells")
-    known = ("title", "cases", "methods", "protocols", "skipped", "environment")
-    if about is None or not isinstance(listed, list) or any(name not in about for name in known):
-        raise RunError(f"{file} is damaged. Evaluate the suite again.")
-    cells = [named_fields(cell) or {} for cell in cast("list[object]", listed)]
-    wanted = ("method", "case", "protocol", "split", "run", "error", "figures")
-    if any(name not in cell for cell in cells for name in wanted):
-        raise RunError(f"{file}: a cell is damaged. Evaluate the suite again.")
-    return about, cells
+    try:
+        return Cells.model_validate(read_json(file))
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise RunError(
+            f"{file} is damaged: {where}: {first['msg']}. Delete it, and evaluate the suite again; "
+            "finished cells are kept."
+        ) from None
 
 
 def _rows(path: Path) -> list[Row]:
@@ -144,10 +190,10 @@ def _rows(path: Path) -> list[Row]:
         raise RunError(f"{file} is not readable: {error}. Evaluate the suite again.") from error
 
 
-def _tables(rows: list[Row]) -> list[dict[str, Any]]:
+def _tables(rows: list[Row], oracles: list[str]) -> list[dict[str, Any]]:
     tables: list[dict[str, Any]] = []
     for title, columns in tables_of(rows).items():
-        head, *lines = laid_out(rows, columns, _BEST + "{}")
+        head, *lines = laid_out(rows, columns, _BEST + "{}", oracles)
         body = [
             {
                 "method": line[0],
@@ -162,26 +208,34 @@ def _tables(rows: list[Row]) -> list[dict[str, Any]]:
     return tables
 
 
-def _matrix(cells: list[dict[str, Any]], query: CellQuery) -> dict[str, Any]:
+def _matrix(cells: list[Cell], oracles: list[str], query: CellQuery) -> dict[str, Any]:
     """Arrange one figure by sequence and method; every cell leads to its run."""
-    shown = [cell for cell in cells if query.split in cell["figures"]]
-    methods = list(dict.fromkeys(cell["method"] for cell in shown))
+    shown = [cell for cell in cells if query.split in cell.figures]
+    methods = list(dict.fromkeys(cell.method for cell in shown))
     unit = unit_of(set(query.metric.split("_")), "m")
     rows: list[dict[str, Any]] = []
-    for case in dict.fromkeys(cell["case"] for cell in shown):
-        of_case = {cell["method"]: cell for cell in shown if cell["case"] == case}
+    for case in dict.fromkeys(cell.case for cell in shown):
+        of_case = {cell.method: cell for cell in shown if cell.case == case}
         values = {
-            method: cell["figures"][query.split].get(query.metric)
-            for method, cell in of_case.items()
+            name: cell.figures[query.split].get(query.metric) for name, cell in of_case.items()
         }
-        known = [value for value in values.values() if isinstance(value, int | float)]
-        best = (max if is_higher_better(query.metric) else min)(known) if len(known) > 1 else None
+        rivals = [
+            value
+            for name, value in values.items()
+            if value is not None and name not in oracles and not of_case[name].error
+        ]
+        best = (max if is_higher_better(query.metric) else min)(rivals) if len(rivals) > 1 else None
         rows.append(
             {
                 "case": case,
                 "cells": [
-                    _shown(of_case.get(method), values.get(method), unit, best)
-                    for method in methods
+                    _shown(
+                        of_case.get(name),
+                        values.get(name),
+                        unit,
+                        None if name in oracles else best,
+                    )
+                    for name in methods
                 ],
             }
         )
@@ -193,18 +247,18 @@ def _matrix(cells: list[dict[str, Any]], query: CellQuery) -> dict[str, Any]:
     }
 
 
-def _shown(cell: dict[str, Any] | None, value: Any, unit: str, best: Any) -> dict[str, Any]:
+def _shown(cell: Cell | None, value: float | None, unit: str, best: float | None) -> dict[str, Any]:
     return {
         "text": figure(scaled(value, unit)[0]),
-        "is_best": value is not None and value == best,
-        "run": cell["run"] if cell else "",
-        "error": cell["error"] if cell else "",
+        "is_best": value is not None and value == best and cell is not None and not cell.error,
+        "run": cell.run if cell else "",
+        "error": cell.error if cell else "",
     }
 
 
-def _choices(cells: list[dict[str, Any]]) -> dict[str, list[str]]:
-    splits = dict.fromkeys(split for cell in cells for split in cell["figures"])
+def _choices(cells: list[Cell]) -> dict[str, list[str]]:
+    splits = dict.fromkeys(split for cell in cells for split in cell.figures)
     metrics = dict.fromkeys(
-        metric for cell in cells for part in cell["figures"].values() for metric in part
+        metric for cell in cells for part in cell.figures.values() for metric in part
     )
     return {"splits": list(splits), "metrics": list(metrics)}

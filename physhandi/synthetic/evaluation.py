@@ -10,7 +10,6 @@ from typing import Any
 
 import warp as wp
 
-import physhandi
 from physhandi.data.atomic import named_fields
 from physhandi.data.environment import describe_environment
 from physhandi.data.sequence import Sequence
@@ -18,7 +17,8 @@ from physhandi.errors import MissingInputError, SequenceError, UsageError
 from physhandi.progress import NullProgress, Progress
 from physhandi.synthetic.baselines import METHODS, Method, parse_method, settings_of
 from physhandi.synthetic.cells import FAILURES, Bench, Outcome
-from physhandi.synthetic.generator_version import code_hash, outdated, told_version
+from physhandi.synthetic.code_hash import PREDICTIONS, SCORES, code_version
+from physhandi.synthetic.generator_version import outdated, told_version
 from physhandi.synthetic.suite import RESERVED_SEED, Protocol
 from physhandi.synthetic.suite_folder import SuiteFolder
 from physhandi.synthetic.suite_scores import contact_kind, figures_of
@@ -31,11 +31,7 @@ ROBUSTNESS = ("noisy_depth", "noisy_tracks", "noisy_hand")
 """The paper's three disturbances."""
 WRITE_EVERY = 600.0
 """Tables are written after every protocol, and after this time [s]."""
-_CODE = (
-    *("pipeline.py", "data", "hand", "perception", "simulation", "fitting", "metrics"),
-    "synthetic",
-)
-"""What figures depend on."""
+_SCORES = "synthetic/suite_scores.py"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -232,7 +228,7 @@ def _about(order: Order, methods: Many[Method]) -> dict[str, Any]:
         "generators": sorted({version for version in told if version}),
         "notes": [note for recording in order.recordings if (note := outdated(recording))],
         "made_from": {
-            "code": code_hash(Path(physhandi.__file__).parent, _CODE),
+            "code": code_version((*PREDICTIONS, *SCORES, _SCORES)),
             "settings": dict(order.settings),
             "device": [environment["device"], environment["device_name"]],
             "packages": environment["packages"],

@@ -3,6 +3,7 @@
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 from server_world import World
@@ -95,3 +96,86 @@ def test_a_damaged_suite_is_told_and_hides_no_other(world: World, suite: Path) -
     assert "damaged" in world.browser().get("/suites/small").text
     (suite.with_name("whole") / "table.csv").write_text("method\n")
     assert "table.csv is not readable" in world.browser().get("/suites/whole").text
+
+
+@pytest.mark.parametrize(
+    ("place", "wrong", "told"),
+    [
+        (("about", "environment"), {}, "about.environment.started"),
+        (("about", "methods"), ["static"], "about.methods"),
+        (("about", "charts"), ["../secret.svg"], "about.charts.0"),
+        (("cells", 0, "figures"), {"future": 3}, "cells.0.figures.future"),
+        (("cells", 1, "run"), "../x", "cells.1.run"),
+        (("cells", 0), 7, "cells.0"),
+        (("cells",), {}, "cells"),
+    ],
+)
+def test_what_is_damaged_inside_is_named(
+    world: World, suite: Path, place: tuple[str | int, ...], wrong: Any, told: str
+) -> None:
+    content = json.loads((suite / "cells.json").read_text())
+    part = content
+    for name in place[:-1]:
+        part = part[name]
+    part[place[-1]] = wrong
+    (suite / "cells.json").write_text(json.dumps(content))
+    assert f"cells.json is damaged: {told}" in world.browser().get("/suites").text
+    page = world.browser().get("/suites/small")
+    assert page.status_code < 500
+    assert f"cells.json is damaged: {told}" in page.text
+
+
+def test_a_folder_that_no_route_leads_to_is_not_listed(world: World, suite: Path) -> None:
+    shutil.copytree(suite, suite.with_name("a name with spaces"))
+    page = world.browser().get("/suites").text
+    assert "/suites/small" in page
+    assert "with spaces" not in page
+
+
+def test_only_charts_of_the_last_order_are_shown(world: World, suite: Path) -> None:
+    (suite / "charts/old.svg").write_text("<svg/>")
+    (suite / "charts/reconstruction.svg").unlink()
+    page = world.browser().get("/suites/small").text
+    assert "charts/future.svg" in page
+    assert "charts/sequence_sheet.svg" in page
+    assert "old.svg" not in page
+    assert "charts/reconstruction.svg" not in page
+
+
+def test_the_page_does_not_read_curves(world: World, suite: Path) -> None:
+    (suite / "curves.json").write_text("damaged")
+    assert world.browser().get("/suites/small").status_code == 200
+    assert "curves" not in (suite / "cells.json").read_text()
+
+
+def test_neither_an_oracle_nor_what_stands_in_is_the_best(world: World, suite: Path) -> None:
+    content = json.loads((suite / "cells.json").read_text())
+    for cell, value in zip(content["cells"], (0.002, 0.003, 0.001), strict=True):
+        cell["figures"] = {"future": {"track_error": value}}
+    (suite / "cells.json").write_text(json.dumps(content))
+
+    def best() -> str:
+        page = world.browser().get("/suites/small").text.partition('id="sequences"')[2]
+        assert page.count('class="best"') == 1
+        return page.partition('class="best"')[2].partition("(best)")[0]
+
+    assert ">2.000<" in best()  # The third one has no output.
+    content["cells"][2]["error"] = ""
+    content["about"]["oracles"] = [METHODS[2]]
+    (suite / "cells.json").write_text(json.dumps(content))
+    assert ">2.000<" in best()
+    content["about"]["oracles"] = []
+    (suite / "cells.json").write_text(json.dumps(content))
+    assert ">1.000<" in best()
+
+
+def test_a_table_that_is_not_finished_or_for_verification_says_so(
+    world: World, suite: Path
+) -> None:
+    content = json.loads((suite / "cells.json").read_text())
+    content["about"] |= {"missing": 5, "is_verification": True, "notes": ["made <i>before</i>"]}
+    (suite / "cells.json").write_text(json.dumps(content))
+    page = world.browser().get("/suites/small").text
+    assert "5 cells are missing" in page
+    assert "(verification)" in page
+    assert "made &lt;i&gt;before&lt;/i&gt;" in page
