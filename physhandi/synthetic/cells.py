@@ -119,9 +119,6 @@ class Bench:
         folder = self._folder(method, recording, variant)
         try:
             run = self._run(method, recording, variant)
-        except UsageError as error:
-            told = f"Method '{method.name}' on sequence '{recording.name}': {error}"
-            raise UsageError(told) from error
         except FAILURES as error:
             report, curves = self.score(None, reference, recording)
             ran = folder.name if folder.is_dir() else ""
@@ -247,17 +244,21 @@ class Bench:
         elif variant == DISTURBED_HAND:
             hands = self._run(still, recording, "recording")
             noise = HandNoise(error=HAND_NOISE, seed=noise_seed(recording, variant))
-        return execute(
-            method,
-            given,
-            folder,
-            title=title,
-            common=self.common,
-            hands=hands,
-            noise=noise,
-            device=self.device,
-            progress=self.progress,
-        )
+        try:
+            return execute(
+                method,
+                given,
+                folder,
+                title=title,
+                common=self.common,
+                hands=hands,
+                noise=noise,
+                device=self.device,
+                progress=self.progress,
+            )
+        except UsageError as error:
+            told = f"Method '{method.name}' on sequence '{recording.name}': {error}"
+            raise UsageError(told) from error
 
     def _simulated(self, source: Run, target: Sequence, folder: Path, *, title: str) -> Run:
         """Simulate what was fitted elsewhere; a radius that reaches nothing there is no misuse."""

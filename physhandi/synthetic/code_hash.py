@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 
 import physhandi
-from physhandi.data.run_files import artefacts
+from physhandi.synthetic.generator_version import code_hash
 
 INPUTS = ("synthetic/variants.py", "data/sequence_writer.py", "data/truth.py")
 """Makes what methods are given."""
@@ -26,7 +26,6 @@ SCORES = ("metrics", "synthetic/cell_scores.py", "data", "hand")
 """Makes figures of predictions."""
 PACKAGES = ("torch", "warp-lang", "numpy", "scipy", "cma", "safetensors")
 """Libraries that predictions and figures are computed with, beside OpenCV."""
-_KINDS = {".py", ".yaml", ".npz", ".tflite", ".glb"}
 
 
 @lru_cache(maxsize=8)
@@ -39,16 +38,7 @@ def code_version(parts: tuple[str, ...]) -> str:
     Raises:
         FileNotFoundError: If one is not there, for then nothing would tell that it has changed.
     """
-    digest = hashlib.sha256()
-    for part in parts:
-        path = Path(physhandi.__file__).parent / part
-        if not path.exists():
-            raise FileNotFoundError(f"{path} is not there, so its code cannot be hashed.")
-        for rel, file in [("", path)] if path.is_file() else list(artefacts(path)):
-            if file.suffix in _KINDS:
-                digest.update(f"{part}/{rel}\0".encode())
-                digest.update(hashlib.sha256(file.read_bytes()).digest())
+    code = code_hash(Path(physhandi.__file__).parent, parts)
     # Several distributions carry OpenCV.
     versions = [f"opencv {cv2.__version__}", *(f"{name} {version(name)}" for name in PACKAGES)]
-    digest.update("\0".join(versions).encode())
-    return digest.hexdigest()[:16]
+    return hashlib.sha256("\0".join([code, *versions]).encode()).hexdigest()[:16]
