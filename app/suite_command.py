@@ -18,9 +18,10 @@ def evaluate_suite(command: Any, progress: Progress) -> dict[str, Any]:
         UsageError: If a method, seed or sequence makes no sense, or the folder holds other data.
     """
     from physhandi.synthetic.baselines import parse_method, settings_of
-    from physhandi.synthetic.evaluation import Order, evaluate
+    from physhandi.synthetic.evaluation import evaluate
     from physhandi.synthetic.suite import check_seeds, find_suite, make_recordings
     from physhandi.synthetic.suite_folder import check_folder
+    from physhandi.synthetic.suite_tasks import Order
 
     suite = find_suite(command.suite)
     if command.sequences and command.seeds:

@@ -1,10 +1,9 @@
-"""Evaluating methods on sequences: which cells a protocol asks for, and how they are filled."""
+"""Evaluating methods on sequences: fills the cells of an order, and has tables written."""
 
 import logging
 import time
-from collections.abc import Iterator, Mapping
 from collections.abc import Sequence as Many
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,51 +18,16 @@ from physhandi.synthetic.baselines import METHODS, Method, parse_method, setting
 from physhandi.synthetic.cells import FAILURES, Bench, Outcome
 from physhandi.synthetic.code_hash import PREDICTIONS, SCORES, code_version
 from physhandi.synthetic.generator_version import outdated, told_version
-from physhandi.synthetic.suite import RESERVED_SEED, Protocol
+from physhandi.synthetic.suite import RESERVED_SEED
 from physhandi.synthetic.suite_folder import SuiteFolder
 from physhandi.synthetic.suite_scores import contact_kind, figures_of
+from physhandi.synthetic.suite_tasks import Order, Task, list_tasks
 
 _LOG = logging.getLogger(__name__)
 
-SENSITIVITY = ((0.001, 3), (0.002, 3), (0.02, 3), (0.04, 3), (0.002, 1), (0.002, 10), (0.002, 50))
-"""Start values of virtual δ [m] and d_max: the rows of the paper's sensitivity table."""
-ROBUSTNESS = ("noisy_depth", "noisy_tracks", "noisy_hand")
-"""The paper's three disturbances."""
 WRITE_EVERY = 600.0
 """Tables are written after every protocol, and after this time [s]."""
 _SCORES = "synthetic/suite_scores.py"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Order:
-    """What is to be evaluated."""
-
-    title: str
-    """What the report is called."""
-    recordings: tuple[Sequence, ...]
-    """Sequences that methods are scored on."""
-    methods: tuple[str, ...]
-    """Names of methods."""
-    protocols: tuple[Protocol, ...] = ("main",)
-    """Which protocols are run."""
-    settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    """Settings that all methods share."""
-    device: str = "cpu"
-    """Warp device."""
-    command: str = ""
-    """The command that asks for it, which the report repeats."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Task:
-    """One cell that a protocol asks for."""
-
-    protocol: Protocol
-    split: str
-    method: Method
-    recording: Sequence
-    variant: str = "recording"
-    fitted: Sequence | None = None
 
 
 def evaluate(order: Order, out: Path, progress: Progress | None = None) -> dict[str, Any]:
@@ -95,7 +59,7 @@ def evaluate(order: Order, out: Path, progress: Progress | None = None) -> dict[
     for note in folder.about["notes"]:
         _LOG.warning("%s", note)
     work = _Work(order, Bench(out, common=order.settings, device=order.device, progress=progress))
-    tasks = list(_tasks(order, methods))
+    tasks = list(list_tasks(order, methods))
     finished, paths, written = 0, dict[str, Any](), time.monotonic()
 
     def write() -> dict[str, Any]:
@@ -135,7 +99,7 @@ class _Work:
         self.skipped: list[str] = []
         self._blind: dict[str, str] = {}
 
-    def cell(self, task: _Task) -> dict[str, Any] | None:
+    def cell(self, task: Task) -> dict[str, Any] | None:
         """Fill a cell; None if no method could."""
         for recording in filter(None, (task.recording, task.fitted)):
             reason = self._why_blind(recording)
@@ -179,12 +143,12 @@ class _Work:
         if reason not in self.skipped:
             self.skipped.append(reason)
 
-    def _outcome(self, task: _Task) -> Outcome:
+    def _outcome(self, task: Task) -> Outcome:
         if task.fitted is not None:
             return self.bench.unseen(task.method, task.fitted, task.recording)
         return self.bench.outcome(task.method, task.recording, task.variant)
 
-    def _described(self, task: _Task, outcome: Outcome) -> dict[str, Any]:
+    def _described(self, task: Task, outcome: Outcome) -> dict[str, Any]:
         unmoved = None
         if outcome.error and task.method.rule is None:
             static = self.bench.reference(task.recording)
@@ -246,65 +210,3 @@ def _check(order: Order, methods: Many[Method]) -> None:
         raise UsageError(f"Two sequences are named '{doubled[0]}'. Rename one of them.")
     for method in methods:
         settings_of(method, order.settings)
-
-
-def _tasks(order: Order, methods: Many[Method]) -> Iterator[_Task]:
-    for protocol in order.protocols:
-        for recording in order.recordings:
-            for method in methods:
-                yield from _asked(protocol, order, method, recording)
-
-
-def _asked(
-    protocol: Protocol, order: Order, method: Method, recording: Sequence
-) -> Iterator[_Task]:
-    task = _Task(protocol=protocol, split=protocol, method=method, recording=recording)
-    is_plain = method.gets == "recording"
-    if protocol == "main":
-        yield task
-    elif protocol == "single_view" and is_plain:
-        yield replace(task, variant="one_view")
-    elif protocol == "robustness" and is_plain:
-        for variant in ROBUSTNESS:
-            yield replace(task, variant=variant, split=variant)
-    elif protocol == "unseen" and not method.is_corrected:
-        yield replace(task, fitted=_other_of_same_object(recording, order.recordings))
-    elif protocol == "sensitivity" and is_plain and recording is order.recordings[0]:
-        starts = () if method.rule else SENSITIVITY
-        yield from (_started(task, *start) for start in starts)
-
-
-def _started(task: _Task, radius: float, most: int) -> _Task:
-    """Start a method's search elsewhere; it keeps its name, and the split tells where."""
-    start = {
-        "simulation.virtual_connection_radius": radius,
-        "simulation.virtual_max_neighbors": most,
-    }
-    method = replace(task.method, overrides={**task.method.overrides, **start})
-    return replace(task, method=method, split=f"start δ={1000 * radius:g} mm d_max={most}")
-
-
-def _other_of_same_object(recording: Sequence, others: Many[Sequence]) -> Sequence | None:
-    """Find the next recording of the same body in another action; around the end of the list."""
-    own, action = _body(recording)
-    order = list(others)
-    place = order.index(recording)
-    if own is None or action is None:
-        return None
-    for other in order[place + 1 :] + order[:place]:
-        body, done = _body(other)
-        if body == own and done is not None and done != action:
-            return other
-    return None
-
-
-def _body(recording: Sequence) -> tuple[tuple[Any, ...] | None, Any]:
-    """Identify the made body of a recording, and what is done with it.
-
-    Seed and object decide a body's size and material, for one version of the generator.
-    """
-    made = named_fields(recording.provenance.get("synthesize"))
-    if made is None:
-        return None, None
-    body = tuple(made.get(name) for name in ("object", "seed", "resolution"))
-    return (*body, told_version(recording)), made.get("action")

@@ -9,7 +9,8 @@ import pytest
 from server_world import World
 
 from physhandi.data.sequence import Sequence
-from physhandi.synthetic.evaluation import Order, evaluate
+from physhandi.synthetic.evaluation import evaluate
+from physhandi.synthetic.suite_tasks import Order
 
 METHODS = ("static", "rigid_follow", "quick@simulation.connection_radius=0.01")
 

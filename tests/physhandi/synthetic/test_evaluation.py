@@ -18,9 +18,10 @@ from physhandi.data.sequence_writer import write_sequence
 from physhandi.errors import CancelledError, MissingInputError, UsageError
 from physhandi.progress import Progress
 from physhandi.synthetic.cells import Bench
-from physhandi.synthetic.evaluation import Order, evaluate
+from physhandi.synthetic.evaluation import evaluate
 from physhandi.synthetic.generator_version import generator_version
 from physhandi.synthetic.suite_scores import contact_kind
+from physhandi.synthetic.suite_tasks import Order
 
 SETTINGS = {
     "object_.search.generations": 1,

@@ -15,8 +15,10 @@ from physhandi.errors import UsageError
 from physhandi.progress import NullProgress
 from physhandi.synthetic import generator_version as module
 from physhandi.synthetic import synthesize as generator
+from physhandi.synthetic.baselines import parse_method, settings_of
+from physhandi.synthetic.bodies import make_body
 from physhandi.synthetic.generator_version import code_hash, generator_version, outdated
-from physhandi.synthetic.suite import Scene, Suite, make_recordings
+from physhandi.synthetic.suite import SUITES, Scene, Suite, make_recordings
 
 SUITE = Suite(
     name="tiny",
@@ -117,3 +119,23 @@ def test_the_version_changes_with_any_source_or_asset_of_the_generator(tmp_path:
     assert code_hash(tmp_path, parts) in seen
     with pytest.raises(FileNotFoundError):
         code_hash(tmp_path, ("none.py",))
+
+
+@pytest.mark.parametrize(("name", "most"), [("tiny", 441), ("dev", 1000)])
+def test_bodies_of_small_suites_have_few_nodes(name: str, most: int) -> None:
+    suite = SUITES[name]
+    for object_ in {scene.object_ for scene in suite.scenes}:
+        for seed in suite.seeds:
+            random = np.random.default_rng([seed, 0])
+            resolution = suite.recording.get("resolution", "fine")
+            body = make_body(object_, random, resolution=resolution)  # type: ignore[arg-type]
+            assert 20 < len(body.node) <= most
+
+
+def test_every_fit_of_dev_makes_the_same_number_of_steps() -> None:
+    dev = SUITES["dev"]
+    assert "paper" not in dev.methods
+    assert "paper" in SUITES["full"].methods
+    for name in dev.methods:
+        settings = settings_of(parse_method(name), dev.settings)
+        assert settings["object_"]["first_order"]["iterations"] == 80
