@@ -17,11 +17,13 @@ from physhandi.data.sequence_schema import SequenceMeta
 from physhandi.data.sequence_writer import write_sequence
 from physhandi.errors import CancelledError, MissingInputError, UsageError
 from physhandi.progress import Progress
+from physhandi.synthetic import evaluation
+from physhandi.synthetic.baselines import parse_method
 from physhandi.synthetic.cells import Bench
 from physhandi.synthetic.evaluation import evaluate
 from physhandi.synthetic.generator_version import generator_version
 from physhandi.synthetic.suite_scores import contact_kind
-from physhandi.synthetic.suite_tasks import Order
+from physhandi.synthetic.suite_tasks import Order, list_tasks
 
 SETTINGS = {
     "object_.search.generations": 1,
@@ -336,6 +338,23 @@ def test_tables_are_written_after_each_protocol_and_survive_a_crash(
     assert "**Not finished**: 4 cells" in (tmp_path / "report.md").read_text()
 
 
+def test_tables_of_a_long_protocol_are_written_on_the_way(
+    tmp_path: Path, recordings: tuple[Sequence, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known: list[int] = []
+
+    class Listener(Progress):
+        def report(self, stage: str, iteration: int, *rest: Any, **more: Any) -> None:
+            if stage == "suite":
+                file = tmp_path / "cells.json"
+                known.append(len(json.loads(file.read_text())["cells"]) if file.is_file() else 0)
+
+    order = order_of(recordings, methods=("static", "rigid_follow"), protocols=("main",))
+    monkeypatch.setattr(evaluation, "WRITE_EVERY", -1.0)
+    evaluate(order, tmp_path, Listener())
+    assert known == [0, 1, 2, 3, 3]  # Told before each cell; the last one is written at the end.
+
+
 def test_an_order_of_fewer_methods_keeps_what_was_known(
     tmp_path: Path, recordings: tuple[Sequence, ...]
 ) -> None:
@@ -412,7 +431,14 @@ def test_an_unseen_interaction_needs_the_same_body_in_another_action(
     other = write_told(tmp_path / "other", 0.2, "wipe", seed=1)
     order = replace(order, recordings=(low, again, other))
     assert len(evaluate(order, tmp_path / "seeds")["skipped"]) == 3
+    # Another generator may make another body of the same seed.
+    provenance = {**low.provenance, "generator": "older"}
+    old = Sequence(low.folder, replace(low.meta, name="old", provenance=provenance))
+    order = replace(order, recordings=(old, recordings[1]))
+    static = (parse_method("static"),)
+    assert [task.fitted for task in list_tasks(order, static)] == [None, None]
     order = replace(order, recordings=(low, again, recordings[1]))
+    assert [task.fitted for task in list_tasks(order, static)] == [recordings[1]] * 2 + [low]
     assert evaluate(order, tmp_path / "all")["cells"] == 3
 
 
