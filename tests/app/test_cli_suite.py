@@ -10,6 +10,10 @@ import pytest
 
 from app import cli
 from physhandi.data.run import Run
+from physhandi.data.sequence import Sequence
+from physhandi.data.truth import read_truth
+from physhandi.synthetic.generator_version import generator_version
+from physhandi.synthetic.suite import find_suite
 
 
 def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
@@ -99,20 +103,34 @@ def test_the_tiny_suite_is_made_and_evaluated_by_one_command(
 ) -> None:
     pytest.importorskip("mujoco")
     out = tmp_path / "tiny"
-    order = ("--suite", "tiny", "--methods", "static", "phystwin", "quick", "oracle_hand")
-    code, _, error = call(capsys, *order, "--out", out, "--device", "cpu")
+    order = ("--suite", "tiny", "--out", out, "--device", "cpu")
+    code, _, error = call(capsys, *order)
     assert code == 0, error
     rows = rows_of(out / "table.csv")
+    assert tuple(dict.fromkeys(method for method, *_ in rows)) == find_suite("tiny").methods
     for split in ("reconstruction", "future"):
         still = rows["static", split, "track_error"]
         assert 0.003 < rows["quick", split, "track_error"] < 0.8 * still
-        # Another engine made it: the true hand does not make a perfect object.
-        assert 0.003 < rows["oracle_hand", split, "track_error"] < still
     assert rows["phystwin", "future", "chamfer_phystwin"] > 0.002
     assert 0.001 < rows["quick", "hands", "mpjpe"] < 0.02
-    (sequence,) = (out / "sequences").iterdir()
-    assert len(list((sequence / "truth").glob("*.npy"))) > 3
-    (folder,) = (out / "cells").glob("*-quick-*")
-    nodes = Run.open(folder).array(f"sequences/{sequence.name}/rollout.npy").shape[1]
-    assert 50 < nodes <= 441
+    (folder,) = (out / "sequences").iterdir()
+    sequence = Sequence.load(folder)
+    assert sequence.provenance["generator"] == generator_version()
+    assert (out / "report.md").read_text().count(generator_version()) == 1
+    contact_point = read_truth(folder).contact_point
+    assert contact_point is not None
+    assert 50 < len(contact_point) <= 441
+    fits = list((out / "cells").glob(f"{sequence.name}-*"))
+    assert len(fits) == 5
+    for fit in fits:
+        nodes = Run.open(fit).array(f"sequences/{sequence.name}/rollout.npy").shape[1]
+        assert 50 < nodes <= 441
+    code, _, error = call(capsys, *order, "--methods", "oracle_hand")
+    assert code == 0, error
+    more = rows_of(out / "table.csv")
+    assert rows.items() <= more.items()  # What was known stays.
+    for split in ("reconstruction", "future"):
+        # Another engine made it: the true hand does not make a perfect object.
+        still = rows["static", split, "track_error"]
+        assert 0.003 < more["oracle_hand", split, "track_error"] < still
     shutil.rmtree(out)
