@@ -119,7 +119,7 @@ SUITES: dict[str, Suite] = {
                 *("towel lift", "towel fold", "towel wipe", "towel push"),
                 *("rope lift", "rope stretch", "rope fold", "rope push"),
                 *("plush lift", "plush squeeze", "plush stretch", "plush push"),
-                *("pouch lift", "pouch squeeze", "pouch wipe", "pouch push"),
+                *("pouch lift", "pouch squeeze", "pouch stretch", "pouch push"),
             ),
             seeds=(0, 1, 2, 3, 4),
             methods=(
