@@ -190,7 +190,7 @@ def _make_rope(random: Generator, segments: int) -> Body:
 
 def _make_plush(random: Generator, spacing: float) -> Body:
     """A stuffed animal on its back, head towards +x: soft limbs about a stiffer core."""
-    length = random.uniform(0.22, 0.27)
+    length = random.uniform(0.20, 0.24)
     solid, softness = make_plush(length, spacing, random)
     core = random.uniform(2.0, 3.0)
     return _of_solid(
