@@ -115,8 +115,11 @@ class EvaluateHands:
 class EvaluateSuite:
     """Compare methods on a suite of sequences, and write its tables (docs/evaluation.md)."""
 
-    suite: Literal["tiny", "dev", "full"] = "tiny"
-    """Which suite; sequences that are not there yet are made."""
+    suite: Annotated[
+        Literal["tiny", "dev", "full"] | None, arg(help_behavior_hint="(default: tiny)")
+    ] = None
+    """Which suite; sequences that are not there yet are made. With `--sequences`, whose effort
+    methods may take: without it their profiles' own."""
     methods: Annotated[tuple[str, ...], _OF_SUITE] = ()
     """Methods: static, rigid_follow, phystwin, paper, ours, quick, oracle_hand, oracle_parameters,
     each also as NAME+last_residual or NAME@SETTING=VALUE."""

@@ -19,16 +19,22 @@ def evaluate_suite(command: Any, progress: Progress) -> dict[str, Any]:
     """
     from physhandi.synthetic.baselines import parse_method, settings_of
     from physhandi.synthetic.evaluation import evaluate
-    from physhandi.synthetic.suite import check_seeds, find_suite, make_recordings
+    from physhandi.synthetic.suite import (
+        NAMED_SETTINGS,
+        check_seeds,
+        find_suite,
+        make_recordings,
+    )
     from physhandi.synthetic.suite_folder import check_folder
     from physhandi.synthetic.suite_tasks import Order
 
-    suite = find_suite(command.suite)
+    suite = find_suite(command.suite or "tiny")
     if command.sequences and command.seeds:
         raise UsageError("--seeds belongs to a suite's scenes; leave it out with --sequences.")
+    settings = suite.settings if command.suite or not command.sequences else NAMED_SETTINGS
     methods = command.methods or suite.methods
     for method in methods:  # Tells a wrong one before a sequence is made, which takes long.
-        settings_of(parse_method(method), suite.settings)
+        settings_of(parse_method(method), settings)
     seeds = command.seeds or suite.seeds
     check_seeds(seeds)
     device = pick_device(command.device)
@@ -47,7 +53,7 @@ def evaluate_suite(command: Any, progress: Progress) -> dict[str, Any]:
         recordings=tuple(named) or make_recordings(suite, seeds, out / "sequences", progress),
         methods=methods,
         protocols=command.protocols or suite.protocols,
-        settings=suite.settings,
+        settings=settings,
         device=device,
         command=_suite_command(command, device),
     )
@@ -71,7 +77,9 @@ def _joined(seeds: Iterable[int]) -> str:
 
 def _suite_command(command: Any, device: str) -> str:
     """Write the command again, with all that decides the result."""
-    parts = ["physhandi", "evaluate", "suite", "--suite", command.suite]
+    parts = ["physhandi", "evaluate", "suite"]
+    if command.suite or not command.sequences:
+        parts += ["--suite", command.suite or "tiny"]
     for name in ("methods", "seeds", "protocols", "sequences"):
         given = getattr(command, name)
         parts += [f"--{name}", *(str(value) for value in given)] if given else []

@@ -137,6 +137,10 @@ SUITES: dict[str, Suite] = {
 """All suites by name."""
 
 
+NAMED_SETTINGS: Mapping[str, Any] = {"node_spacing": 0.01}
+"""Settings that all methods share on sequences that belong to no suite."""
+
+
 def find_suite(name: str) -> Suite:
     """Find a suite by name.
 

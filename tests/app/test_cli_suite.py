@@ -44,9 +44,24 @@ def test_named_sequences_are_evaluated_where_the_server_finds_them(
     assert rows["static", "future", "track_error"] > 0.03
     report = Path(found["report"]).read_text()
     assert (
-        "* command: `physhandi evaluate suite --suite tiny --methods static rigid_follow "
+        "* command: `physhandi evaluate suite --methods static rigid_follow "
         "--sequences sheet --device cpu`" in report
     )
+    # Nothing cuts methods' own effort down unless a suite is named.
+    assert "settings that all methods share: node_spacing = 0.01\n" in report
+    code, out, _ = call(
+        capsys,
+        "--suite",
+        "tiny",
+        *order,
+        "--json",
+        "--data-dir",
+        data_dir,
+        "--out",
+        folder / "tiny",
+    )
+    assert code == 0
+    assert "object_.search.generations = 2" in Path(json.loads(out)["report"]).read_text()
 
 
 def test_other_sequences_have_a_folder_of_their_own_and_no_other_gets_their_table(
