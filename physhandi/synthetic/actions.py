@@ -20,8 +20,8 @@ ACTIONS: tuple[Action, ...] = ("lift", "fold", "stretch", "squeeze", "wipe", "pu
 _UP = np.array([0.0, 0.0, 1.0])
 # How far hands pull each body beyond its length: as far as friction holds it.
 _STRETCH = {"cloth": 0.02, "towel": 0.05, "rope": -0.01, "plush": 0.08, "pouch": 0.05}
-# Shortest recording in which hands go the whole way [s].
-_WHOLE_WAY = 1.5
+# Shortest recording in which hands go the whole way, so that they are as slow in shorter ones [s].
+_WHOLE_WAY = 3.0
 DURATION = 3.0
 """How long an action is recorded if nothing else is asked for [s]."""
 
