@@ -178,7 +178,7 @@ def test_a_left_hand_and_a_shorter_recording_can_be_asked_for():
     short, long = lift(0.5), lift(2.0)
     assert (short.side, short.end) == ("left", 0.5)
     rise = [grip(one, one.end)[2] - grip(one, 0.0)[2] for one in (short, long)]
-    assert rise[0] == pytest.approx(rise[1] / 3, abs=0.002)
+    assert rise[0] == pytest.approx(rise[1] / 4, abs=0.002)
 
 
 def test_an_unknown_action_is_refused_by_name():

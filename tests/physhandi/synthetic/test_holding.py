@@ -27,7 +27,7 @@ def test_friction_alone_lifts_a_rope(seed: int):
     assert truth.contact[-1].any()
     risen = (truth.position[-1] - truth.position[0])[held, 2].mean()
     lifted = (script.at((FRAMES - 1) / 30).position - script.at(0.0).position)[2]
-    assert lifted > 0.05
+    assert lifted > 0.03
     assert risen > 0.8 * lifted
     other_end = np.argmax(np.abs(rope.node[:, 0] - rope.node[held, 0].mean()))
     assert truth.position[-1, other_end, 2] < 0.02  # it hangs from the hand
