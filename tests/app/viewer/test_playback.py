@@ -126,11 +126,12 @@ def test_no_frame_is_left_out_while_drawing_takes_time() -> None:
     time.sleep(2.0)
     playback.close()
     frames = [frame for frame, is_playing in screen.drawn if is_playing]
-    assert frames[-1] == pytest.approx(50, abs=4)
+    assert frames[-1] == pytest.approx(50, abs=6)
     steps = [after - before for before, after in pairwise(frames)]
-    # A busy machine may be late by a whole frame now and then, a clock that drifts is so always.
-    assert sum(step > 1 for step in steps) <= 2
-    assert steps.count(1) > 40
+    # A busy machine may be late by a whole frame now and then; a clock that waits for 40 ms after
+    # each drawing leaves out a dozen.
+    assert sum(step > 1 for step in steps) <= 5
+    assert steps.count(1) > 35
 
 
 def test_steps_wrap_and_stop_the_clock(playback: Playback, screen: Screen) -> None:
@@ -144,17 +145,24 @@ def test_steps_wrap_and_stop_the_clock(playback: Playback, screen: Screen) -> No
 
 
 def test_speed_scales_time() -> None:
-    screen = Screen()
-    playback = Playback(1000, 10.0, screen)
+    drawn: list[tuple[int, float]] = []
+
+    def draw(frame: int, is_playing: bool) -> None:
+        if is_playing:
+            drawn.append((frame, time.monotonic()))
+
+    playback = Playback(1000, 10.0, draw)
     playback.set_speed(2.0)
     playback.start()
     playback.play()
-    begin = time.monotonic()
-    time.sleep(0.5)
-    playback.play(on=False)
-    expected = 20.0 * (time.monotonic() - begin)
+    end = time.monotonic() + 20
+    while (not drawn or drawn[-1][0] < 20) and time.monotonic() < end:
+        time.sleep(0.02)
     playback.close()
-    assert playback.frame == pytest.approx(expected, abs=3)
+    # Drawing may begin late on a busy machine; between two drawings the clock has gone as time has.
+    (first, begin), (last, finish) = drawn[0], drawn[-1]
+    assert last - first == pytest.approx(20.0 * (finish - begin), abs=3)
+    assert last >= 20
 
 
 def test_an_error_while_drawing_does_not_stop_the_clock(caplog) -> None:
