@@ -13,7 +13,7 @@ from numpy import ndarray
 from numpy.random import Generator
 
 from physhandi.errors import UsageError
-from physhandi.synthetic.scenes import make_sheet
+from physhandi.synthetic.scenes import Sheet, make_sheet
 from physhandi.synthetic.solids import Solid, make_pillow, make_plush
 from physhandi.synthetic.tubes import ROUND, tube_faces, tube_vertices
 
@@ -121,17 +121,10 @@ def _make_cloth(random: Generator, columns: int) -> Body:
     """A thin square cloth."""
     side = random.uniform(0.25, 0.30)
     radius = 0.0025
-    sheet = make_sheet(side, side, side / columns, random, height=radius)
-    return Body(
-        name="cloth",
-        node=sheet.node,
-        elements=sheet.faces,
-        faces=sheet.faces,
-        surface_node_count=len(sheet.node),
-        size=_extent(sheet.node),
+    return _of_sheet(
+        "cloth",
+        make_sheet(side, side, side / columns, random, height=radius),
         stiffness=_log_uniform(random, 1.5e5, 5e5),
-        element_stiffness=np.ones(len(sheet.faces)),
-        poisson=0.25,
         thickness=random.uniform(0.0008, 0.0012),
         radius=radius,
         mass=random.uniform(0.15, 0.25) * side * side,
@@ -142,20 +135,33 @@ def _make_towel(random: Generator, columns: int) -> Body:
     """A small, thick and heavy towel."""
     length, width = random.uniform(0.27, 0.33), random.uniform(0.18, 0.22)
     radius = 0.002  # Pieces that do not share a node must not touch at rest.
-    sheet = make_sheet(length, width, length / columns, random, height=radius)
+    return _of_sheet(
+        "towel",
+        make_sheet(length, width, length / columns, random, height=radius),
+        stiffness=_log_uniform(random, 3e4, 8e4),
+        thickness=random.uniform(0.002, 0.003),
+        radius=radius,
+        mass=random.uniform(0.35, 0.5) * length * width,
+    )
+
+
+def _of_sheet(
+    name: BodyName, sheet: Sheet, *, stiffness: float, thickness: float, radius: float, mass: float
+) -> Body:
+    """Make a sheet of one material, which already lies on the ground."""
     return Body(
-        name="towel",
+        name=name,
         node=sheet.node,
         elements=sheet.faces,
         faces=sheet.faces,
         surface_node_count=len(sheet.node),
         size=_extent(sheet.node),
-        stiffness=_log_uniform(random, 3e4, 8e4),
+        stiffness=stiffness,
         element_stiffness=np.ones(len(sheet.faces)),
         poisson=0.25,
-        thickness=random.uniform(0.002, 0.003),
+        thickness=thickness,
         radius=radius,
-        mass=random.uniform(0.35, 0.5) * length * width,
+        mass=mass,
     )
 
 

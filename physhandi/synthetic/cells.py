@@ -7,7 +7,7 @@ again goes on where it stopped, and anything that changed is computed anew.
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -66,10 +66,6 @@ class Outcome:
     """What `physhandi.metrics.report.score_run` says of it, against the whole recording."""
     curves: Mapping[str, Any] = field(default_factory=dict[str, Any])
     """Its errors frame by frame."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Describe it in plain data."""
-        return asdict(self)
 
 
 class Bench:

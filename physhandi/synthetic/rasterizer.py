@@ -122,3 +122,11 @@ def vertex_normals(
     for corner in range(3):
         np.add.at(total, faces[:, corner], normal)
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
+
+
+def triangle_areas(
+    vertex: Float[ndarray, "vertex 3"], faces: Int[ndarray, "face 3"]
+) -> Float[ndarray, " face"]:
+    """Measure each triangle [m²]."""
+    a, b, c = (vertex[faces[:, corner]] for corner in range(3))
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2

@@ -10,6 +10,8 @@ from numpy.random import Generator
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from physhandi.synthetic.rasterizer import triangle_areas
+
 _TETRAHEDRON_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 _LEAST_VOLUME = 0.25
 
@@ -34,8 +36,7 @@ class Solid:
 
     def area(self) -> float:
         """Area of the surface [m²]."""
-        a, b, c = (self.node[self.faces[:, corner]] for corner in range(3))
-        return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0)
+        return float(triangle_areas(self.node, self.faces).sum())
 
 
 def make_pillow(size: tuple[float, float, float], columns: int) -> Solid:

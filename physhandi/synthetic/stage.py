@@ -12,6 +12,7 @@ from physhandi.data.sequence_schema import Side
 from physhandi.synthetic.degradations import Degradations, hand_shift
 from physhandi.synthetic.engines.truth import PhysicalTruth
 from physhandi.synthetic.filming import SurfacePoints
+from physhandi.synthetic.rasterizer import triangle_areas
 from physhandi.synthetic.rendering import Dye, Scene, compose, light_camera
 from physhandi.synthetic.true_hand import TrueHand, soft_tissue_offset
 
@@ -157,8 +158,7 @@ def spread_points(
         count: Number of points.
         random: Decides which.
     """
-    a, b, c = (vertex[faces[:, number]] for number in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    area = triangle_areas(vertex, faces)
     drawn = _DRAWN_PER_KEPT * count
     face = random.choice(len(faces), size=drawn, p=area / area.sum())
     every = SurfacePoints(faces[face], random.dirichlet(np.ones(3), size=drawn))
@@ -174,8 +174,7 @@ def spread_points(
 
 def surface_area(vertex: Float[ndarray, "vertex 3"], faces: Int[ndarray, "face 3"]) -> float:
     """Measure a surface [m²]."""
-    a, b, c = (vertex[faces[:, number]] for number in range(3))
-    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+    return float(triangle_areas(vertex, faces).sum())
 
 
 def _between(value: ndarray, frame: float) -> ndarray:
