@@ -1,11 +1,11 @@
 """Which generator made a sequence: a hash of the code that decides it, and MuJoCo's version."""
 
-import hashlib
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from physhandi.data.sequence import Sequence
+from physhandi.synthetic.code_hash import code_hash
 
 _PARTS = (
     *("bodies.py", "solids.py", "tubes.py", "scenes.py", "stage.py", "shot.py"),
@@ -14,7 +14,6 @@ _PARTS = (
     *("presets.py", "filming.py", "rendering.py", "rasterizer.py", "recording.py"),
     "synthesize.py",
 )
-_KINDS = {".py", ".npz", ".yaml", ".tflite", ".glb"}
 
 
 @lru_cache(maxsize=1)
@@ -28,27 +27,6 @@ def generator_version() -> str:
     except PackageNotFoundError:
         engine = "none"
     return f"{code_hash(Path(__file__).parent, _PARTS)}-mujoco-{engine}"
-
-
-def code_hash(folder: Path, parts: tuple[str, ...]) -> str:
-    """Hash files, and all sources and assets in folders.
-
-    Args:
-        folder: Where they lie.
-        parts: Names of files and folders in it.
-
-    Raises:
-        FileNotFoundError: If a part does not exist.
-    """
-    digest = hashlib.sha256()
-    for part in parts:
-        path = folder / part
-        files = sorted(path.rglob("*")) if path.is_dir() else [path]
-        for file in files:
-            if file == path or file.suffix in _KINDS:
-                digest.update(f"{file.relative_to(folder).as_posix()}\0".encode())
-                digest.update(file.read_bytes())
-    return digest.hexdigest()[:12]
 
 
 def told_version(recording: Sequence) -> str:

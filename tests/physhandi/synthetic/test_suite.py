@@ -17,7 +17,8 @@ from physhandi.synthetic import generator_version as module
 from physhandi.synthetic import synthesize as generator
 from physhandi.synthetic.baselines import parse_method, settings_of
 from physhandi.synthetic.bodies import make_body
-from physhandi.synthetic.generator_version import code_hash, generator_version, outdated
+from physhandi.synthetic.code_hash import code_hash
+from physhandi.synthetic.generator_version import generator_version, outdated
 from physhandi.synthetic.suite import SUITES, Scene, Suite, make_recordings
 
 SUITE = Suite(
