@@ -223,10 +223,15 @@ class Workshop:
         )
         with self._lock:
             self._processes.add(process)
-        timer = threading.Timer(self._seconds, process.kill)
+        late = threading.Event()
+
+        def end() -> None:
+            late.set()
+            process.kill()
+
+        timer = threading.Timer(self._seconds, end)
         timer.daemon = True
         timer.start()
-        start = time.monotonic()
         try:
             answer = _converse(process, order.to_text(), work)
         finally:
@@ -242,8 +247,8 @@ class Workshop:
         if "error" in answer:
             raise _ERRORS.get(str(answer["kind"]), errors.RunError)(str(answer["error"]))
         if not work.path.is_file():
-            late = time.monotonic() - start >= self._seconds
-            why = f"took longer than {self._seconds:.0f} s" if late else "was ended by the system"
+            limit = f"took longer than {self._seconds:g} s"
+            why = limit if late.is_set() else "was ended by the system"
             raise errors.RunError(f"The file could not be made: it {why}.")
 
     def _make_room(self, newest: Path) -> None:

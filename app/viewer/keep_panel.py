@@ -85,7 +85,9 @@ class PresetChoice:
         label = BY_HAND if chosen is None else chosen.label
         # Another value than the last one that was written here is a user's, about to be heard.
         if self._list.value == self._written != label:
-            self._list.value = self._written = label
+            # Noted first: a user may answer before the next line of this thread runs.
+            self._written = label
+            self._list.value = label
 
     @property
     def chosen(self) -> Preset | None:
@@ -100,8 +102,8 @@ class PresetChoice:
         self.show()
 
     def _choose(self) -> None:
-        self._written = self._list.value
-        preset = self._presets.get(self._written)
+        label = self._written = self._list.value
+        preset = self._presets.get(label)
         if preset is None:
             self.show()  # "By hand" is what the list says, nothing to choose.
             return

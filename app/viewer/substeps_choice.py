@@ -57,7 +57,9 @@ class SubstepsChoice:
         choice = AUTOMATIC if history.is_automatic else BY_HAND if is_other else AS_FITTED
         # Another value than the last one that was written here is a user's, about to be heard.
         if self._choice.value == self._written != choice:
-            self._choice.value = self._written = choice
+            # Noted first: a user may answer before the next line of this thread runs.
+            self._written = choice
+            self._choice.value = choice
         if choice == BY_HAND and self._number.value != number:
             self._number.value = number
         self._number.visible = choice == BY_HAND

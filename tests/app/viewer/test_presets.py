@@ -1,11 +1,17 @@
 import json
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import yaml
 
+from app.viewer.guard import Guard
+from app.viewer.history import History
+from app.viewer.keep_panel import PresetChoice
 from app.viewer.preset_store import PRESET_FORMAT, PresetStore, checked_name
-from app.viewer.presets import AS_FITTED, builtin_presets, changes_of
+from app.viewer.presets import AS_FITTED, BY_HAND, builtin_presets, changes_of
 from physhandi.errors import UsageError
 from physhandi.simulation.model import SimulationParameters
 
@@ -140,3 +146,57 @@ def test_nothing_is_kept_without_a_name_or_a_change(store) -> None:
     with pytest.raises(UsageError, match="no preset of yours called 'soft'"):
         store.delete("soft")
     assert not store.folder.exists()
+
+
+class QuickHand:
+    """A list whose user may answer the very moment that it changes, as a fast browser does."""
+
+    def __init__(self, options: tuple[str, ...]) -> None:
+        self.options = options
+        self.answer = ""
+        self._value = options[0]
+        self._heard: Callable[[Any], None] = lambda _: None
+
+    @property
+    def value(self) -> str:
+        return self._value
+
+    @value.setter
+    def value(self, value: str) -> None:
+        self._value = value
+        answer, self.answer = self.answer, ""
+        if answer:
+            self.choose(answer)
+
+    def choose(self, value: str) -> None:
+        self._value = value
+        self._heard(SimpleNamespace(client=object()))
+
+    def on_update(self, heard: Callable[[Any], None]) -> None:
+        self._heard = heard
+
+
+def test_a_choice_made_the_moment_the_list_changes_is_not_lost() -> None:
+    history = History(FITTED)
+    lists: list[QuickHand] = []
+
+    def add_dropdown(_name: str, options: tuple[str, ...], **_: object) -> QuickHand:
+        lists.append(QuickHand(options))
+        return lists[-1]
+
+    gui: Any = SimpleNamespace(add_dropdown=add_dropdown)
+    guard = Guard(SimpleNamespace())  # type: ignore[arg-type]  # nothing goes wrong here
+    choice = PresetChoice(gui, guard, history, length_unit="m", store=None, moved=lambda: None)
+    (shown,) = lists
+    shown.choose("limp")
+    assert (history.current.drag, shown.value) == (0.5, "limp")
+    history.set("drag", 9.0)
+    choice.show()
+    assert shown.value == BY_HAND
+    shown.answer = AS_FITTED
+    history.undo()
+    choice.show()  # Says "limp", and at once the user wants the fitted parameters.
+    assert (history.current, shown.value) == (FITTED, AS_FITTED)
+    history.undo()
+    choice.show()
+    assert shown.value == "limp"
