@@ -137,6 +137,9 @@ class EvaluateSuite:
     out: Path | None = None
     """Folder to fill, and to go on with; none takes one of its own in `suites/` of the data folder,
     whose suites the server shows."""
+    jobs: int = 1
+    """How many sequences and cells are computed side by side, each in a process of its own. Then
+    the times in the table are those of a shared machine."""
     device: str = "auto"
     """Warp device: auto, cpu or cuda:0."""
     json: bool = False

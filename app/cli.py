@@ -2,6 +2,7 @@
 
 import json
 import logging
+import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -50,8 +51,10 @@ class PrintedProgress(Progress):
         done = round(24 * iteration / max(1, total))
         shown = "" if loss is None else f"  loss {loss:.6g}"
         bar = "█" * done + "░" * (24 - done)
-        line = f"\r{stage:<20} {bar} {iteration}/{total}{shown}  {message}"
-        print(f"{line:<100}", end="", file=sys.stderr, flush=True)
+        line = f"{stage:<20} {bar} {iteration}/{total}{shown}  {message}"
+        # A line that is broken by the terminal could not be drawn over.
+        width = shutil.get_terminal_size((100, 24)).columns - 1
+        print(f"\r{line[:width]:<{width}}", end="", file=sys.stderr, flush=True)
 
     def finish(self) -> None:
         """End the line, if there is one, so that what follows stands on its own."""

@@ -2,7 +2,10 @@
 
 import hashlib
 import shlex
-from collections.abc import Iterable
+import time
+from collections.abc import Iterable, Mapping
+from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 from app.commands import find_sequence, pick_device, read_settings
@@ -17,17 +20,21 @@ def evaluate_suite(command: Any, progress: Progress) -> dict[str, Any]:
     Raises:
         UsageError: If a method, seed or sequence makes no sense, or the folder holds other data.
     """
+    from app.suite_workers import MOST, SuiteWorkers
     from physhandi.synthetic.baselines import parse_method, settings_of
     from physhandi.synthetic.evaluation import evaluate
     from physhandi.synthetic.suite import (
         NAMED_SETTINGS,
+        Making,
         check_seeds,
         find_suite,
+        make_recording,
         make_recordings,
     )
     from physhandi.synthetic.suite_folder import check_folder
     from physhandi.synthetic.suite_tasks import Order
 
+    start = time.monotonic()
     suite = find_suite(command.suite or "tiny")
     if command.sequences and command.seeds:
         raise UsageError("--seeds belongs to a suite's scenes; leave it out with --sequences.")
@@ -48,18 +55,36 @@ def evaluate_suite(command: Any, progress: Progress) -> dict[str, Any]:
         of_seeds = "" if set(seeds) == set(suite.seeds) else f"-seeds-{_joined(seeds)}"
         out = command.out or folders / f"{suite.name}{of_seeds}"
     check_folder(out, title, cases)
-    order = Order(
-        title=title,
-        recordings=tuple(named) or make_recordings(suite, seeds, out / "sequences", progress),
-        methods=methods,
-        protocols=command.protocols or suite.protocols,
-        settings=settings,
-        device=device,
-        command=_suite_command(command, device),
-    )
-    for recording in order.recordings:
-        recording.validate(reads_color=False)
-    return evaluate(order, out, progress)
+    if not 1 <= command.jobs <= MOST:
+        raise UsageError(f"--jobs {command.jobs} makes no sense; choose 1 to {MOST}.")
+    with ExitStack() as stack:
+        # Everything that a user may have got wrong is told before they are started.
+        workers = (
+            stack.enter_context(SuiteWorkers(command.jobs, progress)) if command.jobs > 1 else None
+        )
+
+        def make(makings: Mapping[Path, Making]) -> None:
+            if workers is not None:
+                workers.make(makings)
+                return
+            for target, making in makings.items():
+                make_recording(making, target, progress)
+
+        order = Order(
+            title=title,
+            recordings=tuple(named) or make_recordings(suite, seeds, out / "sequences", make),
+            methods=methods,
+            protocols=command.protocols or suite.protocols,
+            settings=settings,
+            device=device,
+            command=_suite_command(command, device),
+            at_once=command.jobs,
+        )
+        for recording in order.recordings:
+            recording.validate(reads_color=False)
+        fill = None if workers is None else workers.fill(order, out)
+        found = evaluate(order, out, progress, fill=fill)
+    return found | {"seconds": round(time.monotonic() - start, 1)}
 
 
 def _name_for(sequences: list[Sequence]) -> str:
@@ -83,4 +108,5 @@ def _suite_command(command: Any, device: str) -> str:
     for name in ("methods", "seeds", "protocols", "sequences"):
         given = getattr(command, name)
         parts += [f"--{name}", *(str(value) for value in given)] if given else []
+    parts += ["--jobs", str(command.jobs)] if command.jobs > 1 else []
     return shlex.join([*parts, "--device", device])

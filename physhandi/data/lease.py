@@ -100,9 +100,30 @@ class Lease:
 def locked(folder: Path) -> Generator[None]:
     """Hold the run's lock for a moment, so that claims and publications do not mix."""
     try:
-        descriptor = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+        descriptor = _open_lock(folder / _LOCK)
     except FileNotFoundError:
         raise RunError(f"Run folder {folder} is gone; it was deleted or moved.") from None
+    with _held(descriptor):
+        yield
+
+
+@contextmanager
+def locked_file(path: Path) -> Generator[None]:
+    """Hold a lock that other processes wait for; it is let go of however this one ends.
+
+    Args:
+        path: The file that stands for it; made if missing, and left.
+    """
+    with _held(_open_lock(path)):
+        yield
+
+
+def _open_lock(path: Path) -> int:
+    return os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+
+
+@contextmanager
+def _held(descriptor: int) -> Generator[None]:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield

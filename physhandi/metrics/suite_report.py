@@ -238,6 +238,8 @@ def _environment(about: Mapping[str, Any]) -> str:
     made = {"command": [about["command"] and f"`{about['command']}`"]} | {
         name: about[name] for name in ("seeds", "presets", "generators")
     }
+    shared = about.get("at_once", 1)
+    crowd = f", shared by {shared} cells at a time, so times are longer" if shared > 1 else ""
     return "\n".join(
         [
             *(
@@ -245,7 +247,8 @@ def _environment(about: Mapping[str, Any]) -> str:
                 for name, values in made.items()
                 if any(value != "" for value in values)
             ),
-            f"* device: {found['device']} {found['device_name']}, {found['cpu_count']} processors",
+            f"* device: {found['device']} {found['device_name']}, {found['cpu_count']} processors"
+            + crowd,
             f"* system: {found['system']}, Python {found['python']}",
             f"* commit: {found['commit'] or 'not run from a checkout'}",
             f"* packages: {packages}",

@@ -1,12 +1,14 @@
 """Cells of a suite: one method on one sequence, a run folder that is filled once and kept.
 
 A cell's folder is named by a hash of its sequence, method and code, so that a suite that is run
-again goes on where it stopped, and anything that changed is computed anew.
+again goes on where it stopped, and anything that changed is computed anew. Several processes may
+fill cells of one folder: who needs a cell that another one is filling waits for it.
 """
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ import warp as wp
 
 from physhandi.data.atomic import write_json
 from physhandi.data.environment import processor_name
+from physhandi.data.lease import locked_file
 from physhandi.data.run import Run
 from physhandi.data.run_files import EXIT, read_json, read_mapping
 from physhandi.data.sequence import Sequence
@@ -141,7 +144,7 @@ class Bench:
     def lacks(self, method: Method, recording: Sequence, variant: str = "recording") -> str:
         """Say what a recording lacks for a variant of it to be given; empty if nothing."""
         try:
-            make_variant(recording, _given(method, variant), self.out / "inputs")
+            self._make_variant(recording, _given(method, variant))
         except MissingInputError as error:
             return str(error)
         return ""
@@ -175,7 +178,7 @@ class Bench:
         run: Run | None = None
         try:
             source = self._run(method, fitted, method.gets)
-            target = make_variant(recording, given, self.out / "inputs")
+            target = self._make_variant(recording, given)
             folder = self._cell(
                 recording.name, f"{method.name}_unseen", [source.folder.name, given], recording
             )
@@ -224,12 +227,28 @@ class Bench:
     def _run(self, method: Method, recording: Sequence, variant: str) -> Run:
         folder = self._folder(method, recording, variant)
         if folder not in self._finished:
-            self._finished[folder] = self._filled(method, recording, variant, folder)
+            with self._alone(folder.name):
+                self._finished[folder] = self._filled(method, recording, variant, folder)
         return self._finished[folder]
+
+    def _make_variant(self, recording: Sequence, variant: str) -> Sequence:
+        with self._alone(f"{recording.name}-{variant}"):
+            return make_variant(recording, variant, self.out / "inputs")
+
+    @contextmanager
+    def _alone(self, name: str) -> Generator[None]:
+        """Make sure that no other process works on something; wait until that one is finished.
+
+        Who holds one only waits for what it is made from, so none waits for itself.
+        """
+        folder = self.out / "locks"
+        folder.mkdir(parents=True, exist_ok=True)
+        with locked_file(folder / name):
+            yield
 
     def _filled(self, method: Method, recording: Sequence, variant: str, folder: Path) -> Run:
         _raise_again(folder)
-        given = make_variant(recording, variant, self.out / "inputs")
+        given = self._make_variant(recording, variant)
         title = f"{method.name} on {recording.name}"
         if method.is_corrected:
             base = self._run(method.base, recording, variant)
@@ -258,11 +277,12 @@ class Bench:
 
     def _simulated(self, source: Run, target: Sequence, folder: Path, *, title: str) -> Run:
         """Simulate what was fitted elsewhere; a radius that reaches nothing there is no misuse."""
-        _raise_again(folder, also=UsageError)
         try:
-            return simulate_in(
-                source, target, folder, title=title, device=self.device, progress=self.progress
-            )
+            with self._alone(folder.name):
+                _raise_again(folder, also=UsageError)
+                return simulate_in(
+                    source, target, folder, title=title, device=self.device, progress=self.progress
+                )
         except UsageError as error:
             raise FitError(str(error)) from error
 

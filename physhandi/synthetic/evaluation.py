@@ -2,6 +2,7 @@
 
 import logging
 import time
+from collections.abc import Callable, Iterator
 from collections.abc import Sequence as Many
 from dataclasses import replace
 from pathlib import Path
@@ -25,12 +26,16 @@ from physhandi.synthetic.suite_tasks import Order, Task, list_tasks
 
 _LOG = logging.getLogger(__name__)
 
+Fill = Callable[[Many[Task]], Iterator[int]]
+"""Has cells filled, and yields their numbers as they are finished, each once."""
 WRITE_EVERY = 600.0
 """Tables are written after every protocol, and after this time [s]."""
 _SCORES = "synthetic/suite_scores.py"
 
 
-def evaluate(order: Order, out: Path, progress: Progress | None = None) -> dict[str, Any]:
+def evaluate(
+    order: Order, out: Path, progress: Progress | None = None, *, fill: Fill | None = None
+) -> dict[str, Any]:
     """Run what is missing of an order, and write its tables.
 
     Tables are written on the way too, and when the user stops it or something fails. What an
@@ -40,6 +45,8 @@ def evaluate(order: Order, out: Path, progress: Progress | None = None) -> dict[
         order: What is to be evaluated.
         out: Folder of the suite; finished cells in it are not computed again.
         progress: Told about every cell, and about every iteration in it.
+        fill: Has others fill the cells ahead, by `filler`; without it they are filled here, one
+            after the other.
 
     Returns:
         ``out``, ``table`` and ``report`` (paths), ``cells`` and ``failed`` (numbers of cells),
@@ -52,27 +59,26 @@ def evaluate(order: Order, out: Path, progress: Progress | None = None) -> dict[
         CancelledError: If the user asked to stop; what is finished stays.
     """
     progress = progress or NullProgress()
-    methods = tuple(parse_method(name) for name in dict.fromkeys(order.methods))
-    order = replace(order, protocols=tuple(dict.fromkeys(order.protocols)))
-    _check(order, methods)
+    order, methods, tasks = _read(order)
     folder = SuiteFolder(out, _about(order, methods))
     for note in folder.about["notes"]:
         _LOG.warning("%s", note)
-    work = _Work(order, Bench(out, common=order.settings, device=order.device, progress=progress))
-    tasks = list(list_tasks(order, methods))
+    work = _Work(order, out, progress)
     finished, paths, written = 0, dict[str, Any](), time.monotonic()
+    before = ""
 
     def write() -> dict[str, Any]:
         return folder.write(_environment(order), work.skipped, len(tasks) - finished)
 
     try:
-        for number, task in enumerate(tasks):
-            is_other = number > 0 and task.protocol != tasks[number - 1].protocol
+        for number in range(len(tasks)) if fill is None else fill(tasks):
+            task = tasks[number]
+            is_other, before = task.protocol != before, task.protocol
             if folder.done and (is_other or time.monotonic() - written > WRITE_EVERY):
                 paths, written = write(), time.monotonic()
             progress.check_cancelled()
             told = f"{task.method.name}, {task.recording.name}"
-            progress.report("suite", number, len(tasks), message=told)
+            progress.report("suite", finished, len(tasks), message=told)
             cell = work.cell(task)
             finished += 1
             if cell is not None:
@@ -90,17 +96,43 @@ def evaluate(order: Order, out: Path, progress: Progress | None = None) -> dict[
     }
 
 
+def filler(order: Order, out: Path, progress: Progress) -> Callable[[int], None]:
+    """Prepare to fill single cells of an order, beside other processes that fill others.
+
+    Args:
+        order: The order, the same for all of them.
+        out: Folder of the suite.
+        progress: Told about every iteration.
+
+    Returns:
+        Fills the cell of a number, as `evaluate` counts them; nothing is to be done for one that
+        nobody could fill.
+    """
+    order, _, tasks = _read(order)
+    work = _Work(order, out, progress)
+
+    def fill(number: int) -> None:
+        work.outcome(tasks[number])
+
+    return fill
+
+
 class _Work:
     """Fills cells, and remembers which could not be asked for."""
 
-    def __init__(self, order: Order, bench: Bench) -> None:
-        self.bench = bench
+    def __init__(self, order: Order, out: Path, progress: Progress) -> None:
+        self.bench = Bench(out, common=order.settings, device=order.device, progress=progress)
         self.recordings = order.recordings
         self.skipped: list[str] = []
         self._blind: dict[str, str] = {}
 
     def cell(self, task: Task) -> dict[str, Any] | None:
-        """Fill a cell; None if no method could."""
+        """Fill a cell and describe it; None if it cannot be asked for."""
+        outcome = self.outcome(task)
+        return None if outcome is None else self._described(task, outcome)
+
+    def outcome(self, task: Task) -> Outcome | None:
+        """Fill a cell; None if it cannot be asked for."""
         for recording in filter(None, (task.recording, task.fitted)):
             reason = self._why_blind(recording)
             if reason:
@@ -117,7 +149,9 @@ class _Work:
             if reason:
                 self._skip(f"{task.method.name}, {task.recording.name}, {task.split}: {reason}")
                 return None
-        return self._described(task, self._outcome(task))
+        if task.fitted is not None:
+            return self.bench.unseen(task.method, task.fitted, task.recording)
+        return self.bench.outcome(task.method, task.recording, task.variant)
 
     def raise_if_blind(self) -> None:
         """Tell that nothing can be scored at all.
@@ -142,11 +176,6 @@ class _Work:
     def _skip(self, reason: str) -> None:
         if reason not in self.skipped:
             self.skipped.append(reason)
-
-    def _outcome(self, task: Task) -> Outcome:
-        if task.fitted is not None:
-            return self.bench.unseen(task.method, task.fitted, task.recording)
-        return self.bench.outcome(task.method, task.recording, task.variant)
 
     def _described(self, task: Task, outcome: Outcome) -> dict[str, Any]:
         unmoved = None
@@ -186,6 +215,7 @@ def _about(order: Order, methods: Many[Method]) -> dict[str, Any]:
         "cases": [recording.name for recording in order.recordings],
         "protocols": list(order.protocols),
         "settings": dict(order.settings),
+        "at_once": order.at_once,
         "seeds": seeds,
         "is_verification": any(seed >= RESERVED_SEED for seed in seeds),
         "presets": sorted({str(one["preset"]) for one in made if "preset" in one}),
@@ -199,6 +229,14 @@ def _about(order: Order, methods: Many[Method]) -> dict[str, Any]:
             "sequences": {r.name: r.fingerprint() for r in order.recordings},
         },
     }
+
+
+def _read(order: Order) -> tuple[Order, tuple[Method, ...], list[Task]]:
+    """Read an order: each protocol once, its methods, and the cells that it asks for."""
+    methods = tuple(parse_method(name) for name in dict.fromkeys(order.methods))
+    order = replace(order, protocols=tuple(dict.fromkeys(order.protocols)))
+    _check(order, methods)
+    return order, methods, list(list_tasks(order, methods))
 
 
 def _check(order: Order, methods: Many[Method]) -> None:

@@ -5,7 +5,7 @@ Difficulty is set here and in the scenes, once, before any method is tuned. Seed
 """
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Many
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +18,8 @@ from physhandi.progress import Progress
 
 SuiteName = Literal["tiny", "dev", "full"]
 Protocol = Literal["main", "single_view", "unseen", "robustness", "sensitivity"]
+Making = Mapping[str, Any]
+"""What the generator is told of one sequence."""
 RESERVED_SEED = 1000
 """Seeds from here on are reserved for verification."""
 BASELINES = ("static", "rigid_follow", "phystwin")
@@ -166,7 +168,7 @@ def check_seeds(seeds: Many[int]) -> None:
 
 
 def make_recordings(
-    suite: Suite, seeds: Many[int], folder: Path, progress: Progress
+    suite: Suite, seeds: Many[int], folder: Path, make: Callable[[Mapping[Path, Making]], None]
 ) -> tuple[Sequence, ...]:
     """Make the sequences of a suite; those that are there already are opened.
 
@@ -174,41 +176,46 @@ def make_recordings(
         suite: The suite.
         seeds: Seeds of every scene.
         folder: Where the sequences lie.
-        progress: Told about every frame.
+        make: Makes those that are missing, by `make_recording`, in any order.
 
     Raises:
         UsageError: If a seed makes no sense, or a sequence that is there was made otherwise; then
             nothing is made.
         SequenceError: If a sequence that is there is damaged; delete its folder to make it anew.
     """
-    from physhandi.synthetic.synthesize import synthesize
-
     check_seeds(seeds)
-    orders = {
-        folder / scene.name(seed): _order(suite, scene, seed)
+    makings = {
+        folder / scene.name(seed): _making(suite, scene, seed)
         for scene in suite.scenes
         for seed in seeds
     }
-    found = {target: Sequence.load(target) for target in orders if target.is_dir()}
+    found = {target: Sequence.load(target) for target in makings if target.is_dir()}
     for target, recording in found.items():
-        _check_made(suite, recording, orders[target])
-    for target, order in orders.items():
-        if target not in found:
-            found[target] = synthesize(
-                order["object"],
-                **{name: value for name, value in order.items() if name != "object"},
-                out=target,
-                progress=progress,
-            )
-    return tuple(found[target] for target in orders)
+        _check_made(suite, recording, makings[target])
+    make({target: making for target, making in makings.items() if target not in found})
+    return tuple(found.get(target) or Sequence.load(target) for target in makings)
 
 
-def _order(suite: Suite, scene: Scene, seed: int) -> dict[str, Any]:
+def make_recording(making: Making, target: Path, progress: Progress) -> None:
+    """Make one sequence of a suite.
+
+    Args:
+        making: Its object, and what else `synthesize` is told.
+        target: Its folder.
+        progress: Told about every frame.
+    """
+    from physhandi.synthetic.synthesize import synthesize
+
+    others = {name: value for name, value in making.items() if name != "object"}
+    synthesize(making["object"], **others, out=target, progress=progress)
+
+
+def _making(suite: Suite, scene: Scene, seed: int) -> dict[str, Any]:
     scripted = {"object": scene.object_, "action": scene.action, "seed": seed, "hold": scene.hold}
     return scripted | dict(suite.recording)
 
 
-def _check_made(suite: Suite, recording: Sequence, order: Mapping[str, Any]) -> None:
+def _check_made(suite: Suite, recording: Sequence, making: Making) -> None:
     """Refuse a sequence that is not the one that would be made.
 
     Raises:
@@ -218,7 +225,7 @@ def _check_made(suite: Suite, recording: Sequence, order: Mapping[str, Any]) -> 
 
     known = inspect.signature(synthesize).parameters.values()
     wanted = {p.name: p.default for p in known if p.default is not inspect.Parameter.empty}
-    wanted |= {"changes": {}} | dict(order)
+    wanted |= {"changes": {}} | dict(making)
     made = named_fields(recording.provenance.get("synthesize"))
     if made is None or not {"object", "action", "seed"} <= made.keys():
         differs = "was not made by `physhandi synthesize`"

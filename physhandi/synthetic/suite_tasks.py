@@ -35,6 +35,8 @@ class Order:
     """Warp device."""
     command: str = ""
     """The command that asks for it, which the report repeats."""
+    at_once: int = 1
+    """How many cells are computed side by side, which share the machine."""
 
 
 @dataclass(frozen=True, kw_only=True)

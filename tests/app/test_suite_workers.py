@@ -1,0 +1,197 @@
+"""Processes that share the work on a suite: same tables, each cell once, and a clear end."""
+
+import json
+import os
+import signal
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import psutil
+import pytest
+from suite_world import METHODS, order_of, table, write_told
+
+from app import suite_workers
+from app.suite_process import order_from_json, order_to_json
+from app.suite_workers import SuiteWorkers
+from physhandi.data.lease import locked_file
+from physhandi.data.run import Run
+from physhandi.data.sequence import Sequence
+from physhandi.errors import CancelledError, RunError, UsageError
+from physhandi.progress import NullProgress, Progress
+from physhandi.synthetic.baselines import parse_method
+from physhandi.synthetic.evaluation import evaluate, filler
+from physhandi.synthetic.suite_tasks import Order, list_tasks
+
+pytestmark = pytest.mark.timeout(300)
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> tuple[Sequence, ...]:
+    root = tmp_path_factory.mktemp("recordings")
+    return write_told(root / "low", 0.12), write_told(root / "high", 0.2, "wipe")
+
+
+@pytest.fixture(scope="module")
+def order(recordings: tuple[Sequence, ...]) -> Order:
+    return order_of(recordings, at_once=2)
+
+
+def children() -> list[psutil.Process]:
+    return [p for p in psutil.Process().children() if "app.suite_process" in p.cmdline()]
+
+
+class Watched(Progress):
+    """Remembers what it is told, and asks to stop when some words are among it."""
+
+    def __init__(self, stop_at: str = "") -> None:
+        self.told: list[tuple[str, int, int, str]] = []
+        self._stop_at = stop_at
+
+    def report(
+        self,
+        stage: str,
+        iteration: int,
+        total: int,
+        loss: float | None = None,
+        message: str = "",
+    ) -> None:
+        self.told.append((stage, iteration, total, message))
+
+    def check_cancelled(self) -> None:
+        if self._stop_at and any(self._stop_at in message for *_, message in self.told):
+            raise CancelledError("stopped")
+
+
+def test_two_processes_give_the_table_of_one_and_fill_each_cell_once(
+    tmp_path: Path, order: Order
+) -> None:
+    evaluate(order, tmp_path / "one")
+    progress = Watched()
+    with SuiteWorkers(2, progress) as workers:
+        out = tmp_path / "two"
+        found = evaluate(order, out, progress, fill=workers.fill(order, out))
+        first, second = children()
+        assert [first.cpu_affinity(), second.cpu_affinity()] == suite_workers._shares(2)
+    assert (found["cells"], found["failed"], found["skipped"]) == (14, 0, [])
+    assert children() == []
+    one, two = table(tmp_path / "one"), table(out)
+    assert list(one) == list(two)
+    for key, row in one.items():
+        if key[1] == "runtime":
+            assert float(two[key]["mean"]) > 0
+        else:  # One thread or two, sums are rounded otherwise.
+            assert float(two[key]["mean"]) == pytest.approx(float(row["mean"]), rel=2e-3), key
+    names = [sorted(p.name for p in (tmp_path / n / "cells").iterdir()) for n in ("one", "two")]
+    assert names[0] == names[1]
+    assert {Run.open(out / "cells" / name).attempt for name in names[1]} == {1}
+    assert progress.told[-1][:3] == ("suite", 14, 14)
+    assert any("quick, low" in message for *_, message in progress.told)
+    assert "shared by 2 cells at a time" in (out / "report.md").read_text()
+
+
+def test_whatever_is_made_of_other_cells_comes_last(recordings: tuple[Sequence, ...]) -> None:
+    methods = ("quick+last_residual", "static", "quick")
+    asked = order_of(recordings, methods=methods, protocols=("unseen", "main"))
+    tasks = list(list_tasks(asked, [parse_method(name) for name in methods]))
+    placed = [tasks[number] for number in suite_workers._in_order(tasks)]
+    assert sorted(map(id, placed)) == sorted(map(id, tasks))
+    assert [(t.method.name, t.recording.name) for t in placed if t.protocol == "main"] == [
+        *(("static", "low"), ("static", "high"), ("quick", "low"), ("quick", "high")),
+        *(("quick+last_residual", "low"), ("quick+last_residual", "high")),
+    ]
+    assert [t.protocol for t in placed] == ["main"] * 6 + ["unseen"] * 4
+
+
+def test_a_cell_that_another_process_fills_is_waited_for(tmp_path: Path, order: Order) -> None:
+    (tmp_path / "locks").mkdir()
+    fill = filler(replace(order, methods=("static",)), tmp_path, NullProgress())
+    fill(0)
+    (name,) = (path.name for path in (tmp_path / "cells").iterdir())
+    again = filler(replace(order, methods=("static",)), tmp_path, NullProgress())
+    waiting = threading.Thread(target=lambda: again(0))
+    with locked_file(tmp_path / "locks" / name):
+        waiting.start()
+        waiting.join(0.5)
+        assert waiting.is_alive()
+    waiting.join(30)
+    assert not waiting.is_alive()
+    assert Run.open(tmp_path / "cells" / name).attempt == 1
+
+
+def test_a_process_that_is_killed_is_told_and_the_command_goes_on(
+    tmp_path: Path, order: Order
+) -> None:
+    class Killer(Watched):
+        def report(self, *about: object, **more: object) -> None:
+            super().report(*about, **more)  # type: ignore[arg-type]  # passed on as it came
+            busy = [m for *_, m in self.told if m.startswith("static, low") and "%" in m]
+            if busy and len(children()) == 2:
+                children()[0].send_signal(signal.SIGKILL)
+
+    out = tmp_path / "suite"
+    told = r"ended while it worked on .*exit code -9.*--jobs"
+    with pytest.raises(RunError, match=told), SuiteWorkers(2, Killer()) as workers:
+        evaluate(order, out, fill=workers.fill(order, out))
+    assert children() == []
+    with SuiteWorkers(2, NullProgress()) as workers:
+        found = evaluate(order, out, fill=workers.fill(order, out))
+    assert (found["cells"], found["failed"]) == (14, 0)
+
+
+def test_a_wish_to_stop_ends_all_processes_and_keeps_what_is_finished(
+    tmp_path: Path, order: Order
+) -> None:
+    progress = Watched(stop_at="quick, low")
+    start = time.monotonic()
+    with pytest.raises(CancelledError), SuiteWorkers(2, progress) as workers:
+        evaluate(order, tmp_path, progress, fill=workers.fill(order, tmp_path))
+    assert children() == []
+    assert time.monotonic() - start < 120
+    cells = json.loads((tmp_path / "cells.json").read_text())
+    assert {cell["method"] for cell in cells["cells"]} >= {"static"}
+    assert 0 < cells["about"]["missing"] < 14
+
+
+def test_what_a_process_finds_wrong_is_told_in_its_words(tmp_path: Path, order: Order) -> None:
+    wrong = replace(order, methods=("quick@object_.search.population=1",))
+    with SuiteWorkers(2, NullProgress()) as workers:
+        with pytest.raises(UsageError, match=r"population is 1; expected a whole number from 2"):
+            evaluate(wrong, tmp_path, fill=workers.fill(wrong, tmp_path))
+        making = {"object": "brick", "action": "lift", "seed": 0}
+        with pytest.raises(UsageError, match="no object named 'brick'"):
+            workers.make({tmp_path / "brick": making})
+    assert not (tmp_path / "brick").exists()
+
+
+def test_an_order_survives_being_told_to_another_process(order: Order) -> None:
+    again = order_from_json(json.loads(json.dumps(order_to_json(order))))
+    assert [r.fingerprint() for r in again.recordings] == [
+        r.fingerprint() for r in order.recordings
+    ]
+    assert replace(again, recordings=()) == replace(order, recordings=())
+    assert again.methods == METHODS
+
+
+@pytest.mark.parametrize(
+    ("processors", "count", "shares"),
+    [
+        ({0, 1}, 2, [[0], [1]]),
+        ({0, 1, 2, 3, 4}, 2, [[0, 1], [2, 3, 4]]),
+        ({3}, 2, [[3], [3]]),
+        ({2, 5}, 3, [[2], [2], [5]]),
+    ],
+)
+def test_processors_are_shared_out(
+    monkeypatch: pytest.MonkeyPatch, processors: set[int], count: int, shares: list[list[int]]
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: processors)
+    assert suite_workers._shares(count) == shares
+
+
+def test_a_number_of_processes_that_makes_no_sense_is_refused() -> None:
+    for count in (0, 1, 65):
+        with pytest.raises(UsageError, match=f"{count} processes make no sense"):
+            SuiteWorkers(count, NullProgress())
+    assert children() == []
