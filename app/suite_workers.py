@@ -27,6 +27,7 @@ from physhandi.synthetic.suite_tasks import Order, Task
 MOST = 64
 """Processes at most."""
 _LISTEN = 0.2
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _ENDED = object()
 
 
@@ -181,6 +182,8 @@ class SuiteWorkers:
 
     def _start(self, number: int, share: Many[int]) -> _Worker:
         processors = ",".join(str(processor) for processor in share)
+        # Libraries take a thread for each processor of the machine, and would hinder each other.
+        environment = os.environ | dict.fromkeys(_THREADS, str(len(share)))
         process = subprocess.Popen(
             [sys.executable, "-m", "app.suite_process", str(os.getpid()), processors],
             stdin=subprocess.PIPE,
@@ -188,6 +191,7 @@ class SuiteWorkers:
             text=True,
             # `-m` searches the working directory first, so it must be the one of our packages.
             cwd=PACKAGE_ROOT,
+            env=environment,
             # An interrupt from the keyboard is for the parent, which ends them.
             start_new_session=True,
         )

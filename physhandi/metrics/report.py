@@ -73,7 +73,11 @@ def score_rollout(
 
 
 def measure_run(
-    out: Path, sequence: Sequence, *, hand_points: StoredPoints | None = None
+    out: Path,
+    sequence: Sequence,
+    *,
+    hand_points: StoredPoints | None = None,
+    with_baselines: bool = True,
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Give what `score_run` and `frame_errors` give, measured once.
 
@@ -81,6 +85,8 @@ def measure_run(
         out: Output folder of the run.
         sequence: The sequence.
         hand_points: As for `score_run`.
+        with_baselines: Whether to measure the static and the rigid baseline too, which takes twice
+            as long as the rollout alone.
 
     Raises:
         RunError: If a file of the run is damaged.
@@ -98,6 +104,8 @@ def measure_run(
         motions, substituted = _motions(
             rollout, reference, read(folder / "control.npy"), sequence.frame_count
         )
+        if not with_baselines:
+            motions = {"rollout": motions["rollout"]}
         curves = {name: error_curves(nodes, reference) for name, nodes in motions.items()}
         report |= _tabulated(motions, curves, substituted, reference, splits)
         frames |= {name: _plain(of_method) for name, of_method in curves.items()}

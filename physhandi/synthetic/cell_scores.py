@@ -35,7 +35,7 @@ def measure_cell(
     """
     with tempfile.TemporaryDirectory() as folder:
         assemble(Path(folder), run, reference, recording)
-        report, frames = measure_run(Path(folder), recording)
+        report, frames = measure_run(Path(folder), recording, with_baselines=False)
     curves: dict[str, Any] = frames.get("rollout", {})
     add_photometric(report, curves, run, reference, recording)
     return report, curves

@@ -70,3 +70,20 @@ def test_chamfer_equals_brute_force(seed: int) -> None:
         torch.from_numpy(observed).float(), torch.from_numpy(real), torch.from_numpy(node).float()
     )
     assert loss.tolist() == pytest.approx(expected, rel=1e-4)
+
+
+def test_the_nearest_node_is_found_far_from_the_origin_and_between_padding() -> None:
+    random = np.random.default_rng(3)
+    far = np.array([3.0, -2.0, 1.0])
+    node = far + random.uniform(-0.01, 0.01, (2, 400, 3))
+    observed = far + random.uniform(-0.01, 0.01, (2, 60, 3))
+    real = random.random((2, 60)) < 0.7
+    node, observed = node.astype(np.float32), observed.astype(np.float32)
+    expected = []
+    for frame in range(2):
+        gap = observed[frame][real[frame], None].astype(float) - node[frame].astype(float)
+        expected.append((gap**2).sum(axis=2).min(axis=1).mean())
+    observed[~real] = np.nan
+    loss = chamfer_loss(torch.from_numpy(observed), torch.from_numpy(real), torch.from_numpy(node))
+    assert loss.tolist() == pytest.approx(expected, rel=1e-3)
+    assert min(expected) > 1e-7
