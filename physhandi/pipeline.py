@@ -277,7 +277,8 @@ def _stage_springs(
         artefacts.save_model(attempt, problem.name, result.models[problem.name])
     first = problems[0]
     artefacts.save_object(attempt, result.parameters, result.models[first.name], first.rest_node)
-    _finish(attempt, SPRINGS, [result.loss_before], [result.loss_after], result.curve)
+    losses = [result.loss_before], [result.loss_after]
+    _finish(attempt, SPRINGS, *losses, result.curve, note=result.stopped)
 
 
 def _stage_refinement(
@@ -343,8 +344,10 @@ def _finish(
     before: list[float],
     after: list[float],
     curve: list[list[float]],
+    *,
+    note: str = "",
 ) -> None:
-    summary: dict[str, Any] = {"curve": curve}
+    summary: dict[str, Any] = {"curve": curve} | ({"note": note} if note else {})
     if before:
         summary |= {"before": float(np.mean(before)), "after": float(np.mean(after))}
     attempt.finish_stage(stage, summary)

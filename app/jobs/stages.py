@@ -26,6 +26,8 @@ class StageView:
     """Loss at its start."""
     after: float | None = None
     """Loss at its end."""
+    note: str = ""
+    """What there is to know about how it ended."""
 
 
 def stages_of(run: Run, state: str) -> list[dict[str, Any]]:
@@ -87,6 +89,7 @@ def stage_views(
                     done[name].get("seconds"),
                     summary.get("before"),
                     summary.get("after"),
+                    str(summary.get("note", "")),
                 )
             )
         elif state != "succeeded" and name == current and mark:

@@ -1,5 +1,6 @@
 """Stage 2, first order: a stiffness and a damping for every spring, by gradient descent."""
 
+import logging
 import math
 from collections.abc import Sequence as Many
 from dataclasses import dataclass, replace
@@ -22,6 +23,7 @@ from physhandi.progress import Progress
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
 
 STAGE = "first_order"
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +41,8 @@ class FirstOrderResult:
     """Mean loss of the returned models [m²]."""
     curve: list[list[float]]
     """Iteration and mean loss, as iterations are ranked by."""
+    stopped: str = ""
+    """Why it went no further than it did; empty if all iterations were made."""
 
 
 def _horizon(iteration: int, config: FirstOrderConfig, frame_count: int) -> int:
@@ -71,27 +75,26 @@ def optimise_springs(
         The best models, as `FirstOrderConfig` ranks them.
 
     Raises:
-        FitError: If the start already diverges, or what was ranked best does.
+        FitError: If the start already diverges or has no usable gradient, or what was ranked best
+            diverges. What goes wrong later ends the descent, and the best so far is returned.
     """
     settings = config.first_order
     if settings.truncates_damping:
-        parameters = replace(
-            parameters,
-            damping=float(math.trunc(parameters.damping)),
-            drag=float(math.trunc(parameters.drag)),
-        )
+        parameters = _truncated(parameters)
     models = {p.name: build_problem_model(p, parameters) for p in problems}
     # Springs may stiffen while they are fitted, so the limit is kept farther away.
     parameters = settle_substeps(list(models.values()), parameters, config, safety=SAFETY * SAFETY)
     material = Material(models, parameters, settings)
-    loss_before = mean_loss(problems, models, parameters, config, device)
-    if not math.isfinite(loss_before):
-        raise FitError("The searched parameters diverge; raise substeps_per_frame in the profile.")
+    loss_before = _finite(
+        mean_loss(problems, models, parameters, config, device),
+        "The searched parameters diverge; raise substeps_per_frame in the profile.",
+    )
     best, best_parameters = dict(models), parameters
     best_loss = math.inf if settings.judges_online else loss_before
     curve = [[0.0, loss_before]]
     descent = Descent(material, parameters, config, device)
     preview = RolloutPreview(STAGE, progress)
+    stopped = ""
     for iteration in range(settings.iterations):
         progress.check_cancelled()
         try:
@@ -99,10 +102,14 @@ def optimise_springs(
                 descent.walk(p, models[p.name], _horizon(iteration, settings, p.frame_count))
                 for p in problems
             ]
-        except SimulationDivergedError as error:
-            progress.report(STAGE, iteration, settings.iterations, best_loss, f"stopped: {error}")
+            note = _tell(problems, met)
+        except (SimulationDivergedError, FitError) as error:
+            if isinstance(error, FitError) and iteration == 0:
+                raise
+            stopped = f"Stopped after {iteration} of {settings.iterations} iterations. {error}"
+            logger.warning("%s: %s", STAGE, stopped)
+            progress.report(STAGE, iteration, settings.iterations, best_loss, stopped)
             break
-        note = _tell(problems, met)
         now = {name: material.model(name, model) for name, model in models.items()}
         now_parameters = material.parameters(parameters)
         if settings.judges_online:
@@ -115,19 +122,30 @@ def optimise_springs(
         curve.append([float(iteration + 1), loss])
         progress.report(STAGE, iteration + 1, settings.iterations, loss, note)
     if settings.judges_online:
-        best_loss = mean_loss(problems, best, best_parameters, config, device)
-        if not math.isfinite(best_loss):
-            raise FitError(
-                "The springs that did best while they were fitted diverge when simulated from "
-                "start to end; raise substeps_per_frame or switch judges_online off in the profile."
-            )
+        best_loss = _finite(
+            mean_loss(problems, best, best_parameters, config, device),
+            "The springs that did best while they were fitted diverge when simulated from start "
+            "to end; raise substeps_per_frame or switch judges_online off in the profile.",
+        )
     return FirstOrderResult(
         models=best,
         parameters=best_parameters,
         loss_before=loss_before,
         loss_after=best_loss,
         curve=curve,
+        stopped=stopped,
     )
+
+
+def _finite(loss: float, otherwise: str) -> float:
+    if not math.isfinite(loss):
+        raise FitError(otherwise)
+    return loss
+
+
+def _truncated(parameters: SimulationParameters) -> SimulationParameters:
+    damping, drag = math.trunc(parameters.damping), math.trunc(parameters.drag)
+    return replace(parameters, damping=float(damping), drag=float(drag))
 
 
 def _is_judged(iteration: int, config: FirstOrderConfig) -> bool:

@@ -40,6 +40,12 @@ def test_the_stage_that_was_reached_is_marked_even_if_it_never_reported(
     assert shown["search"] == "to-come"
 
 
+def test_a_stage_tells_why_it_went_no_further() -> None:
+    short = [{"name": "hands", "summary": {"before": 2.0, "after": 1.0, "note": "Stopped early."}}]
+    assert stage_views(NAMES, short, "running", "observation")[0].note == "Stopped early."
+    assert stage_views(NAMES, DONE, "running", "observation")[0].note == ""
+
+
 def test_a_stage_that_was_passed_over_is_left_out() -> None:
     late = [*DONE, {"name": "evaluation", "summary": {}}]
     assert states("succeeded", "evaluation", late) == {"hands": "done", "evaluation": "done"}

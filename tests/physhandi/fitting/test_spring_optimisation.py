@@ -144,6 +144,37 @@ def test_the_start_stays_when_simulating_again_finds_nothing_better(
     assert [loss for _, loss in result.curve] == [2.0, 2.0, 2.0]
 
 
+def test_a_gradient_that_is_lost_on_the_way_ends_the_descent_with_the_best_so_far(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    told: list[str] = []
+
+    class Heard(NullProgress):
+        def report(self, *about: object, **_: object) -> None:
+            told.append(str(about[4]))
+
+    met: list[float | None] = [1.5, 1.0, 1.2, None]
+    waiting = iter(met)
+
+    def walk(self: Descent, *_: object) -> float | None:
+        with torch.no_grad():
+            self.material.logarithms()[0][0] += 0.1
+        return next(waiting)
+
+    monkeypatch.setattr(Descent, "walk", walk)
+    monkeypatch.setattr(spring_optimisation, "mean_loss", lambda *_, **__: 2.0)
+    chosen = config(iterations=50, judges_online=True, judged_every=1)
+    result = optimise_springs([sliding_pair(0.3)], PARAMETERS, chosen, Heard())
+    assert float(result.models["pair"].stiffness[0]) == pytest.approx(100.0 * math.exp(0.2))
+    assert [loss for _, loss in result.curve] == [2.0, 1.5, 1.0, 1.2]
+    assert result.stopped.startswith("Stopped after 3 of 50 iterations. No sequence has a usable")
+    assert told[-1] == result.stopped
+    assert result.stopped in caplog.text
+    monkeypatch.setattr(Descent, "walk", lambda *_: None)
+    with pytest.raises(FitError, match="usable gradient"):
+        optimise_springs([sliding_pair(0.3)], PARAMETERS, chosen, NullProgress())
+
+
 def test_the_limit_on_gradients_can_be_lifted() -> None:
     problem = sliding_pair(0.3)
     taut = replace(problem, rest_node=problem.object_node * np.float32(0.9))
@@ -151,6 +182,7 @@ def test_the_limit_on_gradients_can_be_lifted() -> None:
         optimise_springs([taut], PARAMETERS, config(steepest=1e-9), NullProgress())
     result = optimise_springs([taut], PARAMETERS, config(), NullProgress())
     assert result.loss_after < result.loss_before
+    assert result.stopped == ""
 
 
 def test_a_walk_tells_the_mean_loss_it_met() -> None:
