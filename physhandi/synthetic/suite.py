@@ -98,7 +98,7 @@ SUITES: dict[str, Suite] = {
         Suite(
             name="dev",
             about="Six sequences without images, and 80 first-order steps in every fit so that all "
-            "methods take 25 minutes on a fast GPU: for daily work on methods.",
+            "methods take a quarter of an hour on a fast GPU: for daily work on methods.",
             scenes=_scenes(
                 "cloth lift", "cloth fold", "rope lift", "rope push", "plush squeeze", "pouch lift"
             ),
