@@ -43,7 +43,7 @@ class Settings(BaseSettings):
     allowed_hosts: Annotated[tuple[str, ...], NoDecode] = ()
     """Further host names that browsers may use, as behind a reverse proxy (comma separated)."""
     parallel_fits: int = Field(default=1, ge=1, le=64)
-    """Fits that run side by side; others wait."""
+    """Fits that run side by side, each with its share of threads; others wait."""
     waiting_fits: int = Field(default=100, ge=1, le=10_000)
     """Fits that may wait in line."""
     cancel_grace_s: float = Field(default=8.0, gt=0, le=600)

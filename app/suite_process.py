@@ -21,7 +21,7 @@ from typing import Any, TextIO
 
 from app.jobs.processes import die_with_parent
 from physhandi.data.sequence import Sequence
-from physhandi.errors import PhysHandiError, describe
+from physhandi.errors import PhysHandiError, UsageError, describe
 from physhandi.progress import Progress
 from physhandi.synthetic.suite_tasks import Order
 
@@ -85,7 +85,9 @@ def work(requests: TextIO, answers: TextIO) -> None:
                 make_recording(asked["make"], Path(asked["target"]), progress)
             elif "order" in asked:
                 fill = filler(order_from_json(asked["order"]), Path(asked["out"]), progress)
-            elif fill is not None:
+            elif fill is None:
+                raise UsageError("A cell was asked for before an order.")
+            else:
                 fill(asked["cell"])
         except (PhysHandiError, OSError, MemoryError) as error:
             tell(error=describe(error), kind=type(error).__name__)

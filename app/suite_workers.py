@@ -16,6 +16,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
 
+from app.jobs.processes import child_environment
 from app.settings import PACKAGE_ROOT
 from app.suite_process import order_to_json
 from physhandi import errors
@@ -27,7 +28,6 @@ from physhandi.synthetic.suite_tasks import Order, Task
 MOST = 64
 """Processes at most."""
 _LISTEN = 0.2
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _ENDED = object()
 
 
@@ -58,6 +58,7 @@ class _Worker:
 class SuiteWorkers:
     """A few processes that share the work on a suite; they end with it.
 
+    After an error nothing more can be asked of them: some may still work on what was asked before.
     Each has its own share of the machine's processors. Cells that are made from others (a last
     residual, an unseen interaction) come last, so that processes seldom wait for each other.
     """
@@ -182,8 +183,6 @@ class SuiteWorkers:
 
     def _start(self, number: int, share: Many[int]) -> _Worker:
         processors = ",".join(str(processor) for processor in share)
-        # Libraries take a thread for each processor of the machine, and would hinder each other.
-        environment = os.environ | dict.fromkeys(_THREADS, str(len(share)))
         process = subprocess.Popen(
             [sys.executable, "-m", "app.suite_process", str(os.getpid()), processors],
             stdin=subprocess.PIPE,
@@ -191,7 +190,7 @@ class SuiteWorkers:
             text=True,
             # `-m` searches the working directory first, so it must be the one of our packages.
             cwd=PACKAGE_ROOT,
-            env=environment,
+            env=child_environment(threads=len(share)),
             # An interrupt from the keyboard is for the parent, which ends them.
             start_new_session=True,
         )
@@ -214,8 +213,9 @@ def _lost(worker: _Worker) -> errors.PhysHandiError:
     labels = [job.label for job in worker.jobs if job is not None]
     doing = f"while it worked on {labels[0]}" if labels else "while it had nothing to do"
     return errors.RunError(
-        f"A process of the suite ended {doing} (exit code {code}). If memory ran out, take "
-        "fewer of them (--jobs). What is finished stays; the same command goes on."
+        f"A process of the suite ended {doing} (exit code {code}; its last words stand above). "
+        "If memory ran out, take fewer of them (--jobs). What is finished stays; the same command "
+        "goes on."
     )
 
 

@@ -19,6 +19,7 @@ from typing import IO, Any, Literal
 import viser
 
 from app.exports.order import SUFFIXES, Order
+from app.jobs.processes import child_environment
 from app.settings import PACKAGE_ROOT
 from physhandi import __version__, errors
 from physhandi.data.atomic import sweep_temporary, temporary_name
@@ -36,8 +37,6 @@ MOST_BYTES = 2**30
 MOST_SECONDS = 300.0
 """How long making one file may take."""
 _VERSION = 1
-_THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-_SECRETS = ("PHYSHANDI_TOKEN",)
 _WORDS_KEPT = 4_000
 _ERRORS: dict[str, type[errors.PhysHandiError]] = {
     "UsageError": errors.UsageError,
@@ -210,7 +209,6 @@ class Workshop:
 
     def _run(self, order: Order, work: Work) -> None:
         command = [sys.executable, "-m", "app.exports.process", str(os.getpid()), str(work.path)]
-        environment = {n: v for n, v in os.environ.items() if n not in _SECRETS} | _THREADS
         process = subprocess.Popen(
             command,
             stdin=subprocess.PIPE,
@@ -219,7 +217,7 @@ class Workshop:
             text=True,
             # `-m` searches the working directory first, so it must be the one of our packages.
             cwd=PACKAGE_ROOT,
-            env=environment,
+            env=child_environment(threads=1),
         )
         with self._lock:
             self._processes.add(process)

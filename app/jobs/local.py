@@ -1,20 +1,18 @@
 """Fits as child processes of this machine."""
 
-import os
 import secrets
 import subprocess
 import sys
 from pathlib import Path
 
-from app.jobs.processes import COOKIE, cookie_of
+from app.jobs.processes import COOKIE, child_environment, cookie_of
 from app.settings import PACKAGE_ROOT
 
 WORKER = "app.jobs.worker"
-_SECRETS = ("PHYSHANDI_TOKEN",)
 
 
 def start_supervisor(
-    run_folder: Path, device: str, *, worker: str = WORKER
+    run_folder: Path, device: str, *, worker: str = WORKER, threads: int | None = None
 ) -> subprocess.Popen[bytes]:
     """Start the process that starts and watches a run's worker, in a session of its own.
 
@@ -24,12 +22,12 @@ def start_supervisor(
         run_folder: Folder of the run.
         device: Warp device.
         worker: Python module that does the work.
+        threads: How many threads its libraries may start; none for one each processor.
 
     Returns:
         The started process.
     """
-    environment = {name: value for name, value in os.environ.items() if name not in _SECRETS}
-    environment |= {
+    environment = child_environment(threads) | {
         COOKIE: cookie_of(run_folder, secrets.token_hex(8)),
         "PYTHONUNBUFFERED": "1",
     }

@@ -13,6 +13,8 @@ import psutil
 
 COOKIE = "PHYSHANDI_RUN"
 """Environment variable that marks a run's processes; children inherit it, wherever they move."""
+_SECRETS = ("PHYSHANDI_TOKEN",)
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _LOCK = ".supervisor.lock"
 _PR_SET_PDEATHSIG = 1
 _PR_SET_CHILD_SUBREAPER = 36
@@ -21,6 +23,17 @@ _PR_SET_CHILD_SUBREAPER = 36
 def cookie_of(run_folder: Path, nonce: str) -> str:
     """Make the mark of one start of a run."""
     return f"{run_folder}:{nonce}"
+
+
+def child_environment(threads: int | None = None) -> dict[str, str]:
+    """Give what a child process is told of this one's environment: all but secrets.
+
+    Args:
+        threads: How many threads its numeric libraries may start; none for one each processor,
+            which hinder each other badly where several such processes work side by side.
+    """
+    found = {name: value for name, value in os.environ.items() if name not in _SECRETS}
+    return found | ({} if threads is None else dict.fromkeys(_THREADS, str(threads)))
 
 
 def processes_of(run_folder: Path, nonce: str | None = None) -> Iterator[psutil.Process]:

@@ -325,7 +325,13 @@ class Scheduler:
 
     def _start(self, item: RunItem) -> None:
         (item.folder / EXIT).unlink(missing_ok=True)
-        process = start_supervisor(item.folder, self._settings.device, worker=self._worker)
+        at_a_time = self._settings.parallel_fits
+        process = start_supervisor(
+            item.folder,
+            self._settings.device,
+            worker=self._worker,
+            threads=None if at_a_time == 1 else max(1, (os.cpu_count() or 1) // at_a_time),
+        )
         self._started[item.id] = process
         self._busy = (*self._busy, item.id)
         (item.folder / QUEUED).unlink(missing_ok=True)

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Literal
 
 from app.jobs.catalog import Catalog, NotFoundError, RunItem
+from app.jobs.processes import child_environment
 from app.previews.worker import MOVING, NONE, STILL
 from app.settings import PACKAGE_ROOT, Settings
 from physhandi.data.atomic import write_bytes
@@ -30,8 +31,6 @@ _ENDED_FROM_OUTSIDE = (-signal.SIGTERM, -signal.SIGINT)
 _SECONDS_EACH = 60.0
 _MOST_WAITING = 400
 _MOST_FILES = 4_000
-_THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-_SECRETS = ("PHYSHANDI_TOKEN",)
 
 
 @dataclass(frozen=True)
@@ -177,7 +176,6 @@ class Previews:
             {"kind": s.kind, "folder": str(s.folder), "target": str(self._folder / s.key)}
             for s in missing
         ]
-        environment = {k: v for k, v in os.environ.items() if k not in _SECRETS} | _THREADS
         with self._lock:
             if self._is_closed or not orders:
                 return
@@ -187,7 +185,7 @@ class Previews:
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
                 cwd=PACKAGE_ROOT,
-                env=environment,
+                env=child_environment(threads=1),
             )
         try:
             self._child.communicate(

@@ -98,6 +98,7 @@ def test_help_tells_what_is_taken_by_default(capsys: pytest.CaptureFixture[str])
         (("--sequences", "sheet", "--seeds", "1"), "--seeds belongs"),
         (("--sequences", "nowhere"), "'nowhere' is neither"),
         (("--suite", "tiny", "--seeds", "-3"), "negative"),
+        (("--suite", "tiny", "--jobs", "0"), "--jobs 0 makes no sense; choose 1 to 64"),
         (("--suite", "tiny", "--methods", "quick@nothing=1"), "nothing"),
     ],
 )
@@ -119,8 +120,10 @@ def test_the_tiny_suite_is_made_and_evaluated_by_one_command(
     pytest.importorskip("mujoco")
     out = tmp_path / "tiny"
     order = ("--suite", "tiny", "--out", out, "--device", "cpu")
-    code, _, error = call(capsys, *order)
+    code, told, error = call(capsys, *order, "--jobs", "2", "--json")
     assert code == 0, error
+    assert 5 < json.loads(told)["seconds"] < 300
+    assert "--suite tiny --jobs 2 --device cpu" in (out / "report.md").read_text()
     rows = rows_of(out / "table.csv")
     assert tuple(dict.fromkeys(method for method, *_ in rows)) == find_suite("tiny").methods
     for split in ("reconstruction", "future"):

@@ -141,6 +141,9 @@ def test_two_slots_run_two_fits_side_by_side(desks: Callable[..., Desk]) -> None
     desk = desks(parallel_fits=2)
     runs = [desk.launch(f"wait {number}") for number in range(3)]
     until(lambda: [desk.state(r) for r in runs] == ["running", "running", "queued"])
+    # Libraries that start a thread for every processor would hinder the other fit.
+    (worker, *_) = processes_of(desk.run(runs[1]).folder)
+    assert worker.environ()["OMP_NUM_THREADS"] == str(max(1, (os.cpu_count() or 1) // 2))
     desk.scheduler.cancel(runs[0])
     until(lambda: [desk.state(r) for r in runs] == ["cancelled", "running", "running"])
 

@@ -156,12 +156,13 @@ def test_a_wish_to_stop_ends_all_processes_and_keeps_what_is_finished(
 
 def test_what_a_process_finds_wrong_is_told_in_its_words(tmp_path: Path, order: Order) -> None:
     wrong = replace(order, methods=("quick@object_.search.population=1",))
-    with SuiteWorkers(2, NullProgress()) as workers:
-        with pytest.raises(UsageError, match=r"population is 1; expected a whole number from 2"):
-            evaluate(wrong, tmp_path, fill=workers.fill(wrong, tmp_path))
-        making = {"object": "brick", "action": "lift", "seed": 0}
-        with pytest.raises(UsageError, match="no object named 'brick'"):
-            workers.make({tmp_path / "brick": making})
+    told = r"population is 1; expected a whole number from 2"
+    with pytest.raises(UsageError, match=told), SuiteWorkers(2, NullProgress()) as workers:
+        evaluate(wrong, tmp_path, fill=workers.fill(wrong, tmp_path))
+    making = {"object": "brick", "action": "lift", "seed": 0}
+    told = "no object named 'brick'"
+    with pytest.raises(UsageError, match=told), SuiteWorkers(2, NullProgress()) as workers:
+        workers.make({tmp_path / "brick": making})
     assert not (tmp_path / "brick").exists()
 
 

@@ -67,9 +67,11 @@ def test_two_runs_are_compared_in_one_scene(home: Page, lifted: str, picture) ->
     home.keyboard.press("Enter")
     scene.until(lambda: scene.value("Frame") == 59, "the chart goes to the frame")
     # Beside each other both colors are seen, each in its half; over each other in one place.
+    scene.until(
+        lambda: all(colored(home, color).size > 120 for color in ("blue", "orange")),
+        "both halves are drawn",
+    )
     halves = [colored(home, color) for color in ("blue", "orange")]
-    assert halves[0].size > 120
-    assert halves[1].size > 120
     assert halves[0].max() < halves[1].min()
     picture(home, "compare")
     home.keyboard.press("m")
