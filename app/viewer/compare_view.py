@@ -85,6 +85,9 @@ class CompareView:
 
     def turn(self, client: viser.ClientHandle) -> None:
         """Let the sides follow a client's camera."""
+        if self.look.mode == "side" and self._cameras.has_lost(client):
+            self._aim(client, self._cameras.before(client))
+            return
         self.drawing.turn(Eye.of(client.camera.wxyz))
         if self.look.mode == "wipe":
             self._redraw()

@@ -56,6 +56,7 @@ class FigureCameras:
 
     def __init__(self) -> None:
         self._poses: dict[int, Pose] = {}
+        self._aims: dict[int, tuple[Float[ndarray, " 3"], tuple[int, int]]] = {}
 
     def aim(
         self,
@@ -81,10 +82,27 @@ class FigureCameras:
         center, wide, high = box
         distance = max(high / 2, wide / 2 * height / (width - hidden)) / slope
         aside = 0.5 * hidden * (2 * slope * distance / height) * eye.right
+        place = center + aside - distance * eye.ahead
+        self._aims[client.client_id] = place, (camera.image_width, camera.image_height)
         with client.atomic():
             camera.up_direction, camera.fov = pose.up, _FOV
-            camera.position = center + aside - distance * eye.ahead
-            camera.look_at = center + aside
+            camera.position, camera.look_at = place, center + aside
+
+    def has_lost(self, client: viser.ClientHandle) -> bool:
+        """Tell whether a camera that was aimed no longer shows the figure, and no user did that.
+
+        A browser may hear where its first camera stands after it was told to look at the figure;
+        and the window may have got another size.
+        """
+        aim, before = self._aims.get(client.client_id), self._poses.get(client.client_id)
+        if aim is None or before is None:
+            return False
+        camera, (place, size) = client.camera, aim
+        near = 1e-3 * float(np.linalg.norm(place - camera.look_at))
+        if np.linalg.norm(camera.position - place) < near:
+            return (camera.image_width, camera.image_height) != size
+        gaps = camera.position - before.position, camera.look_at - before.look_at
+        return all(float(np.linalg.norm(gap)) < near for gap in gaps)
 
     def before(self, client: viser.ClientHandle) -> Pose:
         """Find where a camera stands, or stood before it was moved to the figure."""
@@ -92,6 +110,7 @@ class FigureCameras:
 
     def forget(self, client: viser.ClientHandle) -> Pose:
         """Find where a camera stood, and forget it."""
+        self._aims.pop(client.client_id, None)
         return self._poses.pop(client.client_id, None) or Pose.of(client.camera)
 
     def restore(self, server: viser.ViserServer) -> None:
@@ -105,6 +124,7 @@ class FigureCameras:
                 eye.up_direction, eye.fov = pose.up, pose.fov
                 eye.position, eye.look_at = pose.position, pose.look_at
         self._poses.clear()
+        self._aims.clear()
 
 
 def picture_of_figure(client: viser.ClientHandle, box: Box) -> dict[str, Any]:

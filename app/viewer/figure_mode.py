@@ -159,7 +159,12 @@ class FigureMode:
     def turn(self, client: viser.ClientHandle) -> None:
         """Let the halves follow a client's camera."""
         figure = self._figure
-        if self._is_on and figure is not None:
+        if not self._is_on or figure is None:
+            return
+        if self.cameras.has_lost(client):
+            with self._lock:
+                self._aim(client, self.cameras.before(client))
+        else:
             figure.turn(Eye.of(client.camera.wxyz))
 
     def welcome(self, client: viser.ClientHandle) -> None:

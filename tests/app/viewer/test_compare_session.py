@@ -257,3 +257,27 @@ def test_the_camera_comes_back_by_a_key(sessions: Sessions) -> None:
         client.tell_camera(look_at=away.tolist(), position=np.add(away, (1.0, 0.0, 0.0)).tolist())
         press(client, "R")
         client.until(lambda: np.linalg.norm(np.array(client.camera["look_at"]) - first) < 0.15)
+
+
+def test_a_camera_that_was_not_moved_by_a_user_keeps_both_sides_in_its_picture(
+    sessions: Sessions,
+) -> None:
+    with watch(sessions, "a=sheet&b=moved&f=3") as client:
+        client.until(lambda: client.camera["fov"] < 0.3)
+        aimed = np.array(client.camera["position"])
+        (session,) = sessions._sessions.values()
+        first = session._server.initial_camera
+        # A browser may hear where its first camera stands after it was told to look at both.
+        client.tell_camera(
+            position=first.position.tolist(), look_at=first.look_at.tolist(), fov=0.8
+        )
+        client.until(lambda: np.allclose(client.camera["position"], aimed, atol=1e-6))
+        client.until(lambda: client.camera["fov"] < 0.3)
+        # A window that is narrower needs a camera that is farther away.
+        client.tell_camera(image_width=320)
+        client.until(lambda: not np.allclose(client.camera["position"], aimed, atol=0.01))
+        moved = np.add(client.camera["position"], 0.4).tolist()
+        client.tell_camera(position=moved)
+        client.tell_camera(image_width=900)
+        client.listen(0.6)
+        assert list(client.camera["position"]) == moved
