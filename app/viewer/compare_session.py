@@ -187,11 +187,12 @@ class CompareSession(SceneServer):
     def _welcome(self, client: viser.ClientHandle) -> None:
         """Start playing when the first client is there, and follow its camera."""
         self._seen = time.monotonic()
-        self._view.welcome(client)
-        client.camera.on_update(self._guard(lambda _: self._view.turn(client)))
+        # At once: a user who is quick may have stopped the clock before the rest is done.
         if not self._has_played:
             self._has_played = True
             self._playback.play()
+        self._view.welcome(client)
+        client.camera.on_update(self._guard(lambda _: self._view.turn(client)))
 
     def _reset_view(self, event: Any) -> None:
         if not self._view.reset_view(event.client):

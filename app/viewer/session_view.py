@@ -230,6 +230,7 @@ class Session(SceneServer):
         self._playback.play(on=state.is_playing)
 
     def _switch(self, sequence_name: str) -> None:
+        self._has_played = True
         content = self._load(sequence_name)
         with self._lock, self._server.atomic():
             self._playback.play(on=False)
@@ -246,12 +247,13 @@ class Session(SceneServer):
     def _welcome(self, client: viser.ClientHandle) -> None:
         """Start playing when the first client is there, and follow its camera."""
         self._seen = time.monotonic()
-        for mode in (self._figure, self._pin):
-            mode.welcome(client)
-            client.camera.on_update(self._guard(lambda _, turn=mode.turn: turn(client)))
+        # At once: a user who is quick may have stopped the clock before the rest is done.
         if not self._has_played:
             self._has_played = True
             self._playback.play()
+        for mode in (self._figure, self._pin):
+            mode.welcome(client)
+            client.camera.on_update(self._guard(lambda _, turn=mode.turn: turn(client)))
 
     def _reset_view(self, event: Any) -> None:
         if self._figure.is_on:

@@ -1,11 +1,13 @@
 import json
 import re
+from typing import Any
 
 import numpy as np
 import pytest
 from viewer_client import ViewerClient
 from viewer_world import FRAMES, FakeSettings
 
+from app.viewer.figure_mode import FigureMode
 from app.viewer.session import Sessions, TooManySessionsError
 from app.viewer.snapshot_files import write_csv, write_npz, write_ply, write_yaml
 from physhandi.data.run import Run
@@ -231,3 +233,18 @@ def test_a_session_that_nobody_looks_at_is_closed(catalog) -> None:
             assert sessions.list()[0].id == watched
     finally:
         sessions.shutdown()
+
+
+def test_the_clock_starts_before_all_else_so_that_nobody_has_stopped_it_yet(
+    sessions: Sessions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    welcome, was_playing = FigureMode.welcome, list[bool]()
+
+    def watched(self: FigureMode, client: Any) -> None:
+        (session,) = sessions._sessions.values()
+        was_playing.append(session._playback.is_playing)
+        welcome(self, client)
+
+    monkeypatch.setattr(FigureMode, "welcome", watched)
+    with watch(sessions) as client:
+        client.until(lambda: was_playing == [True])
