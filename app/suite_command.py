@@ -3,9 +3,9 @@
 import hashlib
 import shlex
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from contextlib import ExitStack
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 from app.commands import find_sequence, pick_device, read_settings
@@ -25,10 +25,9 @@ def evaluate_suite(command: Any, progress: Progress) -> dict[str, Any]:
     from physhandi.synthetic.evaluation import evaluate
     from physhandi.synthetic.suite import (
         NAMED_SETTINGS,
-        Making,
         check_seeds,
         find_suite,
-        make_recording,
+        make_one_by_one,
         make_recordings,
     )
     from physhandi.synthetic.suite_folder import check_folder
@@ -59,17 +58,10 @@ def evaluate_suite(command: Any, progress: Progress) -> dict[str, Any]:
         raise UsageError(f"--jobs {command.jobs} makes no sense; choose 1 to {MOST}.")
     with ExitStack() as stack:
         # Everything that a user may have got wrong is told before they are started.
-        workers = (
-            stack.enter_context(SuiteWorkers(command.jobs, progress)) if command.jobs > 1 else None
-        )
-
-        def make(makings: Mapping[Path, Making]) -> None:
-            if workers is not None:
-                workers.make(makings)
-                return
-            for target, making in makings.items():
-                make_recording(making, target, progress)
-
+        make, workers = partial(make_one_by_one, progress=progress), None
+        if command.jobs > 1:
+            workers = stack.enter_context(SuiteWorkers(command.jobs, progress))
+            make = workers.make
         order = Order(
             title=title,
             recordings=tuple(named) or make_recordings(suite, seeds, out / "sequences", make),

@@ -176,7 +176,8 @@ def make_recordings(
         suite: The suite.
         seeds: Seeds of every scene.
         folder: Where the sequences lie.
-        make: Makes those that are missing, by `make_recording`, in any order.
+        make: Makes those that are missing: `make_one_by_one`, or several at a time by
+            `make_recording`.
 
     Raises:
         UsageError: If a seed makes no sense, or a sequence that is there was made otherwise; then
@@ -194,6 +195,17 @@ def make_recordings(
         _check_made(suite, recording, makings[target])
     make({target: making for target, making in makings.items() if target not in found})
     return tuple(found.get(target) or Sequence.load(target) for target in makings)
+
+
+def make_one_by_one(makings: Mapping[Path, Making], progress: Progress) -> None:
+    """Make sequences of a suite, one after the other.
+
+    Args:
+        makings: What the generator is told of each, by its folder.
+        progress: Told about every frame.
+    """
+    for target, making in makings.items():
+        make_recording(making, target, progress)
 
 
 def make_recording(making: Making, target: Path, progress: Progress) -> None:

@@ -1,7 +1,6 @@
 """Sequences of a suite: made once, taken up again only if they would be made the same way."""
 
 import functools
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,14 +19,7 @@ from physhandi.synthetic.baselines import parse_method, settings_of
 from physhandi.synthetic.bodies import make_body
 from physhandi.synthetic.code_hash import code_hash
 from physhandi.synthetic.generator_version import generator_version, outdated
-from physhandi.synthetic.suite import (
-    SUITES,
-    Making,
-    Scene,
-    Suite,
-    make_recording,
-    make_recordings,
-)
+from physhandi.synthetic.suite import SUITES, Scene, Suite, make_one_by_one, make_recordings
 
 SUITE = Suite(
     name="tiny",
@@ -61,11 +53,8 @@ def made(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
 
 
 def make(folder: Path, suite: Suite = SUITE) -> tuple[Sequence, ...]:
-    def make_all(makings: Mapping[Path, Making]) -> None:
-        for target, making in makings.items():
-            make_recording(making, target, NullProgress())
-
-    return make_recordings(suite, suite.seeds, folder, make_all)
+    by_one = functools.partial(make_one_by_one, progress=NullProgress())
+    return make_recordings(suite, suite.seeds, folder, by_one)
 
 
 def test_what_is_there_is_taken_up_and_the_rest_is_made(tmp_path: Path, made: list[str]) -> None:
