@@ -7,6 +7,7 @@ from typing import Any
 
 import viser
 
+from app.viewer.followed import FollowedChoice
 from app.viewer.guard import Guard, notify
 from app.viewer.history import History
 from app.viewer.preset_store import PresetStore
@@ -56,7 +57,7 @@ class PresetChoice:
         self._store = store
         self._moved = moved
         self._presets: dict[str, Preset] = {}
-        self._wanted = self._written = AS_FITTED
+        self._wanted = AS_FITTED
         self.problems: tuple[str, ...] = ()
         """What is wrong with files among the users' presets."""
         self._list: Any = gui.add_dropdown(
@@ -65,6 +66,7 @@ class PresetChoice:
             hint="Changes made to the fitted parameters, all at once; ★ are your own",
         )
         self._list.on_update(guard.by_user(lambda _: self._choose()))
+        self._choice = FollowedChoice(self._list)
         self.refresh()
 
     def refresh(self) -> None:
@@ -76,18 +78,13 @@ class PresetChoice:
         options = (*self._presets, BY_HAND)
         if tuple(self._list.options) != options:
             self._list.options = options
-            self._written = self._list.value
+            self._choice.take()
         self.show()
 
     def show(self) -> None:
         """Name the preset in force."""
         chosen = self.chosen
-        label = BY_HAND if chosen is None else chosen.label
-        # Another value than the last one that was written here is a user's, about to be heard.
-        if self._list.value == self._written != label:
-            # Noted first: a user may answer before the next line of this thread runs.
-            self._written = label
-            self._list.value = label
+        self._choice.show(BY_HAND if chosen is None else chosen.label)
 
     @property
     def chosen(self) -> Preset | None:
@@ -102,8 +99,7 @@ class PresetChoice:
         self.show()
 
     def _choose(self) -> None:
-        label = self._written = self._list.value
-        preset = self._presets.get(label)
+        preset = self._presets.get(self._choice.take())
         if preset is None:
             self.show()  # "By hand" is what the list says, nothing to choose.
             return

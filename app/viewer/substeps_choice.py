@@ -6,6 +6,7 @@ from typing import Any
 
 import viser
 
+from app.viewer.followed import FollowedChoice
 from app.viewer.guard import Guard
 from app.viewer.history import History
 from app.viewer.resimulation import Readout
@@ -30,13 +31,13 @@ class SubstepsChoice:
         """
         self._history = history
         self._moved = moved
-        self._written = AS_FITTED
         self._in_use = history.start.substeps_per_frame
-        self._choice: Any = gui.add_dropdown(
+        choice: Any = gui.add_dropdown(
             "substeps",
             (AS_FITTED, AUTOMATIC, BY_HAND),
             hint="Integration steps a frame. Automatic takes as few as are stable at frame 0",
         )
+        self._followed = FollowedChoice(choice)
         self._number: Any = gui.add_number(
             "number",
             self._in_use,
@@ -46,7 +47,7 @@ class SubstepsChoice:
             visible=False,
             hint="More are slower and more exact; too few and the object explodes",
         )
-        self._choice.on_update(guard.by_user(lambda _: self._choose()))
+        choice.on_update(guard.by_user(lambda _: self._choose()))
         self._number.on_update(guard.by_user(lambda _: self._type()))
 
     def show(self) -> None:
@@ -55,11 +56,7 @@ class SubstepsChoice:
         number = history.current.substeps_per_frame
         is_other = number != history.start.substeps_per_frame
         choice = AUTOMATIC if history.is_automatic else BY_HAND if is_other else AS_FITTED
-        # Another value than the last one that was written here is a user's, about to be heard.
-        if self._choice.value == self._written != choice:
-            # Noted first: a user may answer before the next line of this thread runs.
-            self._written = choice
-            self._choice.value = choice
+        self._followed.show(choice)
         if choice == BY_HAND and self._number.value != number:
             self._number.value = number
         self._number.visible = choice == BY_HAND
@@ -69,8 +66,7 @@ class SubstepsChoice:
         self._in_use = readout.substeps_per_frame
 
     def _choose(self) -> None:
-        history, choice = self._history, self._choice.value
-        self._written = choice
+        history, choice = self._history, self._followed.take()
         if choice == BY_HAND:
             # Nothing is simulated anew before another number is typed.
             self._number.value, self._number.visible = self._in_use, True
