@@ -1,5 +1,6 @@
 """The panel of a comparison: how both are shown, what the colors mean, and the difference."""
 
+import threading
 from collections.abc import Callable
 from html import escape
 from typing import Any
@@ -26,7 +27,10 @@ _COMPARED = {
 
 
 class ComparePanel:
-    """Switches of the look, the legend, and the difference at every tick as a plot."""
+    """Switches of the look, the legend, and the difference at every tick as a plot.
+
+    Clock, measuring and users write from threads of their own.
+    """
 
     def __init__(
         self,
@@ -56,6 +60,8 @@ class ComparePanel:
         self._unit, self._factor = "mm", 1e3
         self._tick, self._tick_count = 0, 1
         self._scales = (0.0, 0.0)
+        # What is written must not be older than what it replaces.
+        self._lock = threading.RLock()
         gui = server.gui
         self.folder = gui.add_folder("A and B")
         with self.folder:
@@ -116,16 +122,21 @@ class ComparePanel:
         self._dress()
         self.follow()
 
-    def follow(self) -> None:
-        """Show what is measured by now; for any thread."""
-        self._look.scale = scale_end(self._curve.strong * self._factor) / self._factor
-        self._plot.data = self._data()
-        self._fit_scales()
-        self._write()
+    def follow(self) -> bool:
+        """Show what is measured by now; for any thread. Tells whether the color scale changed."""
+        with self._lock:
+            before = self._look.scale
+            self._look.scale = scale_end(self._curve.strong * self._factor) / self._factor
+            self._plot.data = self._data()
+            self._fit_scales()
+            self._write()
+            return self._look.scale != before
 
     def show(self, tick: int, *, is_playing: bool) -> None:
         """Tell which tick is on the screen."""
-        if tick != self._tick:
+        with self._lock:
+            if tick == self._tick:
+                return
             self._tick = tick
             self._write()
             if not is_playing or tick % 5 == 0:
@@ -161,9 +172,10 @@ class ComparePanel:
         self._change()
 
     def _dress(self) -> None:
-        self._fade.visible = self._look.mode == "overlay"
-        self._wipe.visible = self._look.mode == "wipe"
-        self._write()
+        with self._lock:
+            self._fade.visible = self._look.mode == "overlay"
+            self._wipe.visible = self._look.mode == "wipe"
+            self._write()
 
     def _write(self) -> None:
         """Write the legend and the difference of the tick on the screen."""

@@ -120,8 +120,5 @@ class CompareView:
 
     def _measured(self) -> None:
         """Take in what was measured; runs in the thread of the curve."""
-        if self._panel is not None:
-            before = self.look.scale
-            self._panel.follow()
-            if self.look.tint == "difference" and self.look.scale != before:
-                self._redraw()
+        if self._panel is not None and self._panel.follow() and self.look.tint == "difference":
+            self._redraw()

@@ -252,8 +252,9 @@ class Session(SceneServer):
             self._has_played = True
             self._playback.play()
         for mode in (self._figure, self._pin):
-            mode.welcome(client)
+            # Before the camera is aimed: where it stood may be heard a moment later.
             client.camera.on_update(self._guard(lambda _, turn=mode.turn: turn(client)))
+            mode.welcome(client)
 
     def _reset_view(self, event: Any) -> None:
         if self._figure.is_on:

@@ -40,10 +40,16 @@ def sessions(catalog: FolderCatalog) -> Iterator[Sessions]:
 
 
 @pytest.fixture
-def server_client() -> Iterator[tuple[viser.ViserServer, ViewerClient]]:
-    """A bare viser server with one client, which has told it its camera."""
+def server() -> Iterator[viser.ViserServer]:
+    """A bare viser server."""
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    yield server
+    server.stop()
+
+
+@pytest.fixture
+def server_client(server: viser.ViserServer) -> Iterator[tuple[viser.ViserServer, ViewerClient]]:
+    """A bare viser server with one client, which has told it its camera."""
     with ViewerClient(f"ws://127.0.0.1:{server.get_port()}") as client:
         client.until(lambda: len(server.get_clients()) == 1)
         yield server, client
-    server.stop()

@@ -1,0 +1,77 @@
+"""The panel of a comparison, written by the clock, by what measures and by users."""
+
+import threading
+
+import numpy as np
+import viser
+
+from app.viewer.compare_curve import DifferenceCurve
+from app.viewer.compare_look import Look
+from app.viewer.compare_panel import ComparePanel
+from app.viewer.difference import FrameDifference, Way
+from app.viewer.guard import Guard
+
+
+class MeasuredMeanwhile(DifferenceCurve):
+    """A difference that gets known while the clock's thread writes that it is not."""
+
+    def __init__(self) -> None:
+        super().__init__(lambda: None)
+        self.is_measured = False
+        self.was_asked = threading.Event()
+        self.has_written = threading.Event()
+
+    @property
+    def way(self) -> Way | None:
+        return "nodes"
+
+    @property
+    def strong(self) -> float:
+        return 0.055
+
+    def columns(self) -> tuple[np.ndarray, np.ndarray]:
+        return np.full(12, 0.04), np.full(12, 0.055)
+
+    def at(self, tick: int) -> FrameDifference | None:
+        if self.is_measured:
+            return FrameDifference(mean=0.04, strong=0.055, largest=0.055)
+        self.is_measured = True
+        self.was_asked.set()
+        self.has_written.wait(0.3)
+        return None
+
+
+def test_what_was_measured_is_not_overwritten_by_what_was_known_before(
+    server: viser.ViserServer,
+) -> None:
+    curve = MeasuredMeanwhile()
+    curve.is_measured = True
+    panel = ComparePanel(
+        server, Guard(server), Look(tint="difference"), curve, change=lambda: None, has_keys=False
+    )
+    panel.name({"a": "one", "b": "two"}, (), unit="m", tick_count=12)
+    curve.is_measured = False
+
+    def measure() -> None:
+        assert curve.was_asked.wait(10.0)
+        panel.follow()
+        curve.has_written.set()
+
+    measuring = threading.Thread(target=measure)
+    measuring.start()
+    panel.show(3, is_playing=False)
+    measuring.join(10.0)
+    said = panel._text.content
+    assert "mean 40" in said
+    assert "measuring" not in said
+
+
+def test_a_panel_tells_whether_its_color_scale_changed(server: viser.ViserServer) -> None:
+    look = Look(tint="difference")
+    curve = MeasuredMeanwhile()
+    curve.is_measured = True
+    panel = ComparePanel(server, Guard(server), look, curve, change=lambda: None, has_keys=False)
+    assert look.scale == 0.0
+    assert panel.follow()
+    assert abs(look.scale - 0.1) < 1e-12
+    assert not panel.follow()
