@@ -4,6 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 PORT ?= 8080
+# How often a test of sockets, processes or browsers may be tried again; each new try is listed.
+RERUNS ?= 0
 DATA ?= data
 # Without an NVIDIA GPU install torch's CPU build first (README, "Installing torch"); this variable is passed to pip.
 TORCH ?= torch==2.13.0
@@ -34,7 +36,8 @@ fmt: install
 
 test: install browser
 	rm -f .coverage .coverage.*
-	$(BIN)/python -m pytest -n 2 --dist loadfile --cov --cov-report=term
+	$(BIN)/python -m pytest -n 2 --dist loadfile --cov --cov-report=term --reruns $(RERUNS) --max-suite-reruns 3 \
+	  --rerun-show-tracebacks --rerun-exclude-path tests/physhandi --rerun-exclude-path tests/bad_input
 
 # The README's pictures, made by the browser tests.
 pictures: install browser
