@@ -4,12 +4,18 @@ import re
 import time
 from collections.abc import Callable
 from pathlib import Path
+from urllib.parse import parse_qsl, urljoin
 
 import numpy as np
 from playwright.sync_api import Locator, Page
 from scipy.spatial.distance import cdist
 
 _NUMBER = r"([\d.]+(?:e[+-]?\d+)?)"
+TIMEOUT_MS = 120_000
+"""How long browsers wait for what must come; a busy machine can be ten times as slow as others."""
+_SENT = "() => new Promise((done) => setTimeout(done, 60))"
+"""viser's browser sends at once or 50 ms later, and of what waits until then only the last."""
+_SESSION = "document.getElementById('scene').contentWindow.location.pathname.split('/')[2]"
 
 
 class ScenePage:
@@ -34,9 +40,10 @@ class ScenePage:
     def has(self, text: str) -> bool:
         return text in self.text()
 
-    def number(self, before: str = "", after: str = "") -> float | None:
+    def number(self, before: str = "", after: str = "", text: str | None = None) -> float | None:
         """Read the number between two texts of the panel, as long as it is there."""
-        found = re.search(re.escape(before) + r"\s*" + _NUMBER + re.escape(after), self.text())
+        text = self.text() if text is None else text
+        found = re.search(re.escape(before) + r"\s*" + _NUMBER + re.escape(after), text)
         return float(found[1]) if found else None
 
     def field(self, label: str) -> Locator:
@@ -53,6 +60,7 @@ class ScenePage:
         field = self.field(label)
         field.fill(f"{value:g}")
         field.press("Enter")
+        self._send()
 
     def write(self, label: str, text: str) -> None:
         """Type into a field for text."""
@@ -61,13 +69,36 @@ class ScenePage:
         field = row.locator("input")
         field.fill(text)
         field.press("Enter")
+        self._send()
 
     def press(self, name: str) -> None:
         self.panel.get_by_role("button", name=name, exact=True).click()
+        self._send()
+
+    def _send(self) -> None:
+        """Let what was done leave the browser, before anything else is done takes its place."""
+        self.panel.locator("body").evaluate(_SENT)
+
+    def link(self) -> dict[str, str]:
+        """What the server shows, as its link tells it; a field holds at once what is typed."""
+        session = self.page.evaluate(_SESSION)
+        address = urljoin(self.page.url, f"/api/v1/sessions/{session}/link")
+        return dict(parse_qsl(self.page.request.get(address).json()["query"]))
+
+    def frame(self) -> int:
+        """The frame that the server shows."""
+        return int(self.link()["f"])
 
     def pause(self) -> None:
+        """Stop the clock; the last frame that it drew may be told after the button has changed."""
         self.press("Pause")
         self.panel.get_by_role("button", name="Play", exact=True).wait_for()
+        self.until(lambda: self.value("Frame") == self.frame(), "the clock stands")
+
+    def go(self, frame: int) -> None:
+        """Go to a frame, and wait until the server has done so."""
+        self.set("Frame", frame)
+        self.until(lambda: self.value("Frame") == self.frame() == frame, f"frame {frame}")
 
     def unfold(self, folder: str) -> None:
         self.panel.get_by_text(folder, exact=True).click()
@@ -84,11 +115,39 @@ class ScenePage:
         """How far the rollout is from the fitted one [mm]; None while it is simulated."""
         return self.number(after=" mm from the fitted rollout")
 
+    def new_difference(self, what: str, *known: float) -> float:
+        """Wait until another rollout than the fitted one and known ones is there, and read it once.
+
+        A value may be simulated twice, when it is typed and when it is entered.
+        """
+        found: list[float] = []
+
+        def is_there() -> bool:
+            value = self.difference()
+            if value is None or value in {0.0, *known}:
+                return False
+            found.append(value)
+            return True
+
+        self.until(is_there, what)
+        return found[-1]
+
     def springs(self) -> tuple[float | None, float | None]:
         """The numbers of object springs and virtual springs that are shown."""
-        return self.number("object springs"), self.number("virtual springs")
+        return self.rollout()[:2]
 
-    def until(self, condition: Callable[[], bool], what: str, seconds: float = 45.0) -> None:
+    def rollout(self) -> tuple[float | None, float | None, float | None]:
+        """Both numbers of springs and the difference, as they are shown at one moment."""
+        text = self.text()
+        return (
+            self.number("object springs", text=text),
+            self.number("virtual springs", text=text),
+            self.number(after=" mm from the fitted rollout", text=text),
+        )
+
+    def until(
+        self, condition: Callable[[], bool], what: str, seconds: float = TIMEOUT_MS / 1e3
+    ) -> None:
         """Wait for something; says what the panel shows if it does not come true."""
         end = time.monotonic() + seconds
         while not condition():

@@ -1,12 +1,15 @@
 """A small run: a sheet held by 30 control points, in two sequences of 20 frames."""
 
+import itertools
 from collections.abc import Sequence as Listing
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import viser
 from numpy import ndarray
 
+from app.benchmarks.viewer_client import ViewerClient
 from app.viewer.content import Content, HandSurface
 from app.viewer.take import Take
 from physhandi.data.camera import PinholeCamera
@@ -20,6 +23,7 @@ from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.topology import build_model
 
 FRAMES = 20
+_MARKS = itertools.count()
 PARAMETERS = SimulationParameters(
     connection_radius=0.035,
     max_neighbors=12,
@@ -50,6 +54,23 @@ class FakeSettings:
     live_sessions: int = 3
     live_idle_s: float = 900.0
     device: str = "cpu"
+
+
+def rest_at(client: ViewerClient, frame: int) -> None:
+    """Stop the clock at a frame, once it plays as it does when somebody looks."""
+    client.until(lambda: client.find("Pause"))
+    client.set("Pause", True)
+    client.until(lambda: client.find("Play"))
+    # A slider that stands at a value already is not heard: by way of another frame it is.
+    client.set("Frame", frame - 1 if frame else 1)
+    client.set("Frame", frame)
+
+
+def hear_all(server: viser.ViserServer, client: ViewerClient) -> None:
+    """Take in all that a server has said until now, and one message more."""
+    mark = f"all until mark {next(_MARKS)}."
+    server.gui.set_panel_label(mark)
+    client.until(lambda: any(message.get("label") == mark for message in client.messages))
 
 
 def sheet() -> ndarray:

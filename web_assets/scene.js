@@ -16,6 +16,8 @@
     const isCombined = event.ctrlKey || event.metaKey || event.altKey;
     if (isCombined ? event.key.toLowerCase() !== "z" : event.key.length > 1 && !NAMED.includes(event.key)) return;
     if (isTyping(event) || OF_PAGE.includes(event.key) || document.querySelector("dialog[open], details[open]")) return;
+    /* A chart that has the focus has named keys of its own. */
+    if (event.key.length > 1 && event.target.closest?.(".plot")) return;
     if (event.key === " " && event.target.closest?.("button, summary, a")) return;
     event.preventDefault();
     event.stopImmediatePropagation();

@@ -342,8 +342,11 @@ class Scheduler:
         """End what is left of runs whose supervisor was killed."""
         for process, cookie in list(marked_processes()):
             folder = Path(cookie.rpartition(":")[0])
-            is_ours = folder.parent == self._settings.run_dir and folder.name not in self._started
-            if is_ours and supervisor_of(folder) is None:
+            if folder.parent != self._settings.run_dir:
+                continue
+            with self._lock:  # A run that is being started has a process before it is noted.
+                is_lost = folder.name not in self._started and supervisor_of(folder) is None
+            if is_lost:
                 logger.warning("process %d of run %s lost its supervisor", process.pid, folder.name)
                 end_processes(folder, grace_s=0.0)
 

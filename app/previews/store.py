@@ -31,6 +31,7 @@ _ENDED_FROM_OUTSIDE = (-signal.SIGTERM, -signal.SIGINT)
 _SECONDS_EACH = 60.0
 _MOST_WAITING = 400
 _MOST_FILES = 4_000
+_PAUSE_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -153,13 +154,16 @@ class Previews:
         return self._folder / f"{source.key}{ending}"
 
     def _work(self) -> None:
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            while batch := self._next_batch():
+        while batch := self._next_batch():
+            try:
+                self._folder.mkdir(parents=True, exist_ok=True)
                 self._draw(batch)
                 self._tidy(batch)
-        except OSError as error:
-            logger.warning("no previews are made: %s", error)
+            except OSError as error:
+                # Pages ask again for what is missing; a full disk must not be asked all the time.
+                logger.warning("some previews were not made: %s", error)
+                with self._lock:
+                    self._lock.wait_for(lambda: self._is_closed, timeout=_PAUSE_S)
 
     def _next_batch(self) -> list[_Source]:
         with self._lock:

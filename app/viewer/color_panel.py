@@ -1,13 +1,15 @@
 """Chooses what colors tell, shows the legend and holds the range."""
 
 import math
+import threading
 from collections.abc import Callable
 from typing import Any, Protocol
 
 import viser
 
-from app.viewer.coloring import Legend, Range
+from app.viewer.coloring import Legend
 from app.viewer.content import Content
+from app.viewer.followed import FollowedChoice
 from app.viewer.guard import Guard
 from app.viewer.keyboard import bind
 from app.viewer.layers import Coloring, Layers
@@ -48,8 +50,8 @@ class ColorPanel:
         self._layers = Layers()
         self._painter: Paints | None = None
         self._is_metric = True
-        self._written: tuple[float, float] | None = None
         self._said = ""
+        self._turn = threading.Lock()
         gui = server.gui
         self._folder = gui.add_folder("Colors", visible=False)
         with self._folder:
@@ -63,6 +65,7 @@ class ColorPanel:
             self._ends = gui.add_vector2(
                 "Range", (0.0, 1.0), step=1e-4, hint="Values at the ends; typing holds them"
             )
+        self._range = FollowedChoice(self._ends)
         self._choice.on_update(guard.by_user(lambda _: self.choose(self._choice.value)))
         self._hold.on_update(guard.by_user(lambda _: self._toggle_hold()))
         self._ends.on_update(guard.by_user(lambda _: self._type()))
@@ -102,9 +105,10 @@ class ColorPanel:
     def next(self, step: int) -> None:
         """Color by the next quantity of the list, or by one before."""
         options = list(self._choice.options)
-        if self._folder.visible:
-            at = options.index(self._layers.color)
-            self.choose(options[(at + step) % len(options)])
+        with self._turn:  # Two quick presses are heard in threads of their own.
+            if self._folder.visible:
+                at = options.index(self._layers.color)
+                self.choose(options[(at + step) % len(options)])
 
     def show(self, *, is_playing: bool, is_hidden: bool) -> None:
         """Follow what was painted last, or say nothing while something else is shown."""
@@ -119,7 +123,8 @@ class ColorPanel:
         if legend is None or painter is None:
             return
         factor = painter.quantity(self._layers.color).factor
-        self._write((legend.limits[0] * factor, legend.limits[1] * factor))
+        low, high = (_rounded(end * factor) for end in legend.limits)
+        self._range.show((low, high))
 
     @staticmethod
     def _legend_head(said: str) -> str:
@@ -136,13 +141,6 @@ class ColorPanel:
         self._hold.visible = self._ends.visible = is_colored
         self._legend.visible = is_colored
 
-    def _write(self, limits: Range) -> None:
-        """Show the ends, unless they are a user's that are about to be heard."""
-        rounded = (_rounded(limits[0]), _rounded(limits[1]))
-        if rounded != self._written:
-            self._written = rounded
-            self._ends.value = rounded
-
     def _toggle_hold(self) -> None:
         legend = self._painter.legend if self._painter is not None else None
         if self._hold.value and legend is not None:
@@ -154,13 +152,12 @@ class ColorPanel:
     def _type(self) -> None:
         """Take over the ends that a user typed, and hold them."""
         painter = self._painter
+        low, high = (float(end) for end in self._range.take())
         if painter is None or self._layers.color == "plain":
             return
         factor = painter.quantity(self._layers.color).factor
-        low, high = (float(end) for end in self._ends.value)
         if not (math.isfinite(low) and math.isfinite(high)) or high <= low:
             return  # Half-typed numbers; the scale waits until they make sense.
-        self._written = (low, high)
         self._layers.color_range = (low / factor, high / factor)
         self._hold.value = True
         self._redraw()

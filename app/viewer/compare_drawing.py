@@ -87,6 +87,8 @@ class CompareDrawing:
         with self._lock:
             self._nodes.clear()
             self._is_ground_laid = False
+            # A camera that is heard late turns nothing any more.
+            self._captions = dict.fromkeys(SIDES, "")
 
     def turn(self, eye: Eye) -> None:
         """Keep the sides left and right as the camera turns."""

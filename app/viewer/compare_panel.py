@@ -59,6 +59,7 @@ class ComparePanel:
         self._notes: tuple[str, ...] = ()
         self._unit, self._factor = "mm", 1e3
         self._tick, self._tick_count = 0, 1
+        self._plotted = 0
         self._scales = (0.0, 0.0)
         # What is written must not be older than what it replaces.
         self._lock = threading.RLock()
@@ -127,7 +128,7 @@ class ComparePanel:
         with self._lock:
             before = self._look.scale
             self._look.scale = scale_end(self._curve.strong * self._factor) / self._factor
-            self._plot.data = self._data()
+            self._draw_plot()
             self._fit_scales()
             self._write()
             return self._look.scale != before
@@ -135,12 +136,12 @@ class ComparePanel:
     def show(self, tick: int, *, is_playing: bool) -> None:
         """Tell which tick is on the screen."""
         with self._lock:
-            if tick == self._tick:
-                return
-            self._tick = tick
-            self._write()
-            if not is_playing or tick % 5 == 0:
-                self._plot.data = self._data()
+            if tick != self._tick:
+                self._tick = tick
+                self._write()
+            # A clock that stops may leave behind what was not worth drawing while it ran.
+            if tick != self._plotted and (not is_playing or tick % 5 == 0):
+                self._draw_plot()
 
     def swap(self) -> None:
         """Let A and B change their places."""
@@ -165,10 +166,11 @@ class ComparePanel:
 
     def _choose(self) -> None:
         look = self._look
-        look.mode = next(mode for mode, label in MODES.items() if label == self._mode.value)
-        look.tint = "difference" if self._tint.value else "side"
-        look.fade, look.wipe = self._fade.value, self._wipe.value
-        self._dress()
+        with self._lock:  # What is taken last must be what was read last.
+            look.mode = next(mode for mode, label in MODES.items() if label == self._mode.value)
+            look.tint = "difference" if self._tint.value else "side"
+            look.fade, look.wipe = self._fade.value, self._wipe.value
+            self._dress()
         self._change()
 
     def _dress(self) -> None:
@@ -230,6 +232,10 @@ class ComparePanel:
             self._scales = (last, top)
             y = uplot.Scale(range=(0.0, top))
             self._plot.scales = {"x": uplot.Scale(time=False, range=(0.0, last)), "y": y}
+
+    def _draw_plot(self) -> None:
+        self._plotted = self._tick
+        self._plot.data = self._data()
 
     def _data(self) -> tuple[np.ndarray, ...]:
         """Collect the curves; the plot needs two points at least, and knows no gaps."""

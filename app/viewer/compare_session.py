@@ -136,8 +136,7 @@ class CompareSession(SceneServer):
         self._view.curve.close()
         self._server.stop()
         for content in self._pair.contents:
-            for view in content.views:
-                view.close()
+            content.close()
 
     def _build(self) -> None:
         server, guard, pair = self._server, self._guard, self._pair

@@ -91,6 +91,11 @@ class Content:
         """Whether lengths are metres."""
         return self.length_unit == "m"
 
+    def close(self) -> None:
+        """Release the video decoders; a view that is asked again opens its own anew."""
+        for view in self.views:
+            view.close()
+
 
 def open_run(catalog: Catalog, run_id: str, sequence_name: str | None = None) -> Content:
     """Collect what a run has found out about one of its sequences.

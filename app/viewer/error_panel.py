@@ -87,6 +87,7 @@ class ErrorPanel:
         self._measured = 0
         self._frame = 0
         self._refreshed = 0.0
+        self._is_late = False
         self._folder = server.gui.add_folder("Error per frame")
         with self._folder:
             self._text = server.gui.add_html("")
@@ -102,7 +103,8 @@ class ErrorPanel:
     def show(self, frame: int, *, is_playing: bool) -> None:
         """Tell which frame is on the screen."""
         with self._lock:
-            if frame != self._frame:
+            # A clock that stops may leave behind what was not worth writing while it ran.
+            if frame != self._frame or (self._is_late and not is_playing):
                 self._frame = frame
                 self._write(at_once=not is_playing)
 
@@ -132,7 +134,8 @@ class ErrorPanel:
 
     def _write(self, *, at_once: bool) -> None:
         now = time.monotonic()
-        if not at_once and now - self._refreshed < _REFRESH:
+        self._is_late = not at_once and now - self._refreshed < _REFRESH
+        if self._is_late:
             return
         self._refreshed = now
         track, again = self.errors

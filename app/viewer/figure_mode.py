@@ -158,14 +158,14 @@ class FigureMode:
 
     def turn(self, client: viser.ClientHandle) -> None:
         """Let the halves follow a client's camera."""
-        figure = self._figure
-        if not self._is_on or figure is None:
-            return
-        if self.cameras.has_lost(client):
-            with self._lock:
+        with self._lock:  # A figure that is being left aims no camera.
+            figure = self._figure
+            if not self._is_on or figure is None:
+                return
+            if self.cameras.has_lost(client):
                 self._aim(client, self.cameras.before(client))
-        else:
-            figure.turn(Eye.of(client.camera.wxyz))
+                return
+        figure.turn(Eye.of(client.camera.wxyz))
 
     def welcome(self, client: viser.ClientHandle) -> None:
         """Show the figure whole to a client that comes while it is on."""

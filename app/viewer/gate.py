@@ -70,22 +70,28 @@ def create_gate(sessions: Sessions) -> APIRouter:
             await _refuse(websocket, 404, _GONE)
             return
         watching[session] += 1
+        upstream: ClientConnection | None = None
         try:
-            await _connect(websocket, found.port)
+            upstream = await _connect(websocket, found.port)
+            if upstream is not None:
+                await _exchange(websocket, upstream)
         finally:
+            # Before the scene has hung up, which may take long: the tab may be coming back.
             watching[session] -= 1
             if watching[session] <= 0:
                 del watching[session]
+            if upstream is not None:
+                await upstream.close()
 
     return router
 
 
-async def _connect(websocket: WebSocket, port: int) -> None:
-    """Join a client and its session's viser server until one of them is gone."""
+async def _connect(websocket: WebSocket, port: int) -> ClientConnection | None:
+    """Reach a session's viser server for a client; None if one of them cannot be reached."""
     offered = [p for p in websocket.scope["subprotocols"] if p.startswith(_PROTOCOL)]
     if not offered:
         await _refuse(websocket, 400, "A viser client must name its version.")
-        return
+        return None
     try:
         upstream = await connect(
             f"ws://127.0.0.1:{port}",
@@ -97,14 +103,14 @@ async def _connect(websocket: WebSocket, port: int) -> None:
     except (OSError, websockets.InvalidHandshake) as error:
         logger.info("the viewer of session did not answer: %s", error)
         await _refuse(websocket, 502, "The viewer of this session does not answer.")
-        return
-    async with upstream:
-        try:
-            await websocket.accept(subprotocol=upstream.subprotocol)
-        except (OSError, RuntimeError, WebSocketDisconnect):
-            logger.debug("the client was gone before it came in")
-            return
-        await _exchange(websocket, upstream)
+        return None
+    try:
+        await websocket.accept(subprotocol=upstream.subprotocol)
+    except (OSError, RuntimeError, WebSocketDisconnect):
+        logger.debug("the client was gone before it came in")
+        await upstream.close()
+        return None
+    return upstream
 
 
 async def _is_taken(watching: Counter[str], session: str) -> bool:

@@ -79,6 +79,12 @@ class History:
                 self._add(parameters, is_automatic)
             return self.current
 
+    def set_substeps(self, number: int, *, is_automatic: bool = False) -> SimulationParameters:
+        """Change the number of substeps, and whether it is chosen automatically."""
+        with self._lock:
+            changed = replace(self.current, substeps_per_frame=number)
+            return self.replace(changed, is_automatic=is_automatic)
+
     def put_back(self, *fields: str) -> SimulationParameters:
         """Give some parameters their fitted values again."""
         fitted = {field: getattr(self.start, field) for field in fields}

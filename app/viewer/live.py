@@ -229,8 +229,13 @@ class LiveSimulation:
         with self._lock:
             early, self._early = self._early, {}
             early |= {session: message for session, (message, _) in self._pending.items()}
-        for message in early.values():
+        for session, message in early.items():
             self._send(message)
+            with self._lock:
+                is_held = session in self._held
+            if message.fields.get("is_held", is_held) != is_held:
+                # It was let go, or held, while the message was on its way.
+                self._send(Message(PAUSE if is_held else RESUME, {"session": session}))
 
     def _deliver(self, message: Message) -> None:
         if message.kind == "ready":

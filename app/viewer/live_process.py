@@ -39,16 +39,32 @@ class Mailboxes:
         self._condition = threading.Condition()
         self._latest: dict[str, Message] = {}
         self._controls: list[Message] = []
+        self._newest: dict[str, int] = {}
         self._is_closed = False
 
     def put(self, message: Message) -> None:
-        """Replace the request of the message's session; what changes its pace is kept beside it."""
+        """Replace the request of the message's session; what changes its pace is kept beside it.
+
+        What was overtaken on its way by a newer request of the session is ignored.
+        """
+        session = message["session"]
         with self._condition:
             if message.kind in CONTROLS:
                 self._controls.append(message)
-            else:
-                self._latest[message["session"]] = message
+            elif not self._is_overtaken(message):
+                if message.kind == "simulate":
+                    self._newest[session] = message["request"]
+                elif message.kind == "close":
+                    self._newest.pop(session, None)
+                self._latest[session] = message
             self._condition.notify()
+
+    def _is_overtaken(self, message: Message) -> bool:
+        # Several threads of the server send, one of them what it noted before a crash or a start.
+        newest = self._newest.get(message["session"], 0)
+        if message.kind == "simulate":
+            return message["request"] < newest
+        return message.kind == "prepare" and newest > 0
 
     def take(self, *, wait: bool) -> list[Message] | None:
         """Empty all mailboxes.
@@ -121,7 +137,7 @@ class LiveSimulator:
             self._holds.hear(request)
             return
         if request.kind == "simulate":
-            if self._newest.get(session) == request["request"]:
+            if request["request"] <= self._newest.get(session, 0):
                 return  # The server repeats a request if it is not sure that it arrived.
             self._newest[session] = request["request"]
         self._active.pop(session, None)

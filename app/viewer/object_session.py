@@ -61,6 +61,7 @@ class ObjectSession:
         self._closed = threading.Event()
         # Sliders, buttons and the simulation are heard in threads of their own.
         self._lock = threading.RLock()
+        self._asking = threading.Lock()
         self._panel: PhysicsPanel | None = None
         self._resimulation = Resimulation(
             session,
@@ -129,8 +130,9 @@ class ObjectSession:
         """Simulate the parameters in force, even the fitted ones."""
         panel = self._panel
         if panel is not None:
-            parameters, is_automatic = panel.history.current, panel.is_automatic
-            self._resimulation.request(parameters, automatic_substeps=is_automatic)
+            with self._asking:  # What is asked for last must be what was read last.
+                parameters, is_automatic = panel.history.current, panel.is_automatic
+                self._resimulation.request(parameters, automatic_substeps=is_automatic)
             self._show_readout(at_once=True)
 
     def _set_pace(self, pace: str) -> None:
@@ -180,7 +182,8 @@ class ObjectSession:
         readout = self._show_readout(at_once=kind != "frame")
         if kind in {"stability", "ready"}:
             return
-        self._errors.follow(self._resimulation.newest, at_once=kind != "frame")
+        with self._lock:  # What is measured last must be what was read last.
+            self._errors.follow(self._resimulation.newest, at_once=kind != "frame")
         if kind == "frame":
             self._follow(ready, is_held=readout.is_held)
             return
@@ -202,9 +205,13 @@ class ObjectSession:
         if is_held:
             playback.play(on=False)
             playback.seek(ready - 1)
-        elif playback.is_playing:
-            playback.limit(ready)
-            if ready == 1:
-                playback.seek(0)
-        elif playback.frame == ready - 1:
+            return
+        # Of a clock that stands, too: it may be started before another frame is ready.
+        playback.limit(ready)
+        if not self._resimulation.is_busy:
+            # Somebody went back to the fit meanwhile, and no other frame will come.
+            playback.limit(playback.frame_count)
+        elif playback.is_playing and ready == 1:
+            playback.seek(0)
+        elif not playback.is_playing and playback.frame == ready - 1:
             playback.redraw()

@@ -1,5 +1,6 @@
 """The panel of one session: layers and view."""
 
+import threading
 from collections.abc import Callable
 from dataclasses import fields
 from typing import Any
@@ -42,6 +43,8 @@ class LayersPanel:
         self._switches: dict[str, viser.GuiCheckboxHandle] = {}
         self._views: dict[str, View] = {}
         self._framing: Framing | None = None
+        # Two quick presses of a key are heard in threads of their own.
+        self._turn = threading.Lock()
         gui = server.gui
         with gui.add_folder("Layers", expand_by_default=content.fitted is None):
             for field, label in (
@@ -140,14 +143,16 @@ class LayersPanel:
     def _press(self, field: str) -> None:
         """Switch a layer by its key, if there is anything in it."""
         switch = self._switches[field]
-        if switch.visible:
-            switch.value = not switch.value
-            setattr(self._layers, field, switch.value)
-            self._redraw()
+        with self._turn:
+            if switch.visible:
+                switch.value = not switch.value
+                setattr(self._layers, field, switch.value)
+        self._redraw()
 
     def _turn_theme(self) -> None:
-        self._theme.value = "light" if self._is_dark else "dark"
-        self._dress()
+        with self._turn:
+            self._theme.value = "light" if self._is_dark else "dark"
+            self._dress()
 
     def _switch(self, field: str) -> Callable[[Any], None]:
         def switch(event: Any) -> None:

@@ -4,7 +4,6 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import viser
@@ -12,6 +11,7 @@ import viser
 from app.keys import Action
 from app.viewer.contact_knobs import ground_knobs, self_collision_knobs
 from app.viewer.content import Content
+from app.viewer.followed import FollowedChoice
 from app.viewer.guard import Guard
 from app.viewer.history import History
 from app.viewer.keep_panel import Keeping, KeepPanel, PresetChoice
@@ -94,13 +94,15 @@ class PhysicsPanel:
             )
             pace.on_click(guard(lambda event: set_pace(event.target.value)))
             self._changes = gui.add_markdown("")
-            self._put_back: Any = gui.add_dropdown(
-                "Put back",
-                (_PUT_BACK,),
-                visible=False,
-                hint="Give one parameter its fitted value again",
+            self._put_back = FollowedChoice(
+                gui.add_dropdown(
+                    "Put back",
+                    (_PUT_BACK,),
+                    visible=False,
+                    hint="Give one parameter its fitted value again",
+                )
             )
-            self._put_back.on_update(guard.by_user(lambda _: self._put_one_back()))
+            self._put_back.handle.on_update(guard.by_user(lambda _: self._put_one_back()))
             with gui.add_folder("More physics", expand_by_default=False):
                 self._sliders.add(*main_knobs[_FIRST_KNOBS:])
                 self._substeps = SubstepsChoice(gui, guard, self.history, self._run)
@@ -210,7 +212,7 @@ class PhysicsPanel:
             self._run()
 
     def _put_one_back(self) -> None:
-        fields = self._changed.get(self._put_back.value)
+        fields = self._changed.get(self._put_back.take())
         if fields:
             self.history.put_back(*fields)
             self._run()
@@ -239,7 +241,7 @@ class PhysicsPanel:
         )
         self._changed = {change.name: change.fields for change in changes}
         text = ", ".join(change.text for change in changes)
-        self._put_back.options = (_PUT_BACK, *self._changed)
-        self._put_back.value = _PUT_BACK
-        self._put_back.visible = bool(changes)
+        self._put_back.handle.options = (_PUT_BACK, *self._changed)
+        self._put_back.show(_PUT_BACK)
+        self._put_back.handle.visible = bool(changes)
         self._changes.content = f"Changed: {text or 'nothing: parameters as fitted'}"

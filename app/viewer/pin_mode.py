@@ -184,17 +184,20 @@ class PinMode:
 
     def welcome(self, client: viser.ClientHandle) -> None:
         """Show both sides to a client that comes while they are on."""
-        if self._view is not None:
-            self._view.welcome(client)
+        with self._lock:
+            if self._view is not None:
+                self._view.welcome(client)
 
     def turn(self, client: viser.ClientHandle) -> None:
         """Let the sides follow a client's camera."""
-        if self._view is not None:
-            self._view.turn(client)
+        with self._lock:  # A comparison that is being left aims no camera.
+            if self._view is not None:
+                self._view.turn(client)
 
     def reset_view(self, client: viser.ClientHandle) -> bool:
         """Show both sides whole to a client; False if they are not beside each other."""
-        return self._view is not None and self._view.reset_view(client)
+        with self._lock:
+            return self._view is not None and self._view.reset_view(client)
 
     def _enter(self, content: Content, framing: Framing, take: Take) -> None:
         drawing = CompareDrawing(self._server, content, framing, [take])

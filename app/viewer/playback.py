@@ -100,10 +100,16 @@ class Playback:
         """Go to a frame; numbers outside the sequence are moved to its ends."""
         self._change(_position=float(min(max(frame, 0), self.frame_count - 1)))
 
+    def toggle(self) -> None:
+        """Start the clock if it stands, stop it if it runs."""
+        with self._condition:
+            self.play(on=not self._is_playing)
+
     def step(self, count: int) -> None:
         """Stop, and go some frames forward or, if negative, back."""
-        self.play(on=False)
-        self.seek((self.frame + count) % self.frame_count)
+        with self._condition:
+            self.play(on=False)
+            self.seek((self.frame + count) % self.frame_count)
 
     def set_speed(self, speed: float) -> None:
         """Set how many sequence seconds pass in a second."""

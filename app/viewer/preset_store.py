@@ -1,5 +1,6 @@
 """The presets that users keep: one YAML or JSON file each in the data folder."""
 
+import logging
 import re
 import threading
 from collections.abc import Callable, Mapping
@@ -13,6 +14,8 @@ from physhandi.data.plain_yaml import parse_yaml
 from physhandi.errors import PhysHandiError, UsageError, describe
 from physhandi.fitting.parameter_changes import changed_parameters
 from physhandi.simulation.model import SimulationParameters
+
+logger = logging.getLogger(__name__)
 
 PRESET_FORMAT = "physhandi-preset/1"
 _FIELDS = frozenset({"format", "name", "parameters", "length_unit"})
@@ -128,7 +131,11 @@ class PresetStore:
         with self._lock:
             listeners = list(self._listeners)
         for listener in listeners:
-            listener()
+            try:
+                listener()
+            except Exception:
+                # Its session may have just ended, which is no matter of whoever made the change.
+                logger.exception("a session could not be told of changed presets")
 
 
 def read_preset(path: Path) -> Preset:

@@ -155,6 +155,12 @@ class Resimulation:
             return self._shown, min(frame, self._shown.ready - 1)
 
     @property
+    def is_busy(self) -> bool:
+        """Whether frames are being simulated."""
+        with self._lock:
+            return self._is_busy
+
+    @property
     def newest(self) -> Take:
         """The rollout that was asked for last, as far as it is there."""
         with self._lock:

@@ -151,8 +151,7 @@ class Session(SceneServer):
         self._figure.close()
         self._pin.close()
         self._server.stop()
-        for view in self._content.views:
-            view.close()
+        self._content.close()
 
     def _load(self, sequence_name: str | None) -> Content:
         if self.kind == "run":
@@ -166,7 +165,7 @@ class Session(SceneServer):
         if len(self._names) > 1:
             now = self._content.sequence_name
             choice = server.gui.add_dropdown("Sequence", self._names, initial_value=now)
-            choice.on_update(guard.by_user(lambda event: self._switch(event.target.value)))
+            choice.on_update(guard.by_user(lambda _: self._switch(choice)))
         self._timeline = TimelinePanel(server, self._playback, guard)
         self._strip = FrameStrip(server, self._timeline.behind_slider)
         self._figure = FigureMode(server, guard, self._live, self.id, self._playback.redraw)
@@ -229,15 +228,20 @@ class Session(SceneServer):
         self._playback.seek(state.frame)
         self._playback.play(on=state.is_playing)
 
-    def _switch(self, sequence_name: str) -> None:
+    def _switch(self, choice: viser.GuiDropdownHandle[str]) -> None:
         self._has_played = True
+        sequence_name = choice.value
         content = self._load(sequence_name)
         with self._lock, self._server.atomic():
+            if choice.value != sequence_name:  # Another one was chosen while this one was read.
+                content.close()
+                return
             self._playback.play(on=False)
             if self._object is not None:
                 self._object.remove()
                 self._object = None
             self._stage.clear()
+            self._content.close()
             self._content = content
             self._playback.replace(content.frame_count, content.frame_rate)
             self._timeline.replace(content.frame_count)

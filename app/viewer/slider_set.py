@@ -1,5 +1,6 @@
 """The sliders and tick boxes of the physics panel, which follow the parameters in force."""
 
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -31,6 +32,8 @@ class SliderSet:
         self._guard = guard
         self._history = history
         self._moved = moved
+        # Each slider is heard in a thread of its own.
+        self._lock = threading.Lock()
         self._controls: list[tuple[Knob | Switch, Any]] = []
 
     @property
@@ -79,6 +82,8 @@ class SliderSet:
         return slider
 
     def _move(self, knob: Knob | Switch, control: Any) -> None:
-        before = self._history.current
-        if self._history.set(knob.field, knob.from_slider(control.value)) != before:
+        with self._lock:  # What is set last must be what was read last.
+            before = self._history.current
+            has_changed = self._history.set(knob.field, knob.from_slider(control.value)) != before
+        if has_changed:
             self._moved()

@@ -1,7 +1,6 @@
 """Choosing how many substeps a frame has, and the warning when those are too few."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import viser
@@ -75,14 +74,11 @@ class SubstepsChoice:
             number = self._in_use
         else:
             number = history.start.substeps_per_frame
-        parameters = replace(history.current, substeps_per_frame=number)
-        history.replace(parameters, is_automatic=choice == AUTOMATIC)
+        history.set_substeps(number, is_automatic=choice == AUTOMATIC)
         self._moved()
 
     def _type(self) -> None:
-        number = min(max(int(self._number.value), 1), _MOST)
-        parameters = replace(self._history.current, substeps_per_frame=number)
-        self._history.replace(parameters)
+        self._history.set_substeps(min(max(int(self._number.value), 1), _MOST))
         self._moved()
 
 

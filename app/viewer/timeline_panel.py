@@ -1,5 +1,6 @@
 """The clock of one session in its panel and under its keys."""
 
+import asyncio
 from collections.abc import Callable
 from typing import Any
 
@@ -11,6 +12,8 @@ from app.viewer.guard import Guard
 from app.viewer.keyboard import bind
 from app.viewer.playback import Playback
 
+_SETTLED = 0.3
+"""Time without a scrub after which the slider is told once more where it stands [s]."""
 _SPEEDS = (0.1, 2.0)
 _PACES = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0)
 """Speeds that keys step through."""
@@ -22,6 +25,7 @@ class TimelinePanel:
     def __init__(self, server: viser.ViserServer, playback: Playback, guard: Guard) -> None:
         self._playback = playback
         self._loop_of_events = server.get_event_loop()
+        self._settling: asyncio.TimerHandle | None = None
         gui = server.gui
         self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY, hint="Space")
         self._frame = gui.add_slider(
@@ -32,13 +36,13 @@ class TimelinePanel:
         loop = gui.add_checkbox("Loop", initial_value=True)
         self._speed, self._loop = speed, loop
 
-        self._play.on_click(guard(lambda _: self._toggle()))
+        self._play.on_click(guard(lambda _: playback.toggle()))
         self._frame.on_update(self._scrub)
         step.on_click(guard(lambda event: playback.step(1 if event.target.value == "1 ▶" else -1)))
         speed.on_update(guard.by_user(lambda _: playback.set_speed(speed.value)))
         loop.on_update(guard.by_user(lambda _: playback.set_loop(on=loop.value)))
         actions: dict[Action, Callable[[], None]] = {
-            "play": self._toggle,
+            "play": playback.toggle,
             "next": lambda: playback.step(1),
             "previous": lambda: playback.step(-1),
             "ten_on": lambda: playback.step(10),
@@ -94,12 +98,9 @@ class TimelinePanel:
         now = self._playback.speed
         index = int(np.argmin([abs(now - speed) for speed in _PACES])) + steps
         speed = _PACES[min(max(index, 0), len(_PACES) - 1)]
-        self._speed.value = speed
         self._playback.set_speed(speed)
         self._playback.play()
-
-    def _toggle(self) -> None:
-        self._playback.play(on=not self._playback.is_playing)
+        self._speed.value = speed
 
     async def _scrub(self, event: Any) -> None:
         # At once, in viser's own thread, so that the running clock has no time to interfere.
@@ -107,3 +108,17 @@ class TimelinePanel:
         if event.client is not None:
             self._playback.play(on=False)
             self._playback.seek(frame)
+            if self._settling is not None:
+                self._settling.cancel()
+            self._settling = self._loop_of_events.call_later(_SETTLED, self._settle)
+
+    def _settle(self) -> None:
+        """Tell the slider of a scrub where it stands.
+
+        A frame of the running clock may have met the user's choice on its way, and moved the slider
+        away from it after it was sent. Viser sends no value that it believes to be there already:
+        another one comes first, which it does not send in the end.
+        """
+        frame = self._playback.frame
+        self._frame.value = frame - 1 if frame > 0 else 1
+        self._frame.value = frame

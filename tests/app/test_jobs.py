@@ -2,9 +2,12 @@
 
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import psutil
 import pytest
@@ -22,7 +25,7 @@ TESTS = Path(__file__).parent.parent
 GRACE_S = 0.4
 
 
-def until(claim: Callable[[], object], seconds: float = 15.0) -> None:
+def until(claim: Callable[[], object], seconds: float = 120.0) -> None:
     end = time.monotonic() + seconds
     while not claim():
         assert time.monotonic() < end, "waited too long"
@@ -183,21 +186,33 @@ def test_a_polite_worker_is_cancelled_at_its_next_report_and_resumed_later(desk:
     assert (run.folder / "current").read_text().strip() == "2"
 
 
-def test_cancelling_ends_the_whole_tree_however_stubborn(desk: Desk) -> None:
+def test_cancelling_ends_the_whole_tree_however_stubborn(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
     run_id = desk.launch("stubborn")
     run = desk.run(run_id)
     pids = pids_of(run)
     assert all(is_alive(pid) for pid in pids)
     assert os.getsid(pids[1]) == pids[1]
-    start = time.monotonic()
+    # It is ended in a thread, which might be done before the second wish.
+    told, end = threading.Event(), desk.scheduler._end
+
+    def end_when_told(*run: Any) -> None:
+        assert told.wait(60)
+        end(*run)
+
+    monkeypatch.setattr(desk.scheduler, "_end", end_when_told)
     for _ in range(2):
         desk.scheduler.cancel(run_id)
         assert desk.state(run_id) == "stopping"
+    start = time.monotonic()
+    told.set()
     desk.until(run_id, "cancelled")
-    assert GRACE_S * 0.9 < time.monotonic() - start < GRACE_S + 6
-    assert not any(is_alive(pid) for pid in pids)
+    assert time.monotonic() - start > GRACE_S * 0.9
     assert list(processes_of(run.folder)) == []
-    assert supervisor_of(run.folder) is None
+    # Of what was killed the kernel has still to let go.
+    until(lambda: not any(is_alive(pid) for pid in pids))
+    until(lambda: supervisor_of(run.folder) is None)
     with pytest.raises(RunError, match="nothing to cancel"):
         desk.scheduler.cancel(run_id)
     follower = desk.launch("publish")
@@ -211,7 +226,7 @@ def test_a_fit_is_cancelled_while_its_program_is_loading(desk: Desk) -> None:
     desk.until(run_id, "cancelled")
     run = desk.run(run_id)
     assert list(processes_of(run.folder)) == []
-    assert supervisor_of(run.folder) is None
+    until(lambda: supervisor_of(run.folder) is None)
 
 
 def test_a_closed_server_starts_nothing_more(desk: Desk) -> None:
@@ -331,3 +346,44 @@ def test_the_worker_never_learns_the_token(desk: Desk, monkeypatch: pytest.Monke
     run_id = desk.launch("stubborn")
     worker, _ = pids_of(desk.run(run_id))
     assert "PHYSHANDI_TOKEN" not in psutil.Process(worker).environ()
+
+
+def test_a_sweep_spares_the_run_that_is_just_being_started(
+    data_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    desk = Desk(data_dir)
+    new, lost = desk.run(desk.launch("new")), data_dir / "runs" / "lost"
+    folders = (new.folder, lost, data_dir / "elsewhere" / "lost")
+    ended: list[tuple[Path, bool]] = []
+    reached, lock = threading.Event(), desk.scheduler._lock
+
+    class WatchedLock:
+        def __enter__(self) -> None:
+            if threading.current_thread() is sweeper:
+                reached.set()
+            lock.acquire()
+
+        def __exit__(self, *_: object) -> None:
+            lock.release()
+
+    def sweep() -> None:
+        desk.scheduler._sweep()
+        reached.set()
+
+    def start(*_: object, **__: object) -> Any:
+        # The process has its mark, but has not claimed the run yet: now it is found.
+        sweeper.start()
+        assert reached.wait(60)
+        return SimpleNamespace(poll=lambda: None)
+
+    sweeper = threading.Thread(target=sweep)
+    for name, stand_in in {
+        "marked_processes": lambda: [(SimpleNamespace(pid=1), f"{f}:x") for f in folders],
+        "end_processes": lambda folder, **_: ended.append((folder, lock._is_owned())),
+        "start_supervisor": start,
+    }.items():
+        monkeypatch.setattr(scheduler_module, name, stand_in)
+    monkeypatch.setattr(desk.scheduler, "_lock", WatchedLock())
+    desk.scheduler.start_now(new)
+    sweeper.join(60)
+    assert ended == [(lost, False)]  # To end them takes long, so nobody waits for it.

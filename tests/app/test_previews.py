@@ -1,10 +1,16 @@
 """Small pictures of sequences and runs: what they show, how they are made and kept."""
 
+import json
 import os
 import shutil
+import signal
+import subprocess
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +18,7 @@ import yaml
 from PIL import Image, ImageSequence
 from server_world import World
 
-from app.previews import worker
+from app.previews import store, worker
 from app.previews.camera import fitting_camera
 from app.previews.clip import clip_of_run, clip_of_sequence
 from app.previews.draw import HEIGHT, WIDTH, Motion, draw_motion
@@ -108,7 +114,7 @@ def test_depth_is_shown_where_there_is_no_color(tmp_path: Path) -> None:
 
 
 def until(is_so: Callable[[], bool]) -> None:
-    end = time.monotonic() + 60.0
+    end = time.monotonic() + 150.0
     while not is_so():
         assert time.monotonic() < end
         time.sleep(0.05)
@@ -184,6 +190,68 @@ def test_what_ends_its_process_is_noted_and_the_others_are_drawn(
         previews.shutdown()
     assert drawn == ["sheet"]
     assert previews.look("sequence", "sheet").state == "none"
+
+
+def test_a_folder_that_is_deleted_while_pictures_are_drawn_ends_nothing(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The note that it crashed cannot be written; there is nothing to tidy; at last it is drawn.
+    codes = iter((1, -signal.SIGTERM, 0))
+
+    class Child:
+        def __init__(self, *_: object, **__: object) -> None:
+            self.returncode = next(codes)
+
+        def communicate(self, orders: bytes, **_: object) -> None:
+            if self.returncode:
+                shutil.rmtree(world.settings.preview_dir)
+                return
+            for order in json.loads(orders):
+                Path(f"{order['target']}{worker.MOVING}").write_bytes(b"RIFF")
+
+        def kill(self) -> None:
+            pass
+
+    monkeypatch.setattr(store, "subprocess", SimpleNamespace(**vars(subprocess) | {"Popen": Child}))
+    monkeypatch.setattr(store, "_PAUSE_S", 0.0)
+    previews = Previews(world.settings, world.catalog)
+    previews.start()
+
+    def is_drawn() -> bool:
+        assert previews._thread.is_alive()
+        return previews.look("sequence", "sheet").state == "ready"
+
+    try:
+        until(is_drawn)
+    finally:
+        previews.shutdown()
+    assert next(codes, None) is None
+
+
+def test_waiting_after_a_failure_does_not_delay_the_end(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    previews = Previews(world.settings, world.catalog)
+    is_waiting = threading.Event()
+    wait_for = previews._lock.wait_for
+
+    def note_wait(is_so: Callable[[], bool], timeout: float) -> Any:
+        is_waiting.set()  # The lock is held, so nobody says that it ends before it waits.
+        return wait_for(is_so, timeout)
+
+    def fail(_: object) -> None:
+        raise OSError("no space left")
+
+    monkeypatch.setattr(previews._lock, "wait_for", note_wait)
+    monkeypatch.setattr(previews, "_draw", fail)
+    monkeypatch.setattr(store, "_PAUSE_S", 3600.0)
+    previews.look("sequence", "sheet")
+    previews.start()
+    assert is_waiting.wait(60)
+    previews.look("sequence", "sheet")  # Asking does not end the pause.
+    previews.shutdown()
+    previews._thread.join(60)
+    assert not previews._thread.is_alive()
 
 
 def test_a_picture_that_cannot_be_drawn_leaves_a_note_that_says_why(tmp_path: Path) -> None:

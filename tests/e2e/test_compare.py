@@ -52,7 +52,7 @@ def test_two_runs_are_compared_in_one_scene(home: Page, lifted: str, picture) ->
     scene = ScenePage(home)
     scene.until(lambda: scene.has("Swap sides"), "the panel appears")
     scene.pause()
-    scene.set("Frame", FRAME)
+    scene.go(FRAME)
     expected = 12.0 * FRAME / 59
     scene.until(lambda: scene.has(f"mean {expected:.3g} mm"), "the difference is told")
     # The table knows both, and the name of a user is text.
@@ -63,16 +63,18 @@ def test_two_runs_are_compared_in_one_scene(home: Page, lifted: str, picture) ->
     chart = home.locator("figure.chart", has_text="Difference of A and B")
     chart.locator(".plot").focus()
     home.keyboard.press("End")
+    expect(chart.locator("output")).to_have_class("readout at-cursor")
     expect(chart.locator("output")).to_contain_text("mean 12 mm")
+    assert scene.frame() == FRAME, "the key is the chart's, not the scene's"
     home.keyboard.press("Enter")
     scene.until(lambda: scene.value("Frame") == 59, "the chart goes to the frame")
+
     # Beside each other both colors are seen, each in its half; over each other in one place.
-    scene.until(
-        lambda: all(colored(home, color).size > 120 for color in ("blue", "orange")),
-        "both halves are drawn",
-    )
-    halves = [colored(home, color) for color in ("blue", "orange")]
-    assert halves[0].max() < halves[1].min()
+    def are_apart() -> bool:
+        left, right = (colored(home, color) for color in ("blue", "orange"))
+        return min(left.size, right.size) > 120 and left.max() < right.min()
+
+    scene.until(are_apart, "both halves are drawn")
     picture(home, "compare")
     home.keyboard.press("m")
     scene.until(lambda: scene.has("A ↔ B"), "the overlay")

@@ -75,3 +75,15 @@ def test_a_panel_tells_whether_its_color_scale_changed(server: viser.ViserServer
     assert panel.follow()
     assert abs(look.scale - 0.1) < 1e-12
     assert not panel.follow()
+
+
+def test_the_plot_marks_the_frame_at_which_the_clock_stops(server: viser.ViserServer) -> None:
+    curve = MeasuredMeanwhile()
+    curve.is_measured = True
+    panel = ComparePanel(server, Guard(server), Look(), curve, change=lambda: None, has_keys=False)
+    panel.name({"a": "one", "b": "two"}, (), unit="m", tick_count=12)
+    for tick in (4, 5, 6, 7):
+        panel.show(tick, is_playing=True)
+    assert np.flatnonzero(panel._plot.data[3]).tolist() == [5]
+    panel.show(7, is_playing=False)
+    assert np.flatnonzero(panel._plot.data[3]).tolist() == [7]

@@ -1,3 +1,4 @@
+import asyncio
 import gzip
 import threading
 import time
@@ -12,12 +13,14 @@ import uvicorn
 import viser._messages
 from fastapi import FastAPI
 from viewer_client import PROTOCOL, ViewerClient
-from viewer_world import FRAMES
+from viewer_world import FRAMES, rest_at
+from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from app.viewer.gate import create_gate
 from app.viewer.session import Sessions
+from app.viewer.session_state import SessionState
 
 
 @pytest.fixture
@@ -87,7 +90,11 @@ def test_a_client_gets_the_scene_through_the_gate(address, sessions, slash) -> N
         client.until(lambda: {"/object/nodes", "/springs/virtual"} <= set(client.nodes))
         client.until(lambda: "object springs" in client.texts())
         client.until(lambda: sessions.list()[0].client_count == 1)
-    end = time.monotonic() + 5
+    wait_until_nobody_looks(sessions)
+
+
+def wait_until_nobody_looks(sessions: Sessions) -> None:
+    end = time.monotonic() + 60
     while sessions.list()[0].client_count and time.monotonic() < end:
         time.sleep(0.02)
     assert sessions.list()[0].client_count == 0
@@ -107,7 +114,7 @@ def test_closing_a_session_hangs_up(address, sessions) -> None:
         client.until(lambda: client.nodes)
         sessions.close(session)
         with pytest.raises(ConnectionClosed):
-            client.until(lambda: False, seconds=10)
+            client.until(lambda: False, seconds=60)
     assert fetch(f"http://{address}/viewer/{session}/")[0] == 404
 
 
@@ -143,22 +150,58 @@ def test_a_tab_that_is_reloaded_keeps_its_session(address, sessions) -> None:
         live = sessions.get(session)
         client.until(lambda: live.state.pose is not None)
         client.until(lambda: live.state.pose.position.tolist() == [0.5, 0.4, 0.3])
+    wait_until_nobody_looks(sessions)
     assert fetch(f"http://{address}/viewer/{session}/")[0] == 200
     assert [info.id for info in sessions.list()] == [session]
     with ViewerClient(f"ws://{address}/viewer/{session}") as client:
         client.until(lambda: first_positions(client)[-1:] == [pytest.approx((0.5, 0.4, 0.3))])
 
 
+def test_a_tab_may_come_back_before_its_scene_has_hung_up(
+    address, sessions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    close, is_leaving = ClientConnection.close, threading.Event()
+
+    async def slow(connection: ClientConnection) -> None:
+        is_leaving.set()
+        await asyncio.sleep(4.0)
+        await close(connection)
+
+    monkeypatch.setattr(ClientConnection, "close", slow)
+    session = sessions.open("run", "sheet", "me")
+    with ViewerClient(f"ws://{address}/viewer/{session}") as client:
+        client.until(lambda: client.nodes)
+    assert is_leaving.wait(60.0)
+    assert fetch(f"http://{address}/viewer/{session}/")[0] == 200
+    assert [info.id for info in sessions.list()] == [session]
+
+
+def has_heard_all(state: SessionState) -> bool:
+    """Whether all is set that `test_a_second_tab_gets_a_copy_with_the_same_state` sets.
+
+    Each element of the panel is heard in a thread of its own.
+    """
+    assert state.layers is not None
+    assert state.pose is not None
+    return (
+        (state.speed, state.theme, state.layers.dark) == (0.5, "dark", True)
+        and not state.layers.virtual_springs
+        and state.pose.position.tolist() == [0.3, 0.2, 0.1]
+        and (state.frame, state.is_playing) == (7, False)
+    )
+
+
 def test_a_second_tab_gets_a_copy_with_the_same_state(address, sessions) -> None:
     session = sessions.open("run", "sheet", "me")
     with ViewerClient(f"ws://{address}/viewer/{session}") as client:
         client.until(lambda: "object springs" in client.texts())
+        client.until(lambda: client.find("stiffness 10^"))
         slider = client.find("stiffness 10^")
         client.set("Sequence", "drag")
         client.until(lambda: sessions.get(session)._content.sequence_name == "drag")
         client.until(lambda: client.find("stiffness 10^") not in {slider, ""})
         client.until(lambda: sessions.get(session)._playback.is_playing)
-        client.set("Frame", 7)
+        rest_at(client, 7)
         client.set("Speed", 0.5)
         client.set("Virtual springs", False)
         client.set("Background", "dark")
@@ -166,8 +209,8 @@ def test_a_second_tab_gets_a_copy_with_the_same_state(address, sessions) -> None
         client.tell_camera(position=(0.3, 0.2, 0.1), look_at=(0.0, 0.1, 0.0))
         client.until(lambda: f"simulated {FRAMES}/{FRAMES}" in client.texts())
         client.until(lambda: "x0.1" in client.texts())
-        status, _ = fetch(f"http://{address}/viewer/{session}/")
-        assert status == 200  # After the redirect.
+        client.until(lambda: has_heard_all(sessions.get(session).state))
+        assert fetch(f"http://{address}/viewer/{session}/")[0] == 200  # After the redirect.
         own, copied = (sessions.get(info.id) for info in sessions.list())
         assert (own.id, copied.owner) == (session, "me")
         state = copied.state
@@ -182,8 +225,8 @@ def test_a_second_tab_gets_a_copy_with_the_same_state(address, sessions) -> None
             second.until(lambda: {"/object/nodes", "/forces"} <= set(second.nodes))
             second.until(lambda: first_positions(second)[-1:] == [pytest.approx((0.3, 0.2, 0.1))])
             names = ("Sequence", "Frame", "Speed", "stiffness 10^", "Virtual springs", "Background")
-            shown = [second.value(name) for name in names]
-            assert shown == ["drag", 7, 0.5, -1.0, False, "dark"]
+            wanted = ["drag", 7, 0.5, -1.0, False, "dark"]
+            second.until(lambda: [second.value(name) for name in names] == wanted)
             assert "/springs/virtual" not in second.nodes
             fitted = own._content.fitted.position[7]
             second.until(

@@ -83,6 +83,23 @@ def test_a_preset_is_kept_read_by_another_server_and_deleted(store) -> None:
     assert len(heard) == 2
 
 
+def test_a_listener_that_fails_keeps_a_change_neither_from_its_user_nor_from_others(
+    store, caplog
+) -> None:
+    heard: list[int] = []
+
+    def fail() -> None:
+        raise RuntimeError("this panel was removed")
+
+    store.subscribe(fail)
+    store.subscribe(lambda: heard.append(1))
+    assert store.save("Wet towel", {"drag": 7.5}, "m").name == "Wet towel"
+    assert heard == [1]
+    store.delete("Wet towel")
+    assert heard == [1, 1]
+    assert [str(record.exc_info[1]) for record in caplog.records] == ["this panel was removed"] * 2
+
+
 def test_the_same_name_replaces_and_another_one_of_the_same_letters_does_not(store) -> None:
     store.save("A b", {"drag": 1.0}, "m")
     store.save("a B", {"drag": 2.0}, "m")
