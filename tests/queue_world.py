@@ -20,6 +20,7 @@ from app.security import Security
 from app.server import create_app
 from app.settings import Settings
 from app.viewer.session import TooManySessionsError
+from physhandi.data.run import read_events
 
 HOSTILE = "<img src=x onerror=alert(1)>\u202e"
 
@@ -78,12 +79,24 @@ class QueueWorld:
         assert response.status_code == 201
         return response.json()["id"]
 
-    def until(self, run_id: str, state: str, seconds: float = 15.0) -> dict[str, Any]:
+    def until(self, run_id: str, state: str, seconds: float = 120.0) -> dict[str, Any]:
         end = time.monotonic() + seconds
         while (run := self.client.get(f"/api/v1/runs/{run_id}").json())["state"] != state:
             assert time.monotonic() < end, run
             time.sleep(0.03)
         return run
+
+    def until_reported(self, run_id: str, stage: str, iteration: int = 1) -> None:
+        """Wait for a report; a run is called running before its worker has made its files."""
+        end = time.monotonic() + 120.0
+        wanted = (stage, iteration)
+        while wanted not in (told := self._reports(run_id)):
+            assert time.monotonic() < end, told
+            time.sleep(0.03)
+
+    def _reports(self, run_id: str) -> list[tuple[str, int]]:
+        events, _ = read_events(self.folder(run_id))
+        return [(event["stage"], event["iteration"]) for event in events]
 
     def tell(self, run_id: str, *commands: list[Any]) -> None:
         """Give a run named `script` its next commands; see `job_worker.script`."""
@@ -117,8 +130,9 @@ def queue_world(data_dir: Path, bundled: Path) -> Iterator[QueueWorld]:
 @contextmanager
 def serving(world: QueueWorld) -> Iterator[int]:
     """Let browsers in on a port of this machine; when it is over, every stream has ended."""
+    # A server that gives up waiting leaves sockets open, of which Python complains later.
     config = uvicorn.Config(
-        world.app, port=0, lifespan="off", log_level="error", timeout_graceful_shutdown=2
+        world.app, port=0, lifespan="off", log_level="error", timeout_graceful_shutdown=60
     )
     server = uvicorn.Server(config)
     thread = Thread(target=server.run, daemon=True)
@@ -128,5 +142,5 @@ def serving(world: QueueWorld) -> Iterator[int]:
     yield server.servers[0].sockets[0].getsockname()[1]
     world.app.state.stopping.set()
     server.should_exit = True
-    thread.join(timeout=5)
+    thread.join(timeout=90)
     assert not thread.is_alive()

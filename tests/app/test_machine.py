@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -34,17 +35,25 @@ def made_up(arguments: list[str]) -> str:
     return TWO_CARDS[arguments[0].partition("=")[0]]
 
 
-def test_the_load_is_what_the_kernel_tells(tmp_path: Path) -> None:
-    load = Machine(tmp_path, Cards(made_up)).load()
+def taken(folder: Path) -> tuple[int, int, int, int]:
+    """Bytes of memory, of used memory, of the disk and of its free part, as the kernel tells."""
     lines = Path("/proc/meminfo").read_text().splitlines()
     kibibytes = {line.split(":")[0]: int(line.split()[1]) for line in lines}
-    assert load["memory"]["total"] == kibibytes["MemTotal"] * 1024
     used = (kibibytes["MemTotal"] - kibibytes["MemAvailable"]) * 1024
-    assert load["memory"]["used"] == pytest.approx(used, rel=0.2)
-    assert load["memory"]["share"] == pytest.approx(used / load["memory"]["total"], abs=0.05)
-    disk = shutil.disk_usage(tmp_path)
-    assert load["disk"]["total"] == disk.total
-    assert load["disk"]["free"] == pytest.approx(disk.free, rel=0.05)
+    disk = shutil.disk_usage(folder)
+    return kibibytes["MemTotal"] * 1024, used, disk.total, disk.free
+
+
+def test_the_load_is_what_the_kernel_tells(tmp_path: Path) -> None:
+    machine = Machine(tmp_path, Cards(made_up))
+    # Others take and give back meanwhile: what is told lies between before and after.
+    before, load, after = taken(tmp_path), machine.load(), taken(tmp_path)
+    total, used, disk_total, disk_free = (sorted(pair) for pair in zip(before, after, strict=True))
+    assert load["memory"]["total"] == total[0]
+    assert used[0] * 0.8 < load["memory"]["used"] < used[1] * 1.2
+    assert used[0] / total[0] - 0.05 < load["memory"]["share"] < used[1] / total[0] + 0.05
+    assert load["disk"]["total"] == disk_total[0]
+    assert disk_free[0] * 0.95 < load["disk"]["free"] < disk_free[1] * 1.05
     assert load["processor"]["count"] == os.cpu_count()
     assert 0.0 <= load["processor"]["share"] <= 1.0
 
@@ -64,19 +73,18 @@ def test_a_run_takes_what_all_its_processes_take(tmp_path: Path) -> None:
     try:
         assert supervisor.stdout is not None
         supervisor.stdout.readline()
-        end = time.monotonic() + 10.0
+        end = time.monotonic() + 120.0
         first = machine.of_run(tmp_path)
         assert first is not None
         assert first["processes"] == 2
-        while (taken := machine.of_run(tmp_path)) and (
-            taken["processors"] < 0.02 or taken["memory"] < 85 * 2**20
+        # More than one processor is told if something came between two looks at two clocks.
+        while (found := machine.of_run(tmp_path)) and not (
+            0.02 <= found["processors"] < 1.5 and found["memory"] > 85 * 2**20
         ):
-            assert time.monotonic() < end
+            assert time.monotonic() < end, found
             time.sleep(0.2)
-        assert taken is not None
-        assert taken["memory"] > 85 * 2**20
-        assert taken["processors"] < 1.5
-        assert taken["card_memory"] is None
+        assert found is not None
+        assert found["card_memory"] is None
     finally:
         end_processes(tmp_path, grace_s=0.0)
         supervisor.communicate()
@@ -118,19 +126,21 @@ def test_without_a_card_or_an_answer_there_is_none(monkeypatch: pytest.MonkeyPat
         ask_driver(["--version"])
 
 
-def test_nobody_waits_for_a_slow_driver() -> None:
-    asked: list[float] = []
+def test_nobody_waits_for_a_slow_driver(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cards_module, "_KEPT_S", float("inf"))
+    asked: list[list[str]] = []
+    answer = threading.Event()
 
     def slow(arguments: list[str]) -> str:
-        asked.append(time.monotonic())
-        time.sleep(0.3)
+        asked.append(arguments)
+        assert answer.wait(60)
         return made_up(arguments)
 
     cards = Cards(slow)
-    begin = time.monotonic()
     assert [cards.read() for _ in range(50)] == [[]] * 50
-    assert time.monotonic() - begin < 0.2
-    end = time.monotonic() + 5.0
+    assert len(asked) <= 1
+    answer.set()
+    end = time.monotonic() + 60.0
     while not cards.read():
         assert time.monotonic() < end
         time.sleep(0.02)

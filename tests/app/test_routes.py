@@ -1,5 +1,6 @@
 """The routes of the API and the pages, with a real queue and made-up live scenes."""
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -116,7 +117,12 @@ def test_a_page_shows_results_with_units_and_its_parts_alone(world: QueueWorld) 
 def test_a_failure_is_told_on_top_without_the_insides_of_the_program(world: QueueWorld) -> None:
     run_id = world.launch("defect")
     world.until(run_id, "failed")
-    assert "Traceback" in (world.folder(run_id) / "log.txt").read_text()
+    # A worker's last words reach the log when the run has failed already.
+    log, end = world.folder(run_id) / "log.txt", time.monotonic() + 120.0
+    while "KeyError" not in log.read_text():
+        assert time.monotonic() < end
+        time.sleep(0.03)
+    assert "Traceback" in log.read_text()
     page = world.client.get(f"/runs/{run_id}").text
     assert "The fit failed in <em>zeroth order</em>" in page
     assert "KeyError: &#39;a &lt;b&gt;key&lt;/b&gt;&#39;" in page

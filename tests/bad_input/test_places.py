@@ -202,7 +202,7 @@ def in_a_process(folder: Path, *order: str, setup: str = "") -> tuple[int, str]:
         cwd=folder,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=170,
         check=False,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
     )

@@ -20,14 +20,16 @@ from playwright.sync_api import (
     expect,
     sync_playwright,
 )
+from scene_page import TIMEOUT_MS
 
 from app.jobs.processes import end_processes
 
 ROOT = Path(__file__).parents[2]
 START = "from app.cli import main; main()"
 _CHROMIUM = ["--no-sandbox", "--use-angle=gl-egl", "--ignore-gpu-blocklist"]
-_START_SECONDS = 60.0
-_TIMEOUT_MS = 45_000
+_START_SECONDS = 180.0
+_WHOLE_TEST_SECONDS = 900
+"""Starting server and browser belongs to the first test of a file."""
 _PICTURES = "PHYSHANDI_PICTURES"
 """Names the folder of the README's pictures, which are made anew if it is set (`make pictures`)."""
 _SETTLE_MS = 2_000
@@ -46,6 +48,13 @@ class Served:
     """The address that it printed, with the token."""
     data_dir: Path
     """Where it keeps runs."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Give tests that drive a browser time; what they wait for has limits of its own."""
+    for item in items:
+        if item.path.parent == Path(__file__).parent:
+            item.add_marker(pytest.mark.timeout(_WHOLE_TEST_SECONDS))
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +77,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
             end_processes(run, grace_s=0)
         server.terminate()
         try:
-            server.wait(20)
+            server.wait(120)
         finally:
             server.kill()
             server.wait()
@@ -76,7 +85,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 
 @pytest.fixture(scope="module")
 def playwright_driver() -> Iterator[Playwright]:
-    expect.set_options(timeout=_TIMEOUT_MS)
+    expect.set_options(timeout=TIMEOUT_MS)
     with sync_playwright() as driver:
         yield driver
 
@@ -87,7 +96,9 @@ def browser(playwright_driver: Playwright) -> Iterator[Browser]:
     if executable is None:
         reason = "needs Debian's chromium with libegl-mesa0 and libgl1-mesa-dri"
         (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)
-    browser = playwright_driver.chromium.launch(executable_path=executable, args=_CHROMIUM)
+    browser = playwright_driver.chromium.launch(
+        executable_path=executable, args=_CHROMIUM, timeout=TIMEOUT_MS
+    )
     yield browser
     browser.close()
 
@@ -97,7 +108,7 @@ def context(browser: Browser) -> Iterator[BrowserContext]:
     """A browser without history; its pages may not complain of anything."""
     complaints: list[str] = []
     context = browser.new_context(viewport={"width": 1280, "height": 800})
-    context.set_default_timeout(_TIMEOUT_MS)
+    context.set_default_timeout(TIMEOUT_MS)
     context.add_init_script(_REPORT_VIOLATIONS)
     context.on("console", lambda m: m.type == "error" and complaints.append(m.text))
     context.on("weberror", lambda error: complaints.append(str(error.error)))

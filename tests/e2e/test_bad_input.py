@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from bad_input_world import fields, put, truncated
 from playwright.sync_api import Browser, Page, expect
+from scene_page import TIMEOUT_MS
 from sheet_sequence import write_sheet
 
 pytestmark = pytest.mark.e2e
@@ -26,6 +27,7 @@ def page(browser: Browser, served) -> Iterator[Page]:
     shutil.copytree(BUNDLED_RUN, torn)
     truncated(f"attempts/1/out/{ROLLOUT}")(torn)
     context = browser.new_context()
+    context.set_default_timeout(TIMEOUT_MS)
     defects: list[str] = []
     context.on("weberror", lambda error: defects.append(str(error.error)))
     page = context.new_page()

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
-from scene_page import ScenePage
+from scene_page import TIMEOUT_MS, ScenePage
 
 pytestmark = pytest.mark.e2e
 FRAME = 30
@@ -30,7 +30,7 @@ def test_the_figure_shows_both_topologies_in_one_picture(
 ) -> None:
     scene.page.keyboard.press("f")
     scene.until(lambda: scene.has("PhysTwin-style: simulated 60/60 frames"), "the figure")
-    scene.set("Frame", FRAME)
+    scene.go(FRAME)
     picture(scene.page, "figure_view")
     scene.unfold("Export")
     with np.load(scene.download("NPZ", tmp_path)) as data:
@@ -61,28 +61,29 @@ def test_the_figure_shows_both_topologies_in_one_picture(
 
 
 def test_a_scene_is_one_tab_s_own(scene: ScenePage, browser: Browser, served) -> None:
-    scene.set("Frame", FRAME)
+    scene.go(FRAME)
     scene.set("stiffness 10^", -1)
-    scene.until(lambda: (scene.difference() or 0) > 0, "another rollout")
-    difference, address = scene.difference(), scene.page.url
+    difference, address = scene.new_difference("another rollout"), scene.page.url
 
     second = scene.page.context.new_page()
     second.goto(address)
     copied = ScenePage(second)
     copied.until(lambda: copied.difference() == difference, "the same rollout")
-    assert second.url.partition("?")[0] != address.partition("?")[0]
-    assert copied.value("Frame") == FRAME
+    original = address.partition("?")[0]
+    copied.until(lambda: second.url.partition("?")[0] != original, "an address of its own")
+    copied.until(lambda: copied.value("Frame") == copied.frame() == FRAME, "the same frame")
     copied.set("stiffness 10^", 0.5)
-    copied.until(lambda: copied.difference() not in {None, difference}, "a rollout of its own")
-    assert scene.difference() == difference
+    copied.new_difference("a rollout of its own", difference)
+    scene.until(lambda: scene.difference() == difference, "the first tab as it was")
 
     own = second.url.partition("?")[0]  # What follows is the state, which changes.
     second.reload()
     copied.until(lambda: copied.has("object springs"), "the scene again")
     assert second.url.partition("?")[0] == own
-    assert copied.value("stiffness 10^") == 0.5
+    copied.until(lambda: copied.value("stiffness 10^") == 0.5, "its stiffness")
 
     stranger = browser.new_context().new_page()
+    stranger.set_default_timeout(TIMEOUT_MS)
     stranger.goto(served.url)
     assert stranger.goto(address).status == 404
     expect(stranger.locator("main")).to_contain_text("belongs to another browser")

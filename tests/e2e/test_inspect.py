@@ -55,6 +55,40 @@ def yellow(image: np.ndarray) -> int:
     return int(((image[..., 0] > 120) & (image[..., 1] > 180) & (image[..., 2] < 100)).sum())
 
 
+def goes_to_a_frame_of_the_chart(scene: ScenePage) -> bool:
+    """Click into a chart over frames; tells whether the scene went there."""
+    chart = scene.panel.locator(".u-over").first
+    try:
+        chart.scroll_into_view_if_needed()
+        box = chart.bounding_box()
+        if box is None:
+            return False
+        scene.page.mouse.click(box["x"] + 0.75 * box["width"], box["y"] + 0.5 * box["height"])
+        scene.page.wait_for_timeout(500)
+    except PlaywrightError:
+        return False  # The readings were just written anew, and the chart with them.
+    return abs(scene.value("Frame") - 0.75 * 59) <= 1
+
+
+def blue_at_rest(scene: ScenePage) -> int:
+    """Count the blue pixels once the plain nodes are drawn and nothing changes any more."""
+    counts = [0, 0]
+
+    def is_at_rest() -> bool:
+        counts.append(blue(shot_of(scene)))
+        return counts[-1] == counts[-2] > 500
+
+    scene.until(is_at_rest, "the plain nodes are drawn")
+    return counts[-1]
+
+
+def press_and_see(scene: ScenePage, key: str, field: str) -> None:
+    """Press a key and wait until the server has changed what it shows."""
+    before = scene.link().get(field)
+    scene.page.keyboard.press(key)
+    scene.until(lambda: scene.link().get(field) != before, f"another '{field}' by {key}")
+
+
 def test_keys_colors_and_clicks_work_in_the_scene_and_around_it(scene, picture):
     page = scene.page
     # The page around has the focus; the keys reach the scene all the same.
@@ -65,38 +99,28 @@ def test_keys_colors_and_clicks_work_in_the_scene_and_around_it(scene, picture):
         page.keyboard.press("Shift+ArrowRight")
         scene.until(lambda count=count: scene.value("Frame") == count, f"frame {count}")
     for layer in "156":
-        page.keyboard.press(layer)
+        press_and_see(scene, layer, "show")
 
-    before = shot_of(scene)
+    before = blue_at_rest(scene)
     for _ in range(5):
-        page.keyboard.press("c")
+        press_and_see(scene, "c", "color")
     scene.until(lambda: scene.has("Speed"), "the legend")
-    scene.until(lambda: blue(shot_of(scene)) < 0.1 * blue(before), "other colors than plain blue")
+    scene.until(lambda: blue(shot_of(scene)) < 0.1 * before, "other colors than plain blue")
     scene.until(lambda: yellow(shot_of(scene)) > 50, "the fastest nodes are yellow")
 
     rollout = np.load(
         next(BUNDLED.glob("runs/towel_fold_quick/attempts/1/out/sequences/*/rollout.npy"))
     )
     page.mouse.click(*place_on_page(scene, rollout[FRAME, NODE].astype(np.float64)))
-    scene.until(lambda: scene.has("object node "), "the reading of a node")
-    named = int(scene.number("object node "))
+    scene.until(lambda: scene.number("velocity") is not None, "the reading of a node")
+    reading = scene.text()
+    named = int(scene.number("object node ", text=reading))
     shown = np.linalg.norm(rollout[FRAME, named] - rollout[FRAME, NODE])
     assert shown < 0.02  # It, or one in front of it.
     speed = 30 * np.linalg.norm(rollout[FRAME, named] - rollout[FRAME - 1, named])
-    assert scene.number("velocity") == pytest.approx(speed, rel=0.01)
+    assert scene.number("velocity", text=reading) == pytest.approx(speed, rel=0.01)
 
-    def goes_to_a_frame_of_the_chart() -> bool:
-        chart = scene.panel.locator(".u-over").first
-        try:
-            chart.scroll_into_view_if_needed()
-            box = chart.bounding_box()
-            page.mouse.click(box["x"] + 0.75 * box["width"], box["y"] + 0.5 * box["height"])
-            page.wait_for_timeout(500)
-        except PlaywrightError:
-            return False  # The readings were just written anew, and the chart with them.
-        return abs(scene.value("Frame") - 0.75 * 59) <= 1
-
-    scene.until(goes_to_a_frame_of_the_chart, "the frame in the chart")
+    scene.until(lambda: goes_to_a_frame_of_the_chart(scene), "the frame in the chart")
 
     picture(page, "inspect")
     page.keyboard.press("?")

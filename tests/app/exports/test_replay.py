@@ -1,6 +1,7 @@
 """The page of a replay and what it plays."""
 
 import time
+from typing import Any
 from urllib.parse import quote
 
 from server_world import World
@@ -18,11 +19,16 @@ def test_a_replay_is_made_in_the_background_and_played_without_a_session(
     page = browser.get("/runs/fitted/replay")
     assert page.status_code == 200
     assert f'data-replay="{REPLAY}"' in page.text
-    end = time.monotonic() + 20
-    while (told := browser.post(f"{REPLAY}?sequence=sheet").json())["state"] == "making":
-        assert time.monotonic() < end
-        time.sleep(0.05)
-    assert told["state"] == "ready"
+
+    def have_made(query: str) -> Any:
+        end = time.monotonic() + 150
+        while (told := browser.post(f"{REPLAY}?{query}").json())["state"] == "making":
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        assert told["state"] == "ready"
+        return told
+
+    told = have_made("sequence=sheet")
     file = browser.get(told["url"])
     assert len(file.content) == told["bytes"]
     assert Recording.read(file.content).seconds > 0.3
@@ -31,7 +37,7 @@ def test_a_replay_is_made_in_the_background_and_played_without_a_session(
     assert "playbackPath" not in client.text[:2000]
     assert "worker-src 'self' blob:" in client.headers["content-security-policy"]
     assert len(made) == 1
-    browser.post(f"{REPLAY}?theme=dark&sequence=sheet")
+    have_made("theme=dark&sequence=sheet")
     assert [order.query.get("theme") for order in made] == ["light", "dark"]
     assert world.sessions.list() == []
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy import ndarray
 from viewer_client import ViewerClient
-from viewer_world import FRAMES, PARAMETERS, content_of, controls, sheet
+from viewer_world import FRAMES, PARAMETERS, content_of, controls, hear_all, rest_at, sheet
 
 from app.viewer.figure import ARROWS, Figure, Side
 from app.viewer.figure_camera import Eye, picture_of_figure
@@ -35,21 +35,35 @@ def watch(sessions: Sessions) -> ViewerClient:
 
 def enter(client: ViewerClient) -> None:
     client.until(lambda: "object springs" in client.texts())
-    client.set("Frame", FRAME)
-    client.until(lambda: any(p.get("label") == "Play" for p in client.gui.values()))
+    rest_at(client, FRAME)
     client.set("Compare with PhysTwin", True)
     done = f"PhysTwin-style: simulated {FRAMES}/{FRAMES} frames"
     client.until(lambda: done in client.texts() and "/figure/phystwin/forces" in client.nodes)
     # The arrow scale is chosen anew when both rollouts are known.
     client.until(lambda: legend_force(client) > 0)
+    # The camera is moved before the figure is drawn, but in messages of its own.
+    client.until(lambda: client.camera["fov"] < 0.3 and client.camera["position"][0] != 1.0)
 
 
 def legend_force(client: ViewerClient) -> float:
-    return float(client.nodes["/figure/legend/text_3"]["text"].removeprefix("force, ")[:-2])
+    return float(text_of(client, "legend/text_3").removeprefix("force, ")[:-2] or 0)
+
+
+def text_of(client: ViewerClient, label: str) -> str:
+    return str(client.nodes.get(f"/figure/{label}", {}).get("text", ""))
+
+
+def place_of(client: ViewerClient, name: str) -> ndarray:
+    return np.array(client.positions.get(f"/figure/{name}", (np.nan,) * 3))
 
 
 def arrows(client: ViewerClient, name: str) -> ndarray:
-    return client.nodes[name]["points"].reshape(-1, 2, 3)
+    return client.nodes.get(name, {}).get("points", np.zeros(0)).reshape(-1, 2, 3)
+
+
+def lengths_of(client: ViewerClient, name: str) -> ndarray:
+    arrow = arrows(client, name)
+    return np.linalg.norm(arrow[:, 1] - arrow[:, 0], axis=1)
 
 
 def rolled_out(run: Run) -> Take:
@@ -90,36 +104,39 @@ def test_both_sides_are_shown_in_one_scale_and_the_scene_comes_back(sessions, ru
                 )
             )
         assert np.abs(rival.position[FRAME] - ours).max() > 1e-3
-        assert client.nodes["/figure/title_ours"]["text"] == "ours"
-        detail = client.nodes["/figure/detail_phystwin"]["text"]
-        assert detail == f"δ 40 mm · d_max 50 · {recount(run, 0.04, 50)} virtual springs"
-        detail = client.nodes["/figure/detail_ours"]["text"]
-        assert detail == f"δ 20 mm · d_max 3 · {recount(run, 0.02, 3)} virtual springs"
-        assert "both sides use them" in client.texts()
-        # One length means one force on both sides, and in the legend.
-        lengths, forces = [], []
-        for side, take in (("ours", session._content.fitted), ("phystwin", rival)):
-            arrow = arrows(client, f"/figure/{side}/forces")
-            strength = np.sort(np.linalg.norm(take.forces(FRAME), axis=1))[::-1]
-            lengths.append(np.linalg.norm(arrow[:, 1] - arrow[:, 0], axis=1))
-            forces.append(strength[: len(arrow)])
-            assert len(arrow) > 10
-        unit = np.concatenate(lengths) / np.concatenate(forces)
-        np.testing.assert_allclose(unit, unit[0], rtol=1e-3)
-        (scale,) = arrows(client, "/figure/legend/force")
-        length = float(np.linalg.norm(scale[1] - scale[0]))
-        assert length / legend_force(client) == pytest.approx(unit[0], rel=1e-3)
-        assert not client.visible["/object/nodes"]
-        assert client.camera["fov"] < 0.3
+        client.until(lambda: text_of(client, "title_ours") == "ours")
+        detail = f"δ 40 mm · d_max 50 · {recount(run, 0.04, 50)} virtual springs"
+        client.until(lambda: text_of(client, "detail_phystwin") == detail)
+        other = f"δ 20 mm · d_max 3 · {recount(run, 0.02, 3)} virtual springs"
+        client.until(lambda: text_of(client, "detail_ours") == other)
+        client.until(lambda: "both sides use them" in client.texts())
+        strengths = {
+            side: np.sort(np.linalg.norm(take.forces(FRAME), axis=1))[::-1]
+            for side, take in (("ours", session._content.fitted), ("phystwin", rival))
+        }
+
+        def is_to_scale() -> bool:
+            """Whether one length means one force on both sides, and in the legend."""
+            units = [lengths_of(client, "/figure/legend/force") / legend_force(client)]
+            for side, strength in strengths.items():
+                length = lengths_of(client, f"/figure/{side}/forces")
+                if len(length) <= 10:
+                    return False
+                units.append(length / strength[: len(length)])
+            unit = np.concatenate(units)
+            return len(units[0]) == 1 and np.allclose(unit, unit[0], rtol=1e-3, atol=0)
+
+        client.until(is_to_scale)
+        client.until(lambda: client.visible.get("/object/nodes") is False)
         client.tell_camera()
         client.set("Back to the scene", True)
         client.until(lambda: client.visible["/object/nodes"] and client.camera["fov"] > 0.5)
+        client.until(lambda: client.camera["look_at"] == pytest.approx([0, 0, 0]))
+        client.until(lambda: client.camera["position"] == pytest.approx([1, 1, 1]))
         hidden = [n for n in client.visible if n.startswith("/figure/") and client.visible[n]]
         implied = {"/figure/ours/object", "/figure/ours/springs", "/figure/ours/controls"}
         implied |= {name.replace("ours", "phystwin") for name in implied} | {"/figure/legend"}
         assert set(hidden) <= implied
-        assert client.camera["position"] == pytest.approx([1, 1, 1])
-        assert client.camera["look_at"] == pytest.approx([0, 0, 0])
         assert client.camera["fov"] == pytest.approx(0.8)
 
 
@@ -135,18 +152,18 @@ def test_the_halves_stay_left_and_right_as_the_camera_turns(sessions) -> None:
         enter(client)
         # The camera looks along z with the world's x to its right.
         client.tell_camera(wxyz=(1.0, 0.0, 0.0, 0.0))
-        client.until(lambda: abs(client.positions["/figure/phystwin"][1]) < 1e-9)
-        left, right = (np.array(client.positions[f"/figure/{side}"]) for side in SIDES)
-        assert right[0] > 0.05
-        np.testing.assert_allclose(left, -right, atol=1e-6)
-        np.testing.assert_allclose(right[1:], 0, atol=1e-6)
+        client.until(lambda: place_of(client, "phystwin")[0] > 0.05)
+        client.until(lambda: np.allclose(place_of(client, "phystwin")[1:], 0, atol=1e-6))
+        right = place_of(client, "phystwin")
+        client.until(lambda: np.allclose(place_of(client, "ours"), -right, atol=1e-6))
         client.tell_camera(wxyz=TURNED)
-        client.until(lambda: client.positions["/figure/phystwin"][1] > 0.05)
-        x, _, z = client.positions["/figure/phystwin"]
+        client.until(lambda: place_of(client, "phystwin")[1] > 0.05)
+        x, _, z = place_of(client, "phystwin")
         assert (x, z) == pytest.approx((0, 0), abs=1e-6)
-        high = np.array(client.positions["/figure/title_ours"])
-        low = np.array(client.positions["/figure/legend/text_0"])
-        assert (high - low) @ Eye.of(np.array(TURNED)).up > 0.05
+        up = Eye.of(np.array(TURNED)).up
+        client.until(
+            lambda: (place_of(client, "title_ours") - place_of(client, "legend/text_0")) @ up > 0.05
+        )
 
 
 def test_the_live_process_holds_the_object_in_phystwins_way(run) -> None:
@@ -226,14 +243,13 @@ def test_no_side_streams_more_than_300_arrows_or_too_many_bytes(server_client) -
     sides = {name: Side(take=take, frame=1, caption=name) for name in SIDES}
     layers = Layers(object_springs=True)
     figure.draw(sides, 1, layers, is_playing=True)
-    client.until(lambda: "/figure/phystwin/forces" in client.nodes)
+    hear_all(server, client)
     before = client.bytes_received
     figure.draw({k: replace(s, frame=2) for k, s in sides.items()}, 2, layers, is_playing=True)
-    client.until(lambda: len(arrows(client, "/figure/phystwin/forces")) > 0)
-    client.until(lambda: client.bytes_received - before > 60_000)
+    hear_all(server, client)
     for side in SIDES:
         assert 100 < len(arrows(client, f"/figure/{side}/forces")) <= ARROWS == 300
-    assert client.bytes_received - before < 100_000
+    assert 60_000 < client.bytes_received - before < 100_000
 
 
 def test_a_picture_is_centered_on_what_is_seen_beside_the_panel(server_client) -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from viewer_client import ViewerClient
-from viewer_world import PARAMETERS
+from viewer_world import PARAMETERS, hear_all, rest_at
 
 from app.keys import KEYS, LAYER_KEYS, Key
 from app.viewer.colormaps import table
@@ -14,14 +14,32 @@ FRAME = 12
 
 
 @pytest.fixture
-def paused(sessions):
+def paused(sessions, run):
     """A session of the sheet that rests at one frame, and its client."""
+    position = run.array("sequences/lift/rollout.npy")
     session = sessions.get(sessions.open("run", "sheet", "me"))
     with ViewerClient(f"ws://127.0.0.1:{session.port}") as client:
         client.until(lambda: "/object/nodes" in client.nodes)
-        client.set("Frame", FRAME)
+        rest_at(client, FRAME)
         client.until(lambda: session._playback.frame == FRAME and not session._playback.is_playing)
+        client.until(lambda: np.array_equal(shown(client), position[FRAME]))
         yield session, client
+
+
+def shown(client) -> np.ndarray:
+    """Where the nodes are drawn."""
+    return client.array("/object/nodes", "points")
+
+
+def color_count(client, name: str = "/object/nodes") -> int:
+    """How many colors a node of the scene has."""
+    return len(client.nodes.get(name, {}).get("colors", ())) // 3
+
+
+def history(client, kind: str) -> list[np.ndarray]:
+    """The curves of the plot of a quantity; none if there is none."""
+    plots = (p["data"] for p in client.gui.values() if kind in str(p.get("series")))
+    return list(next(plots, ()))
 
 
 def texts(client) -> str:
@@ -29,12 +47,25 @@ def texts(client) -> str:
 
 
 def press(client, hotkey: str, modifier: str | None = None) -> None:
-    commands = {
+    client.until(lambda: (hotkey, modifier) in commands(client))
+    client.send("CommandTriggerMessage", uuid=commands(client)[hotkey, modifier])
+
+
+def commands(client) -> dict[tuple[str, str | None], str]:
+    """The ids of the commands that are heard, by their keys."""
+    return {
         (m["props"]["hotkey"], m["props"]["modifier"]): m["uuid"]
         for m in client.messages
         if m["type"] == "RegisterCommandMessage"
     }
-    client.send("CommandTriggerMessage", uuid=commands[hotkey, modifier])
+
+
+def show_only_nodes(session, client) -> None:
+    """Hide what holds the sheet, so that only nodes can be hit from above."""
+    layers = session._stage.scene.layers
+    press(client, "6"), press(client, "5")
+    client.until(lambda: not (layers.controls or layers.virtual_springs))
+    client.until(lambda: client.visible.get("/springs/virtual") is False)
 
 
 def click(client, target, *, shift: bool = False) -> None:
@@ -51,23 +82,28 @@ def click(client, target, *, shift: bool = False) -> None:
 
 def test_colors_follow_the_choice_and_the_legend_says_what_they_mean(paused, run) -> None:
     _, client = paused
-    plain = client.nodes["/object/nodes"]["colors"]
-    assert len(plain) == 3
+    client.until(lambda: color_count(client) == 1)
     client.set("Color by", "speed")
-    client.until(lambda: len(client.nodes["/object/nodes"]["colors"]) == 3 * 81)
+    client.until(lambda: color_count(client) == 81)
     client.until(lambda: "<b>Speed</b><span>m/s</span>" in texts(client))
     position = run.array("sequences/lift/rollout.npy")
     speed = 30.0 * np.linalg.norm(position[FRAME] - position[FRAME - 1], axis=1)
+    ramp = table("sequential").astype(int)
+
+    def is_painted() -> bool:
+        """Whether the range, which is told after the colors, is that of the colors."""
+        color, high = client.array("/object/nodes", "colors"), client.value("Range")[1]
+        step = np.array([np.abs(ramp - c).sum(axis=1).argmin() for c in color.astype(int)])
+        return np.allclose(step / 255, np.clip(speed / high, 0, 1), rtol=0, atol=0.01)
+
+    client.until(is_painted)
     low, high = client.value("Range")
     assert low == 0
     assert 0.5 * speed.max() < high < 5 * speed.max()
     color = client.array("/object/nodes", "colors")
-    ramp = table("sequential").astype(int)
-    step = np.array([np.abs(ramp - c).sum(axis=1).argmin() for c in color.astype(int)])
-    np.testing.assert_allclose(step / 255, np.clip(speed / high, 0, 1), atol=0.01)
     # The springs have the colors of both ends, and the plain ones are hidden.
-    assert client.visible["/springs/object"] is False
-    assert len(client.nodes["/springs/object_painted"]["colors"]) > 3
+    client.until(lambda: client.visible.get("/springs/object") is False)
+    client.until(lambda: color_count(client, "/springs/object_painted") > 1)
 
     client.set("Range", (0.0, 2.0 * high))
     client.until(lambda: client.value("Hold range") is True)
@@ -75,22 +111,30 @@ def test_colors_follow_the_choice_and_the_legend_says_what_they_mean(paused, run
     client.set("Hold range", False)
     client.until(lambda: client.array("/object/nodes", "colors").tolist() == color.tolist())
     client.set("Color by", "plain")
-    client.until(lambda: len(client.nodes["/object/nodes"]["colors"]) == 3)
+    client.until(lambda: color_count(client) == 1)
 
 
-def test_colors_are_sent_only_when_they_change(paused) -> None:
+def test_colors_are_sent_only_when_they_change(paused, run) -> None:
     session, client = paused
+    position = run.array("sequences/lift/rollout.npy")
     client.set("Color by", "stiffness")
-    client.until(lambda: len(client.nodes["/object/nodes"]["colors"]) == 3 * 81)
+    client.until(lambda: color_count(client) == 81)
+
+    def hear_out() -> None:
+        with session._lock:  # Until a frame that is being drawn is drawn to its end.
+            server = session._server
+        hear_all(server, client)
 
     def sent(field: str) -> int:
         return sum(
             m["type"] == "SceneNodeUpdateMessage" and field in m["updates"] for m in client.messages
         )
 
-    before, moved = sent("colors"), sent("points")
+    hear_out()
+    before = sent("colors")
     session._playback.seek(FRAME + 3)
-    client.until(lambda: sent("points") > moved)
+    client.until(lambda: np.array_equal(shown(client), position[FRAME + 3]))
+    hear_out()
     assert sent("colors") == before
     client.set("Color by", "speed")
     client.until(lambda: sent("colors") > before)
@@ -109,7 +153,8 @@ def test_a_surface_is_drawn_plain_and_in_colors(paused) -> None:
             n for n in client.nodes if "surface/step" in n and client.visible.get(n) is not False
         ]
 
-    client.until(lambda: client.visible["/object/surface/plain"] is False and len(parts()) > 1)
+    client.until(lambda: client.visible.get("/object/surface/plain") is False)
+    client.until(lambda: len(parts()) > 1)
     client.until(lambda: sum(len(client.array(n, "faces")) for n in parts()) == 128)
     assert all(client.nodes[name]["flat_shading"] for name in parts())
     press(client, "3")
@@ -117,14 +162,12 @@ def test_a_surface_is_drawn_plain_and_in_colors(paused) -> None:
 
 
 def test_a_click_reads_a_node_and_its_history_until_escape(paused, run) -> None:
-    _, client = paused
+    session, client = paused
     position = run.array("sequences/lift/rollout.npy")
-    # Only nodes can be hit from above: what holds the sheet is hidden.
-    press(client, "6"), press(client, "5")
-    client.until(lambda: client.visible.get("/springs/virtual") is False)
+    show_only_nodes(session, client)
     click(client, position[FRAME][40])
     client.until(lambda: "object node 40" in texts(client))
-    client.until(lambda: "/picked/point" in client.nodes)
+    client.until(lambda: {"/picked/point", "/picked/name"} <= set(client.nodes))
     np.testing.assert_allclose(client.array("/picked/point", "points")[0], position[FRAME][40])
     assert tuple(client.nodes["/picked/point"]["colors"]) == MARK
     assert client.nodes["/picked/name"]["text"] == "object node 40"
@@ -132,22 +175,21 @@ def test_a_click_reads_a_node_and_its_history_until_escape(paused, run) -> None:
     for name in ("position", "velocity", "stiffness", "damping", "strain", "held by"):
         assert name in said
     client.set("History of", "height")
-    client.until(lambda: any("height" in str(p.get("series")) for p in client.gui.values()))
-    plot = next(p for p in client.gui.values() if "height" in str(p.get("series")))
-    np.testing.assert_allclose(plot["data"][1], 1e3 * position[:, 40, 2], rtol=1e-6)
+    client.until(lambda: history(client, "height"))
+    _, height, now = history(client, "height")
+    np.testing.assert_allclose(height, 1e3 * position[:, 40, 2], rtol=1e-6)
     # The frame on the screen is marked.
-    assert int(np.argmax(plot["data"][2])) == FRAME
+    assert int(np.argmax(now)) == FRAME
 
     press(client, "escape")
     client.until(lambda: "object node 40" not in texts(client))
-    assert not any("height" in str(p.get("series")) for p in client.gui.values())
+    client.until(lambda: not history(client, "height"))
 
 
 def test_a_click_beside_everything_keeps_what_was_read(paused, run) -> None:
     session, client = paused
     position = run.array("sequences/lift/rollout.npy")
-    press(client, "6"), press(client, "5")
-    client.until(lambda: client.visible.get("/springs/virtual") is False)
+    show_only_nodes(session, client)
     click(client, position[FRAME][40])
     client.until(lambda: "object node 40" in texts(client))
     click(client, (9.0, 9.0, 0.0))
@@ -169,11 +211,11 @@ def test_keys_move_the_clock_switch_layers_and_turn_colors_over(paused) -> None:
     client.until(lambda: session._playback.is_playing)
     press(client, "L")
     client.until(lambda: client.value("Speed") == pytest.approx(1.0))
-    press(client, "K")
-    client.until(lambda: not session._playback.is_playing)
+    # Again and again: the clock is started last of all that the key before does.
+    client.until(lambda: press(client, "K") or not session._playback.is_playing)
     layers = session._stage.scene.layers
     press(client, "2")
-    client.until(lambda: not layers.nodes and client.visible["/object/nodes"] is False)
+    client.until(lambda: not layers.nodes and client.visible.get("/object/nodes") is False)
     # The run has no hand: its key does nothing.
     press(client, "1")
     press(client, "C")
@@ -200,8 +242,10 @@ def test_a_re_simulated_rollout_has_the_same_colors(paused) -> None:
     take, at = session._object.at(FRAME)
     assert take.parameters.drag != PARAMETERS.drag
     distance = 1e3 * take.frame_distance(session._content.fitted, at)
-    assert 0 < distance < client.value("Range")[1] * 2
-    assert len(client.nodes["/object/nodes"]["colors"]) == 3 * 81
+    assert distance > 0
+    # The range grows while the rollout is simulated.
+    client.until(lambda: distance < client.value("Range")[1] * 2)
+    client.until(lambda: color_count(client) == 81)
 
 
 def test_every_hot_key_is_bound_once_and_listed(paused) -> None:

@@ -1,10 +1,27 @@
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 
+import numpy as np
 import pytest
 
 from app.viewer.playback import Playback
+
+PATIENCE = 60.0
+"""How long to wait for what should happen soon [s]."""
+
+
+class Time:
+    """A clock that goes on only while somebody waits, who is woken a little late."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def wait(self, seconds: float) -> None:
+        self.now += seconds + 0.001
 
 
 class Screen:
@@ -15,18 +32,19 @@ class Screen:
         self.drawn.append((frame, is_playing))
 
     def wait_for(self, frame: int) -> None:
-        end = time.monotonic() + 5
-        while time.monotonic() < end:
-            if any(drawn == frame for drawn, _ in self.drawn):
-                return
-            time.sleep(0.005)
-        raise AssertionError(f"frame {frame} was not drawn: {self.drawn}")
+        self.until(lambda: any(drawn == frame for drawn, _ in self.drawn))
 
-    def wait_beyond(self, frame: int, seconds: float = 5.0) -> float:
+    def until(self, condition: Callable[[], bool]) -> None:
+        end = time.monotonic() + PATIENCE
+        while not condition():
+            assert time.monotonic() < end, f"it did not come true: {self.drawn}"
+            time.sleep(0.005)
+
+    def wait_beyond(self, frame: int) -> float:
         """Wait for a later frame; returns how long that took."""
         start = time.monotonic()
         while all(drawn <= frame for drawn, _ in self.drawn):
-            assert time.monotonic() < start + seconds, self.drawn
+            assert time.monotonic() < start + PATIENCE, self.drawn
             time.sleep(0.002)
         return time.monotonic() - start
 
@@ -52,14 +70,7 @@ def test_it_draws_the_first_frame_and_then_rests(playback: Playback, screen: Scr
 
 def test_it_plays_around_and_around(playback: Playback, screen: Screen) -> None:
     playback.play()
-    end = time.monotonic() + 5
-    while time.monotonic() < end:
-        frames = [frame for frame, _ in screen.drawn]
-        if any(after < before for before, after in pairwise(frames)):
-            break
-        time.sleep(0.02)
-    else:
-        raise AssertionError(f"it never started over: {frames}")
+    screen.until(lambda: any(after < before for (before, _), (after, _) in pairwise(screen.drawn)))
     assert playback.is_playing
 
 
@@ -68,12 +79,13 @@ def test_without_loop_it_stops_at_the_end_and_starts_over(
 ) -> None:
     playback.set_loop(on=False)
     playback.play()
-    screen.wait_for(9)
+    screen.until(lambda: (9, False) in screen.drawn)
     time.sleep(0.1)
     assert (playback.frame, playback.is_playing) == (9, False)
     assert screen.drawn[-1] == (9, False)
+    playback.set_speed(1e-4)  # So slow that it is still at the beginning when it is asked.
     playback.play()
-    assert playback.frame < 9
+    assert (playback.frame, playback.is_playing) == (0, True)
 
 
 def test_the_running_clock_waits_for_frames_that_are_being_computed(
@@ -90,15 +102,16 @@ def test_the_running_clock_waits_for_frames_that_are_being_computed(
 
 def test_a_frame_that_was_waited_for_is_drawn_at_once() -> None:
     screen = Screen()
-    playback = Playback(10, 2.0, screen)  # A frame lasts half a second.
+    playback = Playback(10, 100.0, screen)
     playback.limit(2)
     playback.start()
     playback.play()
-    screen.wait_for(1)
+    screen.until(playback._is_starved)
+    playback.set_speed(5e-4)  # From here on a frame lasts 20 seconds.
     time.sleep(0.7)
     assert screen.drawn[-1][0] == 1
     playback.limit(3)
-    assert screen.wait_beyond(1) < 0.25
+    assert screen.wait_beyond(1) < 10.0
     playback.close()
 
 
@@ -110,28 +123,34 @@ def test_frames_that_become_ready_later_are_not_drawn_before(screen: Screen) -> 
         playback.limit(ready)
         time.sleep(0.001)
     playback.close()
-    assert 1 <= len(screen.drawn) < 10
+    # Once as it starts, perhaps once more as it begins to play, and then each frame once.
+    assert 1 <= len(screen.drawn) <= len({frame for frame, _ in screen.drawn}) + 2
 
 
-def test_no_frame_is_left_out_while_drawing_takes_time() -> None:
-    screen = Screen()
+def play_in(time_: Time, playback: Playback, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Play until it is closed, in a time that goes on only while the clock waits or draws."""
+    monkeypatch.setattr("app.viewer.playback.time", time_)
+    monkeypatch.setattr(playback._condition, "wait", time_.wait)
+    playback.play()
+    playback.start()
+    playback._thread.join(timeout=PATIENCE)
+    assert not playback._thread.is_alive()
 
-    def draw(frame: int, is_playing: bool) -> None:
-        screen(frame, is_playing)
-        time.sleep(0.012)
+
+def test_no_frame_is_left_out_while_drawing_takes_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    time_, frames = Time(), list[int]()
+
+    def draw(frame: int, _: bool) -> None:
+        frames.append(frame)
+        time_.now += 0.012
+        if frame >= 50:
+            playback.close()
 
     playback = Playback(1000, 25.0, draw)
-    playback.start()
-    playback.play()
-    time.sleep(2.0)
-    playback.close()
-    frames = [frame for frame, is_playing in screen.drawn if is_playing]
-    assert frames[-1] == pytest.approx(50, abs=6)
-    steps = [after - before for before, after in pairwise(frames)]
-    # A busy machine may be late by a whole frame now and then; a clock that waits for 40 ms after
-    # each drawing leaves out a dozen.
-    assert sum(step > 1 for step in steps) <= 5
-    assert steps.count(1) > 35
+    play_in(time_, playback, monkeypatch)
+    # A clock that waits for 40 ms after each drawing leaves out a dozen.
+    assert frames == list(range(51))
+    assert time_.now == pytest.approx(2.0, abs=0.05)
 
 
 def test_steps_wrap_and_stop_the_clock(playback: Playback, screen: Screen) -> None:
@@ -144,25 +163,19 @@ def test_steps_wrap_and_stop_the_clock(playback: Playback, screen: Screen) -> No
     assert playback.frame == 9
 
 
-def test_speed_scales_time() -> None:
-    drawn: list[tuple[int, float]] = []
+def test_speed_scales_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    time_, drawn = Time(), list[tuple[int, float]]()
 
-    def draw(frame: int, is_playing: bool) -> None:
-        if is_playing:
-            drawn.append((frame, time.monotonic()))
+    def draw(frame: int, _: bool) -> None:
+        drawn.append((frame, time_.now))
+        if frame >= 20:
+            playback.close()
 
     playback = Playback(1000, 10.0, draw)
     playback.set_speed(2.0)
-    playback.start()
-    playback.play()
-    end = time.monotonic() + 20
-    while (not drawn or drawn[-1][0] < 20) and time.monotonic() < end:
-        time.sleep(0.02)
-    playback.close()
-    # Drawing may begin late on a busy machine; between two drawings the clock has gone as time has.
-    (first, begin), (last, finish) = drawn[0], drawn[-1]
-    assert last - first == pytest.approx(20.0 * (finish - begin), abs=3)
-    assert last >= 20
+    play_in(time_, playback, monkeypatch)
+    assert [frame for frame, _ in drawn] == list(range(21))
+    assert [at for _, at in drawn] == pytest.approx(np.arange(21) / 20.0, abs=0.002)
 
 
 def test_an_error_while_drawing_does_not_stop_the_clock(caplog) -> None:
@@ -176,9 +189,9 @@ def test_an_error_while_drawing_does_not_stop_the_clock(caplog) -> None:
     playback = Playback(3, 30.0, draw)
     playback.start()
     playback.seek(1)
-    time.sleep(0.2)
+    Screen().until(lambda: 1 in frames)
     playback.seek(2)
-    time.sleep(0.2)
+    Screen().until(lambda: 2 in frames)
     playback.close()
     assert frames[-1] == 2
     assert "no such picture" in caplog.text

@@ -2,7 +2,6 @@
 
 import json
 import struct
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -120,7 +119,10 @@ def test_previews_are_seldom_and_together_take_a_small_share_of_the_time(
     assert due()
 
 
-def test_a_run_takes_previews_and_nobody_else_wants_any(tmp_path: Path) -> None:
+def test_a_run_takes_previews_and_nobody_else_wants_any(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(preview_module, "INTERVAL_S", 1e6)  # However long this test takes.
     assert not NullProgress().wants_preview()
     run = make_run(tmp_path / "run")
     with pytest.raises(RunError, match="cannot be read"):
@@ -128,9 +130,7 @@ def test_a_run_takes_previews_and_nobody_else_wants_any(tmp_path: Path) -> None:
     with run.begin_attempt() as attempt:
         progress = attempt.progress()
         assert progress.wants_preview()
-        begin = time.perf_counter()
         progress.preview(make)
-        assert time.perf_counter() - begin < 0.5
         assert not progress.wants_preview()
         attempt.publish()
     assert read_preview(run.folder)[0]["number"] == 1

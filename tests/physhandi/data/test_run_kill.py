@@ -6,6 +6,7 @@ import os
 import signal
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -16,9 +17,11 @@ from physhandi.data.run import Run, read_events
 from physhandi.data.run_files import attempt_numbers
 
 KILLS = 30
+MOST_WRITTEN = 40
+"""Files that are written between start and kill, at most."""
 
 
-def write_for_ever(folder: Path) -> None:
+def write_for_ever(folder: Path, written: Any) -> None:
     run = Run.open(folder)
     attempt = run.begin_attempt()
     progress = attempt.progress()
@@ -26,13 +29,17 @@ def write_for_ever(folder: Path) -> None:
     number = 0 if known is None else int(known["x"][0])
     while True:
         number += 1
-        attempt.save_array("array.npy", np.full(50_000, number))
-        attempt.save_tensors("tensors.safetensors", {"x": np.full(20_000, number)})
-        attempt.save_json("data.json", [number] * 2000)
-        attempt.save_yaml("data.yaml", {"number": number})
-        attempt.checkpoint("state", {"x": np.full(20_000, number)})
-        progress.report("write", number, 10**9, float(number))
-        attempt.finish_stage(f"stage{number % 3}", {"number": number})
+        for write in (
+            lambda n: attempt.save_array("array.npy", np.full(50_000, n)),
+            lambda n: attempt.save_tensors("tensors.safetensors", {"x": np.full(20_000, n)}),
+            lambda n: attempt.save_json("data.json", [n] * 2000),
+            lambda n: attempt.save_yaml("data.yaml", {"number": n}),
+            lambda n: attempt.checkpoint("state", {"x": np.full(20_000, n)}),
+            lambda n: progress.report("write", n, 10**9, float(n)),
+            lambda n: attempt.finish_stage(f"stage{n % 3}", {"number": n}),
+        ):
+            write(number)
+            written.value += 1
 
 
 def holder_of(folder: Path) -> int | None:
@@ -76,12 +83,14 @@ def test_kills_in_the_middle_of_writing(tmp_path: Path) -> None:
     chance = np.random.default_rng(7)
     files, leftovers, states, furthest = 0, 0, set(), 0
     for _ in range(KILLS):
-        child = context.Process(target=write_for_ever, args=(run.folder,))
+        # Not after so much time, in which a busy machine gets nothing written.
+        written = context.Value("i", 0, lock=False)
+        enough = chance.integers(0, MOST_WRITTEN)
+        child = context.Process(target=write_for_ever, args=(run.folder, written))
         child.start()
-        deadline = time.monotonic() + 20
-        while holder_of(run.folder) != child.pid and time.monotonic() < deadline:
-            time.sleep(0.001)
-        time.sleep(chance.uniform(0.0, 0.12))
+        while holder_of(run.folder) != child.pid or written.value < enough:
+            assert child.is_alive()
+            time.sleep(0.0002)
         os.kill(child.pid or 0, signal.SIGKILL)
         child.join()
         files += check_whole(run)

@@ -57,7 +57,7 @@ def meet_two(waited=(0, 0), stop=NO_STOP, late=(0, 0)):
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join(timeout=60)
+        thread.join(timeout=150)
         assert not thread.is_alive()
     return met.numpy().tolist()
 
