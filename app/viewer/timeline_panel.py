@@ -106,19 +106,22 @@ class TimelinePanel:
         # At once, in viser's own thread, so that the running clock has no time to interfere.
         frame = event.target.value
         if event.client is not None:
+            was_playing = self._playback.is_playing
             self._playback.play(on=False)
             self._playback.seek(frame)
             if self._settling is not None:
                 self._settling.cancel()
-            self._settling = self._loop_of_events.call_later(_SETTLED, self._settle)
+            if was_playing or self._settling is not None:
+                self._settling = self._loop_of_events.call_later(_SETTLED, self._settle)
 
     def _settle(self) -> None:
-        """Tell the slider of a scrub where it stands.
+        """Tell the slider where it stands after a scrub that stopped the clock.
 
         A frame of the running clock may have met the user's choice on its way, and moved the slider
         away from it after it was sent. Viser sends no value that it believes to be there already:
         another one comes first, which it does not send in the end.
         """
+        self._settling = None
         frame = self._playback.frame
         self._frame.value = frame - 1 if frame > 0 else 1
         self._frame.value = frame
