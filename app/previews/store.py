@@ -16,7 +16,7 @@ from typing import Literal
 
 from app.jobs.catalog import Catalog, NotFoundError, RunItem
 from app.jobs.processes import child_environment
-from app.previews.worker import MOVING, NONE, STILL
+from app.previews.worker import MOVING, NONE, SECONDS_EACH, STILL
 from app.settings import PACKAGE_ROOT, Settings
 from physhandi.data.atomic import write_bytes
 from physhandi.data.run_files import CURRENT
@@ -28,7 +28,8 @@ Kind = Literal["run", "sequence"]
 _VERSION = 1
 _BATCH = 8
 _ENDED_FROM_OUTSIDE = (-signal.SIGTERM, -signal.SIGINT)
-_SECONDS_EACH = 60.0
+_PATIENCE = 10.0
+"""How many times as long as its processor time a preview may take by the clock."""
 _MOST_WAITING = 400
 _MOST_FILES = 4_000
 _PAUSE_S = 1.0
@@ -193,7 +194,7 @@ class Previews:
             )
         try:
             self._child.communicate(
-                json.dumps(orders).encode(), timeout=_SECONDS_EACH * len(orders)
+                json.dumps(orders).encode(), timeout=_PATIENCE * SECONDS_EACH * len(orders)
             )
         except subprocess.TimeoutExpired:
             self._child.kill()

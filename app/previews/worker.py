@@ -2,8 +2,11 @@
 
 import json
 import logging
+import math
 import os
+import resource
 import sys
+import time
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -16,6 +19,9 @@ from physhandi.errors import describe
 
 STILL, MOVING, NONE = ".still.webp", ".moving.webp", ".none"
 """Endings of the two pictures, and of the note that says why there are none."""
+SECONDS_EACH = 60
+"""Processor time that one preview may take [s]; by the clock it may be many times as much, as
+everything else goes first."""
 _POLITENESS = 10
 
 
@@ -53,6 +59,8 @@ def main() -> None:
     cv2.setNumThreads(1)
     logging.getLogger("physhandi").setLevel(logging.ERROR)
     orders: list[dict[str, str]] = json.loads(sys.stdin.read())
+    most = math.ceil(time.process_time() + SECONDS_EACH * len(orders))
+    resource.setrlimit(resource.RLIMIT_CPU, (most, most))
     # A list is told apart by its still pictures, so all of those come first.
     for is_still in (True, False):
         for order in orders:

@@ -5,6 +5,7 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -23,7 +24,7 @@ from app.previews.camera import fitting_camera
 from app.previews.clip import clip_of_run, clip_of_sequence
 from app.previews.draw import HEIGHT, WIDTH, Motion, draw_motion
 from app.previews.store import Previews
-from app.settings import BUNDLED
+from app.settings import BUNDLED, PACKAGE_ROOT
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence import Sequence
 
@@ -190,6 +191,30 @@ def test_what_ends_its_process_is_noted_and_the_others_are_drawn(
         previews.shutdown()
     assert drawn == ["sheet"]
     assert previews.look("sequence", "sheet").state == "none"
+
+
+def test_what_computes_for_too_long_is_ended_and_what_waits_is_not() -> None:
+    code = (
+        "import app.previews.worker as worker, os, time\n"
+        "worker.SECONDS_EACH = 1\n"
+        "def draw(order, *, is_still):\n"
+        "    while order['kind'] == 'endless': pass\n"
+        "    time.sleep(2.0)\n"
+        "worker.draw = draw\n"
+        "worker.main()\n"
+    )
+
+    def end(kind: str) -> int:
+        return subprocess.run(
+            [sys.executable, "-c", code, str(os.getpid())],
+            input=json.dumps([{"kind": kind}]).encode(),
+            cwd=PACKAGE_ROOT,
+            timeout=150,
+            check=False,
+        ).returncode
+
+    assert end("sequence") == 0
+    assert end("endless") in {-signal.SIGKILL, -signal.SIGXCPU}
 
 
 def test_a_folder_that_is_deleted_while_pictures_are_drawn_ends_nothing(

@@ -83,7 +83,8 @@ def test_a_picture_appears_when_it_is_made_and_moves_while_it_is_pointed_at(
     card = home.locator("article[data-sequence=towel_fold]")
     moving = card.locator("img.moving")
     expect(card.locator("img.still")).to_be_visible()
-    expect(moving).to_have_count(1)
+    # Pictures are drawn when nothing else has to be done, which may be late.
+    expect(moving).to_have_count(1, timeout=5 * TIMEOUT_MS)
     expect(moving).to_be_hidden()
     card.hover()
     expect(moving).to_be_visible()
