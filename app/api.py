@@ -141,9 +141,11 @@ def _add_listings(router: APIRouter, catalog: Catalog, scheduler: Scheduler) -> 
     @router.get("/runs/{run_id}")
     def show_run(run_id: Id) -> dict[str, Any]:
         item = catalog.run_item(run_id)
+        # The state first: of a run that is called finished, all results are there.
+        followed = follow_run(item, scheduler)
         results = describe_results(item.run) if item.run else {}
         order = describe_order(item.run) if item.run else {}
-        return follow_run(item, scheduler) | order | {"results": results}
+        return followed | order | {"results": results}
 
     @router.get("/runs/{run_id}/losses")
     def show_losses(run_id: Id) -> dict[str, Any]:

@@ -8,6 +8,10 @@ from typing import Any
 import pytest
 from queue_world import HOSTILE, QueueWorld, queue_world
 
+from app import api
+from app.jobs.catalog import RunItem
+from app.jobs.scheduler import Scheduler
+
 
 @pytest.fixture
 def world(data_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[QueueWorld]:
@@ -41,6 +45,29 @@ def test_a_fit_is_launched_followed_shown_and_deleted(world: QueueWorld) -> None
     assert world.client.delete(f"/api/v1/runs/{run_id}").status_code == 204
     assert world.client.get(f"/api/v1/runs/{run_id}").status_code == 404
     assert "No runs yet" in world.client.get("/").text
+
+
+def test_a_run_that_is_called_finished_has_its_results(
+    world: QueueWorld, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_id = world.launch("script")
+    world.tell(run_id, ["report", "first", 1, 1, 2.0])
+    world.until_reported(run_id, "first")
+    follow = api.follow_run
+
+    def follow_late(item: RunItem, scheduler: Scheduler) -> dict[str, Any]:
+        """Look at a run's state when it has just ended."""
+        world.tell(run_id, ["finish", "first", {"before": 2.0, "after": 1.0}], ["publish"])
+        end = time.monotonic() + 120.0
+        while (told := follow(item, scheduler))["state"] != "succeeded":
+            assert time.monotonic() < end, told
+            time.sleep(0.03)
+        return told
+
+    monkeypatch.setattr(api, "follow_run", follow_late)
+    run = world.client.get(f"/api/v1/runs/{run_id}").json()
+    assert run["state"] == "succeeded"
+    assert run["results"]["losses"]["first"]["after"] == 1.0
 
 
 def test_a_fit_is_cancelled_and_resumed(world: QueueWorld) -> None:
