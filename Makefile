@@ -10,7 +10,7 @@ DATA ?= data
 # Without an NVIDIA GPU install torch's CPU build first (README, "Installing torch"); this variable is passed to pip.
 TORCH ?= torch==2.13.0
 
-.PHONY: install demo test check fmt bench test-gpu pictures browser clean
+.PHONY: install demo test races check fmt bench test-gpu pictures browser clean
 
 install: $(STAMP)
 
@@ -38,6 +38,10 @@ test: install browser
 	rm -f .coverage .coverage.*
 	$(BIN)/python -m pytest -n 2 --dist loadfile --cov --cov-report=term --reruns $(RERUNS) --max-suite-reruns 3 \
 	  --rerun-show-tracebacks --rerun-exclude-path tests/physhandi --rerun-exclude-path tests/bad_input
+
+# Live scenes, jobs and pages while their threads are held up at random.
+races: install
+	PYTHONPATH=tests $(BIN)/python -m pytest -n 2 --dist loadfile -p random_pauses tests/app
 
 # The README's pictures, made by the browser tests.
 pictures: install browser

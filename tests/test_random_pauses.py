@@ -1,0 +1,26 @@
+import shlex
+import sys
+
+from random_pauses import Pauses
+
+from app.viewer.compare_look import scale_end
+
+
+def test_only_functions_of_the_application_are_held_up() -> None:
+    pauses: list[float] = []
+    before = sys.getprofile()
+    sys.setprofile(Pauses(1.0, 0.25, pauses.append))
+    try:
+        shlex.split("a b")
+        elsewhere = len(pauses)
+        end = scale_end(0.055)
+    finally:
+        sys.setprofile(before)
+    assert elsewhere == 0
+    assert len(pauses) >= 2
+    assert all(0.0 <= pause < 0.25 for pause in pauses)
+    assert end == 0.1
+    never = Pauses(0.0, 0.25, pauses.append)
+    count = len(pauses)
+    never(sys._getframe(), "call", None)
+    assert len(pauses) == count
