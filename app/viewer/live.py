@@ -190,12 +190,15 @@ class LiveSimulation:
     def _send(self, message: Message) -> None:
         """Write a message; a broken connection is the supervisor's business."""
         with self._write_lock:
-            connection = self._connection
-            if connection is not None:
-                try:
-                    send(connection, message)
-                except OSError:
-                    logger.info("the live simulation process is gone; message not sent")
+            self._write(message)
+
+    def _write(self, message: Message) -> None:
+        connection = self._connection
+        if connection is not None:
+            try:
+                send(connection, message)
+            except OSError:
+                logger.info("the live simulation process is gone; message not sent")
 
     def _supervise(self) -> None:
         # The kernel's death signal is tied to the thread that started the process, so the
@@ -226,16 +229,13 @@ class LiveSimulation:
         return ours
 
     def _resend(self) -> None:
-        with self._lock:
-            early, self._early = self._early, {}
-            early |= {session: message for session, (message, _) in self._pending.items()}
-        for session, message in early.items():
-            self._send(message)
+        # Nobody else writes meanwhile: what is newer, or changes the pace, must come after it.
+        with self._write_lock:
             with self._lock:
-                is_held = session in self._held
-            if message.fields.get("is_held", is_held) != is_held:
-                # It was let go, or held, while the message was on its way.
-                self._send(Message(PAUSE if is_held else RESUME, {"session": session}))
+                early, self._early = self._early, {}
+                early |= {session: message for session, (message, _) in self._pending.items()}
+            for message in early.values():
+                self._write(message)
 
     def _deliver(self, message: Message) -> None:
         if message.kind == "ready":

@@ -281,15 +281,21 @@ def test_a_simulation_that_is_let_go_while_it_is_sent_again_goes_on(
     monkeypatch.setattr(live, "start", lambda: None)
     live.hold("a", on=True)
     live.request("a", LiveRequest(run=tmp_path, sequence="lift", parameters=PARAMETERS))
-    arrived: list[str] = []
+    arrived: list[Message] = []
 
-    def send(message: Message) -> None:
-        if message.kind == "simulate":
-            live.hold("a", on=False)  # Overtakes it.
-        arrived.append(message.kind)
+    threads: list[threading.Thread] = []
 
-    monkeypatch.setattr(live, "_send", send)
+    def write(message: Message) -> None:
+        if message.kind == "simulate" and not threads:
+            threads.append(beside(lambda: live.hold("a", on=False)))
+            threads[0].join(SHORT)  # It would overtake the message if it could.
+        arrived.append(message)
+
+    monkeypatch.setattr(live, "_write", write)
     live._resend()
-    assert arrived == ["resume", "simulate", "resume"]
+    threads[0].join(PATIENCE)
+    assert [message.kind for message in arrived] == ["simulate", "resume"]
+    assert arrived[0]["is_held"]
     live._resend()
-    assert arrived[3:] == ["resume", "simulate"]
+    assert [message.kind for message in arrived[2:]] == ["simulate"]
+    assert not arrived[2]["is_held"]
