@@ -6,6 +6,7 @@ SciPy, chumpy or torch is ever given to it, since their own ways to be rebuilt t
 """
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any, cast
 
@@ -19,7 +20,7 @@ _PLAIN_KINDS = "biufcSU"
 _BYTE_ORDERS = {"<", ">", "|", "="}
 
 
-class Inert:
+class Inert(ABC):
     """Something a pickle rebuilt; only `resolve` gives its value."""
 
     __slots__ = ("_arguments", "_state", "_value")
@@ -46,8 +47,9 @@ class Inert:
             self._value = self._build()
         return self._value
 
+    @abstractmethod
     def _build(self) -> Any:
-        raise NotImplementedError
+        """Rebuild the value from what the pickle passed."""
 
     def _fields(self, what: str) -> dict[Any, Any]:
         state = self._state
