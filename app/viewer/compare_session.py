@@ -190,9 +190,7 @@ class CompareSession(SceneServer):
         if not self._has_played:
             self._has_played = True
             self._playback.play()
-        # Before the camera is aimed: where it stood may be heard a moment later.
-        client.camera.on_update(self._guard(lambda _: self._view.turn(client)))
-        self._view.welcome(client)
+        self._let_in(client, self._view)
 
     def _reset_view(self, event: Any) -> None:
         if not self._view.reset_view(event.client):

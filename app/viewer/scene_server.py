@@ -3,12 +3,25 @@
 import threading
 import time
 from abc import ABC, abstractmethod
+from typing import Protocol
 
 import viser
 
 from app.viewer.guard import Guard, plain
 from app.viewer.session_state import Kind, Pose, SessionInfo
 from app.viewer.viser_server import start_viser
+
+
+class FollowsCameras(Protocol):
+    """Shows something that depends on where a client's camera stands."""
+
+    def welcome(self, client: viser.ClientHandle, /) -> None:
+        """Show it to a client that has just come."""
+        ...
+
+    def turn(self, client: viser.ClientHandle, /) -> None:
+        """Follow a client's camera."""
+        ...
 
 
 class SceneServer(ABC):
@@ -79,6 +92,12 @@ class SceneServer(ABC):
     @abstractmethod
     def _forget(self, client: viser.ClientHandle) -> Pose:
         """Forget a client; returns where its camera stood in the scene."""
+
+    def _let_in(self, client: viser.ClientHandle, shown: FollowsCameras) -> None:
+        """Show a new client something that follows its camera from now on."""
+        # Heard before it is aimed: where a browser's camera stood may be told a moment later.
+        client.camera.on_update(self._guard(lambda _: shown.turn(client)))
+        shown.welcome(client)
 
     def _part(self, client: viser.ClientHandle) -> None:
         """Keep the camera of a client that leaves, for the tab that is being reloaded."""

@@ -255,10 +255,8 @@ class Session(SceneServer):
         if not self._has_played:
             self._has_played = True
             self._playback.play()
-        for mode in (self._figure, self._pin):
-            # Before the camera is aimed: where it stood may be heard a moment later.
-            client.camera.on_update(self._guard(lambda _, turn=mode.turn: turn(client)))
-            mode.welcome(client)
+        self._let_in(client, self._figure)
+        self._let_in(client, self._pin)
 
     def _reset_view(self, event: Any) -> None:
         if self._figure.is_on:
