@@ -296,7 +296,7 @@ def test_only_one_of_several_processes_may_begin(tmp_path: Path) -> None:
         run = make_run(tmp_path / f"fit{trial}")
         start, results = context.Barrier(3), context.Queue()
         children = [
-            context.Process(target=try_to_begin, args=(run.folder, start, results))
+            context.Process(target=try_to_begin, args=(run.folder, start, results), daemon=True)
             for _ in range(3)
         ]
         for child in children:

@@ -4,8 +4,10 @@ import json
 import multiprocessing
 import os
 import signal
+import sys
 import time
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -19,10 +21,29 @@ from physhandi.data.run_files import attempt_numbers
 KILLS = 30
 MOST_WRITTEN = 40
 """Files that are written between start and kill, at most."""
+FILE_CALLS = {"open", "write", "tofile", "flush", "fsync", "close", "replace", "unlink", "mkdir"}
+CALLS_APART = 11
+"""Calls to the file system by which each death of a child's own is later than the one before."""
 
 
-def write_for_ever(folder: Path, written: Any) -> None:
+def die_before(last: int) -> None:
+    """Let this process be gone before it makes its `last`-th call to the file system."""
+    made = 0
+
+    def count(frame: FrameType, event: str, function: Any) -> None:
+        nonlocal made
+        if event == "c_call" and getattr(function, "__name__", "") in FILE_CALLS:
+            made += 1
+            if made >= last:
+                os.kill(os.getpid(), signal.SIGKILL)
+
+    sys.setprofile(count)
+
+
+def write_for_ever(folder: Path, written: Any, last: int | None) -> None:
     run = Run.open(folder)
+    if last is not None:
+        die_before(last)
     attempt = run.begin_attempt()
     progress = attempt.progress()
     known = attempt.load_checkpoint("state")
@@ -82,19 +103,25 @@ def test_kills_in_the_middle_of_writing(tmp_path: Path) -> None:
     context = multiprocessing.get_context("fork")
     chance = np.random.default_rng(7)
     files, leftovers, states, furthest = 0, 0, set(), 0
-    for _ in range(KILLS):
-        # Not after so much time, in which a busy machine gets nothing written.
+    for kill in range(KILLS):
         written = context.Value("i", 0, lock=False)
-        enough = chance.integers(0, MOST_WRITTEN)
-        child = context.Process(target=write_for_ever, args=(run.folder, written))
+        # Every second child dies by itself, since what another process's kill hits is chance.
+        last = 1 + CALLS_APART * (kill // 2) if kill % 2 else None
+        child = context.Process(
+            target=write_for_ever, args=(run.folder, written, last), daemon=True
+        )
         child.start()
-        while holder_of(run.folder) != child.pid or written.value < enough:
-            assert child.is_alive()
-            time.sleep(0.0002)
-        os.kill(child.pid or 0, signal.SIGKILL)
+        if last is None:
+            # Not after so much time, in which a busy machine gets nothing written.
+            enough = chance.integers(0, MOST_WRITTEN)
+            while holder_of(run.folder) != child.pid or written.value < enough:
+                assert child.is_alive()
+                time.sleep(0.0002)
+            os.kill(child.pid or 0, signal.SIGKILL)
         child.join()
+        assert child.exitcode == -signal.SIGKILL
         files += check_whole(run)
-        leftovers += len(list(run.folder.rglob(".*.tmp")))
+        leftovers += last is not None and any(run.folder.rglob(".*.tmp"))
         states.add(run.state)
         state = latest_checkpoint(run)
         if furthest > 0:
@@ -106,7 +133,7 @@ def test_kills_in_the_middle_of_writing(tmp_path: Path) -> None:
     assert "failed" in states
     assert files > 5 * KILLS
     assert furthest > 0
-    assert leftovers > 0  # Otherwise no kill hit a write, and the test shows nothing.
+    assert leftovers > 2  # Otherwise no death came within a write, and the test shows nothing.
     with run.begin_attempt() as attempt:
         assert list(run.folder.rglob(".*.tmp")) == []
         state = read_checkpoint(attempt.folder / "ckpt", "state")
