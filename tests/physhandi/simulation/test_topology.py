@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from jaxtyping import TypeCheckError
 
@@ -23,6 +23,13 @@ PARAMETERS = SimulationParameters(
     connection_radius=0.15, max_neighbors=5, virtual_connection_radius=0.2
 )
 
+SAME_EVERYWHERE = settings(
+    max_examples=40,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.too_slow],
+)
+
 
 def cloud(seed, count):
     return np.random.default_rng(seed).uniform(0.0, 0.3, (count, 3))
@@ -38,7 +45,7 @@ def brute_force(query, node, radius, most, *, is_same):
     return proposals
 
 
-@settings(max_examples=40, deadline=None)
+@SAME_EVERYWHERE
 @given(
     st.integers(0, 10_000), st.integers(0, 40), st.floats(0.01, 0.3), st.integers(0, 45)
 )  # fmt: skip
@@ -52,7 +59,7 @@ def test_object_springs_are_the_union_of_what_nodes_propose(seed, count, radius,
     )
 
 
-@settings(max_examples=40, deadline=None)
+@SAME_EVERYWHERE
 @given(
     st.integers(0, 10_000),
     st.integers(0, 30),
