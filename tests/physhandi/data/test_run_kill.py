@@ -53,7 +53,7 @@ def write_for_ever(folder: Path, written: Any, last: int | None) -> None:
         for write in (
             lambda n: attempt.save_array("array.npy", np.full(50_000, n)),
             lambda n: attempt.save_tensors("tensors.safetensors", {"x": np.full(20_000, n)}),
-            lambda n: attempt.save_json("data.json", [n] * 2000),
+            lambda n: attempt.save_json("data.json", [n] * 100),
             lambda n: attempt.save_yaml("data.yaml", {"number": n}),
             lambda n: attempt.checkpoint("state", {"x": np.full(20_000, n)}),
             lambda n: progress.report("write", n, 10**9, float(n)),
