@@ -19,7 +19,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, TextIO
 
-from app.jobs.processes import die_with_parent
+from app.child_modules import die_with_parent
 from physhandi.data.sequence import Sequence
 from physhandi.errors import PhysHandiError, UsageError, describe
 from physhandi.progress import Progress

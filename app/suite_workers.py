@@ -5,7 +5,6 @@ import json
 import os
 import queue
 import subprocess
-import sys
 import threading
 from collections import deque
 from collections.abc import Iterator, Mapping
@@ -16,8 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
 
-from app.jobs.processes import child_environment
-from app.settings import PACKAGE_ROOT
+from app.child_modules import start_module
 from app.suite_process import order_to_json
 from physhandi import errors
 from physhandi.progress import Progress
@@ -183,14 +181,12 @@ class SuiteWorkers:
 
     def _start(self, number: int, share: Many[int]) -> _Worker:
         processors = ",".join(str(processor) for processor in share)
-        process = subprocess.Popen(
-            [sys.executable, "-m", "app.suite_process", str(os.getpid()), processors],
+        process = start_module(
+            "app.suite_process",
+            *(str(os.getpid()), processors),
+            threads=len(share),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            text=True,
-            # `-m` searches the working directory first, so it must be the one of our packages.
-            cwd=PACKAGE_ROOT,
-            env=child_environment(threads=len(share)),
             # An interrupt from the keyboard is for the parent, which ends them.
             start_new_session=True,
         )

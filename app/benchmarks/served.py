@@ -50,7 +50,7 @@ class Served:
             ServerFailedError: If it does not start; says what it wrote.
         """
         command = [sys.executable, "-c", _START, "serve", "--port", "0"]
-        command += ["--data-dir", str(data_dir), "--device", device]
+        command += ["--data-dir", str(data_dir.resolve()), "--device", device]
         ours = {k: v for k, v in os.environ.items() if not k.startswith("PHYSHANDI_")}
         self._said = tempfile.TemporaryFile("w+")  # noqa: SIM115  # closed with the server
         start = time.perf_counter()
@@ -59,7 +59,9 @@ class Served:
             stdout=subprocess.PIPE,
             stderr=self._said,
             text=True,
-            env=ours | {"PYTHONPATH": str(PACKAGE_ROOT)} | dict(environment or {}),
+            # `-c` searches the working directory first, so it must be the one of our packages.
+            cwd=PACKAGE_ROOT,
+            env=ours | dict(environment or {}),
         )
         self.url = self._printed()
         self.start_seconds = time.perf_counter() - start

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from typing import TextIO
 
-from app.jobs.processes import die_with_parent
+from app.child_modules import die_with_parent
 from physhandi.errors import PhysHandiError, describe
 
 _NICENESS = 5

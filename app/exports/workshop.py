@@ -6,7 +6,6 @@ import logging
 import os
 import shutil
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Generator
@@ -18,9 +17,8 @@ from typing import IO, Any, Literal
 
 import viser
 
+from app.child_modules import start_module
 from app.exports.order import SUFFIXES, Order
-from app.jobs.processes import child_environment
-from app.settings import PACKAGE_ROOT
 from physhandi import __version__, errors
 from physhandi.data.atomic import sweep_temporary, temporary_name
 from physhandi.data.run_files import CURRENT
@@ -208,16 +206,13 @@ class Workshop:
             work.future.set_exception(error)
 
     def _run(self, order: Order, work: Work) -> None:
-        command = [sys.executable, "-m", "app.exports.process", str(os.getpid()), str(work.path)]
-        process = subprocess.Popen(
-            command,
+        process = start_module(
+            "app.exports.process",
+            *(str(os.getpid()), str(work.path)),
+            threads=1,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
-            text=True,
-            # `-m` searches the working directory first, so it must be the one of our packages.
-            cwd=PACKAGE_ROOT,
-            env=child_environment(threads=1),
         )
         with self._lock:
             self._processes.add(process)

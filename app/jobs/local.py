@@ -2,18 +2,17 @@
 
 import secrets
 import subprocess
-import sys
 from pathlib import Path
 
-from app.jobs.processes import COOKIE, child_environment, cookie_of
-from app.settings import PACKAGE_ROOT
+from app.child_modules import start_module
+from app.jobs.processes import COOKIE, cookie_of
 
 WORKER = "app.jobs.worker"
 
 
 def start_supervisor(
     run_folder: Path, device: str, *, worker: str = WORKER, threads: int | None = None
-) -> subprocess.Popen[bytes]:
+) -> "subprocess.Popen[str]":
     """Start the process that starts and watches a run's worker, in a session of its own.
 
     It outlives the server; a restarted server finds it by the lock that it holds.
@@ -27,18 +26,15 @@ def start_supervisor(
     Returns:
         The started process.
     """
-    environment = child_environment(threads) | {
-        COOKIE: cookie_of(run_folder, secrets.token_hex(8)),
-        "PYTHONUNBUFFERED": "1",
-    }
-    command = [sys.executable, "-m", "app.jobs.supervise", "--run-dir", str(run_folder)]
-    return subprocess.Popen(
-        [*command, "--device", device, "--worker", worker],
-        stdin=subprocess.DEVNULL,
+    return start_module(
+        "app.jobs.supervise",
+        *("--run-dir", str(run_folder), "--device", device, "--worker", worker),
+        threads=threads,
+        environment={
+            COOKIE: cookie_of(run_folder, secrets.token_hex(8)),
+            "PYTHONUNBUFFERED": "1",
+        },
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
-        # `-m` searches the working directory first, so it must be the one of our packages.
-        cwd=PACKAGE_ROOT,
-        env=environment,
     )

@@ -1,39 +1,25 @@
 """The processes of a run: how they are marked, found again and ended for sure."""
 
-import ctypes
 import fcntl
 import os
 import signal
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
 
+from app.child_modules import set_process_option
+
 COOKIE = "PHYSHANDI_RUN"
 """Environment variable that marks a run's processes; children inherit it, wherever they move."""
-_SECRETS = ("PHYSHANDI_TOKEN",)
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _LOCK = ".supervisor.lock"
-_PR_SET_PDEATHSIG = 1
 _PR_SET_CHILD_SUBREAPER = 36
 
 
 def cookie_of(run_folder: Path, nonce: str) -> str:
     """Make the mark of one start of a run."""
     return f"{run_folder}:{nonce}"
-
-
-def child_environment(threads: int | None = None) -> dict[str, str]:
-    """Give what a child process is told of this one's environment: all but secrets.
-
-    Args:
-        threads: How many threads its numeric libraries may start; none for one each processor,
-            which hinder each other badly where several such processes work side by side.
-    """
-    found = {name: value for name, value in os.environ.items() if name not in _SECRETS}
-    return found | ({} if threads is None else dict.fromkeys(_THREADS, str(threads)))
 
 
 def processes_of(run_folder: Path, nonce: str | None = None) -> Iterator[psutil.Process]:
@@ -126,18 +112,7 @@ def supervisor_of(run_folder: Path) -> int | None:
 
 def adopt_orphans() -> None:
     """Become the parent of all grandchildren that lose theirs (Linux)."""
-    _prctl(_PR_SET_CHILD_SUBREAPER, 1)
-
-
-def die_with_parent(parent: int) -> None:
-    """Make the kernel kill this process when its parent ends (Linux); end it if that has happened.
-
-    Args:
-        parent: Process id that the parent is expected to have.
-    """
-    _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:
-        sys.exit(1)
+    set_process_option(_PR_SET_CHILD_SUBREAPER, 1)
 
 
 def _try_lock(descriptor: int, kind: int) -> bool:
@@ -146,11 +121,6 @@ def _try_lock(descriptor: int, kind: int) -> bool:
     except BlockingIOError:
         return False
     return True
-
-
-def _prctl(option: int, value: int) -> None:
-    if sys.platform == "linux" and ctypes.CDLL(None, use_errno=True).prctl(option, value, 0, 0, 0):
-        raise OSError(ctypes.get_errno(), "prctl failed")
 
 
 def _signal_all(

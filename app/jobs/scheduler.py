@@ -73,7 +73,7 @@ class Scheduler:
         self.forecast = Forecast(catalog, settings.device)
         """Estimates how long fits still take."""
         self._lock = threading.RLock()
-        self._started: dict[str, subprocess.Popen[bytes]] = {}
+        self._started: dict[str, subprocess.Popen[str]] = {}
         self._stopping: dict[str, threading.Thread] = {}
         self._ended: dict[str, tuple[int, JobView]] = {}
         self._line: tuple[str, ...] = ()

@@ -6,7 +6,6 @@ import logging
 import os
 import signal
 import subprocess
-import sys
 import threading
 from collections import OrderedDict
 from collections.abc import Iterable
@@ -14,10 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from app.child_modules import start_module
 from app.jobs.catalog import Catalog, NotFoundError, RunItem
-from app.jobs.processes import child_environment
 from app.previews.worker import MOVING, NONE, SECONDS_EACH, STILL
-from app.settings import PACKAGE_ROOT, Settings
+from app.settings import Settings
 from physhandi.data.atomic import write_bytes
 from physhandi.data.run_files import CURRENT
 from physhandi.data.sequence_schema import FILE
@@ -83,7 +82,7 @@ class Previews:
         self._folder = settings.preview_dir
         self._lock = threading.Condition()
         self._waiting: OrderedDict[str, _Source] = OrderedDict()
-        self._child: subprocess.Popen[bytes] | None = None
+        self._child: subprocess.Popen[str] | None = None
         self._is_closed = False
         self._thread = threading.Thread(target=self._work, name="previews", daemon=True)
 
@@ -184,17 +183,17 @@ class Previews:
         with self._lock:
             if self._is_closed or not orders:
                 return
-            self._child = subprocess.Popen(
-                [sys.executable, "-m", "app.previews.worker", str(os.getpid())],
+            self._child = start_module(
+                "app.previews.worker",
+                str(os.getpid()),
+                threads=1,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
-                cwd=PACKAGE_ROOT,
-                env=child_environment(threads=1),
             )
         try:
             self._child.communicate(
-                json.dumps(orders).encode(), timeout=_PATIENCE * SECONDS_EACH * len(orders)
+                json.dumps(orders), timeout=_PATIENCE * SECONDS_EACH * len(orders)
             )
         except subprocess.TimeoutExpired:
             self._child.kill()

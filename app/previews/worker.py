@@ -12,7 +12,7 @@ from pathlib import Path
 
 import cv2
 
-from app.jobs.processes import die_with_parent
+from app.child_modules import die_with_parent
 from app.previews.clip import clip_of_run, clip_of_sequence
 from physhandi.data.atomic import write_bytes
 from physhandi.errors import describe

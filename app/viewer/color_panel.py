@@ -62,13 +62,14 @@ class ColorPanel:
             self._hold = gui.add_checkbox(
                 "Hold range", initial_value=False, hint="Keep the ends when the rollout changes"
             )
-            self._ends = gui.add_vector2(
-                "Range", (0.0, 1.0), step=1e-4, hint="Values at the ends; typing holds them"
+            self._range = FollowedChoice(
+                gui.add_vector2(
+                    "Range", (0.0, 1.0), step=1e-4, hint="Values at the ends; typing holds them"
+                )
             )
-        self._range = FollowedChoice(self._ends)
         self._choice.on_update(guard.by_user(lambda _: self.choose(self._choice.value)))
         self._hold.on_update(guard.by_user(lambda _: self._toggle_hold()))
-        self._ends.on_update(guard.by_user(lambda _: self._type()))
+        self._range.handle.on_update(guard.by_user(lambda _: self._type()))
         bind(server, guard, "color", lambda _, __: self.next(1))
         bind(server, guard, "color_back", lambda _, __: self.next(-1))
         self._show_range_fields()
@@ -138,7 +139,7 @@ class ColorPanel:
 
     def _show_range_fields(self) -> None:
         is_colored = self._layers.color != "plain"
-        self._hold.visible = self._ends.visible = is_colored
+        self._hold.visible = self._range.handle.visible = is_colored
         self._legend.visible = is_colored
 
     def _toggle_hold(self) -> None:

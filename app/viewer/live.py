@@ -4,7 +4,6 @@ import logging
 import os
 import socket
 import subprocess
-import sys
 import threading
 import time
 from collections import deque
@@ -14,6 +13,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+from app.child_modules import start_module
 from app.viewer.holds import PAUSE, RESUME, STEP
 from app.viewer.wire import Message, WireError, receive, send
 from physhandi.simulation.model import SimulationParameters
@@ -66,7 +66,7 @@ class LiveSimulation:
         self._held: set[str] = set()
         self._numbers = count(1)
         self._connection: socket.socket | None = None
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: subprocess.Popen[str] | None = None
         self._crashes: deque[float] = deque(maxlen=_MAX_CRASHES)
         self._is_closed = False
         self._is_ready = False
@@ -217,10 +217,10 @@ class LiveSimulation:
     def _spawn(self) -> socket.socket:
         ours, theirs = socket.socketpair()
         with theirs:
-            command = [sys.executable, "-m", "app.viewer.live_process"]
-            arguments = [str(theirs.fileno()), str(os.getpid()), self._device]
-            self._process = subprocess.Popen(
-                [*command, *arguments], pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL
+            self._process = start_module(
+                "app.viewer.live_process",
+                *(str(theirs.fileno()), str(os.getpid()), self._device),
+                pass_fds=[theirs.fileno()],
             )
         with self._write_lock:
             self._connection = ours

@@ -6,9 +6,7 @@ main thread simulates one frame of each active session in turn. The process ends
 does.
 """
 
-import ctypes
 import logging
-import os
 import signal
 import socket
 import sys
@@ -19,6 +17,7 @@ from collections.abc import Iterator
 import numpy as np
 import warp as wp
 
+from app.child_modules import die_with_parent
 from app.viewer.fitted_object import FittedObject
 from app.viewer.holds import CONTROLS, Holds
 from app.viewer.warm_up import warm_up
@@ -28,8 +27,6 @@ from physhandi.simulation.model import SimulationParameters
 from physhandi.simulation.stability import with_stable_substeps
 
 logger = logging.getLogger(__name__)
-
-_PR_SET_PDEATHSIG = 1
 
 
 class Mailboxes:
@@ -238,14 +235,6 @@ class LiveSimulator:
             known = (key, FittedObject(*key))
             self._objects[request["session"]] = known
         return known[1]
-
-
-def die_with_parent(parent: int) -> None:
-    """Ask the kernel to kill this process when its parent dies, on systems that can."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:
-        sys.exit(0)
 
 
 def main(arguments: list[str]) -> None:

@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -227,7 +226,7 @@ def test_a_folder_that_is_deleted_while_pictures_are_drawn_ends_nothing(
         def __init__(self, *_: object, **__: object) -> None:
             self.returncode = next(codes)
 
-        def communicate(self, orders: bytes, **_: object) -> None:
+        def communicate(self, orders: str, **_: object) -> None:
             if self.returncode:
                 shutil.rmtree(world.settings.preview_dir)
                 return
@@ -237,7 +236,7 @@ def test_a_folder_that_is_deleted_while_pictures_are_drawn_ends_nothing(
         def kill(self) -> None:
             pass
 
-    monkeypatch.setattr(store, "subprocess", SimpleNamespace(**vars(subprocess) | {"Popen": Child}))
+    monkeypatch.setattr(store, "start_module", Child)
     monkeypatch.setattr(store, "_PAUSE_S", 0.0)
     previews = Previews(world.settings, world.catalog)
     previews.start()

@@ -60,7 +60,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     folder = tmp_path_factory.mktemp("served")
-    command = [sys.executable, "-c", START, "serve", "--port", "0", "--data-dir", "data"]
+    # Users start it where they work, and often have a package of this name there.
+    (folder / "app").mkdir()
+    (folder / "app" / "__init__.py").write_text("raise SystemExit('a package of the user')")
+    command = [sys.executable, "-P", "-c", START, "serve", "--port", "0", "--data-dir", "data"]
     printed = folder / "printed"
     with printed.open("w") as out, (folder / "log").open("w") as log:
         environment = os.environ | {"PYTHONPATH": str(ROOT)}

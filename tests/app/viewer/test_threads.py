@@ -154,7 +154,7 @@ def test_typed_ends_of_the_colors_are_not_replaced_before_they_are_heard(
         rest_at(client, 7)
         colors = session._inspection.colors
         colors.choose("speed")
-        client.until(lambda: colors._ends.value != (0.0, 1.0))
+        client.until(lambda: colors._range.handle.value != (0.0, 1.0))
         painter = colors._painter
         assert painter is not None
         assert painter.legend is not None
@@ -165,14 +165,14 @@ def test_typed_ends_of_the_colors_are_not_replaced_before_they_are_heard(
         )
         monkeypatch.setattr(colors, "_painter", grown)
         colors.show(is_playing=False, is_hidden=False)
-        assert colors._ends.value == (0.25, 0.75)
+        assert colors._range.handle.value == (0.25, 0.75)
         colors._type()
         factor = painter.quantity("speed").factor
         assert colors._layers.color_range == pytest.approx((0.25 / factor, 0.75 / factor))
         # What was heard follows the sequence again when it is let go.
         colors._layers.color_range = None
         colors.show(is_playing=False, is_hidden=False)
-        assert colors._ends.value == pytest.approx((0.0, 40.0 * factor))
+        assert colors._range.handle.value == pytest.approx((0.0, 40.0 * factor))
 
 
 def test_the_last_value_of_a_slider_is_in_force(
