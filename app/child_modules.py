@@ -6,8 +6,10 @@ import signal
 import subprocess
 import sys
 from collections.abc import Collection, Mapping
+from pathlib import Path
 
-from app.settings import PACKAGE_ROOT
+PACKAGE_ROOT = Path(__file__).resolve().parent.parent
+"""Folder of the packages and, in a checkout and in a wheel alike, of the data beside them."""
 
 _SECRETS = ("PHYSHANDI_TOKEN",)
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")

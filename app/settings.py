@@ -7,8 +7,8 @@ from typing import Annotated
 from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
-PACKAGE_ROOT = Path(__file__).resolve().parent.parent
-"""Folder of the packages and, in a checkout and in a wheel alike, of the data beside them."""
+from app.child_modules import PACKAGE_ROOT
+
 BUNDLED = PACKAGE_ROOT / "sequences"
 WEB_ASSETS = PACKAGE_ROOT / "web_assets"
 

@@ -18,12 +18,13 @@ import yaml
 from PIL import Image, ImageSequence
 from server_world import World
 
+from app.child_modules import PACKAGE_ROOT
 from app.previews import store, worker
 from app.previews.camera import fitting_camera
 from app.previews.clip import clip_of_run, clip_of_sequence
 from app.previews.draw import HEIGHT, WIDTH, Motion, draw_motion
 from app.previews.store import Previews
-from app.settings import BUNDLED, PACKAGE_ROOT
+from app.settings import BUNDLED
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence import Sequence
 

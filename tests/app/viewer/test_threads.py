@@ -159,7 +159,7 @@ def test_typed_ends_of_the_colors_are_not_replaced_before_they_are_heard(
         assert painter is not None
         assert painter.legend is not None
         # As viser keeps what a user has typed, before it is told to anybody.
-        colors._ends._impl.value = (0.25, 0.75)
+        colors._range.handle._impl.value = (0.25, 0.75)
         grown = SimpleNamespace(
             legend=replace(painter.legend, limits=(0.0, 40.0)), quantity=painter.quantity
         )
