@@ -1,4 +1,4 @@
-"""Child processes that run one of our modules and end with the process that started them."""
+"""Starts our modules in processes of their own, and lets these end with their parent."""
 
 import ctypes
 import os
