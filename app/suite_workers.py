@@ -183,7 +183,8 @@ class SuiteWorkers:
         processors = ",".join(str(processor) for processor in share)
         process = start_module(
             "app.suite_process",
-            *(str(os.getpid()), processors),
+            str(os.getpid()),
+            processors,
             threads=len(share),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,

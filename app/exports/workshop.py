@@ -208,7 +208,8 @@ class Workshop:
     def _run(self, order: Order, work: Work) -> None:
         process = start_module(
             "app.exports.process",
-            *(str(os.getpid()), str(work.path)),
+            str(os.getpid()),
+            str(work.path),
             threads=1,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,

@@ -219,7 +219,9 @@ class LiveSimulation:
         with theirs:
             self._process = start_module(
                 "app.viewer.live_process",
-                *(str(theirs.fileno()), str(os.getpid()), self._device),
+                str(theirs.fileno()),
+                str(os.getpid()),
+                self._device,
                 pass_fds=[theirs.fileno()],
             )
         with self._write_lock:

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import yaml
 from bad_input_world import Terminal
-from hypothesis import HealthCheck, example, given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from property_tests import SAME_EVERYWHERE
 from server_world import make_world
 from starlette.testclient import TestClient
 
@@ -23,12 +24,7 @@ from physhandi.errors import FitError, RunError, SequenceError, UsageError
 from physhandi.simulation.model import SimulationParameters
 from physhandi.simulation.topology import build_model
 
-QUICK = settings(
-    max_examples=25,
-    deadline=None,
-    derandomize=True,
-    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
-)
+QUICK = settings(SAME_EVERYWHERE, max_examples=25)
 NUMBER = st.one_of(
     st.floats(), st.integers(), st.sampled_from([0, -1, 10**12, 10**400, 1e308, math.nan, math.inf])
 )

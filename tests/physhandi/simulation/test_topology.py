@@ -5,9 +5,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from jaxtyping import TypeCheckError
+from property_tests import SAME_EVERYWHERE
 
 from physhandi.simulation.model import SimulationParameters
 from physhandi.simulation.topology import (
@@ -21,13 +22,6 @@ from physhandi.simulation.topology import (
 
 PARAMETERS = SimulationParameters(
     connection_radius=0.15, max_neighbors=5, virtual_connection_radius=0.2
-)
-
-SAME_EVERYWHERE = settings(
-    max_examples=40,
-    deadline=None,
-    derandomize=True,
-    suppress_health_check=[HealthCheck.too_slow],
 )
 
 
@@ -45,7 +39,7 @@ def brute_force(query, node, radius, most, *, is_same):
     return proposals
 
 
-@SAME_EVERYWHERE
+@settings(SAME_EVERYWHERE, max_examples=40)
 @given(
     st.integers(0, 10_000), st.integers(0, 40), st.floats(0.01, 0.3), st.integers(0, 45)
 )  # fmt: skip
@@ -59,7 +53,7 @@ def test_object_springs_are_the_union_of_what_nodes_propose(seed, count, radius,
     )
 
 
-@SAME_EVERYWHERE
+@settings(SAME_EVERYWHERE, max_examples=40)
 @given(
     st.integers(0, 10_000),
     st.integers(0, 30),
