@@ -65,7 +65,8 @@ class ColorPanel:
             self._range = FollowedChoice(
                 gui.add_vector2(
                     "Range", (0.0, 1.0), step=1e-4, hint="Values at the ends; typing holds them"
-                )
+                ),
+                guard,
             )
         self._choice.on_update(guard.by_user(lambda _: self.choose(self._choice.value)))
         self._hold.on_update(guard.by_user(lambda _: self._toggle_hold()))

@@ -81,6 +81,13 @@ class Guard:
         by_user.__qualname__ = callback.__qualname__
         return self(by_user)
 
+    def on_event_loop(self, action: Callable[[], None]) -> None:
+        """Do something on the event loop that hears the users, where none of them comes between.
+
+        What is handed in first is done first.
+        """
+        self._server.get_event_loop().call_soon_threadsafe(action)
+
     def _tell(self, event: Any, title: str, error: Exception) -> None:
         lines = str(error).splitlines() or [type(error).__name__]
         target = event if isinstance(event, viser.ClientHandle) else event.client

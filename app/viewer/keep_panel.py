@@ -1,6 +1,7 @@
 """Choosing a preset, and keeping what sliders have found as a preset or as a run."""
 
 import html
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -58,15 +59,16 @@ class PresetChoice:
         self._moved = moved
         self._presets: dict[str, Preset] = {}
         self._wanted = AS_FITTED
+        self._turn = threading.Lock()
         self.problems: tuple[str, ...] = ()
         """What is wrong with files among the users' presets."""
-        self._list: Any = gui.add_dropdown(
+        choice: Any = gui.add_dropdown(
             "Preset",
             (AS_FITTED, BY_HAND),
             hint="Changes made to the fitted parameters, all at once; ★ are your own",
         )
-        self._list.on_update(guard.by_user(lambda _: self._choose()))
-        self._choice = FollowedChoice(self._list)
+        choice.on_update(guard.by_user(lambda _: self._choose()))
+        self._choice = FollowedChoice(choice, guard)
         self.refresh()
 
     def refresh(self) -> None:
@@ -75,16 +77,14 @@ class PresetChoice:
         fitted = self._history.start
         suitable = [p for p in (*builtin_presets(), *own) if p.suits(fitted, self._unit)]
         self._presets = {preset.label: preset for preset in suitable}
-        options = (*self._presets, BY_HAND)
-        if tuple(self._list.options) != options:
-            self._list.options = options
-            self._choice.take()
+        self._choice.offer((*self._presets, BY_HAND))
         self.show()
 
     def show(self) -> None:
         """Name the preset in force."""
-        chosen = self.chosen
-        self._choice.show(BY_HAND if chosen is None else chosen.label)
+        with self._turn:  # What is shown last must be what was read last.
+            chosen = self.chosen
+            self._choice.show(BY_HAND if chosen is None else chosen.label)
 
     @property
     def chosen(self) -> Preset | None:

@@ -100,7 +100,8 @@ class PhysicsPanel:
                     (_PUT_BACK,),
                     visible=False,
                     hint="Give one parameter its fitted value again",
-                )
+                ),
+                guard,
             )
             self._put_back.handle.on_update(guard.by_user(lambda _: self._put_one_back()))
             with gui.add_folder("More physics", expand_by_default=False):
@@ -219,8 +220,9 @@ class PhysicsPanel:
 
     def _run(self) -> None:
         """Show the parameters in force and simulate them."""
-        self._sliders.show()
-        self._substeps.show()
+        with self._turn:
+            self._sliders.show()
+            self._substeps.show()
         self._moved()
 
     def _moved(self) -> None:
@@ -241,7 +243,7 @@ class PhysicsPanel:
         )
         self._changed = {change.name: change.fields for change in changes}
         text = ", ".join(change.text for change in changes)
-        self._put_back.handle.options = (_PUT_BACK, *self._changed)
+        self._put_back.offer((_PUT_BACK, *self._changed))
         self._put_back.show(_PUT_BACK)
         self._put_back.handle.visible = bool(changes)
         self._changes.content = f"Changed: {text or 'nothing: parameters as fitted'}"

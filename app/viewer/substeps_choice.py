@@ -36,7 +36,7 @@ class SubstepsChoice:
             (AS_FITTED, AUTOMATIC, BY_HAND),
             hint="Integration steps a frame. Automatic takes as few as are stable at frame 0",
         )
-        self._followed = FollowedChoice(choice)
+        self._followed = FollowedChoice(choice, guard)
         self._number: Any = gui.add_number(
             "number",
             self._in_use,

@@ -165,55 +165,92 @@ def test_nothing_is_kept_without_a_name_or_a_change(store) -> None:
     assert not store.folder.exists()
 
 
-class QuickHand:
-    """A list whose user may answer the very moment that it changes, as a fast browser does."""
+class SharedList:
+    """A list that viser's event loop, the program and a user's callback share."""
 
     def __init__(self, options: tuple[str, ...]) -> None:
         self.options = options
-        self.answer = ""
-        self._value = options[0]
+        self.value = options[0]
         self._heard: Callable[[Any], None] = lambda _: None
 
-    @property
-    def value(self) -> str:
-        return self._value
-
-    @value.setter
-    def value(self, value: str) -> None:
-        self._value = value
-        answer, self.answer = self.answer, ""
-        if answer:
-            self.choose(answer)
-
     def choose(self, value: str) -> None:
-        self._value = value
+        self.receive(value)
+        self.call()
+
+    def receive(self, value: str) -> None:
+        """Store a choice, as viser does before it calls anybody."""
+        self.value = value
+
+    def call(self) -> None:
         self._heard(SimpleNamespace(client=object()))
 
     def on_update(self, heard: Callable[[Any], None]) -> None:
         self._heard = heard
 
 
-def test_a_choice_made_the_moment_the_list_changes_is_not_lost() -> None:
-    history = History(FITTED)
-    lists: list[QuickHand] = []
+class Loop:
+    """An event loop that works when it is told to."""
 
-    def add_dropdown(_name: str, options: tuple[str, ...], **_: object) -> QuickHand:
-        lists.append(QuickHand(options))
+    def __init__(self) -> None:
+        self._waiting: list[Callable[[], None]] = []
+
+    def call_soon_threadsafe(self, action: Callable[[], None]) -> None:
+        self._waiting.append(action)
+
+    def work(self) -> None:
+        while self._waiting:
+            self._waiting.pop(0)()
+
+
+@pytest.fixture
+def shown_list() -> tuple[History, PresetChoice, SharedList, Loop]:
+    """A history, the list of its presets, the control and its event loop."""
+    history, lists, loop = History(FITTED), [], Loop()
+
+    def add_dropdown(_name: str, options: tuple[str, ...], **_: object) -> SharedList:
+        lists.append(SharedList(options))
         return lists[-1]
 
     gui: Any = SimpleNamespace(add_dropdown=add_dropdown)
-    guard = Guard(SimpleNamespace())  # type: ignore[arg-type]  # nothing goes wrong here
-    choice = PresetChoice(gui, guard, history, length_unit="m", store=None, moved=lambda: None)
-    (shown,) = lists
+    server: Any = SimpleNamespace(get_event_loop=lambda: loop)
+    choice = PresetChoice(
+        gui, Guard(server), history, length_unit="m", store=None, moved=lambda: None
+    )
+    loop.work()
+    return history, choice, lists[0], loop
+
+
+def test_a_choice_made_the_moment_the_list_changes_is_not_lost(shown_list) -> None:
+    history, choice, shown, loop = shown_list
     shown.choose("limp")
     assert (history.current.drag, shown.value) == (0.5, "limp")
     history.set("drag", 9.0)
     choice.show()
+    loop.work()
     assert shown.value == BY_HAND
-    shown.answer = AS_FITTED
     history.undo()
-    choice.show()  # Says "limp", and at once the user wants the fitted parameters.
+    choice.show()  # Says "limp"…
+    shown.receive(AS_FITTED)  # …but the user has just chosen the fitted parameters…
+    loop.work()
+    assert shown.value == AS_FITTED
+    shown.call()  # …which is heard now.
+    choice.show()
+    loop.work()
     assert (history.current, shown.value) == (FITTED, AS_FITTED)
     history.undo()
     choice.show()
+    loop.work()
     assert shown.value == "limp"
+
+
+def test_what_a_list_no_longer_offers_is_followed_again(shown_list) -> None:
+    history, choice, shown, loop = shown_list
+    shown.choose("limp")
+    shown.options = (AS_FITTED, "limp")  # It was made with fewer presets than there are now.
+    choice.refresh()
+    loop.work()
+    assert (shown.value, "stiff" in shown.options) == ("limp", True)
+    history.reset()
+    choice.show()
+    loop.work()
+    assert shown.value == AS_FITTED
