@@ -1,7 +1,6 @@
 import asyncio
 import gzip
 import threading
-import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -14,6 +13,7 @@ import viser._messages
 from fastapi import FastAPI
 from viewer_client import PROTOCOL, ViewerClient
 from viewer_world import FRAMES, hear_all, rest_at
+from waiting import LIMIT_S, until
 from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
@@ -39,8 +39,7 @@ def address(sessions: Sessions) -> Iterator[str]:
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run)
     thread.start()
-    while not server.started:
-        time.sleep(0.01)
+    until(lambda: server.started)
     port = server.servers[0].sockets[0].getsockname()[1]
     yield f"127.0.0.1:{port}"
     server.should_exit = True
@@ -90,14 +89,7 @@ def test_a_client_gets_the_scene_through_the_gate(address, sessions, slash) -> N
         client.until(lambda: {"/object/nodes", "/springs/virtual"} <= set(client.nodes))
         client.until(lambda: "object springs" in client.texts())
         client.until(lambda: sessions.list()[0].client_count == 1)
-    wait_until_nobody_looks(sessions)
-
-
-def wait_until_nobody_looks(sessions: Sessions) -> None:
-    end = time.monotonic() + 60
-    while sessions.list()[0].client_count and time.monotonic() < end:
-        time.sleep(0.02)
-    assert sessions.list()[0].client_count == 0
+    until(lambda: sessions.list()[0].client_count == 0)
 
 
 @pytest.mark.parametrize("offered", [None, ["chat"]])
@@ -150,7 +142,7 @@ def test_a_tab_that_is_reloaded_keeps_its_session(address, sessions) -> None:
         live = sessions.get(session)
         client.until(lambda: live.state.pose is not None)
         client.until(lambda: live.state.pose.position.tolist() == [0.5, 0.4, 0.3])
-    wait_until_nobody_looks(sessions)
+    until(lambda: sessions.list()[0].client_count == 0)
     assert fetch(f"http://{address}/viewer/{session}/")[0] == 200
     assert [info.id for info in sessions.list()] == [session]
     with ViewerClient(f"ws://{address}/viewer/{session}") as client:
@@ -160,19 +152,21 @@ def test_a_tab_that_is_reloaded_keeps_its_session(address, sessions) -> None:
 def test_a_tab_may_come_back_before_its_scene_has_hung_up(
     address, sessions, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    is_leaving = threading.Event()
+    is_leaving, may_leave = threading.Event(), threading.Event()
 
     async def slow(connection: ClientConnection) -> None:
         is_leaving.set()
-        await asyncio.sleep(3.0)
+        assert await asyncio.to_thread(may_leave.wait, LIMIT_S)
         connection.transport.abort()
 
     monkeypatch.setattr(ClientConnection, "close", slow)
     session = sessions.open("run", "sheet", "me")
     with ViewerClient(f"ws://{address}/viewer/{session}") as client:
         client.until(lambda: client.nodes)
-    assert is_leaving.wait(60.0)
-    assert fetch(f"http://{address}/viewer/{session}/")[0] == 200
+    assert is_leaving.wait(LIMIT_S)
+    status, _ = fetch(f"http://{address}/viewer/{session}/")
+    may_leave.set()
+    assert status == 200
     assert [info.id for info in sessions.list()] == [session]
 
 

@@ -9,11 +9,13 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 from viewer_world import FRAMES, PARAMETERS, controls, sheet
+from waiting import WatchedLock, until
 
 from app.viewer.live import LiveRequest, LiveSimulation
 from app.viewer.live_process import LiveSimulator, Mailboxes
@@ -21,6 +23,7 @@ from app.viewer.wire import Message
 from physhandi.data.run import Run
 
 SECONDS = 60.0
+TESTS = Path(__file__).parents[2]
 
 
 class Mailbox:
@@ -154,13 +157,22 @@ def test_automatic_substeps_survive_what_the_fitted_number_does_not(live, mailbo
     assert messages[0]["substeps_per_frame"] > PARAMETERS.substeps_per_frame
 
 
+def finish_another(live: LiveSimulation, run: Run) -> None:
+    """Simulate for another session; meanwhile every session gets a turn for each of its frames."""
+    other = Mailbox()
+    live.subscribe("b", other)
+    live.request("b", ask(run))
+    other.until("finished")
+    live.unsubscribe("b")
+
+
 def test_a_held_simulation_goes_on_frame_by_frame_and_gives_the_same_motion(
     live, mailbox, run
 ) -> None:
     live.hold("a", on=True)
     live.request("a", ask(run))
     seen = mailbox.until("frame")
-    time.sleep(0.2)
+    finish_another(live, run)
     assert mailbox.messages.empty()
     for frame in (1, 2):
         live.step("a")
@@ -177,7 +189,7 @@ def test_a_killed_process_comes_back_held(live, mailbox, run) -> None:
     mailbox.until("frame")
     os.kill(live.process_id, signal.SIGKILL)
     assert mailbox.until("frame")[-1]["frame"] == 0
-    time.sleep(0.2)
+    finish_another(live, run)
     assert mailbox.messages.empty()
     live.hold("a", on=False)
     mailbox.until("finished")
@@ -223,7 +235,8 @@ def test_what_is_repeated_after_a_crash_does_not_overtake_a_newer_request(
     live.hold("a", on=True)  # So that it is not done before it is killed.
     older, newer = live.request("a", ask(run)), []
     mailbox.until("frame")
-    write = live._write
+    write, lock = live._write, WatchedLock()
+    monkeypatch.setattr(live, "_write_lock", lock)
 
     def write_late(message: Message) -> None:
         if message.kind == "simulate" and message["request"] == older:
@@ -231,7 +244,7 @@ def test_what_is_repeated_after_a_crash_does_not_overtake_a_newer_request(
                 target=lambda: newer.append(live.request("a", ask(run, drag=9.0)))
             )
             ask_again.start()
-            ask_again.join(0.3)
+            until(lambda: newer or ask_again.ident in lock.waiting)
         write(message)
 
     monkeypatch.setattr(live, "_write", write_late)
@@ -290,28 +303,29 @@ def test_an_older_request_does_not_replace_the_active_one() -> None:
 
 def test_the_process_dies_with_its_parent() -> None:
     script = (
-        "import os, time\n"
+        "import os\n"
         "from app.viewer.live import LiveSimulation\n"
+        "from waiting import until\n"
         "live = LiveSimulation()\n"
         "live.subscribe('a', lambda message: None)\n"
-        "while live.process_id is None: time.sleep(0.01)\n"
+        "until(lambda: live.process_id)\n"
         "os.write(1, str(live.process_id).encode())\n"
         "os._exit(0)\n"
     )
     out = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, check=True, timeout=SECONDS
+        [sys.executable, "-c", script],
+        capture_output=True,
+        check=True,
+        timeout=SECONDS,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(TESTS), str(TESTS.parent)])},
     )
-    end = time.monotonic() + SECONDS
-    while time.monotonic() < end and _is_running(int(out.stdout)):
-        time.sleep(0.05)
-    assert not _is_running(int(out.stdout))
+    until(lambda: not _is_running(int(out.stdout)))
 
 
 def test_close_leaves_no_process() -> None:
     live = LiveSimulation()
     live.subscribe("a", lambda _: None)
-    while (process := live.process_id) is None:
-        time.sleep(0.01)
+    process = until(lambda: live.process_id)
     live.close()
     assert not _is_running(process)
 
@@ -336,10 +350,7 @@ def test_the_process_warms_up_by_itself(run) -> None:
         first = Mailbox()
         live.subscribe("a", first)
         live.prepare("a", ask(run))  # Before the process is there, perhaps.
-        end = time.monotonic() + SECONDS
-        while not live.is_ready:
-            assert time.monotonic() < end
-            time.sleep(0.02)
+        until(lambda: live.is_ready)
         process = live.process_id
         live.request("a", ask(run, drag=9.0))
         messages = first.until("finished")

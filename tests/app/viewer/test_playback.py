@@ -1,159 +1,166 @@
-import time
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 
 import numpy as np
 import pytest
+from waiting import until
 
 from app.viewer.playback import Playback
 
-PATIENCE = 60.0
-"""How long to wait for what should happen soon [s]."""
 
+class Clock:
+    """Time and condition of a playback: time goes on only while the playback waits for it.
 
-class Time:
-    """A clock that goes on only while somebody waits, who is woken a little late."""
+    What a test wants done happens at its moment; whoever waits is woken a little late.
+    """
 
     def __init__(self) -> None:
         self.now = 0.0
+        self.wishes: list[tuple[float, Callable[[], None]]] = []
+        self.is_resting = False
+        self._is_woken = False
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def at(self, moment: float, action: Callable[[], None]) -> None:
+        self.wishes.append((moment, action))
+        self.wishes.sort(key=lambda wish: wish[0])
 
     def monotonic(self) -> float:
         return self.now
 
-    def wait(self, seconds: float) -> None:
-        self.now += seconds + 0.001
+    def notify_all(self) -> None:
+        self._is_woken = True
+
+    def wait(self, seconds: float | None = None) -> None:
+        self.is_resting = seconds is None
+        end = np.inf if seconds is None else self.now + seconds + 0.001
+        self._is_woken = False
+        while not self._is_woken and self.wishes and self.wishes[0][0] <= end:
+            moment, action = self.wishes.pop(0)
+            self.now = max(self.now, moment)
+            action()
+        if not self._is_woken:
+            assert np.isfinite(end), "it rests, and nothing is left to be done"
+            self.now = end
 
 
-class Screen:
-    def __init__(self) -> None:
+class Film:
+    """A playback in made-up time, what it draws, and when."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, frame_count: int, rate: float) -> None:
+        self.clock = Clock()
         self.drawn: list[tuple[int, bool]] = []
+        self.moments: list[float] = []
+        self.cost = 0.0
+        """How long it takes to draw a frame [s]."""
+        self.playback = Playback(frame_count, rate, self._draw)
+        self.playback._condition = self.clock  # type: ignore[assignment]
+        monkeypatch.setattr("app.viewer.playback.time", self.clock)
 
-    def __call__(self, frame: int, is_playing: bool) -> None:
+    @property
+    def frames(self) -> list[int]:
+        return [frame for frame, _ in self.drawn]
+
+    def moment_of(self, frame: int) -> float:
+        return self.moments[self.frames.index(frame)]
+
+    def run(self, end: float) -> None:
+        """Let the playback do its work, in this thread, until its clock has come so far."""
+        self.clock.at(end, self.playback.close)
+        self.playback._run()
+
+    def _draw(self, frame: int, is_playing: bool) -> None:
         self.drawn.append((frame, is_playing))
-
-    def wait_for(self, frame: int) -> None:
-        self.until(lambda: any(drawn == frame for drawn, _ in self.drawn))
-
-    def until(self, condition: Callable[[], bool]) -> None:
-        end = time.monotonic() + PATIENCE
-        while not condition():
-            assert time.monotonic() < end, f"it did not come true: {self.drawn}"
-            time.sleep(0.005)
-
-    def wait_beyond(self, frame: int) -> float:
-        """Wait for a later frame; returns how long that took."""
-        start = time.monotonic()
-        while all(drawn <= frame for drawn, _ in self.drawn):
-            assert time.monotonic() < start + PATIENCE, self.drawn
-            time.sleep(0.002)
-        return time.monotonic() - start
+        self.moments.append(self.clock.now)
+        self.clock.now += self.cost
 
 
 @pytest.fixture
-def screen() -> Screen:
-    return Screen()
+def film(monkeypatch: pytest.MonkeyPatch) -> Film:
+    return Film(monkeypatch, 10, 100.0)
 
 
 @pytest.fixture
-def playback(screen: Screen) -> Iterator[Playback]:
-    playback = Playback(10, 100.0, screen)
+def playback() -> Iterator[Playback]:
+    playback = Playback(10, 100.0, lambda *_: None)
     playback.start()
     yield playback
     playback.close()
 
 
-def test_it_draws_the_first_frame_and_then_rests(playback: Playback, screen: Screen) -> None:
-    screen.wait_for(0)
-    time.sleep(0.1)
-    assert screen.drawn == [(0, False)]
+def test_it_draws_the_first_frame_and_then_rests(film: Film) -> None:
+    film.run(1000.0)
+    assert film.drawn == [(0, False)]
+    assert film.clock.is_resting
 
 
-def test_it_plays_around_and_around(playback: Playback, screen: Screen) -> None:
-    playback.play()
-    screen.until(lambda: any(after < before for (before, _), (after, _) in pairwise(screen.drawn)))
-    assert playback.is_playing
+def test_it_plays_around_and_around(film: Film) -> None:
+    film.playback.play()
+    film.run(1.0)
+    assert any(after < before for before, after in pairwise(film.frames))
+    assert film.playback.is_playing
 
 
-def test_without_loop_it_stops_at_the_end_and_starts_over(
-    playback: Playback, screen: Screen
+def test_without_loop_it_stops_at_the_end_and_starts_over(film: Film) -> None:
+    film.playback.set_loop(on=False)
+    film.playback.play()
+    film.run(1.0)
+    assert (film.playback.frame, film.playback.is_playing) == (9, False)
+    assert film.drawn[-1] == (9, False)
+    assert film.clock.is_resting
+    film.playback.play()
+    assert (film.playback.frame, film.playback.is_playing) == (0, True)
+
+
+def test_the_running_clock_waits_for_frames_that_are_being_computed(film: Film) -> None:
+    film.playback.limit(4)
+    film.playback.play()
+    film.clock.at(1.0, lambda: film.playback.limit(10))
+    film.run(2.0)
+    assert film.moment_of(3) < 0.1
+    assert max(f for f, at in zip(film.frames, film.moments, strict=True) if at < 1.0) == 3
+    assert film.moment_of(4) >= 1.0
+
+
+def test_a_frame_that_was_waited_for_is_drawn_at_once(film: Film) -> None:
+    film.playback.limit(2)
+    film.playback.play()
+    # From here on a frame lasts 20 seconds.
+    film.clock.at(0.5, lambda: film.playback.set_speed(5e-4))
+    film.clock.at(1.5, lambda: film.playback.limit(3))
+    film.run(2.0)
+    assert film.frames[-1] == 2
+    assert film.moment_of(2) == pytest.approx(1.5, abs=0.1)
+
+
+def test_frames_that_become_ready_later_are_not_drawn_before(
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    playback.set_loop(on=False)
-    playback.play()
-    screen.until(lambda: (9, False) in screen.drawn)
-    time.sleep(0.1)
-    assert (playback.frame, playback.is_playing) == (9, False)
-    assert screen.drawn[-1] == (9, False)
-    playback.set_speed(1e-4)  # So slow that it is still at the beginning when it is asked.
-    playback.play()
-    assert (playback.frame, playback.is_playing) == (0, True)
-
-
-def test_the_running_clock_waits_for_frames_that_are_being_computed(
-    playback: Playback, screen: Screen
-) -> None:
-    playback.limit(4)
-    playback.play()
-    screen.wait_for(3)
-    time.sleep(0.15)
-    assert max(frame for frame, _ in screen.drawn) == 3
-    playback.limit(10)
-    screen.wait_beyond(3)
-
-
-def test_a_frame_that_was_waited_for_is_drawn_at_once() -> None:
-    screen = Screen()
-    playback = Playback(10, 100.0, screen)
-    playback.limit(2)
-    playback.start()
-    playback.play()
-    screen.until(playback._is_starved)
-    playback.set_speed(5e-4)  # From here on a frame lasts 20 seconds.
-    time.sleep(0.7)
-    assert screen.drawn[-1][0] == 1
-    playback.limit(3)
-    assert screen.wait_beyond(1) < 10.0
-    playback.close()
-
-
-def test_frames_that_become_ready_later_are_not_drawn_before(screen: Screen) -> None:
-    playback = Playback(1000, 4.0, screen)
-    playback.start()
-    playback.play()
+    film = Film(monkeypatch, 1000, 4.0)
+    film.playback.play()
     for ready in range(2, 400):
-        playback.limit(ready)
-        time.sleep(0.001)
-    playback.close()
-    # Once as it starts, perhaps once more as it begins to play, and then each frame once.
-    assert 1 <= len(screen.drawn) <= len({frame for frame, _ in screen.drawn}) + 2
-
-
-def play_in(time_: Time, playback: Playback, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Play until it is closed, in a time that goes on only while the clock waits or draws."""
-    monkeypatch.setattr("app.viewer.playback.time", time_)
-    monkeypatch.setattr(playback._condition, "wait", time_.wait)
-    playback.play()
-    playback.start()
-    playback._thread.join(timeout=PATIENCE)
-    assert not playback._thread.is_alive()
+        film.clock.at(ready * 1e-3, lambda ready=ready: film.playback.limit(ready))
+    film.run(1.0)
+    # Each frame once.
+    assert film.frames == [0, 1, 2, 3]
 
 
 def test_no_frame_is_left_out_while_drawing_takes_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    time_, frames = Time(), list[int]()
-
-    def draw(frame: int, _: bool) -> None:
-        frames.append(frame)
-        time_.now += 0.012
-        if frame >= 50:
-            playback.close()
-
-    playback = Playback(1000, 25.0, draw)
-    play_in(time_, playback, monkeypatch)
+    film = Film(monkeypatch, 1000, 25.0)
+    film.cost = 0.012
+    film.playback.play()
+    film.run(2.03)
     # A clock that waits for 40 ms after each drawing leaves out a dozen.
-    assert frames == list(range(51))
-    assert time_.now == pytest.approx(2.0, abs=0.05)
+    assert film.frames == list(range(51))
+    assert film.moment_of(50) == pytest.approx(2.0, abs=0.05)
 
 
-def test_steps_wrap_and_stop_the_clock(playback: Playback, screen: Screen) -> None:
+def test_steps_wrap_and_stop_the_clock(playback: Playback) -> None:
     playback.play()
     playback.step(-1)
     playback.seek(0)
@@ -164,18 +171,12 @@ def test_steps_wrap_and_stop_the_clock(playback: Playback, screen: Screen) -> No
 
 
 def test_speed_scales_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    time_, drawn = Time(), list[tuple[int, float]]()
-
-    def draw(frame: int, _: bool) -> None:
-        drawn.append((frame, time_.now))
-        if frame >= 20:
-            playback.close()
-
-    playback = Playback(1000, 10.0, draw)
-    playback.set_speed(2.0)
-    play_in(time_, playback, monkeypatch)
-    assert [frame for frame, _ in drawn] == list(range(21))
-    assert [at for _, at in drawn] == pytest.approx(np.arange(21) / 20.0, abs=0.002)
+    film = Film(monkeypatch, 1000, 10.0)
+    film.playback.set_speed(2.0)
+    film.playback.play()
+    film.run(1.02)
+    assert film.frames == list(range(21))
+    assert film.moments == pytest.approx(np.arange(21) / 20.0, abs=0.002)
 
 
 def test_an_error_while_drawing_does_not_stop_the_clock(caplog) -> None:
@@ -189,9 +190,9 @@ def test_an_error_while_drawing_does_not_stop_the_clock(caplog) -> None:
     playback = Playback(3, 30.0, draw)
     playback.start()
     playback.seek(1)
-    Screen().until(lambda: 1 in frames)
+    until(lambda: 1 in frames)
     playback.seek(2)
-    Screen().until(lambda: 2 in frames)
+    until(lambda: 2 in frames)
     playback.close()
     assert frames[-1] == 2
     assert "no such picture" in caplog.text

@@ -2,7 +2,7 @@
 
 import asyncio
 import threading
-import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 from viewer_client import ViewerClient
 from viewer_world import FRAMES, PARAMETERS, FakeSettings, controls, hear_all, rest_at, sheet
+from waiting import WatchedLock, until
 
+from app.viewer import session_view
 from app.viewer.resimulation import STARTING
 from app.viewer.session import Session, Sessions
 from app.viewer.stage import Stage
@@ -88,9 +90,6 @@ def test_two_tabs_stream_what_their_own_sliders_ask_for(many) -> None:
         first.set("Play", True)
         first.until(lambda: any(p.get("label") == "Pause" for p in first.gui.values()))
 
-        with pytest.raises(TimeoutError, match="it did not come true"):
-            second.until(lambda: False, seconds=0.5)
-        assert second.messages[heard:] == []
         hear_out(own, second)
         assert len(second.messages[heard:]) == 1  # That of being asked to say all.
         assert own.state.parameters == PARAMETERS != other.state.parameters
@@ -156,8 +155,9 @@ def test_one_s_own_forgotten_tab_makes_room(catalog) -> None:
 
 
 def test_one_session_draws_at_a_time(many, monkeypatch) -> None:
+    turn, is_watched = WatchedLock(), threading.Event()
     lock, drawing, most = threading.Lock(), 0, 0
-    drawn: set[int] = set()
+    drawn: Counter[int] = Counter()
     real = Stage.draw
 
     def draw(self: Stage, *given: object, **options: object) -> None:
@@ -165,18 +165,21 @@ def test_one_session_draws_at_a_time(many, monkeypatch) -> None:
         with lock:
             drawing += 1
             most = max(most, drawing)
-            drawn.add(id(self))
-        time.sleep(0.003)
+        if is_watched.is_set():  # All scenes play now: another one wants to draw as well.
+            until(lambda: turn.waiting or not is_watched.is_set())
+            drawn[id(self)] += 1
         real(self, *given, **options)
         with lock:
             drawing -= 1
 
     monkeypatch.setattr(Stage, "draw", draw)
+    monkeypatch.setattr(session_view, "TURN", turn)
     tabs = [open_tab(many) for _ in range(4)]
     with ExitStack() as stack:
         for _, client in tabs:
             stack.enter_context(client)
             client.until(lambda client=client: client.find("Pause"))
-        time.sleep(0.5)
-    assert len(drawn) == len(tabs)
+        is_watched.set()
+        until(lambda: len(drawn) == len(tabs) and min(drawn.values()) > 3, lambda: drawn)
+        is_watched.clear()
     assert most == 1

@@ -2,8 +2,7 @@
 
 import re
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 from viewer_client import ViewerClient
 from viewer_world import FRAMES, PARAMETERS, FakeSettings, FolderCatalog
+from waiting import until
 
 from app.viewer.keep_panel import Keeping
 from app.viewer.preset_store import PresetStore
@@ -243,21 +243,14 @@ def test_what_a_run_is_told_gives_the_parameters_of_the_scene(run) -> None:
     assert run_changes(run, fitted, fitted, is_automatic=True) == {"substeps_per_frame": "auto"}
 
 
-def wait_for(condition: Callable[[], bool], seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
-
-
 def test_a_saved_run_is_followed_until_it_ends(kept, begun) -> None:
     run = kept.saver.save("sheet", "lift", "  A   name ", {"drag": 1.0})
     assert (run.name, begun) == ("A name", [run])
     told: list[SavedRun] = []
     thread = kept.saver.follow(run, told.append, threading.Event())
-    wait_for(lambda: len(told) == 1)
+    until(lambda: len(told) == 1)
     with run.begin_attempt() as attempt:
-        wait_for(lambda: len(told) == 2)
+        until(lambda: len(told) == 2)
         attempt.save_array("x.npy", np.zeros(3))
         attempt.publish()
     thread.join(timeout=60)
