@@ -49,7 +49,8 @@ def stubborn(run: Run, attempt: Attempt) -> None:
     attempt.progress().report("first", 1, 1, 2.0)
     (run.folder / "pids.tmp").write_text(f"{os.getpid()} {child.pid}")
     (run.folder / "pids.tmp").rename(run.folder / "pids")
-    time.sleep(300)
+    while True:
+        signal.pause()
 
 
 def killed(run: Run, attempt: Attempt) -> None:

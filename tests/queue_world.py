@@ -1,7 +1,6 @@
 """An application whose queue works, with the workers of `job_worker` and made-up live scenes."""
 
 import json
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -12,6 +11,7 @@ from typing import Any
 import uvicorn
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
+from waiting import until
 
 from app.jobs.catalog import Catalog
 from app.jobs.processes import end_processes
@@ -79,20 +79,20 @@ class QueueWorld:
         assert response.status_code == 201
         return response.json()["id"]
 
-    def until(self, run_id: str, state: str, seconds: float = 120.0) -> dict[str, Any]:
-        end = time.monotonic() + seconds
-        while (run := self.client.get(f"/api/v1/runs/{run_id}").json())["state"] != state:
-            assert time.monotonic() < end, run
-            time.sleep(0.03)
+    def until(self, run_id: str, state: str) -> dict[str, Any]:
+        run: dict[str, Any] = {}
+
+        def has_state() -> bool:
+            run.clear()
+            run.update(self.client.get(f"/api/v1/runs/{run_id}").json())
+            return run["state"] == state
+
+        until(has_state, lambda: run)
         return run
 
     def until_reported(self, run_id: str, stage: str, iteration: int = 1) -> None:
         """Wait for a report; a run is called running before its worker has made its files."""
-        end = time.monotonic() + 120.0
-        wanted = (stage, iteration)
-        while wanted not in (told := self._reports(run_id)):
-            assert time.monotonic() < end, told
-            time.sleep(0.03)
+        until(lambda: (stage, iteration) in self._reports(run_id), lambda: self._reports(run_id))
 
     def _reports(self, run_id: str) -> list[tuple[str, int]]:
         events, _ = read_events(self.folder(run_id))
@@ -137,8 +137,7 @@ def serving(world: QueueWorld) -> Iterator[int]:
     server = uvicorn.Server(config)
     thread = Thread(target=server.run, daemon=True)
     thread.start()
-    while not server.started:
-        time.sleep(0.01)
+    until(lambda: server.started)
     yield server.servers[0].sockets[0].getsockname()[1]
     world.app.state.stopping.set()
     server.should_exit = True

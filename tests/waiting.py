@@ -9,23 +9,22 @@ Answer = TypeVar("Answer")
 
 LIMIT_S = 120.0
 """So long a machine may be busy with something else; what takes longer does not happen [s]."""
-_INTERVAL_S = 0.01
 
 
 def until(
-    ask: Callable[[], Answer], tell: Callable[[], object] = str, *, seconds: float = LIMIT_S
+    ask: Callable[[], Answer], tell: Callable[[], object] = str, *, interval: float = 0.01
 ) -> Answer:
     """Ask until the answer is true, and return it.
 
     Args:
         ask: What is waited for.
         tell: What the failure says, asked when time is up.
-        seconds: When to give up [s].
+        interval: How long to leave the processor to others before asking again [s].
     """
-    end = time.monotonic() + seconds
+    end = time.monotonic() + LIMIT_S
     while not (answer := ask()):
-        assert time.monotonic() < end, f"it did not come true within {seconds:g} s: {tell()}"
-        time.sleep(_INTERVAL_S)
+        assert time.monotonic() < end, f"it did not come true within {LIMIT_S:g} s: {tell()}"
+        time.sleep(interval)
     return answer
 
 

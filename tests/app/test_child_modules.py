@@ -3,11 +3,11 @@
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import psutil
 import pytest
+from waiting import until
 
 from app.child_modules import PACKAGE_ROOT, start_module
 
@@ -16,9 +16,7 @@ ECHO = ("json.tool", "--compact", "--no-ensure-ascii")
 
 
 def environment_of(process: psutil.Process) -> dict[str, str]:
-    while not (told := process.environ()):
-        time.sleep(0.01)  # The kernel is just replacing the program.
-    return told
+    return until(process.environ)  # The kernel may just be replacing the program.
 
 
 def test_a_child_gets_our_packages_and_few_threads_and_no_secret(

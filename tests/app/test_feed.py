@@ -1,4 +1,4 @@
-import time
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -76,18 +76,22 @@ def test_a_slow_look_is_not_repeated_at_once_but_a_page_sees_what_is_there(
 ) -> None:
     monkeypatch.setattr(feed_module, "_INTERVAL_S", 0.0)
     monkeypatch.setattr(feed_module, "_SHARE", 1e-4)
+    clock = SimpleNamespace(now=1.0)
+    clock.monotonic = lambda: clock.now
+    monkeypatch.setattr(feed_module, "time", clock)
     runs = [{"id": "a", "state": "queued"}]
     looks: list[int] = []
 
     def look() -> list[dict[str, Any]]:
         looks.append(1)
-        time.sleep(0.01)
+        clock.now += 0.01
         return [dict(run) for run in runs]
 
     feed = Feed(look)
     start, shown = feed.snapshot()
     assert shown == runs
     runs[0]["state"] = "running"
+    clock.now += 99.0
     assert feed.since(start) == []
     assert len(looks) == 1
     changed, shown = feed.snapshot()
@@ -95,3 +99,6 @@ def test_a_slow_look_is_not_repeated_at_once_but_a_page_sees_what_is_there(
     assert changed != start
     assert seen(feed, start) == [("run", {"id": "a", "state": "running"})]
     assert len(looks) == 2
+    clock.now += 101.0
+    feed.since(start)
+    assert len(looks) == 3

@@ -11,6 +11,7 @@ from typing import Any
 
 import psutil
 import pytest
+from waiting import until
 
 from app.jobs import scheduler as scheduler_module
 from app.jobs.catalog import Catalog
@@ -23,13 +24,6 @@ from physhandi.errors import PhysHandiError, RunError, SequenceError, UsageError
 
 TESTS = Path(__file__).parent.parent
 GRACE_S = 0.4
-
-
-def until(claim: Callable[[], object], seconds: float = 120.0) -> None:
-    end = time.monotonic() + seconds
-    while not claim():
-        assert time.monotonic() < end, "waited too long"
-        time.sleep(0.02)
 
 
 class Desk:
@@ -126,9 +120,8 @@ def test_runs_wait_in_order_while_the_only_slot_is_taken(desk: Desk) -> None:
     until(lambda: [desk.view(run_id).place for run_id in waiting] == [1, 2])
     assert [desk.state(run_id) for run_id in waiting] == ["queued", "queued"]
     assert "one fit runs at a time" in desk.view(waiting[1]).reason
-    for _ in range(20):
-        assert desk.state(waiting[0]) == "queued"
-        time.sleep(0.02)
+    desk.scheduler._step()
+    assert [desk.state(run_id) for run_id in waiting] == ["queued", "queued"]
     (desk.run(first).folder / "go").touch()
     desk.until(first, "succeeded")
     desk.until(waiting[0], "running")
@@ -167,7 +160,7 @@ def test_a_run_that_waits_is_cancelled_without_starting(desk: Desk) -> None:
     assert desk.state(second) == "cancelled"
     (desk.run(first).folder / "go").touch()
     desk.until(first, "succeeded")
-    time.sleep(0.6)
+    desk.scheduler._step()
     assert desk.state(second) == "cancelled"
     assert read_events(desk.run(second).folder)[0] == []
 
@@ -237,7 +230,7 @@ def test_a_closed_server_starts_nothing_more(desk: Desk) -> None:
     folder = desk.run(running).folder
     (folder / "go").touch()
     until(lambda: supervisor_of(folder) is None)
-    time.sleep(0.6)
+    assert not desk.scheduler._thread.is_alive()
     assert (desk.run(waiting).folder / "queued.json").is_file()
 
 
@@ -294,7 +287,8 @@ def test_a_restarted_server_finds_running_and_waiting_runs_again(
     after = desks()
     assert after.state(running) == "running"
     until(lambda: after.view(waiting).place == 1)
-    time.sleep(0.6)
+    after.scheduler._step()
+    after.scheduler._sweep()
     assert [after.state(running), after.state(waiting)] == ["running", "queued"]
     assert holder is not None
     now = live_holder(after.run(running).folder)

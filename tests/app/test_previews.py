@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ import pytest
 import yaml
 from PIL import Image, ImageSequence
 from server_world import World
+from waiting import until
 
 from app.child_modules import PACKAGE_ROOT
 from app.previews import store, worker
@@ -114,13 +114,6 @@ def test_depth_is_shown_where_there_is_no_color(tmp_path: Path) -> None:
     assert clip.frames[0].reshape(-1, 3).std(axis=0).min() > 10
 
 
-def until(is_so: Callable[[], bool]) -> None:
-    end = time.monotonic() + 150.0
-    while not is_so():
-        assert time.monotonic() < end
-        time.sleep(0.05)
-
-
 def until_ready(previews: Previews, kind: str, name: str) -> None:
     until(lambda: previews.look(kind, name).state != "pending")
 
@@ -195,11 +188,11 @@ def test_what_ends_its_process_is_noted_and_the_others_are_drawn(
 
 def test_what_computes_for_too_long_is_ended_and_what_waits_is_not() -> None:
     code = (
-        "import app.previews.worker as worker, os, time\n"
+        "import app.previews.worker as worker, os, signal\n"
         "worker.SECONDS_EACH = 1\n"
         "def draw(order, *, is_still):\n"
         "    while order['kind'] == 'endless': pass\n"
-        "    time.sleep(2.0)\n"
+        "    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)\n"
         "worker.draw = draw\n"
         "worker.main()\n"
     )

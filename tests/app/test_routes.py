@@ -1,12 +1,12 @@
 """The routes of the API and the pages, with a real queue and made-up live scenes."""
 
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from queue_world import HOSTILE, QueueWorld, queue_world
+from waiting import until
 
 from app import api
 from app.jobs.catalog import RunItem
@@ -58,11 +58,8 @@ def test_a_run_that_is_called_finished_has_its_results(
     def follow_late(item: RunItem, scheduler: Scheduler) -> dict[str, Any]:
         """Look at a run's state when it has just ended."""
         world.tell(run_id, ["finish", "first", {"before": 2.0, "after": 1.0}], ["publish"])
-        end = time.monotonic() + 120.0
-        while (told := follow(item, scheduler))["state"] != "succeeded":
-            assert time.monotonic() < end, told
-            time.sleep(0.03)
-        return told
+        until(lambda: follow(item, scheduler)["state"] == "succeeded")
+        return follow(item, scheduler)
 
     monkeypatch.setattr(api, "follow_run", follow_late)
     run = world.client.get(f"/api/v1/runs/{run_id}").json()
@@ -145,10 +142,8 @@ def test_a_failure_is_told_on_top_without_the_insides_of_the_program(world: Queu
     run_id = world.launch("defect")
     world.until(run_id, "failed")
     # A worker's last words reach the log when the run has failed already.
-    log, end = world.folder(run_id) / "log.txt", time.monotonic() + 120.0
-    while "KeyError" not in log.read_text():
-        assert time.monotonic() < end
-        time.sleep(0.03)
+    log = world.folder(run_id) / "log.txt"
+    until(lambda: "KeyError" in log.read_text())
     assert "Traceback" in log.read_text()
     page = world.client.get(f"/runs/{run_id}").text
     assert "The fit failed in <em>zeroth order</em>" in page

@@ -5,7 +5,6 @@ import os
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,7 @@ from playwright.sync_api import (
     sync_playwright,
 )
 from scene_page import TIMEOUT_MS
+from waiting import until
 
 from app.jobs.processes import end_processes
 
@@ -69,11 +69,12 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         environment = os.environ | {"PYTHONPATH": str(ROOT)}
         server = subprocess.Popen(command, cwd=folder, stdout=out, stderr=log, env=environment)
     try:
-        end = time.monotonic() + _START_SECONDS
-        while not printed.read_text().endswith("\n"):
+
+        def has_printed() -> bool:
             assert server.poll() is None, (folder / "log").read_text()
-            assert time.monotonic() < end, "the server printed no address"
-            time.sleep(0.1)
+            return printed.read_text().endswith("\n")
+
+        until(has_printed, (folder / "log").read_text)
         yield Served(printed.read_text().strip(), folder / "data")
     finally:
         for run in (folder / "data" / "runs").glob("*"):

@@ -1,11 +1,11 @@
 """The page of a replay and what it plays."""
 
-import time
 from typing import Any
 from urllib.parse import quote
 
 from server_world import World
 from viser_file import Recording
+from waiting import until
 
 from app.exports.order import Order
 
@@ -21,12 +21,13 @@ def test_a_replay_is_made_in_the_background_and_played_without_a_session(
     assert f'data-replay="{REPLAY}"' in page.text
 
     def have_made(query: str) -> Any:
-        end = time.monotonic() + 150
-        while (told := browser.post(f"{REPLAY}?{query}").json())["state"] == "making":
-            assert time.monotonic() < end
-            time.sleep(0.05)
-        assert told["state"] == "ready"
-        return told
+        def told() -> Any:
+            answer = browser.post(f"{REPLAY}?{query}").json()
+            return answer if answer["state"] != "making" else None
+
+        answer = until(told)
+        assert answer["state"] == "ready"
+        return answer
 
     told = have_made("sequence=sheet")
     file = browser.get(told["url"])

@@ -1,7 +1,7 @@
 """The workshop: processes, cache, limits and errors."""
 
+import os
 import threading
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -96,12 +96,10 @@ def test_the_cache_forgets_what_was_not_used_for_longest(
 ) -> None:
     pretend(monkeypatch)
     workshop = Workshop(tmp_path / "cache", most_bytes=350)
-    paths = []
-    for frame in range(3):
-        paths.append(workshop.make(replace(order, query={"f": str(frame)})))
-        time.sleep(0.02)
+    paths = [workshop.make(replace(order, query={"f": str(frame)})) for frame in range(3)]
+    for moment, path in enumerate(paths):
+        os.utime(path, (moment, moment))
     Workshop(tmp_path / "cache").make(replace(order, query={"f": "0"}))  # Used again.
-    time.sleep(0.02)
     paths.append(workshop.make(replace(order, query={"f": "3"})))
     assert [path.exists() for path in paths] == [True, False, True, True]
     workshop.close()

@@ -5,7 +5,6 @@ import multiprocessing
 import os
 import signal
 import sys
-import time
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 import yaml
 from safetensors.numpy import load_file
+from waiting import until
 
 from physhandi.data.checkpoint import read_checkpoint
 from physhandi.data.run import Run, read_events
@@ -96,6 +96,17 @@ def check_whole(run: Run) -> int:
     return count
 
 
+def kill_after(count: int, child: Any, written: Any, run: Run) -> None:
+    """Kill a child that holds the run and has written so many files."""
+
+    def has_written() -> bool:
+        assert child.is_alive()
+        return holder_of(run.folder) == child.pid and written.value >= count
+
+    until(has_written, interval=0.0002)
+    os.kill(child.pid, signal.SIGKILL)
+
+
 def test_kills_in_the_middle_of_writing(tmp_path: Path) -> None:
     run = Run.create(
         tmp_path / "fit", name="fit", kind="reconstruction", sequences=[], config={"a": 1}
@@ -113,11 +124,7 @@ def test_kills_in_the_middle_of_writing(tmp_path: Path) -> None:
         child.start()
         if last is None:
             # Not after so much time, in which a busy machine gets nothing written.
-            enough = chance.integers(0, MOST_WRITTEN)
-            while holder_of(run.folder) != child.pid or written.value < enough:
-                assert child.is_alive()
-                time.sleep(0.0002)
-            os.kill(child.pid or 0, signal.SIGKILL)
+            kill_after(int(chance.integers(0, MOST_WRITTEN)), child, written, run)
         child.join()
         assert child.exitcode == -signal.SIGKILL
         files += check_whole(run)
