@@ -13,23 +13,24 @@ from starlette.exceptions import HTTPException
 from app.comparison import NewComparison
 from app.jobs.about import RunChanges, change_about
 from app.jobs.catalog import Catalog, NotFoundError
-from app.jobs.describe import (
+from app.jobs.log import open_log
+from app.jobs.machine import Machine
+from app.jobs.order import describe_order
+from app.jobs.scheduler import Scheduler
+from app.jobs.streams import Feed, News, Streams
+from app.jobs.views import (
+    RunQuery,
     describe_results,
     describe_run,
     describe_sequence,
     follow_run,
     frame_errors,
     loss_curves,
+    page_of,
+    select_runs,
 )
-from app.jobs.feed import Feed
-from app.jobs.listing import RunQuery, page_of, select_runs
-from app.jobs.log import open_log
-from app.jobs.machine import Machine
-from app.jobs.order import describe_order
-from app.jobs.scheduler import Scheduler
-from app.jobs.streams import News, Streams
 from app.jobs.watch import Watch
-from physhandi.fitting.profile import load_profile, profile_names
+from physhandi.fitting.config import load_profile, profile_names
 
 Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
 Path = Annotated[str, Field(max_length=200)]

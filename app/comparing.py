@@ -7,14 +7,14 @@ from fastapi.responses import HTMLResponse
 
 from app.comparison import CompareAsk, Id
 from app.jobs.catalog import Catalog, RunItem
-from app.jobs.describe import describe_results, describe_run, frame_errors
 from app.jobs.scheduler import Scheduler
+from app.jobs.views import describe_results, describe_run, frame_errors
 from app.pages import Pages
 from app.pages.diff import compare_runs
-from app.viewer.compare_curve import Pairing
-from app.viewer.compare_pair import chosen_sequences, open_pair, pairing_of
-from app.viewer.difference import compare_frames, way_of
-from physhandi.data.atomic import named_fields
+from app.viewer.compare.curve import Pairing
+from app.viewer.compare.difference import compare_frames, way_of
+from app.viewer.compare.pair import chosen_sequences, open_pair, pairing_of
+from physhandi.data.files import named_fields
 from physhandi.data.run import Run
 from physhandi.errors import RunError
 

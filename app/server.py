@@ -18,24 +18,22 @@ from starlette.exceptions import HTTPException
 
 from app.api import create_api
 from app.comparing import create_comparing
+from app.exports.cache import FileCache, TooManyFilesError
 from app.exports.routes import create_exports
-from app.exports.workshop import TooManyFilesError, Workshop
 from app.jobs.catalog import Catalog, NotFoundError
-from app.jobs.describe import describe_run
-from app.jobs.feed import Feed
 from app.jobs.machine import Machine
 from app.jobs.scheduler import QueueFullError, Scheduler
-from app.monitor import create_monitor
-from app.monitor.overview import Overview
+from app.jobs.streams import Feed
+from app.jobs.views import describe_run
+from app.monitor import Overview, create_monitor
 from app.pages import Pages, create_pages
 from app.previews.store import Previews
 from app.security import Gatekeeper, Security
 from app.settings import WEB_ASSETS, Settings
 from app.viewer.gate import create_gate
-from app.viewer.keep_panel import Keeping
-from app.viewer.preset_store import PresetStore
-from app.viewer.save_run import RunSaver
-from app.viewer.session import Sessions, TooManySessionsError
+from app.viewer.physics.keep_panel import RunSaver, UserStorage
+from app.viewer.physics.presets import PresetStore
+from app.viewer.sessions import Sessions, TooManySessionsError
 from physhandi import __version__
 from physhandi.errors import (
     MissingInputError,
@@ -84,7 +82,7 @@ def create_app(
     security = security or Security(settings)
     catalog = catalog or Catalog(settings)
     scheduler = scheduler or Scheduler(settings, catalog)
-    keeping = Keeping(
+    keeping = UserStorage(
         PresetStore(settings.data_dir / "presets"),
         RunSaver(catalog, settings.run_dir, scheduler.start_now),
     )
@@ -93,7 +91,7 @@ def create_app(
     feed = Feed(lambda: [describe_run(item, scheduler) for item in catalog.runs()])
     pages = Pages()
     previews = Previews(settings, catalog)
-    workshop = Workshop(settings.data_dir / "cache" / "exports")
+    workshop = FileCache(settings.data_dir / "cache" / "exports")
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncGenerator[None]:

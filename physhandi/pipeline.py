@@ -20,11 +20,24 @@ from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.errors import MissingInputError
 from physhandi.fitting import artefacts
+from physhandi.fitting.config import (
+    EVALUATION,
+    HANDS,
+    OBSERVATION,
+    REFINEMENT,
+    SEARCH,
+    SIMULATION,
+    SPRINGS,
+    PipelineConfig,
+    apply_overrides,
+    config_from_dict,
+    config_to_dict,
+    load_profile,
+)
+from physhandi.fitting.config import STAGES as STAGES
 from physhandi.fitting.hand_reconstruction import reconstruct_hands
 from physhandi.fitting.object_problem import ObjectProblem, build_problem
 from physhandi.fitting.object_reconstruction import search_object
-from physhandi.fitting.overrides import apply_overrides
-from physhandi.fitting.profile import PipelineConfig, config_from_dict, config_to_dict, load_profile
 from physhandi.fitting.rollouts import (
     control_trajectory_of,
     object_nodes_of,
@@ -34,16 +47,6 @@ from physhandi.fitting.rollouts import (
 )
 from physhandi.fitting.simulate import simulate_again
 from physhandi.fitting.spring_optimisation import optimise_springs
-from physhandi.fitting.stage_names import (
-    EVALUATION,
-    HANDS,
-    OBSERVATION,
-    REFINEMENT,
-    SEARCH,
-    SIMULATION,
-    SPRINGS,
-)
-from physhandi.fitting.stage_names import STAGES as STAGES
 from physhandi.metrics.report import measure_run, score_run
 from physhandi.perception.lifting import observe_object
 from physhandi.progress import Progress

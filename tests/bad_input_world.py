@@ -15,7 +15,7 @@ from app import cli
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence, ViewMeta
-from physhandi.data.sequence_schema import SequenceMeta
+from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import SequenceWriter
 
 FILMED_FRAMES, WIDTH, HEIGHT = 4, 48, 36

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from physhandi.synthetic.true_hand import Capsule, HandPose
+from physhandi.synthetic.hands.true_hand import Capsule, HandPose
 
 
 @dataclass(frozen=True)

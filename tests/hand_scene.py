@@ -6,7 +6,7 @@ import numpy as np
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence import Sequence, ViewMeta
-from physhandi.data.sequence_schema import SequenceMeta
+from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import SequenceWriter
 from physhandi.hand.model import HandKind, Side, load_hand_model
 from physhandi.hand.motion import HandMotion

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from phystwin_case import edit_json, edit_pickle, save_pickle
 
-from physhandi.data.importers import phystwin_tables
+from physhandi.data.importers import phystwin_files
 from physhandi.data.importers.phystwin import import_phystwin
 from physhandi.errors import ImportFailedError
 
@@ -78,7 +78,7 @@ def refuse(folder: Path, damage: Damage, message: str, patch: pytest.MonkeyPatch
     Reading its good pickles in this process (`patch`) saves a child process for each.
     """
     if patch is not None:
-        patch.setattr(phystwin_tables, "read_untrusted", load)
+        patch.setattr(phystwin_files, "read_untrusted", load)
     damage(folder)
     with pytest.raises(ImportFailedError, match=message):
         import_phystwin(folder, folder.parent / "out")

@@ -13,10 +13,10 @@ from app.jobs.scheduler import Scheduler
 from app.security import Security
 from app.server import create_app
 from app.settings import BUNDLED, Settings
-from app.viewer.session import Sessions
+from app.viewer.sessions import Sessions
 from physhandi import pipeline
 from physhandi.data.run import Run
-from physhandi.fitting.profile import PipelineConfig, config_to_dict
+from physhandi.fitting.config import PipelineConfig, config_to_dict
 
 TOKEN = "a-token-that-only-the-tests-know"  # noqa: S105
 HOST = "127.0.0.1:8080"

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from physhandi.data.sequence import Sequence
-from physhandi.data.sequence_schema import SequenceMeta
+from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import write_sequence
-from physhandi.fitting.profile import PipelineConfig, load_profile
+from physhandi.fitting.config import PipelineConfig, load_profile
 from physhandi.fitting.search import SearchVariable
 from physhandi.simulation.model import SimulationParameters
 from physhandi.simulation.simulator import Simulator

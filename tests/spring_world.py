@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from app.viewer.content import Content
-from app.viewer.take import Take
+from app.viewer.content.content import Content
+from app.viewer.content.object_rollout import ObjectRollout
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
 
 
-def two_springs(frames: int = 4) -> Take:
+def two_springs(frames: int = 4) -> ObjectRollout:
     """Node 1 runs away from node 0 at 3 m/s; a control stands above node 0."""
     model = SpringMassModel(
         object_node=np.array([[0, 0, 0], [1, 0, 0], [5, 5, 5]], np.float32),
@@ -23,12 +23,12 @@ def two_springs(frames: int = 4) -> Take:
     position[:, 1, 0] += 0.1 * np.arange(frames)
     control = np.full((frames, 1, 3), [0.0, 0.0, 1.0], np.float32)
     parameters = SimulationParameters(stiffness_scale=2.0, frame_rate=30.0)
-    return Take(
+    return ObjectRollout(
         model=model, parameters=parameters, control=control, position=position, ready=frames
     )
 
 
-def content_of(take: Take, **fields) -> Content:
+def content_of(take: ObjectRollout, **fields) -> Content:
     return Content(
         title="t",
         sequence_name="s",

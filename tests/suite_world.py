@@ -9,10 +9,10 @@ import numpy as np
 from sheet_sequence import FRAMES, NODE, write_sheet
 
 from physhandi.data.sequence import Sequence
-from physhandi.data.sequence_schema import SequenceMeta
+from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import write_sequence
-from physhandi.synthetic.generator_version import generator_version
-from physhandi.synthetic.suite_tasks import Order
+from physhandi.synthetic.code_version import generator_version
+from physhandi.synthetic.suite.evaluation import Order
 
 SETTINGS = {
     "object_.search.generations": 1,

@@ -3,10 +3,10 @@
 import numpy as np
 from numpy import ndarray
 
-from physhandi.synthetic.bodies import Body
+from physhandi.synthetic.bodies.bodies import Body
+from physhandi.synthetic.bodies.sheets import make_sheet
 from physhandi.synthetic.engines.truth import PhysicalTruth
-from physhandi.synthetic.scenes import make_sheet
-from physhandi.synthetic.true_hand import BONE_COUNT, HandPose, load_true_hand
+from physhandi.synthetic.hands.true_hand import BONE_COUNT, HandPose, load_true_hand
 
 SPEED = 0.30
 """Speed at which the hands and the sheet's far edge rise [m/s]."""

@@ -17,15 +17,6 @@ SOURCE_FILES = sorted(
 KERNEL_FILES = sorted((ROOT / "physhandi/simulation/kernels").glob("*.py"))
 READABLE = 20
 """Files of a folder that a person reads at a glance."""
-CROWDED = {
-    "app/jobs": 28,
-    "app/viewer": 83,
-    "physhandi/data": 25,
-    "physhandi/fitting": 34,
-    "physhandi/simulation": 25,
-    "physhandi/synthetic": 36,
-}
-"""Folders that hold more, and how many more they may hold until they are put in order."""
 CIRCLES = [["physhandi.hand.mano", "physhandi.hand.model", "physhandi.hand.open_hand"]]
 """Modules that import each other until they are one."""
 
@@ -142,11 +133,7 @@ def test_every_configuration_field_is_documented() -> None:
 def test_a_folder_is_read_at_a_glance() -> None:
     for folder in sorted({path.parent for path in SOURCE_FILES}):
         count = sum(path.name != "__init__.py" for path in folder.glob("*.py"))
-        allowed = CROWDED.get(place(folder), READABLE)
-        assert count <= allowed, f"{place(folder)} holds {count} files: name its parts and move"
-    for folder, allowed in CROWDED.items():
-        count = sum(path.name != "__init__.py" for path in (ROOT / folder).glob("*.py"))
-        assert count > READABLE, f"{folder} is in order: take it from CROWDED ({allowed})"
+        assert count <= READABLE, f"{place(folder)} holds {count} files: name its parts and move"
 
 
 def imported_modules(path: Path) -> set[str]:

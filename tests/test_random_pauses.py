@@ -3,7 +3,7 @@ import sys
 
 from random_pauses import Pauses
 
-from app.viewer.compare_look import scale_end
+from app.viewer.compare.look import scale_end
 
 
 def test_only_functions_of_the_application_are_held_up() -> None:

@@ -10,12 +10,12 @@ import viser
 from numpy import ndarray
 
 from app.benchmarks.viewer_client import ViewerClient
-from app.viewer.content import Content, HandSurface
-from app.viewer.take import Take
+from app.viewer.content.content import Content, HandSurface
+from app.viewer.content.object_rollout import ObjectRollout
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
-from physhandi.data.sequence_schema import SequenceMeta, ViewMeta
+from physhandi.data.sequence_meta import SequenceMeta, ViewMeta
 from physhandi.data.sequence_writer import SequenceWriter
 from physhandi.data.view import View
 from physhandi.simulation.model import SimulationParameters
@@ -130,7 +130,7 @@ def content_of(
     """A resting sheet with these hands, each with its vertices and faces, and control nodes."""
     model = build_model(sheet(), control[0], PARAMETERS)
     position = np.repeat(sheet()[None], len(control), axis=0)
-    fitted = Take(
+    fitted = ObjectRollout(
         model=model, parameters=PARAMETERS, control=control, position=position, ready=len(control)
     )
     surfaces = tuple(

@@ -10,9 +10,9 @@ from numpy import ndarray
 
 from app.benchmarks.served import Served
 from app.benchmarks.streams import Screen, percentiles
-from app.viewer.fitted_object import FittedObject
-from app.viewer.parameters import Knob, knobs
-from app.viewer.resimulation import STARTING
+from app.viewer.live.fitted_object import FittedObject
+from app.viewer.live.rollouts import STARTING
+from app.viewer.physics.parameters import Knob, knobs
 from physhandi.data.run import Run
 
 FIELDS = ("stiffness_scale", "connection_radius")

@@ -264,7 +264,7 @@ class _Bench:
         return {**found, "worst_p95_ms": max(found[path]["p95_ms"] for path in _LISTS)}
 
     def _live(self) -> dict[str, Any]:
-        from app.viewer.latency import measure_latency
+        from app.benchmarks.latency import measure_latency
 
         measured = measure_latency(self._run, self._sequence, device="cpu")
         kind = measured["kinds"]["stiffness, substeps automatic"]

@@ -13,17 +13,17 @@ from pydantic import Field
 from starlette.background import BackgroundTask
 from starlette.exceptions import HTTPException
 
+from app.exports.cache import FileCache
 from app.exports.links import CLOSED, Id, address, read_query
-from app.exports.order import SMALLEST, SUFFIXES, Order
+from app.exports.making import store_take
 from app.exports.painter import LARGEST
+from app.exports.permalink import state_from_query, state_to_query
+from app.exports.request import SMALLEST, SUFFIXES, FileRequest
 from app.exports.schema import MEDIA_TYPES, RunFormat, errors, files
-from app.exports.take_store import store_take
-from app.exports.workshop import Workshop
 from app.jobs.catalog import Catalog
-from app.permalink import state_from_query, state_to_query
-from app.viewer.session import Sessions
-from app.viewer.session_view import Session
-from app.viewer.snapshot_files import write_yaml
+from app.viewer.export.snapshot import write_yaml
+from app.viewer.session import Session
+from app.viewer.sessions import Sessions
 from physhandi.data.exporters import export_run
 from physhandi.data.run import Run
 from physhandi.errors import PhysHandiError, RunError, UsageError
@@ -37,7 +37,7 @@ Link = Annotated[
 ]
 
 
-def create_files(catalog: Catalog, sessions: Sessions, workshop: Workshop) -> APIRouter:
+def create_files(catalog: Catalog, sessions: Sessions, workshop: FileCache) -> APIRouter:
     """Make the routes.
 
     Args:
@@ -83,7 +83,7 @@ def create_files(catalog: Catalog, sessions: Sessions, workshop: Workshop) -> AP
             return _simple(catalog, run_id, kind, sequence, f)
         if kind == "yaml":
             raise UsageError("format: yaml describes the run itself; leave changed parameters out.")
-        order = order_of(catalog, catalog.run(run_id), kind, query)
+        order = request_of(catalog, catalog.run(run_id), kind, query)
         path = workshop.make(replace(order, width=width, height=height))
         return _answer(path, run_id, kind, query)
 
@@ -120,12 +120,12 @@ def create_files(catalog: Catalog, sessions: Sessions, workshop: Workshop) -> AP
     return router
 
 
-def order_of(
+def request_of(
     catalog: Catalog,
     run: Run,
     format: Any,  # noqa: A002
     query: Mapping[str, str],
-) -> Order:
+) -> FileRequest:
     """Describe a file of a run.
 
     Args:
@@ -147,7 +147,7 @@ def order_of(
             recordings[name] = str(catalog.sequence_item(name).folder)
         except PhysHandiError:
             continue  # A run can be looked at without its recording.
-    return Order(
+    return FileRequest(
         kind="run",
         folder=str(run.folder),
         format=format,
@@ -162,11 +162,11 @@ def _order_of_scene(
     session: Session,
     format: Any,  # noqa: A002
     query: Mapping[str, str],
-) -> Order:
+) -> FileRequest:
     if session.kind == "run":
-        return order_of(catalog, catalog.run(session.target), format, query)
+        return request_of(catalog, catalog.run(session.target), format, query)
     folder = catalog.sequence_item(session.target).folder
-    return Order(kind="sequence", folder=str(folder), format=format, query=query)
+    return FileRequest(kind="sequence", folder=str(folder), format=format, query=query)
 
 
 def _check_frame(run: Run, query: Mapping[str, str]) -> None:

@@ -9,10 +9,10 @@ from fastapi.responses import RedirectResponse
 from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 
+from app.exports.permalink import state_from_query, state_to_query
 from app.exports.schema import errors
-from app.permalink import state_from_query, state_to_query
-from app.viewer.session import Sessions
-from app.viewer.session_view import Session
+from app.viewer.session import Session
+from app.viewer.sessions import Sessions
 from physhandi.errors import UsageError
 
 Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]

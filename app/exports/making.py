@@ -1,37 +1,83 @@
 """Making the file of an order: the same for the server's child process and for the shell."""
 
+import json
+import os
 import shutil
+import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any, TextIO
 
 import cv2
 import numpy as np
 
+from app.child import die_with_parent
 from app.exports.offscreen import Offscreen
-from app.exports.order import SUFFIXES, Order
-from app.exports.painter import paint, visible_from
+from app.exports.painter import paint_scene, visible_from
 from app.exports.primitives import parts_of
-from app.exports.recording import record
+from app.exports.recording import record_scene
+from app.exports.request import SUFFIXES, FileRequest
 from app.exports.scale_bar import draw_scale
-from app.exports.take_store import load_take
-from app.viewer.bundle import Picture, bundle
-from app.viewer.content import Content, open_run, open_sequence
+from app.viewer.content.content import Content, open_run, open_sequence
+from app.viewer.content.object_rollout import ObjectRollout
+from app.viewer.content.session_state import Pose, SessionState
+from app.viewer.export.bundle import Picture, bundle
+from app.viewer.export.snapshot import Snapshot, scene_data
 from app.viewer.restoring import complete_state
-from app.viewer.session_state import Pose, SessionState
-from app.viewer.snapshot import Snapshot, scene_data
-from app.viewer.take import Take
-from physhandi.data.atomic import write_bytes
 from physhandi.data.exporters import export_scene
+from physhandi.data.files import write_atomically, write_bytes, write_json
 from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
-from physhandi.errors import UsageError
-from physhandi.simulation.model import SimulationParameters
+from physhandi.errors import PhysHandiError, UsageError, describe
+from physhandi.simulation.model import SimulationParameters, SpringMassModel
+
+_ARRAYS, _PARAMETERS, _MODEL = "take.npz", "parameters.json", "model_"
+
+
+def store_take(folder: Path, take: ObjectRollout) -> None:
+    """Keep the frames of a rollout that are ready.
+
+    Args:
+        folder: Where to; must exist.
+        take: The rollout.
+    """
+    count = take.ready
+    arrays: dict[str, Any] = {
+        "position": np.asarray(take.position[:count]),
+        "control": np.asarray(take.control[:count]),
+    }
+    if take.velocity is not None:
+        arrays["velocity"] = np.asarray(take.velocity[:count])
+    arrays |= {_MODEL + name: array for name, array in take.model.to_tensors().items()}
+    write_atomically(
+        folder / _ARRAYS,
+        lambda stream: np.savez(stream, allow_pickle=False, **arrays),
+        is_durable=False,
+    )
+    write_json(folder / _PARAMETERS, take.parameters.to_dict(), is_durable=False)
+
+
+def load_take(folder: Path) -> ObjectRollout:
+    """Read what `store_take` kept."""
+    with np.load(folder / _ARRAYS, allow_pickle=False) as stored:
+        arrays = dict(stored)
+    model = {n.removeprefix(_MODEL): a for n, a in arrays.items() if n.startswith(_MODEL)}
+    parameters = json.loads((folder / _PARAMETERS).read_text())
+    return ObjectRollout(
+        model=SpringMassModel.from_tensors(model),
+        parameters=SimulationParameters.from_dict(parameters),
+        control=arrays["control"],
+        position=arrays["position"],
+        velocity=arrays.get("velocity"),
+        ready=len(arrays["position"]),
+    )
+
 
 Report = Callable[[int, int], None]
 
 
-def make(order: Order, out: Path, report: Report = lambda _done, _of: None) -> None:
+def make(order: FileRequest, out: Path, report: Report = lambda _done, _of: None) -> None:
     """Make a file, in one step or not at all.
 
     Args:
@@ -49,7 +95,7 @@ def make(order: Order, out: Path, report: Report = lambda _done, _of: None) -> N
     take = _take(order, state, content, report)
     if order.format in {"viser", "html"}:
         as_html = order.format == "html"
-        write_bytes(out, record(content, take, state, report, as_html=as_html))
+        write_bytes(out, record_scene(content, take, state, report, as_html=as_html))
         return
     snapshot = Snapshot(
         content=content,
@@ -71,7 +117,7 @@ def make(order: Order, out: Path, report: Report = lambda _done, _of: None) -> N
 class _Places:
     """Finds the run or sequence of an order, and recordings by name."""
 
-    def __init__(self, order: Order) -> None:
+    def __init__(self, order: FileRequest) -> None:
         self._order = order
 
     def run(self, run_id: str, /) -> Run:
@@ -81,7 +127,7 @@ class _Places:
         return Sequence.load(Path(self._order.recordings.get(sequence_id, sequence_id)))
 
 
-def _open(order: Order, state: SessionState) -> tuple[Content, Run | None]:
+def _open(order: FileRequest, state: SessionState) -> tuple[Content, Run | None]:
     places = _Places(order)
     if order.kind == "sequence":
         return open_sequence(places, order.folder), None
@@ -89,7 +135,9 @@ def _open(order: Order, state: SessionState) -> tuple[Content, Run | None]:
     return content, places.run(order.folder)
 
 
-def _take(order: Order, state: SessionState, content: Content, report: Report) -> Take | None:
+def _take(
+    order: FileRequest, state: SessionState, content: Content, report: Report
+) -> ObjectRollout | None:
     """Find the rollout: one that was stored, the fitted one, or one that is simulated now."""
     fitted, parameters = content.fitted, state.parameters
     if order.take:
@@ -102,15 +150,15 @@ def _take(order: Order, state: SessionState, content: Content, report: Report) -
 
 
 def _simulate(
-    order: Order,
+    order: FileRequest,
     parameters: SimulationParameters,
     content: Content,
     report: Report,
     *,
     is_automatic: bool,
-) -> Take:
+) -> ObjectRollout:
     # These load the simulator, which takes longer than most files that need none.
-    from app.viewer.fitted_object import FittedObject
+    from app.viewer.live.fitted_object import FittedObject
     from physhandi.simulation.stability import with_stable_substeps
 
     fitted = FittedObject(order.folder, content.sequence_name)
@@ -118,7 +166,7 @@ def _simulate(
     model = fitted.model(parameters)
     if is_automatic:
         parameters = with_stable_substeps(parameters, model, control[0])
-    take = Take.empty(model, parameters, control)
+    take = ObjectRollout.empty(model, parameters, control)
     simulator = fitted.simulator(model, parameters, order.device)
     for frame, position, velocity in simulator.frames(control):
         take.position[frame] = position
@@ -129,12 +177,12 @@ def _simulate(
     return take
 
 
-def _picture(order: Order, snapshot: Snapshot, state: SessionState) -> Picture:
+def _picture(order: FileRequest, snapshot: Snapshot, state: SessionState) -> Picture:
     with Offscreen(snapshot.content, snapshot.take, state) as scene:
         scene.draw(snapshot.frame, is_playing=False)
         pose: Pose = scene.pose
         parts = visible_from(parts_of(scene.server), pose)
-        image = paint(parts, pose, order.width, order.height, is_dark=scene.is_dark)
+        image = paint_scene(parts, pose, order.width, order.height, is_dark=scene.is_dark)
         if scene.legend is not None:
             image = draw_scale(image, scene.legend, is_dark=scene.is_dark)
     is_written, content = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))
@@ -143,7 +191,7 @@ def _picture(order: Order, snapshot: Snapshot, state: SessionState) -> Picture:
     return Picture(content=content.tobytes(), pose=pose, width=order.width, height=order.height)
 
 
-def _write_motion(order: Order, snapshot: Snapshot, out: Path) -> None:
+def _write_motion(order: FileRequest, snapshot: Snapshot, out: Path) -> None:
     scene = scene_data(snapshot)
     name = (
         "frames" if order.format == "ply" else f"motion.{SUFFIXES.get(order.format, order.format)}"
@@ -153,3 +201,30 @@ def _write_motion(order: Order, snapshot: Snapshot, out: Path) -> None:
         if written.is_dir():
             written = Path(shutil.make_archive(str(written), "zip", written))
         written.replace(out)
+
+
+_NICENESS = 5
+
+
+def main(arguments: list[str], orders: TextIO, answers: TextIO) -> int:
+    """Make the file; returns the exit code."""
+    parent, out = int(arguments[0]), Path(arguments[1])
+    die_with_parent(parent)
+    os.nice(_NICENESS)  # Live scenes go first.
+    from app.exports.request import FileRequest
+
+    def tell(**about: object) -> None:
+        answers.write(json.dumps(about) + "\n")
+        answers.flush()
+
+    try:
+        order = FileRequest.from_text(orders.read())
+        make(order, out, lambda done, of: tell(done=done, of=of))
+    except (PhysHandiError, OSError, MemoryError) as error:
+        tell(error=describe(error), kind=type(error).__name__)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:], sys.stdin, sys.stdout))

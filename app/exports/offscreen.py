@@ -9,14 +9,14 @@ import viser
 from jaxtyping import Float
 from numpy import ndarray
 
-from app.viewer.coloring import Legend
-from app.viewer.content import Content
-from app.viewer.framing import frame_content
-from app.viewer.guard import plain
-from app.viewer.scene import FRAME_BYTES, Scene
-from app.viewer.session_state import Pose, SessionState
-from app.viewer.take import Take
-from app.viewer.viser_server import start_viser
+from app.viewer.color.coloring import Legend
+from app.viewer.content.content import Content
+from app.viewer.content.object_rollout import ObjectRollout
+from app.viewer.content.session_state import Pose, SessionState
+from app.viewer.scene.framing import frame_content
+from app.viewer.scene.scene import FRAME_BYTES, Scene
+from app.viewer.ui.guard import plain
+from app.viewer.ui.scene_server import start_viser
 
 GRID = 2.0**-14
 """Positions of recordings are rounded to a multiple of this part of the scene's size."""
@@ -28,7 +28,7 @@ class Offscreen:
     def __init__(
         self,
         content: Content,
-        take: Take | None,
+        take: ObjectRollout | None,
         state: SessionState,
         *,
         frame_bytes: int = FRAME_BYTES,
@@ -114,10 +114,10 @@ class Offscreen:
 
 
 @dataclass(eq=False, kw_only=True)
-class _RoundedTake(Take):
+class _RoundedTake(ObjectRollout):
     """Shows rounded positions, but its forces are those of the exact ones."""
 
-    exact: Take
+    exact: ObjectRollout
 
     def forces(self, frame: int) -> Float[ndarray, "node 3"]:
         return self.exact.forces(frame)
@@ -126,7 +126,9 @@ class _RoundedTake(Take):
         return self.exact.spring_forces(frame)
 
 
-def _rounded(content: Content, take: Take | None, step: float) -> tuple[Content, Take | None]:
+def _rounded(
+    content: Content, take: ObjectRollout | None, step: float
+) -> tuple[Content, ObjectRollout | None]:
     """Round all that moves to a grid, on which half of a float's digits are zero."""
 
     def rounded(point: ndarray) -> ndarray:

@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from app.exports.primitives import Part
-from app.viewer.session_state import Pose
+from app.viewer.content.session_state import Pose
 
 BACKGROUND = {False: (255, 255, 255), True: (20, 21, 23)}
 """Behind everything, on light and dark pages."""
@@ -66,7 +66,7 @@ class _Shapes:
     scale: Float[ndarray, " shape"]
 
 
-def paint(
+def paint_scene(
     parts: Iterable[Part], pose: Pose, width: int, height: int, *, is_dark: bool = False
 ) -> UInt8[ndarray, "row column 3"]:
     """Paint a picture.

@@ -4,9 +4,9 @@ from collections.abc import Callable
 from html import escape
 
 from app.exports.offscreen import Offscreen
-from app.viewer.content import Content
-from app.viewer.session_state import SessionState
-from app.viewer.take import Take
+from app.viewer.content.content import Content
+from app.viewer.content.object_rollout import ObjectRollout
+from app.viewer.content.session_state import SessionState
 from physhandi.errors import UsageError
 
 MOST_FRAMES = 3_000
@@ -17,9 +17,9 @@ _PACKING = 0.97
 """What is left for frames of a file, beside what describes the scene."""
 
 
-def record(
+def record_scene(
     content: Content,
-    take: Take | None,
+    take: ObjectRollout | None,
     state: SessionState,
     report: Callable[[int, int], None],
     *,

@@ -11,14 +11,14 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import FileResponse, HTMLResponse
 from pydantic import BaseModel
 
-from app.exports.files import order_of
+from app.exports.cache import FileCache, FileJob
+from app.exports.files import request_of
 from app.exports.links import Id, read_query
-from app.exports.order import Order
+from app.exports.permalink import state_from_query
+from app.exports.request import FileRequest
 from app.exports.schema import errors, files
-from app.exports.workshop import Work, Workshop
 from app.jobs.catalog import Catalog
 from app.pages.render import Pages
-from app.permalink import state_from_query
 from physhandi.errors import UsageError, describe
 
 _CLIENT = Path(viser.__file__).parent / "client" / "build" / "index.html"
@@ -45,7 +45,7 @@ class Replay(BaseModel):
     """Why it could not be made."""
 
 
-def create_replays(catalog: Catalog, workshop: Workshop, pages: Pages) -> APIRouter:
+def create_replays(catalog: Catalog, workshop: FileCache, pages: Pages) -> APIRouter:
     """Make the routes.
 
     ``/viewer/replay/`` is viser's page, which plays the file that its query names. It holds no data
@@ -60,9 +60,9 @@ def create_replays(catalog: Catalog, workshop: Workshop, pages: Pages) -> APIRou
     client = _CLIENT.read_bytes()
     packed = gzip.compress(client, mtime=0)
 
-    def order(run_id: str, sequence: str | None, theme: str) -> Order:
+    def order(run_id: str, sequence: str | None, theme: str) -> FileRequest:
         query = {"sequence": sequence} if sequence else {}
-        return order_of(catalog, catalog.run(run_id), "viser", query | {"theme": theme})
+        return request_of(catalog, catalog.run(run_id), "viser", query | {"theme": theme})
 
     @router.get("/runs/{run_id}/replay", include_in_schema=False)
     def show_page(run_id: Id, request: Request) -> HTMLResponse:
@@ -118,7 +118,7 @@ def create_replays(catalog: Catalog, workshop: Workshop, pages: Pages) -> APIRou
     return router
 
 
-def _describe(work: Work, url: str) -> Replay:
+def _describe(work: FileJob, url: str) -> Replay:
     size, message = 0, ""
     if work.state == "ready":
         size = work.path.stat().st_size

@@ -2,17 +2,17 @@
 
 from fastapi import APIRouter
 
+from app.exports.cache import FileCache
 from app.exports.files import create_files
 from app.exports.links import create_links, link_of
 from app.exports.replay import create_replays
-from app.exports.workshop import Workshop
 from app.jobs.catalog import Catalog
 from app.pages import Pages
-from app.viewer.session import Sessions
+from app.viewer.sessions import Sessions
 
 
 def create_exports(
-    catalog: Catalog, sessions: Sessions, pages: Pages, workshop: Workshop
+    catalog: Catalog, sessions: Sessions, pages: Pages, workshop: FileCache
 ) -> APIRouter:
     """Make the routes of links, replays and files, and let scenes know their links.
 

@@ -5,9 +5,9 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray
 
-from app.viewer.coloring import Legend
-from app.viewer.colormaps import table
-from app.viewer.legend import number, tick_values
+from app.viewer.color.coloring import Legend
+from app.viewer.color.colormaps import table
+from app.viewer.color.legend import number, tick_values
 
 _INK = {False: (30, 36, 44), True: (226, 230, 236)}
 _SMALLEST = 160

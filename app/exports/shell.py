@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl, urlsplit
 
-from app.exports.files import order_of
+from app.exports.files import request_of
 from app.exports.making import make
-from app.exports.order import SUFFIXES, Order
+from app.exports.permalink import state_from_query
+from app.exports.request import SUFFIXES, FileRequest
 from app.jobs.catalog import Catalog
-from app.permalink import state_from_query
 from physhandi.data.exporters import FORMATS, export_run
 from physhandi.data.run import Run
 from physhandi.errors import UsageError
@@ -106,9 +106,9 @@ def read_link(text: str) -> Mapping[str, str]:
     return fields
 
 
-def _order(run: Run, wish: Wish, query: Mapping[str, str], catalog: Catalog) -> Order:
-    whole = order_of(catalog, run, wish.format, query)
-    return Order(
+def _order(run: Run, wish: Wish, query: Mapping[str, str], catalog: Catalog) -> FileRequest:
+    whole = request_of(catalog, run, wish.format, query)
+    return FileRequest(
         kind="run",
         folder=str(run.folder.resolve()),
         format=wish.format,

@@ -6,14 +6,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from physhandi.errors import UsageError
-from physhandi.fitting.profile import PipelineConfig, config_from_dict
-from physhandi.fitting.stage_names import (
+from physhandi.fitting.config import (
     EVALUATION,
     HANDS,
     OBSERVATION,
     REFINEMENT,
     SEARCH,
     SPRINGS,
+    PipelineConfig,
+    config_from_dict,
 )
 
 _NODE_COST = 6.0

@@ -11,10 +11,10 @@ from app.jobs.effort import Extent
 from app.jobs.estimate import Estimate, Plan, estimate, plan_from
 from app.jobs.reference import Reference, scaled_plan
 from app.jobs.timeline import Timeline
-from physhandi.data.atomic import named_fields
 from physhandi.data.environment import ENVIRONMENT
+from physhandi.data.files import named_fields
 from physhandi.data.run import Run, read_events
-from physhandi.data.run_files import ATTEMPTS, CURRENT, EXIT, OUT, read_mapping
+from physhandi.data.run_folder import ATTEMPTS, CURRENT, EXIT, OUT, read_mapping
 from physhandi.errors import PhysHandiError
 
 _REFERENCES = 5

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from physhandi.data.run_files import LOG
+from physhandi.data.run_folder import LOG
 
 TAIL_BYTES = 20_000
 """How much of the end of a log a page begins with."""

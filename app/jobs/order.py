@@ -5,18 +5,22 @@ from functools import lru_cache
 from typing import Any
 
 from app.jobs.catalog import Catalog, RunItem, UnknownRunError
-from physhandi.data.atomic import named_fields
+from physhandi.data.files import named_fields
 from physhandi.data.run import Run
 from physhandi.errors import UsageError
-from physhandi.fitting.overrides import apply_overrides, changes, values_of
-from physhandi.fitting.profile import (
+from physhandi.fitting.config import (
+    GROUPS,
     PipelineConfig,
+    Setting,
+    all_settings,
+    apply_overrides,
+    changes,
     config_from_dict,
     config_to_dict,
     load_profile,
     profile_names,
+    values_of,
 )
-from physhandi.fitting.settings import GROUPS, Setting, all_settings
 
 
 def fit_config(

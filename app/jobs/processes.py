@@ -2,14 +2,16 @@
 
 import fcntl
 import os
+import secrets
 import signal
+import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
 
-from app.child_modules import set_process_option
+from app.child import set_process_option, start_module
 
 COOKIE = "PHYSHANDI_RUN"
 """Environment variable that marks a run's processes; children inherit it, wherever they move."""
@@ -136,3 +138,36 @@ def _signal_all(
         except psutil.Error:
             continue
     return count
+
+
+WORKER = "app.jobs.worker"
+
+
+def start_supervisor(
+    run_folder: Path, device: str, *, worker: str = WORKER, threads: int | None = None
+) -> "subprocess.Popen[str]":
+    """Start the process that starts and watches a run's worker, in a session of its own.
+
+    It outlives the server; a restarted server finds it by the lock that it holds.
+
+    Args:
+        run_folder: Folder of the run.
+        device: Warp device.
+        worker: Python module that does the work.
+        threads: How many threads its libraries may start; none for one each processor.
+
+    Returns:
+        The started process.
+    """
+    return start_module(
+        "app.jobs.supervise",
+        *("--run-dir", str(run_folder), "--device", device, "--worker", worker),
+        threads=threads,
+        environment={
+            COOKIE: cookie_of(run_folder, secrets.token_hex(8)),
+            "PYTHONUNBUFFERED": "1",
+        },
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )

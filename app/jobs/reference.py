@@ -7,7 +7,7 @@ from typing import Any
 from app.jobs.effort import Extent, effort_of, hand_halves
 from app.jobs.estimate import Plan, plan_from
 from app.jobs.timeline import Part, Timeline
-from physhandi.fitting.stage_names import HANDS
+from physhandi.fitting.config import HANDS
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """The queue of fits: one thread starts them, watches them and ends cancelled ones."""
 
+import fcntl
 import json
 import logging
 import os
@@ -12,18 +13,48 @@ from pathlib import Path
 from typing import Any
 
 from app.jobs.catalog import Catalog, RunItem
-from app.jobs.claim import claim_folder
 from app.jobs.forecast import Forecast
-from app.jobs.local import WORKER, start_supervisor
 from app.jobs.order import default_name, fit_config
-from app.jobs.processes import end_processes, marked_processes, processes_of, supervisor_of
+from app.jobs.processes import (
+    WORKER,
+    end_processes,
+    marked_processes,
+    processes_of,
+    start_supervisor,
+    supervisor_of,
+)
 from app.jobs.supervise import note_end
 from app.settings import Settings
-from physhandi.data.atomic import write_json
+from physhandi.data.files import write_json
 from physhandi.data.lease import live_holder
 from physhandi.data.run import Run, new_run_id
-from physhandi.data.run_files import EXIT
+from physhandi.data.run_folder import EXIT
 from physhandi.errors import PhysHandiError, RunError, UsageError
+
+_LOCK = ".server.lock"
+
+
+def claim_folder(data_dir: Path) -> int:
+    """Become the one server of a data folder until the returned descriptor is closed.
+
+    Raises:
+        RunError: If another server works on it.
+    """
+    data_dir.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(data_dir / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        holder = os.read(descriptor, 32).decode(errors="replace") or "unknown"
+        os.close(descriptor)
+        raise RunError(
+            f"Another server (process {holder}) works on {data_dir}. "
+            "Stop it, or choose another --data-dir."
+        ) from None
+    os.ftruncate(descriptor, 0)
+    os.write(descriptor, str(os.getpid()).encode())
+    return descriptor
+
 
 logger = logging.getLogger(__name__)
 

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import BinaryIO
 
 from app.jobs.processes import COOKIE, adopt_orphans, claim_supervision, end_processes
-from physhandi.data.atomic import write_json
+from physhandi.data.files import write_json
 from physhandi.data.lease import live_holder, locked
-from physhandi.data.run_files import CANCEL, EXIT, LOG, now
+from physhandi.data.run_folder import CANCEL, EXIT, LOG, now
 
 LOG_LIMIT = 50 * 2**20
 """Bytes of log that are kept from the start."""

@@ -1,5 +1,6 @@
 """What one browser is told about one run: its state, its progress and its log."""
 
+import os
 import re
 import time
 from collections.abc import Callable, Iterator
@@ -7,11 +8,32 @@ from pathlib import Path
 from typing import Any
 
 from app.jobs.log import read_log
-from app.jobs.preview import preview_number
 from app.jobs.scheduler import AT_WORK, ENDED
 from app.jobs.streams import News
+from physhandi.data.attempt import PREVIEW
 from physhandi.data.run import read_events
 from physhandi.errors import PhysHandiError
+
+_MOST_BYTES = 2**20
+
+
+def preview_number(run_folder: Path) -> int:
+    """Number a run's preview; another one has another number, and 0 is none."""
+    try:
+        return (run_folder / PREVIEW).stat(follow_symlinks=False).st_mtime_ns // 1000
+    except OSError:
+        return 0
+
+
+def preview_bytes(run_folder: Path) -> bytes | None:
+    """Read a run's preview; a link that a job might have put there is not followed."""
+    try:
+        descriptor = os.open(run_folder / PREVIEW, os.O_RDONLY | os.O_NOFOLLOW)
+    except OSError:
+        return None
+    with os.fdopen(descriptor, "rb") as stream:
+        return stream.read(_MOST_BYTES)
+
 
 _LOAD_INTERVAL_S = 2.0
 _CURSOR = re.compile(r"(-?\d{1,15})(?:-(\d{1,15}))?")

@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from types import FrameType
 
-from app.child_modules import die_with_parent
+from app.child import die_with_parent
 from physhandi.data.run import Run
 from physhandi.errors import CancelledError, PhysHandiError, describe
 from physhandi.progress import Progress

@@ -8,14 +8,13 @@ from fastapi import APIRouter, Header, Query, Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from app.jobs.catalog import Catalog
-from app.jobs.describe import describe_sequence
-from app.jobs.feed import Feed
-from app.jobs.listing import STATES, RunQuery, page_of, select_runs
 from app.jobs.scheduler import ENDED
+from app.jobs.streams import Feed
+from app.jobs.views import STATES, RunQuery, describe_sequence, page_of, select_runs
 from app.pages.render import Pages
 from app.previews.store import Kind, Previews
 from physhandi.errors import UsageError
-from physhandi.fitting.profile import load_profile, profile_names
+from physhandi.fitting.config import load_profile, profile_names
 
 _RECENT_RUNS = 8
 _HOME_SEQUENCES = 6

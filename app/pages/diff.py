@@ -8,7 +8,7 @@ from typing import Any, cast
 from app.pages.metrics import about_quantity, figure, is_count, is_higher_better, scaled, unit_of
 from app.pages.parameters import field_notes
 from app.pages.render import duration, short, words
-from physhandi.data.atomic import named_fields
+from physhandi.data.files import named_fields
 
 LEAST, MOST = 2, 5
 """How many runs can be compared."""

@@ -3,7 +3,7 @@
 from typing import Any, cast
 
 from app.pages.render import short, words
-from physhandi.data.atomic import named_fields
+from physhandi.data.files import named_fields
 
 METHODS = {
     "rollout": "The fitted object, simulated from frame 0 on with the motion of the hand.",

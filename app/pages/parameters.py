@@ -8,10 +8,10 @@ from typing import Any
 
 from app.pages.metrics import scaled
 from app.pages.render import short
-from physhandi.data.atomic import named_fields
+from physhandi.data.files import named_fields
 from physhandi.data.run import Run
 from physhandi.errors import PhysHandiError
-from physhandi.fitting.field_notes import notes_of
+from physhandi.fitting.config import notes_of
 from physhandi.simulation.model import SimulationParameters
 
 _FOUND = "object/parameters.yaml"

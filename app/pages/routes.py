@@ -11,11 +11,11 @@ from pydantic import Field
 from starlette.exceptions import HTTPException
 
 from app.jobs.catalog import Catalog, RunItem
-from app.jobs.describe import describe_results, describe_run, follow_run
-from app.jobs.feed import Feed
 from app.jobs.log import read_log
 from app.jobs.order import order_of
 from app.jobs.scheduler import ENDED, Scheduler
+from app.jobs.streams import Feed
+from app.jobs.views import describe_results, describe_run, follow_run
 from app.pages.browse import add_lists
 from app.pages.diff import LEAST, MOST, compare_runs
 from app.pages.metrics import METHODS, tabulate

@@ -11,11 +11,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from app.jobs.catalog import NotFoundError
 from app.pages.metrics import about_quantity, figure, scaled, unit_of
 from app.pages.render import Pages
-from physhandi.data.run_files import read_json
+from physhandi.data.run_folder import read_json
 from physhandi.errors import PhysHandiError, RunError
-from physhandi.metrics.suite_layout import laid_out
-from physhandi.metrics.suite_report import tables_of
-from physhandi.metrics.suite_tables import Row, is_higher_better, read_rows
+from physhandi.metrics.suite_report import Row, is_higher_better, laid_out, read_rows, tables_of
 
 _NAME = r"^[A-Za-z0-9_-]{1,64}$"
 Name = Annotated[str, Field(pattern=_NAME)]

@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from app.previews.draw import HEIGHT, WIDTH, Motion, draw_motion
 from app.previews.links import marker_links
-from physhandi.data.atomic import named_fields, temporary_name
+from physhandi.data.files import named_fields, temporary_name
 from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View

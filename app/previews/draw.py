@@ -9,7 +9,7 @@ from numpy import ndarray
 
 from app.previews.camera import fitting_camera
 from physhandi.data.camera import PinholeCamera
-from physhandi.synthetic.rasterizer import Raster, rasterize, vertex_normals
+from physhandi.synthetic.film.rasterizer import Raster, rasterize, vertex_normals
 
 WIDTH, HEIGHT = 384, 240
 """Size of a preview [px]."""

@@ -13,13 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from app.child_modules import start_module
+from app.child import start_module
 from app.jobs.catalog import Catalog, NotFoundError, RunItem
 from app.previews.worker import MOVING, NONE, SECONDS_EACH, STILL
 from app.settings import Settings
-from physhandi.data.atomic import write_bytes
-from physhandi.data.run_files import CURRENT
-from physhandi.data.sequence_schema import FILE
+from physhandi.data.files import write_bytes
+from physhandi.data.run_folder import CURRENT
+from physhandi.data.sequence_meta import FILE
 
 logger = logging.getLogger(__name__)
 

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import cv2
 
-from app.child_modules import die_with_parent
+from app.child import die_with_parent
 from app.previews.clip import clip_of_run, clip_of_sequence
-from physhandi.data.atomic import write_bytes
+from physhandi.data.files import write_bytes
 from physhandi.errors import describe
 
 STILL, MOVING, NONE = ".still.webp", ".moving.webp", ".none"

@@ -16,7 +16,7 @@ from starlette.websockets import WebSocketDisconnect, WebSocketState
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
-from app.viewer.session import Sessions
+from app.viewer.sessions import Sessions
 
 logger = logging.getLogger(__name__)
 

@@ -3,11 +3,11 @@
 from dataclasses import fields, replace
 from typing import Any
 
-from app.viewer.content import Content
-from app.viewer.framing import frame_content
-from app.viewer.layers import default_layers
-from app.viewer.session_state import SessionState
-from app.viewer.view_pose import pose_of_view
+from app.viewer.content.content import Content
+from app.viewer.content.layers import default_layers
+from app.viewer.content.session_state import SessionState
+from app.viewer.scene.cameras import pose_of_view
+from app.viewer.scene.framing import frame_content
 from physhandi.errors import UsageError
 from physhandi.simulation.model import SimulationParameters
 

@@ -1,255 +1,347 @@
-"""The live sessions of a server: opening, copying, closing and forgetting them."""
+"""One live session: a viser server with scene, panel and clock."""
 
-import logging
-import secrets
-import threading
-from collections import OrderedDict
+import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Protocol, get_args
+from dataclasses import replace
+from typing import Any
 
-from app.viewer.compare_session import CompareSession
-from app.viewer.content import Catalog
-from app.viewer.keep_panel import Keeping
-from app.viewer.live import LiveSimulation
-from app.viewer.session_state import Kind, SessionInfo, SessionState
-from app.viewer.session_view import Session as Session
-from physhandi.errors import PhysHandiError, UsageError
+import viser
 
-logger = logging.getLogger(__name__)
-
-_REAP_INTERVAL = 20.0
-_MAKES_ROOM_AFTER = 30.0
-_REMEMBERED = 200
-
-
-AnySession = Session | CompareSession
-
-
-class TooManySessionsError(PhysHandiError):
-    """No further live session can be opened now."""
-
-
-class ViewerSettings(Protocol):
-    """What the sessions need to know of the server's settings."""
-
-    @property
-    def live_sessions(self) -> int:
-        """Most live sessions at a time."""
-        ...
-
-    @property
-    def live_idle_s(self) -> float:
-        """Seconds after which a session that nobody looks at is closed."""
-        ...
-
-    @property
-    def device(self) -> str:
-        """Warp device of the live simulation."""
-        ...
+from app.viewer.clock.playback import TURN, Playback
+from app.viewer.compare.figure_mode import FigureMode
+from app.viewer.compare.pin_mode import PinMode
+from app.viewer.content.content import Catalog, Content, open_run, open_sequence
+from app.viewer.content.object_rollout import ObjectRollout
+from app.viewer.content.session_state import Kind, Pose, SessionState
+from app.viewer.export.export_panel import ExportPanel
+from app.viewer.export.snapshot import Snapshot
+from app.viewer.inspect.inspector import Inspection
+from app.viewer.live.client import SimulationClient
+from app.viewer.physics.frame_strip import FrameStrip
+from app.viewer.physics.keep_panel import UserStorage
+from app.viewer.physics.object_session import ObjectSession
+from app.viewer.restoring import complete_state, differences
+from app.viewer.scene.framing import frame_content
+from app.viewer.scene.panels import LayersPanel, TimelinePanel, add_legend, set_theme
+from app.viewer.scene.scene import Scene
+from app.viewer.ui.scene_server import SceneServer
 
 
-@dataclass(frozen=True, kw_only=True)
-class Farewell:
-    """What is remembered of a session that was closed."""
+class ViewSwitch:
+    """Draws the scene, the figure or two rollouts, and hides the others; used by the clock."""
 
-    kind: Kind
-    """Whether it showed a run, a sequence or two runs together."""
-    target: str
-    """Id of the run or the sequence; of a comparison the query after ``/compare?``."""
-    title: str
-    """Name of what it showed."""
-    owner: str
-    """Whose session it was."""
-    reason: str
-    """Why it was closed, as a sentence."""
+    def __init__(self, scene: Scene, figure: FigureMode, pin: PinMode) -> None:
+        self.scene = scene
+        self._figure = figure
+        self._pin = pin
+        self._shown: Scene | FigureMode | PinMode = scene
+
+    def draw(
+        self, frame: int, take: ObjectRollout | None, take_frame: int, *, is_playing: bool
+    ) -> None:
+        """Bring what is seen to a frame.
+
+        Args:
+            frame: Frame of hands, observation and cameras.
+            take: The object's rollout; None without an object.
+            take_frame: Frame of the rollout, which may lag behind while it is being computed.
+            is_playing: Whether the clock is running.
+        """
+        mode = self._mode(take)
+        now = self.scene if mode is None else mode
+        if now is not self._shown:
+            self._shown.hide()
+            self._shown = now
+        if mode is None or take is None:
+            self.scene.draw(frame, take, take_frame, is_playing=is_playing)
+        else:
+            mode.draw(take, take_frame, frame, self.scene.layers, is_playing=is_playing)
+
+    def snapshot(
+        self, content: Content, frame: int, take: ObjectRollout | None, take_frame: int
+    ) -> Snapshot:
+        """Collect what is seen, for the export panel."""
+        snapshot = Snapshot(content=content, frame=frame, take=take, take_frame=take_frame)
+        mode = self._mode(take)
+        if mode is None or take is None:
+            return snapshot
+        sides = mode.sides(take, take_frame, frame)
+        return replace(snapshot, sides=sides, picture=mode.framed_picture)
+
+    def _mode(self, take: ObjectRollout | None) -> FigureMode | PinMode | None:
+        """Tell what is shown instead of the scene."""
+        if take is None:
+            return None
+        return next((mode for mode in (self._pin, self._figure) if mode.is_on), None)
+
+    def clear(self) -> None:
+        """Remove everything, to make room for another content."""
+        self._pin.stop()
+        self._figure.close()
+        self.scene.clear()
 
 
-class Sessions:
-    """All live sessions of the server and the process that simulates for them.
-
-    A session belongs to the browser that opened it; nobody else finds it.
-    """
+class Session(SceneServer):
+    """What one browser tab looks at: a viser server with scene, panel and clock."""
 
     def __init__(
         self,
-        settings: ViewerSettings,
+        session_id: str,
+        *,
+        kind: Kind,
+        target: str,
+        owner: str,
         catalog: Catalog,
-        keeping: Keeping | None = None,
+        live: SimulationClient,
+        state: SessionState | None = None,
+        keeping: UserStorage | None = None,
     ) -> None:
-        """Prepare; nothing is started before the first session.
+        """Open a run or a sequence; raises the catalog's errors before a server is started.
 
         Args:
-            settings: Limits and device.
-            catalog: Finds runs and sequences.
-            keeping: Where users keep presets and runs; None if they cannot.
-        """
-        self._keeping = keeping
-        self._settings = settings
-        self._catalog = catalog
-        self._lock = threading.Lock()
-        self._sessions: dict[str, AnySession] = {}
-        self._farewells: OrderedDict[str, Farewell] = OrderedDict()
-        self._opening = 0
-        self.link_of: Callable[[Session], str] = lambda _: ""
-        self.live = LiveSimulation(settings.device)
-        self._closed = threading.Event()
-        self._reaper: threading.Thread | None = None
-
-    def open(
-        self, kind: Kind, target: str, owner: str, *, state: SessionState | None = None
-    ) -> str:
-        """Open a live session.
-
-        Args:
+            session_id: Unguessable id.
             kind: What `target` is the id of.
-            target: Id of a run or a sequence, or the query of two runs to compare.
-            owner: Who asks.
-            state: What to begin with; None for what suits the content.
-
-        Returns:
-            The session's id, for ``/viewer/<id>/``.
-
-        Raises:
-            TooManySessionsError: If as many sessions as allowed are open.
-            PhysHandiError: If the run or sequence cannot be shown.
+            target: Id of a run or a sequence.
+            owner: Whose session it is.
+            catalog: Finds runs and sequences.
+            live: The process that simulates.
+            state: What to begin with, as `state` of another session told it.
+            keeping: Where presets and runs are kept.
         """
-        if kind not in get_args(Kind):
-            raise UsageError(f"A session shows a run, a sequence or a comparison, not {kind!r}.")
-        self._reserve(owner)
+        self.kind: Kind = kind
+        self._target = target
+        self.link_of: Callable[[Session], str] = lambda _: ""
+        self._catalog = catalog
+        self._live = live
+        self._keeping = keeping
+        self._has_played = False
+        self._names: tuple[str, ...] = ()
+        if kind == "run":
+            self._names = tuple(catalog.run(target).sequence_names)
+        self._content = self._load(state.sequence_name if state is not None else None)
+        state = None if state is None else complete_state(state, self._content)
+        super().__init__(session_id, owner=owner, title=self._content.title)
+        self._playback = Playback(self._content.frame_count, self._content.frame_rate, self._draw)
+        self._object: ObjectSession | None = None
         try:
-            session_id = secrets.token_urlsafe(18)
-            session = self._make(session_id, kind, target, owner, state)
-            if isinstance(session, Session):
-                session.link_of = self.link_of
-            with self._lock:
-                self._sessions[session_id] = session
-        finally:
-            with self._lock:
-                self._opening -= 1
-        logger.info("session opened for %s %s by %s", kind, target, owner)
-        return session_id
+            self._build()
+            if state is not None:
+                self._restore(state)
+        except BaseException:
+            self._server.stop()
+            raise
+        self._playback.start()
 
-    def copy(self, session: AnySession) -> str:
-        """Open another session of the same owner that begins where a session stands.
+    @property
+    def target(self) -> str:
+        """Id of the run or the sequence."""
+        return self._target
 
-        Raises:
-            TooManySessionsError: If as many sessions as allowed are open.
-        """
-        return self.open(session.kind, session.target, session.owner, state=session.state)
+    @property
+    def title(self) -> str:
+        """Its name."""
+        return self._content.title
 
-    def get(self, session_id: str) -> AnySession | None:
-        """Find a session; None if there is none of that id."""
+    @property
+    def state(self) -> SessionState:
+        """What the user has set up, for a copy of this session."""
         with self._lock:
-            return self._sessions.get(session_id)
-
-    def find(self, session_id: str, owner: str) -> AnySession | None:
-        """Find a session of an owner; None if there is none, or if it is somebody else's."""
-        session = self.get(session_id)
-        return session if session is not None and session.owner == owner else None
-
-    def farewell(self, session_id: str, owner: str) -> Farewell | None:
-        """Remember a session of an owner that was closed; None if there was none."""
-        with self._lock:
-            farewell = self._farewells.get(session_id)
-        return farewell if farewell is not None and farewell.owner == owner else None
-
-    def list(self) -> list[SessionInfo]:
-        """Describe all sessions, the oldest first."""
-        with self._lock:
-            sessions = list(self._sessions.values())
-        return [session.info for session in sessions]
-
-    def close(self, session_id: str, reason: str = "You closed it.") -> bool:
-        """Close a session; returns whether there was one.
-
-        Args:
-            session_id: Its id.
-            reason: Why, as a sentence for the one who comes back to it.
-        """
-        with self._lock:
-            session = self._sessions.pop(session_id, None)
-            if session is not None:
-                self._farewells[session_id] = Farewell(
-                    kind=session.kind,
-                    target=session.target,
-                    title=session.info.title,
-                    owner=session.owner,
-                    reason=reason,
-                )
-                while len(self._farewells) > _REMEMBERED:
-                    self._farewells.popitem(last=False)
-        if session is not None:
-            session.close()
-        return session is not None
-
-    def shutdown(self) -> None:
-        """Close all sessions and end the live simulation process."""
-        self._closed.set()
-        for info in self.list():
-            self.close(info.id)
-        self.live.close()
-
-    def reap(self) -> int:
-        """Close the sessions that nobody has looked at for too long; returns how many."""
-        most = self._settings.live_idle_s
-        time = f"{most / 60:.3g} minutes" if most >= 60 else f"{most:.3g} seconds"
-        reason = f"Nobody looked at it for {time}."
-        idle = [info.id for info in self.list() if info.idle >= most]
-        return sum(self.close(session_id, reason) for session_id in idle)
-
-    def _make(
-        self, session_id: str, kind: Kind, target: str, owner: str, state: SessionState | None
-    ) -> AnySession:
-        if kind == "comparison":
-            return CompareSession(
-                session_id, target=target, owner=owner, catalog=self._catalog, state=state
+            panel = self._object.panel if self._object is not None else None
+            theme, prefers_dark = self._layers.theme
+            return SessionState(
+                sequence_name=self._content.sequence_name,
+                frame=self._playback.frame,
+                is_playing=self._playback.is_playing,
+                speed=self._playback.speed,
+                does_loop=self._playback.does_loop,
+                layers=replace(self._stage.scene.layers),
+                theme=theme,
+                prefers_dark=prefers_dark,
+                parameters=panel.history.current if panel is not None else None,
+                automatic_substeps=panel is not None and panel.is_automatic,
+                is_figure=self._figure.is_on,
+                pose=self._figure.pose(),
+                parameter_changes=differences(panel.history.start, panel.history.current)
+                if panel is not None
+                else {},
             )
-        return Session(
-            session_id,
-            kind=kind,
-            target=target,
-            owner=owner,
-            catalog=self._catalog,
-            live=self.live,
-            state=state,
-            keeping=self._keeping,
+
+    @property
+    def offers(self) -> tuple[str, ...]:
+        """What can be done with it; see `SessionInfo`."""
+        there = {
+            "object": self._content.fitted is not None,
+            "colors": self._inspection.colors.is_there,
+            "figure": self._figure.is_offered,
+        }
+        return tuple(name for name, is_there in there.items() if is_there)
+
+    def snapshot(self) -> Snapshot:
+        """Collect what is on the screen, to be saved."""
+        run = self._catalog.run(self._target) if self.kind == "run" else None
+        with self._lock:
+            frame = self._playback.frame
+            take, take_frame = self._take(frame)
+            snapshot = self._stage.snapshot(self._content, frame, take, take_frame)
+            layers = replace(self._stage.scene.layers)
+        return replace(snapshot, run=run, layers=layers, link=self.link_of(self))
+
+    def go(self, frame: int) -> None:
+        """Stop at a frame."""
+        self._timeline.go(frame)
+
+    def prefer_dark(self, *, on: bool) -> None:
+        """Follow the browser's color scheme, unless the user has chosen a background."""
+        self._layers.prefer_dark(on=on)
+
+    def close(self) -> None:
+        """Stop clock, simulation and server."""
+        self._is_closed = True
+        self._playback.close()
+        if self._object is not None:
+            self._object.close()
+        self._figure.close()
+        self._pin.close()
+        self._server.stop()
+        self._content.close()
+
+    def _load(self, sequence_name: str | None) -> Content:
+        if self.kind == "run":
+            return open_run(self._catalog, self._target, sequence_name)
+        return open_sequence(self._catalog, self._target)
+
+    def _build(self) -> None:
+        server, guard = self._server, self._guard
+        set_theme(server, dark=False)
+        add_legend(server, self._content)
+        if len(self._names) > 1:
+            now = self._content.sequence_name
+            choice = server.gui.add_dropdown("Sequence", self._names, initial_value=now)
+            choice.on_update(guard.by_user(lambda _: self._switch(choice)))
+        self._timeline = TimelinePanel(server, self._playback, guard)
+        self._strip = FrameStrip(server, self._timeline.behind_slider)
+        self._figure = FigureMode(server, guard, self._live, self.id, self._playback.redraw)
+        self._pin = PinMode(server, guard, self._figure, self._newest, self._playback.redraw)
+        self._inspection = Inspection(
+            server,
+            guard,
+            self._playback.redraw,
+            reset_view=self._reset_view,
+            snapshot=lambda event: export.save("PNG", event.client),
         )
+        self._physics_place = server.gui.add_folder(None)
+        self._layers = LayersPanel(server, self._content, guard, self._playback.redraw)
+        export = self._export = ExportPanel(server, guard, self.snapshot)
+        self._fill()
+        server.on_client_connect(guard(self._welcome))
+        server.on_client_disconnect(guard(self._part))
 
-    def _reserve(self, owner: str) -> None:
-        self._make_room(owner)
-        with self._lock:
-            if self._is_full():
-                raise TooManySessionsError(
-                    f"{len(self._sessions)} live sessions are open, the most this server allows. "
-                    "Close one of them, or watch the replay, which needs no session."
-                )
-            self._opening += 1
-            if self._reaper is None:
-                self._reaper = threading.Thread(
-                    target=self._reap_now_and_then, name="viewer-reaper", daemon=True
-                )
-                self._reaper.start()
+    def _fill(self) -> None:
+        """Build what belongs to the content: scene, switches and physics."""
+        content = self._content
+        framing = frame_content(content)
+        scene = Scene(self._server, content, framing)
+        self._stage = ViewSwitch(scene, self._figure, self._pin)
+        self._layers.replace(content, scene.layers, framing, has_surface=scene.may_have_surface)
+        self._inspection.replace(content, scene, framing)
+        run = self._catalog.run(self._target) if self.kind == "run" else None
+        self._export.offer(content)
+        self._pin.offer(content, framing)
+        self._figure.offer(content, framing, run.folder if run is not None else None)
+        if content.fitted is None or run is None:
+            return
+        with self._physics_place:
+            self._object = ObjectSession(
+                self._server,
+                self._guard,
+                self._playback,
+                session=self.id,
+                live=self._live,
+                content=content,
+                fitted=content.fitted,
+                run=run,
+                strip=self._strip,
+                keeping=self._keeping,
+            )
 
-    def _is_full(self) -> bool:
-        return len(self._sessions) + self._opening >= self._settings.live_sessions
+    def _restore(self, state: SessionState) -> None:
+        """Go on where another session stands."""
+        self._has_played = True
+        self._timeline.restore(state.speed, does_loop=state.does_loop)
+        if state.layers is not None:
+            self._layers.restore(state.layers, state.theme, prefers_dark=state.prefers_dark)
+            self._inspection.colors.restore()
+        if self._object is not None and self._object.panel is not None and state.parameters:
+            self._object.panel.restore(state.parameters, is_automatic=state.automatic_substeps)
+        if state.pose is not None:
+            state.pose.give_first(self._server.initial_camera)
+        if state.is_figure:
+            self._figure.toggle()
+        self._playback.seek(state.frame)
+        self._playback.play(on=state.is_playing)
 
-    def _make_room(self, owner: str) -> None:
-        """If all places are taken, close a session that its owner, who asks, has left."""
-        with self._lock:
-            if not self._is_full():
+    def _switch(self, choice: viser.GuiDropdownHandle[str]) -> None:
+        self._has_played = True
+        sequence_name = choice.value
+        content = self._load(sequence_name)
+        with self._lock, self._server.atomic():
+            if choice.value != sequence_name:  # Another one was chosen while this one was read.
+                content.close()
                 return
-        left = [s for s in self.list() if s.owner == owner and s.idle >= _MAKES_ROOM_AFTER]
-        if left:
-            oldest = max(left, key=lambda info: info.idle)
-            self.close(oldest.id, "It made room for another scene that you opened.")
+            self._playback.play(on=False)
+            if self._object is not None:
+                self._object.remove()
+                self._object = None
+            self._stage.clear()
+            self._content.close()
+            self._content = content
+            self._playback.replace(content.frame_count, content.frame_rate)
+            self._timeline.replace(content.frame_count)
+            self._fill()
+        self._playback.play()
 
-    def _reap_now_and_then(self) -> None:
-        while not self._closed.wait(min(_REAP_INTERVAL, self._settings.live_idle_s)):
-            try:
-                count = self.reap()
-            except Exception:
-                logger.exception("closing idle sessions failed")
-                continue
-            if count:
-                logger.info("%d idle sessions closed", count)
+    def _welcome(self, client: viser.ClientHandle) -> None:
+        """Start playing when the first client is there, and follow its camera."""
+        self._seen = time.monotonic()
+        # At once: a user who is quick may have stopped the clock before the rest is done.
+        if not self._has_played:
+            self._has_played = True
+            self._playback.play()
+        self._let_in(client, self._figure)
+        self._let_in(client, self._pin)
+
+    def _reset_view(self, event: Any) -> None:
+        if self._figure.is_on:
+            self._figure.reset_view(event.client)
+        elif not self._pin.reset_view(event.client):
+            self._layers.reset_view(event)
+
+    def _forget(self, client: viser.ClientHandle) -> Pose:
+        return self._figure.part(client)
+
+    def _draw(self, frame: int, is_playing: bool) -> None:
+        with self._lock, TURN:
+            take, take_frame = self._take(frame)
+            self._stage.draw(frame, take, take_frame, is_playing=is_playing)
+            self._timeline.show(is_playing=is_playing)
+            self._inspection.show(
+                take,
+                frame,
+                take_frame,
+                is_playing=is_playing,
+                is_hidden=(self._figure.is_on or self._pin.is_on) and take is not None,
+            )
+            if self._object is not None:
+                self._object.show(frame, is_playing=is_playing)
+        self._server.flush()  # viser would wait for more, up to 17 ms.
+
+    def _newest(self) -> ObjectRollout | None:
+        """Find the rollout that was asked for last, as far as it is there."""
+        return self._object.newest if self._object is not None else self._content.fitted
+
+    def _take(self, frame: int) -> tuple[ObjectRollout | None, int]:
+        """Find the rollout to show in a frame, and which of its frames."""
+        if self._object is not None:
+            return self._object.at(frame)
+        fitted = self._content.fitted
+        return fitted, frame if fitted is None else min(frame, fitted.ready - 1)

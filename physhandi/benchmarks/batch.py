@@ -17,9 +17,8 @@ from physhandi.benchmarks.timing import (
     describe_traffic,
     time_in_turns,
 )
-from physhandi.simulation.batch import BatchSimulator
-from physhandi.simulation.batch_losses import MotionTarget
-from physhandi.simulation.master import MasterTopology
+from physhandi.simulation.engines.batch import BatchSimulator, MotionTarget
+from physhandi.simulation.master_topology import MasterTopology
 from physhandi.simulation.model import SimulationParameters
 
 _COST = (0, 48, 0)

@@ -17,7 +17,7 @@ from physhandi.benchmarks.timing import (
     time_in_turns,
 )
 from physhandi.simulation import differentiable
-from physhandi.simulation.trajectory import frame_bytes, memory_budget, stored_frames
+from physhandi.simulation.engines.tape import frame_bytes, memory_budget, stored_frames
 
 GRADIENT_COST = (56, 168, 48)
 """Bytes of a substep forward with 36 B a node written down, and back: springs 20 + 36 (read, and

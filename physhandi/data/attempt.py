@@ -1,46 +1,418 @@
 """One try at filling a run: its files, finished stages and publication."""
 
+import json
+import os
+import shutil
 import time
-from collections.abc import Mapping
+import zlib
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, cast
 
+import numpy as np
+from jaxtyping import Float, Int
 from numpy import ndarray
+from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from physhandi.data.atomic import (
+from physhandi.data.environment import ENVIRONMENT
+from physhandi.data.files import (
+    json_line,
+    named_fields,
+    read_tensors,
     sweep_temporary,
     temporary_name,
     write_array,
+    write_atomically,
     write_bytes,
     write_json,
     write_yaml,
 )
-from physhandi.data.checkpoint import packed, read_checkpoint, write_checkpoint
-from physhandi.data.environment import ENVIRONMENT
 from physhandi.data.lease import Lease, locked
-from physhandi.data.resume import prune, take_over
-from physhandi.data.run_files import (
+from physhandi.data.run_folder import (
     ATTEMPTS,
     CANCEL,
     CHECKPOINTS,
     CURRENT,
+    EVENTS,
     EXIT,
     MANIFEST,
     OUT,
+    PROGRESS,
     RUN_FORMAT,
     STAGES,
     artefacts,
     attempt_numbers,
     file_record,
+    find_damage,
     inside,
     now,
+    read_events,
+    read_json,
     read_mapping,
 )
-from physhandi.data.run_progress import RunProgress
 from physhandi.errors import CancelledError, RunError, describe
-from physhandi.progress import Progress
+from physhandi.progress import Preview, Progress
+
+
+def take_over(previous: Path, folder: Path) -> list[dict[str, Any]]:
+    """Link the files of finished stages and the checkpoints of the attempt before.
+
+    Args:
+        previous: Folder of the attempt before.
+        folder: Folder of the new attempt.
+
+    Returns:
+        The leading finished stages whose files are all still what they were.
+    """
+    stages = _whole_stages(previous) if (previous / STAGES).is_file() else []
+    for stage in stages:
+        for rel in stage["files"]:
+            _link(inside(previous / OUT, rel), inside(folder / OUT, rel))
+    for rel, path in artefacts(previous / CHECKPOINTS):
+        _link(path, inside(folder / CHECKPOINTS, rel))
+    if stages:
+        write_json(folder / STAGES, stages)
+    return stages
+
+
+def prune(run_folder: Path, keep: set[int]) -> None:
+    """Remove attempts that are neither to be kept nor published."""
+    current = run_folder / CURRENT
+    text = current.read_text().strip() if current.is_file() else ""
+    published = {int(text)} if text.isdigit() else set[int]()
+    for number in set(attempt_numbers(run_folder)) - keep - published:
+        shutil.rmtree(run_folder / ATTEMPTS / str(number), ignore_errors=True)
+
+
+def _whole_stages(previous: Path) -> list[dict[str, Any]]:
+    """Give the leading finished stages whose files are all still what they were."""
+    stages = _listed_stages(previous / STAGES)
+    latest: dict[str, Any] = {}
+    for stage in stages:
+        latest |= stage["files"]
+    for count, stage in enumerate(stages):
+        files = {rel: latest[rel] for rel in stage["files"]}
+        if find_damage(previous / OUT, files) is not None:
+            return stages[:count]
+    return stages
+
+
+def _listed_stages(path: Path) -> list[dict[str, Any]]:
+    """Read the list of finished stages; a damaged one proves nothing, so none is finished."""
+    try:
+        content = read_json(path)
+    except RunError:
+        return []
+    entries: list[Any] = cast("list[Any]", content) if isinstance(content, list) else [None]
+    stages = [named_fields(entry) or {} for entry in entries]
+    is_whole = all(
+        isinstance(stage.get("name"), str)
+        and isinstance(stage.get("files"), dict)
+        and isinstance(stage.get("summary"), dict)
+        for stage in stages
+    )
+    return stages if is_whole else []
+
+
+def _link(source: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if target.exists():
+        return
+    try:
+        os.link(source, target)
+    except OSError:  # Some file systems have no hard links.
+        shutil.copy2(source, target)
+
+
+def packed(tensors: Mapping[str, ndarray]) -> dict[str, ndarray]:
+    """Copy tensors into the layout that safetensors can store (C order)."""
+    return {name: np.array(tensor, order="C") for name, tensor in tensors.items()}
+
+
+def write_checkpoint(folder: Path, name: str, tensors: Mapping[str, ndarray]) -> None:
+    """Replace the older of a checkpoint's two files."""
+    folder.mkdir(parents=True, exist_ok=True)
+    numbers = {slot: _number(folder / f"{name}.{slot}.safetensors") for slot in "ab"}
+    slot = min("ab", key=lambda slot: numbers[slot])
+    content = packed(tensors)
+    note = {"number": str(max(numbers.values()) + 1), "crc32": str(_checksum(content))}
+    write_bytes(folder / f"{name}.{slot}.safetensors", save(content, metadata=note))
+
+
+def read_checkpoint(folder: Path, name: str) -> dict[str, ndarray] | None:
+    """Read the newest whole checkpoint of a name; None if there is none."""
+    paths = [folder / f"{name}.{slot}.safetensors" for slot in "ab"]
+    for path in sorted(paths, key=_number, reverse=True):
+        if _number(path) < 0:
+            continue
+        tensors = read_tensors(path)
+        if _note(path).get("crc32") == str(_checksum(tensors)):
+            return tensors
+    return None
+
+
+def _number(path: Path) -> int:
+    """Give a checkpoint file's running number; -1 if it is absent or damaged."""
+    number = _note(path).get("number", "")
+    return int(number) if number.isdigit() else -1
+
+
+def _note(path: Path) -> dict[str, str]:
+    try:
+        opened: Any = safe_open(path, framework="numpy")
+        with opened as stream:
+            return dict(stream.metadata() or {})
+    except (SafetensorError, OSError):
+        return {}
+
+
+def _checksum(tensors: Mapping[str, ndarray]) -> int:
+    checksum = 0
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        header = f"{name} {tensor.dtype.str} {tensor.shape}".encode()
+        checksum = zlib.crc32(tensor.tobytes(), zlib.crc32(header, checksum))
+    return checksum
+
+
+PREVIEW = "preview.safetensors"
+MOST_FRAMES = 24
+"""Frames of a preview; longer motions are shown with fewer frames a second."""
+MOST_POINTS = {"object": 400, "control": 120, "seen": 120, "joints": 42}
+"""Points of each kind in a frame."""
+INTERVAL_S = 1.5
+"""Least time between two previews."""
+SHARE = 0.008
+"""Most of a fit's time that previews may take; what is not used is saved up for dear ones."""
+_UNKNOWN = 65535
+_STEPS = 65534
+
+
+class PreviewFile:
+    """Writes previews of a run, so seldom that the fit does not feel it."""
+
+    def __init__(self, run_folder: Path) -> None:
+        """Prepare; the first preview is due at once, and what an earlier attempt showed goes."""
+        self._path = run_folder / PREVIEW
+        self._path.unlink(missing_ok=True)
+        self._begin = time.monotonic()
+        self._due = 0.0
+        self._number = 0
+        self.spent_s = 0.0
+        """Time that all previews took together."""
+
+    def is_due(self) -> bool:
+        """Tell whether it is time for another preview."""
+        return time.monotonic() >= self._due
+
+    def write(self, make: Callable[[], Preview]) -> None:
+        """Replace the file, and put the next one off until all took at most `SHARE` of the time."""
+        begin = time.monotonic()
+        self._number += 1
+        content = encode(make(), self._number)
+        write_atomically(self._path, lambda stream: stream.write(content), is_durable=False)
+        self.spent_s += time.monotonic() - begin
+        self._due = max(begin + INTERVAL_S, self._begin + self.spent_s / SHARE)
+
+
+def encode(preview: Preview, number: int) -> bytes:
+    """Make the content of the file.
+
+    Args:
+        preview: What to show.
+        number: How many previews of the attempt there were, this one included.
+    """
+    picked: dict[str, ndarray] = {}
+    known: dict[str, ndarray] = dict(preview.points)
+    count = len(next(iter(known.values())))
+    frames = _spread(count, min(count, MOST_FRAMES))
+    for kind, points in known.items():
+        most = min(points.shape[1], MOST_POINTS[kind])
+        kept = _spread(points.shape[1], most)
+        picked[kind] = np.asarray(points[frames][:, kept], np.float32)
+    # What runs away must not shrink the rest to a dot: the box is that of the first frame, with
+    # room for the motion of hands around it.
+    low, side = _box(picked)
+    arrays: dict[str, ndarray] = {}
+    for kind, points in picked.items():
+        unit = (points - low) / side
+        is_known = np.isfinite(unit).all(axis=-1, keepdims=True)
+        whole = np.round(np.clip(np.nan_to_num(unit), 0.0, 1.0) * _STEPS)
+        arrays[kind] = np.where(is_known, whole, _UNKNOWN).astype(np.uint16)
+    about = {
+        "stage": preview.stage,
+        "sequence": preview.sequence,
+        "loss": preview.loss if np.isfinite(preview.loss) else None,
+        "frame_rate": preview.frame_rate,
+        "frames": frames.tolist(),
+        "low": low.tolist(),
+        "side": side,
+        "number": number,
+    }
+    return save(packed(arrays), metadata={"about": json.dumps(about)})
+
+
+def read_preview(run_folder: Path) -> tuple[dict[str, Any], dict[str, Float[ndarray, "f p 3"]]]:
+    """Read a run's preview.
+
+    Returns:
+        What is shown (``stage sequence loss frame_rate frames low side number``), and the points
+        of each kind, NaN where they are not known [m].
+
+    Raises:
+        RunError: If there is none, or it is damaged.
+    """
+    path = run_folder / PREVIEW
+    try:
+        opened: Any = safe_open(path, framework="numpy")
+        with opened as stream:
+            about = named_fields(json.loads(dict(stream.metadata() or {})["about"])) or {}
+            arrays = {str(kind): np.asarray(stream.get_tensor(kind)) for kind in stream.keys()}  # noqa: SIM118
+        points: dict[str, ndarray] = {}
+        for kind, whole in arrays.items():
+            metres = np.asarray(about["low"]) + whole / _STEPS * float(about["side"])
+            points[kind] = np.where(whole == _UNKNOWN, np.nan, metres)
+    except (SafetensorError, OSError, KeyError, ValueError) as error:
+        raise RunError(f"{path} cannot be read: {error}.") from error
+    return about, points
+
+
+def _spread(count: int, most: int) -> Int[ndarray, " kept"]:
+    """Choose so many of the numbers from 0 to `count` - 1, evenly and with both ends."""
+    return np.rint(np.linspace(0, count - 1, most)).astype(np.int64)
+
+
+def _box(picked: dict[str, Float[ndarray, "frame point 3"]]) -> tuple[ndarray, float]:
+    """Find a cube that holds what is shown; of simulated points only those of the first frame.
+
+    Returns:
+        Its lower corner and its side [m].
+    """
+    sure = [
+        (points[:1] if kind == "object" else points).reshape(-1, 3)
+        for kind, points in picked.items()
+    ]
+    everything = np.concatenate(sure)
+    everything = everything[np.isfinite(everything).all(axis=1)]
+    if not len(everything):
+        return np.zeros(3), 1.0
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    side = 1.3 * max(float((high - low).max()), 1e-3)
+    return np.asarray((low + high) / 2 - side / 2, float), side
+
+
+_SNAPSHOT_INTERVAL_S = 0.2
+_HEARTBEAT_INTERVAL_S = 5.0
+_LINE_LIMIT = 4096
+
+
+class RunProgress(Progress):
+    """Writes each report to ``events.jsonl`` and the latest one to ``progress.json``.
+
+    Reports also renew the lease, so that a process that was replaced stops at its next report.
+    """
+
+    def __init__(self, folder: Path, attempt: int, lease: Lease, also: Progress | None) -> None:
+        self._folder = folder
+        self._attempt = attempt
+        self._lease = lease
+        self._also = also
+        known, _ = read_events(folder)
+        self._seq = max((int(event.get("seq", -1)) for event in known), default=-1)
+        self._stage = ""
+        self._stage_start = (0.0, 0)
+        self._snapshot_time = -_SNAPSHOT_INTERVAL_S
+        self._heartbeat_time = time.monotonic()
+        self._preview = PreviewFile(folder)
+        self._end_torn_line()
+
+    def report(
+        self,
+        stage: str,
+        iteration: int,
+        total: int,
+        loss: float | None = None,
+        message: str = "",
+    ) -> None:
+        """Record that `iteration` of `total` of a stage is finished; see `Progress.report`."""
+        clock = time.monotonic()
+        is_new_stage = stage != self._stage
+        if is_new_stage:
+            self._stage, self._stage_start = stage, (clock, iteration)
+        self._seq += 1
+        event: dict[str, object] = {
+            "seq": self._seq,
+            "time": time.time(),
+            "attempt": self._attempt,
+            "stage": stage,
+            "iteration": iteration,
+            "total": total,
+            "loss": loss,
+            "message": message,
+        }
+        self._append(event)
+        if (
+            is_new_stage
+            or iteration >= total
+            or clock - self._snapshot_time >= _SNAPSHOT_INTERVAL_S
+        ):
+            self._snapshot_time = clock
+            snapshot = event | {"eta_s": self._eta(clock, iteration, total)}
+            write_json(self._folder / PROGRESS, snapshot, is_durable=False)
+        if clock - self._heartbeat_time >= _HEARTBEAT_INTERVAL_S:
+            self._heartbeat_time = clock
+            self._lease.heartbeat()
+        if self._also is not None:
+            self._also.report(stage, iteration, total, loss, message)
+
+    def wants_preview(self) -> bool:
+        """Tell whether it is time for a preview; see `PreviewFile`."""
+        return self._preview.is_due()
+
+    def preview(self, make: Callable[[], Preview]) -> None:
+        """Replace the run's preview file."""
+        self._preview.write(make)
+
+    def check_cancelled(self) -> None:
+        """Raise `CancelledError` if the run's ``CANCEL`` file is there."""
+        if (self._folder / CANCEL).exists():
+            raise CancelledError(f"Run '{self._folder.name}' was cancelled.")
+        if self._also is not None:
+            self._also.check_cancelled()
+
+    def _eta(self, clock: float, iteration: int, total: int) -> float | None:
+        start, first = self._stage_start
+        done = iteration - first
+        return (clock - start) / done * (total - iteration) if done > 0 else None
+
+    def _append(self, event: dict[str, object]) -> None:
+        line = json_line(event)
+        if len(line) >= _LINE_LIMIT:
+            excess = len(line) - _LINE_LIMIT + 8
+            line = json_line(event | {"message": str(event["message"])[: -max(excess, 1)]})
+            if len(line) >= _LINE_LIMIT:  # Escaped characters count six times.
+                line = json_line(event | {"message": ""})
+        self._write(line.encode() + b"\n")
+
+    def _write(self, content: bytes) -> None:
+        """Append with a single call, so that lines of two processes never mix."""
+        descriptor = os.open(self._folder / EVENTS, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+        try:
+            os.write(descriptor, content)
+        finally:
+            os.close(descriptor)
+
+    def _end_torn_line(self) -> None:
+        path = self._folder / EVENTS
+        if not path.is_file() or path.stat().st_size == 0:
+            return
+        with path.open("rb") as stream:
+            stream.seek(-1, os.SEEK_END)
+            if stream.read(1) != b"\n":
+                self._write(b"\n")
+
 
 _LOSSES = "losses.json"
 _ATTEMPT_FILES = {_LOSSES, ENVIRONMENT}

@@ -6,7 +6,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from physhandi.data.run_files import now
+from physhandi.data.run_folder import now
 
 ENVIRONMENT = "environment.json"
 _PACKAGES = ("physhandi", "warp-lang", "torch", "numpy", "scipy")

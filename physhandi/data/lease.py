@@ -12,8 +12,8 @@ from typing import Any
 
 import psutil
 
-from physhandi.data.atomic import write_json
-from physhandi.data.run_files import LEASE, read_mapping
+from physhandi.data.files import write_json
+from physhandi.data.run_folder import LEASE, read_mapping
 from physhandi.errors import RunError
 
 REMOTE_TIMEOUT_S = 120.0

@@ -9,10 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from physhandi.data.atomic import named_fields, plain, temporary_name, write_bytes, write_yaml
 from physhandi.data.attempt import Attempt
+from physhandi.data.attempt import RunProgress as RunProgress
+from physhandi.data.files import named_fields, plain, temporary_name, write_bytes, write_yaml
 from physhandi.data.lease import Lease, live_holder, locked
-from physhandi.data.run_files import (
+from physhandi.data.result import RunOutputs
+from physhandi.data.result import RunState as RunState
+from physhandi.data.run_folder import (
     ATTEMPTS,
     CANCEL,
     JOB,
@@ -25,12 +28,9 @@ from physhandi.data.run_files import (
     read_mapping,
     read_yaml,
 )
-from physhandi.data.run_files import new_run_id as new_run_id
-from physhandi.data.run_files import read_events as read_events
-from physhandi.data.run_outputs import RunOutputs
-from physhandi.data.run_outputs import RunState as RunState
-from physhandi.data.run_progress import RunProgress as RunProgress
-from physhandi.data.sequence_schema import FILE, read_meta
+from physhandi.data.run_folder import new_run_id as new_run_id
+from physhandi.data.run_folder import read_events as read_events
+from physhandi.data.sequence_meta import FILE, read_meta
 from physhandi.errors import RunError
 
 RunKind = Literal["reconstruction", "simulation"]

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Integer
 from numpy import ndarray
 
-from physhandi.data.atomic import (
+from physhandi.data.files import (
     is_abandoned,
     sweep_temporary,
     sync_folder,
@@ -21,7 +21,7 @@ from physhandi.data.atomic import (
     write_yaml,
 )
 from physhandi.data.sequence import Sequence
-from physhandi.data.sequence_schema import FILE, SAFE_NAME, SequenceMeta
+from physhandi.data.sequence_meta import FILE, SAFE_NAME, SequenceMeta
 from physhandi.errors import SequenceError
 
 

@@ -11,8 +11,8 @@ from typing import Any
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from physhandi.data.atomic import read_array
-from physhandi.data.sequence_schema import Side
+from physhandi.data.files import read_array
+from physhandi.data.sequence_meta import Side
 
 FOLDER = "truth"
 """Folder of a sequence that holds the truth."""

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 
-from physhandi.data.atomic import read_array
 from physhandi.data.camera import PinholeCamera
+from physhandi.data.files import read_array
 from physhandi.errors import SequenceError
 
 _CACHED_FRAMES = 16

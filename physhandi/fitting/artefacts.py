@@ -11,12 +11,11 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from safetensors.numpy import load_file
 
-from physhandi.data.atomic import named_fields, read_array
 from physhandi.data.attempt import Attempt
+from physhandi.data.files import named_fields, parse_yaml, read_array
 from physhandi.data.observation import ObjectObservation
-from physhandi.data.plain_yaml import parse_yaml
 from physhandi.data.run import Run
-from physhandi.data.run_files import reading
+from physhandi.data.run_folder import reading
 from physhandi.data.sequence import Sequence
 from physhandi.errors import RunError
 from physhandi.hand.model import load_hand_model

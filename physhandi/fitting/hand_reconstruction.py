@@ -1,19 +1,673 @@
 """Stage 1: a hand mesh in every frame, from keypoints and depth of all views (paper, 3.2)."""
 
+import math
+from collections.abc import Callable, Iterator
+from collections.abc import Sequence as Many
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float
 from numpy import ndarray
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation, Slerp
+from torch import Tensor
 
+from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence import Sequence
 from physhandi.errors import FitError, MissingInputError
-from physhandi.fitting.hand_config import HandFitConfig as HandFitConfig
-from physhandi.fitting.hand_problem import HandProblem
-from physhandi.hand.model import load_hand_model
+from physhandi.fitting.config import HandFitConfig
+from physhandi.hand.model import HandModel, Side, load_hand_model
 from physhandi.hand.motion import HandMotion
+from physhandi.hand.rotation import quaternion_matrix
 from physhandi.perception.keypoints import detect_sequence
-from physhandi.progress import NullProgress, Progress
+from physhandi.perception.lifting import HAND_LABEL, surface_points
+from physhandi.progress import NullProgress, Preview, Progress
+
+_MIN_ANGLE = np.deg2rad(3)
+
+
+def triangulate(
+    cameras: Many[PinholeCamera],
+    pixel: Float[ndarray, "view point 2"],
+    weight: Float[ndarray, "view point"],
+    tolerance: float,
+) -> Float[ndarray, "point 3"]:
+    """Triangulate points by the direct linear transform, keeping only those that all views confirm.
+
+    Args:
+        cameras: Camera of each view.
+        pixel: Where each view sees each point; NaN where it does not [px].
+        weight: Trust in each observation.
+        tolerance: Largest distance between an observation and the point's projection [px].
+
+    Returns:
+        World points; NaN where fewer than two views see the point, where they see it along nearly
+        the same ray, or where one of them disagrees.
+    """
+    point = np.full((pixel.shape[1], 3), np.nan)
+    if len(cameras) < 2:
+        return point
+    is_seen = np.isfinite(pixel).all(-1) & (weight > 0)
+    rows = np.zeros((pixel.shape[1], 2 * len(cameras), 4))
+    for view, camera in enumerate(cameras):
+        projection = camera.K @ camera.T_camera_world[:3]
+        straight = camera.undistort(np.where(is_seen[view][:, None], pixel[view], 0.0))
+        equation = straight[:, :, None] * projection[2] - projection[:2]
+        trust = np.where(is_seen[view], weight[view], 0.0)[:, None, None]
+        scale = np.linalg.norm(projection[0, :3])
+        rows[:, 2 * view : 2 * view + 2] = trust * equation / scale
+    enough = is_seen.sum(0) >= 2
+    if not enough.any():
+        return point
+    solution = np.linalg.svd(rows[enough])[2][:, -1]
+    homogeneous = np.where(abs(solution[:, 3:]) > 1e-12, solution[:, 3:], np.nan)
+    point[enough] = solution[:, :3] / homogeneous
+    is_confirmed = _widest_angle(cameras, point, is_seen) > _MIN_ANGLE
+    for view, camera in enumerate(cameras):
+        error = np.linalg.norm(camera.project(point) - pixel[view], axis=-1)
+        is_confirmed &= ~is_seen[view] | (error <= tolerance)
+    point[~is_confirmed] = np.nan
+    return point
+
+
+def _widest_angle(
+    cameras: Many[PinholeCamera],
+    point: Float[ndarray, "point 3"],
+    is_seen: ndarray,
+) -> Float[ndarray, " point"]:
+    """Compute the largest angle between the rays on which a point is seen [rad]."""
+    rays = np.stack([point - camera.T_world_camera[:3, 3] for camera in cameras])
+    rays /= np.maximum(np.linalg.norm(rays, axis=-1, keepdims=True), 1e-12)
+    widest = np.zeros(point.shape[0])
+    for first in range(len(cameras)):
+        for second in range(first):
+            angle = np.arccos(np.clip((rays[first] * rays[second]).sum(-1), -1, 1))
+            widest = np.where(is_seen[first] & is_seen[second], np.fmax(widest, angle), widest)
+    return widest
+
+
+PALM = (0, 1, 5, 9, 13, 17)
+"""Keypoints that move with the palm."""
+_PALM_BONES = ((0, 5), (0, 9), (0, 13), (0, 17), (5, 17))
+_MIN_PALM_POINTS = 4
+
+
+@dataclass(frozen=True)
+class WristGuess:
+    """Where the wrist is in every frame, roughly."""
+
+    rotation: Float[ndarray, "frame 4"]
+    """Unit quaternion (x, y, z, w) of the hand, without jumps of sign."""
+    translation: Float[ndarray, "frame 3"]
+    """Position of the wrist [m, before scale]."""
+    scale: float
+    """Length units of the sequence per metre."""
+
+
+def guess_wrist(
+    cameras: Many[PinholeCamera],
+    keypoint: Float[ndarray, "view frame 21 3"],
+    model: HandModel,
+    *,
+    metric: bool,
+    tolerance: float,
+) -> WristGuess:
+    """Place the template's palm on the triangulated palm, and bridge the frames without one.
+
+    Args:
+        cameras: Camera of each view.
+        keypoint: Pixel x, pixel y and confidence; NaN where not seen [px].
+        model: The hand.
+        metric: Whether lengths are metres; otherwise the scale is estimated too.
+        tolerance: Largest error at which views agree about a keypoint [px].
+
+    Raises:
+        FitError: If no frame shows enough of the palm.
+    """
+    template = _template(model)
+    view_count, frame_count = keypoint.shape[:2]
+    flat = keypoint.reshape(view_count, -1, 3)
+    weight = np.nan_to_num(flat[..., 2])
+    point = triangulate(cameras, flat[..., :2], weight, tolerance).reshape(frame_count, 21, 3)
+    scale = 1.0 if metric else _scale(point, template)
+    palm = list(PALM)
+    rotation, translation = np.zeros((frame_count, 4)), np.zeros((frame_count, 3))
+    is_known = np.zeros(frame_count, dtype=bool)
+    for frame in range(frame_count):
+        is_seen = np.isfinite(point[frame, palm]).all(-1)
+        if is_seen.sum() >= _MIN_PALM_POINTS:
+            pose = _align(template[palm][is_seen], point[frame, palm][is_seen] / scale)
+            rotation[frame], translation[frame] = pose[0].as_quat(), pose[1]
+            is_known[frame] = True
+    if not is_known.any():
+        for frame in range(frame_count):
+            pose = _guess_from_one_view(cameras, keypoint[:, frame, palm], template[palm] * scale)
+            if pose is not None:
+                rotation[frame], translation[frame] = pose[0].as_quat(), pose[1] / scale
+                is_known[frame] = True
+    if not is_known.any():
+        raise FitError(
+            f"The {model.side} hand cannot be placed: no frame shows "
+            f"{_MIN_PALM_POINTS} keypoints of its palm apart from each other. Check the keypoints "
+            "and the calibration."
+        )
+    rotation, translation = _bridge(rotation, translation, is_known)
+    return WristGuess(rotation, translation, scale)
+
+
+def _template(model: HandModel) -> Float[ndarray, "21 3"]:
+    zero = torch.zeros(1, 3, dtype=torch.float64)
+    keypoint = model.keypoints(zero.new_zeros(10), zero.new_zeros(1, 15, 3), zero, zero)
+    return keypoint[0].numpy()
+
+
+def _scale(point: Float[ndarray, "frame 21 3"], template: Float[ndarray, "21 3"]) -> float:
+    """Compare the palm's lengths, medians over frames, with the template's."""
+    ratio = [
+        np.linalg.norm(point[:, i] - point[:, j], axis=-1)
+        / np.linalg.norm(template[i] - template[j])
+        for i, j in _PALM_BONES
+    ]
+    known = np.array(ratio)
+    return float(np.nanmedian(known)) if np.isfinite(known).any() else 1.0
+
+
+def _align(
+    source: Float[ndarray, "point 3"], target: Float[ndarray, "point 3"]
+) -> tuple[Rotation, Float[ndarray, " 3"]]:
+    """Find the rigid motion that takes one set of points closest to another (Kabsch)."""
+    covariance = (target - target.mean(0)).T @ (source - source.mean(0))
+    left, _, right = np.linalg.svd(covariance)
+    flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    rotation = Rotation.from_matrix(left @ flip @ right)
+    return rotation, target.mean(0) - rotation.apply(source.mean(0))
+
+
+def _guess_from_one_view(
+    cameras: Many[PinholeCamera],
+    keypoint: Float[ndarray, "view point 3"],
+    template: Float[ndarray, "point 3"],
+) -> tuple[Rotation, Float[ndarray, " 3"]] | None:
+    """Solve perspective-n-point in the view that is surest of the palm."""
+    is_seen = np.asarray(np.isfinite(keypoint).all(-1))
+    usable = np.where(is_seen.sum(1) >= _MIN_PALM_POINTS, np.nansum(keypoint[..., 2], 1), 0.0)
+    view = int(np.argmax(usable))
+    if usable[view] <= 0:
+        return None
+    camera, seen = cameras[view], np.flatnonzero(is_seen[view, :])
+    pixel = camera.undistort(keypoint[view, seen, :2].astype(np.float64))
+    try:
+        found, vector, offset = cv2.solvePnP(
+            template[seen], pixel, camera.K, None, flags=cv2.SOLVEPNP_SQPNP
+        )
+    except cv2.error:  # The keypoints are all in one place.
+        return None
+    if not found:
+        return None
+    pose = camera.T_world_camera
+    rotation = Rotation.from_matrix(pose[:3, :3]) * Rotation.from_rotvec(vector[:, 0])
+    return rotation, pose[:3, :3] @ offset[:, 0] + pose[:3, 3]
+
+
+def _bridge(
+    rotation: Float[ndarray, "frame 4"],
+    translation: Float[ndarray, "frame 3"],
+    is_known: Bool[ndarray, " frame"],
+) -> tuple[Float[ndarray, "frame 4"], Float[ndarray, "frame 3"]]:
+    """Interpolate over unknown frames; the first and last known pose are kept outside."""
+    frame, known = np.arange(len(is_known)), np.flatnonzero(is_known)
+    if len(known) > 1:
+        between = np.clip(frame, known[0], known[-1])
+        rotation = Slerp(known, Rotation.from_quat(rotation[known]))(between).as_quat()
+    else:
+        rotation = np.repeat(rotation[known], len(frame), axis=0)
+    for t in range(1, len(frame)):
+        if rotation[t] @ rotation[t - 1] < 0:
+            rotation[t] = -rotation[t]
+    columns = [np.interp(frame, known, translation[known, axis]) for axis in range(3)]
+    return rotation, np.stack(columns, axis=1)
+
+
+_KNUCKLE = ((-1.7, 0.6), (-0.4, 0.4), (-0.25, 0.25))
+_MIDDLE = ((-2.0, 0.2), (-0.08, 0.08), (-0.08, 0.08))
+_LAST = ((-1.5, 0.4), (-0.08, 0.08), (-0.08, 0.08))
+_THUMB = (
+    ((-0.9, 0.9), (-0.9, 0.9), (-0.6, 0.6)),
+    ((-1.2, 0.6), (-0.4, 0.4), (-0.3, 0.3)),
+    ((-1.6, 0.6), (-0.15, 0.15), (-0.15, 0.15)),
+)
+JOINT_LIMIT = np.array([*_THUMB, *([_KNUCKLE, _MIDDLE, _LAST] * 4)])
+"""Lower and upper bound of each joint's rotation vector, for a right hand [rad]."""
+
+
+@dataclass(frozen=True)
+class KeypointTarget:
+    """Keypoints of one hand in all views, with the lens distortion taken out."""
+
+    pixel: Float[Tensor, "view frame 21 2"]
+    """Where the keypoints were seen; zero where they were not [px]."""
+    weight: Float[Tensor, "view frame 21"]
+    """Confidence; zero where a keypoint was not seen."""
+    noise: Float[Tensor, " view"]
+    """Error to be expected of a keypoint in each view [px]."""
+    projection: Float[Tensor, "view 3 4"]
+    """Maps homogeneous world points to pixels without lens distortion."""
+
+
+def keypoint_target(
+    cameras: Many[PinholeCamera],
+    keypoint: Float[ndarray, "view frame 21 3"],
+    relative_noise: float,
+) -> KeypointTarget:
+    """Prepare keypoints for `reprojection_loss`.
+
+    Args:
+        cameras: Camera of each view.
+        keypoint: Pixel x, pixel y and confidence; NaN where not seen [px].
+        relative_noise: Expected error as a share of the hand's size in the image.
+    """
+    is_seen = np.isfinite(keypoint).all(-1) & (keypoint[..., 2] > 0)
+    filled = np.where(is_seen[..., None], keypoint, 0.0).astype(np.float64)
+    pixel = np.stack([c.undistort(k[..., :2]) for c, k in zip(cameras, filled, strict=True)])
+    projection = np.stack([camera.K @ camera.T_camera_world[:3] for camera in cameras])
+    noise = np.maximum(relative_noise * np.array([_hand_size(view) for view in keypoint]), 0.5)
+    return KeypointTarget(
+        pixel=torch.tensor(pixel, dtype=torch.float32),
+        weight=torch.tensor(filled[..., 2] * is_seen, dtype=torch.float32),
+        noise=torch.tensor(noise, dtype=torch.float32),
+        projection=torch.tensor(projection, dtype=torch.float32),
+    )
+
+
+def _hand_size(keypoint: Float[ndarray, "frame 21 3"]) -> float:
+    """Measure how large a hand usually is in a view: the diagonal of its keypoints' box [px]."""
+    is_whole = np.isfinite(keypoint).all(-1).sum(1) >= 15
+    if not is_whole.any():
+        return 100.0
+    pixel = keypoint[is_whole, :, :2]
+    diagonal = np.linalg.norm(np.nanmax(pixel, 1) - np.nanmin(pixel, 1), axis=-1)
+    return float(np.median(diagonal))
+
+
+def reprojection_loss(
+    point: Float[Tensor, "frame 21 3"], target: KeypointTarget, breadth: float
+) -> Float[Tensor, ""]:
+    """Compare projected keypoints with seen ones, a frame's sum averaged over frames.
+
+    Cauchy's robust loss ``c² log(1 + (r / c)²)`` of the distance ``r`` in units of the expected
+    noise: an observation that is wrong by many ``c`` no longer pulls.
+
+    Args:
+        point: Keypoints in the world frame.
+        target: What was seen.
+        breadth: ``c``, the distance in units of noise beyond which an observation is doubted.
+    """
+    frame_count = point.shape[0]
+    homogeneous = torch.cat([point, torch.ones_like(point[..., :1])], -1)
+    seen = torch.einsum("vij,fkj->vfki", target.projection, homogeneous)
+    depth = seen[..., 2:]
+    nearest = 1e-3 * depth.detach().abs().median()
+    pixel = seen[..., :2] / depth.clamp(min=float(nearest) + 1e-9)
+    squared = ((pixel - target.pixel) ** 2).sum(-1) / target.noise[:, None, None] ** 2
+    robust = breadth**2 * torch.log1p(squared / breadth**2)
+    return (target.weight * robust).sum() / frame_count
+
+
+def limit_loss(articulation: Float[Tensor, "frame 15 3"], model: HandModel) -> Float[Tensor, ""]:
+    """Sum the squares of what the joints turn beyond their limits, averaged over frames [rad²]."""
+    mirror = torch.tensor([1.0, -1.0, -1.0] if model.side == "left" else [1.0, 1.0, 1.0])
+    limit = torch.tensor(JOINT_LIMIT, dtype=articulation.dtype)
+    turned = articulation * mirror
+    beyond = (limit[..., 0] - turned).relu() + (turned - limit[..., 1]).relu()
+    return (beyond**2).sum() / articulation.shape[0]
+
+
+def acceleration_loss(point: Float[Tensor, "frame 21 3"]) -> Float[Tensor, ""]:
+    """Sum the squared second differences of the keypoints over time, averaged over frames."""
+    if point.shape[0] < 3:
+        return point.sum() * 0
+    second = point[2:] - 2 * point[1:-1] + point[:-2]
+    return (second**2).sum() / point.shape[0]
+
+
+def velocity_loss(point: Float[Tensor, "frame joint 3"]) -> Float[Tensor, ""]:
+    """Sum the squared differences from frame to frame, averaged over frames."""
+    return ((point[1:] - point[:-1]) ** 2).sum() / point.shape[0]
+
+
+_CANDIDATES = 8
+_REFRESH = 10
+_DOUBT = 3.0
+
+
+@dataclass(eq=False)
+class DepthTarget:
+    """Points that the views measured on one hand, and the vertices they belong to."""
+
+    point: Float[Tensor, "frame point 3"]
+    """Measured points; zero where a frame has fewer [m]."""
+    towards_camera: Float[Tensor, "frame point 3"]
+    """Unit vector from each point to the camera that measured it."""
+    weight: Float[Tensor, "frame point"]
+    """One divided by the frame's number of points; zero where there is none."""
+    vertex: Tensor | None = None
+    """Vertex that each point is compared with, renewed now and then."""
+    age: int = 0
+    """Uses since it was renewed."""
+
+
+def depth_target(sequence: Sequence, side: Side, point_count: int) -> DepthTarget | None:
+    """Collect the measured points of one hand from all views with depth and masks.
+
+    Args:
+        sequence: The recording.
+        side: Which hand.
+        point_count: Most points kept in a frame, evenly spread over the image.
+
+    Returns:
+        The points; None if no view has depth and masks of this hand.
+    """
+    views = [view for view in sequence.views if view.has_depth and view.has_mask]
+    frames = []
+    for frame in range(sequence.frame_count):
+        point, camera = np.zeros((0, 3)), np.zeros((0, 3))
+        for view in views:
+            is_hand = view.mask(frame) == HAND_LABEL[side]
+            seen = surface_points(view, view.depth(frame), is_hand)
+            point = np.concatenate([point, seen])
+            camera = np.concatenate([camera, view.camera.T_world_camera[:3, 3] - seen])
+        chosen = np.linspace(0, len(point) - 1, min(point_count, len(point))).round().astype(int)
+        frames.append((point[chosen], camera[chosen]))
+    if not any(len(point) for point, _ in frames):
+        return None
+    shape = (len(frames), point_count, 3)
+    point, ray, weight = np.zeros(shape), np.zeros(shape), np.zeros(shape[:2])
+    for frame, (seen, camera) in enumerate(frames):
+        count = len(seen)
+        if count:
+            point[frame, :count] = seen
+            ray[frame, :count] = camera / np.linalg.norm(camera, axis=1, keepdims=True)
+            weight[frame, :count] = 1 / count
+    return DepthTarget(
+        point=torch.tensor(point, dtype=torch.float32),
+        towards_camera=torch.tensor(ray, dtype=torch.float32),
+        weight=torch.tensor(weight, dtype=torch.float32),
+    )
+
+
+def depth_loss(
+    vertex: Float[Tensor, "frame vertex 3"],
+    faces: Tensor,
+    target: DepthTarget,
+    noise: float,
+) -> Float[Tensor, ""]:
+    """Compare measured points with the surface, along its normal (one way, Cauchy's robust loss).
+
+    Args:
+        vertex: The hand's surface in the world frame [m].
+        faces: Its triangles.
+        target: The measured points; the vertices they belong to are renewed every tenth call.
+        noise: Expected error of a measurement [m].
+
+    Returns:
+        Mean over points, then frames, in units of the noise, squared.
+    """
+    normal = vertex_normals(vertex, faces)
+    if target.vertex is None or target.age >= _REFRESH:
+        target.vertex, target.age = _correspond(vertex.detach(), normal.detach(), target), 0
+    target.age += 1
+    index = target.vertex[..., None].expand(-1, -1, 3)
+    offset = target.point - vertex.gather(1, index)
+    along = (offset * normal.gather(1, index)).sum(-1)
+    aside = ((offset**2).sum(-1) - along**2).clamp(min=0)
+    squared = (along**2 + 0.1 * aside) / noise**2
+    robust = _DOUBT**2 * torch.log1p(squared / _DOUBT**2)
+    return (target.weight * robust).sum() / max(int((target.weight.sum(1) > 0).sum()), 1)
+
+
+def vertex_normals(
+    vertex: Float[Tensor, "frame vertex 3"], faces: Tensor
+) -> Float[Tensor, "frame vertex 3"]:
+    """Compute unit normals of vertices, the area-weighted mean of their triangles'."""
+    a, b, c = (vertex[:, faces[:, corner]] for corner in range(3))
+    normal = torch.cross(b - a, c - a, dim=-1)
+    total = torch.zeros_like(vertex)
+    for corner in range(3):
+        total = total.index_add(1, faces[:, corner], normal)
+    return total / total.norm(dim=-1, keepdim=True).clamp(min=1e-12)
+
+
+def _correspond(vertex: Tensor, normal: Tensor, target: DepthTarget) -> Tensor:
+    """Find for each point the nearest vertex among its neighbours that faces the camera."""
+    chosen = torch.zeros(target.weight.shape, dtype=torch.int64)
+    for frame in range(len(vertex)):
+        count = int((target.weight[frame] > 0).sum())
+        if not count:
+            continue
+        tree = KDTree(vertex[frame].numpy())
+        near = np.asarray(tree.query(target.point[frame, :count].numpy(), k=_CANDIDATES)[1])
+        facing = normal[frame][near] * target.towards_camera[frame, :count, None]
+        first = (facing.sum(-1) > 0).numpy().argmax(axis=1)
+        chosen[frame, :count] = torch.from_numpy(
+            np.take_along_axis(near, first[:, None], axis=1)[:, 0]
+        )
+    return chosen
+
+
+STAGE = "hand_reconstruction"
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedHand:
+    """The fit of one hand."""
+
+    motion: HandMotion
+    """Its motion."""
+    loss_before: float
+    """Loss of the first guess, without depth."""
+    loss_after: float
+    """Loss of the result, without depth."""
+    curve: list[tuple[int, float]]
+    """Loss of every tenth iteration."""
+
+
+class HandProblem:
+    """One hand: what was seen of it, and the parameters that explain it."""
+
+    def __init__(
+        self,
+        sequence: Sequence,
+        keypoint: Float[ndarray, "view frame 21 3"],
+        model: HandModel,
+        config: HandFitConfig,
+    ) -> None:
+        self.model, self.config, self.metric = model, config, sequence.metric
+        cameras: list[PinholeCamera] = [view.camera for view in sequence.views]
+        self.target: KeypointTarget = keypoint_target(cameras, keypoint, config.keypoint_noise)
+        tolerance = config.agreement * float(self.target.noise.max())
+        guess = guess_wrist(cameras, keypoint, model, metric=sequence.metric, tolerance=tolerance)
+        self.frame_rate = sequence.frame_rate
+        self.parameters = _parameters(guess, len(keypoint[0]))
+        self.name = sequence.name
+        self.joints: Tensor | None = None
+        """The 21 keypoints of every frame, as the latest loss saw them."""
+        self.depth: DepthTarget | None = None
+        if sequence.metric and config.depth_iterations:
+            self.depth = depth_target(sequence, model.side, config.depth_points)
+
+    def hand(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Shape, wrist rotation, wrist position [m] and scale."""
+        p = self.parameters
+        rotation = quaternion_matrix(p["rotation"])
+        return 3 * torch.tanh(p["shape"] / 3), rotation, p["translation"], p["log_scale"].exp()
+
+    def loss(self, breadth: float) -> Tensor:
+        """Compute the loss without depth."""
+        config, articulation = self.config, self.parameters["articulation"]
+        shape, rotation, translation, scale = self.hand()
+        still = torch.zeros_like(translation)
+        local = self.model.keypoints(shape, articulation, still, still)
+        metres = local @ rotation.transpose(-1, -2) + translation[:, None]
+        self.joints = (metres * scale).detach()
+        reach = config.acceleration_noise / self.frame_rate**2
+        turn = config.turn_noise * 30 / self.frame_rate
+        return (
+            reprojection_loss(metres * scale, self.target, breadth)
+            + config.limit_weight * limit_loss(articulation, self.model)
+            + config.pose_weight * (articulation**2).sum() / len(articulation)
+            + config.shape_weight * (self.parameters["shape"] ** 2).sum()
+            + acceleration_loss(metres) / reach**2
+            + velocity_loss(articulation) / turn**2
+        )
+
+    def depth_term(self, target: DepthTarget) -> Tensor:
+        """Compute the weighted depth loss."""
+        shape, rotation, translation, _ = self.hand()
+        still = torch.zeros_like(translation)
+        local = self.model(shape, self.parameters["articulation"], still, still).vertex
+        vertex = local @ rotation.transpose(-1, -2) + translation[:, None]
+        faces = torch.from_numpy(self.model.faces)
+        return self.config.depth_weight * depth_loss(vertex, faces, target, self.config.depth_noise)
+
+    def solve(self, progress: Progress) -> SolvedHand:
+        """Fit to keypoints, then to keypoints and depth."""
+        config = self.config
+        with torch.no_grad():
+            before = float(self.loss(config.doubt))
+        curve: list[tuple[int, float]] = []
+        total = config.iterations + (config.depth_iterations if self.depth else 0)
+
+        def widening(iteration: int) -> float:
+            share = min(iteration / (0.6 * config.iterations), 1.0)
+            return config.doubt * 10 ** (1 - share)
+
+        def step(iteration: int, loss: Tensor) -> None:
+            progress.check_cancelled()
+            if iteration % 10 == 0 or iteration == total:
+                value = float(loss.detach())
+                curve.append((iteration, value))
+                message = f"{self.model.side.capitalize()} hand"
+                progress.report(STAGE, iteration, total, value, message)
+                self._show(value, progress)
+
+        with _one_thread():
+            self._descend(
+                config.iterations, config.learning_rate, lambda i: self.loss(widening(i)), step, 0
+            )
+            if self.depth is not None:
+                depth = self.depth
+                self._descend(
+                    config.depth_iterations,
+                    config.learning_rate / 4,
+                    lambda _: self.loss(config.doubt) + self.depth_term(depth),
+                    step,
+                    config.iterations,
+                )
+        with torch.no_grad():
+            after = float(self.loss(config.doubt))
+        if not math.isfinite(after):
+            raise FitError(
+                f"The fit of the {self.model.side} hand did not stay finite (loss {after})."
+            )
+        return SolvedHand(self._motion(), before, after, curve)
+
+    def _show(self, loss: float, progress: Progress) -> None:
+        """Let people see the hand as it is."""
+        joints = self.joints
+        if joints is not None and progress.wants_preview():
+            progress.preview(
+                lambda: Preview(
+                    stage=STAGE,
+                    sequence=self.name,
+                    loss=loss,
+                    frame_rate=self.frame_rate,
+                    points={"joints": joints.numpy()},
+                )
+            )
+
+    def _descend(
+        self,
+        iterations: int,
+        rate: float,
+        loss_at: Callable[[int], Tensor],
+        step: Callable[[int, Tensor], None],
+        first: int,
+    ) -> None:
+        share = {
+            "shape": 2.0,
+            "articulation": 1.0,
+            "rotation": 0.3,
+            "translation": 0.1,
+            "log_scale": 0.1,
+        }
+        groups = [
+            {"params": [value.requires_grad_()], "lr": rate * share[name]}
+            for name, value in self.parameters.items()
+            if not (self.metric and name == "log_scale")
+        ]
+        optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
+        schedule = torch.optim.lr_scheduler.LambdaLR(
+            optimizer, lambda i: 0.05 + 0.475 * (1 + math.cos(math.pi * i / iterations))
+        )
+        for iteration in range(iterations):
+            optimizer.zero_grad()
+            loss = loss_at(iteration)
+            loss.backward()
+            optimizer.step()
+            schedule.step()
+            step(first + iteration + 1, loss)
+
+    def _motion(self) -> HandMotion:
+        with torch.no_grad():
+            shape, rotation, translation, scale = self.hand()
+        turn = Rotation.from_matrix(rotation.numpy()).as_rotvec()
+        return HandMotion(
+            side=self.model.side,
+            model=self.model.kind,
+            shape=shape.numpy().astype(np.float32),
+            articulation=self.parameters["articulation"].detach().numpy().copy(),
+            wrist_rotation=_without_jumps(turn).astype(np.float32),
+            wrist_translation=translation.detach().numpy().copy(),
+            scale=1.0 if self.metric else float(scale),
+        )
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Keep torch from spreading small tensors over busy cores, which costs more than it gains."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _parameters(guess: WristGuess, frame_count: int) -> dict[str, Tensor]:
+    articulation = torch.zeros(frame_count, 15, 3)
+    articulation[:, 3:, 0] = -0.3
+    return {
+        "shape": torch.zeros(10),
+        "articulation": articulation,
+        "rotation": torch.tensor(guess.rotation, dtype=torch.float32),
+        "translation": torch.tensor(guess.translation, dtype=torch.float32),
+        "log_scale": torch.tensor(math.log(guess.scale), dtype=torch.float32),
+    }
+
+
+def _without_jumps(vector: Float[ndarray, "frame 3"]) -> Float[ndarray, "frame 3"]:
+    """Describe each rotation by whichever of its two vectors is nearer to the frame before."""
+    vector = vector.copy()
+    for frame in range(1, len(vector)):
+        angle = np.linalg.norm(vector[frame])
+        other = vector[frame] * (1 - 2 * np.pi / max(angle, 1e-9))
+        near, far = (np.linalg.norm(v - vector[frame - 1]) for v in (vector[frame], other))
+        if far < near and angle > 1e-3:
+            vector[frame] = other
+    return vector
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

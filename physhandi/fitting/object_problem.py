@@ -1,6 +1,9 @@
 """What the object fit is given of one sequence: nodes, controls and observations."""
 
-from dataclasses import dataclass
+import math
+from collections.abc import Callable
+from collections.abc import Sequence as Many
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -11,8 +14,100 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from physhandi.data.observation import ObjectObservation
-from physhandi.errors import FitError
-from physhandi.fitting.losses import chamfer_loss, track_loss
+from physhandi.errors import FitError, SimulationDivergedError
+from physhandi.fitting.config import ObjectFitConfig
+from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.simulator import Simulator
+from physhandi.simulation.stability import stable_substeps
+from physhandi.simulation.topology import build_model
+
+
+def chamfer_loss(
+    observed: Float[Tensor, "frame point 3"],
+    is_observed: Bool[Tensor, "frame point"],
+    node: Float[Tensor, "frame node 3"],
+    *,
+    count: Float[Tensor, " frame"] | None = None,
+) -> Float[Tensor, " frame"]:
+    """Measure how far observed points lie from the nearest node, one way, squared [m²].
+
+    The nearest node is held fixed in the gradient (physics.md §4.1; PhysTwin's Chamfer term).
+
+    Args:
+        observed: Observed points, padded to one length [m].
+        is_observed: Which of them are real.
+        node: Simulated object nodes [m].
+        count: What to divide by instead of the number of points of each frame.
+
+    Returns:
+        Mean squared distance of each frame; 0 where a frame saw nothing.
+    """
+    nearest = _nearest(observed, is_observed, node)
+    chosen = torch.gather(node, 1, nearest[..., None].expand(-1, -1, 3))
+    squared = ((torch.nan_to_num(observed) - chosen) ** 2).sum(dim=2) * is_observed
+    divisor = is_observed.sum(dim=1) if count is None else count
+    return squared.sum(dim=1) / divisor.clamp(min=1)
+
+
+def track_loss(
+    observed: Float[Tensor, "frame track 3"],
+    is_valid: Bool[Tensor, "frame track"],
+    predicted: Float[Tensor, "frame track 3"],
+    *,
+    count: Float[Tensor, " frame"] | None = None,
+) -> Float[Tensor, " frame"]:
+    """Measure how far followed surface points are from where the simulation carried them [m²].
+
+    PhysTwin's smooth L1 with β = 1 m, averaged over coordinates, is one sixth of this value.
+
+    Args:
+        observed: Observed tracks [m].
+        is_valid: Where a track can be trusted.
+        predicted: The same surface points, carried by the simulated nodes [m].
+        count: What to divide by instead of the number of valid tracks of each frame.
+
+    Returns:
+        Mean squared distance of each frame; 0 where a frame has no valid track.
+    """
+    squared = ((torch.nan_to_num(observed) - predicted) ** 2).sum(dim=2) * is_valid
+    divisor = is_valid.sum(dim=1) if count is None else count
+    return squared.sum(dim=1) / divisor.clamp(min=1)
+
+
+def acceleration_loss(
+    velocity: Float[Tensor, "frame node 3"],
+) -> Float[Tensor, " frame"]:
+    """Measure how abruptly frame-to-frame changes of velocity differ, half-squared [m²/s²].
+
+    PhysTwin's regulariser of the zeroth-order stage: smooth L1 with β = 1 of the difference of
+    two successive velocity changes, averaged over nodes and coordinates.
+
+    Args:
+        velocity: Node velocities at the frames [m/s].
+
+    Returns:
+        One value a frame, 0 for the first two.
+    """
+    change = velocity[1:] - velocity[:-1]
+    jerk = change[1:] - change[:-1]
+    value = torch.nn.functional.smooth_l1_loss(jerk, torch.zeros_like(jerk), reduction="none")
+    return torch.cat([velocity.new_zeros(2), value.mean(dim=(1, 2))])[: velocity.shape[0]]
+
+
+def _nearest(
+    observed: Float[Tensor, "frame point 3"],
+    is_observed: Bool[Tensor, "frame point"],
+    node: Float[Tensor, "frame node 3"],
+) -> Int[Tensor, "frame point"]:
+    """Find the nearest node of each observed point, by a tree: all distances would take longer."""
+    nearest = torch.zeros(is_observed.shape, dtype=torch.int64)
+    for frame, nodes in enumerate(node.detach().cpu().numpy()):
+        seen = is_observed[frame].cpu()
+        if len(nodes) and seen.any():
+            _, found = KDTree(nodes).query(observed[frame].cpu()[seen].numpy())
+            nearest[frame, seen] = torch.from_numpy(found)
+    return nearest.to(node.device)
+
 
 CARRIERS = 4  # nodes that carry one observed surface point
 
@@ -245,3 +340,90 @@ def initial_velocity(
     weight = 1.0 / (distance + 1e-6)
     weight /= weight.sum(axis=1, keepdims=True)
     return (moved[near] * weight[..., None]).sum(axis=1).astype(np.float32)
+
+
+SAFETY = 1.25
+"""Margin of the substeps over the stability limit."""
+
+
+def problem_parameters(
+    parameters: SimulationParameters, problem: ObjectProblem
+) -> SimulationParameters:
+    """Set the frame rate, ground and gravity of one sequence, as far as the parameters let it."""
+    return parameters.in_world(
+        frame_rate=problem.frame_rate,
+        ground_height=problem.ground_height,
+        gravity=problem.gravity,
+    )
+
+
+def build_problem_model(
+    problem: ObjectProblem, parameters: SimulationParameters
+) -> SpringMassModel:
+    """Connect the object's nodes and attach the control nodes of frame 0."""
+    model = build_model(
+        problem.object_node,
+        problem.control[0],
+        problem_parameters(parameters, problem),
+        rest_node=problem.rest_node,
+    )
+    return replace(model, initial_velocity=problem.initial_velocity)
+
+
+def simulate_problem(
+    problem: ObjectProblem, model: SpringMassModel, parameters: SimulationParameters, device: str
+) -> tuple[Float[Tensor, "frame node 3"], Float[Tensor, "frame node 3"]]:
+    """Roll the model out over the frames to fit; positions [m] and velocities [m/s]."""
+    simulator = Simulator(model, problem_parameters(parameters, problem), device=device)
+    rollout = simulator.rollout(problem.control[: problem.frame_count])
+    return torch.from_numpy(rollout.position), torch.from_numpy(rollout.velocity)
+
+
+def mean_loss(
+    problems: Many[ObjectProblem],
+    models: dict[str, SpringMassModel],
+    parameters: SimulationParameters,
+    config: ObjectFitConfig,
+    device: str,
+    *,
+    acceleration_weight: float = 0.0,
+    seen: Callable[[ObjectProblem, Float[Tensor, "frame node 3"]], None] | None = None,
+) -> float:
+    """Simulate every sequence and average its frame losses; infinite if one diverges [m²].
+
+    The mean is over the frames 1, 2, … to fit (physics.md §4.1); frame 0 is given. `seen` is
+    handed each simulated motion [m].
+    """
+    losses = []
+    for problem in problems:
+        try:
+            node, velocity = simulate_problem(problem, models[problem.name], parameters, device)
+        except SimulationDivergedError:
+            return math.inf
+        if seen is not None:
+            seen(problem, node)
+        frame_losses = problem.frame_losses(
+            node[1:], track_weight=config.track_weight, freeze_counts=config.freezes_counts
+        )
+        if acceleration_weight > 0.0:
+            frame_losses = frame_losses + acceleration_weight * acceleration_loss(velocity)[1:]
+        losses.append(float(frame_losses.mean()))
+    return float(np.mean(losses))
+
+
+def settle_substeps(
+    models: Many[SpringMassModel],
+    parameters: SimulationParameters,
+    config: ObjectFitConfig,
+    *,
+    safety: float = SAFETY,
+) -> SimulationParameters:
+    """Choose the substeps that keep all models stable, if the configuration says so.
+
+    A step near the limit may stay bounded and still be noise: a search without this finds
+    parameters whose simulation no longer has useful gradients.
+    """
+    if not config.automatic_substeps:
+        return parameters
+    needed = max(stable_substeps(model, parameters, safety=safety) for model in models)
+    return replace(parameters, substeps_per_frame=10 * math.ceil(needed / 10))

@@ -2,13 +2,262 @@
 
 from collections.abc import Sequence as Many
 
-from physhandi.fitting.candidates import Judge
-from physhandi.fitting.object_config import ObjectFitConfig
-from physhandi.fitting.object_problem import ObjectProblem
-from physhandi.fitting.reach import check_problem
-from physhandi.fitting.search import SearchResult, search_parameters
+import numpy as np
+import torch
+import warp as wp
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.spatial import KDTree
+
+from physhandi.errors import FitError, UsageError
+from physhandi.fitting.config import ObjectFitConfig
+from physhandi.fitting.object_problem import (
+    ObjectProblem,
+    mean_loss,
+    problem_parameters,
+    settle_substeps,
+    simulate_problem,
+)
+from physhandi.fitting.preview import RolloutPreview
+from physhandi.fitting.search import STAGE, SearchConfig, SearchResult, search_parameters
 from physhandi.progress import Progress
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.engines.batch import BatchSimulator, MotionTarget
+from physhandi.simulation.master_topology import MasterTopology
+from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.topology import MINIMUM_LENGTH
+
+
+class Judge:
+    """Finds the loss of candidates over all sequences.
+
+    On CUDA a generation is one batch for each sequence, and the host waits for each batch once;
+    on a CPU, or with self-collision, candidates take turns.
+    """
+
+    def __init__(
+        self,
+        problems: Many[ObjectProblem],
+        config: ObjectFitConfig,
+        progress: Progress,
+        *,
+        device: str = "cpu",
+    ) -> None:
+        """Reduce the observations to what is compared.
+
+        Args:
+            problems: One for each sequence.
+            config: Weights and substeps.
+            progress: Asked between simulations whether to stop.
+            device: Warp device.
+        """
+        self._problems, self._config, self._progress = problems, config, progress
+        self._device = device
+        self._targets = [motion_target(problem, config) for problem in problems]
+        self._preview = RolloutPreview(STAGE, progress)
+        self._best_loss = np.inf
+        self._best: tuple[SimulationParameters, SpringMassModel] | None = None
+
+    def __call__(
+        self, candidates: Many[SimulationParameters]
+    ) -> list[tuple[SimulationParameters, float]]:
+        """Return each candidate with its substeps, and its loss [m²].
+
+        The loss is infinite for a candidate that diverges, has no springs or needs more substeps
+        than the configuration allows.
+        """
+        candidates = [problem_parameters(p, self._problems[0]) for p in candidates]
+        masters = [
+            MasterTopology.of(
+                problem.object_node,
+                problem.control[0],
+                candidates,
+                rest_node=problem.rest_node,
+                initial_velocity=problem.initial_velocity,
+            )
+            for problem in self._problems
+        ]
+        settled, possible = [], []
+        for index, parameters in enumerate(candidates):
+            models = [master.model(parameters) for master in masters]
+            settled.append(settle_substeps(models, parameters, self._config))
+            if self._is_possible(models, settled[-1]):
+                possible.append(index)
+        losses = np.full((len(masters), len(candidates)), np.inf)
+        for row, master in enumerate(masters):
+            self._simulate(row, master, settled, possible, losses[row])
+        mean = [float(value) for value in losses.mean(axis=0)]
+        winner = int(np.argmin(mean))
+        if mean[winner] < self._best_loss:
+            self._best_loss = mean[winner]
+            self._best = settled[winner], masters[0].model(settled[winner])
+        self._show_best()
+        return list(zip(settled, mean, strict=True))
+
+    def _show_best(self) -> None:
+        """Simulate the best candidate for whoever watches, at most once for each."""
+        if self._best is None or not self._progress.wants_preview():
+            return
+        (parameters, model), self._best = self._best, None
+        problem = self._problems[0]
+        self._preview.show_made(
+            problem,
+            self._best_loss,
+            lambda: simulate_problem(problem, model, parameters, self._device)[0],
+        )
+
+    def _is_possible(self, models: Many[SpringMassModel], parameters: SimulationParameters) -> bool:
+        has_springs = all(len(model.spring_nodes) > 0 for model in models)
+        return has_springs and parameters.substeps_per_frame <= self._config.most_substeps
+
+    def _simulate(
+        self,
+        row: int,
+        master: MasterTopology,
+        candidates: Many[SimulationParameters],
+        possible: list[int],
+        losses: np.ndarray,
+    ) -> None:
+        """Fill in the losses of the candidates that can be simulated, in one sequence."""
+        problem = self._problems[row]
+        is_shared = wp.get_device(self._device).is_cuda
+        batch = []
+        for index in possible:
+            if not candidates[index].self_collision:
+                batch.append(index)
+                continue
+            self._progress.check_cancelled()
+            models = {problem.name: master.model(candidates[index])}
+            losses[index] = mean_loss(
+                [problem],
+                models,
+                candidates[index],
+                self._config,
+                self._device,
+                acceleration_weight=self._config.acceleration_weight,
+            )
+        for part in [batch] if is_shared and batch else [[index] for index in batch]:
+            self._progress.check_cancelled()
+            parameters = [problem_parameters(candidates[index], problem) for index in part]
+            simulator = BatchSimulator(master, parameters, self._device)
+            control = problem.control[: problem.frame_count]
+            losses[part] = simulator.losses(control, self._targets[row]).loss
+
+
+def motion_target(problem: ObjectProblem, config: ObjectFitConfig) -> MotionTarget:
+    """Reduce what was observed of a sequence to points, tracks and their weights.
+
+    The loss that it stands for is that of `ObjectProblem.frame_losses`.
+    """
+
+    def weights(counts: torch.Tensor, factor: float) -> np.ndarray:
+        divisor = counts.sum(dim=1)
+        if config.freezes_counts:
+            divisor = divisor[1].expand(len(counts))
+        return (factor * counts / divisor.clamp(min=1)[:, None]).numpy().astype(np.float32)
+
+    return MotionTarget(
+        cloud=torch.nan_to_num(problem.cloud).numpy(),
+        cloud_weight=weights(problem.is_observed, 1.0),
+        surface_count=problem.surface_count,
+        track=torch.nan_to_num(problem.track).numpy(),
+        track_weight=weights(problem.is_valid, config.track_weight),
+        carrier=problem.carrier.numpy(),
+        carrier_weight=problem.carrier_weight.numpy(),
+        track_offset=problem.track_offset.numpy(),
+        acceleration_weight=config.acceleration_weight,
+    )
+
+
+def check_problem(
+    problem: ObjectProblem, start: SimulationParameters, config: SearchConfig
+) -> None:
+    """Refuse an object whose springs no candidate of the search could form.
+
+    Args:
+        problem: One sequence of the search.
+        start: Values that the search starts from.
+        config: Intervals of the search.
+
+    Raises:
+        FitError: If control nodes are too far from the object, or its nodes from each other, or in
+            one place; names both the distance and the widest radius.
+    """
+
+    def widest(field: str) -> float:
+        variable = config.variables.get(field)
+        return max(getattr(start, field), 0.0 if variable is None else variable.high)
+
+    radius = widest("virtual_connection_radius")
+    gap = _control_gap(problem.control[0], problem.object_node)
+    if gap >= radius and problem.control.shape[1] > 0:
+        raise FitError(
+            f"Sequence '{problem.name}': at frame 0 the control nodes are {gap:.3g} m or more away "
+            f"from the object, but virtual springs reach {radius:.3g} m at most "
+            "(virtual_connection_radius): nothing would hold it. Check that hands or control.npy "
+            "lie in the object's world and unit, and that they touch it at frame 0."
+        )
+    radius = widest("connection_radius")
+    gap = _node_gap(problem.rest_node)
+    if gap >= radius and len(problem.rest_node) > 1:
+        what = "in one place" if np.isinf(gap) else f"{gap:.3g} m or more apart"
+        raise FitError(
+            f"Sequence '{problem.name}': the {len(problem.rest_node)} object nodes are {what}, but "
+            f"springs join nodes that are more than {MINIMUM_LENGTH:g} m and less than "
+            f"{radius:.3g} m apart (connection_radius): it would fall to pieces. Give more nodes, "
+            "or a profile that searches a wider radius."
+        )
+
+
+def check_springs(
+    name: str,
+    model: SpringMassModel,
+    parameters: SimulationParameters,
+    control_0: Float[ndarray, "control 3"],
+    rest_node: Float[ndarray, "node 3"],
+) -> None:
+    """Refuse parameters under which a sequence's object falls to pieces or is held by nothing.
+
+    Args:
+        name: Name of the sequence.
+        model: Springs that the parameters make.
+        parameters: Radii and neighbor limits, for the message.
+        control_0: Positions of the control nodes at frame 0 [m].
+        rest_node: The object's rest shape [m].
+
+    Raises:
+        UsageError: If there is no object spring, or no virtual one; names the value to change.
+    """
+    if model.object_spring_count == 0 and model.node_count > 1:
+        raise UsageError(
+            f"No object spring forms in sequence '{name}': {_cause(parameters, '')} and the "
+            f"nearest nodes are {_node_gap(rest_node):.3g} m apart. Raise connection_radius above "
+            "that, and max_neighbors to at least 1."
+        )
+    if model.virtual_spring_count == 0 and len(control_0):
+        gap = _control_gap(control_0, model.object_node)
+        raise UsageError(
+            f"No virtual spring forms in sequence '{name}': {_cause(parameters, 'virtual_')} and "
+            f"the nearest control node is {gap:.3g} m from the object. Raise "
+            "virtual_connection_radius above that, and virtual_max_neighbors to at least 1."
+        )
+
+
+def _cause(parameters: SimulationParameters, prefix: str) -> str:
+    radius = getattr(parameters, f"{prefix}connection_radius")
+    most = getattr(parameters, f"{prefix}max_neighbors")
+    return f"{prefix}connection_radius is {radius:.3g} m, {prefix}max_neighbors is {most},"
+
+
+def _control_gap(control: ndarray, node: ndarray) -> float:
+    """Distance between the object and the nearest control node [m]."""
+    return float(KDTree(node).query(control)[0].min(initial=np.inf))
+
+
+def _node_gap(node: ndarray) -> float:
+    """Distance of the nearest two nodes that may be joined; infinite if there are none [m]."""
+    count = min(len(node), 64)
+    distance = np.reshape(KDTree(node).query(node, k=count)[0], -1)
+    return float(distance[distance > MINIMUM_LENGTH].min(initial=np.inf))
 
 
 def search_object(

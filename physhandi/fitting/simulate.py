@@ -12,11 +12,10 @@ from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.errors import RunError
 from physhandi.fitting import artefacts
+from physhandi.fitting.config import changed_parameters, config_from_dict
 from physhandi.fitting.hand_reconstruction import reconstruct_hands
 from physhandi.fitting.object_problem import initial_velocity
-from physhandi.fitting.parameter_changes import changed_parameters
-from physhandi.fitting.profile import config_from_dict
-from physhandi.fitting.reach import check_springs
+from physhandi.fitting.object_reconstruction import check_springs
 from physhandi.fitting.rollouts import control_trajectory_of, object_nodes_of, simulate_sequence
 from physhandi.perception.lifting import observe_object
 from physhandi.progress import Progress

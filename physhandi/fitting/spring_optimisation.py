@@ -2,25 +2,271 @@
 
 import logging
 import math
+from collections.abc import Mapping
 from collections.abc import Sequence as Many
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from physhandi.errors import FitError, SimulationDivergedError
-from physhandi.fitting.descent import Descent
-from physhandi.fitting.material import Material
-from physhandi.fitting.object_config import FirstOrderConfig, ObjectFitConfig
-from physhandi.fitting.object_problem import ObjectProblem
-from physhandi.fitting.object_simulation import (
+from physhandi.fitting.config import FirstOrderConfig, ObjectFitConfig
+from physhandi.fitting.object_problem import (
     SAFETY,
+    ObjectProblem,
     build_problem_model,
     mean_loss,
+    problem_parameters,
     settle_substeps,
 )
 from physhandi.fitting.preview import RolloutPreview
 from physhandi.progress import Progress
+from physhandi.simulation import differentiable
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
+
+CONTACT = {
+    "restitution": (0.0, 1.0),
+    "friction": (0.0, 2.0),
+    "self_restitution": (0.0, 1.0),
+    "self_friction": (0.0, 2.0),
+}
+"""Interval of each contact coefficient; outside it acts as at the nearer end (physics.md §3.2)."""
+SMALLEST = 1e-6
+"""Stands for a zero, which has no logarithm, in a spring's stiffness [N] or damping [N·s/m]."""
+
+
+class Material:
+    """Logarithms of stiffness and damping, object springs shared, virtual springs per sequence.
+
+    A spring that starts without stiffness is off and stays off, dashpot included: where PhysTwin's
+    linear search reaches 0 N, its springs have the logarithm -∞ and no gradient.
+    """
+
+    def __init__(
+        self,
+        models: Mapping[str, SpringMassModel],
+        parameters: SimulationParameters,
+        config: FirstOrderConfig,
+    ) -> None:
+        """Start from the springs of every sequence's model.
+
+        Args:
+            models: Model of each sequence; they must share their object springs.
+            parameters: Where the contact coefficients start.
+            config: What is learned.
+
+        Raises:
+            FitError: If two sequences connect the object's nodes differently.
+        """
+        first = next(iter(models.values()))
+        self._object_count = first.object_spring_count
+        for name, model in models.items():
+            same = np.array_equal(
+                model.spring_nodes[: self._object_count], first.spring_nodes[: self._object_count]
+            )
+            if model.object_spring_count != self._object_count or not same:
+                raise FitError(
+                    f"Sequence '{name}' connects the object's nodes differently from the first "
+                    "one: sequences fitted together must share one object and its rest nodes."
+                )
+        self._config = config
+        self._shared = _logarithms(first, slice(None, self._object_count))
+        self._own = {n: _logarithms(m, slice(self._object_count, None)) for n, m in models.items()}
+        self._is_off = {n: torch.from_numpy(m.stiffness <= 0.0) for n, m in models.items()}
+        self._start = [tensor.detach().clone() for tensor in self.logarithms()]
+        self._contact: dict[str, Tensor] = {}
+        if config.learns_contact:
+            self._contact = {
+                name: torch.tensor(float(getattr(parameters, name)), requires_grad=True)
+                for name in CONTACT
+            }
+
+    def logarithms(self) -> list[Tensor]:
+        """The learned logarithms, of stiffness (row 0) and damping (row 1) of some springs."""
+        return [self._shared, *self._own.values()]
+
+    def tensors(self) -> list[Tensor]:
+        """All that is learned."""
+        return [*self.logarithms(), *self._contact.values()]
+
+    def of(self, name: str) -> tuple[Float[Tensor, " spring"], Float[Tensor, " spring"]]:
+        """Log stiffness [log N] and damping [N·s/m] of all springs of one sequence's model."""
+        both = torch.cat([self._shared, self._own[name]], dim=1)
+        log_stiffness, is_off = both[0], self._is_off[name]
+        if self._config.most_stiffness is not None:
+            # The gradient of a clamp is zero where it acts.
+            log_stiffness = log_stiffness.clamp(max=math.log(self._config.most_stiffness))
+        damping = (both[1] if self._config.learns_damping else both[1].detach()).exp()
+        off = torch.full_like(log_stiffness, -math.inf)
+        return torch.where(is_off, off, log_stiffness), damping * ~is_off
+
+    def contact(self) -> dict[str, Tensor]:
+        """The learned contact coefficients by name; empty if none are learned."""
+        return dict(self._contact)
+
+    def gradient(self, name: str) -> Float[Tensor, " spring"]:
+        """Gradient that a backward pass left in the log stiffness of one sequence's springs."""
+        parts = (self._shared, self._own[name])
+        rows = [torch.zeros_like(part[0]) if part.grad is None else part.grad[0] for part in parts]
+        return torch.cat(rows)
+
+    def distance_from_start(self) -> Float[Tensor, ""]:
+        """Sum of the squared changes of all logarithms."""
+        pairs = zip(self.logarithms(), self._start, strict=True)
+        return torch.stack([((now - then) ** 2).sum() for now, then in pairs]).sum()
+
+    def model(self, name: str, model: SpringMassModel) -> SpringMassModel:
+        """Put what was learned of the springs into one sequence's model."""
+        log_stiffness, damping = self.of(name)
+        return replace(
+            model,
+            stiffness=log_stiffness.detach().exp().numpy().astype(np.float32),
+            damping=damping.detach().numpy().astype(np.float32),
+        )
+
+    def parameters(self, parameters: SimulationParameters) -> SimulationParameters:
+        """Put what was learned of contact into the global parameters, as it acts."""
+        learned = {
+            name: min(max(float(value.detach()), CONTACT[name][0]), CONTACT[name][1])
+            for name, value in self._contact.items()
+        }
+        return replace(parameters, **learned)
+
+
+def _logarithms(model: SpringMassModel, part: slice) -> Tensor:
+    both = np.stack([model.stiffness[part], model.damping[part]])
+    return torch.log(torch.from_numpy(both).clamp(min=SMALLEST)).requires_grad_()
+
+
+State = tuple[Float[Tensor, "node 3"], Float[Tensor, "node 3"]]
+"""Positions [m] and velocities [m/s] of the object nodes."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Window:
+    """A few simulated frames whose gradient lies in the material."""
+
+    frame_losses: Float[Tensor, " frame"]
+    """Loss of each frame, with the material as it was [m²]."""
+    state: State
+    """Where the nodes were in the last frame."""
+
+
+class Descent:
+    """Walks through sequences and learns the material on the way, from sane gradients only."""
+
+    def __init__(
+        self,
+        material: Material,
+        parameters: SimulationParameters,
+        config: ObjectFitConfig,
+        device: str = "cpu",
+    ) -> None:
+        self.material = material
+        self._parameters = parameters
+        self._config = config
+        self._device = device
+        settings = config.first_order
+        self._optimizer = torch.optim.Adam(
+            material.tensors(), lr=settings.learning_rate, betas=(0.9, settings.beta_2)
+        )
+        self._reach: dict[str, int] = {}
+
+    def walk(self, problem: ObjectProblem, model: SpringMassModel, horizon: int) -> float | None:
+        """Walk once through a sequence and update after every window of frames.
+
+        Each window starts where the last one ended, with the material that has since changed
+        (physics.md §4.3).
+
+        Args:
+            problem: The sequence.
+            model: Its springs, as they were at the start.
+            horizon: Frames to walk, frame 0 included.
+
+        Returns:
+            Mean loss met on the way [m²], or none if a window had no usable gradient; the rest of
+            the sequence is then left out.
+
+        Raises:
+            SimulationDivergedError: If the motion runs away.
+        """
+        length = self._config.first_order.window or horizon - 1
+        state = torch.from_numpy(model.object_node), torch.from_numpy(model.initial_velocity)
+        losses = []
+        for begin in range(0, horizon - 1, length):
+            window = self.look(problem, model, (begin, min(begin + length, horizon - 1)), state)
+            if window is None:
+                return None
+            self._optimizer.step()
+            losses.append(window.frame_losses)
+            state = window.state
+        return float(torch.cat(losses).double().mean())
+
+    def look(
+        self,
+        problem: ObjectProblem,
+        model: SpringMassModel,
+        frames: tuple[int, int],
+        state: State,
+    ) -> Window | None:
+        """Simulate one window and leave the gradient of its mean loss in the material.
+
+        Motion that is chaotic over the window has gradients that grow without bound and point
+        nowhere. The gradient then reaches back over half as many frames, and again half as many
+        until it is sane; how far it came is tried first the next time.
+
+        Args:
+            problem: The sequence.
+            model: Its springs.
+            frames: First frame, whose state is given, and last frame.
+            state: The nodes in the first frame.
+
+        Returns:
+            What was simulated, or none if not even one frame has a sane gradient.
+        """
+        begin, end = frames
+        steepest = self._config.first_order.steepest
+        reach = min(self._reach.get(problem.name, end - begin), end - begin)
+        while reach >= 1:
+            self._optimizer.zero_grad()
+            log_stiffness, damping = self.material.of(problem.name)
+            contact: dict[str, Any] = self.material.contact()
+            node, velocity = differentiable.rollout(
+                model,
+                problem_parameters(self._parameters, problem),
+                torch.from_numpy(problem.control[begin : end + 1]),
+                log_stiffness=log_stiffness,
+                damping=damping,
+                initial_position=state[0],
+                initial_velocity=state[1],
+                device=self._device,
+                window=reach,
+                **contact,
+            )
+            frame_losses = problem.frame_losses(
+                node[1:],
+                first_frame=begin + 1,
+                track_weight=self._config.track_weight,
+                freeze_counts=self._config.freezes_counts,
+            )
+            prior = self._config.first_order.prior_weight * self.material.distance_from_start()
+            loss = frame_losses.mean() + prior
+            loss.backward()
+            if steepest is None or self._slope() <= steepest * float(loss.detach()):
+                if reach < end - begin:
+                    self._reach[problem.name] = reach
+                last = node[-1].detach(), velocity[-1].detach()
+                return Window(frame_losses=frame_losses.detach(), state=last)
+            reach //= 2
+        return None
+
+    def _slope(self) -> float:
+        gradients = [t.grad for t in self.material.logarithms() if t.grad is not None]
+        return max(float(gradient.double().norm()) for gradient in gradients)
+
 
 STAGE = "first_order"
 logger = logging.getLogger(__name__)

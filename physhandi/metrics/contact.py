@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from physhandi.data.sequence_schema import Side
+from physhandi.data.sequence_meta import Side
 from physhandi.data.truth import Truth
 from physhandi.metrics.alignment import REACH, carried_points
 from physhandi.metrics.geometry import nearest_distance, nearest_node

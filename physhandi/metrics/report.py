@@ -3,25 +3,432 @@
 Definitions, units and the paper's columns are in docs/metrics.md.
 """
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+import yaml
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
+from physhandi.data.files import read_array, read_tensors
 from physhandi.data.sequence import Sequence
+from physhandi.data.truth import read_truth
+from physhandi.errors import RunError
+from physhandi.metrics.alignment import carried_points
 from physhandi.metrics.baselines import rigid_follow_baseline, static_baseline
 from physhandi.metrics.contact import (
     THRESHOLDS,
     ContactLabels,
     ContactReference,
     contact_scores,
+    joined_nodes,
     predicted_contacts,
+    proximity_labels,
+    true_labels,
+    true_proximity_labels,
 )
-from physhandi.metrics.report_curves import CURVES, Curves, error_curves
-from physhandi.metrics.report_hands import StoredPoints, score_hands
-from physhandi.metrics.report_inputs import Reference, read, read_reference, read_topology
+from physhandi.metrics.geometry import (
+    Norm,
+    chamfer_one_way,
+    chamfer_symmetric,
+    dynamic_nodes,
+    dynamic_tracks,
+    marker_error,
+    track_error,
+    track_error_phystwin,
+)
+from physhandi.metrics.hands import (
+    evaluate_hands,
+    hand_chamfer,
+    held_where_missing,
+    joint_errors,
+    vertex_errors,
+)
+from physhandi.metrics.topology import radius_deviation, resolution
+from physhandi.metrics.truth_metrics import TrueSurface, true_surface, truth_curves
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScoringReference:
+    """What a rollout is compared with; any part may be absent."""
+
+    object_node: Float[ndarray, "node 3"]
+    """Object nodes in frame 0 [m]."""
+    surface_count: int | None = None
+    """Leading nodes that lie on the surface, which alone enter Chamfer distances; None: all."""
+    point: Float[ndarray, "frame track 3"] | None = None
+    """Observed tracks [m]; NaN where not visible."""
+    is_visible: Bool[ndarray, "frame track"] | None = None
+    """Whether a track is visible."""
+    node_of_track: Int[ndarray, " track"] | None = None
+    """Node that each track observes; None lets the nodes around it carry it."""
+    validation: Float[ndarray, "frame validation 3"] | None = None
+    """Annotated points that no fit saw [m]; NaN where not annotated. They replace the tracks where
+    tracks are scored."""
+    cloud: tuple[Float[ndarray, "_ 3"], ...] = ()
+    """Observed points per frame [m]; none takes the visible tracks."""
+    marker: Float[ndarray, "frame marker 3"] | None = None
+    """Identified points [m]; NaN where not seen."""
+    marker_node: Int[ndarray, " marker"] | None = None
+    """Node that each marker observes."""
+    controlled_markers: tuple[int, ...] = ()
+    """Markers that are not scored because they move with the controls."""
+    true_surface: TrueSurface | None = None
+    """Where the object really was."""
+    contact: ContactReference | None = None
+    """What contacts are judged by."""
+
+
+def read_reference(
+    folder: Path, sequence: Sequence, rollout: Float[ndarray, "frame node 3"] | None
+) -> ScoringReference | None:
+    """Collect what a run and its sequence know; None if there is no object to score.
+
+    Args:
+        folder: The run's folder of this sequence.
+        sequence: The sequence.
+        rollout: What the run simulated.
+
+    Raises:
+        RunError: If a file of the run is damaged.
+        SequenceError: If the sequence tells a true surface that cannot be one.
+    """
+    point = read_scoring_inputs(folder / "observation" / "point.npy")
+    is_visible = read_scoring_inputs(folder / "observation" / "is_visible.npy")
+    node_of_track = read_scoring_inputs(folder / "observation" / "node_of_track.npy")
+    node = read_scoring_inputs(folder / "object_node.npy")
+    if node is None:
+        node = sequence.object_node if rollout is None else rollout[0]
+    if node is None or (point is None and sequence.marker is None):
+        return None
+    if sequence.marker is not None and point is not None and is_visible is not None:
+        free = [m for m in range(point.shape[1]) if m not in sequence.controlled_markers]
+        point, is_visible = point[:, free], is_visible[:, free]
+        node_of_track = None if node_of_track is None else node_of_track[free]
+    return ScoringReference(
+        object_node=node,
+        surface_count=sequence.surface_node_count,
+        point=point,
+        is_visible=is_visible,
+        node_of_track=node_of_track,
+        validation=sequence.validation_track,
+        cloud=tuple(read_split(folder / "observation", "cloud") or ()),
+        marker=sequence.marker,
+        marker_node=sequence.marker_node,
+        controlled_markers=sequence.controlled_markers,
+        true_surface=true_surface(read_truth(sequence.folder)),
+        contact=_contact(folder, sequence, node, point, is_visible),
+    )
+
+
+def read_topology(out: Path, object_node: Float[ndarray, "node 3"]) -> dict[str, Any] | None:
+    """Relate the fitted connection radii to the resolution; None if there is no fitted object.
+
+    Args:
+        out: Output folder of the run; its rest shape has the resolution that counts.
+        object_node: Nodes that stand in where the run stores no rest shape [m].
+
+    Raises:
+        RunError: If a file of the run is damaged.
+    """
+    path = out / "object" / "parameters.yaml"
+    node = read_scoring_inputs(out / "object" / "rest_node.npy")
+    node = object_node if node is None else node
+    if not path.is_file() or len(node) < 2:
+        return None
+    try:
+        parameters = yaml.safe_load(path.read_text(encoding="utf-8"))
+        radius, virtual = (
+            float(parameters[name]) for name in ("connection_radius", "virtual_connection_radius")
+        )
+    except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError) as error:
+        raise RunError(f"{path} does not tell the connection radii: {error}.") from error
+    spacing = resolution(node.astype(np.float64))
+    return {
+        "resolution": spacing,
+        "connection_radius": radius,
+        "virtual_connection_radius": virtual,
+        "rrd_object": radius_deviation(radius, spacing),
+        "rrd_virtual": radius_deviation(virtual, spacing),
+    }
+
+
+def read_scoring_inputs(path: Path) -> Any:
+    """Read an array of a run; None if it is not there.
+
+    Raises:
+        RunError: If it is damaged.
+    """
+    if not path.is_file():
+        return None
+    try:
+        return read_array(path)
+    except (ValueError, OSError) as error:
+        raise RunError(f"{path} is not a readable array: {error}.") from error
+
+
+def read_split(folder: Path, name: str) -> list[ndarray] | None:
+    """Read point sets that are stored one after the other, with where each of them ends."""
+    points, end = (
+        read_scoring_inputs(folder / f"{name}.npy"),
+        read_scoring_inputs(folder / f"{name}_end.npy"),
+    )
+    return None if points is None or end is None else np.split(points, end.reshape(-1)[:-1])
+
+
+def _contact(
+    folder: Path,
+    sequence: Sequence,
+    node: Float[ndarray, "node 3"],
+    point: ndarray | None,
+    is_visible: ndarray | None,
+) -> ContactReference | None:
+    """Prepare the judgement of contacts; None without hands or without springs to judge."""
+    vertices = [read_scoring_inputs(folder / f"hand_{side}_vertex.npy") for side in sequence.hands]
+    whole = [held_where_missing(vertex)[0] for vertex in vertices if vertex is not None]
+    known = [vertex for vertex in whole if vertex is not None]
+    path = folder / "model.safetensors"
+    if not known or not path.is_file():
+        return None
+    try:
+        tensors = read_tensors(path)
+        virtual = tensors["spring_nodes"][int(tensors["object_spring_count"][0]) :]
+    except Exception as error:  # safetensors has no common class of errors
+        raise RunError(f"{path} is not a readable model: {error}.") from error
+    hand = np.concatenate(known, axis=1).astype(np.float64)
+    start = node.astype(np.float64)
+    told = read_truth(sequence.folder)
+    truth = true_labels(told, start)
+    if truth is not None:
+        labels = dict.fromkeys(THRESHOLDS, truth)
+    else:
+        seen = None if point is None else point.astype(np.float64)
+        labels = proximity_labels(start, hand, seen, is_visible)
+    return ContactReference(
+        hand=hand,
+        is_joined=joined_nodes(virtual, len(node)),
+        kind="proximity" if truth is None else "true",
+        labels=labels,
+        true_proximity=true_proximity_labels(told, start, sequence.hands),
+    )
+
+
+CURVES = (
+    "chamfer_phystwin",
+    "chamfer_l1",
+    "chamfer_l2",
+    "chamfer_symmetric",
+    "chamfer_dynamic_l1",
+    "chamfer_dynamic_l2",
+    "chamfer_dynamic_symmetric",
+    "chamfer_truth",
+    "chamfer_truth_to_nodes",
+    "chamfer_nodes_to_truth",
+    "track_error_phystwin",
+    "track_error",
+    "marker_error",
+)
+"""Metrics that have a value [m] for every frame."""
+
+Curves = dict[str, Float[ndarray, " frame"]]
+
+
+def error_curves(nodes: Float[ndarray, "frame node 3"], reference: ScoringReference) -> Curves:
+    """Measure every frame by every metric that the reference allows [m]; NaN where it cannot.
+
+    Args:
+        nodes: Simulated nodes, finite in every frame [m].
+        reference: What was observed, and the true surface if it is known.
+    """
+    surface = nodes[:, : reference.surface_count]
+    curves = _shape_curves(surface, reference) | _track_curves(nodes, reference)
+    if reference.point is not None and reference.is_visible is not None:
+        point = reference.point[: len(nodes)].astype(np.float64)
+        if point.shape[1]:
+            curves |= _dynamic_curves(surface, point, reference.is_visible[: len(nodes)])
+    if reference.true_surface is not None:
+        curves |= truth_curves(surface, reference.true_surface)
+    if reference.marker is not None and reference.marker_node is not None:
+        marker = reference.marker[: len(nodes)].astype(np.float64)
+        free = [m for m in range(marker.shape[1]) if m not in reference.controlled_markers]
+        curves["marker_error"] = marker_error(
+            marker, nodes, reference.marker_node, np.array(free, dtype=np.int64)
+        )
+    return curves
+
+
+def _shape_curves(surface: Float[ndarray, "frame node 3"], reference: ScoringReference) -> Curves:
+    """CD_full: PhysTwin's, over visible tracks, and ours, over the fused cloud."""
+    curves: Curves = {}
+    tracks = _visible_tracks(reference, len(surface))
+    if tracks:
+        curves["chamfer_phystwin"] = _each(tracks, surface, "l1")
+    observed = tracks
+    if len(reference.cloud) >= len(surface):
+        observed = [cloud.astype(np.float64) for cloud in reference.cloud[: len(surface)]]
+    if observed:
+        curves["chamfer_l1"] = _each(observed, surface, "l1")
+        curves["chamfer_l2"] = _each(observed, surface, "l2")
+        pairs = zip(observed, surface, strict=True)
+        curves["chamfer_symmetric"] = np.array([chamfer_symmetric(o, n) for o, n in pairs])
+    return curves
+
+
+def _dynamic_curves(
+    surface: Float[ndarray, "frame node 3"],
+    point: Float[ndarray, "frame track 3"],
+    is_visible: Bool[ndarray, "frame track"],
+) -> Curves:
+    """CD_dyn: only tracks that move in any frame, and for the way back only nodes beside them."""
+    is_dynamic = dynamic_tracks(point, is_visible)
+    moving = [point[f, is_visible[f] & is_dynamic] for f in range(len(surface))]
+    start = np.where(is_visible[0][:, None], point[0], np.nan)
+    beside = surface[:, dynamic_nodes(surface[0], start, is_dynamic)]
+    return {
+        "chamfer_dynamic_l1": _each(moving, surface, "l1"),
+        "chamfer_dynamic_l2": _each(moving, surface, "l2"),
+        "chamfer_dynamic_symmetric": np.array(
+            [chamfer_symmetric(o, n) for o, n in zip(moving, beside, strict=True)]
+        ),
+    }
+
+
+def _track_curves(nodes: Float[ndarray, "frame node 3"], reference: ScoringReference) -> Curves:
+    """Track: of annotated points where there are any, else of the observed tracks."""
+    point, is_visible, node_of_track = (
+        reference.point,
+        reference.is_visible,
+        reference.node_of_track,
+    )
+    if reference.validation is not None:
+        point, node_of_track = reference.validation, None
+        is_visible = np.asarray(np.isfinite(point).all(axis=2))
+    if point is None or is_visible is None or not point.shape[1]:
+        return {}
+    point, is_visible = point[: len(nodes)].astype(np.float64), is_visible[: len(nodes)]
+    curves = {"track_error_phystwin": track_error_phystwin(point, is_visible, nodes)}
+    if node_of_track is not None:
+        curves["track_error"] = track_error(point, is_visible, nodes[:, node_of_track])
+    else:  # A track that frame 0 does not show has no known place on the object.
+        known = np.flatnonzero(is_visible[0])
+        carried = carried_points(point[0, known], nodes)
+        curves["track_error"] = track_error(point[:, known], is_visible[:, known], carried)
+    return curves
+
+
+def _visible_tracks(reference: ScoringReference, frame_count: int) -> list[Float[ndarray, "_ 3"]]:
+    if reference.point is None or reference.is_visible is None or not reference.point.shape[1]:
+        return []
+    return [
+        reference.point[f, reference.is_visible[f]].astype(np.float64) for f in range(frame_count)
+    ]
+
+
+def _each(
+    observed: list[Float[ndarray, "_ 3"]], nodes: Float[ndarray, "frame node 3"], norm: Norm
+) -> Float[ndarray, " frame"]:
+    return np.array([chamfer_one_way(o, nodes[frame], norm) for frame, o in enumerate(observed)])
+
+
+HAND_AGGREGATION = (
+    "reprojection [px] over all seen keypoints of all views and frames; "
+    "distances as mean over frames, frame 0 included"
+)
+
+StoredPoints = tuple[Float[ndarray, "point 3"], Int[ndarray, "hand frame"]]
+"""Points of all hands and frames one after the other [m], and where those of each frame end."""
+
+
+def score_hands(
+    folder: Path, sequence: Sequence, given: StoredPoints | None = None
+) -> tuple[dict[str, Any], dict[str, Curves]]:
+    """Compare each hand with detected keypoints, measured points and the truth.
+
+    Args:
+        folder: The run's folder of this sequence.
+        sequence: Gives cameras and, if it has it, the truth.
+        given: What the views measured on the hands; None reads it from the run.
+
+    Returns:
+        For each hand its figures, and the same distances [m] frame by frame. A hand that has a
+        truth but no fit is listed with an unknown error.
+
+    Raises:
+        RunError: If a file of the run is damaged.
+    """
+    truth = read_truth(sequence.folder)
+    detected = read_scoring_inputs(folder / "keypoint.npy")
+    points = read_split(folder / "observation", "hand_point")
+    if given is not None:
+        points = np.split(given[0], given[1].reshape(-1)[:-1])
+    scores: dict[str, Any] = {}
+    curves: dict[str, Curves] = {}
+    for hand, side in enumerate(sequence.hands):
+        joint = read_scoring_inputs(folder / f"hand_{side}_keypoint.npy")
+        vertex = read_scoring_inputs(folder / f"hand_{side}_vertex.npy")
+        true_joint, true_vertex = truth.hand_keypoint.get(side), truth.hand_vertex.get(side)
+        score: dict[str, Any] = {}
+        if joint is not None and detected is not None:
+            score |= _reprojection(sequence, joint, detected[:, :, hand : hand + 1])
+        joint, missing = (
+            (None, sequence.frame_count) if joint is None else held_where_missing(joint)
+        )
+        vertex = None if vertex is None else held_where_missing(vertex)[0]
+        errors = _truth_errors(joint, vertex, true_joint, true_vertex)
+        if vertex is not None and points is not None:
+            of_hand = points[hand * sequence.frame_count : (hand + 1) * sequence.frame_count]
+            errors = hand_chamfer(vertex, tuple(of_hand)) | errors
+        if true_joint is not None and joint is None:
+            score["mpjpe"] = None
+        if not score and not errors:
+            continue
+        score |= {name: _mean_error(curve) for name, curve in errors.items()}
+        scores[side] = score | {
+            "unit": "m",
+            "aggregation": HAND_AGGREGATION,
+            "substituted_frames": missing,
+        }
+        if errors:
+            curves[side] = errors
+    return scores, curves
+
+
+def _reprojection(
+    sequence: Sequence,
+    joint: Float[ndarray, "frame 21 3"],
+    detected: Float[ndarray, "view frame 1 21 3"],
+) -> dict[str, Any]:
+    cameras = [view.camera for view in sequence.views]
+    (score,) = evaluate_hands(cameras, [joint], detected)
+    return {
+        "reprojection_median": score.fitted.median,
+        "reprojection_mean": score.fitted.mean,
+        "reprojection_p95": score.fitted.p95,
+        "scored_keypoints": score.fitted.keypoint_count,
+        "scored_frames": score.frame_count,
+    }
+
+
+def _truth_errors(
+    joint: Float[ndarray, "frame 21 3"] | None,
+    vertex: Float[ndarray, "frame vertex 3"] | None,
+    true_joint: Float[ndarray, "frame 21 3"] | None,
+    true_vertex: Float[ndarray, "frame true_vertex 3"] | None,
+) -> Curves:
+    errors: Curves = {}
+    if joint is not None and true_joint is not None:
+        errors |= joint_errors(joint, true_joint)
+    if vertex is not None and true_vertex is not None:
+        errors |= vertex_errors(vertex, true_vertex, joint, true_joint)
+    return errors
+
+
+def _mean_error(curve: Float[ndarray, " frame"]) -> float | None:
+    known = curve[np.isfinite(curve)]
+    return float(known.mean()) if len(known) else None
+
 
 AGGREGATION = (
     "mean over frames of the mean over points; frame 0 is not scored; "
@@ -43,7 +450,7 @@ Motions = dict[str, Float[ndarray, "frame node 3"]]
 
 def score_rollout(
     rollout: Float[ndarray, "frame node 3"] | None,
-    reference: Reference,
+    reference: ScoringReference,
     *,
     control: Float[ndarray, "frame control 3"] | None = None,
     reconstruction_frames: range,
@@ -92,7 +499,7 @@ def measure_run(
         RunError: If a file of the run is damaged.
     """
     folder = out / "sequences" / sequence.name
-    rollout = read(folder / "rollout.npy")
+    rollout = read_scoring_inputs(folder / "rollout.npy")
     reference = read_reference(folder, sequence, rollout)
     report: dict[str, Any] = {}
     frames: dict[str, Any] = {"unit": "m", "frames": list(range(sequence.frame_count))}
@@ -102,7 +509,7 @@ def measure_run(
             "future": sequence.future_frames,
         }
         motions, substituted = _motions(
-            rollout, reference, read(folder / "control.npy"), sequence.frame_count
+            rollout, reference, read_scoring_inputs(folder / "control.npy"), sequence.frame_count
         )
         if not with_baselines:
             motions = {"rollout": motions["rollout"]}
@@ -159,7 +566,7 @@ def frame_errors(out: Path, sequence: Sequence) -> dict[str, Any]:
 
 
 def _motions(
-    rollout: ndarray | None, reference: Reference, control: ndarray | None, frame_count: int
+    rollout: ndarray | None, reference: ScoringReference, control: ndarray | None, frame_count: int
 ) -> tuple[Motions, int]:
     """Put the rollout, completed, beside the baselines; return also the number of stand-ins."""
     static = np.asarray(static_baseline(reference.object_node.astype(np.float64), frame_count))
@@ -174,7 +581,7 @@ def _tabulated(
     motions: Motions,
     curves: dict[str, Curves],
     substituted: int,
-    reference: Reference,
+    reference: ScoringReference,
     splits: dict[str, range],
 ) -> dict[str, Any]:
     report: dict[str, Any] = {

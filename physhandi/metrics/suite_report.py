@@ -2,12 +2,417 @@
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
+from xml.sax.saxutils import escape
 
-from physhandi.metrics.suite_layout import Column, latex_table, markdown_table
-from physhandi.metrics.suite_plots import bar_chart, line_chart
-from physhandi.metrics.suite_tables import Difference, Row
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+COLUMNS = ("method", "split", "metric", "mean", "low", "high", "n")
+"""Columns of ``table.csv``."""
+PAIRED_COLUMNS = (
+    *("method", "against", "split", "metric"),
+    *("difference", "low", "high", "better", "n"),
+)
+"""Columns of ``paired.csv``."""
+RESAMPLES = 4000
+"""Resamples of a bootstrap."""
+LEVEL = 0.95
+"""Share of the resamples that an interval holds."""
+_SEED = 20250
+_HIGHER = ("iou", "psnr", "contact_accuracy", "contact_f1")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Score:
+    """One figure of one case: a method on a sequence."""
+
+    method: str
+    """Name of the method."""
+    case: str
+    """Name of the sequence."""
+    split: str
+    """What the figure is taken over."""
+    metric: str
+    """Name of the metric."""
+    value: float
+    """The figure, in metres where it is a length."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """A method's mean over cases."""
+
+    method: str
+    """Name of the method."""
+    split: str
+    """What the figures are taken over."""
+    metric: str
+    """Name of the metric."""
+    mean: float
+    """Mean over cases."""
+    low: float
+    """Lower end of the interval; the mean itself where there is one case."""
+    high: float
+    """Upper end of the interval."""
+    n: int
+    """Number of cases."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Difference:
+    """How much a method's figures differ from another one's on the cases that both have."""
+
+    method: str
+    """Name of the method."""
+    against: str
+    """The method that is subtracted."""
+    split: str
+    """What the figures are taken over."""
+    metric: str
+    """Name of the metric."""
+    difference: float
+    """Mean over cases of the method's figure less the other's."""
+    low: float
+    """Lower end of the interval."""
+    high: float
+    """Upper end of the interval."""
+    better: int
+    """Cases in which the method is strictly better."""
+    n: int
+    """Cases that both have."""
+
+
+def is_higher_better(metric: str) -> bool:
+    """Tell whether more of a metric is better; all others are distances or times."""
+    return metric.startswith(_HIGHER)
+
+
+def resampled_means(
+    value: Float[ndarray, " case"], resamples: int = RESAMPLES
+) -> Float[ndarray, " resample"]:
+    """Average resamples of the cases, drawn with replacement from a fixed seed.
+
+    The draw depends on the number of cases alone. Figures of several methods on the same cases are
+    therefore resampled together: the bootstrap is paired.
+
+    Raises:
+        ValueError: If there is no case.
+    """
+    if len(value) == 0:
+        raise ValueError("there is no case to resample")
+    draw = np.random.default_rng([_SEED, len(value)]).integers(
+        len(value), size=(resamples, len(value))
+    )
+    return value[draw].mean(axis=1)
+
+
+def interval(value: Float[ndarray, " case"], resamples: int = RESAMPLES) -> tuple[float, float]:
+    """Give the percentile interval of the mean over cases."""
+    tail = (1.0 - LEVEL) / 2.0
+    low, high = np.quantile(resampled_means(value, resamples), (tail, 1.0 - tail))
+    return float(low), float(high)
+
+
+def summarise(scores: Iterable[Score]) -> list[Row]:
+    """Average every metric of every method and split over its cases, in the order they come."""
+    rows: list[Row] = []
+    for (method, split, metric), cases in _grouped(scores).items():
+        value = np.array([cases[case] for case in sorted(cases)])
+        low, high = interval(value)
+        rows.append(
+            Row(
+                method=method,
+                split=split,
+                metric=metric,
+                mean=float(value.mean()),
+                low=low,
+                high=high,
+                n=len(value),
+            )
+        )
+    return rows
+
+
+def compare(scores: Iterable[Score], against: str) -> list[Difference]:
+    """Subtract one method's figures from those of every other, case by case."""
+    grouped = _grouped(scores)
+    found: list[Difference] = []
+    for (method, split, metric), cases in grouped.items():
+        other = grouped.get((against, split, metric), {})
+        shared = sorted(cases.keys() & other.keys())
+        if method == against or not shared:
+            continue
+        value = np.array([cases[case] - other[case] for case in shared])
+        low, high = interval(value)
+        better = value > 0 if is_higher_better(metric) else value < 0
+        found.append(
+            Difference(
+                method=method,
+                against=against,
+                split=split,
+                metric=metric,
+                difference=float(value.mean()),
+                low=low,
+                high=high,
+                better=int(better.sum()),
+                n=len(shared),
+            )
+        )
+    return found
+
+
+def to_csv(rows: Sequence[Row] | Sequence[Difference], columns: tuple[str, ...] = COLUMNS) -> str:
+    """Write rows as comma-separated values with a header; numbers keep 7 digits."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(columns)
+    for row in rows:
+        cells = [getattr(row, column) for column in columns]
+        writer.writerow([f"{c:.7g}" if isinstance(c, float) else c for c in cells])
+    return stream.getvalue()
+
+
+def read_rows(text: str) -> list[Row]:
+    """Read back what `to_csv` wrote of rows.
+
+    Raises:
+        ValueError: If the columns are others, or a number is not one.
+    """
+    table = list(csv.reader(io.StringIO(text)))
+    if not table or tuple(table[0]) != COLUMNS:
+        raise ValueError(f"the columns must be {', '.join(COLUMNS)}")
+    rows: list[Row] = []
+    for line, cells in enumerate(table[1:], 2):
+        if len(cells) != len(COLUMNS):
+            raise ValueError(f"line {line} has {len(cells)} cells instead of {len(COLUMNS)}")
+        method, split, metric, mean, low, high, n = cells
+        rows.append(
+            Row(
+                method=method,
+                split=split,
+                metric=metric,
+                mean=float(mean),
+                low=float(low),
+                high=float(high),
+                n=int(n),
+            )
+        )
+    return rows
+
+
+def _grouped(scores: Iterable[Score]) -> dict[tuple[str, str, str], dict[str, float]]:
+    grouped: dict[tuple[str, str, str], dict[str, float]] = {}
+    for score in scores:
+        if np.isfinite(score.value):
+            key = (score.method, score.split, score.metric)
+            grouped.setdefault(key, {})[score.case] = score.value
+    return grouped
+
+
+_NONE = "–"  # noqa: RUF001  # a dash, as tables have it
+_LATEX = (
+    ("\\", "\\textbackslash{}"),
+    *((sign, f"\\{sign}") for sign in "_%&#$"),
+    ("δ", "$\\delta$"),
+    ("×", "$\\times$"),  # noqa: RUF001
+    ("↑", "$\\uparrow$"),
+    ("–", "--"),  # noqa: RUF001
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Column:
+    """One column of a printed table."""
+
+    split: str
+    """Which split it shows."""
+    metric: str
+    """Which metric it shows."""
+    title: str
+    """What stands above it, unit included."""
+    factor: float = 1.0
+    """What figures are multiplied by, for example 1000 for millimetres."""
+    digits: int = 2
+    """Digits after the point."""
+
+
+def markdown_table(
+    rows: Sequence[Row], columns: Sequence[Column], unranked: Collection[str] = ()
+) -> str:
+    """Lay methods out against columns, with intervals; the best of a column is bold."""
+    head, *body = laid_out(rows, columns, "**{}**", unranked)
+    lines = [[text.replace("|", "\\|") for text in line] for line in (head, *body)]
+    lines.insert(1, ["---"] + ["---:"] * (len(head) - 1))
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def latex_table(
+    rows: Sequence[Row], columns: Sequence[Column], unranked: Collection[str] = ()
+) -> str:
+    """Lay methods out against columns as a ``tabular`` of booktabs; the best is bold."""
+    # The command is put in after escaping, which would break it.
+    head, *body = laid_out(rows, columns, "\x00{}\x01", unranked)
+    lines = [" & ".join(_escaped(text) for text in line) + " \\\\\n" for line in (head, *body)]
+    kinds = "l" + "r" * (len(head) - 1)
+    return (
+        f"\\begin{{tabular}}{{{kinds}}}\n\\toprule\n{lines[0]}\\midrule\n"
+        f"{''.join(lines[1:])}\\bottomrule\n\\end{{tabular}}\n"
+    )
+
+
+def laid_out(
+    rows: Sequence[Row],
+    columns: Sequence[Column],
+    best: str = "{}",
+    unranked: Collection[str] = (),
+) -> list[list[str]]:
+    """Arrange rows as lines of texts: a head, then one line a method in the order of the rows.
+
+    All methods that print the best figure are best, unless all print it. Where methods have figures
+    of different numbers of cases, the number stands beside each of them and none is best: a mean
+    without the hard cases is no better.
+
+    Args:
+        rows: Means over cases.
+        columns: What is shown; columns for which no method has a figure are left out.
+        best: How the best figure of a column is set, with ``{}`` where it goes.
+        unranked: Methods that are never best, and that others need not beat.
+    """
+    found = {(row.method, row.split, row.metric): row for row in rows}
+    methods = list(dict.fromkeys(row.method for row in rows))
+    shown = [c for c in columns if any((m, c.split, c.metric) in found for m in methods)]
+    methods = [m for m in methods if any((m, c.split, c.metric) in found for c in shown)]
+    lines = [["method", *(column.title for column in shown)], *([method] for method in methods)]
+    for column in shown:
+        given = [found.get((method, column.split, column.metric)) for method in methods]
+        texts = _column(given, column, best, unranked)
+        for line, text in zip(lines[1:], texts, strict=True):
+            line.append(text)
+    return lines
+
+
+def _column(
+    rows: Sequence[Row | None], column: Column, best: str, unranked: Collection[str]
+) -> list[str]:
+    rivals = [row for row in rows if row is not None and row.method not in unranked]
+    pick = max if is_higher_better(column.metric) else min
+    printed = {_printed(row.mean, column) for row in rivals}
+    is_ranked = len(printed) > 1 and len({row.n for row in rivals}) == 1
+    winner = _printed(pick(row.mean for row in rivals), column) if is_ranked else None
+    is_uneven = len({row.n for row in rows if row is not None}) > 1
+    texts: list[str] = []
+    for row in rows:
+        if row is None:
+            texts.append(_NONE)
+            continue
+        low, mean, high = (_printed(value, column) for value in (row.low, row.mean, row.high))
+        is_best = mean == winner and row.method not in unranked
+        parts = [best.format(mean) if is_best else mean]
+        parts += [f"[{low}, {high}]"] if row.n > 1 else []
+        parts += [f"(n = {row.n})"] if is_uneven else []
+        texts.append(" ".join(parts))
+    return texts
+
+
+def _printed(value: float, column: Column) -> str:
+    return f"{value * column.factor:.{column.digits}f}"
+
+
+def _escaped(text: str) -> str:
+    for plain, escaped in _LATEX:
+        text = text.replace(plain, escaped)
+    return text.replace("\x00", "\\textbf{").replace("\x01", "}")
+
+
+_COLORS = ("#4269d0", "#efb118", "#ff725c", "#6cc5b0", "#3ca951", "#ff8ab7", "#a463f2", "#97bbf5")
+_WIDTH, _LEFT, _RIGHT, _LINE, _AXIS = 720.0, 220.0, 70.0, 24.0, 50.0
+_STYLE = (
+    "<style>text{font:12px sans-serif;fill:#333}.axis{stroke:#999}"
+    "@media(prefers-color-scheme:dark){text{fill:#ddd}}</style>"
+)
+
+
+def bar_chart(title: str, bars: Sequence[tuple[str, float, float, float]]) -> str:
+    """Draw one bar a method with the ends of its interval.
+
+    Args:
+        title: What is shown, unit included.
+        bars: For each method its name, its mean, and the low and high end of its interval.
+    """
+    height = _LINE * (len(bars) + 2)
+    most = max([high for *_, high in bars] + [mean for _, mean, *_ in bars]) or 1.0
+    scale = (_WIDTH - _LEFT - _RIGHT) / most
+    parts: list[str] = []
+    for number, (name, mean, low, high) in enumerate(bars):
+        y = _LINE * (number + 1.6)
+        end, middle = _LEFT + scale * mean, y + 7
+        parts += [
+            _text(_LEFT - 8, y + 11, name, anchor="end"),
+            f'<rect x="{_LEFT}" y="{y:.1f}" width="{scale * mean:.1f}" height="14" '
+            f'fill="{_COLORS[number % len(_COLORS)]}"/>',
+            _segment(_LEFT + scale * low, middle, _LEFT + scale * high, middle),
+            _text(max(end, _LEFT + scale * high) + 6, y + 11, f"{mean:.2f}"),
+        ]
+    return _drawing(title, height, parts)
+
+
+def line_chart(title: str, lines: Mapping[str, Sequence[float | None]]) -> str:
+    """Draw one line a method over the frames; where a value is unknown the line is broken.
+
+    Args:
+        title: What is shown, unit included.
+        lines: For each method its values, frame by frame.
+    """
+    top, bottom = 40.0, 240.0
+    known = [value for line in lines.values() for value in line if value is not None]
+    most = max(known, default=0.0) or 1.0
+    count = max(len(line) for line in lines.values())
+    across = (_WIDTH - _AXIS - _LEFT) / max(1, count - 1)
+    parts = [
+        _segment(_AXIS, bottom, _WIDTH - _LEFT, bottom),
+        _segment(_AXIS, top, _AXIS, bottom),
+        _text(_AXIS - 6, top + 4, f"{most:.3g}", anchor="end"),
+        _text(_AXIS - 6, bottom + 4, "0", anchor="end"),
+        _text(_WIDTH - _LEFT, bottom + 18, f"frame {count - 1}", anchor="end"),
+    ]
+    for number, (name, line) in enumerate(lines.items()):
+        color = _COLORS[number % len(_COLORS)]
+        pen, path = "M", ""
+        for frame, value in enumerate(line):
+            if value is None:
+                pen = "M"
+                continue
+            x, y = _AXIS + across * frame, bottom - (bottom - top) * value / most
+            path += f"{pen}{x:.1f} {y:.1f}"
+            pen = "L"
+        parts.append(f'<path d="{path}" fill="none" stroke="{color}" stroke-width="1.6"/>')
+        at = top + 18 * number
+        parts.append(
+            f'<rect x="{_WIDTH - _LEFT + 12}" y="{at}" width="10" height="10" fill="{color}"/>'
+        )
+        parts.append(_text(_WIDTH - _LEFT + 28, at + 10, name))
+    return _drawing(title, max(bottom + 30, top + 18 * len(lines)), parts)
+
+
+def _drawing(title: str, height: float, parts: Sequence[str]) -> str:
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH:g} {height:g}" '
+        f'role="img" aria-label="{escape(title, {chr(34): "&quot;"})}">{_STYLE}'
+        f"{_text(8.0, 16.0, title)}{''.join(parts)}</svg>\n"
+    )
+
+
+def _text(x: float, y: float, text: str, *, anchor: str = "start") -> str:
+    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>'
+
+
+def _segment(x0: float, y0: float, x1: float, y1: float) -> str:
+    return f'<line class="axis" x1="{x0:.1f}" y1="{y0:.1f}" x2="{x1:.1f}" y2="{y1:.1f}"/>'
+
 
 _MM, _CM = 1000.0, 100.0
 _PAPER = (

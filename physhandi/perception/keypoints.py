@@ -1,24 +1,207 @@
 """Keypoints of hands in images and in the views of a sequence."""
 
+import threading
 from collections.abc import Sequence as SequenceOf
 from dataclasses import dataclass
+from pathlib import Path
 
+import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
+import physhandi.hand
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
 from physhandi.errors import MissingInputError
 from physhandi.hand.model import Side
-from physhandi.perception.hand_networks import (
-    LandmarkNetwork,
-    PalmNetwork,
-    Region,
-    landmark_region,
-    overlap,
-)
 from physhandi.progress import NullProgress, Progress
+
+_ASSETS = Path(physhandi.hand.__file__).parent / "assets"
+_PALM_SIZE, _LANDMARK_SIZE = 192, 224
+_STRIDES = ((8, 2), (16, 6))
+"""Anchor grids of the palm network: cell size [px] and anchors per cell."""
+_PALM_SCORE = 0.5
+_OVERLAP = 0.3
+
+
+@dataclass(frozen=True)
+class Region:
+    """A square region of an image that holds one hand, fingers pointing up inside it."""
+
+    center: Float[ndarray, " 2"]
+    """Pixel x and y of the middle [px]."""
+    size: float
+    """Length of a side [px]."""
+    angle: float
+    """Clockwise turn of the region in the image [rad]."""
+
+    def to_image(self) -> Float[ndarray, "2 3"]:
+        """Map the unit square (y down) to the image, as an affine matrix."""
+        cosine, sine = np.cos(self.angle), np.sin(self.angle)
+        linear = self.size * np.array([[cosine, -sine], [sine, cosine]])
+        return np.column_stack([linear, self.center - linear @ [0.5, 0.5]])
+
+
+@dataclass(frozen=True)
+class Landmarks:
+    """What the landmark network says about one region."""
+
+    pixel: Float[ndarray, "21 2"]
+    """Keypoints in the image [px]."""
+    presence: float
+    """Probability that the region shows a hand."""
+    right: float
+    """Probability that it is a right hand."""
+
+
+class PalmNetwork:
+    """Finds palms anywhere in an image."""
+
+    def __init__(self, threads: int = 2) -> None:
+        self._network = _Network("palm_detection_full.tflite", threads)
+        self._anchor = _anchors()
+
+    def __call__(self, image: UInt8[ndarray, "row column 3"]) -> list[Region]:
+        """Find the regions of an RGB image that hold a hand, the most certain first."""
+        height, width = image.shape[:2]
+        side = max(height, width)
+        whole = Region(np.array([width, height]) / 2, float(side), 0.0)
+        box, score = self._network(_crop(image, whole, _PALM_SIZE))
+        logit = np.clip(score.reshape(-1).astype(np.float64), -100, 100)
+        probability = 1 / (1 + np.exp(-logit))
+        keep = probability >= _PALM_SCORE
+        value = box.reshape(-1, 9, 2)[keep].astype(np.float64) / _PALM_SIZE
+        value[:, [0, 2, 3, 4, 5, 6, 7, 8]] += self._anchor[keep][:, None]
+        offset = (side - np.array([width, height])) / 2
+        value = value * side
+        value[:, [0, 2, 3, 4, 5, 6, 7, 8]] -= offset
+        return [_palm_region(palm) for palm in _merge(value, probability[keep])]
+
+
+class LandmarkNetwork:
+    """Finds the 21 keypoints of the hand in a region."""
+
+    def __init__(self, threads: int = 2) -> None:
+        self._network = _Network("hand_landmark_full.tflite", threads)
+
+    def __call__(self, image: UInt8[ndarray, "row column 3"], region: Region) -> Landmarks:
+        """Find the keypoints of the hand in a region of an RGB image."""
+        landmark, presence, handedness, _ = self._network(_crop(image, region, _LANDMARK_SIZE))
+        local = landmark.reshape(21, 3)[:, :2].astype(np.float64) / _LANDMARK_SIZE
+        matrix = region.to_image()
+        return Landmarks(
+            pixel=local @ matrix[:, :2].T + matrix[:, 2],
+            presence=float(presence.item()),
+            right=float(handedness.item()),
+        )
+
+
+def landmark_region(pixel: Float[ndarray, "21 2"]) -> Region:
+    """Guess from a hand's keypoints where the same hand is going to be in the next frame."""
+    part = pixel[[0, 1, 2, 3, 5, 6, 9, 10, 13, 14, 17, 18]]
+    knuckle = (pixel[5] + pixel[13]) / 4 + pixel[9] / 2
+    angle = _turn_to_up(pixel[0], knuckle)
+    return _region_around(part, angle, shift=-0.1, scale=2.0)
+
+
+def overlap(first: Float[ndarray, "21 2"], second: Float[ndarray, "21 2"]) -> float:
+    """Compute the intersection over union of two hands' bounding boxes."""
+    low = np.maximum(first.min(0), second.min(0))
+    high = np.minimum(first.max(0), second.max(0))
+    shared = float(np.prod(np.maximum(high - low, 0)))
+    total = float(np.prod(np.ptp(first, axis=0)) + np.prod(np.ptp(second, axis=0)))
+    return shared / max(total - shared, 1e-9)
+
+
+class _Network:
+    def __init__(self, file: str, threads: int) -> None:
+        from ai_edge_litert.interpreter import Interpreter
+
+        self._interpreter = Interpreter(str(_ASSETS / file), num_threads=threads)
+        self._interpreter.allocate_tensors()
+        self._input = self._interpreter.get_input_details()[0]["index"]
+        details = self._interpreter.get_output_details()
+        self._outputs = [d["index"] for d in sorted(details, key=lambda d: d["name"])]
+        self._lock = threading.Lock()
+
+    def __call__(self, picture: Float[ndarray, "row column 3"]) -> list[ndarray]:
+        with self._lock:
+            self._interpreter.set_tensor(self._input, picture[None])
+            self._interpreter.invoke()
+            return [self._interpreter.get_tensor(index) for index in self._outputs]
+
+
+def _crop(
+    image: UInt8[ndarray, "row column 3"], region: Region, size: int
+) -> Float[ndarray, "row column 3"]:
+    """Cut a region out of an image, black outside, values 0 to 1."""
+    matrix = region.to_image()
+    matrix[:, :2] /= size
+    matrix[:, 2] += matrix[:, :2] @ [0.5, 0.5] - 0.5
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return cv2.warpAffine(image, matrix, (size, size), flags=flags).astype(np.float32) / 255
+
+
+def _anchors() -> Float[ndarray, "anchor 2"]:
+    """Lay out the centres of the palm network's anchors in the unit square."""
+    grids = []
+    for stride, count in _STRIDES:
+        cells = (np.arange(_PALM_SIZE // stride) + 0.5) * stride / _PALM_SIZE
+        y, x = np.meshgrid(cells, cells, indexing="ij")
+        grids.append(np.repeat(np.stack([x, y], -1).reshape(-1, 2), count, axis=0))
+    return np.concatenate(grids)
+
+
+def _merge(
+    palm: Float[ndarray, "palm 9 2"], score: Float[ndarray, " palm"]
+) -> list[Float[ndarray, "9 2"]]:
+    """Average detections that overlap, weighted by score (weighted non-maximum suppression)."""
+    merged = []
+    left = np.argsort(-score, kind="stable")
+    while len(left):
+        best = palm[left[0]]
+        is_same = _box_overlap(best, palm[left]) > _OVERLAP
+        is_same[0] = True
+        same = left[is_same]
+        merged.append(np.average(palm[same], axis=0, weights=score[same]))
+        left = left[~is_same]
+    return merged
+
+
+def _box_overlap(
+    first: Float[ndarray, "9 2"], others: Float[ndarray, "palm 9 2"]
+) -> Float[ndarray, " palm"]:
+    low = np.maximum(first[0] - first[1] / 2, others[:, 0] - others[:, 1] / 2)
+    high = np.minimum(first[0] + first[1] / 2, others[:, 0] + others[:, 1] / 2)
+    shared = np.maximum(high - low, 0).prod(1)
+    return shared / np.maximum(first[1].prod() + others[:, 1].prod(1) - shared, 1e-12)
+
+
+def _palm_region(palm: Float[ndarray, "9 2"]) -> Region:
+    """Enlarge a palm's box to the whole hand; keypoints 0 and 2 are wrist and middle knuckle."""
+    center, extent, wrist, knuckle = palm[0], palm[1], palm[2], palm[4]
+    angle = _turn_to_up(wrist, knuckle)
+    up = np.array([np.sin(angle), -np.cos(angle)])
+    return Region(center + 0.5 * extent[1] * up, 2.6 * float(extent.max()), angle)
+
+
+def _region_around(
+    point: Float[ndarray, "point 2"], angle: float, *, shift: float, scale: float
+) -> Region:
+    cosine, sine = np.cos(angle), np.sin(angle)
+    to_image = np.array([[cosine, -sine], [sine, cosine]])
+    local = point @ to_image
+    low, high = local.min(0), local.max(0)
+    extent = high - low
+    center = (low + high) / 2 + [0, shift * extent[1]]
+    return Region(to_image @ center, scale * float(extent.max()), angle)
+
+
+def _turn_to_up(wrist: Float[ndarray, " 2"], knuckle: Float[ndarray, " 2"]) -> float:
+    x, y = knuckle - wrist
+    return float(np.arctan2(x, -y))
+
 
 _PRESENCE = 0.5
 _SAME_HAND = 0.5

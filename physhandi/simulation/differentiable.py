@@ -16,13 +16,13 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from physhandi.simulation.dataflow import DataflowAdjoint
-from physhandi.simulation.frame_adjoint import FrameAdjoint
-from physhandi.simulation.frame_sums import SCALARS
+from physhandi.simulation.engines.cpu import ThreadedAdjoint
+from physhandi.simulation.engines.cuda import DataflowAdjoint
+from physhandi.simulation.engines.frame_sums import SCALARS
+from physhandi.simulation.engines.graph_adjoint import FrameAdjoint
+from physhandi.simulation.engines.tape import TapeLayout, Trajectory
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
 from physhandi.simulation.simulator import Simulator
-from physhandi.simulation.threaded import ThreadedAdjoint
-from physhandi.simulation.trajectory import Layout, Trajectory
 
 CACHED_SIMULATORS = 16
 """How many models keep their captured graphs and tape between calls of `rollout`."""
@@ -110,7 +110,9 @@ def rollout(
     return position.to(control.device), velocity.to(control.device)
 
 
-def tape_layout(model: SpringMassModel, parameters: SimulationParameters, device: str) -> Layout:
+def tape_layout(
+    model: SpringMassModel, parameters: SimulationParameters, device: str
+) -> TapeLayout:
     """Say what a rollout with these arguments keeps of a frame; see `trajectory.frame_bytes`."""
     return _bridge(model, parameters, device).adjoint.layout
 

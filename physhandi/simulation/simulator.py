@@ -11,16 +11,15 @@ from jaxtyping import Float, Float32
 from numpy import ndarray
 
 from physhandi.errors import SimulationDivergedError
-from physhandi.simulation.dataflow import Dataflow
+from physhandi.simulation.engines.cpu import Threaded
+from physhandi.simulation.engines.cuda import Dataflow
+from physhandi.simulation.engines.graph import Recording, SpringSums
 from physhandi.simulation.kernels.integration import integrate_nodes
 from physhandi.simulation.kernels.springs import pull_springs
 from physhandi.simulation.kernels.world import World
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
-from physhandi.simulation.recording import Recording
 from physhandi.simulation.self_collision import SelfCollision
-from physhandi.simulation.spring_sums import SpringSums
 from physhandi.simulation.stability import explain_divergence
-from physhandi.simulation.threaded import Threaded
 
 wp.config.log_level = wp.LOG_WARNING
 

@@ -13,20 +13,20 @@ from typing import cast, get_args
 import numpy as np
 
 from physhandi.data.sequence import Sequence, ViewMeta
-from physhandi.data.sequence_schema import SequenceMeta, Side
+from physhandi.data.sequence_meta import SequenceMeta, Side
 from physhandi.data.sequence_writer import SequenceWriter
 from physhandi.errors import UsageError
 from physhandi.progress import NullProgress, Progress
-from physhandi.synthetic.actions import ACTIONS, script_action
-from physhandi.synthetic.bodies import BodyName, Resolution, make_body
-from physhandi.synthetic.cameras import MOST, make_viewpoints
+from physhandi.synthetic.bodies.bodies import BodyName, Resolution, make_body
+from physhandi.synthetic.code_version import generator_version
 from physhandi.synthetic.engines.mujoco_flex import simulate_truth
 from physhandi.synthetic.engines.truth import FRAME_RATE, CapsuleHand, Hold, PhysicalTruth
-from physhandi.synthetic.generator_version import generator_version
-from physhandi.synthetic.presets import changed, find_preset
-from physhandi.synthetic.recording import Images, record
-from physhandi.synthetic.stage import SIDES, make_stage
-from physhandi.synthetic.true_hand import TrueHand, load_true_hand
+from physhandi.synthetic.film.cameras import MOST, make_viewpoints
+from physhandi.synthetic.film.degradations import changed, find_preset
+from physhandi.synthetic.film.filmed_scene import SIDES, make_filmed_scene
+from physhandi.synthetic.film.recording import Images, record
+from physhandi.synthetic.hands.actions import ACTIONS, script_action
+from physhandi.synthetic.hands.true_hand import TrueHand, load_true_hand
 
 _LOG = logging.getLogger(__name__)
 
@@ -102,7 +102,7 @@ def synthesize(
         # Or all sequences of a seed would share the errors of one calibration.
         place = [seed, 2, get_args(BodyName).index(name), ACTIONS.index(action)]
         own = int(np.random.default_rng(place).integers(2**32))
-        stage = make_stage(truth, hands, level, own)
+        stage = make_filmed_scene(truth, hands, level, own)
         views = make_viewpoints(stage.extent(), cameras, level, own)
         record(writer, stage, views, level, seed=own, images=images, progress=progress)
         settings = {

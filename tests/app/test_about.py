@@ -7,7 +7,7 @@ import yaml
 from server_world import World
 from starlette.testclient import TestClient
 
-from physhandi.data import atomic
+from physhandi.data import files
 from physhandi.data.run import Run
 
 ADDRESS = "/api/v1/runs/fitted"
@@ -111,7 +111,7 @@ def test_a_full_disk_leaves_what_was_there(
     def fail(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(atomic.os, "fsync", fail)
+    monkeypatch.setattr(files.os, "fsync", fail)
     with pytest.raises(OSError, match="No space left"):
         Run.open(folder).rename(note="second")
     assert (folder / "run.yaml").read_bytes() == before

@@ -14,7 +14,7 @@ from sheet_sequence import FITTED, FRAMES, NODE
 from starlette.testclient import TestClient
 
 from physhandi.data.run import Run
-from physhandi.fitting.stage_names import STAGES
+from physhandi.fitting.config import STAGES
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import psutil
 import pytest
 from waiting import until
 
-from app.child_modules import PACKAGE_ROOT, start_module
+from app.child import PACKAGE_ROOT, start_module
 
 SECONDS = 150.0
 ECHO = ("json.tool", "--compact", "--no-ensure-ascii")
@@ -56,7 +56,7 @@ def test_a_folder_of_the_user_s_named_like_a_package_is_not_run(tmp_path: Path) 
         (tmp_path / package).mkdir()
         (tmp_path / package / "__init__.py").write_text("raise SystemExit('not ours')")
     code = (
-        "from app.viewer.live import LiveSimulation\n"
+        "from app.viewer.live.client import LiveSimulation\n"
         "import queue\n"
         "heard = queue.Queue()\n"
         "live = LiveSimulation()\n"

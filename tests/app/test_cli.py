@@ -10,11 +10,12 @@ import pytest
 from server_world import tiny_config
 from sheet_sequence import FRAMES, NODE
 
-from app import cli, commands
+from app import cli
+from app.cli import commands
 from physhandi import pipeline
 from physhandi.data.run import Run
 from physhandi.fitting.artefacts import load_model, load_parameters
-from physhandi.fitting.profile import PipelineConfig
+from physhandi.fitting.config import PipelineConfig
 from physhandi.simulation.stability import LONGEST_STEP, SAFETY, largest_stable_step
 
 

@@ -12,8 +12,8 @@ from app import cli
 from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.data.truth import read_truth
-from physhandi.synthetic.generator_version import generator_version
-from physhandi.synthetic.suite import find_suite
+from physhandi.synthetic.code_version import generator_version
+from physhandi.synthetic.suite.suite import find_suite
 
 
 def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:

@@ -8,7 +8,7 @@ import pytest
 from server_world import World
 
 from physhandi.data.run import Run
-from physhandi.data.run_files import RUN
+from physhandi.data.run_folder import RUN
 
 HOSTILE = "<img src=x onerror=alert(1)>"
 LIFT = 0.004

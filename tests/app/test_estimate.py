@@ -11,8 +11,7 @@ from app.jobs.effort import Extent, effort_of
 from app.jobs.estimate import Plan, estimate, plan_from
 from app.jobs.reference import Reference, scaled_plan
 from app.jobs.timeline import Part, Timeline
-from physhandi.fitting.overrides import apply_overrides
-from physhandi.fitting.profile import config_to_dict, load_profile
+from physhandi.fitting.config import apply_overrides, config_to_dict, load_profile
 
 Report = dict[str, float | str]
 STAGES = (("hands", 40, 20.0), ("search", 5, 10.0), ("springs", 30, 60.0), ("evaluation", 1, 5.0))

@@ -3,8 +3,8 @@ from typing import Any
 
 import pytest
 
-from app.jobs import feed as feed_module
-from app.jobs.feed import Feed
+from app.jobs import streams as feed_module
+from app.jobs.streams import Feed
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from server_world import World
 
 from app.jobs.forecast import Forecast
 from physhandi.data.run import Run
-from physhandi.data.run_files import read_mapping
+from physhandi.data.run_folder import read_mapping
 
 ENVIRONMENT = "attempts/1/out/environment.json"
 

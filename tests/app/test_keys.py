@@ -7,7 +7,7 @@ from pathlib import Path
 from server_world import World
 
 from app.keys import KEYS, key_of
-from app.viewer.quantities import QUANTITIES
+from app.viewer.color.quantities import QUANTITIES
 
 DOCS = Path(__file__).parents[2] / "docs" / "viewer.md"
 

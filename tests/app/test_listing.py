@@ -9,10 +9,9 @@ import pytest
 from pydantic import ValidationError
 from server_world import World
 
-from app.jobs import run_index
+from app.jobs import catalog
 from app.jobs.catalog import Catalog, UnknownRunError
-from app.jobs.listing import SORTS, RunQuery, page_of, select_runs, tags_of
-from app.jobs.summary import summarize
+from app.jobs.views import SORTS, RunQuery, page_of, select_runs, summarize, tags_of
 from app.settings import Settings
 from physhandi.data.run import Run
 from physhandi.errors import UsageError
@@ -220,7 +219,7 @@ def test_a_run_that_changed_is_described_anew(world: World) -> None:
 def test_runs_are_remembered_until_their_files_change(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(run_index, "_WORTH_SAVING", 2)
+    monkeypatch.setattr(catalog, "_WORTH_SAVING", 2)
     opened: list[str] = []
 
     def open_run(folder: Path) -> Run:

@@ -11,9 +11,8 @@ from typing import Any
 import pytest
 from waiting import until
 
-from app.jobs import cards as cards_module
-from app.jobs.cards import Cards, ask_driver
-from app.jobs.machine import Machine
+from app.jobs import machine as cards_module
+from app.jobs.machine import Cards, Machine, ask_driver
 from app.jobs.processes import end_processes
 
 BUSY = """

@@ -3,7 +3,7 @@ import hashlib
 import json
 import re
 
-from app.jobs.describe import thin
+from app.jobs.views import thin
 from app.pages.render import Pages, duration, short, words
 from app.settings import WEB_ASSETS
 

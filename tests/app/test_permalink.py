@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app.permalink import state_from_query, state_to_query
-from app.viewer.layers import Layers
-from app.viewer.session_state import Pose, SessionState
+from app.exports.permalink import state_from_query, state_to_query
+from app.viewer.content.layers import Layers
+from app.viewer.content.session_state import Pose, SessionState
 from physhandi.errors import UsageError
 
 

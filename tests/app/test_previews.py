@@ -18,7 +18,7 @@ from PIL import Image, ImageSequence
 from server_world import World
 from waiting import until
 
-from app.child_modules import PACKAGE_ROOT
+from app.child import PACKAGE_ROOT
 from app.previews import store, worker
 from app.previews.camera import fitting_camera
 from app.previews.clip import clip_of_run, clip_of_sequence

@@ -5,11 +5,10 @@ from pathlib import Path
 import pytest
 from run_world import make_run
 
-from app.jobs.failures import explain
-from app.jobs.stages import stage_views, stages_of
-from physhandi.data.atomic import write_json
+from app.jobs.views import explain, stage_views, stages_of
+from physhandi.data.files import write_json
 from physhandi.data.run import Run
-from physhandi.fitting.stage_names import STAGES
+from physhandi.fitting.config import STAGES
 
 NAMES = ["hands", "observation", "search", "springs", "evaluation"]
 DONE = [{"name": "hands", "seconds": 3.5, "summary": {"before": 2.0, "after": 1.0}}]

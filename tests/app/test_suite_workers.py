@@ -12,17 +12,15 @@ import psutil
 import pytest
 from suite_world import METHODS, order_of, table, write_told
 
-from app import suite_workers
-from app.suite_process import order_from_json, order_to_json
-from app.suite_workers import SuiteWorkers
+from app.cli import suite_workers
+from app.cli.suite_workers import SuiteWorkers, order_from_json, order_to_json
 from physhandi.data.lease import locked_file
 from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.errors import CancelledError, RunError, UsageError
 from physhandi.progress import NullProgress, Progress
-from physhandi.synthetic.baselines import parse_method
-from physhandi.synthetic.evaluation import evaluate, filler
-from physhandi.synthetic.suite_tasks import Order, list_tasks
+from physhandi.synthetic.suite.evaluation import Order, evaluate, filler, list_tasks
+from physhandi.synthetic.suite.methods import parse_method
 
 pytestmark = pytest.mark.timeout(900)
 
@@ -43,7 +41,7 @@ def children() -> list[psutil.Process]:
     found = []
     for process in psutil.Process().children():
         with suppress(psutil.Error):
-            if "app.suite_process" in process.cmdline():
+            if "app.cli.suite_workers" in process.cmdline():
                 found.append(process)
     return found
 

@@ -9,8 +9,7 @@ import pytest
 from server_world import World
 
 from physhandi.data.sequence import Sequence
-from physhandi.synthetic.evaluation import evaluate
-from physhandi.synthetic.suite_tasks import Order
+from physhandi.synthetic.suite.evaluation import Order, evaluate
 
 METHODS = ("static", "rigid_follow", "quick@simulation.connection_radius=0.01")
 

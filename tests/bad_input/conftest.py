@@ -9,7 +9,7 @@ from bad_input_world import Terminal, write_filmed
 from server_world import fit_sheet, tiny_config
 from sheet_sequence import write_sheet
 
-from app import commands
+from app.cli import commands
 
 Copy = Callable[[], Path]
 

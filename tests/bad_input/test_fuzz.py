@@ -16,7 +16,7 @@ from property_tests import SAME_EVERYWHERE
 from server_world import make_world
 from starlette.testclient import TestClient
 
-from app.commands import OVERRIDES
+from app.cli.commands import OVERRIDES
 from physhandi import pipeline
 from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence

@@ -12,7 +12,7 @@ from bad_input_world import Bad, Terminal, array, bad, put, removed, table, text
 from sheet_sequence import write_sheet
 
 from physhandi.data.run import Run
-from physhandi.data.run_files import artefacts, file_record
+from physhandi.data.run_folder import artefacts, file_record
 
 OUT = "attempts/1/out"
 SHEET = f"{OUT}/sequences/sheet"

@@ -25,7 +25,7 @@ from bad_input_world import (
 )
 from server_world import tiny_config
 
-from app import commands
+from app.cli import commands
 
 DEPTH, MASK, VIDEO, KEYPOINT = (
     f"views/front/{part}"

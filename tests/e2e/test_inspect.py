@@ -9,8 +9,8 @@ from playwright.sync_api import Error as PlaywrightError
 from scene_page import ScenePage
 from viewer_world import FolderCatalog
 
-from app.viewer.content import open_run
-from app.viewer.framing import frame_content
+from app.viewer.content.content import open_run
+from app.viewer.scene.framing import frame_content
 
 pytestmark = pytest.mark.e2e
 BUNDLED = Path(__file__).parents[2] / "sequences"

@@ -10,7 +10,7 @@ from playwright.sync_api import BrowserContext, Page, expect
 from queue_world import QueueWorld, queue_world, serving
 from sheet_sequence import write_sheet
 
-from physhandi.data.preview import PreviewFile
+from physhandi.data.attempt import PreviewFile
 from physhandi.progress import Preview
 
 pytestmark = pytest.mark.e2e

@@ -14,7 +14,7 @@ from physhandi.data.run import Run, read_events
 from physhandi.data.sequence import Sequence
 from physhandi.errors import CancelledError, MissingInputError, RunError, UsageError
 from physhandi.fitting.artefacts import load_model, load_parameters
-from physhandi.fitting.profile import PipelineConfig, config_to_dict
+from physhandi.fitting.config import PipelineConfig, config_to_dict
 from physhandi.progress import Progress
 
 

@@ -10,7 +10,7 @@ from recordings import recording
 from physhandi import pipeline
 from physhandi.data.importers.mocap import import_mocap
 from physhandi.data.run import Run
-from physhandi.fitting.profile import config_to_dict, load_profile
+from physhandi.fitting.config import config_to_dict, load_profile
 
 
 @pytest.mark.slow

@@ -7,7 +7,6 @@ from pathlib import Path
 from jaxtyping import Int
 from numpy import ndarray
 
-from physhandi.data.atomic import temporary_name
 from physhandi.data.exporters.gltf import write_gltf
 from physhandi.data.exporters.mesh import write_frame, write_frames
 from physhandi.data.exporters.scene_data import SceneData, read_scene
@@ -17,6 +16,7 @@ from physhandi.data.exporters.table import (
     write_tables,
     write_trajectories,
 )
+from physhandi.data.files import temporary_name
 from physhandi.data.run import Run
 from physhandi.errors import UsageError
 

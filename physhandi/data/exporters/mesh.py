@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
-from physhandi.data.atomic import write_bytes
 from physhandi.data.exporters.scene_data import SceneData
+from physhandi.data.files import write_bytes
 
 _OBJECT, _CONTROL, _HAND = (
     np.array(color, np.uint8) for color in ((60, 110, 220), (210, 60, 50), (225, 180, 155))

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy import ndarray
 
-from physhandi.data.atomic import (
+from physhandi.data.exporters.scene_data import SceneData
+from physhandi.data.files import (
     json_line,
     named_fields,
     plain,
@@ -17,7 +18,6 @@ from physhandi.data.atomic import (
     write_bytes,
     write_yaml,
 )
-from physhandi.data.exporters.scene_data import SceneData
 from physhandi.data.run import Run
 
 _FORMULA_START = ("=", "+", "-", "@", "\t", "\r")

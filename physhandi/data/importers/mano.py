@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from physhandi.data.atomic import named_fields, write_atomically
-from physhandi.data.untrusted import read_untrusted
+from physhandi.data.files import named_fields, write_atomically
+from physhandi.data.foreign import read_untrusted
 from physhandi.errors import ImportFailedError
 
 FORMAT = "physhandi-mano-1"

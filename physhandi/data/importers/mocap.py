@@ -9,10 +9,10 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.interpolate import CubicSpline  # pyright: ignore[reportMissingTypeStubs]  # it has none
 
-from physhandi.data.atomic import read_array
+from physhandi.data.files import read_array
 from physhandi.data.length_unit import doubt_extent, doubt_position
 from physhandi.data.sequence import Sequence
-from physhandi.data.sequence_schema import SequenceMeta
+from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import write_sequence
 from physhandi.errors import ImportFailedError
 from physhandi.progress import NullProgress, Progress

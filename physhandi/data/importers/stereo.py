@@ -16,7 +16,7 @@ from numpy import ndarray
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence import Sequence, ViewMeta
-from physhandi.data.sequence_schema import SequenceMeta, Side
+from physhandi.data.sequence_meta import SequenceMeta, Side
 from physhandi.data.sequence_writer import SequenceWriter
 from physhandi.errors import ImportFailedError
 from physhandi.progress import NullProgress, Progress

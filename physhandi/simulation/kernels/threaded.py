@@ -10,8 +10,8 @@ import warp as wp
 
 from physhandi.simulation.kernels.contacts import advance
 from physhandi.simulation.kernels.integration import free_velocity, is_too_fast
-from physhandi.simulation.kernels.lanes import Material, Parts, Record, pull_cut, pull_inner
 from physhandi.simulation.kernels.meeting import meet
+from physhandi.simulation.kernels.simd import Material, Parts, Record, pull_cut, pull_inner
 from physhandi.simulation.kernels.world import World
 
 wp.set_module_options({"enable_backward": False})

@@ -9,7 +9,8 @@ import warp as wp
 
 from physhandi.simulation.kernels.adjoint import before_drag, retract
 from physhandi.simulation.kernels.contacts import Motion
-from physhandi.simulation.kernels.lanes import (
+from physhandi.simulation.kernels.meeting import meet
+from physhandi.simulation.kernels.simd import (
     Bars,
     Material,
     Parts,
@@ -17,7 +18,6 @@ from physhandi.simulation.kernels.lanes import (
     retract_cut,
     retract_inner,
 )
-from physhandi.simulation.kernels.meeting import meet
 from physhandi.simulation.kernels.threaded import (
     as_record,
     gather_material,

@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from physhandi.data.sequence_schema import Side
-from physhandi.synthetic.bodies import Body
+from physhandi.data.sequence_meta import Side
+from physhandi.synthetic.bodies.bodies import Body
 from physhandi.synthetic.engines.truth import CapsuleHand
-from physhandi.synthetic.true_hand import Capsule
+from physhandi.synthetic.hands.true_hand import Capsule
 
 # A contact pushes as hard as its node is heavy. A node may bear many others, so it must be firm.
 _FIRM = "0.002 1"

@@ -13,10 +13,10 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from physhandi.data.sequence_schema import Side
+from physhandi.data.sequence_meta import Side
 from physhandi.errors import SimulationDivergedError, UsageError
 from physhandi.progress import NullProgress, Progress
-from physhandi.synthetic.bodies import Body
+from physhandi.synthetic.bodies.bodies import Body
 from physhandi.synthetic.engines.flex_scene import FlexParameters, list_bones, write_scene
 from physhandi.synthetic.engines.truth import (
     FRAME_RATE,

@@ -7,9 +7,9 @@ from typing import Literal, Protocol
 from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 
-from physhandi.data.sequence_schema import Side
-from physhandi.synthetic.bodies import Body
-from physhandi.synthetic.true_hand import Capsule, HandPose
+from physhandi.data.sequence_meta import Side
+from physhandi.synthetic.bodies.bodies import Body
+from physhandi.synthetic.hands.true_hand import Capsule, HandPose
 
 FRAME_RATE = 30.0
 """Frames per second [Hz]."""

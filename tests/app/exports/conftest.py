@@ -6,23 +6,23 @@ from pathlib import Path
 import pytest
 from server_world import World
 
+from app.exports.cache import FileCache, FileJob
 from app.exports.making import make
-from app.exports.order import Order
-from app.exports.workshop import Work, Workshop
+from app.exports.request import FileRequest
 from physhandi.data.run import Run
 
 
 @pytest.fixture
-def made(monkeypatch: pytest.MonkeyPatch) -> list[Order]:
+def made(monkeypatch: pytest.MonkeyPatch) -> list[FileRequest]:
     """Has files made in this process; the orders that were carried out."""
-    orders: list[Order] = []
+    orders: list[FileRequest] = []
 
-    def run(_: Workshop, order: Order, work: Work) -> None:
-        again = Order.from_text(order.to_text())
+    def run(_: FileCache, order: FileRequest, work: FileJob) -> None:
+        again = FileRequest.from_text(order.to_text())
         orders.append(again)
         make(again, work.path)
 
-    monkeypatch.setattr(Workshop, "_run", run)
+    monkeypatch.setattr(FileCache, "_run", run)
     return orders
 
 
@@ -32,7 +32,7 @@ def run(world: World) -> Run:
 
 
 @pytest.fixture
-def workshop(tmp_path: Path) -> Iterator[Workshop]:
-    workshop = Workshop(tmp_path / "cache")
+def workshop(tmp_path: Path) -> Iterator[FileCache]:
+    workshop = FileCache(tmp_path / "cache")
     yield workshop
     workshop.close()

@@ -15,9 +15,9 @@ from gltf_player import Player
 from server_world import World
 from viser_file import Recording
 
-from app.exports.order import Order
+from app.exports.request import FileRequest
 from app.exports.schema import MEDIA_TYPES
-from app.viewer.fitted_object import FittedObject
+from app.viewer.live.fitted_object import FittedObject
 from physhandi.data.run import Run
 from physhandi.simulation.simulator import Simulator
 
@@ -62,7 +62,7 @@ def read_ply(content: bytes, folder: Path) -> np.ndarray:
 
 
 def test_a_changed_parameter_is_simulated_before_it_is_written(
-    world: World, run: Run, made: list[Order], tmp_path: Path
+    world: World, run: Run, made: list[FileRequest], tmp_path: Path
 ) -> None:
     fitted = FittedObject(str(run.folder), "sheet")
     parameters = replace(fitted.take.parameters, drag=9.0)
@@ -84,7 +84,7 @@ def test_a_changed_parameter_is_simulated_before_it_is_written(
 
 
 def test_pictures_have_the_size_and_the_view_that_were_asked_for(
-    world: World, made: list[Order]
+    world: World, made: list[FileRequest]
 ) -> None:
     small = fetch(world, "png&f=3&width=320&height=200&show=nodes&theme=dark")
     image = cv2.imdecode(np.frombuffer(small, np.uint8), cv2.IMREAD_COLOR)
@@ -100,7 +100,9 @@ def test_pictures_have_the_size_and_the_view_that_were_asked_for(
     assert len(made) == 2
 
 
-def test_recordings_come_as_files_and_as_pages(world: World, made: list[Order], run: Run) -> None:
+def test_recordings_come_as_files_and_as_pages(
+    world: World, made: list[FileRequest], run: Run
+) -> None:
     recording = Recording.read(fetch(world, "viser"))
     shown = recording.at(recording.seconds)["/object/nodes"]["points"].reshape(-1, 3)
     np.testing.assert_allclose(shown, rollout(run)[-1], atol=2e-4)
@@ -110,7 +112,9 @@ def test_recordings_come_as_files_and_as_pages(world: World, made: list[Order], 
     assert len(made) == 2
 
 
-def test_a_live_scene_gives_the_rollout_of_its_sliders(world: World, made: list[Order]) -> None:
+def test_a_live_scene_gives_the_rollout_of_its_sliders(
+    world: World, made: list[FileRequest]
+) -> None:
     script = world.script()
     order = {"kind": "run", "id": "fitted"}
     scene = script.post("/api/v1/sessions", json=order).json()["id"]
@@ -155,7 +159,7 @@ def test_a_live_scene_gives_the_rollout_of_its_sliders(world: World, made: list[
     ],
 )
 def test_errors_name_the_field_in_the_shape_that_openapi_tells(
-    world: World, made: list[Order], query: str, status: int, word: str
+    world: World, made: list[FileRequest], query: str, status: int, word: str
 ) -> None:
     answer = world.script().get(f"{RUN}?{query}")
     assert answer.status_code == status

@@ -5,7 +5,7 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 from server_world import World
 
-from app.viewer.physics_panel import PhysicsPanel
+from app.viewer.physics.panel import PhysicsPanel
 
 QUERY = "f=3&cam=1,-2,0.5,0.1,0.2,0.3&fov=40&show=nodes,forces&scale=0.5&theme=dark&speed=0.5"
 

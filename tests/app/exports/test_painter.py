@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from app.exports.painter import BACKGROUND, paint, visible_from
+from app.exports.painter import BACKGROUND, paint_scene, visible_from
 from app.exports.primitives import Part, parts_of
-from app.viewer.session_state import Pose
-from app.viewer.viser_server import start_viser
+from app.viewer.content.session_state import Pose
+from app.viewer.ui.scene_server import start_viser
 
 RED, BLUE = np.array([[200.0, 10.0, 10.0]]), np.array([[10.0, 10.0, 200.0]])
 UP = np.array([0.0, 0.0, 1.0])
@@ -32,7 +32,7 @@ def covered(image: np.ndarray, channel: int) -> np.ndarray:
 
 def test_a_disk_is_where_and_as_large_as_the_pinhole_says() -> None:
     place, size, width, height = (0.4, 1.0, 1.5), 0.3, 400, 300
-    image = paint([disk(place, RED, size)], pose(), width, height)
+    image = paint_scene([disk(place, RED, size)], pose(), width, height)
     assert image.shape == (height, width, 3)
     focal = 0.5 * height / math.tan(math.radians(30))
     depth = place[1] + 2.0
@@ -45,7 +45,7 @@ def test_a_disk_is_where_and_as_large_as_the_pinhole_says() -> None:
 
 def test_a_tall_picture_has_no_seam_between_its_strips() -> None:
     height = 1_300
-    image = paint([disk((0.0, 0.0, 1.0), RED, 2.0)], pose(), 800, height)
+    image = paint_scene([disk((0.0, 0.0, 1.0), RED, 2.0)], pose(), 800, height)
     seen = covered(image, 0)
     focal = 0.5 * height / math.tan(math.radians(30))
     assert seen.sum(axis=1).max() == pytest.approx(min(800, 2 * 0.5 * focal), abs=2)
@@ -57,7 +57,7 @@ def test_a_tall_picture_has_no_seam_between_its_strips() -> None:
 
 def test_the_nearer_shape_hides_the_farther_one_in_whatever_order_they_come() -> None:
     near, far = disk((0.0, 0.0, 1.0), RED, 0.2), disk((0.0, 3.0, 1.0), BLUE, 2.0)
-    first, second = (paint(parts, pose(), 200, 200) for parts in ([near, far], [far, near]))
+    first, second = (paint_scene(parts, pose(), 200, 200) for parts in ([near, far], [far, near]))
     np.testing.assert_array_equal(first, second)
     assert covered(first, 0)[100, 100]
     assert covered(first, 2)[100, 130]
@@ -68,7 +68,7 @@ def test_a_sheer_surface_lets_through_what_is_behind_it_and_not_what_is_before()
     gray = np.full((2, 3), 100.0)
     sheet = Part(kind="triangle", point=square.astype(float), color=gray, opacity=0.75)
     behind, before = disk((-0.5, 1.0, 1.0), RED, 0.4), disk((0.3, -1.0, 1.0), BLUE, 0.2)
-    image = paint([sheet, behind, before], pose(), 300, 300).astype(int)
+    image = paint_scene([sheet, behind, before], pose(), 300, 300).astype(int)
     focal = 150 / math.tan(math.radians(30))
     through = image[150, round(149.5 - 0.5 * focal / 3)]
     np.testing.assert_allclose(through, 0.75 * 100 + 0.25 * RED[0], atol=2)
@@ -78,13 +78,13 @@ def test_a_sheer_surface_lets_through_what_is_behind_it_and_not_what_is_before()
 
 def test_lines_arrows_and_pictures_are_drawn_up_to_the_camera() -> None:
     line = np.array([[[0.0, -5.0, 0.8], [0.0, 5.0, 0.8]]])  # Comes from behind the camera.
-    image = paint([Part(kind="line", point=line, color=RED, size=3.0)], pose(), 200, 200)
+    image = paint_scene([Part(kind="line", point=line, color=RED, size=3.0)], pose(), 200, 200)
     seen = covered(image, 0)
     assert seen[-1, 96:104].any()
     assert not seen[:100].any()
     arrow = np.array([[[-0.5, 0.0, 1.0], [0.5, 0.0, 1.0]]])
     part = Part(kind="arrow", point=arrow, color=BLUE, size=0.02, head=(0.1, 0.3))
-    seen = covered(paint([part], pose(), 400, 400), 2)
+    seen = covered(paint_scene([part], pose(), 400, 400), 2)
     rows = seen.sum(axis=0)
     focal = 200 / math.tan(math.radians(30))
     neck = round(199.5 + 0.5 * 0.2 * focal)
@@ -94,7 +94,7 @@ def test_lines_arrows_and_pictures_are_drawn_up_to_the_camera() -> None:
     shown = np.zeros((64, 64, 3), np.uint8)
     shown[:32, :32] = (250, 0, 0)
     picture = Part(kind="picture", point=corner, color=RED, image=shown)
-    seen = covered(paint([picture], pose(), 200, 200), 0)
+    seen = covered(paint_scene([picture], pose(), 200, 200), 0)
     assert seen[75, 75]
     assert not seen[75, 125]
     assert not seen[125, 75]
@@ -103,8 +103,8 @@ def test_lines_arrows_and_pictures_are_drawn_up_to_the_camera() -> None:
 
 def test_what_is_behind_the_camera_or_far_outside_is_left_out() -> None:
     behind, aside = disk((0.0, -3.0, 1.0), RED, 1.0), disk((1e7, 0.0, 1.0), RED, 1.0)
-    assert (paint([behind, aside], pose(), 64, 48) == 255).all()
-    dark = paint([], pose(), 64, 48, is_dark=True)
+    assert (paint_scene([behind, aside], pose(), 64, 48) == 255).all()
+    dark = paint_scene([], pose(), 64, 48, is_dark=True)
     assert (dark == BACKGROUND[True]).all()
 
 

@@ -10,9 +10,9 @@ from viewer_world import content_of
 from viser_file import Recording
 
 from app.exports.offscreen import GRID
-from app.exports.recording import BYTES_FOR_300_FRAMES, record
-from app.permalink import state_from_query
-from app.viewer.content import Content
+from app.exports.permalink import state_from_query
+from app.exports.recording import BYTES_FOR_300_FRAMES, record_scene
+from app.viewer.content.content import Content
 from app.viewer.restoring import complete_state
 from physhandi.errors import UsageError
 
@@ -37,7 +37,7 @@ def content() -> Content:
 def recorded(content: Content, query: dict[str, str], *, as_html: bool = False) -> bytes:
     state = complete_state(state_from_query(query), content)
     told: list[tuple[int, int]] = []
-    result = record(
+    result = record_scene(
         content, content.fitted, state, lambda *step: told.append(step), as_html=as_html
     )
     assert told == [(frame + 1, FRAMES) for frame in range(FRAMES)]
@@ -67,7 +67,7 @@ def test_forces_are_those_of_the_exact_positions(content: Content) -> None:
     assert exact is not None
     strength = np.linalg.norm(exact.forces(5), axis=-1)
     recording = Recording.read(
-        record(content, exact, state, lambda _done, _of: None, as_html=False)
+        record_scene(content, exact, state, lambda _done, _of: None, as_html=False)
     )
     arrow = recording.at(5 / 30 + 0.001)["/forces"]["points"].reshape(-1, 2, 3)
     length = np.linalg.norm(arrow[:, 1] - arrow[:, 0], axis=-1)
@@ -128,7 +128,7 @@ def test_a_page_holds_the_recording_and_loads_nothing(content: Content) -> None:
 def test_endless_sequences_are_refused(content: Content) -> None:
     state = complete_state(state_from_query({}), content)
     with pytest.raises(UsageError, match="at most 3000 are recorded"):
-        record(
+        record_scene(
             replace(content, frame_count=3_001),
             content.fitted,
             state,

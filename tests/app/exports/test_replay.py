@@ -7,13 +7,13 @@ from server_world import World
 from viser_file import Recording
 from waiting import until
 
-from app.exports.order import Order
+from app.exports.request import FileRequest
 
 REPLAY = "/api/v1/runs/fitted/replay"
 
 
 def test_a_replay_is_made_in_the_background_and_played_without_a_session(
-    world: World, made: list[Order]
+    world: World, made: list[FileRequest]
 ) -> None:
     browser = world.browser()
     page = browser.get("/runs/fitted/replay")
@@ -50,7 +50,7 @@ def test_the_camera_of_a_link_reaches_the_player(world: World) -> None:
     assert 'data-theme="dark"' in page
 
 
-def test_wrong_wishes_and_strangers_get_no_replay(world: World, made: list[Order]) -> None:
+def test_wrong_wishes_and_strangers_get_no_replay(world: World, made: list[FileRequest]) -> None:
     browser = world.browser()
     for query, word in (
         ("cam=1,2", "cam"),

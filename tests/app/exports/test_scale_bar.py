@@ -7,9 +7,9 @@ import pytest
 from viewer_world import content_of, controls
 
 from app.exports.scale_bar import draw_scale
-from app.viewer.coloring import Legend, Painter
-from app.viewer.colormaps import table
-from app.viewer.layers import Layers
+from app.viewer.color.coloring import Legend, Painter
+from app.viewer.color.colormaps import table
+from app.viewer.content.layers import Layers
 
 
 @pytest.fixture

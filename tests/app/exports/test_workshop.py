@@ -12,45 +12,45 @@ import psutil
 import pytest
 from server_world import World
 
-from app.exports import workshop as workshop_module
-from app.exports.files import order_of
-from app.exports.order import Order
-from app.exports.workshop import TooManyFilesError, Work, Workshop
+from app.exports import cache as workshop_module
+from app.exports.cache import FileCache, FileJob, TooManyFilesError
+from app.exports.files import request_of
+from app.exports.request import FileRequest
 from physhandi.data.run import Run
 from physhandi.errors import RunError, UsageError
 
 
 @pytest.fixture
-def order(world: World) -> Order:
-    return order_of(world.catalog, world.catalog.run("fitted"), "png", {"f": "2"})
+def order(world: World) -> FileRequest:
+    return request_of(world.catalog, world.catalog.run("fitted"), "png", {"f": "2"})
 
 
 def pretend(
-    monkeypatch: pytest.MonkeyPatch, work: Callable[[Order, Work], None] | None = None
-) -> list[Order]:
+    monkeypatch: pytest.MonkeyPatch, work: Callable[[FileRequest, FileJob], None] | None = None
+) -> list[FileRequest]:
     """Write 100 bytes instead of starting a process."""
-    orders: list[Order] = []
+    orders: list[FileRequest] = []
 
-    def run(_: Workshop, order: Order, made: Work) -> None:
+    def run(_: FileCache, order: FileRequest, made: FileJob) -> None:
         orders.append(order)
         if work is not None:
             work(order, made)
         made.path.write_bytes(b"x" * 100)
 
-    monkeypatch.setattr(Workshop, "_run", run)
+    monkeypatch.setattr(FileCache, "_run", run)
     return orders
 
 
 def test_a_process_makes_the_file_and_tells_how_far_it_is(
-    workshop: Workshop, order: Order, monkeypatch: pytest.MonkeyPatch
+    workshop: FileCache, order: FileRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    go, run = threading.Event(), Workshop._run
+    go, run = threading.Event(), FileCache._run
 
-    def run_when_told(workshop: Workshop, order: Order, work: Work) -> None:
+    def run_when_told(workshop: FileCache, order: FileRequest, work: FileJob) -> None:
         assert go.wait(60)
         run(workshop, order, work)
 
-    monkeypatch.setattr(Workshop, "_run", run_when_told)
+    monkeypatch.setattr(FileCache, "_run", run_when_told)
     picture = workshop.begin(replace(order, width=64, height=48))
     recording = workshop.begin(replace(order, format="viser"))
     wrong = workshop.begin(replace(order, query={"f": "77"}))
@@ -66,12 +66,12 @@ def test_a_process_makes_the_file_and_tells_how_far_it_is(
     left = []
     for process in psutil.Process().children():
         with suppress(psutil.Error):  # Of other tests, and ending at this moment.
-            left += [process] if "app.exports.process" in process.cmdline() else []
+            left += [process] if "app.exports.making" in process.cmdline() else []
     assert left == []
 
 
 def test_the_same_order_is_made_once_and_again_when_the_run_changed(
-    workshop: Workshop, order: Order, run: Run, monkeypatch: pytest.MonkeyPatch
+    workshop: FileCache, order: FileRequest, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = pretend(monkeypatch)
     first = workshop.make(order)
@@ -85,33 +85,33 @@ def test_the_same_order_is_made_once_and_again_when_the_run_changed(
     current = run.folder / "current"
     current.write_text(current.read_text() + "\n")
     assert workshop.make(order) != first
-    again = Workshop(first.parent)
+    again = FileCache(first.parent)
     assert again.make(order) == workshop.make(order)
     assert len(made) == 4
     again.close()
 
 
 def test_the_cache_forgets_what_was_not_used_for_longest(
-    tmp_path: Path, order: Order, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, order: FileRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pretend(monkeypatch)
-    workshop = Workshop(tmp_path / "cache", most_bytes=350)
+    workshop = FileCache(tmp_path / "cache", most_bytes=350)
     paths = [workshop.make(replace(order, query={"f": str(frame)})) for frame in range(3)]
     for moment, path in enumerate(paths):
         os.utime(path, (moment, moment))
-    Workshop(tmp_path / "cache").make(replace(order, query={"f": "0"}))  # Used again.
+    FileCache(tmp_path / "cache").make(replace(order, query={"f": "0"}))  # Used again.
     paths.append(workshop.make(replace(order, query={"f": "3"})))
     assert [path.exists() for path in paths] == [True, False, True, True]
     workshop.close()
 
 
 def test_there_is_an_end_to_files_that_wait(
-    tmp_path: Path, order: Order, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, order: FileRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     go = threading.Event()
     made = pretend(monkeypatch, lambda _order, _work: go.wait(120) and None)
     monkeypatch.setattr(workshop_module, "MOST_WAITING", 3)
-    workshop = Workshop(tmp_path / "cache", at_once=1)
+    workshop = FileCache(tmp_path / "cache", at_once=1)
     works = [workshop.begin(replace(order, query={"f": str(frame)})) for frame in range(3)]
     assert workshop.begin(replace(order, query={"f": "0"})) is works[0]
     with pytest.raises(TooManyFilesError, match="3 files are being made already"):
@@ -123,8 +123,8 @@ def test_there_is_an_end_to_files_that_wait(
     workshop.close()
 
 
-def test_a_process_that_takes_too_long_is_ended(tmp_path: Path, order: Order) -> None:
-    workshop = Workshop(tmp_path / "cache", seconds=0.05)
+def test_a_process_that_takes_too_long_is_ended(tmp_path: Path, order: FileRequest) -> None:
+    workshop = FileCache(tmp_path / "cache", seconds=0.05)
     with pytest.raises(RunError, match=r"took longer than 0.05 s"):
         workshop.make(order)
     assert list((tmp_path / "cache").iterdir()) == []
@@ -132,11 +132,11 @@ def test_a_process_that_takes_too_long_is_ended(tmp_path: Path, order: Order) ->
 
 
 def test_a_failure_is_told_and_the_next_order_tries_again(
-    workshop: Workshop, order: Order, monkeypatch: pytest.MonkeyPatch
+    workshop: FileCache, order: FileRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     troubles = [RunError("a file is damaged")]
 
-    def fail(_order: Order, _work: Work) -> None:
+    def fail(_order: FileRequest, _work: FileJob) -> None:
         if troubles:
             raise troubles.pop()
 
@@ -149,7 +149,7 @@ def test_a_failure_is_told_and_the_next_order_tries_again(
 
 
 def test_what_is_made_once_leaves_nothing_behind(
-    workshop: Workshop, order: Order, monkeypatch: pytest.MonkeyPatch
+    workshop: FileCache, order: FileRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = pretend(monkeypatch)
     with workshop.once(order, lambda folder: (folder / "take.npz").touch()) as path:

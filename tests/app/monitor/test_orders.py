@@ -10,7 +10,7 @@ import yaml
 from queue_world import HOSTILE, QueueWorld
 
 from physhandi.data.run import Run
-from physhandi.fitting.profile import config_from_dict, load_profile
+from physhandi.fitting.config import config_from_dict, load_profile
 
 OVERRIDES = {
     "object_.search.generations": 12,

@@ -13,7 +13,7 @@ from fastapi.testclient import TestClient
 from queue_world import HOSTILE, QueueWorld, serving
 from waiting import until
 
-from physhandi.data.preview import PREVIEW, PreviewFile
+from physhandi.data.attempt import PREVIEW, PreviewFile
 from physhandi.progress import Preview
 
 ROUTES = (

@@ -6,7 +6,7 @@ import viser
 from viewer_client import ViewerClient
 from viewer_world import FakeSettings, FolderCatalog, Recording, make_run, make_sequence
 
-from app.viewer.session import Sessions
+from app.viewer.sessions import Sessions
 from physhandi.data.run import Run
 
 

@@ -13,11 +13,11 @@ import pytest
 import yaml
 from viewer_world import FRAMES, PARAMETERS, content_of, controls, look_at
 
-from app.viewer.bundle import Picture, bundle
-from app.viewer.figure import Side
-from app.viewer.layers import Layers
-from app.viewer.session_state import Pose
-from app.viewer.snapshot import Snapshot
+from app.viewer.compare.figure import Side
+from app.viewer.content.layers import Layers
+from app.viewer.content.session_state import Pose
+from app.viewer.export.bundle import Picture, bundle
+from app.viewer.export.snapshot import Snapshot
 
 
 class Recorded:

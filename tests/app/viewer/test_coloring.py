@@ -10,12 +10,12 @@ import pytest
 from spring_world import content_of, two_springs
 from viewer_world import FolderCatalog
 
-from app.viewer.coloring import Painter
-from app.viewer.colormaps import UNKNOWN, levels, paint, table
-from app.viewer.content import open_run
-from app.viewer.layers import COLORINGS, Layers
-from app.viewer.observed import PointSet, Tracks
-from app.viewer.quantities import QUANTITIES, measure
+from app.viewer.color.coloring import Painter
+from app.viewer.color.colormaps import UNKNOWN, levels, paint, table
+from app.viewer.color.quantities import QUANTITIES, measure
+from app.viewer.content.content import open_run
+from app.viewer.content.layers import COLORINGS, Layers
+from app.viewer.content.observed import PointSet, Tracks
 
 BUNDLED = Path(__file__).parents[3] / "sequences"
 

@@ -1,6 +1,6 @@
 import pytest
 
-from app.viewer.compare_clock import CompareClock
+from app.viewer.compare.pair import CompareClock
 
 
 def test_equal_recordings_show_equal_frames() -> None:

@@ -5,11 +5,11 @@ import threading
 import numpy as np
 import viser
 
-from app.viewer.compare_curve import DifferenceCurve
-from app.viewer.compare_look import Look
-from app.viewer.compare_panel import ComparePanel
-from app.viewer.difference import FrameDifference, Way
-from app.viewer.guard import Guard
+from app.viewer.compare.curve import DifferenceCurve
+from app.viewer.compare.difference import FrameDifference, Way
+from app.viewer.compare.look import Look
+from app.viewer.compare.panel import ComparePanel
+from app.viewer.ui.guard import Guard
 
 
 class MeasuredMeanwhile(DifferenceCurve):

@@ -10,9 +10,9 @@ from viewer_client import ViewerClient
 from viewer_world import FRAMES, PARAMETERS, FakeSettings, FolderCatalog, make_run
 
 from app.comparison import CompareAsk
-from app.viewer.compare_pair import open_pair
-from app.viewer.figure_export import write_figure_npz
-from app.viewer.session import Sessions
+from app.viewer.compare.figure_export import write_figure_npz
+from app.viewer.compare.pair import open_pair
+from app.viewer.sessions import Sessions
 from physhandi.data.run import Run
 from physhandi.errors import MissingInputError, PhysHandiError, UsageError
 

@@ -8,7 +8,7 @@ from numpy import ndarray
 from scipy.optimize import minimize
 from viewer_world import FRAMES, PARAMETERS, content_of, controls, sheet
 
-from app.viewer.difference import (
+from app.viewer.compare.difference import (
     compare_frames,
     summarize,
     surface_difference,
@@ -16,10 +16,10 @@ from app.viewer.difference import (
     triangle_distance,
     way_of,
 )
-from app.viewer.take import Take
+from app.viewer.content.object_rollout import ObjectRollout
 
 
-def moved(offset: ndarray) -> tuple[Take, Take]:
+def moved(offset: ndarray) -> tuple[ObjectRollout, ObjectRollout]:
     """A resting sheet, and one of which node `n` moves by `offset[n]` each frame."""
     first = content_of({}, controls((0.0, 0.0, 1.0))).fitted
     assert first is not None
@@ -65,7 +65,7 @@ def test_other_nodes_are_compared_with_the_surface() -> None:
         damping=empty,
         object_spring_count=0,
     )
-    second = Take(
+    second = ObjectRollout(
         model=model,
         parameters=PARAMETERS,
         control=first.control,

@@ -18,9 +18,9 @@ from viewer_world import (
     rest_at,
 )
 
-from app.viewer.error_panel import ErrorPanel, load_track_error
-from app.viewer.session import Sessions
-from app.viewer.take import Take
+from app.viewer.content.object_rollout import ObjectRollout
+from app.viewer.physics.error_panel import ErrorPanel, load_track_error
+from app.viewer.sessions import Sessions
 from physhandi.data.run import Run
 
 ERRORS = [None, *[0.001 * frame for frame in range(1, FRAMES)]]
@@ -49,10 +49,10 @@ def content():
     return content_of({}, controls((0.0, 0.0, 1.0)))
 
 
-def rollout(content, ready: int) -> Take:
+def rollout(content, ready: int) -> ObjectRollout:
     """A rollout whose nodes are 2 mm a frame to the side of the fitted one."""
     fitted = content.fitted
-    take = Take.empty(fitted.model, fitted.parameters, fitted.control)
+    take = ObjectRollout.empty(fitted.model, fitted.parameters, fitted.control)
     take.position[:] = fitted.position
     take.position[..., 0] += 0.002 * np.arange(FRAMES)[:, None]
     take.ready = ready
@@ -113,7 +113,7 @@ def test_the_plot_grows_with_the_simulation_and_not_more_often_than_it_is_read(
 ) -> None:
     (panel, client), (server, _) = panel, server_client
     clock = SimpleNamespace(now=time.monotonic() + 1.0, monotonic=lambda: clock.now)
-    monkeypatch.setattr("app.viewer.error_panel.time", clock)
+    monkeypatch.setattr("app.viewer.physics.error_panel.time", clock)
     take = rollout(content, 5)
     panel.show(3, is_playing=False)
     panel.follow(take, at_once=True)

@@ -9,14 +9,14 @@ from numpy import ndarray
 from viewer_client import ViewerClient
 from viewer_world import FRAMES, PARAMETERS, content_of, controls, hear_all, rest_at, sheet
 
-from app.viewer.figure import ARROWS, Figure, Side
-from app.viewer.figure_camera import Eye, picture_of_figure
-from app.viewer.figure_export import write_figure_csv, write_figure_npz
-from app.viewer.fitted_object import FittedObject
-from app.viewer.framing import frame_content
-from app.viewer.layers import Layers
-from app.viewer.session import Sessions
-from app.viewer.take import Take
+from app.viewer.compare.figure import ARROWS, Figure, Side
+from app.viewer.compare.figure_camera import Eye, picture_of_figure
+from app.viewer.compare.figure_export import write_figure_csv, write_figure_npz
+from app.viewer.content.layers import Layers
+from app.viewer.content.object_rollout import ObjectRollout
+from app.viewer.live.fitted_object import FittedObject
+from app.viewer.scene.framing import frame_content
+from app.viewer.sessions import Sessions
 from physhandi.data.run import Run
 from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.topology import build_model
@@ -66,7 +66,7 @@ def lengths_of(client: ViewerClient, name: str) -> ndarray:
     return np.linalg.norm(arrow[:, 1] - arrow[:, 0], axis=1)
 
 
-def rolled_out(run: Run) -> Take:
+def rolled_out(run: Run) -> ObjectRollout:
     """Simulate PhysTwin's way without the live process."""
     control = run.array("sequences/lift/control.npy")
     values = replace(
@@ -79,7 +79,7 @@ def rolled_out(run: Run) -> Take:
     )
     model = build_model(sheet(), control[0], values)
     motion = Simulator(model, values).rollout(control)
-    return Take(
+    return ObjectRollout(
         model=model,
         parameters=values,
         control=control,
@@ -221,7 +221,7 @@ def test_the_downloads_hold_positions_springs_and_forces_of_both_sides(run) -> N
         assert np.abs(total).max() > 1.0
 
 
-def replace_rollout(take: Take | None, run: Run) -> Take:
+def replace_rollout(take: ObjectRollout | None, run: Run) -> ObjectRollout:
     assert take is not None
     take.position = run.array("sequences/lift/rollout.npy")
     return take
@@ -236,7 +236,9 @@ def test_no_side_streams_more_than_300_arrows_or_too_many_bytes(server_client) -
     model = build_model(node, control[0], PARAMETERS)
     assert model.object_spring_count > 4_000
     position = node + np.linspace(0, 0.01, 3, dtype=np.float32)[:, None, None]
-    take = Take(model=model, parameters=PARAMETERS, control=control, position=position, ready=3)
+    take = ObjectRollout(
+        model=model, parameters=PARAMETERS, control=control, position=position, ready=3
+    )
     assert (np.linalg.norm(take.forces(2), axis=1) > 1e-6).sum() > 2 * ARROWS
     server, client = server_client
     figure = Figure(server, content, take, frame_content(content))

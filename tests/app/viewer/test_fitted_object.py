@@ -6,8 +6,8 @@ import pytest
 import yaml
 from viewer_world import PARAMETERS, make_run
 
-from app.viewer.content import load_fitted
-from app.viewer.fitted_object import FittedObject
+from app.viewer.content.content import load_fitted
+from app.viewer.live.fitted_object import FittedObject
 from physhandi.simulation.topology import retopologize
 
 

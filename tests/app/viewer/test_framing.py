@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from app.viewer.content import Content, open_run, open_sequence
-from app.viewer.framing import frame_content
-from app.viewer.layers import default_layers
+from app.viewer.content.content import Content, open_run, open_sequence
+from app.viewer.content.layers import default_layers
+from app.viewer.scene.framing import frame_content
 
 
 def in_view(framing, point) -> bool:

@@ -18,9 +18,9 @@ from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+from app.viewer.content.session_state import SessionState
 from app.viewer.gate import create_gate
-from app.viewer.session import Sessions
-from app.viewer.session_state import SessionState
+from app.viewer.sessions import Sessions
 
 
 @pytest.fixture

@@ -5,16 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.permalink import state_from_query
-from app.viewer.coloring import Painter
-from app.viewer.content import Content, HandSurface
-from app.viewer.framing import frame_content
-from app.viewer.hand_coloring import HandPainter, joint_weights
-from app.viewer.layers import Layers
-from app.viewer.legend import legend_html
-from app.viewer.picking import Pick
-from app.viewer.readings import Readings
+from app.exports.permalink import state_from_query
+from app.viewer.color.coloring import Painter
+from app.viewer.color.hand_coloring import HandPainter, joint_weights
+from app.viewer.color.legend import legend_html
+from app.viewer.content.content import Content, HandSurface
+from app.viewer.content.layers import Layers
+from app.viewer.inspect.picking import Pick
+from app.viewer.inspect.readings import Readings
 from app.viewer.restoring import complete_state
+from app.viewer.scene.framing import frame_content
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.view import View
 

@@ -1,5 +1,4 @@
-from app.viewer.holds import PAUSE, RESUME, STEP, Holds
-from app.viewer.wire import Message
+from app.viewer.live.wire import PAUSE, RESUME, STEP, Holds, Message
 
 
 def say(holds: Holds, *kinds: str) -> None:

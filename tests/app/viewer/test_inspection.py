@@ -6,9 +6,9 @@ from viewer_client import ViewerClient
 from viewer_world import PARAMETERS, hear_all, rest_at
 
 from app.keys import KEYS, LAYER_KEYS, Key
-from app.viewer.colormaps import table
-from app.viewer.inspector import MARK
-from app.viewer.layers import COLORINGS, Layers
+from app.viewer.color.colormaps import table
+from app.viewer.content.layers import COLORINGS, Layers
+from app.viewer.inspect.inspector import MARK
 
 FRAME = 12
 

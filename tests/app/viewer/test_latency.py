@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from viewer_world import FRAMES
 
-from app.viewer import latency
-from app.viewer.latency import measure_latency
+from app.benchmarks import latency
+from app.benchmarks.latency import measure_latency
 from physhandi.data.run import Run
 from physhandi.errors import MissingInputError, SimulationError
 
@@ -70,7 +70,7 @@ def test_it_needs_no_package_of_the_server() -> None:
     missing = ["fastapi", "open3d", "pydantic", "torch", "trimesh", "tyro", "uvicorn", "viser"]
     code = (
         f"import sys; sys.modules.update(dict.fromkeys({missing!r}))\n"
-        "import app.viewer.latency, app.viewer.live_process, app.viewer.warm_up\n"
+        "import app.benchmarks.latency, app.viewer.live.worker, app.viewer.live.worker\n"
         "print('imported')"
     )
     command = [sys.executable, "-c", code]

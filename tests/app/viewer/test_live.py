@@ -17,9 +17,9 @@ from scipy.spatial import cKDTree
 from viewer_world import FRAMES, PARAMETERS, controls, sheet
 from waiting import WatchedLock, until
 
-from app.viewer.live import LiveRequest, LiveSimulation
-from app.viewer.live_process import LiveSimulator, Mailboxes
-from app.viewer.wire import Message
+from app.viewer.live.client import LiveRequest, SimulationClient
+from app.viewer.live.wire import Message
+from app.viewer.live.worker import Mailboxes, SimulationWorker
 from physhandi.data.run import Run
 
 SECONDS = 60.0
@@ -43,14 +43,14 @@ class Mailbox:
 
 
 @pytest.fixture(scope="module")
-def live() -> Iterator[LiveSimulation]:
-    live = LiveSimulation()
+def live() -> Iterator[SimulationClient]:
+    live = SimulationClient()
     yield live
     live.close()
 
 
 @pytest.fixture
-def mailbox(live: LiveSimulation) -> Iterator[Mailbox]:
+def mailbox(live: SimulationClient) -> Iterator[Mailbox]:
     mailbox = Mailbox()
     live.subscribe("a", mailbox)
     yield mailbox
@@ -157,7 +157,7 @@ def test_automatic_substeps_survive_what_the_fitted_number_does_not(live, mailbo
     assert messages[0]["substeps_per_frame"] > PARAMETERS.substeps_per_frame
 
 
-def finish_another(live: LiveSimulation, run: Run) -> None:
+def finish_another(live: SimulationClient, run: Run) -> None:
     """Simulate for another session; meanwhile every session gets a turn for each of its frames."""
     other = Mailbox()
     live.subscribe("b", other)
@@ -287,7 +287,7 @@ def test_a_mailbox_ignores_what_was_overtaken_on_its_way(is_taken: bool) -> None
 
 def test_an_older_request_does_not_replace_the_active_one() -> None:
     with socket.socket() as connection:
-        simulator = LiveSimulator(connection, "cpu")
+        simulator = SimulationWorker(connection, "cpu")
         simulator._start(simulate(2))
         active = simulator._active["a"]
         for number in (1, 2):
@@ -304,7 +304,7 @@ def test_an_older_request_does_not_replace_the_active_one() -> None:
 def test_the_process_dies_with_its_parent() -> None:
     script = (
         "import os\n"
-        "from app.viewer.live import LiveSimulation\n"
+        "from app.viewer.live.client import LiveSimulation\n"
         "from waiting import until\n"
         "live = LiveSimulation()\n"
         "live.subscribe('a', lambda message: None)\n"
@@ -323,7 +323,7 @@ def test_the_process_dies_with_its_parent() -> None:
 
 
 def test_close_leaves_no_process() -> None:
-    live = LiveSimulation()
+    live = SimulationClient()
     live.subscribe("a", lambda _: None)
     process = until(lambda: live.process_id)
     live.close()
@@ -343,7 +343,7 @@ def _is_running(process: int) -> bool:
 
 
 def test_the_process_warms_up_by_itself(run) -> None:
-    live = LiveSimulation()
+    live = SimulationClient()
     try:
         live.start()
         live.start()

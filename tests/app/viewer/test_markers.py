@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from app.previews.links import marker_links
-from app.viewer.coloring import Painter
-from app.viewer.content import Content
-from app.viewer.inspector import clickable
-from app.viewer.layers import Layers
-from app.viewer.markers import Markers
-from app.viewer.picking import Pick, Ray, Target, pick
-from app.viewer.readings import Readings
+from app.viewer.color.coloring import Painter
+from app.viewer.content.content import Content
+from app.viewer.content.layers import Layers
+from app.viewer.content.markers import Markers
+from app.viewer.inspect.inspector import clickable
+from app.viewer.inspect.picking import Pick, Ray, Target, pick
+from app.viewer.inspect.readings import Readings
 
 _ROPE = np.array([0.0, 0.02, 0.1, 0.18, 0.26])
 

@@ -2,9 +2,8 @@ from dataclasses import replace
 
 import pytest
 
-from app.viewer.contact_knobs import ground_knobs, self_collision_knobs
-from app.viewer.history import History
-from app.viewer.parameters import changes_in, knobs
+from app.viewer.physics.history import History
+from app.viewer.physics.parameters import changes_in, ground_knobs, knobs, self_collision_knobs
 from physhandi.simulation.model import SimulationParameters
 
 

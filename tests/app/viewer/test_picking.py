@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from viewer_world import content_of, controls
 
-from app.viewer.layers import Layers
-from app.viewer.picking import Pick, Ray, Target, first_triangle, nearest_on_segments, pick
+from app.viewer.content.layers import Layers
+from app.viewer.inspect.picking import Pick, Ray, Target, first_triangle, nearest_on_segments, pick
 
 NO_FACES = np.zeros((0, 3), np.int32)
 EYE = np.array([0.0, 0.0, 1.0])

@@ -6,7 +6,7 @@ import numpy as np
 from viewer_client import ViewerClient
 from viewer_world import FRAMES, rest_at
 
-from app.viewer.session import Sessions
+from app.viewer.sessions import Sessions
 from physhandi.data.run import Run
 
 FRAME = 15

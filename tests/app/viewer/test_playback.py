@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from waiting import until
 
-from app.viewer.playback import Playback
+from app.viewer.clock.playback import Playback
 
 
 class Clock:
@@ -60,7 +60,7 @@ class Film:
         """How long it takes to draw a frame [s]."""
         self.playback = Playback(frame_count, rate, self._draw)
         self.playback._condition = self.clock  # type: ignore[assignment]
-        monkeypatch.setattr("app.viewer.playback.time", self.clock)
+        monkeypatch.setattr("app.viewer.clock.playback.time", self.clock)
 
     @property
     def frames(self) -> list[int]:

@@ -7,11 +7,18 @@ from typing import Any
 import pytest
 import yaml
 
-from app.viewer.guard import Guard
-from app.viewer.history import History
-from app.viewer.keep_panel import PresetChoice
-from app.viewer.preset_store import PRESET_FORMAT, PresetStore, checked_name
-from app.viewer.presets import AS_FITTED, BY_HAND, builtin_presets, changes_of
+from app.viewer.physics.history import History
+from app.viewer.physics.keep_panel import PresetChoice
+from app.viewer.physics.presets import (
+    AS_FITTED,
+    BY_HAND,
+    PRESET_FORMAT,
+    PresetStore,
+    builtin_presets,
+    changes_of,
+    checked_name,
+)
+from app.viewer.ui.guard import Guard
 from physhandi.errors import UsageError
 from physhandi.simulation.model import SimulationParameters
 

@@ -8,12 +8,11 @@ from spring_world import content_of, two_springs
 from viewer_world import content_of as sheet_with_hands
 from viewer_world import controls
 
-from app.viewer.coloring import Legend, Painter
-from app.viewer.legend import legend_html, number, tick_values
-from app.viewer.over_time import HISTORIES, follow, unit_of
-from app.viewer.picking import Pick
-from app.viewer.quantities import QUANTITIES
-from app.viewer.readings import Readings
+from app.viewer.color.coloring import Legend, Painter
+from app.viewer.color.legend import legend_html, number, tick_values
+from app.viewer.color.quantities import QUANTITIES
+from app.viewer.inspect.picking import Pick
+from app.viewer.inspect.readings import HISTORIES, Readings, follow, unit_of
 
 
 @pytest.fixture

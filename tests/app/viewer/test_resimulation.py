@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from viewer_world import FRAMES, PARAMETERS
 
-from app.viewer.content import load_fitted
-from app.viewer.live import LiveRequest
-from app.viewer.resimulation import Resimulation
-from app.viewer.wire import Message
+from app.viewer.content.content import load_fitted
+from app.viewer.live.client import LiveRequest
+from app.viewer.live.rollouts import LiveRollouts
+from app.viewer.live.wire import Message
 
 
 class FakeLive:
@@ -58,10 +58,10 @@ def changes() -> list[tuple[str, int]]:
 
 
 @pytest.fixture
-def resimulation(live, run, changes) -> Resimulation:
+def resimulation(live, run, changes) -> LiveRollouts:
     fitted = load_fitted(run, "lift")
     assert fitted is not None
-    return Resimulation(
+    return LiveRollouts(
         "s",
         live,
         fitted,
@@ -71,7 +71,7 @@ def resimulation(live, run, changes) -> Resimulation:
     )
 
 
-def start(resimulation: Resimulation, live: FakeLive, count: int) -> int:
+def start(resimulation: LiveRollouts, live: FakeLive, count: int) -> int:
     resimulation.request(replace(PARAMETERS, drag=7.0), automatic_substeps=False)
     number = len(live.requests)
     tensors = resimulation.fitted.model.to_tensors()

@@ -6,8 +6,8 @@ import trimesh
 from numpy import ndarray
 from viewer_world import FRAMES, PARAMETERS, Recording, content_of, controls
 
-from app.viewer.content import Content
-from app.viewer.rival import Rival
+from app.viewer.compare.phystwin_baseline import PhysTwinBaseline
+from app.viewer.content.content import Content
 from physhandi.data.run import Run
 
 
@@ -16,9 +16,9 @@ def ball(center: tuple[float, float, float], subdivisions: int = 3) -> tuple[nda
     return np.asarray(mesh.vertices + center, np.float32), np.asarray(mesh.faces, np.int32)
 
 
-def rival_of(content: Content) -> Rival:
+def rival_of(content: Content) -> PhysTwinBaseline:
     assert content.fitted is not None
-    return Rival.of(content, content.fitted)
+    return PhysTwinBaseline.of(content, content.fitted)
 
 
 def test_thirty_points_are_picked_among_those_that_a_camera_sees(recording: Recording) -> None:

@@ -6,11 +6,11 @@ import viser
 from viewer_client import ViewerClient
 from viewer_world import hear_all
 
-from app.viewer.content import Content, HandSurface
-from app.viewer.framing import frame_content
-from app.viewer.layers import PLAYING_SPRINGS
-from app.viewer.scene import Scene
-from app.viewer.take import Take
+from app.viewer.content.content import Content, HandSurface
+from app.viewer.content.layers import PLAYING_SPRINGS
+from app.viewer.content.object_rollout import ObjectRollout
+from app.viewer.scene.framing import frame_content
+from app.viewer.scene.scene import Scene
 from physhandi.simulation.model import SimulationParameters
 from physhandi.simulation.topology import build_model
 
@@ -28,7 +28,7 @@ def large_content() -> Content:
     model = build_model(node, control[0], PARAMETERS)
     position = node + np.linspace(0, 0.1, FRAMES, dtype=np.float32)[:, None, None]
     face = rng.integers(0, 1_000, (2_000, 3)).astype(np.int32)
-    fitted = Take(
+    fitted = ObjectRollout(
         model=model, parameters=PARAMETERS, control=control, position=position, ready=FRAMES
     )
     return Content(

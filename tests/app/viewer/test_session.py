@@ -8,9 +8,9 @@ import pytest
 from viewer_client import ViewerClient
 from viewer_world import FRAMES, FakeSettings
 
-from app.viewer.figure_mode import FigureMode
-from app.viewer.session import Sessions, TooManySessionsError
-from app.viewer.snapshot_files import write_csv, write_npz, write_ply, write_yaml
+from app.viewer.compare.figure_mode import FigureMode
+from app.viewer.export.snapshot import write_csv, write_npz, write_ply, write_yaml
+from app.viewer.sessions import Sessions, TooManySessionsError
 from physhandi.data.run import Run
 from physhandi.errors import MissingInputError, PhysHandiError, RunError, UsageError
 from physhandi.simulation.model import SimulationParameters
@@ -190,7 +190,7 @@ def test_downloads_hold_what_is_on_the_screen(sessions, run) -> None:
 @pytest.fixture
 def nobody_makes_room(monkeypatch: pytest.MonkeyPatch) -> None:
     """However long opening takes, no session counts as left."""
-    monkeypatch.setattr("app.viewer.session._MAKES_ROOM_AFTER", math.inf)
+    monkeypatch.setattr("app.viewer.sessions._MAKES_ROOM_AFTER", math.inf)
 
 
 @pytest.mark.usefixtures("nobody_makes_room")
@@ -237,7 +237,7 @@ def test_what_cannot_be_shown_takes_no_place(catalog, tmp_path) -> None:
 
 
 def test_a_session_that_nobody_looks_at_is_closed(catalog, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("app.viewer.session._REAP_INTERVAL", 0.2)
+    monkeypatch.setattr("app.viewer.sessions._REAP_INTERVAL", 0.2)
     settings = FakeSettings()
     sessions = Sessions(settings, catalog)
     try:

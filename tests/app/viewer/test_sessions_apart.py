@@ -13,10 +13,10 @@ from viewer_client import ViewerClient
 from viewer_world import FRAMES, PARAMETERS, FakeSettings, controls, hear_all, rest_at, sheet
 from waiting import WatchedLock, until
 
-from app.viewer import session_view
-from app.viewer.resimulation import STARTING
-from app.viewer.session import Session, Sessions
-from app.viewer.stage import Stage
+from app.viewer import session
+from app.viewer.live.rollouts import STARTING
+from app.viewer.session import ViewSwitch
+from app.viewer.sessions import Session, Sessions
 from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.topology import build_model
 
@@ -158,9 +158,9 @@ def test_one_session_draws_at_a_time(many, monkeypatch) -> None:
     turn, is_watched = WatchedLock(), threading.Event()
     lock, drawing, most = threading.Lock(), 0, 0
     drawn: Counter[int] = Counter()
-    real = Stage.draw
+    real = ViewSwitch.draw
 
-    def draw(self: Stage, *given: object, **options: object) -> None:
+    def draw(self: ViewSwitch, *given: object, **options: object) -> None:
         nonlocal drawing, most
         with lock:
             drawing += 1
@@ -172,8 +172,8 @@ def test_one_session_draws_at_a_time(many, monkeypatch) -> None:
         with lock:
             drawing -= 1
 
-    monkeypatch.setattr(Stage, "draw", draw)
-    monkeypatch.setattr(session_view, "TURN", turn)
+    monkeypatch.setattr(ViewSwitch, "draw", draw)
+    monkeypatch.setattr(session, "TURN", turn)
     tabs = [open_tab(many) for _ in range(4)]
     with ExitStack() as stack:
         for _, client in tabs:

@@ -1,7 +1,7 @@
 import numpy as np
 
-from app.viewer.observed import DepthCloud
-from app.viewer.skeleton import BONES, lift_keypoints
+from app.viewer.content.observed import DepthCloud
+from app.viewer.content.skeleton import BONES, lift_keypoints
 
 
 def test_keypoints_seen_by_two_views_come_back_where_they_were(recording) -> None:

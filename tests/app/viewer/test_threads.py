@@ -15,16 +15,16 @@ import viser
 from viewer_client import ViewerClient
 from viewer_world import FRAMES, PARAMETERS, rest_at
 
-from app.viewer.content import Content
-from app.viewer.figure_camera import Eye
-from app.viewer.guard import Guard
-from app.viewer.history import History
-from app.viewer.live import LiveRequest, LiveSimulation
-from app.viewer.parameters import Knob, knobs
-from app.viewer.session import Sessions
-from app.viewer.session_view import Session
-from app.viewer.slider_set import SliderSet
-from app.viewer.wire import Message
+from app.viewer.compare.figure_camera import Eye
+from app.viewer.content.content import Content
+from app.viewer.live.client import LiveRequest, SimulationClient
+from app.viewer.live.wire import Message
+from app.viewer.physics.history import History
+from app.viewer.physics.panel import SliderSet
+from app.viewer.physics.parameters import Knob, knobs
+from app.viewer.session import Session
+from app.viewer.sessions import Sessions
+from app.viewer.ui.guard import Guard
 
 PATIENCE = 30.0
 SHORT = 0.3
@@ -249,7 +249,7 @@ def test_a_slider_and_the_number_of_substeps_do_not_take_each_other_back(
             is_set.wait(SHORT)
         return replace(parameters, **values)
 
-    monkeypatch.setattr("app.viewer.history.replace", slow)
+    monkeypatch.setattr("app.viewer.physics.history.replace", slow)
     late = beside(lambda: history.set_substeps(77))
     assert has_read.wait(PATIENCE)
     history.set("drag", 9.0)
@@ -277,7 +277,7 @@ def test_a_parameter_to_be_put_back_is_not_forgotten_before_it_is_heard(
 def test_a_simulation_that_is_let_go_while_it_is_sent_again_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    live = LiveSimulation("cpu")
+    live = SimulationClient("cpu")
     monkeypatch.setattr(live, "start", lambda: None)
     live.hold("a", on=True)
     live.request("a", LiveRequest(run=tmp_path, sequence="lift", parameters=PARAMETERS))

@@ -12,10 +12,9 @@ from viewer_client import ViewerClient
 from viewer_world import FRAMES, PARAMETERS, FakeSettings, FolderCatalog
 from waiting import until
 
-from app.viewer.keep_panel import Keeping
-from app.viewer.preset_store import PresetStore
-from app.viewer.save_run import RunSaver, SavedRun, run_changes
-from app.viewer.session import Sessions
+from app.viewer.physics.keep_panel import RunSaver, SavedRun, UserStorage, run_changes
+from app.viewer.physics.presets import PresetStore
+from app.viewer.sessions import Sessions
 from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.errors import UsageError
@@ -36,13 +35,13 @@ def begun() -> list[Run]:
 
 
 @pytest.fixture
-def kept(root: Path, recording, tmp_path: Path, begun: list[Run]) -> Keeping:
+def kept(root: Path, recording, tmp_path: Path, begun: list[Run]) -> UserStorage:
     saver = RunSaver(RecordedCatalog(root), tmp_path / "runs", begun.append)
-    return Keeping(PresetStore(tmp_path / "presets"), saver)
+    return UserStorage(PresetStore(tmp_path / "presets"), saver)
 
 
 @pytest.fixture
-def sessions(catalog, kept: Keeping) -> Iterator[Sessions]:
+def sessions(catalog, kept: UserStorage) -> Iterator[Sessions]:
     sessions = Sessions(FakeSettings(), catalog, kept)
     yield sessions
     sessions.shutdown()

@@ -5,7 +5,7 @@ import threading
 import numpy as np
 import pytest
 
-from app.viewer.wire import Message, WireError, receive, send
+from app.viewer.live.wire import Message, WireError, receive, send
 
 
 @pytest.fixture

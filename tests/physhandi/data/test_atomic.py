@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from physhandi.data.atomic import (
+from physhandi.data.files import (
     is_abandoned,
     json_line,
     plain,

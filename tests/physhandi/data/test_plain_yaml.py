@@ -2,7 +2,7 @@
 
 import pytest
 
-from physhandi.data.plain_yaml import parse_yaml
+from physhandi.data.files import parse_yaml
 
 
 def test_plain_data_is_read() -> None:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from run_world import make_run
 
-from physhandi.data import preview as preview_module
-from physhandi.data.preview import PREVIEW, PreviewFile, encode, read_preview
+from physhandi.data import attempt as preview_module
+from physhandi.data.attempt import PREVIEW, PreviewFile, encode, read_preview
 from physhandi.errors import RunError
 from physhandi.progress import NullProgress, Preview
 

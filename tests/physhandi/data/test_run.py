@@ -267,7 +267,7 @@ def test_the_newest_whole_checkpoint_is_read(tmp_path: Path) -> None:
 def test_a_replaced_process_stops_at_its_next_report(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("physhandi.data.run_progress._HEARTBEAT_INTERVAL_S", 0.0)
+    monkeypatch.setattr("physhandi.data.attempt._HEARTBEAT_INTERVAL_S", 0.0)
     run = make_run(tmp_path / "fit")
     progress = run.begin_attempt().progress()
     before = json.loads((run.folder / "lease.json").read_text())["time"]

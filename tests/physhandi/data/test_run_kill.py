@@ -14,9 +14,9 @@ import yaml
 from safetensors.numpy import load_file
 from waiting import until
 
-from physhandi.data.checkpoint import read_checkpoint
+from physhandi.data.attempt import read_checkpoint
 from physhandi.data.run import Run, read_events
-from physhandi.data.run_files import attempt_numbers
+from physhandi.data.run_folder import attempt_numbers
 
 KILLS = 30
 MOST_WRITTEN = 40

@@ -10,7 +10,7 @@ import yaml
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence import Sequence, find_sequences
-from physhandi.data.sequence_schema import SequenceMeta, ViewMeta
+from physhandi.data.sequence_meta import SequenceMeta, ViewMeta
 from physhandi.data.sequence_writer import SequenceWriter, write_sequence
 from physhandi.errors import SequenceError
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from physhandi.data.sequence import Sequence
-from physhandi.data.sequence_schema import SequenceMeta
+from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import write_sequence
 from physhandi.data.truth import read_truth
 from physhandi.errors import SequenceError

@@ -15,8 +15,7 @@ import torch
 from foreign_pickle import chumpy_select, python2_pickle
 from hostile_pickles import BROKEN, EXPLODING, canaries
 
-from physhandi.data.inert import array_from_bytes
-from physhandi.data.untrusted_worker import convert
+from physhandi.data.foreign import array_from_bytes, convert
 from physhandi.errors import ImportFailedError
 
 MOST = 1 << 30

@@ -9,10 +9,14 @@ import pytest
 
 from physhandi.data.observation import ObjectObservation
 from physhandi.errors import CancelledError
-from physhandi.fitting.candidates import Judge
-from physhandi.fitting.object_config import ObjectFitConfig
-from physhandi.fitting.object_problem import ObjectProblem, build_problem
-from physhandi.fitting.object_simulation import build_problem_model, mean_loss
+from physhandi.fitting.config import ObjectFitConfig
+from physhandi.fitting.object_problem import (
+    ObjectProblem,
+    build_problem,
+    build_problem_model,
+    mean_loss,
+)
+from physhandi.fitting.object_reconstruction import Judge
 from physhandi.progress import NullProgress, Preview, Progress
 from physhandi.simulation.model import SimulationParameters
 

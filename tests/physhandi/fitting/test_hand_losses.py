@@ -7,16 +7,18 @@ import pytest
 import torch
 
 from physhandi.data.camera import PinholeCamera
-from physhandi.fitting.hand_depth import DepthTarget, depth_loss, vertex_normals
-from physhandi.fitting.hand_losses import (
+from physhandi.fitting.hand_reconstruction import (
     JOINT_LIMIT,
+    DepthTarget,
     acceleration_loss,
+    depth_loss,
     keypoint_target,
     limit_loss,
     reprojection_loss,
+    triangulate,
     velocity_loss,
+    vertex_normals,
 )
-from physhandi.fitting.triangulation import triangulate
 from physhandi.hand.model import load_hand_model
 
 

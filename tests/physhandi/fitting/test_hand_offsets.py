@@ -8,7 +8,7 @@ import torch
 from hand_scene import grasping
 from scipy.spatial.transform import Rotation
 
-from physhandi.fitting.hand_offsets import HandOffsets, OffsetDescent, control_nodes
+from physhandi.fitting.hand_refinement import HandOffsets, OffsetDescent, control_nodes
 from physhandi.hand.model import load_hand_model
 
 RATES = {"articulation": 0.01, "rotation": 0.02, "translation": 1e-3}

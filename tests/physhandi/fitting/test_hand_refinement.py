@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from physhandi.errors import CancelledError, SimulationDivergedError
 from physhandi.fitting import hand_refinement
-from physhandi.fitting.hand_losses import keypoint_target
+from physhandi.fitting.hand_reconstruction import keypoint_target
 from physhandi.fitting.hand_refinement import (
     Refinement,
     RefinementConfig,

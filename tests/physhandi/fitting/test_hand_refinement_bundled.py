@@ -11,12 +11,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bundled_sequence import FRAME_RATE
 from refinement_world import mpjpe, mpvpe, with_error
 
 from physhandi import pipeline
 from physhandi.data.run import Run
 from physhandi.errors import CancelledError
 from physhandi.fitting import artefacts, hand_refinement
+from physhandi.fitting.config import config_from_dict, config_to_dict
 from physhandi.fitting.hand_refinement import (
     RefinedHands,
     RefinementConfig,
@@ -24,14 +26,12 @@ from physhandi.fitting.hand_refinement import (
     refine_hands,
 )
 from physhandi.fitting.object_problem import build_problem
-from physhandi.fitting.profile import config_from_dict, config_to_dict
 from physhandi.hand.model import load_hand_model
 from physhandi.hand.motion import HandMotion
 from physhandi.progress import NullProgress, Progress
 from physhandi.simulation.model import SimulationParameters
 from physhandi.simulation.topology import build_model
-from physhandi.synthetic.bundled import FRAME_RATE
-from physhandi.synthetic.scenes import fold_motion
+from physhandi.synthetic.bodies.sheets import fold_motion
 
 SEQUENCES = Path(__file__).parents[3] / "sequences"
 NAME = "towel_fold"

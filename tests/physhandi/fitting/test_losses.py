@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from physhandi.fitting.losses import acceleration_loss, chamfer_loss, track_loss
+from physhandi.fitting.object_problem import acceleration_loss, chamfer_loss, track_loss
 
 
 def test_chamfer_is_one_way_and_squared() -> None:

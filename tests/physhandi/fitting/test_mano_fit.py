@@ -15,9 +15,8 @@ from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.errors import MissingInputError, UsageError
 from physhandi.fitting.artefacts import load_motions
-from physhandi.fitting.hand_config import HandFitConfig
+from physhandi.fitting.config import HandFitConfig, config_from_dict, config_to_dict, load_profile
 from physhandi.fitting.hand_reconstruction import reconstruct_hands
-from physhandi.fitting.profile import config_from_dict, config_to_dict, load_profile
 from physhandi.hand.model import Side, load_hand_model
 
 BUNDLED = Path(__file__).parents[3] / "sequences"

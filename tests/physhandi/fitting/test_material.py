@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from physhandi.errors import FitError
-from physhandi.fitting.material import Material
-from physhandi.fitting.object_config import FirstOrderConfig
+from physhandi.fitting.config import FirstOrderConfig
+from physhandi.fitting.spring_optimisation import Material
 from physhandi.simulation.model import SimulationParameters, SpringMassModel
 
 PARAMETERS = SimulationParameters(

@@ -7,10 +7,9 @@ import pytest
 
 from physhandi.data.observation import ObjectObservation
 from physhandi.errors import CancelledError, FitError
-from physhandi.fitting.object_config import FirstOrderConfig, ObjectFitConfig
-from physhandi.fitting.object_problem import ObjectProblem, build_problem
+from physhandi.fitting.config import FirstOrderConfig, ObjectFitConfig
+from physhandi.fitting.object_problem import ObjectProblem, build_problem, mean_loss
 from physhandi.fitting.object_reconstruction import search_object
-from physhandi.fitting.object_simulation import mean_loss
 from physhandi.fitting.search import SearchConfig, SearchVariable
 from physhandi.fitting.spring_optimisation import optimise_springs
 from physhandi.progress import NullProgress, Progress

@@ -6,9 +6,17 @@ from typing import Any
 import pytest
 
 from physhandi.errors import SettingsError
-from physhandi.fitting.overrides import apply_overrides, changes, values_of
-from physhandi.fitting.profile import config_from_dict, config_to_dict, load_profile
-from physhandi.fitting.settings import GROUPS, INTERVALS, all_settings
+from physhandi.fitting.config import (
+    GROUPS,
+    INTERVALS,
+    all_settings,
+    apply_overrides,
+    changes,
+    config_from_dict,
+    config_to_dict,
+    load_profile,
+    values_of,
+)
 
 QUICK = load_profile("quick")
 

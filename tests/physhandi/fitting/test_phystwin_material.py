@@ -9,12 +9,8 @@ from phystwin_experiment import OPTIMUM, find_springs
 
 from physhandi.data.importers.phystwin_experiment import Checkpoint, Contact, Optimum
 from physhandi.errors import ImportFailedError
-from physhandi.fitting.phystwin_material import (
-    phystwin_model,
-    phystwin_parameters,
-    spring_numbers,
-)
-from physhandi.fitting.profile import load_profile
+from physhandi.fitting.config import load_profile
+from physhandi.fitting.phystwin_run import phystwin_model, phystwin_parameters, spring_numbers
 from physhandi.simulation.model import SimulationParameters
 from physhandi.simulation.topology import build_model
 

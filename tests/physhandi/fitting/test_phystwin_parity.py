@@ -13,12 +13,15 @@ import pytest
 import torch
 
 from physhandi.data.observation import ObjectObservation
-from physhandi.fitting.descent import Descent
-from physhandi.fitting.material import Material
-from physhandi.fitting.object_config import ObjectFitConfig
-from physhandi.fitting.object_problem import ObjectProblem, build_problem
-from physhandi.fitting.object_simulation import build_problem_model, mean_loss, simulate_problem
-from physhandi.fitting.profile import PipelineConfig, load_profile
+from physhandi.fitting.config import ObjectFitConfig, PipelineConfig, load_profile
+from physhandi.fitting.object_problem import (
+    ObjectProblem,
+    build_problem,
+    build_problem_model,
+    mean_loss,
+    simulate_problem,
+)
+from physhandi.fitting.spring_optimisation import Descent, Material
 from physhandi.simulation.model import SpringMassModel
 
 UP = np.array([1.0, -1.0, -1.0], np.float32)

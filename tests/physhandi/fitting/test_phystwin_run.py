@@ -10,7 +10,7 @@ from phystwin_case import FRAMES, Case, edit_pickle, save_pickle, write_case
 from phystwin_experiment import OPTIMUM, Experiment, save_checkpoint, write_experiment
 from sheet_sequence import write_sheet
 
-from app.viewer.content import open_run
+from app.viewer.content.content import open_run
 from physhandi import pipeline
 from physhandi.data.importers.phystwin import import_phystwin
 from physhandi.data.run import Run

@@ -11,9 +11,9 @@ from hand_scene import grasping, looking_at_hand, seen_keypoints, write_scene
 from refinement_world import held_patch, moved
 
 from physhandi.data.observation import ObjectObservation
+from physhandi.fitting.config import FirstOrderConfig, ObjectFitConfig
 from physhandi.fitting.hand_reconstruction import HandFitConfig, reconstruct_hands
 from physhandi.fitting.hand_refinement import RefinementConfig, refine_hands
-from physhandi.fitting.object_config import FirstOrderConfig, ObjectFitConfig
 from physhandi.fitting.object_problem import ObjectProblem, build_problem
 from physhandi.fitting.object_reconstruction import search_object
 from physhandi.fitting.search import SearchConfig, SearchVariable

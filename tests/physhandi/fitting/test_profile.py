@@ -6,13 +6,8 @@ from pathlib import Path
 import pytest
 
 from physhandi.errors import UsageError
-from physhandi.fitting import profile
-from physhandi.fitting.profile import (
-    config_from_dict,
-    config_to_dict,
-    load_profile,
-    profile_names,
-)
+from physhandi.fitting import config
+from physhandi.fitting.config import config_from_dict, config_to_dict, load_profile, profile_names
 
 
 def test_the_four_profiles_of_the_design_exist() -> None:
@@ -58,11 +53,11 @@ def test_the_documentation_tells_every_switch_that_differs() -> None:
     told = table("switch")
     profiles = {name: flat(load_profile(name)) for name in profile_names()}
     for switch, values in told.items():
-        actual = {name: shown(profile[switch]) for name, profile in profiles.items()}
+        actual = {name: shown(config[switch]) for name, config in profiles.items()}
         assert values == actual, switch
     skipped = ("profile", "description", "object_.search.variables", "object_.search.tied")
     for switch in profiles["default"]:
-        is_same = len({str(profile[switch]) for profile in profiles.values()}) == 1
+        is_same = len({str(config[switch]) for config in profiles.values()}) == 1
         assert is_same or switch in told or switch.startswith(skipped), switch
 
 
@@ -153,7 +148,7 @@ def test_a_users_mistake_in_a_file_names_the_profile(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "mine.yaml").write_text("node_spacing: {a: 1}\n")
-    monkeypatch.setattr(profile, "FOLDER", tmp_path)
+    monkeypatch.setattr(config, "FOLDER", tmp_path)
     with pytest.raises(UsageError, match="profile 'mine': node_spacing"):
         load_profile("mine")
 

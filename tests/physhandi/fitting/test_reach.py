@@ -8,7 +8,7 @@ import pytest
 from physhandi.data.observation import ObjectObservation
 from physhandi.errors import FitError, UsageError
 from physhandi.fitting.object_problem import ObjectProblem, build_problem
-from physhandi.fitting.reach import check_problem, check_springs
+from physhandi.fitting.object_reconstruction import check_problem, check_springs
 from physhandi.fitting.search import SearchConfig, SearchVariable
 from physhandi.simulation.model import SimulationParameters
 from physhandi.simulation.topology import build_model

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from physhandi.errors import CancelledError, FitError
-from physhandi.fitting.profile import load_profile
+from physhandi.fitting.config import load_profile
 from physhandi.fitting.search import (
     Judgement,
     SearchConfig,

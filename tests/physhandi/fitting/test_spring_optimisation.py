@@ -10,14 +10,21 @@ import torch
 from physhandi.data.observation import ObjectObservation
 from physhandi.errors import FitError
 from physhandi.fitting import spring_optimisation
-from physhandi.fitting.descent import Descent
-from physhandi.fitting.material import Material
-from physhandi.fitting.object_config import FirstOrderConfig, ObjectFitConfig
-from physhandi.fitting.object_problem import ObjectProblem, build_problem
+from physhandi.fitting.config import FirstOrderConfig, ObjectFitConfig
+from physhandi.fitting.object_problem import (
+    ObjectProblem,
+    build_problem,
+    build_problem_model,
+    mean_loss,
+)
 from physhandi.fitting.object_reconstruction import search_object
-from physhandi.fitting.object_simulation import build_problem_model, mean_loss
 from physhandi.fitting.search import SearchConfig, SearchVariable
-from physhandi.fitting.spring_optimisation import FirstOrderResult, optimise_springs
+from physhandi.fitting.spring_optimisation import (
+    Descent,
+    FirstOrderResult,
+    Material,
+    optimise_springs,
+)
 from physhandi.progress import NullProgress
 from physhandi.simulation.model import SimulationParameters
 

@@ -8,9 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from physhandi.hand.gltf import read_skinned_mesh
 from physhandi.hand.model import JOINT_NAMES, HandPose
-from physhandi.hand.open_hand import ASSETS, SHAPE_NAMES, SHAPE_RATE, OpenHand
+from physhandi.hand.open_hand import ASSETS, SHAPE_NAMES, SHAPE_RATE, OpenHand, read_skinned_mesh
 
 
 def _pose(hand: OpenHand, **changes: Tensor) -> HandPose:

@@ -6,12 +6,7 @@ import pytest
 from scipy.spatial import procrustes
 from scipy.spatial.transform import Rotation
 
-from physhandi.metrics.hand_shape import (
-    hand_chamfer,
-    held_where_missing,
-    joint_errors,
-    vertex_errors,
-)
+from physhandi.metrics.hands import hand_chamfer, held_where_missing, joint_errors, vertex_errors
 
 
 def random_joints(seed: int = 0, frames: int = 3) -> np.ndarray:

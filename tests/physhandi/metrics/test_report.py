@@ -5,9 +5,14 @@ import pytest
 
 from physhandi.data.truth import Truth
 from physhandi.metrics.contact import THRESHOLDS, ContactLabels, ContactReference
-from physhandi.metrics.report import CONTACT_METRICS, METRICS, score_rollout
-from physhandi.metrics.report_curves import CURVES, error_curves
-from physhandi.metrics.report_inputs import Reference
+from physhandi.metrics.report import (
+    CONTACT_METRICS,
+    CURVES,
+    METRICS,
+    ScoringReference,
+    error_curves,
+    score_rollout,
+)
 from physhandi.metrics.truth_metrics import true_surface
 
 NODE = np.array([[0.0, 0, 0], [1.0, 0, 0]])
@@ -32,7 +37,7 @@ def touched() -> ContactReference:
     )
 
 
-def make_reference() -> Reference:
+def make_reference() -> ScoringReference:
     """The true motion rises by 0.1 a frame; its nodes are tracked, and its surface is known."""
     truth = rising(0.1)
     speck = np.array([[0.0, 0, 0], [1e-10, 0, 0], [0, 1e-10, 0]])
@@ -44,7 +49,7 @@ def make_reference() -> Reference:
             object_face=np.arange(6).reshape(2, 3),
         )
     )
-    return Reference(
+    return ScoringReference(
         object_node=NODE,
         point=truth,
         is_visible=np.ones((FRAMES, 2), bool),
@@ -109,7 +114,9 @@ def test_missing_output_counts_as_static() -> None:
 def test_dynamic_chamfer_leaves_out_points_at_rest() -> None:
     truth = rising(0.1)
     truth[:, 1] = NODE[1]
-    reference = Reference(object_node=NODE, point=truth, is_visible=np.ones((FRAMES, 2), bool))
+    reference = ScoringReference(
+        object_node=NODE, point=truth, is_visible=np.ones((FRAMES, 2), bool)
+    )
     report = score_rollout(None, reference, reconstruction_frames=range(FRAMES))
     scores = report["reconstruction"]["rollout"]
     assert scores["chamfer_l2"] == pytest.approx(0.1)
@@ -121,7 +128,7 @@ def test_dynamic_chamfer_leaves_out_points_at_rest() -> None:
 
 
 def test_nothing_dynamic_gives_no_figure() -> None:
-    reference = Reference(
+    reference = ScoringReference(
         object_node=NODE, point=rising(0.0), is_visible=np.ones((FRAMES, 2), bool)
     )
     report = score_rollout(None, reference, reconstruction_frames=range(FRAMES))
@@ -134,7 +141,7 @@ def test_the_two_kinds_of_chamfer_see_different_points_in_different_norms() -> N
     visible = np.ones((2, 2), bool)
     cloud = (NODE, np.array([[0.0, 0.3, 0.4], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]))
     point = np.stack([NODE, NODE + np.array([0.0, 0.6, 0.8])])
-    reference = Reference(object_node=NODE, point=point, is_visible=visible, cloud=cloud)
+    reference = ScoringReference(object_node=NODE, point=point, is_visible=visible, cloud=cloud)
     curves = error_curves(np.stack([NODE, NODE]), reference)
     assert curves["chamfer_phystwin"][1] == pytest.approx(1.4)  # Tracks, |dx| + |dy| + |dz|.
     assert curves["chamfer_l1"][1] == pytest.approx((0.7 + 0 + 1) / 3)
@@ -145,7 +152,7 @@ def test_the_two_kinds_of_chamfer_see_different_points_in_different_norms() -> N
 def test_inner_nodes_do_not_help_a_surface_but_may_hold_a_track() -> None:
     node = np.array([[0.0, 0, 0], [0.0, 0, 0.5]])
     point = np.array([[[0.0, 0, 0.45]], [[0.0, 0, 0.45]]])
-    reference = Reference(
+    reference = ScoringReference(
         object_node=node, surface_count=1, point=point, is_visible=np.ones((2, 1), bool)
     )
     curves = error_curves(np.stack([node, node]), reference)
@@ -162,13 +169,13 @@ def test_tracks_are_known_by_their_node_or_carried_by_those_around() -> None:
     visible[0, 1] = False  # Nobody knows where on the object this one is.
     visible[3] = False
     point[:, 1] += 5.0
-    plain = Reference(object_node=NODE, point=point, is_visible=visible)
+    plain = ScoringReference(object_node=NODE, point=point, is_visible=visible)
     carried = error_curves(rollout, plain)
     assert carried["track_error"][:3] == pytest.approx([0.0, 0.03, 0.06], abs=1e-12)
     assert np.isnan(carried["track_error"][3])
     assert carried["track_error_phystwin"][1] == pytest.approx(np.hypot(0.5, 0.03))
     assert carried["track_error_phystwin"][3] == 0.0
-    named = Reference(
+    named = ScoringReference(
         object_node=NODE, point=point, is_visible=visible, node_of_track=np.array([1, 1])
     )
     gaps = np.linalg.norm(point[1] - rollout[1, 1], axis=1)
@@ -178,7 +185,7 @@ def test_tracks_are_known_by_their_node_or_carried_by_those_around() -> None:
 def test_annotated_points_replace_tracks_where_tracks_are_scored() -> None:
     annotated = rising(0.2)
     annotated[2, 0] = np.nan
-    reference = Reference(
+    reference = ScoringReference(
         object_node=NODE,
         point=rising(0.1),
         is_visible=np.ones((FRAMES, 2), bool),
@@ -191,7 +198,7 @@ def test_annotated_points_replace_tracks_where_tracks_are_scored() -> None:
 
 
 def test_contact_is_scored_for_every_method() -> None:
-    reference = Reference(
+    reference = ScoringReference(
         object_node=NODE,
         point=rising(0.1),
         is_visible=np.ones((FRAMES, 2), bool),

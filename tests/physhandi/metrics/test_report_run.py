@@ -8,7 +8,7 @@ from safetensors.numpy import save_file
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence import Sequence
-from physhandi.data.sequence_schema import SequenceMeta, ViewMeta
+from physhandi.data.sequence_meta import SequenceMeta, ViewMeta
 from physhandi.data.sequence_writer import write_sequence
 from physhandi.errors import RunError
 from physhandi.metrics.report import frame_errors, measure_run, score_run

@@ -2,9 +2,15 @@
 
 import re
 
-from physhandi.metrics.suite_layout import Column, laid_out, latex_table, markdown_table
-from physhandi.metrics.suite_plots import bar_chart, line_chart
-from physhandi.metrics.suite_tables import Row
+from physhandi.metrics.suite_report import (
+    Column,
+    Row,
+    bar_chart,
+    laid_out,
+    latex_table,
+    line_chart,
+    markdown_table,
+)
 
 SHOWN = (
     Column(split="future", metric="track_error", title="Track [mm]", factor=1000.0),

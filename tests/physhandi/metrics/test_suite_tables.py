@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import bootstrap
 
-from physhandi.metrics.suite_tables import (
+from physhandi.metrics.suite_report import (
     COLUMNS,
     PAIRED_COLUMNS,
     Score,

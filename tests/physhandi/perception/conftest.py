@@ -5,7 +5,7 @@ import pytest
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence import Sequence, ViewMeta
-from physhandi.data.sequence_schema import SequenceMeta
+from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import SequenceWriter
 
 RISE = 0.01

@@ -11,18 +11,19 @@ from recordings import recording
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.exporters.overlay import hand_overlay
 from physhandi.data.sequence import Sequence, ViewMeta
-from physhandi.data.sequence_schema import SequenceMeta
+from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import SequenceWriter
 from physhandi.errors import CancelledError, MissingInputError
-from physhandi.hand.keypoint_offset import KEYPOINT_OFFSET
 from physhandi.hand.model import load_hand_model
-from physhandi.hand.open_hand import OpenHand
-from physhandi.perception.hand_networks import Region, landmark_region, overlap
+from physhandi.hand.open_hand import KEYPOINT_OFFSET, OpenHand
 from physhandi.perception.keypoints import (
     DetectedHand,
     KeypointDetector,
+    Region,
     assign_hands,
     detect_sequence,
+    landmark_region,
+    overlap,
 )
 from physhandi.progress import Progress
 

@@ -4,7 +4,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from physhandi.data.sequence_schema import SequenceMeta
+from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import write_sequence
 from physhandi.errors import CancelledError, MissingInputError
 from physhandi.perception.lifting import fuse, hand_points, observe_object, surface_points

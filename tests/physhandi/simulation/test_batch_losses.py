@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from physhandi.simulation.batch import BatchSimulator
-from physhandi.simulation.batch_losses import MotionTarget
-from physhandi.simulation.master import MasterTopology
+from physhandi.simulation.engines.batch import BatchSimulator, MotionTarget
+from physhandi.simulation.master_topology import MasterTopology
 from physhandi.simulation.model import SimulationParameters
 from physhandi.simulation.simulator import Simulator
 

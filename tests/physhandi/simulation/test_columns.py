@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from reference.scenes import as_model, star_scene
 
-from physhandi.simulation.columns import arrange_columns
+from physhandi.simulation.engines.cuda import arrange_columns
+from physhandi.simulation.engines.partition import partition_model
 from physhandi.simulation.model import SimulationParameters
-from physhandi.simulation.partition import partition_model
 from physhandi.simulation.topology import build_model
 
 

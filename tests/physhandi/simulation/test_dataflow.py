@@ -9,8 +9,8 @@ from reference.scenes import as_model, bare_scene, star_scene
 from reference.spring_mass import simulate
 
 from physhandi.errors import SimulationDivergedError
-from physhandi.simulation.dataflow import Dataflow, DataflowAdjoint
-from physhandi.simulation.frame_adjoint import FrameAdjoint
+from physhandi.simulation.engines.cuda import Dataflow, DataflowAdjoint
+from physhandi.simulation.engines.graph_adjoint import FrameAdjoint
 from physhandi.simulation.simulator import Simulator
 
 

@@ -11,14 +11,15 @@ from reference.scenes import as_model, loose_scene, star_scene, tiny_scene
 from reference.spring_mass import simulate
 
 from physhandi.errors import SimulationDivergedError
-from physhandi.simulation import dataflow, differentiable
-from physhandi.simulation.batch import BatchSimulator
-from physhandi.simulation.dataflow import Dataflow, DataflowAdjoint
-from physhandi.simulation.frame_adjoint import FrameAdjoint
-from physhandi.simulation.master import MasterTopology
+from physhandi.simulation import differentiable
+from physhandi.simulation.engines import cuda
+from physhandi.simulation.engines.batch import BatchSimulator
+from physhandi.simulation.engines.cpu import Threaded, ThreadedAdjoint
+from physhandi.simulation.engines.cuda import Dataflow, DataflowAdjoint
+from physhandi.simulation.engines.graph_adjoint import FrameAdjoint
+from physhandi.simulation.master_topology import MasterTopology
 from physhandi.simulation.model import SimulationParameters
 from physhandi.simulation.simulator import Simulator
-from physhandi.simulation.threaded import Threaded, ThreadedAdjoint
 
 WAYS = [
     "threaded on cpu",
@@ -46,7 +47,7 @@ def way(request, monkeypatch):
     if device != "cpu" and not wp.is_cuda_available():
         pytest.skip("needs a CUDA device")
     if name == "large frame":
-        monkeypatch.setattr(dataflow, "FORWARD_LOCALS", 0)
+        monkeypatch.setattr(cuda, "FORWARD_LOCALS", 0)
     return name, device
 
 

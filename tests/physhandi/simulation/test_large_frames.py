@@ -9,10 +9,10 @@ from reference.blocks import PARAMETERS, as_scene, block_gradients, recorded, th
 from reference.spring_mass import simulate
 
 from physhandi.errors import SimulationDivergedError
-from physhandi.simulation import dataflow, large_frames
+from physhandi.simulation.engines import cuda
+from physhandi.simulation.engines.cuda import LargeLayout, most_large_locals
+from physhandi.simulation.engines.partition import Partition
 from physhandi.simulation.kernels.dataflow import FORWARD_LOCALS
-from physhandi.simulation.large_frames import LargeLayout, most_large_locals
-from physhandi.simulation.partition import Partition
 from physhandi.simulation.simulator import Simulator
 
 H200_BYTES = 232448
@@ -38,11 +38,11 @@ def large(monkeypatch):
 
     if not wp.is_cuda_available():
         pytest.skip("needs a CUDA device")
-    monkeypatch.setattr(dataflow, "FORWARD_LOCALS", 0)
+    monkeypatch.setattr(cuda, "FORWARD_LOCALS", 0)
 
     def make(model, parameters=PARAMETERS, layout=None):
         if layout is not None:
-            monkeypatch.setattr(large_frames.LargeLayout, "of", lambda *_: layout)
+            monkeypatch.setattr(cuda.LargeLayout, "of", lambda *_: layout)
         simulator = Simulator(model, parameters, device="cuda:0")
         assert simulator.engine.large is not None
         return simulator
@@ -188,7 +188,7 @@ def test_divergence_names_the_same_substep(large):
 @pytest.mark.gpu
 def test_gradients_go_the_recorded_way(large, monkeypatch):
     model, control = thrown_block(5, frames=3)
-    monkeypatch.setattr(dataflow, "ADJOINT_LOCALS", 0)
+    monkeypatch.setattr(cuda, "ADJOINT_LOCALS", 0)
     theirs = block_gradients(model, control, PARAMETERS, "cuda:0")
     monkeypatch.undo()
     ours = block_gradients(model, control, replace(PARAMETERS, frame_rate=30.0 + 1e-9), "cuda:0")

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from physhandi.simulation import memory
-from physhandi.simulation.memory import container_memory, free_memory
+from physhandi.simulation.engines import tape
+from physhandi.simulation.engines.tape import container_memory, free_memory
 
 
 def write(folder: Path, files: dict[str, str]) -> Path:
@@ -43,7 +43,7 @@ def test_the_smaller_of_machine_and_container_counts(tmp_path, monkeypatch):
     device = SimpleNamespace(is_cuda=False)
     machine = SimpleNamespace(available=2000)
     monkeypatch.setattr("psutil.virtual_memory", lambda: machine)
-    monkeypatch.setattr(memory, "_CGROUP", tmp_path)
+    monkeypatch.setattr(tape, "_CGROUP", tmp_path)
     assert free_memory(device) == 2000
     write(tmp_path, {"memory.max": "1000\n", **VERSION_2})
     assert free_memory(device) == 450

@@ -6,8 +6,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from physhandi.simulation.engines.partition import bisect_nodes, group_springs, partition_model
 from physhandi.simulation.model import SimulationParameters
-from physhandi.simulation.partition import bisect_nodes, group_springs, partition_model
 from physhandi.simulation.topology import build_model
 
 

@@ -12,8 +12,8 @@ from reference.spring_mass import simulate
 
 from physhandi.errors import SimulationDivergedError
 from physhandi.simulation import differentiable
+from physhandi.simulation.engines.cpu import Threaded, ThreadedAdjoint
 from physhandi.simulation.simulator import Simulator
-from physhandi.simulation.threaded import Threaded, ThreadedAdjoint
 
 pytestmark = pytest.mark.skipif(not wp.is_cpu_available(), reason="this Warp has no CPU device")
 

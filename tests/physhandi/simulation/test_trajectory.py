@@ -10,8 +10,9 @@ from reference.blocks import PARAMETERS, block_gradients, thrown_block
 from reference.gradients import gradients, loss_weights
 from reference.scenes import as_model, crossing_scene, cube_scene
 
-from physhandi.simulation import dataflow, differentiable, frame_adjoint, threaded, trajectory
-from physhandi.simulation.trajectory import Trajectory, frame_bytes, memory_budget, stored_frames
+from physhandi.simulation import differentiable
+from physhandi.simulation.engines import cpu, cuda, graph_adjoint, tape
+from physhandi.simulation.engines.tape import Trajectory, frame_bytes, memory_budget, stored_frames
 
 FRAMES = 7
 
@@ -27,7 +28,7 @@ SCENES = {"engine": cube_scene, "recorded": cube_scene, "collisions": crossing_s
 
 @pytest.fixture(autouse=True)
 def nothing_spare(monkeypatch):
-    monkeypatch.setattr(trajectory, "_spare", {})
+    monkeypatch.setattr(tape, "_spare", {})
 
 
 class Counter:
@@ -45,10 +46,10 @@ class Counter:
 
 def test_bytes_of_two_hundred_frames_of_five_thousand_nodes():
     # Three vectors of four floats; states of eight floats and vectors of four; vectors of three.
-    fast = dataflow.tape_layout(5000, 667)
-    on_cpu = threaded.tape_layout(5000, 5000, 667)
-    plain = frame_adjoint.tape_layout(5000, 667, collides=False)
-    colliding = frame_adjoint.tape_layout(5000, 667, collides=True)
+    fast = cuda.tape_layout(5000, 667)
+    on_cpu = cpu.tape_layout(5000, 5000, 667)
+    plain = graph_adjoint.tape_layout(5000, 667, collides=False)
+    colliding = graph_adjoint.tape_layout(5000, 667, collides=True)
     assert 200 * frame_bytes(fast) == 32_016_000_000
     assert 200 * frame_bytes(on_cpu) == 32_048_000_000
     assert 200 * frame_bytes(plain) == 24_036_000_000
@@ -58,7 +59,7 @@ def test_bytes_of_two_hundred_frames_of_five_thousand_nodes():
 def test_the_room_taken_is_what_was_counted(device):
     model, parameters = as_model(cube_scene())
     layout = differentiable.tape_layout(model, parameters, device)
-    tapes = trajectory._take(wp.get_device(device), layout, 2)
+    tapes = tape._take(wp.get_device(device), layout, 2)
     assert sum(array.capacity for tape in tapes for array in tape) == 2 * frame_bytes(layout)
     assert all(array.shape[0] >= parameters.substeps_per_frame for array in tapes[0])
 
@@ -99,8 +100,8 @@ def test_the_last_frames_are_kept_and_make_room_for_the_others(device, stored):
 
 
 def test_memory_is_handed_on_and_only_once(device, monkeypatch):
-    made, real = [], trajectory._room
-    monkeypatch.setattr(trajectory, "_room", lambda *args: made.append(real(*args)) or made[-1])
+    made, real = [], tape._room
+    monkeypatch.setattr(tape, "_room", lambda *args: made.append(real(*args)) or made[-1])
 
     def walked(frames, size=5):
         kept = Trajectory(Counter(size), wp.get_device(device), frames, 10**9)
@@ -109,7 +110,7 @@ def test_memory_is_handed_on_and_only_once(device, monkeypatch):
         return kept, {id(array) for frame in range(1, frames + 1) for array in kept.tape(frame)}
 
     def spare():
-        ((layout, tapes),) = trajectory._spare.values()
+        ((layout, tapes),) = tape._spare.values()
         return layout, len(tapes)
 
     first, mine = walked(3)
@@ -127,14 +128,14 @@ def test_memory_is_handed_on_and_only_once(device, monkeypatch):
     assert spare() == (Counter().layout, 7)
     # Room of another shape is of no use, and is not kept beside.
     others = walked(1, size=6)[0], walked(2, size=7)[0]
-    assert not trajectory._spare
+    assert not tape._spare
     for kept, size, count in zip(others, (6, 7), (1, 2), strict=True):
         kept.release()
         assert spare() == (Counter(size).layout, count)
 
 
 def test_the_budget_is_a_part_of_what_is_free_or_spare(device, monkeypatch):
-    monkeypatch.setattr(trajectory, "free_memory", lambda _: 10_000)
+    monkeypatch.setattr(tape, "free_memory", lambda _: 10_000)
     share = 0.25 if device == "cpu" else 0.5
     assert memory_budget(device) == share * 10_000
     kept = Trajectory(Counter(), wp.get_device(device), 4, 10**9)
@@ -165,7 +166,7 @@ def adjoint_of(kind, scene, device, monkeypatch):
 
     for name in calls:
         monkeypatch.setattr(bridge.adjoint, name, counted(name, getattr(bridge.adjoint, name)))
-    is_recorded = isinstance(bridge.adjoint, frame_adjoint.FrameAdjoint)
+    is_recorded = isinstance(bridge.adjoint, graph_adjoint.FrameAdjoint)
     assert is_recorded == (kind != "engine")
     return bridge.adjoint, calls
 
@@ -204,7 +205,7 @@ def test_only_frames_that_do_not_fit_are_simulated_again(device, stored, monkeyp
     # The budget is that of a device on which so many frames and a half fit.
     share = 0.25 if device == "cpu" else 0.5
     free = int((stored + 0.5) * frame_bytes(adjoint.layout) / share)
-    monkeypatch.setattr(trajectory, "free_memory", lambda _: free)
+    monkeypatch.setattr(tape, "free_memory", lambda _: free)
     log = torch.tensor(np.log(scene.stiffness), requires_grad=True)
     position, _ = differentiable.rollout(
         *as_model(scene), torch.tensor(scene.control), log_stiffness=log, device=device

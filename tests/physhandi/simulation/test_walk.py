@@ -7,10 +7,10 @@ import pytest
 import warp as wp
 from reference.blocks import PARAMETERS, thrown_block
 
-from physhandi.simulation import walk
+from physhandi.simulation.engines import cpu
+from physhandi.simulation.engines.cpu import FIRST_PAUSE, TRIAL, Pace
 from physhandi.simulation.kernels.meeting import ABORT, NO_STOP, meet
 from physhandi.simulation.simulator import Simulator
-from physhandi.simulation.walk import FIRST_PAUSE, TRIAL, Pace
 
 needs_processor = pytest.mark.skipif(
     not wp.is_cpu_available(), reason="this Warp has no CPU device"
@@ -124,7 +124,7 @@ def test_a_walk_that_stopped_early_goes_on(block, monkeypatch):
 def test_a_busy_companion_leaves_one_thread(block, monkeypatch):
     simulator, control, wanted, frame = block
     monkeypatch.setattr(frame, "_together", ())
-    companion = walk._companion(walk.os.getpid())
+    companion = cpu._companion(cpu.os.getpid())
     with companion.lock:
         assert np.array_equal(simulator.rollout(control).position, wanted)
 
@@ -201,7 +201,7 @@ def test_a_pause_between_trials_grows():
             trials.append(clock.now)
     gaps = np.diff(trials)
     assert gaps[0] == pytest.approx(FIRST_PAUSE, abs=0.05)
-    assert gaps[-1] == pytest.approx(walk.LONGEST_PAUSE, abs=0.05)
+    assert gaps[-1] == pytest.approx(cpu.LONGEST_PAUSE, abs=0.05)
 
 
 def test_one_processor_means_one_thread():

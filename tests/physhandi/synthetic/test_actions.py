@@ -4,13 +4,13 @@ from functools import cache
 import numpy as np
 import pytest
 
-from physhandi.data.sequence_schema import Side
+from physhandi.data.sequence_meta import Side
 from physhandi.errors import UsageError
-from physhandi.synthetic.actions import ACTIONS, script_action
-from physhandi.synthetic.bodies import Body, make_body
-from physhandi.synthetic.grasp import INDEX, THUMB, fingertip
-from physhandi.synthetic.hand_script import HandScript
-from physhandi.synthetic.true_hand import TrueHand, load_true_hand
+from physhandi.synthetic.bodies.bodies import Body, make_body
+from physhandi.synthetic.hands.actions import ACTIONS, script_action
+from physhandi.synthetic.hands.grasp import INDEX, THUMB, fingertip
+from physhandi.synthetic.hands.script import HandScript
+from physhandi.synthetic.hands.true_hand import TrueHand, load_true_hand
 
 HANDS: dict[Side, TrueHand] = {
     "right": load_true_hand("right", seed=0),

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from physhandi.errors import UsageError
-from physhandi.synthetic.bodies import BodyName, make_body
-from physhandi.synthetic.tubes import ROUND, tube_faces, tube_vertices
+from physhandi.synthetic.bodies.bodies import BodyName, make_body
+from physhandi.synthetic.bodies.tubes import ROUND, tube_faces, tube_vertices
 
 NAMES = get_args(BodyName)
 

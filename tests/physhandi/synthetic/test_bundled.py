@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from bundled_sequence import Recipe, Truth, generate_bundled, make_truth
 from scipy.spatial import cKDTree
 
 from physhandi.data.sequence import Sequence
@@ -15,7 +16,6 @@ from physhandi.perception.shape import object_nodes_from_observation
 from physhandi.progress import Progress
 from physhandi.simulation.model import SimulationParameters
 from physhandi.simulation.topology import virtual_springs
-from physhandi.synthetic.bundled import Recipe, Truth, generate_bundled, make_truth
 
 SMALL = Recipe(
     frame_count=8,

@@ -14,15 +14,14 @@ from physhandi import pipeline
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence, ViewMeta
-from physhandi.data.sequence_schema import SequenceMeta
+from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import write_sequence
 from physhandi.errors import CancelledError, UsageError
 from physhandi.progress import NullProgress, Progress
-from physhandi.synthetic import cells
-from physhandi.synthetic.baselines import METHODS, parse_method
-from physhandi.synthetic.cell_scores import add_photometric
-from physhandi.synthetic.cells import Bench
-from physhandi.synthetic.code_hash import INPUTS, PREDICTIONS, SCORES, code_version
+from physhandi.synthetic.code_version import INPUTS, PREDICTIONS, SCORES, code_version
+from physhandi.synthetic.suite import cells
+from physhandi.synthetic.suite.cells import Bench, add_photometric
+from physhandi.synthetic.suite.methods import METHODS, parse_method
 
 LIBRARY = Path(physhandi.__file__).parent
 FRAMES = 4

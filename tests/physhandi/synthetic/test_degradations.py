@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from physhandi.errors import UsageError
-from physhandi.synthetic.cameras import (
+from physhandi.synthetic.film.cameras import (
     FARTHEST,
     FOCAL_LENGTH,
     NEAREST,
@@ -14,8 +14,15 @@ from physhandi.synthetic.cameras import (
     make_viewpoints,
     window_around,
 )
-from physhandi.synthetic.degradations import Degradations, depth_sensor, hand_shift, miscalibrated
-from physhandi.synthetic.presets import PRESETS, changed, find_preset
+from physhandi.synthetic.film.degradations import (
+    PRESETS,
+    Degradations,
+    changed,
+    depth_sensor,
+    find_preset,
+    hand_shift,
+    miscalibrated,
+)
 
 BOX = np.array([[x, y, z] for x in (-0.2, 0.2) for y in (-0.15, 0.15) for z in (0.0, 0.2)])
 

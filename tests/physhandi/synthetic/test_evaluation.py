@@ -14,11 +14,10 @@ from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.errors import MissingInputError, UsageError
 from physhandi.progress import Progress
-from physhandi.synthetic.baselines import parse_method
-from physhandi.synthetic.cells import Bench
-from physhandi.synthetic.evaluation import evaluate
-from physhandi.synthetic.suite_scores import contact_kind
-from physhandi.synthetic.suite_tasks import list_tasks
+from physhandi.synthetic.suite.cells import Bench
+from physhandi.synthetic.suite.evaluation import evaluate, list_tasks
+from physhandi.synthetic.suite.folder import contact_kind
+from physhandi.synthetic.suite.methods import parse_method
 
 
 @pytest.fixture(scope="module")

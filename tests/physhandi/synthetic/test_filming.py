@@ -10,8 +10,8 @@ import pytest
 
 from physhandi.data.sequence_writer import SequenceWriter
 from physhandi.errors import SequenceError, describe
-from physhandi.synthetic import filming
-from physhandi.synthetic.filming import save_video
+from physhandi.synthetic.film import filming
+from physhandi.synthetic.film.filming import save_video
 
 COUNT = 12
 Damage = Callable[[Path], None]

@@ -3,7 +3,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from physhandi.errors import SequenceError
-from physhandi.synthetic.grasp import (
+from physhandi.synthetic.hands.grasp import (
     INDEX,
     LITTLE,
     MIDDLE,
@@ -16,7 +16,7 @@ from physhandi.synthetic.grasp import (
     orientation_towards,
     reach,
 )
-from physhandi.synthetic.true_hand import HandPose, TrueHand, load_true_hand
+from physhandi.synthetic.hands.true_hand import HandPose, TrueHand, load_true_hand
 
 UP = np.array([0.0, 0.0, 1.0])
 

@@ -14,17 +14,16 @@ from physhandi import pipeline
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence, ViewMeta
-from physhandi.data.sequence_schema import SequenceMeta
+from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import write_sequence
 from physhandi.errors import CancelledError
 from physhandi.hand.model import load_hand_model
 from physhandi.hand.motion import HandMotion
 from physhandi.progress import NullProgress, Progress
-from physhandi.synthetic import baselines
-from physhandi.synthetic.baselines import METHODS, execute, parse_method
-from physhandi.synthetic.cells import Bench
-from physhandi.synthetic.hand_noise import HandNoise, disturbed
-from physhandi.synthetic.scenes import fold_motion
+from physhandi.synthetic.bodies.sheets import fold_motion
+from physhandi.synthetic.suite import methods
+from physhandi.synthetic.suite.cells import Bench
+from physhandi.synthetic.suite.methods import METHODS, HandNoise, disturbed, execute, parse_method
 
 NOISE = HandNoise(error=0.010, seed=5)
 HAND = "sequences/scene/hand_right.safetensors"
@@ -127,9 +126,9 @@ def test_hands_are_disturbed_once_even_if_the_work_is_killed_at_it(
             disturb(*arguments)
         raise KeyboardInterrupt
 
-    disturb = baselines.disturb_hands
+    disturb = methods.disturb_hands
     with monkeypatch.context() as patch:
-        patch.setattr(baselines, "disturb_hands", killed)
+        patch.setattr(methods, "disturb_hands", killed)
         with pytest.raises(KeyboardInterrupt):
             run_of(recording, tmp_path / "noisy", hands=hands, noise=NOISE)
     assert Run.open(tmp_path / "noisy").stages() == []

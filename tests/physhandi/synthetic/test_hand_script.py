@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from physhandi.synthetic.hand_script import HandScript, Move, Tremor, minimum_jerk
-from physhandi.synthetic.true_hand import BONE_COUNT, HandPose
+from physhandi.synthetic.hands.script import HandScript, Move, Tremor, minimum_jerk
+from physhandi.synthetic.hands.true_hand import BONE_COUNT, HandPose
 
 
 def key(x: float, *, turn: float = 0.0, flexion: float = 0.0) -> HandPose:

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from physhandi.data.sequence_schema import Side
-from physhandi.synthetic.actions import script_action
-from physhandi.synthetic.bodies import make_body
+from physhandi.data.sequence_meta import Side
+from physhandi.synthetic.bodies.bodies import make_body
 from physhandi.synthetic.engines.mujoco_flex import simulate_truth
-from physhandi.synthetic.true_hand import TrueHand, load_true_hand
+from physhandi.synthetic.hands.actions import script_action
+from physhandi.synthetic.hands.true_hand import TrueHand, load_true_hand
 
 FRAMES = 24
 

@@ -1,7 +1,7 @@
 import numpy as np
 
 from physhandi.data.camera import PinholeCamera
-from physhandi.synthetic.rasterizer import rasterize, vertex_normals
+from physhandi.synthetic.film.rasterizer import rasterize, vertex_normals
 
 
 def camera(width: int = 64, height: int = 48) -> PinholeCamera:

@@ -10,17 +10,16 @@ from scipy.spatial import cKDTree
 from synthetic_world import bare_hands, distance_to_sheet, lifted_sheet
 
 from physhandi.data.sequence import Sequence, ViewMeta
-from physhandi.data.sequence_schema import SequenceMeta
+from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import SequenceWriter
 from physhandi.data.truth import read_truth
 from physhandi.perception.lifting import hand_points, observe_object
 from physhandi.progress import NullProgress
-from physhandi.synthetic.cameras import Viewpoint, make_viewpoints
-from physhandi.synthetic.degradations import Degradations
-from physhandi.synthetic.presets import PRESETS
-from physhandi.synthetic.recording import record
-from physhandi.synthetic.rendering import resized
-from physhandi.synthetic.stage import make_stage, spread_points, surface_area
+from physhandi.synthetic.film.cameras import Viewpoint, make_viewpoints
+from physhandi.synthetic.film.degradations import PRESETS, Degradations
+from physhandi.synthetic.film.filmed_scene import make_filmed_scene, spread_points, surface_area
+from physhandi.synthetic.film.recording import record
+from physhandi.synthetic.film.rendering import resized
 
 FRAMES = 4
 CLEAN = PRESETS["clean"]
@@ -37,7 +36,7 @@ def write(
 ) -> Sequence:
     """Record a lifted sheet with two cameras, in small images if there are any."""
     truth = lifted_sheet(FRAMES, sides)
-    stage = make_stage(truth, bare_hands(truth), level, seed)
+    stage = make_filmed_scene(truth, bare_hands(truth), level, seed)
     views = make_viewpoints(stage.extent(), 2, level, seed)
     if images == "all":
         views = tuple(
@@ -190,8 +189,8 @@ def test_a_misplaced_hand_is_filmed_where_it_is_found_but_told_where_it_is(tmp_p
 
 def test_soft_tissue_thickens_the_filmed_hand_only():
     truth = lifted_sheet(2)
-    bare = make_stage(truth, bare_hands(truth), CLEAN, 1).hands[0]
-    soft = make_stage(truth, bare_hands(truth), PRESETS["default"], 1).hands[0]
+    bare = make_filmed_scene(truth, bare_hands(truth), CLEAN, 1).hands[0]
+    soft = make_filmed_scene(truth, bare_hands(truth), PRESETS["default"], 1).hands[0]
     distance = np.linalg.norm(soft.vertex - bare.vertex, axis=-1)
     assert distance.min() > 0.0008
     assert 0.0010 < distance.mean() < 0.0020

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from synthetic_world import bare_hands, lifted_sheet
 
-from physhandi.synthetic.cameras import make_viewpoints, window_around
-from physhandi.synthetic.degradations import Degradations
-from physhandi.synthetic.rendering import (
+from physhandi.synthetic.film.cameras import make_viewpoints, window_around
+from physhandi.synthetic.film.degradations import Degradations
+from physhandi.synthetic.film.filmed_scene import make_filmed_scene
+from physhandi.synthetic.film.rendering import (
     Dye,
     compose,
     look_at,
@@ -15,7 +16,6 @@ from physhandi.synthetic.rendering import (
     resized,
     shadow_points,
 )
-from physhandi.synthetic.stage import make_stage
 
 SQUARE = np.array([[-0.1, -0.1, 0.0], [0.1, -0.1, 0.0], [0.1, 0.1, 0.0], [-0.1, 0.1, 0.0]])
 FACES = np.array([[0, 1, 2], [0, 2, 3]])
@@ -24,7 +24,7 @@ FACES = np.array([[0, 1, 2], [0, 2, 3]])
 @pytest.fixture(scope="module")
 def stage():
     truth = lifted_sheet(2, ("right", "left"))
-    return make_stage(truth, bare_hands(truth), Degradations(), 0)
+    return make_filmed_scene(truth, bare_hands(truth), Degradations(), 0)
 
 
 def raised(height: float):

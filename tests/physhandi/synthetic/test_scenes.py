@@ -5,7 +5,7 @@ from scipy.spatial import cKDTree
 from physhandi.hand.model import load_hand_model
 from physhandi.simulation.model import SimulationParameters
 from physhandi.simulation.topology import build_model
-from physhandi.synthetic.scenes import (
+from physhandi.synthetic.bodies.sheets import (
     FINGERTIPS,
     fold_motion,
     make_sheet,

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from physhandi.synthetic.sensors import (
+from physhandi.synthetic.film.sensors import (
     DepthSensor,
     detect_keypoints,
     segment,

@@ -13,13 +13,12 @@ from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_writer import write_sequence
 from physhandi.errors import UsageError
 from physhandi.progress import NullProgress
-from physhandi.synthetic import generator_version as module
+from physhandi.synthetic import code_version as module
 from physhandi.synthetic import synthesize as generator
-from physhandi.synthetic.baselines import parse_method, settings_of
-from physhandi.synthetic.bodies import make_body
-from physhandi.synthetic.code_hash import code_hash
-from physhandi.synthetic.generator_version import generator_version, outdated
-from physhandi.synthetic.suite import SUITES, Scene, Suite, make_one_by_one, make_recordings
+from physhandi.synthetic.bodies.bodies import make_body
+from physhandi.synthetic.code_version import code_hash, generator_version, outdated
+from physhandi.synthetic.suite.methods import parse_method, settings_of
+from physhandi.synthetic.suite.suite import SUITES, Scene, Suite, make_one_by_one, make_recordings
 
 SUITE = Suite(
     name="tiny",

@@ -12,10 +12,10 @@ from suite_world import order_of, table, write_told
 from physhandi.data.sequence import Sequence
 from physhandi.errors import CancelledError, UsageError
 from physhandi.progress import Progress
-from physhandi.synthetic import evaluation
-from physhandi.synthetic.cells import Bench
-from physhandi.synthetic.evaluation import evaluate
-from physhandi.synthetic.generator_version import generator_version
+from physhandi.synthetic.code_version import generator_version
+from physhandi.synthetic.suite import evaluation
+from physhandi.synthetic.suite.cells import Bench
+from physhandi.synthetic.suite.evaluation import evaluate
 
 
 @pytest.fixture(scope="module")

@@ -3,8 +3,8 @@
 import pytest
 
 from physhandi.errors import UsageError
-from physhandi.synthetic.baselines import METHODS, parse_method, settings_of, shared_stages
-from physhandi.synthetic.suite import SUITES, check_seeds, find_suite
+from physhandi.synthetic.suite.methods import METHODS, parse_method, settings_of, shared_stages
+from physhandi.synthetic.suite.suite import SUITES, check_seeds, find_suite
 
 
 def test_a_name_says_base_settings_and_correction() -> None:

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from physhandi.data.sequence_schema import Side
+from physhandi.data.sequence_meta import Side
 from physhandi.hand.model import load_hand_model
-from physhandi.synthetic.rasterizer import vertex_normals
-from physhandi.synthetic.true_hand import (
+from physhandi.synthetic.film.rasterizer import vertex_normals
+from physhandi.synthetic.hands.true_hand import (
     ASSET,
     BONE_COUNT,
     FINGERTIPS,

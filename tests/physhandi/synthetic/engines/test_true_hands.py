@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from physhandi.synthetic.actions import script_action
-from physhandi.synthetic.bodies import make_body
+from physhandi.synthetic.bodies.bodies import make_body
 from physhandi.synthetic.engines.mujoco_flex import simulate_truth
-from physhandi.synthetic.true_hand import load_true_hand
+from physhandi.synthetic.hands.actions import script_action
+from physhandi.synthetic.hands.true_hand import load_true_hand
 
 pytest.importorskip("mujoco")
 

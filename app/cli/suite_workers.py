@@ -1,0 +1,338 @@
+"""Processes that make the sequences of a suite and fill its cells, a few side by side."""
+
+import itertools
+import json
+import os
+import queue
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Sequence as Many
+from contextlib import suppress
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, TextIO
+
+from app.child import die_with_parent, start_module
+from physhandi import errors
+from physhandi.data.sequence import Sequence
+from physhandi.errors import PhysHandiError, UsageError, describe
+from physhandi.progress import Progress
+from physhandi.synthetic.suite.evaluation import Fill, Order, Task
+from physhandi.synthetic.suite.suite import Making
+
+_TELL_EVERY = 0.5
+
+
+def order_to_json(order: Order) -> dict[str, Any]:
+    """Write an order down for another process; recordings are told by their folders."""
+    about = {field.name: getattr(order, field.name) for field in fields(order)}
+    about["settings"] = dict(order.settings)
+    return about | {"recordings": [str(r.folder.resolve()) for r in order.recordings]}
+
+
+def order_from_json(about: dict[str, Any]) -> Order:
+    """Read an order that another process wrote down.
+
+    Raises:
+        SequenceError: If a recording is damaged or gone.
+    """
+    read = dict(about)
+    read["recordings"] = tuple(Sequence.load(Path(folder)) for folder in about["recordings"])
+    read |= {name: tuple(about[name]) for name in ("methods", "protocols")}
+    return Order(**read)
+
+
+class _Told(Progress):
+    """Tells the parent how far the work is, a few times a second."""
+
+    def __init__(self, tell: Callable[..., None]) -> None:
+        self._tell = tell
+        self._last = 0.0
+
+    def report(
+        self,
+        stage: str,
+        iteration: int,
+        total: int,
+        loss: float | None = None,  # noqa: ARG002
+        message: str = "",  # noqa: ARG002
+    ) -> None:
+        if time.monotonic() - self._last >= _TELL_EVERY:
+            self._last = time.monotonic()
+            self._tell(stage=stage, iteration=iteration, total=total)
+
+
+def work(requests: TextIO, answers: TextIO) -> None:
+    """Do what is asked for until nothing more is."""
+    from physhandi.synthetic.suite.evaluation import filler
+    from physhandi.synthetic.suite.suite import make_recording
+
+    def tell(**about: object) -> None:
+        answers.write(json.dumps(about) + "\n")
+        answers.flush()
+
+    progress = _Told(tell)
+    fill: Callable[[int], None] | None = None
+    for line in requests:
+        asked = json.loads(line)
+        try:
+            if "make" in asked:
+                make_recording(asked["make"], Path(asked["target"]), progress)
+            elif "order" in asked:
+                fill = filler(order_from_json(asked["order"]), Path(asked["out"]), progress)
+            elif fill is None:
+                raise UsageError("A cell was asked for before an order.")
+            else:
+                fill(asked["cell"])
+        except (PhysHandiError, OSError, MemoryError) as error:
+            tell(error=describe(error), kind=type(error).__name__)
+        else:
+            tell(done=True)
+
+
+def main(arguments: list[str]) -> None:
+    """Work for a parent, on processors that no other of its children uses."""
+    die_with_parent(int(arguments[0]))
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {int(number) for number in arguments[1].split(",")})
+    # Libraries print to standard output; answers have that place to themselves.
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    work(sys.stdin, answers)
+
+
+MOST = 64
+"""Processes at most."""
+_LISTEN = 0.2
+_ENDED = object()
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Job:
+    """One piece of work."""
+
+    number: int
+    label: str
+    request: Mapping[str, Any]
+
+
+@dataclass(eq=False, kw_only=True)
+class _Worker:
+    """One process, and what it is doing."""
+
+    process: "subprocess.Popen[str]"
+    requests: IO[str]
+    listener: threading.Thread
+    order: str = ""
+    """The order that it was told last."""
+    jobs: "deque[_Job | None]" = field(default_factory=deque["_Job | None"])
+    """What it owes an answer for, the oldest first; None stands for an order."""
+    state: str = ""
+    """Where it is, in words."""
+
+
+class SuiteWorkers:
+    """A few processes that share the work on a suite; they end with it.
+
+    After an error nothing more can be asked of them: some may still work on what was asked before.
+    Each has its own share of the machine's processors. Cells that are made from others (a last
+    residual, an unseen interaction) come last, so that processes seldom wait for each other.
+    """
+
+    def __init__(self, count: int, progress: Progress) -> None:
+        """Start them.
+
+        Args:
+            count: How many, 2 or more.
+            progress: Told what they do; may ask to stop.
+
+        Raises:
+            UsageError: If the number makes no sense.
+        """
+        if not 2 <= count <= MOST:
+            raise errors.UsageError(f"{count} processes make no sense; choose 2 to {MOST}.")
+        self._progress = progress
+        self._heard: queue.Queue[tuple[int, Any]] = queue.Queue()
+        self._workers = [self._start(number, share) for number, share in enumerate(_shares(count))]
+
+    def __enter__(self) -> "SuiteWorkers":
+        return self
+
+    def __exit__(
+        self,
+        _kind: type[BaseException] | None,
+        _error: BaseException | None,
+        _trace: TracebackType | None,
+    ) -> None:
+        for worker in self._workers:
+            worker.process.kill()
+        for worker in self._workers:
+            worker.process.wait()
+            worker.listener.join()
+            with suppress(BrokenPipeError):  # A request that was never read.
+                worker.requests.close()
+
+    def make(self, makings: Mapping[Path, Making]) -> None:
+        """Make sequences of a suite.
+
+        Raises:
+            PhysHandiError: If one cannot be made; the others stay.
+        """
+        jobs = [
+            _Job(
+                number=number,
+                label=target.name,
+                request={"make": dict(making), "target": str(target.resolve())},
+            )
+            for number, (target, making) in enumerate(makings.items())
+        ]
+        for _ in self._done("sequences", jobs):
+            pass
+
+    def fill(self, order: Order, out: Path) -> Fill:
+        """Give what fills the cells of an order, for `evaluate`.
+
+        Args:
+            order: What is evaluated.
+            out: Folder of the suite.
+        """
+        told = json.dumps({"order": order_to_json(order), "out": str(out.resolve())})
+
+        def fill(tasks: Many[Task]) -> Iterator[int]:
+            jobs = [
+                _Job(
+                    number=number,
+                    label=f"{tasks[number].method.name}, {tasks[number].recording.name}",
+                    request={"cell": number},
+                )
+                for number in _in_order(tasks)
+            ]
+            return self._done("suite", jobs, told)
+
+        return fill
+
+    def _done(self, stage: str, jobs: Many[_Job], order: str = "") -> Iterator[int]:
+        """Have jobs done; yields their numbers as they are finished."""
+        waiting = deque(jobs)
+        finished = 0
+        for worker in self._workers:
+            self._give(worker, waiting, order)
+        while finished < len(jobs):
+            self._progress.check_cancelled()
+            try:
+                number, answer = self._heard.get(timeout=_LISTEN)
+            except queue.Empty:
+                continue
+            worker = self._workers[number]
+            job = worker.jobs[0] if worker.jobs else None
+            if answer is _ENDED:
+                raise _lost(worker)
+            if "error" in answer:
+                raise _as_error(answer)
+            if "done" in answer:
+                worker.jobs.popleft()
+                if job is not None:
+                    finished += 1
+                    worker.state = ""
+                    self._give(worker, waiting, order)
+                    yield job.number
+            elif job is not None:
+                share = 100 * answer["iteration"] // max(1, answer["total"])
+                worker.state = f"{job.label} {answer['stage']} {share} %"
+            told = " · ".join(w.state for w in self._workers if w.state)
+            self._progress.report(stage, finished, len(jobs), message=told)
+
+    def _give(self, worker: _Worker, waiting: deque[_Job], order: str) -> None:
+        if not waiting:
+            return
+        job = waiting.popleft()
+        lines = [json.dumps(job.request)]
+        if order and worker.order != order:
+            worker.order = order
+            worker.jobs.append(None)
+            lines.insert(0, order)
+        worker.jobs.append(job)
+        worker.state = job.label
+        with suppress(BrokenPipeError):  # It has ended, which its listener tells.
+            worker.requests.write("".join(line + "\n" for line in lines))
+            worker.requests.flush()
+
+    def _start(self, number: int, share: Many[int]) -> _Worker:
+        processors = ",".join(str(processor) for processor in share)
+        process = start_module(
+            "app.cli.suite_workers",
+            str(os.getpid()),
+            processors,
+            threads=len(share),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            # An interrupt from the keyboard is for the parent, which ends them.
+            start_new_session=True,
+        )
+        if process.stdin is None or process.stdout is None:
+            raise AssertionError("both were asked for")
+        listener = threading.Thread(target=self._listen, args=(number, process.stdout), daemon=True)
+        listener.start()
+        return _Worker(process=process, requests=process.stdin, listener=listener)
+
+    def _listen(self, number: int, answers: IO[str]) -> None:
+        with answers:
+            for line in answers:
+                self._heard.put((number, json.loads(line)))
+        self._heard.put((number, _ENDED))
+
+
+def _lost(worker: _Worker) -> errors.PhysHandiError:
+    """Say what the end of a process means."""
+    code = worker.process.wait()
+    labels = [job.label for job in worker.jobs if job is not None]
+    doing = f"while it worked on {labels[0]}" if labels else "while it had nothing to do"
+    return errors.RunError(
+        f"A process of the suite ended {doing} (exit code {code}; its last words stand above). "
+        "If memory ran out, take fewer of them (--jobs). What is finished stays; the same command "
+        "goes on."
+    )
+
+
+def _in_order(tasks: Many[Task]) -> list[int]:
+    """Order cells so that what others are made from comes first, method by method."""
+    protocols = list(dict.fromkeys(task.protocol for task in tasks))
+    methods = list(dict.fromkeys(task.method.name for task in tasks))
+
+    def place(number: int) -> tuple[bool, bool, int, int]:
+        task = tasks[number]
+        rank = protocols.index(task.protocol), methods.index(task.method.name)
+        return (task.fitted is not None, task.method.is_corrected, *rank)
+
+    return sorted(range(len(tasks)), key=place)
+
+
+def _shares(count: int) -> list[list[int]]:
+    """Divide this machine's processors; with fewer of them than processes some share one."""
+    if hasattr(os, "sched_getaffinity"):
+        known = sorted(os.sched_getaffinity(0))
+    else:
+        known = list(range(os.cpu_count() or 1))
+    bounds = [number * len(known) // count for number in range(count + 1)]
+    return [
+        known[low:high] or [known[low % len(known)]] for low, high in itertools.pairwise(bounds)
+    ]
+
+
+def _as_error(answer: Mapping[str, Any]) -> errors.PhysHandiError:
+    """Say an error of a process as this one's."""
+    kind = getattr(errors, str(answer["kind"]), errors.RunError)
+    if issubclass(kind, errors.UsageError):  # Some of these are made of more than a sentence.
+        kind = errors.UsageError
+    elif kind not in {errors.MissingInputError, errors.SequenceError, errors.CancelledError}:
+        kind = errors.RunError
+    return kind(str(answer["error"]))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,309 @@
+"""Makes heavy files in child processes, a few at a time, and keeps them in a bounded cache."""
+
+import hashlib
+import json
+import logging
+import os
+import shutil
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Generator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import IO, Any, Literal
+
+import viser
+
+from app.child import start_module
+from app.exports.request import SUFFIXES, FileRequest
+from physhandi import __version__, errors
+from physhandi.data.files import sweep_temporary, temporary_name
+from physhandi.data.run_folder import CURRENT
+from physhandi.data.sequence_meta import FILE
+
+logger = logging.getLogger(__name__)
+
+AT_ONCE = 2
+"""Files that are made side by side."""
+MOST_WAITING = 16
+"""Files that may be made or wait."""
+MOST_BYTES = 2**30
+"""What the cache may hold."""
+MOST_SECONDS = 300.0
+"""How long making one file may take."""
+_VERSION = 1
+_WORDS_KEPT = 4_000
+_ERRORS: dict[str, type[errors.PhysHandiError]] = {
+    "UsageError": errors.UsageError,
+    "MissingInputError": errors.MissingInputError,
+    "SequenceError": errors.SequenceError,
+    "SimulationError": errors.UsageError,
+    "SimulationDivergedError": errors.UsageError,
+}
+"""What a process tells about an error comes back as this one, else as a `RunError`."""
+
+
+class TooManyFilesError(errors.PhysHandiError):
+    """No further file can be made now."""
+
+
+@dataclass(eq=False)
+class FileJob:
+    """A file that is being made, or was."""
+
+    path: Path
+    """Where it will be."""
+    future: "Future[Path]" = field(default_factory=Future[Path])
+    """Ends with its path, or with what went wrong."""
+    done: int = 0
+    """How much is done."""
+    of: int = 0
+    """Of how much; 0 before that is known."""
+    last_used: float = field(default_factory=time.monotonic)
+    """When somebody asked for it."""
+
+    @property
+    def state(self) -> Literal["making", "ready", "failed"]:
+        """How far it is."""
+        if not self.future.done():
+            return "making"
+        return "ready" if self.future.exception() is None else "failed"
+
+
+class FileCache:
+    """Makes files of orders; the same order is made once, and its file kept as long as fits."""
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        at_once: int = AT_ONCE,
+        most_bytes: int = MOST_BYTES,
+        seconds: float = MOST_SECONDS,
+    ) -> None:
+        """Prepare; nothing is started before the first order.
+
+        Args:
+            folder: Where files are kept; it may be deleted at any time.
+            at_once: Files that are made side by side.
+            most_bytes: What the kept files may weigh together.
+            seconds: How long making one file may take [s].
+        """
+        self._folder = folder
+        self._most_bytes, self._seconds = most_bytes, seconds
+        # Processes end with the thread that started them, so these threads stay.
+        self._threads = ThreadPoolExecutor(at_once, thread_name_prefix="export")
+        self._lock = threading.Lock()
+        self._works: dict[str, FileJob] = {}
+        self._processes: set[subprocess.Popen[str]] = set()
+        self._is_closed = False
+
+    def begin(self, order: FileRequest) -> FileJob:
+        """Have a file made, unless it is there or being made.
+
+        Args:
+            order: What is to be made.
+
+        Raises:
+            UsageError: If the order makes no sense.
+            TooManyFilesError: If too many files are being made already.
+        """
+        order.check()
+        path = self._folder / f"{_key(order)}.{SUFFIXES.get(order.format, order.format)}"
+        with self._lock:
+            known = self._works.get(path.name)
+            if known is not None and known.state == "failed":
+                known = None
+            if known is not None and known.state == "ready" and not path.is_file():
+                known = None
+            if known is None:
+                known = self._start(order, path)
+            known.last_used = time.monotonic()
+            return known
+
+    def make(self, order: FileRequest) -> Path:
+        """Have a file made and wait for it; see `begin`.
+
+        Raises:
+            PhysHandiError: If it could not be made.
+        """
+        return self.begin(order).future.result()
+
+    @contextmanager
+    def once(self, order: FileRequest, prepare: Callable[[Path], None]) -> Generator[Path]:
+        """Have a file made that nobody else will ask for.
+
+        Args:
+            order: What is to be made; its `take` is replaced.
+            prepare: Puts a rollout into a folder, see `store_take`.
+
+        Yields:
+            The file, which is gone afterwards.
+        """
+        folder = self._folder / temporary_name("once")
+        folder.mkdir(parents=True)
+        try:
+            prepare(folder)
+            whole = replace(order, take=str(folder))
+            whole.check()
+            out = folder / f"file.{SUFFIXES.get(order.format, order.format)}"
+            with self._lock:
+                work = self._put_in_line(whole, FileJob(out), out.parent.name)
+            yield work.future.result()
+        finally:
+            with self._lock:
+                self._works.pop(folder.name, None)
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def close(self) -> None:
+        """End what is being made."""
+        with self._lock:
+            self._is_closed = True
+            processes = list(self._processes)
+        for process in processes:
+            process.kill()
+        self._threads.shutdown(wait=True, cancel_futures=True)
+
+    def _start(self, order: FileRequest, path: Path) -> FileJob:
+        work = FileJob(path)
+        if path.is_file():
+            os.utime(path)
+            work.future.set_result(path)
+            self._works[path.name] = work
+            return work
+        return self._put_in_line(order, work, path.name)
+
+    def _put_in_line(self, order: FileRequest, work: FileJob, name: str) -> FileJob:
+        busy = sum(known.state == "making" for known in self._works.values())
+        if busy >= MOST_WAITING or self._is_closed:
+            raise TooManyFilesError(
+                f"{busy} files are being made already, the most this server allows. "
+                "Try again in a moment."
+            )
+        self._forget()
+        self._works[name] = work
+        self._threads.submit(self._work, order, work)
+        return work
+
+    def _forget(self) -> None:
+        """Keep the list of works short; their files stay."""
+        ended = [(w.last_used, name) for name, w in self._works.items() if w.state != "making"]
+        for _, name in sorted(ended)[: max(0, len(ended) - 500)]:
+            del self._works[name]
+
+    def _work(self, order: FileRequest, work: FileJob) -> None:
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            self._run(order, work)
+            self._make_room(work.path)
+            work.future.set_result(work.path)
+        except Exception as error:
+            if not isinstance(error, errors.PhysHandiError):
+                logger.exception("making %s failed", work.path.name)
+            work.future.set_exception(error)
+
+    def _run(self, order: FileRequest, work: FileJob) -> None:
+        process = start_module(
+            "app.exports.making",
+            str(os.getpid()),
+            str(work.path),
+            threads=1,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
+        with self._lock:
+            self._processes.add(process)
+        late = threading.Event()
+
+        def end() -> None:
+            late.set()
+            process.kill()
+
+        timer = threading.Timer(self._seconds, end)
+        timer.daemon = True
+        timer.start()
+        try:
+            answer = _converse(process, order.to_text(), work)
+        finally:
+            timer.cancel()
+            process.kill()
+            process.wait()
+            for stream in (process.stdout, process.stderr):
+                if stream is not None:
+                    stream.close()
+            with self._lock:
+                self._processes.discard(process)
+            sweep_temporary(work.path.parent.glob(".*.tmp"))
+        if "error" in answer:
+            raise _ERRORS.get(str(answer["kind"]), errors.RunError)(str(answer["error"]))
+        if not work.path.is_file():
+            limit = f"took longer than {self._seconds:g} s"
+            why = limit if late.is_set() else "was ended by the system"
+            raise errors.RunError(f"The file could not be made: it {why}.")
+
+    def _make_room(self, newest: Path) -> None:
+        """Remove the files that were not used for longest."""
+        entries: list[tuple[float, int, Path]] = []
+        for path in self._folder.iterdir():
+            try:
+                if path.is_file():
+                    status = path.stat()
+                    entries.append((status.st_mtime, status.st_size, path))
+            except OSError:
+                continue  # Another thread has just removed it.
+        total = sum(size for _, size, _ in entries)
+        for _, size, path in sorted(entries):
+            if total <= self._most_bytes:
+                return
+            if path != newest:
+                path.unlink(missing_ok=True)
+                total -= size
+
+
+def _converse(process: "subprocess.Popen[str]", order: str, work: FileJob) -> dict[str, Any]:
+    """Give the order and hear how far it is; returns the last answer if it is an error."""
+    words: list[str] = []
+    listener = threading.Thread(target=_hear, args=(process.stderr, words), daemon=True)
+    listener.start()
+    last: dict[str, Any] = {}
+    try:
+        if process.stdin is not None:
+            process.stdin.write(order)
+            process.stdin.close()
+    except BrokenPipeError:
+        logger.info("the process did not read its order")
+    for line in process.stdout or ():
+        try:
+            last = json.loads(line)
+        except ValueError:
+            words.append(line)
+            continue
+        work.done, work.of = last.get("done", work.done), last.get("of", work.of)
+    code = process.wait()
+    listener.join(timeout=2)
+    if code != 0 and "error" not in last:
+        logger.error("the process ended with code %d: %s", code, "".join(words)[-_WORDS_KEPT:])
+    return last if "error" in last else {}
+
+
+def _hear(stream: IO[str] | None, words: list[str]) -> None:
+    for line in stream or ():
+        words.append(line)
+        del words[:-200]
+
+
+def _key(order: FileRequest) -> str:
+    """Name a file after its order and the state of what it shows."""
+    folder = Path(order.folder)
+    about = folder / (CURRENT if order.kind == "run" else FILE)
+    try:
+        status = about.stat()
+        stamp = (status.st_mtime_ns, status.st_size)
+    except OSError:
+        stamp = (0, 0)
+    text = f"{_VERSION}\0{__version__}\0{viser.__version__}\0{stamp}\0{order.to_text()}"
+    return f"{folder.name}-{hashlib.sha256(text.encode()).hexdigest()[:20]}"

@@ -1,0 +1,72 @@
+"""What a file is to show: an order for the process that makes it."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Literal, get_args
+
+from app.exports.painter import LARGEST
+from app.exports.permalink import state_from_query
+from app.viewer.content.session_state import SessionState
+from physhandi.errors import UsageError
+
+Format = Literal["png", "viser", "html", "zip", "ply", "gltf", "npz", "csv"]
+FORMATS: tuple[Format, ...] = get_args(Format)
+SUFFIXES: dict[str, str] = {"gltf": "glb", "ply": "zip"}
+"""How the files of formats end, if not like the format."""
+SMALLEST = 16
+"""Shortest side of a picture [px]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FileRequest:
+    """A file that is to be made."""
+
+    kind: Literal["run", "sequence"]
+    """What is shown."""
+    folder: str
+    """Where the run or the sequence lies."""
+    format: Format
+    """Which kind of file."""
+    query: Mapping[str, str] = field(default_factory=dict[str, str])
+    """What a link would say of it; see `app.exports.permalink`."""
+    recordings: Mapping[str, str] = field(default_factory=dict[str, str])
+    """Folders of recordings by name, for runs whose recording has moved."""
+    take: str = ""
+    """Folder with a rollout that was simulated elsewhere; see `store_take`."""
+    width: int = 1280
+    """Width of a picture [px]."""
+    height: int = 720
+    """Height of a picture [px]."""
+    device: str = "cpu"
+    """Warp device, if parameters were changed."""
+    link: str = ""
+    """Address that shows the same, for people."""
+
+    def check(self) -> SessionState:
+        """Find out early what cannot work.
+
+        Returns:
+            What is to be shown.
+
+        Raises:
+            UsageError: If a field of the query or a size makes no sense; names it.
+        """
+        for name, size in (("width", self.width), ("height", self.height)):
+            if not SMALLEST <= size <= LARGEST:
+                raise UsageError(f"{name}: {size} is not between {SMALLEST} and {LARGEST} pixels.")
+        state = state_from_query(self.query)
+        if state.is_figure:
+            raise UsageError(
+                "fig: the comparison with PhysTwin is saved from a live scene, where it is shown."
+            )
+        return state
+
+    def to_text(self) -> str:
+        """Write the order on one line."""
+        return json.dumps(asdict(self), sort_keys=True)
+
+    @classmethod
+    def from_text(cls, text: str) -> "FileRequest":
+        """Read an order."""
+        return cls(**json.loads(text))

@@ -1,0 +1,656 @@
+"""What the API and the pages say about sequences and runs, as plain data."""
+
+import builtins
+import hashlib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any, Literal, cast, get_args
+from urllib.parse import urlencode
+from weakref import WeakKeyDictionary
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from app.jobs.catalog import RunItem, SequenceItem
+from app.jobs.remaining import with_time
+from app.jobs.scheduler import AT_WORK, JobView, Scheduler
+from physhandi import errors
+from physhandi.data.environment import ENVIRONMENT
+from physhandi.data.files import named_fields
+from physhandi.data.run import Run, read_events
+from physhandi.data.run_folder import EXIT, read_mapping
+from physhandi.errors import PhysHandiError, UsageError
+from physhandi.fitting.config import SIMULATION, STAGES
+
+_METRICS = "metrics.json"
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """What a run took and how well it did."""
+
+    duration_s: float | None = None
+    """Time that its finished stages took [s]."""
+    track_error_fitted: float | None = None
+    """Track error of the rollout in the frames that were fitted [m]."""
+    track_error_predicted: float | None = None
+    """Track error of the rollout in the frames that were not fitted [m]."""
+    reprojection: float | None = None
+    """Median distance of the hands' joints from their keypoints in the images [px]."""
+
+
+def summarize(run: Run) -> RunSummary:
+    """Read the figures of a run; what is missing or damaged is None, as a list must not fail.
+
+    Of several sequences the mean over the frames of all of them is given. A simulation of a
+    sequence that its source was not fitted to is a prediction from its first frame on.
+    """
+    try:
+        fitted, predicted = _track_errors(run)
+        reprojection = _reprojection(run)
+    except (PhysHandiError, OSError):
+        fitted = predicted = reprojection = None
+    return RunSummary(_duration(run), fitted, predicted, reprojection)
+
+
+def _duration(run: Run) -> float | None:
+    try:
+        seconds = [stage.get("seconds") for stage in run.stages()]
+    except (PhysHandiError, OSError):
+        return None
+    known = [float(value) for value in seconds if isinstance(value, int | float)]
+    return sum(known) if known and len(known) == len(seconds) else None
+
+
+def _track_errors(run: Run) -> tuple[float | None, float | None]:
+    if not run.has(_METRICS):
+        return None, None
+    metrics = named_fields(run.json(_METRICS)) or {}
+    unseen = _unseen_sequences(run)
+    fitted: list[tuple[float, float]] = []
+    predicted: list[tuple[float, float]] = []
+    for name, scores in metrics.items():
+        of_sequence = named_fields(scores) or {}
+        if of_sequence.get("unit", "m") != "m":
+            continue
+        fitted_frames = predicted if name in unseen else fitted
+        fitted_frames += _error_and_weight(of_sequence.get("reconstruction"))
+        predicted += _error_and_weight(of_sequence.get("future"))
+    return _mean(fitted), _mean(predicted)
+
+
+def _reprojection(run: Run) -> float | None:
+    """Give the median reprojection error, weighted by the keypoints of each hand."""
+    metrics = (named_fields(run.json(_METRICS)) if run.has(_METRICS) else None) or {}
+    found: list[tuple[float, float]] = []
+    for scores in metrics.values():
+        hands = named_fields((named_fields(scores) or {}).get("hands")) or {}
+        for score in hands.values():
+            fields = named_fields(score) or {}
+            error, count = fields.get("reprojection_median"), fields.get("scored_keypoints")
+            if isinstance(error, int | float) and isinstance(count, int | float) and count > 0:
+                found.append((float(error), float(count)))
+    return _mean(found)
+
+
+def _unseen_sequences(run: Run) -> set[str]:
+    if run.kind != "simulation":
+        return set()
+    try:
+        source = Run.open(Path(str(run.config.get("source", ""))))
+    except (PhysHandiError, OSError):
+        return set()  # The run that it began from was deleted since.
+    return set(run.sequence_names) - set(source.sequence_names)
+
+
+def _error_and_weight(part: Any) -> list[tuple[float, float]]:
+    """Give the track error of a part of a sequence and its number of frames, if it is known."""
+    fields = named_fields(part) or {}
+    error = (named_fields(fields.get("rollout")) or {}).get("track_error")
+    frames = fields.get("frames")
+    if not isinstance(error, int | float) or isinstance(error, bool):
+        return []
+    match frames:
+        case [int(first), int(end)] if end > first:
+            return [(float(error), float(end - first))]
+        case _:
+            return [(float(error), 1.0)]
+
+
+def _mean(weighted: list[tuple[float, float]]) -> float | None:
+    total = sum(weight for _, weight in weighted)
+    return sum(error * weight for error, weight in weighted) / total if total else None
+
+
+@dataclass(frozen=True)
+class StageView:
+    """One stage of a run, for people."""
+
+    name: str
+    """Name of the stage."""
+    state: str
+    """``done``, ``passed`` (nothing to do), ``at-work``, ``failed``, ``stopped`` or ``to-come``."""
+    seconds: float | None = None
+    """How long it took, or has taken so far."""
+    before: float | None = None
+    """Loss at its start."""
+    after: float | None = None
+    """Loss at its end."""
+    note: str = ""
+    """What there is to know about how it ended."""
+
+
+def stages_of(run: Run, state: str) -> list[dict[str, Any]]:
+    """Tell for each stage of a run how far it is.
+
+    Args:
+        run: The run.
+        state: State of the run, as the queue knows it.
+    """
+    if run.attempt is None:
+        return [asdict(StageView(name, "to-come")) for name in _names(run.kind)]
+    finished = run.stages()
+    progress = run.progress
+    is_current = progress.get("attempt") == run.attempt
+    latest = str(progress["stage"]) if is_current else None
+    views = stage_views(_names(run.kind), finished, state, latest)
+    begun = _running_since(run, finished)
+    now = datetime.now(UTC).timestamp()
+    return [
+        asdict(view)
+        | ({"seconds": now - begun} if view.state == "at-work" and begun is not None else {})
+        for view in views
+    ]
+
+
+def stage_views(
+    names: Sequence[str],
+    finished: Sequence[Mapping[str, Any]],
+    state: str,
+    latest: str | None,
+) -> list[StageView]:
+    """Tell for each stage whether it is done, at work, failed, stopped or still to come.
+
+    A stage that was passed over because the sequences lack what it needs is left out.
+
+    Args:
+        names: Stages that such a run usually has, in their order.
+        finished: Finished stages: ``name summary``, and ``seconds`` if they were measured.
+        state: State of the run.
+        latest: Stage of the latest report of this attempt.
+    """
+    done: dict[str, Mapping[str, Any]] = {str(stage["name"]): stage for stage in finished}
+    known: list[str] = [*names, *done, *([latest] if latest else [])]
+    order = list(dict.fromkeys(known))
+    last_done = max((order.index(name) for name in done), default=-1)
+    # A stage may fail before it reports anything: then it is the one after the last finished.
+    current = latest if latest and latest not in done else next(iter(order[last_done + 1 :]), None)
+    mark = (
+        "at-work" if state in AT_WORK else {"failed": "failed", "cancelled": "stopped"}.get(state)
+    )
+    views: list[StageView] = []
+    for position, name in enumerate(order):
+        if name in done:
+            summary = named_fields(done[name].get("summary")) or {}
+            views.append(
+                StageView(
+                    name,
+                    "done" if _has_worked(name, done[name]) else "passed",
+                    done[name].get("seconds"),
+                    summary.get("before"),
+                    summary.get("after"),
+                    str(summary.get("note", "")),
+                )
+            )
+        elif state != "succeeded" and name == current and mark:
+            views.append(StageView(name, mark))
+        elif state != "succeeded" and position > last_done:
+            views.append(StageView(name, "to-come"))
+    return views
+
+
+def _has_worked(name: str, finished: Mapping[str, Any]) -> bool:
+    """Tell whether a stage had anything to do: those of hands write nothing of hands if not."""
+    files = named_fields(finished.get("files"))
+    if files is None or not name.startswith("hand_"):
+        return True
+    if not files:  # Stage 1 notes at least which sequences there are.
+        return name != "hand_refinement"
+    return any("/hand_" in file for file in files)
+
+
+def _names(kind: str) -> list[str]:
+    return [SIMULATION] if kind == "simulation" else list(STAGES)
+
+
+def _running_since(run: Run, finished: Sequence[Mapping[str, Any]]) -> float | None:
+    """When the stage that is at work began: at the end of the one before, or of this attempt."""
+    environment = named_fields(run.json(ENVIRONMENT)) if run.has(ENVIRONMENT) else None
+    times = [(environment or {}).get("started"), *(stage.get("time") for stage in finished[-1:])]
+    known = [datetime.fromisoformat(time).timestamp() for time in times if isinstance(time, str)]
+    return max(known, default=None)
+
+
+_ADVICE = {
+    "MissingInputError": "Choose a recording that has this part, or import it again with it.",
+    "SequenceError": (
+        "Repair the named file of the sequence and resume, or import the recording again."
+    ),
+    "UsageError": "Launch a new fit with a value that the message allows.",
+    "FitError": (
+        "Look at the recording first: is the hand or object seen in most frames? "
+        "Then launch a fit with another profile."
+    ),
+    "SimulationDivergedError": (
+        "Launch a fit with a profile that searches softer springs or takes more substeps."
+    ),
+    "RunError": "Resume goes on after the last finished stage.",
+    "": "Resume goes on after the last finished stage.",
+}
+_DEFECT = (
+    "This is a mistake of the program, not of your recording. Resume tries the stage again; "
+    "if it stays, report it together with the downloaded log."
+)
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Why a run failed."""
+
+    message: str
+    """What happened."""
+    advice: str
+    """What the user can do."""
+
+
+def explain(run: Run | None, reason: str) -> Failure:
+    """Tell why a run failed and what to do.
+
+    Args:
+        run: The failed run; None if its folder is damaged.
+        reason: What the queue knows of it.
+    """
+    if run is None:
+        return Failure(reason, "Repair the named file, or delete the run's folder.")
+    kind = str(read_mapping(run.folder / EXIT).get("error_type", ""))
+    if kind in _ADVICE:
+        return Failure(reason, _ADVICE[kind])
+    if hasattr(errors, kind):
+        return Failure(reason, _ADVICE["RunError"])
+    if kind == "MemoryError":
+        return Failure(
+            "There was not enough memory.",
+            "End other programs or use a profile with fewer nodes, then resume.",
+        )
+    known = getattr(builtins, kind, None)
+    if isinstance(known, type) and issubclass(known, OSError):
+        return Failure(reason, "Check the disk and the data folder, then resume.")
+    return Failure(f"The program stopped at a mistake of its own ({kind}: {reason}).", _DEFECT)
+
+
+Sort = Literal[
+    "name",
+    "-name",
+    "sequence",
+    "-sequence",
+    "profile",
+    "-profile",
+    "state",
+    "-state",
+    "created",
+    "-created",
+    "duration",
+    "-duration",
+    "fitted",
+    "-fitted",
+    "predicted",
+    "-predicted",
+]
+"""A column to sort by; with a minus, from high to low."""
+SORTS = tuple(name for name in get_args(Sort) if name[0] != "-")
+STATES = ("queued", "starting", "running", "stopping", "succeeded", "failed", "cancelled")
+"""States in the order in which they come."""
+_FIELDS = {
+    "name": "name",
+    "profile": "profile",
+    "created": "created",
+    "duration": "duration_s",
+    "fitted": "track_error_fitted",
+    "predicted": "track_error_predicted",
+}
+_KEYS = ("is", "state", "profile", "sequence", "kind", "tag")
+_FLAGS = ("bundled", "mine", "published", *STATES)
+
+Word = Annotated[str, Field(max_length=120)]
+
+
+class RunQuery(BaseModel):
+    """Which runs, in which order; its fields are the parameters of an address."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    q: Annotated[str, Field(max_length=200)] = ""
+    """Words that name, id, tags, sequences or profile contain, and conditions such as
+    ``state:failed``, ``profile:quick``, ``sequence:towel_fold``, ``kind:simulation``, ``tag:best``
+    or ``is:bundled``; a minus in front turns one around."""
+    state: Word = ""
+    """Only runs in this state."""
+    profile: Word = ""
+    """Only runs of this profile."""
+    sequence: Word = ""
+    """Only runs of this sequence."""
+    kind: Word = ""
+    """Only ``reconstruction`` or ``simulation``."""
+    sort: Sort | Literal[""] = ""
+    """Column to sort by; nothing puts the newest first and the bundled ones last."""
+    limit: Annotated[int, Field(ge=1, le=10_000)] | None = None
+    """Most runs to give; none gives all."""
+    offset: Annotated[int, Field(ge=0)] = 0
+    """Runs to leave out at the beginning."""
+
+    @property
+    def is_filtered(self) -> bool:
+        """Whether it leaves any run out."""
+        return bool(self.q.strip() or self.state or self.profile or self.sequence or self.kind)
+
+    def address(self, path: str = "/runs", **changes: Any) -> str:
+        """Write it as an address, with some fields changed; what is not set is left out."""
+        fields = self.model_dump() | {"offset": 0} | changes
+        defaults = RunQuery()
+        told = {k: v for k, v in fields.items() if v != getattr(defaults, k)}
+        return f"{path}?{urlencode(told)}" if told else path
+
+
+def select_runs(runs: Iterable[Mapping[str, Any]], query: RunQuery) -> list[Mapping[str, Any]]:
+    """Give the runs that a query asks for in its order, whatever its limit and offset.
+
+    Args:
+        runs: Descriptions of `describe_run`, the newest first.
+        query: What is asked for.
+
+    Raises:
+        UsageError: If a condition has an unknown name or value; names it.
+    """
+    conditions = _conditions(query)
+    chosen = [run for run in runs if all(_fits(run, *condition) for condition in conditions)]
+    if not query.sort:
+        return chosen
+    name = query.sort.removeprefix("-")
+    # A run that lacks the figure comes last in either direction.
+    known = [(key, run) for run in chosen if (key := _key(run, name)) is not None]
+    known.sort(key=lambda pair: pair[0], reverse=query.sort.startswith("-"))
+    return [run for _, run in known] + [run for run in chosen if _key(run, name) is None]
+
+
+def page_of(runs: Sequence[Mapping[str, Any]], query: RunQuery) -> Sequence[Mapping[str, Any]]:
+    """Cut out the part that limit and offset ask for."""
+    end = None if query.limit is None else query.offset + query.limit
+    return runs[query.offset : end]
+
+
+def tags_of(label: str) -> list[str]:
+    """Split a run's label into its tags."""
+    return list(dict.fromkeys(tag.strip() for tag in label.split(",") if tag.strip()))
+
+
+def _conditions(query: RunQuery) -> list[tuple[str, str, bool]]:
+    """List what must hold: a key (empty for free text), its value, and whether it must not."""
+    chosen = [
+        (key, str(getattr(query, key)).lower(), False)
+        for key in ("state", "profile", "sequence", "kind")
+        if getattr(query, key)
+    ]
+    for word in query.q.lower().split():
+        is_not = len(word) > 1 and word.startswith("-")
+        key, colon, value = word.removeprefix("-" if is_not else "").partition(":")
+        if not colon:
+            chosen.append(("", key, is_not))
+        elif key not in _KEYS:
+            known = ", ".join(f"{name}:" for name in _KEYS)
+            raise UsageError(f"The filter knows no '{key}:'. It knows {known} and plain words.")
+        elif key == "is" and value not in _FLAGS:
+            known = ", ".join(_FLAGS)
+            raise UsageError(f"The filter knows no 'is:{value}'. After 'is:' write one of {known}.")
+        elif value:
+            chosen.append((key, value, is_not))
+    return chosen
+
+
+def _fits(run: Mapping[str, Any], key: str, value: str, is_not: bool) -> bool:
+    if key == "is":
+        flags = {
+            "bundled": run["is_bundled"],
+            "mine": not run["is_bundled"],
+            "published": run["is_published"],
+        }
+        found = flags.get(value, run["state"] == value)
+    elif key == "sequence":
+        found = value in (name.lower() for name in run["sequences"])
+    elif key == "tag":
+        found = value in (tag.lower() for tag in run["tags"])
+    elif key:
+        found = str(run[key]).lower() == value
+    else:
+        found = value in _text_of(run)
+    return found is not is_not
+
+
+def _text_of(run: Mapping[str, Any]) -> str:
+    told = (run["name"], run["id"], run["profile"], run.get("note", ""))
+    parts = (*told, *run["sequences"], *run["tags"])
+    return "\n".join(parts).lower()
+
+
+def _key(run: Mapping[str, Any], name: str) -> Any:
+    """Give what a run is sorted by; None if it has no such thing."""
+    if name == "state":
+        return STATES.index(run["state"]) if run["state"] in STATES else None
+    value = ", ".join(run["sequences"]) if name == "sequence" else run[_FIELDS[name]]
+    if isinstance(value, str):
+        return value.casefold() or None
+    return value
+
+
+PARTS = ("color", "depth", "mask", "keypoint", "track", "control", "marker", "object_node")
+_RESULTS = ("losses.json", "metrics.json", "object/parameters.yaml", ENVIRONMENT)
+CURVE_LIMIT = 2000
+"""Most points of a curve that are sent to a browser."""
+# Runs and the views of ended runs stay the same objects while nothing changes on disk, so a long
+# list is described once; a run at work has a new view, and is described anew, each time.
+_described: WeakKeyDictionary[Run, tuple[JobView, dict[str, Any]]] = WeakKeyDictionary()
+
+
+def describe_sequence(item: SequenceItem) -> dict[str, Any]:
+    """Describe one sequence of a listing."""
+    described: dict[str, Any] = {
+        "id": item.id,
+        "name": item.id,
+        "is_bundled": item.is_bundled,
+        "error": item.error,
+    }
+    sequence = item.sequence
+    if sequence is None:
+        return described
+    missing = sequence.missing(*PARTS)
+    return described | {
+        "name": sequence.name,
+        "description": sequence.description,
+        "label": sequence.label,
+        "frame_count": sequence.frame_count,
+        "frame_rate": sequence.frame_rate,
+        "duration_s": sequence.frame_count / sequence.frame_rate,
+        "view_count": len(sequence.views),
+        "hands": list(sequence.hands),
+        "marker_count": 0 if sequence.marker is None else sequence.marker.shape[1],
+        "parts": [part for part in PARTS if part not in missing],
+        "metric": sequence.metric,
+        "length_unit": sequence.length_unit,
+        "reconstruction_frames": len(sequence.reconstruction_frames),
+    }
+
+
+def describe_run(item: RunItem, scheduler: Scheduler) -> dict[str, Any]:
+    """Describe one run of a listing, with how far it is and how long it still takes."""
+    view = scheduler.view(item)
+    known = _described.get(item.run) if item.run else None
+    if known is None or known[0] is not view:
+        known = (view, _describe(item, view))
+        if item.run is not None:
+            _described[item.run] = known
+    return with_time(known[1], item.run, view, scheduler)
+
+
+def _describe(item: RunItem, view: JobView) -> dict[str, Any]:
+    described: dict[str, Any] = {
+        "id": item.id,
+        "name": item.id,
+        "is_bundled": item.is_bundled,
+        "state": view.state,
+        "place": view.place,
+        "reason": view.reason,
+        "progress": dict(view.progress),
+        "is_published": view.is_published,
+        "error": item.error,
+        "kind": "",
+        "created": "",
+        "sequences": [],
+        "profile": "",
+        "tags": [],
+        "note": "",
+    }
+    run = item.run
+    if run is None:
+        return described | asdict(RunSummary())
+    profile = named_fields(run.config.get("profile")) or {}
+    return (
+        described
+        | {
+            "name": run.name,
+            "kind": run.kind,
+            "created": run.created,
+            "sequences": run.sequence_names,
+            "profile": str(profile.get("profile", "")),
+            "tags": tags_of(run.label),
+            "note": run.note,
+            "error": view.reason if view.state == "failed" else None,
+        }
+        | asdict(summarize(run) if view.is_published else RunSummary())
+    )
+
+
+def follow_run(item: RunItem, scheduler: Scheduler) -> dict[str, Any]:
+    """Describe one run as its own page shows it.
+
+    Returns:
+        `describe_run`, with ``stages`` (see `StageView`), ``failure`` (``message advice`` of a
+        failed run, else none) and ``revision``, which differs whenever anything but the progress
+        within a stage does.
+    """
+    described = describe_run(item, scheduler)
+    run, state = item.run, described["state"]
+    results: list[tuple[str, int]] = []
+    stages: list[dict[str, Any]] = []
+    try:
+        if run is not None:
+            stages = stages_of(run, state)
+            results = [
+                (rel, (run.out / rel).stat().st_mtime_ns) for rel in _RESULTS if run.has(rel)
+            ]
+    except (PhysHandiError, OSError) as error:
+        described |= {"state": "failed", "reason": str(error)}
+    failure = asdict(explain(run, described["reason"])) if state == "failed" else None
+    shown = [described | {"progress": None, "estimate": None}, results, failure]
+    shown += [stage | {"seconds": None} for stage in stages]
+    revision = hashlib.sha256(json.dumps(shown, default=str).encode()).hexdigest()[:16]
+    return described | {"stages": stages, "failure": failure, "revision": revision}
+
+
+def describe_results(run: Run) -> dict[str, dict[str, Any]]:
+    """Collect what a run has found so far: losses, metrics, parameters and environment."""
+    results: dict[str, dict[str, Any]] = {}
+    try:
+        for name in ("losses", "metrics"):
+            if run.has(f"{name}.json"):
+                results[name] = named_fields(run.json(f"{name}.json")) or {}
+        if run.has(ENVIRONMENT):
+            results["environment"] = named_fields(run.json(ENVIRONMENT)) or {}
+        if run.has("object/parameters.yaml"):
+            results["parameters"] = named_fields(run.yaml("object/parameters.yaml")) or {}
+    except PhysHandiError as error:
+        results["problem"] = {"message": str(error)}
+    return results
+
+
+def frame_errors(run: Run) -> dict[str, dict[str, Any]]:
+    """Give the errors of every frame, for each sequence that they were measured in.
+
+    Returns:
+        For each sequence what its ``frame_errors.json`` holds (``unit frames`` and by method
+        ``track_error chamfer_l2``) and ``future_start``, the first frame that was not fitted.
+    """
+    metrics = describe_results(run).get("metrics", {})
+    found: dict[str, dict[str, Any]] = {}
+    for name in run.sequence_names:
+        rel = f"sequences/{name}/frame_errors.json"
+        if not run.has(rel):
+            continue
+        content = named_fields(run.json(rel)) or {}
+        scores = named_fields(metrics.get(name)) or {}
+        future = (named_fields(scores.get("future")) or {}).get("frames")
+        found[name] = content | {"future_start": future[0] if isinstance(future, list) else None}
+    return found
+
+
+def loss_curves(run: Run) -> tuple[dict[str, dict[str, Any]], int]:
+    """Give the loss of each stage over its iterations, of a running stage as far as it is.
+
+    Returns:
+        For each stage its ``before`` and ``after``, null while it runs, and the ``curve`` of
+        ``[iteration, loss]``, thinned to `CURVE_LIMIT` points so that every peak stays; then the
+        number of the last event that it holds, -1 if there is none.
+    """
+    curves: dict[str, list[list[float]]] = {}
+    events, _ = read_events(run.folder)
+    latest = -1
+    for event in events:
+        latest = int(event.get("seq", latest))
+        loss, iteration = event.get("loss"), event.get("iteration")
+        if not isinstance(loss, int | float) or not isinstance(iteration, int):
+            continue
+        curve = curves.setdefault(str(event.get("stage")), [])
+        if curve and iteration <= curve[-1][0]:
+            curve.clear()  # The stage was started again.
+        curve.append([iteration, float(loss)])
+    stages = describe_results(run).get("losses", {})
+    result: dict[str, dict[str, Any]] = {}
+    for stage in dict.fromkeys([*stages, *curves]):
+        summary = named_fields(stages.get(stage)) or {}
+        curve = _points(summary.get("curve")) or curves.get(stage, [])
+        result[stage] = {
+            "before": summary.get("before"),
+            "after": summary.get("after"),
+            "curve": thin(curve, CURVE_LIMIT),
+        }
+    return result, latest
+
+
+def thin(curve: list[list[float]], limit: int) -> list[list[float]]:
+    """Thin a curve to at most `limit` points, keeping the lowest and highest of each part."""
+    if len(curve) <= limit:
+        return curve
+    parts = limit // 2
+    kept: list[list[float]] = []
+    for part in range(parts):
+        points = curve[part * len(curve) // parts : (part + 1) * len(curve) // parts]
+        low = min(points, key=lambda point: point[1])
+        high = max(points, key=lambda point: point[1])
+        kept.extend([low] if low == high else sorted([low, high], key=lambda point: point[0]))
+    return kept
+
+
+def _points(curve: object) -> list[list[float]]:
+    """Keep the points of a stored curve that have a finite loss."""
+    points = cast("list[Any]", curve) if isinstance(curve, list) else []
+    return [[p[0], p[1]] for p in points if isinstance(p, list) and None not in p]

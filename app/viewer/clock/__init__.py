@@ -1,0 +1,1 @@
+"""Which frame is on the screen."""

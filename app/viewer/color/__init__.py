@@ -1,0 +1,1 @@
+"""What a color means: quantities, color scales and their legend."""

@@ -1,0 +1,170 @@
+"""Chooses what colors tell, shows the legend and holds the range."""
+
+import math
+import threading
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import viser
+
+from app.viewer.color.coloring import Legend
+from app.viewer.color.legend import legend_html
+from app.viewer.color.quantities import Quantity
+from app.viewer.content.content import Content
+from app.viewer.content.layers import Coloring, Layers
+from app.viewer.ui.followed import FollowedChoice
+from app.viewer.ui.guard import Guard
+from app.viewer.ui.keyboard import bind
+
+
+class Paints(Protocol):
+    """Paints an object, or the hands where there is no object."""
+
+    @property
+    def legend(self) -> Legend | None:
+        """What the colors painted last mean; None if they are plain."""
+        ...
+
+    @property
+    def offered(self) -> tuple[Coloring, ...]:
+        """What can be told."""
+        ...
+
+    def quantity(self, coloring: Coloring, /) -> Quantity:
+        """Describe one of the offered colorings."""
+        ...
+
+
+class ColorPanel:
+    """A choice, a legend and a range that follows the sequence or is held."""
+
+    def __init__(self, server: viser.ViserServer, guard: Guard, redraw: Callable[[], None]) -> None:
+        """Add the panel, hidden until there is something to color.
+
+        Args:
+            server: Where to.
+            guard: Wraps the callbacks.
+            redraw: Draws the current frame again.
+        """
+        self._redraw = redraw
+        self._layers = Layers()
+        self._painter: Paints | None = None
+        self._is_metric = True
+        self._said = ""
+        self._turn = threading.Lock()
+        gui = server.gui
+        self._folder = gui.add_folder("Colors", visible=False)
+        with self._folder:
+            self._choice: Any = gui.add_dropdown(
+                "Color by", ("plain",), hint="C: the next one, shift C: the one before"
+            )
+            self._legend = gui.add_html("")
+            self._hold = gui.add_checkbox(
+                "Hold range", initial_value=False, hint="Keep the ends when the rollout changes"
+            )
+            self._range = FollowedChoice(
+                gui.add_vector2(
+                    "Range", (0.0, 1.0), step=1e-4, hint="Values at the ends; typing holds them"
+                ),
+                guard,
+            )
+        self._choice.on_update(guard.by_user(lambda _: self.choose(self._choice.value)))
+        self._hold.on_update(guard.by_user(lambda _: self._toggle_hold()))
+        self._range.handle.on_update(guard.by_user(lambda _: self._type()))
+        bind(server, guard, "color", lambda _, __: self.next(1))
+        bind(server, guard, "color_back", lambda _, __: self.next(-1))
+        self._show_range_fields()
+
+    def replace(self, content: Content, layers: Layers, painter: Paints) -> None:
+        """Offer what a content can tell."""
+        before = self._layers
+        self._layers, self._painter = layers, painter
+        self._is_metric = content.is_metric
+        self._folder.visible = bool(painter.offered)
+        self._choice.options = ("plain", *painter.offered)
+        layers.color = before.color if before.color in self._choice.options else "plain"
+        layers.color_range = before.color_range if layers.color == before.color else None
+        self._follow()
+
+    @property
+    def is_there(self) -> bool:
+        """Whether there is something to color."""
+        return bool(self._folder.visible)
+
+    def restore(self) -> None:
+        """Show what the layers say now."""
+        if self._layers.color not in self._choice.options:
+            self._layers.color, self._layers.color_range = "plain", None
+        self._follow()
+
+    def choose(self, coloring: Coloring) -> None:
+        """Color by another quantity, in the range of its sequence."""
+        if coloring != self._layers.color:
+            self._layers.color, self._layers.color_range = coloring, None
+        self._follow()
+        self._redraw()
+
+    def next(self, step: int) -> None:
+        """Color by the next quantity of the list, or by one before."""
+        options = list(self._choice.options)
+        with self._turn:  # Two quick presses are heard in threads of their own.
+            if self._folder.visible:
+                at = options.index(self._layers.color)
+                self.choose(options[(at + step) % len(options)])
+
+    def show(self, *, is_playing: bool, is_hidden: bool) -> None:
+        """Follow what was painted last, or say nothing while something else is shown."""
+        painter = self._painter
+        legend = painter.legend if painter is not None and not is_hidden else None
+        said = "" if legend is None else legend_html(legend, highest=not is_playing)
+        if is_playing and self._legend_head(said) == self._legend_head(self._said):
+            return
+        if said != self._said:
+            self._said = said
+            self._legend.content = said
+        if legend is None or painter is None:
+            return
+        factor = painter.quantity(self._layers.color).factor
+        low, high = (_rounded(end * factor) for end in legend.limits)
+        self._range.show((low, high))
+
+    @staticmethod
+    def _legend_head(said: str) -> str:
+        """Cut off what changes with every frame."""
+        return said.partition(" · highest ")[0]
+
+    def _follow(self) -> None:
+        self._choice.value = self._layers.color
+        self._hold.value = self._layers.color_range is not None
+        self._show_range_fields()
+
+    def _show_range_fields(self) -> None:
+        is_colored = self._layers.color != "plain"
+        self._hold.visible = self._range.handle.visible = is_colored
+        self._legend.visible = is_colored
+
+    def _toggle_hold(self) -> None:
+        legend = self._painter.legend if self._painter is not None else None
+        if self._hold.value and legend is not None:
+            self._layers.color_range = legend.limits
+        else:
+            self._layers.color_range = None
+        self._redraw()
+
+    def _type(self) -> None:
+        """Take over the ends that a user typed, and hold them."""
+        painter = self._painter
+        low, high = (float(end) for end in self._range.take())
+        if painter is None or self._layers.color == "plain":
+            return
+        factor = painter.quantity(self._layers.color).factor
+        if not (math.isfinite(low) and math.isfinite(high)) or high <= low:
+            return  # Half-typed numbers; the scale waits until they make sense.
+        self._layers.color_range = (low / factor, high / factor)
+        self._hold.value = True
+        self._redraw()
+
+
+def _rounded(value: float) -> float:
+    """Keep four digits."""
+    return float(f"{value:.4g}")

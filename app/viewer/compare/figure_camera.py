@@ -1,0 +1,162 @@
+"""Where the cameras stand while the figure is shown, and how they come back."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import viser
+import viser.transforms
+from jaxtyping import Float
+from numpy import ndarray
+
+from app.viewer.content.session_state import Pose
+
+PICTURE_WIDTH = 1_600
+"""Width of an exported picture of the figure in pixels."""
+_PANEL_PIXELS = 345
+_FOV = float(np.deg2rad(14.0))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Eye:
+    """From where a client looks."""
+
+    right: Float[ndarray, " 3"]
+    """To the right of the picture."""
+    up: Float[ndarray, " 3"]
+    """To the top of the picture."""
+
+    @classmethod
+    def of(cls, wxyz: Float[ndarray, " 4"]) -> "Eye":
+        """Read a camera's orientation; its y axis points down."""
+        R_world_camera = viser.transforms.SO3(np.asarray(wxyz, dtype=np.float64)).as_matrix()
+        return cls(right=R_world_camera[:, 0], up=-R_world_camera[:, 1])
+
+    @classmethod
+    def at(cls, pose: Pose) -> "Eye":
+        """Find the orientation of a camera that looks at a point."""
+        ahead = pose.look_at - pose.position
+        right = np.cross(ahead, pose.up)
+        right = right / max(float(np.linalg.norm(right)), 1e-12)
+        up = np.cross(right, ahead)
+        return cls(right=right, up=up / max(float(np.linalg.norm(up)), 1e-12))
+
+    @property
+    def ahead(self) -> Float[ndarray, " 3"]:
+        """Into the picture."""
+        return np.cross(self.up, self.right)
+
+
+Box = tuple[Float[ndarray, " 3"], float, float]
+"""Middle, width and height of something as it is seen."""
+
+
+class FigureCameras:
+    """Moves the clients' cameras to the figure and back."""
+
+    def __init__(self) -> None:
+        self._poses: dict[int, Pose] = {}
+        self._aims: dict[int, tuple[Float[ndarray, " 3"], tuple[int, int]]] = {}
+
+    def aim(
+        self,
+        client: viser.ClientHandle,
+        pose: Pose,
+        box: Box,
+    ) -> None:
+        """Move a camera back along its view until the figure fits beside the panel.
+
+        The lens becomes a long one, so that both halves are seen from nearly the same side.
+
+        Args:
+            client: Whose camera.
+            pose: Where it stands, or is about to stand if the client has just come.
+            box: The figure.
+        """
+        camera = client.camera
+        self._poses.setdefault(client.client_id, pose)
+        eye = Eye.at(pose)
+        width, height = max(camera.image_width, 1), max(camera.image_height, 1)
+        hidden = _covered(width)
+        slope = float(np.tan(_FOV / 2))
+        center, wide, high = box
+        distance = max(high / 2, wide / 2 * height / (width - hidden)) / slope
+        aside = 0.5 * hidden * (2 * slope * distance / height) * eye.right
+        place = center + aside - distance * eye.ahead
+        self._aims[client.client_id] = place, (camera.image_width, camera.image_height)
+        with client.atomic():
+            camera.up_direction, camera.fov = pose.up, _FOV
+            camera.position, camera.look_at = place, center + aside
+
+    def has_lost(self, client: viser.ClientHandle) -> bool:
+        """Tell whether a camera that was aimed no longer shows the figure, and no user did that.
+
+        A browser may hear where its first camera stands after it was told to look at the figure;
+        and the window may have got another size.
+        """
+        aim, before = self._aims.get(client.client_id), self._poses.get(client.client_id)
+        if aim is None or before is None:
+            return False
+        camera, (place, size) = client.camera, aim
+        near = 1e-3 * float(np.linalg.norm(place - camera.look_at))
+        if np.linalg.norm(camera.position - place) < near:
+            return (camera.image_width, camera.image_height) != size
+        gaps = camera.position - before.position, camera.look_at - before.look_at
+        return all(float(np.linalg.norm(gap)) < near for gap in gaps)
+
+    def before(self, client: viser.ClientHandle) -> Pose:
+        """Find where a camera stands, or stood before it was moved to the figure."""
+        return self._poses.get(client.client_id) or Pose.of(client.camera)
+
+    def forget(self, client: viser.ClientHandle) -> Pose:
+        """Find where a camera stood, and forget it."""
+        self._aims.pop(client.client_id, None)
+        return self._poses.pop(client.client_id, None) or Pose.of(client.camera)
+
+    def restore(self, server: viser.ViserServer) -> None:
+        """Let all cameras stand again where they stood before."""
+        for client in server.get_clients().values():
+            pose = self._poses.get(client.client_id)
+            if pose is None:
+                continue
+            with client.atomic():
+                eye = client.camera
+                eye.up_direction, eye.fov = pose.up, pose.fov
+                eye.position, eye.look_at = pose.position, pose.look_at
+        self._poses.clear()
+        self._aims.clear()
+
+
+def picture_of_figure(client: viser.ClientHandle, box: Box) -> dict[str, Any]:
+    """Find camera and size of a picture of the figure as a client sees it beside the panel.
+
+    What is empty above and below is cut off evenly, so that the middle stays.
+
+    Args:
+        client: Who looks.
+        box: The figure.
+
+    Returns:
+        Arguments of viser's ``get_render``.
+    """
+    camera = client.camera
+    width, height = max(camera.image_width, 1), max(camera.image_height, 1)
+    hidden = _covered(width)
+    pixel = 2 * np.tan(camera.fov / 2) / height
+    distance = float(np.linalg.norm(camera.look_at - camera.position))
+    eye = Eye.of(camera.wxyz)
+    aside = 0.5 * hidden * pixel * distance * eye.right
+    reach = abs(float((box[0] - camera.look_at) @ eye.up)) + 0.5 * box[2]
+    kept = min(2 * reach / (pixel * distance), height)
+    return {
+        "width": PICTURE_WIDTH,
+        "height": max(round(kept * PICTURE_WIDTH / (width - hidden)), 1),
+        "wxyz": camera.wxyz,
+        "position": camera.position - aside,
+        "fov": 2 * float(np.arctan(np.tan(camera.fov / 2) * kept / height)),
+    }
+
+
+def _covered(width: int) -> int:
+    """Guess how many pixels of a picture the panel covers."""
+    return _PANEL_PIXELS if width > 2 * _PANEL_PIXELS else 0

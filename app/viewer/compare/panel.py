@@ -1,0 +1,271 @@
+"""The panel of a comparison: how both are shown, what the colors mean, and the difference."""
+
+import threading
+from collections.abc import Callable
+from html import escape
+from typing import Any
+
+import numpy as np
+import viser
+from viser import uplot
+
+from app.comparison import Mode
+from app.viewer.color.colormaps import table
+from app.viewer.compare.curve import DifferenceCurve
+from app.viewer.compare.look import MODES, SIDES, STYLES, Look, scale_end
+from app.viewer.physics.error_panel import plot_look
+from app.viewer.ui.guard import Guard, plain
+from app.viewer.ui.keyboard import bind
+
+_STYLE = "font-size:0.8em;line-height:1.5;padding:0 0.6em"
+_MEAN, _LARGEST = "rgb(132,94,194)", "rgb(200,70,120)"
+_NOW = "rgba(120,130,145,0.9)"
+_COMPARED = {
+    "nodes": "Each node of A from the same node of B.",
+    "surface": "Each node from the other's surface: A and B are made of different nodes.",
+}
+
+
+class ComparePanel:
+    """Switches of the look, the legend, and the difference at every tick as a plot.
+
+    Clock, measuring and users write from threads of their own.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        guard: Guard,
+        look: Look,
+        curve: DifferenceCurve,
+        *,
+        change: Callable[[], None],
+        has_keys: bool,
+    ) -> None:
+        """Add the panel.
+
+        Args:
+            server: Where to.
+            guard: Wraps the callbacks.
+            look: What the switches change.
+            curve: The difference.
+            change: Called when the look has changed; `moved` tells whether sides move.
+            has_keys: Whether C changes the colors; elsewhere it has another meaning.
+        """
+        self._look = look
+        self._curve = curve
+        self._change = change
+        self._names = dict.fromkeys(SIDES, "")
+        self._notes: tuple[str, ...] = ()
+        self._unit, self._factor = "mm", 1e3
+        self._tick, self._tick_count = 0, 1
+        self._plotted = 0
+        self._scales = (0.0, 0.0)
+        # What is written must not be older than what it replaces.
+        self._lock = threading.RLock()
+        gui = server.gui
+        self.folder = gui.add_folder("A and B")
+        with self.folder:
+            self._legend = gui.add_html("")
+            self._mode = gui.add_dropdown(
+                "Show", tuple(MODES.values()), initial_value=MODES[look.mode], hint="M: the next"
+            )
+            self._tint = gui.add_checkbox(
+                "Difference colors",
+                initial_value=look.tint == "difference",
+                hint="C: color nodes by how far they are from the other side"
+                if has_keys
+                else "Color nodes by how far they are from the other side",
+            )
+            self._fade = gui.add_slider(
+                "A ↔ B", 0.0, 1.0, 0.01, look.fade, hint="Left: A alone, right: B alone"
+            )
+            self._wipe = gui.add_slider(
+                "Line", 0.0, 1.0, 0.01, look.wipe, hint="Left of the line is A, right of it B"
+            )
+            self._swap = gui.add_button(
+                "Swap sides", icon=viser.Icon.ARROWS_LEFT_RIGHT, color="gray", hint="X"
+            )
+            self._text = gui.add_html("")
+            self._plot = gui.add_uplot(self._data(), _series(), **plot_look("", 1), height=120)
+        self._mode.on_update(guard.by_user(lambda _: self._choose()))
+        self._tint.on_update(guard.by_user(lambda _: self._choose()))
+        self._fade.on_update(guard.by_user(lambda _: self._choose()))
+        self._wipe.on_update(guard.by_user(lambda _: self._choose()))
+        self._swap.on_click(guard(lambda _: self.swap()))
+        self._commands = bind(server, guard, "swap", lambda _, __: self.swap())
+        self._commands += bind(server, guard, "compare_mode", lambda _, __: self.next_mode())
+        if has_keys:
+            self._commands += bind(server, guard, "color", lambda _, __: self.toggle_tint())
+        self._dress()
+
+    def remove(self) -> None:
+        """Take the panel and its keys away."""
+        self.folder.remove()
+        for command in self._commands:
+            command.remove()
+
+    def name(
+        self, names: dict[str, str], notes: tuple[str, ...], *, unit: str, tick_count: int
+    ) -> None:
+        """Tell who A and B are.
+
+        Args:
+            names: Name of each side; of a user's text only what `plain` leaves of it.
+            notes: What a user should know of the pair, as sentences.
+            unit: Unit of lengths.
+            tick_count: Number of ticks of the clock.
+        """
+        self._names, self._notes = names, notes
+        self._unit, self._factor = ("mm", 1e3) if unit == "m" else (unit, 1.0)
+        self._tick_count = tick_count
+        self._plot.axes = plot_look(self._unit, 1)["axes"]
+        self._dress()
+        self.follow()
+
+    def follow(self) -> bool:
+        """Show what is measured by now; for any thread. Tells whether the color scale changed."""
+        with self._lock:
+            before = self._look.scale
+            self._look.scale = scale_end(self._curve.strong * self._factor) / self._factor
+            self._draw_plot()
+            self._fit_scales()
+            self._write()
+            return self._look.scale != before
+
+    def show(self, tick: int, *, is_playing: bool) -> None:
+        """Tell which tick is on the screen."""
+        with self._lock:
+            if tick != self._tick:
+                self._tick = tick
+                self._write()
+            # A clock that stops may leave behind what was not worth drawing while it ran.
+            if tick != self._plotted and (not is_playing or tick % 5 == 0):
+                self._draw_plot()
+
+    def swap(self) -> None:
+        """Let A and B change their places."""
+        self._look.is_swapped = not self._look.is_swapped
+        self._dress()
+        self._change()
+
+    def next_mode(self) -> None:
+        """Go to the next way of showing both."""
+        modes = list(MODES)
+        self.show_mode(modes[(modes.index(self._look.mode) + 1) % len(modes)])
+
+    def show_mode(self, mode: Mode) -> None:
+        """Show both in a way."""
+        self._mode.value = MODES[mode]
+        self._choose()
+
+    def toggle_tint(self) -> None:
+        """Switch between colors of sides and of the difference."""
+        self._tint.value = not self._tint.value
+        self._choose()
+
+    def _choose(self) -> None:
+        look = self._look
+        with self._lock:  # What is taken last must be what was read last.
+            look.mode = next(mode for mode, label in MODES.items() if label == self._mode.value)
+            look.tint = "difference" if self._tint.value else "side"
+            look.fade, look.wipe = self._fade.value, self._wipe.value
+            self._dress()
+        self._change()
+
+    def _dress(self) -> None:
+        with self._lock:
+            self._fade.visible = self._look.mode == "overlay"
+            self._wipe.visible = self._look.mode == "wipe"
+            self._write()
+
+    def _write(self) -> None:
+        """Write the legend and the difference of the tick on the screen."""
+        lines = [
+            _dot(STYLES[name].node, f"{name.upper()} {escape(self._names[name])}") for name in SIDES
+        ]
+        if self._look.is_swapped:
+            lines.reverse()
+        if self._look.tint == "difference" and self._curve.way is not None:
+            lines.append(self._ramp())
+        self._set(self._legend, f'<div style="{_STYLE}">{"".join(lines)}</div>')
+        self._set(self._text, f'<div style="{_STYLE}">{"<br/>".join(self._said())}</div>')
+
+    def _said(self) -> list[str]:
+        told = self._curve.at(self._tick)
+        said: list[str] = []
+        if told is not None:
+            mean, largest = (f"{v * self._factor:.3g}" for v in (told.mean, told.largest))
+            said.append(
+                f"{_mark(_MEAN)} mean {mean} {plain(self._unit)} "
+                f"{_mark(_LARGEST)} max {largest} {plain(self._unit)} between A and B"
+            )
+        elif self._curve.way is not None:
+            said.append("measuring the difference …")
+        said += [plain(_COMPARED[self._curve.way])] if self._curve.way else []
+        return said + [f"<em>{escape(note)}</em>" for note in self._notes]
+
+    def _ramp(self) -> str:
+        """Draw the color scale with numbers below it."""
+        stops = ",".join(f"rgb({r},{g},{b})" for r, g, b in table("sequential")[::51])
+        end = self._look.scale * self._factor
+        marks = "".join(f"<span>{end * part:.3g}</span>" for part in (0, 0.25, 0.5, 0.75))
+        marks += f"<span>≥{end:.3g} {plain(self._unit)}</span>"
+        return (
+            '<div style="margin-top:0.4em">difference</div>'
+            '<div style="height:0.7em;border-radius:0.2em;'
+            f'background:linear-gradient(to right,{stops})"></div>'
+            f'<div style="display:flex;justify-content:space-between">{marks}</div>'
+        )
+
+    @staticmethod
+    def _set(place: Any, content: str) -> None:
+        if place.content != content:
+            place.content = content
+
+    def _fit_scales(self) -> None:
+        """Let the plot show all curves; it finds no scale of its own after it was empty."""
+        _, largest = self._curve.columns()
+        top = scale_end(float(np.nan_to_num(largest).max(initial=0.0)) * self._factor) or 1.0
+        last = float(max(self._tick_count - 1, 1))
+        if (last, top) != self._scales:
+            self._scales = (last, top)
+            y = uplot.Scale(range=(0.0, top))
+            self._plot.scales = {"x": uplot.Scale(time=False, range=(0.0, last)), "y": y}
+
+    def _draw_plot(self) -> None:
+        self._plotted = self._tick
+        self._plot.data = self._data()
+
+    def _data(self) -> tuple[np.ndarray, ...]:
+        """Collect the curves; the plot needs two points at least, and knows no gaps."""
+        count = max(self._tick_count, 2)
+        tick = np.arange(count, dtype=np.float64)
+        mean, largest = (np.nan_to_num(c[:count]) * self._factor for c in self._curve.columns())
+        shown = max(len(mean), 2)
+        padded = [np.pad(curve, (0, count - len(curve))) for curve in (mean, largest)]
+        now = np.zeros(count)
+        at = min(self._tick, count - 1)
+        now[at] = max(padded[1][at], float(padded[1].max(initial=0.0)) * 0.5)
+        return tuple(curve[:shown] for curve in (tick, *padded, now))
+
+
+def _mark(color: str) -> str:
+    return f'<span style="color:{color}">●</span>'
+
+
+def _dot(color: tuple[int, int, int], label: str) -> str:
+    return (
+        '<div style="overflow-wrap:anywhere"><span style="display:inline-block;width:0.7em;'
+        f'height:0.7em;border-radius:50%;background:rgb{color};margin-right:0.35em"></span>{label}</div>'
+    )
+
+
+def _series() -> tuple[uplot.Series, ...]:
+    points: Any = {"show": False}
+    return (
+        uplot.Series(label="frame"),
+        uplot.Series(label="mean", stroke=_MEAN, width=1.5, points=points),
+        uplot.Series(label="max", stroke=_LARGEST, width=1.5, points=points),
+        uplot.Series(label="now", stroke=_NOW, width=1, points=points),
+    )

@@ -1,0 +1,124 @@
+"""A comparison in one viser server: what is drawn, its panel, its difference and its cameras."""
+
+from collections.abc import Callable
+from typing import Any
+
+import viser
+
+from app.viewer.compare.curve import DifferenceCurve, Pairing
+from app.viewer.compare.drawing import CompareDrawing
+from app.viewer.compare.figure_camera import Eye, FigureCameras, picture_of_figure
+from app.viewer.compare.look import Look
+from app.viewer.compare.panel import ComparePanel
+from app.viewer.compare.recorded import Halves
+from app.viewer.content.layers import Layers
+from app.viewer.content.session_state import Pose
+from app.viewer.ui.guard import Guard
+
+
+class CompareView:
+    """Shows two rollouts in one scene, so that clock and camera are one by construction."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        guard: Guard,
+        drawing: CompareDrawing,
+        cameras: FigureCameras,
+        *,
+        look: Look,
+        redraw: Callable[[], None],
+        has_keys: bool,
+    ) -> None:
+        """Add the panel where the caller stands.
+
+        Args:
+            server: Where to.
+            guard: Wraps the callbacks.
+            drawing: The scene.
+            cameras: Where the clients' cameras stood before.
+            look: How it begins.
+            redraw: Draws the current frame again.
+            has_keys: Whether C changes the colors.
+        """
+        self.look = look
+        self.drawing = drawing
+        self._server = server
+        self._cameras = cameras
+        self._redraw = redraw
+        self._was_side = look.mode == "side"
+        self._panel: ComparePanel | None = None
+        self.curve = DifferenceCurve(self._measured)
+        self.panel = self._panel = ComparePanel(
+            server, guard, look, self.curve, change=self._change, has_keys=has_keys
+        )
+
+    def draw(self, tick: int, halves: Halves, layers: Layers, *, is_playing: bool) -> None:
+        """Bring both sides to a moment; runs in the thread that draws."""
+        self.drawing.draw(halves, self.look, layers, self.curve.way, is_playing=is_playing)
+        self.panel.show(tick, is_playing=is_playing)
+
+    def follow(self, pairing: Pairing | None) -> None:
+        """Measure the difference of these rollouts from now on."""
+        self.curve.follow(pairing)
+
+    def enter(self) -> None:
+        """Show both sides to all clients."""
+        if self.look.mode == "side":
+            for client in self._server.get_clients().values():
+                self._aim(client, Pose.of(client.camera))
+
+    def leave(self) -> None:
+        """Let all cameras stand again where they stood before."""
+        self._cameras.restore(self._server)
+
+    def close(self) -> None:
+        """Stop measuring, and take scene and panel away."""
+        self.curve.close()
+        self.drawing.clear()
+        self.panel.remove()
+
+    def welcome(self, client: viser.ClientHandle) -> None:
+        """Show both sides to a client that has just come."""
+        if self.look.mode == "side":
+            self._aim(client, Pose.first(self._server.initial_camera))
+
+    def turn(self, client: viser.ClientHandle) -> None:
+        """Let the sides follow a client's camera."""
+        if self.look.mode == "side" and self._cameras.has_lost(client):
+            self._aim(client, self._cameras.before(client))
+            return
+        self.drawing.turn(Eye.of(client.camera.wxyz))
+        if self.look.mode == "wipe":
+            self._redraw()
+
+    def reset_view(self, client: viser.ClientHandle) -> bool:
+        """Show both sides whole to a client that looked elsewhere; False if one has its own way."""
+        if self.look.mode == "side":
+            self._aim(client, Pose.of(client.camera))
+        return self.look.mode == "side"
+
+    def picture(self) -> Callable[[viser.ClientHandle], dict[str, Any]] | None:
+        """Find camera and size of a picture of both sides; None if the client's own will do."""
+        return self._picture if self.look.mode == "side" else None
+
+    def _picture(self, client: viser.ClientHandle) -> dict[str, Any]:
+        return picture_of_figure(client, self.drawing.box(Eye.of(client.camera.wxyz)))
+
+    def _aim(self, client: viser.ClientHandle, pose: Pose) -> None:
+        eye = Eye.at(pose)
+        self._cameras.aim(client, pose, self.drawing.box(eye))
+        self.drawing.turn(eye)
+
+    def _change(self) -> None:
+        """Move the cameras if the sides have moved, and draw again."""
+        is_side = self.look.mode == "side"
+        if is_side != self._was_side:
+            self._was_side = is_side
+            (self.enter if is_side else self.leave)()
+        self._redraw()
+
+    def _measured(self) -> None:
+        """Take in what was measured; runs in the thread of the curve."""
+        if self._panel is not None and self._panel.follow() and self.look.tint == "difference":
+            self._redraw()

@@ -1,0 +1,257 @@
+"""What a session shows: hands, object, observation and cameras of one sequence."""
+
+import logging
+from collections.abc import Sequence as Listing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, Protocol
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from app.viewer.content.markers import Markers
+from app.viewer.content.object_rollout import ObjectRollout
+from app.viewer.content.observed import CloudSet, DepthCloud, Observed, PointSet, Tracks
+from app.viewer.content.skeleton import lift_keypoints
+from physhandi.data.run import Run
+from physhandi.data.sequence import Sequence
+from physhandi.data.view import View
+from physhandi.errors import MissingInputError, PhysHandiError, UsageError
+from physhandi.simulation.model import SimulationParameters, SpringMassModel
+
+logger = logging.getLogger(__name__)
+
+
+class Catalog(Protocol):
+    """Finds runs and sequences by their ids."""
+
+    def run(self, run_id: str, /) -> Run:
+        """Open a run."""
+        ...
+
+    def sequence(self, sequence_id: str, /) -> Sequence:
+        """Open a sequence."""
+        ...
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class HandSurface:
+    """The moving surface of one hand."""
+
+    side: Literal["right", "left"]
+    """``"right"`` or ``"left"``."""
+    vertex: Float[ndarray, "frame vertex 3"]
+    """Vertex positions [m]."""
+    face: Int[ndarray, "face 3"] | None
+    """Triangles, or None if they are not known (points are shown)."""
+    joint: Float[ndarray, "frame joint 3"] | None = None
+    """Its 21 joints [m], if the run holds them."""
+    keypoint: Float[ndarray, "view frame joint 3"] | None = None
+    """Where the views saw the joints (x, y [px], confidence), NaN where they did not."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Content:
+    """Everything that can be shown of one sequence, with or without a run."""
+
+    title: str
+    """Name of the run or the sequence."""
+    sequence_name: str
+    """Name of the sequence."""
+    frame_count: int
+    """Number of frames."""
+    frame_rate: float
+    """Frames per second [Hz]."""
+    reconstruction_count: int
+    """Number of frames that were fitted; the later ones are predicted."""
+    length_unit: str
+    """Unit of all lengths, ``"m"`` if metric."""
+    ground_height: float | None
+    """Height of the ground [m]; None if there is none."""
+    hands: tuple[HandSurface, ...] = ()
+    """Reconstructed hands."""
+    skeletons: tuple[Float[ndarray, "frame keypoint 3"], ...] = ()
+    """Hand keypoints lifted from the views, if there are no reconstructed hands."""
+    control: Float[ndarray, "frame control 3"] | None = None
+    """Control nodes [m]."""
+    fitted: ObjectRollout | None = None
+    """The object's fitted rollout."""
+    observed: Observed | None = None
+    """What the cameras or markers saw."""
+    tracks: Tracks | None = None
+    """Points that were followed over the frames."""
+    markers: Markers | None = None
+    """Identified markers of a recording, if they are shown without an object."""
+    views: Listing[View] = field(default_factory=tuple)
+    """The recording's views."""
+
+    @property
+    def is_metric(self) -> bool:
+        """Whether lengths are metres."""
+        return self.length_unit == "m"
+
+    def close(self) -> None:
+        """Release the video decoders; a view that is asked again opens its own anew."""
+        for view in self.views:
+            view.close()
+
+
+def open_run(catalog: Catalog, run_id: str, sequence_name: str | None = None) -> Content:
+    """Collect what a run has found out about one of its sequences.
+
+    Args:
+        catalog: Finds the run, and the recording behind it.
+        run_id: The run.
+        sequence_name: One of the run's sequences; None for the first.
+
+    Raises:
+        MissingInputError: If the run has no result for that sequence yet.
+        RunError: If a published file is missing or damaged; names it.
+    """
+    run = catalog.run(run_id)
+    if run.is_published:
+        run.verify(allows_more=True)
+    name = sequence_name or run.sequence_names[0]
+    if name not in run.sequence_names:
+        raise UsageError(f"Run '{run.name}' has no sequence '{name}'.")
+    folder = f"sequences/{name}"
+    if not run.has(f"{folder}/meta.yaml"):
+        raise MissingInputError(
+            f"Run '{run.name}' has no result for sequence '{name}' yet ({folder}/meta.yaml is "
+            "missing). Open it when its first stage is finished."
+        )
+    meta = run.yaml(f"{folder}/meta.yaml")
+    sequence = _recording(catalog, run, name)
+    control = run.array(f"{folder}/control.npy") if run.has(f"{folder}/control.npy") else None
+    return Content(
+        title=run.name,
+        sequence_name=name,
+        frame_count=int(meta["frame_count"]),
+        frame_rate=float(meta["frame_rate"]),
+        reconstruction_count=int(meta.get("reconstruction_frames", meta["frame_count"])),
+        length_unit="m" if meta.get("metric", True) else str(meta.get("length_unit", "units")),
+        ground_height=meta.get("ground_height"),
+        hands=_hands(run, folder, [str(side) for side in meta.get("hands", [])]),
+        control=control,
+        fitted=load_fitted(run, name),
+        observed=_run_observation(run, folder) or (_observation(sequence) if sequence else None),
+        tracks=_run_tracks(run, folder),
+        views=sequence.views if sequence else (),
+    )
+
+
+def open_sequence(catalog: Catalog, sequence_id: str) -> Content:
+    """Collect what a recording shows before anything is fitted to it."""
+    sequence = catalog.sequence(sequence_id)
+    return Content(
+        title=sequence.name,
+        sequence_name=sequence.name,
+        frame_count=sequence.frame_count,
+        frame_rate=sequence.frame_rate,
+        reconstruction_count=len(sequence.reconstruction_frames),
+        length_unit="m" if sequence.metric else sequence.length_unit,
+        ground_height=sequence.ground_height,
+        skeletons=lift_keypoints(sequence.views),
+        control=sequence.control,
+        observed=_observation(sequence),
+        markers=Markers.of(sequence),
+        views=sequence.views,
+    )
+
+
+def load_fitted(run: Run, sequence_name: str) -> ObjectRollout | None:
+    """Load the fitted rollout of a run with its model; None if the run has no object."""
+    folder = f"sequences/{sequence_name}"
+    needed = (f"{folder}/rollout.npy", f"{folder}/control.npy", f"{folder}/model.safetensors")
+    if not all(run.has(name) for name in needed):
+        return None
+    position = run.array(needed[0])
+    parameters = SimulationParameters.from_dict(run.yaml("object/parameters.yaml"))
+    if run.has(f"{folder}/meta.yaml"):
+        # As the rollout was simulated: what is stored of the world is the profile's, not this one.
+        meta = run.yaml(f"{folder}/meta.yaml")
+        parameters = parameters.in_world(
+            frame_rate=float(meta["frame_rate"]),
+            ground_height=meta.get("ground_height"),
+            gravity=float(meta.get("gravity", parameters.gravity)),
+        )
+    return ObjectRollout(
+        model=SpringMassModel.from_tensors(run.tensors(needed[2])),
+        parameters=parameters,
+        control=run.array(needed[1])[: len(position)],
+        position=position,
+        ready=len(position),
+    )
+
+
+def _recording(catalog: Catalog, run: Run, name: str) -> Sequence | None:
+    """Find the recording where the run found it, else by its name."""
+    folder = Path(run.sequences[run.sequence_names.index(name)])
+    try:
+        return Sequence.load(folder) if folder.is_dir() else catalog.sequence(name)
+    except PhysHandiError as error:
+        logger.info("the recording behind the run is not shown: %s", error)
+        return None
+
+
+def _hands(run: Run, folder: str, recorded: Listing[str]) -> tuple[HandSurface, ...]:
+    """Load the hands; `recorded` are the sides in the order of the keypoints."""
+    seen = run.array(f"{folder}/keypoint.npy") if run.has(f"{folder}/keypoint.npy") else None
+    hands: list[HandSurface] = []
+    sides: tuple[Literal["right", "left"], ...] = ("right", "left")
+    for side in sides:
+        if run.has(f"{folder}/hand_{side}_vertex.npy"):
+            vertex = run.array(f"{folder}/hand_{side}_vertex.npy")
+            stored = f"{folder}/hand_{side}_face.npy"
+            face = run.array(stored) if run.has(stored) else _faces(side, vertex.shape[1])
+            stored = f"{folder}/hand_{side}_keypoint.npy"
+            joint = run.array(stored) if run.has(stored) else None
+            at = recorded.index(side) if side in recorded else -1
+            is_seen = seen is not None and 0 <= at < seen.shape[2]
+            keypoint = seen[:, :, at] if seen is not None and is_seen else None
+            hands.append(
+                HandSurface(side=side, vertex=vertex, face=face, joint=joint, keypoint=keypoint)
+            )
+    return tuple(hands)
+
+
+def _faces(side: Literal["right", "left"], vertex_count: int) -> Int[ndarray, "face 3"] | None:
+    """Give the open hand's faces to a run that stored none."""
+    from physhandi.hand.model import load_hand_model
+
+    model = load_hand_model(side)
+    if model.vertex_count != vertex_count:
+        logger.info("the %s hand has %d vertices; shown as points", side, vertex_count)
+        return None
+    return np.asarray(model.faces, dtype=np.int32)
+
+
+def _run_observation(run: Run, folder: str) -> Observed | None:
+    clouds = (f"{folder}/observation/cloud.npy", f"{folder}/observation/cloud_end.npy")
+    if all(run.has(name) for name in clouds):
+        return CloudSet(run.array(clouds[0]), run.array(clouds[1]))
+    files = (f"{folder}/observation/point.npy", f"{folder}/observation/is_visible.npy")
+    if not all(run.has(name) for name in files):
+        return None
+    return PointSet(run.array(files[0]), run.array(files[1]))
+
+
+def _run_tracks(run: Run, folder: str) -> Tracks | None:
+    files = (f"{folder}/observation/point.npy", f"{folder}/observation/is_visible.npy")
+    if not all(run.has(name) for name in files):
+        return None
+    point, is_visible = (run.array(name) for name in files)
+    nodes = f"{folder}/observation/node_of_track.npy"
+    node = run.array(nodes) if run.has(nodes) else None
+    return Tracks(point=point, is_visible=is_visible, node=node) if point.shape[1] else None
+
+
+def _observation(sequence: Sequence) -> Observed | None:
+    if sequence.marker is not None:
+        is_seen = np.array(np.isfinite(sequence.marker).all(axis=-1))
+        is_seen[:, list(sequence.controlled_markers)] = False  # Control points are drawn there.
+        return PointSet(sequence.marker, is_seen)
+    if any(view.has_depth for view in sequence.views):
+        return DepthCloud(sequence.views)
+    return None

@@ -1,0 +1,80 @@
+"""Which parts of a scene are shown, and in which colors."""
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from app.viewer.content.content import Content
+from app.viewer.content.object_rollout import ObjectRollout
+
+BLUE = (47, 111, 222)
+RED = (214, 39, 40)
+GREEN = (46, 160, 67)
+YELLOW = (245, 190, 20)
+GREY = (120, 130, 145)
+SKIN = {"right": (224, 172, 140), "left": (205, 150, 122)}
+
+Theme = Literal["as the browser", "light", "dark"]
+"""Which background a user can choose."""
+THEMES: tuple[Theme, ...] = ("as the browser", "light", "dark")
+
+Coloring = Literal[
+    "plain", "error", "stiffness", "damping", "strain", "speed", "force", "difference"
+]
+"""What the colors of an object tell."""
+COLORINGS: tuple[Coloring, ...] = get_args(Coloring)
+
+PLAYING_SPRINGS = 2_000
+"""Most springs that are streamed while the clock is running."""
+
+
+@dataclass
+class Layers:
+    """Which parts of the scene are shown."""
+
+    hands: bool = True
+    """Hand meshes."""
+    nodes: bool = True
+    """Object nodes."""
+    surface: bool = False
+    """Surface of the object, laid through its nodes."""
+    controls: bool = True
+    """Control nodes that hold the object by a virtual spring."""
+    all_controls: bool = False
+    """Control nodes that hold nothing."""
+    virtual_springs: bool = True
+    """Springs between control nodes and object nodes."""
+    object_springs: bool = False
+    """Springs between object nodes."""
+    forces: bool = True
+    """Sum of the virtual springs' forces on each object node."""
+    observed: bool = False
+    """Observed points."""
+    cameras: bool = True
+    """Camera frustums with the frame's image."""
+    ground: bool = True
+    """Grid on the ground, or below everything if the ground is not known."""
+    looks_from: str | None = None
+    """View whose image is the backdrop."""
+    dark: bool = False
+    """Dark background."""
+    force_scale: float = 1.0
+    """Length of the force arrows, relative to the automatic one."""
+    color: Coloring = "plain"
+    """What the colors of nodes, surface and springs tell."""
+    color_range: tuple[float, float] | None = None
+    """Values at the ends of the color scale, in SI units; None for those of the sequence."""
+
+
+def default_layers(content: Content) -> Layers:
+    """Choose what is shown at first: the result if there is one, else the recording."""
+    has_object = content.fitted is not None
+    return Layers(
+        observed=not has_object or (content.tracks is not None and content.tracks.node is not None),
+        cameras=not has_object and bool(content.views),
+        object_springs=content.fitted is not None and _has_few_springs(content.fitted),
+    )
+
+
+def _has_few_springs(take: ObjectRollout) -> bool:
+    """Tell whether all springs fit into a playing frame; they make nodes read as cloth or rope."""
+    return take.model.object_spring_count <= PLAYING_SPRINGS

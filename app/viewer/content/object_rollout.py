@@ -1,0 +1,117 @@
+"""One rollout of the object: the fitted one, or one that is being simulated now."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from physhandi.simulation.forces import (
+    spring_strains,
+    spring_tensions,
+    virtual_forces,
+    virtual_spring_forces,
+)
+from physhandi.simulation.model import SimulationParameters, SpringMassModel
+
+
+@dataclass(eq=False, kw_only=True)
+class ObjectRollout:
+    """Object motion under one set of parameters; frames become ready one after the other."""
+
+    model: SpringMassModel
+    """Topology and material."""
+    parameters: SimulationParameters
+    """What the object was simulated with."""
+    control: Float[ndarray, "frame control 3"]
+    """Control node positions [m]."""
+    position: Float[ndarray, "frame node 3"]
+    """Object node positions [m]; meaningless from frame `ready` on."""
+    velocity: Float[ndarray, "frame node 3"] | None = None
+    """Object node velocities [m/s]; None if they are to be differences of positions."""
+    ready: int = 0
+    """Number of frames that have been simulated."""
+    error: str | None = None
+    """Why the simulation ended early, if it did."""
+
+    @classmethod
+    def empty(
+        cls,
+        model: SpringMassModel,
+        parameters: SimulationParameters,
+        control: Float[ndarray, "frame control 3"],
+    ) -> "ObjectRollout":
+        """Make room for a rollout of which no frame is ready."""
+        shape = (len(control), model.node_count, 3)
+        return cls(
+            model=model,
+            parameters=parameters,
+            control=control,
+            position=np.zeros(shape, np.float32),
+            velocity=np.zeros(shape, np.float32),
+        )
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames when all are ready."""
+        return len(self.position)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether every frame is ready."""
+        return self.ready >= self.frame_count
+
+    def forces(self, frame: int) -> Float[ndarray, "node 3"]:
+        """Compute the sum of the virtual springs' forces on each object node [N]."""
+        return virtual_forces(self.model, self.parameters, *self.state(frame))
+
+    def spring_forces(self, frame: int) -> Float[ndarray, "virtual 3"]:
+        """Compute the force of each virtual spring on its object node [N]."""
+        return virtual_spring_forces(self.model, self.parameters, *self.state(frame))
+
+    def strains(self, frame: int) -> Float[ndarray, " spring"]:
+        """Measure how much longer each spring is than at rest, as a part of its rest length."""
+        position, control = self.position[frame], self.control[frame]
+        return spring_strains(self.model, np.asarray(position), np.asarray(control))
+
+    def tensions(self, frame: int) -> Float[ndarray, " spring"]:
+        """Compute how hard each spring pulls its ends together [N]."""
+        return spring_tensions(self.model, self.parameters, *self.state(frame))
+
+    def state(self, frame: int) -> tuple[ndarray, ndarray, ndarray, ndarray]:
+        """Collect positions and velocities of object nodes, then of control nodes [m, m/s]."""
+        rate = self.parameters.frame_rate
+        if self.velocity is not None:
+            velocity = self.velocity[frame]
+        else:
+            velocity = _difference(self.position, frame, rate)
+        return (
+            np.asarray(self.position[frame]),
+            np.asarray(velocity),
+            np.asarray(self.control[frame]),
+            _difference(self.control, frame, rate),
+        )
+
+    def frame_distance(self, other: "ObjectRollout", frame: int) -> float:
+        """Measure how far the nodes of a frame are from another rollout's, on average [m]."""
+        offset = np.asarray(self.position[frame]) - np.asarray(other.position[frame])
+        return float(np.linalg.norm(offset, axis=-1).mean())
+
+    def mean_distance(self, other: "ObjectRollout") -> float:
+        """Measure how far the ready frames are from another rollout, averaged over nodes [m]."""
+        count = min(self.ready, other.ready)
+        if count == 0 or self.position.shape[1:] != other.position.shape[1:]:
+            return float("nan")
+        offset = np.asarray(self.position[:count]) - np.asarray(other.position[:count])
+        return float(np.linalg.norm(offset, axis=-1).mean())
+
+
+def _difference(
+    point: Float[ndarray, "frame point 3"], frame: int, rate: float
+) -> Float[ndarray, "point 3"]:
+    """Velocity during the frame's substeps: from the frame before to this one [m/s]."""
+    before, after = max(frame - 1, 0), max(frame, 1)
+    after = min(after, len(point) - 1)
+    return ((np.asarray(point[after]) - np.asarray(point[before])) * np.float32(rate)).astype(
+        np.float32
+    )

@@ -1,0 +1,108 @@
+"""What there is to say about a session, and what a user has set up in it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+import viser
+from jaxtyping import Float
+from numpy import ndarray
+
+from app.viewer.content.layers import Layers, Theme
+from physhandi.simulation.model import SimulationParameters
+
+Kind = Literal["run", "sequence", "comparison"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SessionInfo:
+    """What a listing says about a session."""
+
+    id: str
+    """Unguessable id, part of its address."""
+    kind: Kind
+    """Whether a run, a sequence or two runs together are shown."""
+    target: str
+    """Id of the run or the sequence; of a comparison the query after ``/compare?``."""
+    owner: str
+    """Who opened it."""
+    title: str
+    """Name of what is shown."""
+    client_count: int
+    """Browsers that look at it."""
+    created: float
+    """When it was opened [s since 1970]."""
+    idle: float
+    """How long nobody has looked at it [s]."""
+    offers: tuple[str, ...] = ()
+    """What can be done with it: ``object`` is simulated, ``colors`` and the ``figure`` exist."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pose:
+    """Where a camera stands and what it looks at."""
+
+    position: Float[ndarray, " 3"]
+    """Of the camera."""
+    look_at: Float[ndarray, " 3"]
+    """Point in the middle of the picture, about which the camera turns."""
+    up: Float[ndarray, " 3"]
+    """Direction that is upwards in the picture."""
+    fov: float
+    """Vertical field of view [rad]."""
+
+    @classmethod
+    def of(cls, camera: viser.CameraHandle) -> "Pose":
+        """Read a client's camera."""
+        return cls(
+            position=camera.position.copy(),
+            look_at=camera.look_at.copy(),
+            up=camera.up_direction.copy(),
+            fov=camera.fov,
+        )
+
+    @classmethod
+    def first(cls, camera: viser.InitialCameraConfig) -> "Pose":
+        """Read where the cameras of new clients are put."""
+        up = np.array([0.0, 0.0, 1.0]) if camera.up is None else camera.up
+        return cls(position=camera.position, look_at=camera.look_at, up=up, fov=camera.fov)
+
+    def give_first(self, camera: viser.InitialCameraConfig) -> None:
+        """Put the cameras of new clients here."""
+        camera.fov, camera.up = self.fov, self.up
+        camera.position, camera.look_at = self.position, self.look_at
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SessionState:
+    """Everything that a copy of a session begins with."""
+
+    sequence_name: str | None
+    """Sequence of the run; None for its first."""
+    frame: int
+    """Frame that is due."""
+    is_playing: bool
+    """Whether the clock is running."""
+    speed: float
+    """Sequence seconds per second."""
+    does_loop: bool
+    """Whether playing starts over at the end."""
+    layers: Layers | None
+    """What is shown; None for what suits the content."""
+    theme: Theme
+    """Which background was chosen."""
+    prefers_dark: bool
+    """Whether the browser asks for a dark one."""
+    parameters: SimulationParameters | None
+    """What the object was simulated with last; None without an object."""
+    automatic_substeps: bool
+    """Whether the number of substeps is chosen automatically."""
+    is_figure: bool
+    """Whether the figure is shown instead of the scene."""
+    pose: Pose | None
+    """Camera of the first client; None if nobody looked."""
+    layer_changes: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    """Without `layers`: fields of `Layers` that differ from what suits the content."""
+    parameter_changes: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    """Parameters that differ from the fitted ones; they count if there are no `parameters`."""

@@ -1,0 +1,1 @@
+"""What leaves from the screen: pictures, geometry, tables and bundles."""

@@ -1,0 +1,290 @@
+"""Everything that a picture of a scene shows, in one ZIP archive that explains itself."""
+
+import csv
+import io
+import json
+import logging
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+
+from app.viewer.compare.figure import Side
+from app.viewer.content.content import Content
+from app.viewer.content.object_rollout import ObjectRollout
+from app.viewer.content.session_state import Pose
+from app.viewer.export.snapshot import Snapshot, write_ply
+from physhandi import __version__
+from physhandi.data.files import plain, without_non_finite
+from physhandi.errors import MissingInputError
+from physhandi.simulation.forces import spring_strains
+
+logger = logging.getLogger(__name__)
+
+_NODES = ("side", "node", "x_m", "y_m", "z_m", "force_x_N", "force_y_N", "force_z_N")
+_CONTROLS = ("side", "control", "x_m", "y_m", "z_m", "holds_springs")
+_SPRINGS = (
+    *("side", "spring", "kind", "node", "other_node_or_control", "length_m", "rest_length_m"),
+    *("strain", "stiffness_N", "damping_Ns_per_m"),
+)
+_FORCES = ("side", "spring", "node", "control", "force_x_N", "force_y_N", "force_z_N")
+_ALWAYS_THE_SAME = (1980, 1, 1, 0, 0, 0)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Picture:
+    """A picture of the scene."""
+
+    content: bytes
+    """The PNG file."""
+    pose: Pose
+    """Where the camera stood."""
+    width: int
+    """Width [px]."""
+    height: int
+    """Height [px]."""
+
+    @classmethod
+    def of(cls, content: bytes, pose: Pose) -> "Picture":
+        """Read the size from a PNG file."""
+        width, height = (int.from_bytes(content[at : at + 4], "big") for at in (16, 20))
+        return cls(content=content, pose=pose, width=width, height=height)
+
+
+def bundle(snapshot: Snapshot, picture: Picture) -> bytes:
+    """Collect pictures, geometry, springs, forces, parameters, cameras and the link of a view.
+
+    Args:
+        snapshot: What is shown.
+        picture: How it looks.
+
+    Returns:
+        The ZIP archive. The same view gives the same bytes.
+    """
+    files: dict[str, bytes] = {"picture.png": picture.content}
+    files |= dict(_views(snapshot))
+    sides = _sides(snapshot)
+    if sides:
+        files |= _tables(sides)
+        files["frame.npz"] = _arrays(sides, snapshot)
+        files["parameters.yaml"] = _parameters(sides)
+    try:
+        files["frame.ply"] = write_ply(snapshot)
+    except MissingInputError:
+        logger.info("no geometry is in the archive: the recording shows images alone")
+    files["camera.json"] = _json(_camera(picture, snapshot))
+    if snapshot.link:
+        files["permalink.txt"] = f"{snapshot.link}\n".encode()
+    files["README.txt"] = _readme(snapshot, files).encode()
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in sorted(files, key=lambda name: (name != "README.txt", name)):
+            about = zipfile.ZipInfo(name, _ALWAYS_THE_SAME)
+            about.compress_type = zipfile.ZIP_DEFLATED
+            about.external_attr = 0o644 << 16
+            archive.writestr(about, files[name])
+    return stream.getvalue()
+
+
+def _sides(snapshot: Snapshot) -> dict[str, tuple[ObjectRollout, int]]:
+    """Name the rollouts that are shown, each with its frame."""
+    if snapshot.sides is not None:
+        sides: dict[str, Side] = dict(snapshot.sides)
+        return {n: (s.take, s.frame) for n, s in sides.items() if s.take is not None}
+    return {} if snapshot.take is None else {"shown": (snapshot.take, snapshot.take_frame)}
+
+
+def _tables(sides: dict[str, tuple[ObjectRollout, int]]) -> dict[str, bytes]:
+    nodes: list[list[Any]] = []
+    controls: list[list[Any]] = []
+    springs: list[list[Any]] = []
+    forces: list[list[Any]] = []
+    for side, (take, frame) in sides.items():
+        model, first = take.model, take.model.object_spring_count
+        position, control = np.asarray(take.position[frame]), np.asarray(take.control[frame])
+        for node, (place, force) in enumerate(zip(position, take.forces(frame), strict=True)):
+            nodes.append([side, node, *_texts(place), *_texts(force)])
+        ends = np.sort(model.spring_nodes, axis=1)
+        held = np.bincount(ends[first:, 1] - model.node_count, minlength=len(control))
+        for number, place in enumerate(control):
+            controls.append([side, number, *_texts(place), int(held[number])])
+        strain = spring_strains(model, position, control)
+        for number, (node, other) in enumerate(ends.tolist()):
+            is_virtual = number >= first
+            rest = float(model.rest_length[number])
+            stiffness = take.parameters.stiffness_scale * float(model.stiffness[number])
+            about = [(1 + strain[number]) * rest, rest, strain[number], stiffness]
+            kind = "virtual" if is_virtual else "object"
+            end = other - model.node_count if is_virtual else other
+            texts = _texts([*about, float(model.damping[number])])
+            springs.append([side, number, kind, node, end, *texts])
+        for number, force in enumerate(take.spring_forces(frame), first):
+            node, other = ends[number].tolist()
+            forces.append([side, number, node, other - model.node_count, *_texts(force)])
+    return {
+        "nodes.csv": _csv(_NODES, nodes),
+        "controls.csv": _csv(_CONTROLS, controls),
+        "springs.csv": _csv(_SPRINGS, springs),
+        "forces.csv": _csv(_FORCES, forces),
+    }
+
+
+def _arrays(sides: dict[str, tuple[ObjectRollout, int]], snapshot: Snapshot) -> bytes:
+    arrays: dict[str, Any] = {}
+    for side, (take, frame) in sides.items():
+        prefix = "" if side == "shown" else f"{side}_"
+        arrays |= {
+            f"{prefix}position": np.asarray(take.position[frame]),
+            f"{prefix}control": np.asarray(take.control[frame]),
+            f"{prefix}force": take.forces(frame),
+            f"{prefix}virtual_spring_force": take.spring_forces(frame),
+        }
+        arrays |= {f"{prefix}{name}": array for name, array in take.model.to_tensors().items()}
+    for hand in snapshot.content.hands:
+        vertex = hand.vertex[min(snapshot.frame, len(hand.vertex) - 1)]
+        arrays[f"hand_{hand.side}_vertex"] = np.asarray(vertex)
+        if hand.face is not None:
+            arrays[f"hand_{hand.side}_face"] = np.asarray(hand.face)
+    stream = io.BytesIO()
+    np.savez_compressed(stream, allow_pickle=False, **arrays)
+    return stream.getvalue()
+
+
+def _parameters(sides: dict[str, tuple[ObjectRollout, int]]) -> bytes:
+    content = {side: take.parameters.to_dict() for side, (take, _) in sides.items()}
+    return yaml.safe_dump(plain(content.get("shown", content)), sort_keys=False).encode()
+
+
+def _views(snapshot: Snapshot) -> Iterator[tuple[str, bytes]]:
+    """Give the cameras' images of the frame."""
+    for view in snapshot.content.views:
+        if view.has_color:
+            image = view.color(snapshot.frame)
+            is_written, content = cv2.imencode(".png", image[..., ::-1])
+            if is_written:
+                yield f"views/{view.name}.png", content.tobytes()
+
+
+def _camera(picture: Picture, snapshot: Snapshot) -> dict[str, Any]:
+    pose = picture.pose
+    ahead = pose.look_at - pose.position
+    ahead = ahead / np.linalg.norm(ahead)
+    right = np.cross(ahead, pose.up)
+    right = right / np.linalg.norm(right)
+    T_world_camera = np.eye(4)
+    T_world_camera[:3] = np.stack([right, np.cross(ahead, right), ahead, pose.position], axis=1)
+    focal = 0.5 * picture.height / float(np.tan(pose.fov / 2))
+    middle = ((picture.width - 1) / 2, (picture.height - 1) / 2)
+    own = {
+        "width": picture.width,
+        "height": picture.height,
+        "position": pose.position,
+        "look_at": pose.look_at,
+        "up": pose.up,
+        "vertical_field_of_view_deg": float(np.degrees(pose.fov)),
+        "K": [[focal, 0.0, middle[0]], [0.0, focal, middle[1]], [0.0, 0.0, 1.0]],
+        "T_world_camera": T_world_camera,
+    }
+    recorded = {
+        view.name: {
+            "width": view.camera.width,
+            "height": view.camera.height,
+            "K": view.camera.K,
+            "T_world_camera": view.camera.T_world_camera,
+            "distortion": view.camera.distortion,
+        }
+        for view in snapshot.content.views
+    }
+    return {"picture": own, "views": recorded}
+
+
+def _readme(snapshot: Snapshot, files: dict[str, bytes]) -> str:
+    content, run = snapshot.content, snapshot.run
+    unit = content.length_unit
+    layers = {} if snapshot.layers is None else vars(snapshot.layers)
+    there = _layers_there(content)
+    shown = ", ".join(name for name, on in layers.items() if on is True and name in there)
+    named = "metres" if content.is_metric else f"{unit}s, which have no metric scale"
+    units = [f"Lengths are in {named}, times in seconds."]
+    if content.fitted is not None:
+        units.append("Forces are in newtons (a node's unit mass is 1 kg).")
+    color = layers.get("color", "plain")
+    about = [line for name, line in _ABOUT if any(file.startswith(name) for file in files)]
+    return "\n".join(
+        [
+            f"{content.title}: sequence {content.sequence_name}, frame {snapshot.frame}",
+            f"Saved by PhysHanDI {__version__}" + (f" from run {run.id}." if run else "."),
+            "",
+            *units,
+            "The world has z up. Cameras have x right, y down, z ahead.",
+            *([f"Shown were: {shown}."] if shown else []),
+            *([f"Colors tell: {color}."] if color != "plain" else []),
+            "",
+            *about,
+            "",
+            *(_COLUMNS if content.fitted is not None else ()),
+        ]
+    )
+
+
+def _layers_there(content: Content) -> set[str]:
+    """Name the layers that have anything in them."""
+    there = {"ground"}
+    if content.hands or content.skeletons:
+        there.add("hands")
+    if content.fitted is not None:
+        there |= {"nodes", "surface", "virtual_springs", "object_springs", "forces", "all_controls"}
+    if content.control is not None:
+        there.add("controls")
+    if content.observed is not None:
+        there.add("observed")
+    return there | ({"cameras"} if content.views else set())
+
+
+_COLUMNS = (
+    "Column 'side': 'shown', or, of the figure that compares topologies, 'ours' and",
+    "'phystwin'. Numbers of nodes, controls and springs start at 0.",
+    "",
+)
+_ABOUT = (
+    ("picture.png", "picture.png      the view"),
+    ("views/", "views/*.png      what the recording's cameras saw in this frame, if there are any"),
+    ("frame.ply", "frame.ply        nodes, hands and virtual springs (edges) of this frame"),
+    ("nodes.csv", "nodes.csv        object nodes: place, and sum of the virtual springs' forces"),
+    ("controls.csv", "controls.csv     control nodes: place, springs that they hold"),
+    ("springs.csv", "springs.csv      all springs: ends, length, rest length, strain, stiffness"),
+    ("forces.csv", "forces.csv       force of each virtual spring on its object node"),
+    (
+        "frame.npz",
+        "frame.npz        the same as arrays, without rounding, with the hands' surfaces",
+    ),
+    ("parameters.yaml", "parameters.yaml  what the object was simulated with"),
+    (
+        "camera.json",
+        "camera.json      cameras of the picture and of the recording: K, T_world_camera",
+    ),
+    (
+        "permalink.txt",
+        "permalink.txt    opens this view again, put behind the address of the same server",
+    ),
+)
+
+
+def _csv(columns: tuple[str, ...], rows: list[list[Any]]) -> bytes:
+    stream = io.StringIO()
+    table = csv.writer(stream, lineterminator="\n")
+    table.writerow(columns)
+    table.writerows(rows)
+    return stream.getvalue().encode()
+
+
+def _json(content: Any) -> bytes:
+    return (json.dumps(without_non_finite(plain(content)), indent=1) + "\n").encode()
+
+
+def _texts(values: Any) -> list[str]:
+    return [f"{float(value):.9g}" for value in values]

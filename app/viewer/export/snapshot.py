@@ -1,0 +1,169 @@
+"""What is on the screen now, for everything that saves it."""
+
+import csv
+import io
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import viser
+import yaml
+
+from app.viewer.compare.figure import Side
+from app.viewer.content.content import Content
+from app.viewer.content.layers import GREEN, RED, SKIN, Layers
+from app.viewer.content.object_rollout import ObjectRollout
+from physhandi.data.exporters import export_scene
+from physhandi.data.exporters.mesh import frame_to_ply, ply_bytes
+from physhandi.data.exporters.scene_data import HandSurface, SceneData, read_skins
+from physhandi.data.run import Run
+from physhandi.errors import MissingInputError
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Snapshot:
+    """What is on the screen now."""
+
+    content: Content
+    """What is shown."""
+    frame: int
+    """The frame."""
+    take: ObjectRollout | None
+    """The object's rollout."""
+    take_frame: int
+    """Frame of the rollout."""
+    sides: Mapping[str, Side] | None = None
+    """Both halves of the figure, if the figure is shown."""
+    picture: Callable[[viser.ClientHandle], dict[str, Any]] | None = None
+    """Finds the camera of the figure's picture, if the figure is shown."""
+    run: Run | None = None
+    """The run, if it is one that is shown."""
+    layers: Layers | None = None
+    """Which layers are shown, if that is to be told."""
+    link: str = ""
+    """Address on this server that shows the same; empty if there is none."""
+
+
+def scene_data(snapshot: Snapshot) -> SceneData:
+    """Collect the motion that a snapshot belongs to: the rollout's frames that are ready.
+
+    Args:
+        snapshot: What is on the screen.
+
+    Raises:
+        MissingInputError: If it is a recording, in which nothing was reconstructed.
+    """
+    content, take, run = snapshot.content, snapshot.take, snapshot.run
+    if take is None and not content.hands:
+        raise MissingInputError("There is no rollout to save; this is a recording only.")
+    count = content.frame_count if take is None else take.ready
+    nothing = np.zeros((count, 0, 3), np.float32)
+    control = content.control if take is None else take.control
+    return SceneData(
+        sequence=content.sequence_name,
+        frame_rate=content.frame_rate,
+        length_unit=content.length_unit,
+        rollout=nothing if take is None else np.asarray(take.position[:count]),
+        control=nothing if control is None else np.asarray(control[:count]),
+        spring_nodes=np.zeros((0, 2), np.int32) if take is None else take.model.spring_nodes,
+        object_spring_count=0 if take is None else take.model.object_spring_count,
+        hands={
+            hand.side: HandSurface(vertex=hand.vertex[:count], face=hand.face)
+            for hand in content.hands
+        },
+        joints={hand.side: hand.joint[:count] for hand in content.hands if hand.joint is not None},
+        run="" if run is None else run.id,
+        model={} if take is None else take.model.to_tensors(),
+        skins={} if run is None else read_skins(run, content.sequence_name),
+    )
+
+
+def write_ply(snapshot: Snapshot) -> bytes:
+    """Write the frame: the object with its controls and hands, or else what is there of them."""
+    content, take = snapshot.content, snapshot.take
+    if take is not None:
+        return frame_to_ply(scene_data(snapshot), snapshot.take_frame)
+    frame = snapshot.frame
+    parts: list[tuple[Any, tuple[int, int, int]]]
+    parts = [(hand.vertex[frame], SKIN[hand.side]) for hand in content.hands]
+    if not parts and content.control is not None:
+        parts.append((content.control[frame], RED))
+    if content.observed is not None:
+        parts.append((content.observed.points(frame), GREEN))
+    if not parts:
+        raise MissingInputError("This frame shows no geometry to save.")
+    color = [np.tile(np.array(color, np.uint8), (len(point), 1)) for point, color in parts]
+    return ply_bytes(
+        np.concatenate([np.asarray(point, np.float32) for point, _ in parts]),
+        np.concatenate(color),
+        np.zeros((0, 3), np.int32),
+        np.zeros((0, 2), np.int32),
+    )
+
+
+def write_npz(snapshot: Snapshot) -> bytes:
+    """Write all frames: rollout, springs and controls, as they are on the screen."""
+    take, content = snapshot.take, snapshot.content
+    arrays: dict[str, Any] = {}
+    if take is not None:
+        arrays = {
+            "position": take.position[: take.ready],
+            "control": take.control[: take.ready],
+            "spring_nodes": take.model.spring_nodes,
+            "rest_length": take.model.rest_length,
+            "stiffness": take.model.stiffness,
+            "object_spring_count": np.int64(take.model.object_spring_count),
+        }
+    elif content.control is not None:
+        arrays["control"] = content.control
+    for hand in content.hands:
+        arrays[f"hand_{hand.side}_vertex"] = hand.vertex
+    if not arrays:
+        raise MissingInputError("There is no rollout to save; this is a recording only.")
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **arrays)
+    return stream.getvalue()
+
+
+def write_csv(snapshot: Snapshot) -> bytes:
+    """Write a table with one row a frame: mean position and force, largest speed."""
+    take = _take(snapshot)
+    stream = io.StringIO()
+    table = csv.writer(stream)
+    table.writerow(
+        ["frame", "time_s", "mean_x", "mean_y", "mean_z", "force_x", "force_y", "force_z"]
+    )
+    for frame in range(take.ready):
+        mean = np.asarray(take.position[frame]).mean(axis=0)
+        force = take.forces(frame).sum(axis=0)
+        seconds = frame / take.parameters.frame_rate
+        table.writerow([frame, f"{seconds:.6g}", *(f"{v:.6g}" for v in (*mean, *force))])
+    return stream.getvalue().encode()
+
+
+def write_yaml(snapshot: Snapshot) -> bytes:
+    """Write the parameters of the rollout that is on the screen."""
+    return yaml.safe_dump(_take(snapshot).parameters.to_dict(), sort_keys=False).encode()
+
+
+def _take(snapshot: Snapshot) -> ObjectRollout:
+    if snapshot.take is None:
+        raise MissingInputError("There is no simulated object here to save.")
+    return snapshot.take
+
+
+def write_gltf(snapshot: Snapshot) -> bytes:
+    """Write all frames that are ready as one binary glTF file, as they are on the screen."""
+    with tempfile.TemporaryDirectory(prefix="physhandi-export-") as folder:
+        return export_scene(scene_data(snapshot), "gltf", Path(folder) / "x.glb").read_bytes()
+
+
+def write_plys(snapshot: Snapshot) -> bytes:
+    """Write all frames that are ready as PLY files in a ZIP archive."""
+    with tempfile.TemporaryDirectory(prefix="physhandi-export-") as folder:
+        frames = export_scene(scene_data(snapshot), "ply", Path(folder) / "frames")
+        return Path(shutil.make_archive(str(frames), "zip", frames)).read_bytes()

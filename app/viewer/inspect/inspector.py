@@ -1,0 +1,348 @@
+"""Reads what was clicked: its values now, one of them over all frames, and a mark in the scene."""
+
+import html
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import viser
+from jaxtyping import Float
+from numpy import ndarray
+from viser import uplot
+
+from app.viewer.color.color_panel import ColorPanel
+from app.viewer.content.content import Content
+from app.viewer.content.object_rollout import ObjectRollout
+from app.viewer.inspect.picking import Pick, Ray, Target, pick
+from app.viewer.inspect.readings import HISTORIES, History, Readings, Rows, follow, unit_of
+from app.viewer.scene.framing import Framing
+from app.viewer.scene.nodes import SceneNodes
+from app.viewer.scene.scene import Scene
+from app.viewer.ui.guard import Guard
+from app.viewer.ui.keyboard import bind
+
+MARK = (233, 30, 180)
+"""Color of what was clicked, which no scale has."""
+_REFRESH = 0.25
+_LONGEST_UNIT = 8
+_AXIS, _LINE, _NOW = "rgb(120,130,145)", "rgb(47,111,222)", "rgba(233,30,180,0.9)"
+_NONE = '<div style="font-size:0.8em;padding:0 0.9em 0.4em;opacity:0.8">Click {} to read it.</div>'
+
+
+def clickable(content: Content) -> str:
+    """Name what can be clicked in a content; empty if there is nothing."""
+    has_object = content.fitted is not None
+    found = ["a node", "a spring"] if has_object else []
+    if not has_object and content.control is not None:
+        found.append("a control point" if content.markers is None else "a gripper")
+    if content.markers is not None:
+        found.append("a marker")
+    if content.hands:
+        found.append("the hand")
+    return " or ".join([", ".join(found[:-1]), found[-1]] if len(found) > 1 else found)
+
+
+class Inspector:
+    """The panel of the thing that was clicked; clicks and the clock come in different threads."""
+
+    def __init__(self, server: viser.ViserServer, guard: Guard, redraw: Callable[[], None]) -> None:
+        """Add the panel, which says what to do until something is clicked.
+
+        Args:
+            server: Where to.
+            guard: Wraps the callbacks.
+            redraw: Draws the current frame again.
+        """
+        self._server = server
+        self._redraw = redraw
+        self._lock = threading.RLock()
+        self._nodes = SceneNodes(server)
+        self._content: Content | None = None
+        self._scene: Scene | None = None
+        self._readings: Readings | None = None
+        self._framing: Framing | None = None
+        self._pick: Pick | None = None
+        self._shown: tuple[ObjectRollout | None, int, int] = (None, 0, 0)
+        self._measured: tuple[Any, ...] | None = None
+        self._curve: Float[ndarray, " frame"] = np.zeros(0)
+        self._refreshed = 0.0
+        self._invitation = ""
+        gui = server.gui
+        self._folder = gui.add_folder("Inspect", expand_by_default=True)
+        with self._folder:
+            self._text = gui.add_html("")
+            self._kind: Any = gui.add_dropdown("History of", ("speed",), visible=False)
+            self._plot: Any = None
+            self._clear = gui.add_button("Clear", color="gray", hint="Esc", visible=False)
+        self._kind.on_update(guard.by_user(lambda _: self._choose_history()))
+        self._clear.on_click(guard(lambda _: self.clear()))
+        server.scene.on_click()(guard(lambda event: self._click(event, prefers_hand=False)))
+        server.scene.on_click(modifier="shift")(
+            guard(lambda event: self._click(event, prefers_hand=True))
+        )
+
+    @property
+    def pick(self) -> Pick | None:
+        """What was clicked."""
+        return self._pick
+
+    def replace(self, content: Content, scene: Scene, framing: Framing) -> None:
+        """Get ready for another content."""
+        with self._lock:
+            things = clickable(content)
+            self._folder.visible = bool(things)
+            self._invitation = _NONE.format(things)
+            self.clear()
+            self._content, self._scene, self._framing = content, scene, framing
+            self._readings = Readings(content, scene.painter)
+
+    def clear(self) -> None:
+        """Forget what was clicked."""
+        with self._lock:
+            self._pick = None
+            self._nodes.clear()
+            self._text.content = self._invitation
+            self._kind.visible = self._clear.visible = False
+            self._remove_plot()
+
+    def look_at(self, found: Pick | None) -> None:
+        """Read a thing, or nothing."""
+        with self._lock:
+            if found is None or self._readings is None:
+                self.clear()
+                return
+            self._pick = self._readings.settle(found)
+            options = HISTORIES[self._pick.kind]
+            color = self._scene.layers.color if self._scene is not None else "plain"
+            before = self._kind.value
+            self._kind.options = options
+            wanted = color if color in options else before
+            self._kind.value = wanted if wanted in options else options[0]
+            self._kind.visible = self._clear.visible = True
+            self._measured = None
+            self._remove_plot()
+        self._redraw()
+
+    def show(
+        self,
+        take: ObjectRollout | None,
+        frame: int,
+        take_frame: int,
+        *,
+        is_playing: bool,
+        is_hidden: bool,
+    ) -> None:
+        """Follow the clock.
+
+        Args:
+            take: The rollout that is drawn.
+            frame: Frame of the hands.
+            take_frame: Frame of the rollout.
+            is_playing: Whether the clock is running, so that less may be sent.
+            is_hidden: Whether something else is shown instead of the scene.
+        """
+        with self._lock:
+            self._shown = (take, frame, take_frame)
+            chosen, readings = self._pick, self._readings
+            if chosen is None or readings is None:
+                return
+            if not readings.exists(chosen, take):
+                self.clear()
+                return
+            self._mark(chosen, readings, take, frame, take_frame, is_hidden=is_hidden)
+            now = time.monotonic()
+            if is_playing and now - self._refreshed < _REFRESH:
+                return
+            self._refreshed = now
+            title = readings.title(chosen, take)
+            rows = readings.rows(chosen, take, frame, take_frame)
+            self._text.content = _table(title, rows)
+            self._draw_history(chosen, take, take_frame if chosen.kind != "hand" else frame)
+
+    def _click(self, event: viser.SceneClickEvent, *, prefers_hand: bool) -> None:
+        with self._lock:
+            content, scene, framing = self._content, self._scene, self._framing
+            if content is None or scene is None or framing is None:
+                return
+            take, frame, take_frame = self._shown
+            camera = event.client.camera
+            ray = Ray(
+                origin=np.asarray(event.ray_origin, dtype=np.float64),
+                direction=np.asarray(event.ray_direction, dtype=np.float64),
+                pixel=float(camera.fov) / max(int(camera.image_height), 1),
+            )
+            target = Target(
+                content=content,
+                take=take,
+                frame=frame,
+                take_frame=take_frame,
+                layers=scene.layers,
+                spacing=framing.spacing,
+                faces=scene.faces,
+            )
+            found = pick(ray, target, prefers_hand=prefers_hand)
+        if found is not None:
+            self.look_at(found)
+
+    def _mark(
+        self,
+        chosen: Pick,
+        readings: Readings,
+        take: ObjectRollout | None,
+        frame: int,
+        take_frame: int,
+        *,
+        is_hidden: bool,
+    ) -> None:
+        """Mark the thing in the scene, with the virtual springs that hold it."""
+        framing = self._framing
+        if framing is None:
+            return
+        place = readings.place(chosen, take, frame, take_frame)
+        links = readings.links(chosen, take, take_frame)
+        size = 1.6 if take is None and chosen.kind != "hand" else 0.46
+        with self._server.atomic():
+            self._nodes.points(
+                "/picked/point", place, MARK, size * framing.spacing, is_visible=not is_hidden
+            )
+            self._nodes.segments("/picked/links", links, MARK, 3.0, is_visible=not is_hidden)
+            name = readings.title(chosen, take).partition(" (")[0]
+            if is_hidden:
+                self._nodes.show("/picked/name", is_visible=False)
+                return
+            above = place.mean(axis=0) + np.array([0.0, 0.0, 0.9 * framing.spacing])
+            self._nodes.label(
+                "/picked/name",
+                name,
+                above,
+                anchor="bottom-center",
+                height=0.02 * framing.extent,
+            )
+
+    def _choose_history(self) -> None:
+        self._measured = None
+        with self._lock:
+            self._remove_plot()
+        self._redraw()
+
+    def _draw_history(self, chosen: Pick, take: ObjectRollout | None, frame: int) -> None:
+        """Bring the curve to what is simulated, and its mark to the frame on the screen."""
+        content, scene = self._content, self._scene
+        if content is None or scene is None:
+            return
+        kind: History = self._kind.value
+        state = (chosen, kind, take, take.ready if take is not None else 0, scene.painter.reference)
+        unit, factor = unit_of(kind, content, scene.painter)
+        if state != self._measured:
+            self._curve = factor * follow(chosen, kind, take, content, scene.painter)
+            self._measured = state
+        shown = np.flatnonzero(np.isfinite(self._curve))
+        if len(shown) < 2:  # A plot without points does not find its scale again.
+            shown, curve = np.arange(2), np.zeros(max(len(self._curve), 2))
+        else:
+            curve = self._curve
+        now = np.full(len(curve), float(np.min(curve[shown], initial=0.0)))
+        now[min(frame, len(now) - 1)] = float(np.max(curve[shown]))
+        data = tuple(np.asarray(part[shown]) for part in (np.arange(len(curve)) * 1.0, curve, now))
+        if self._plot is None:
+            self._add_plot(data, kind, unit, content.frame_count)
+        else:
+            self._plot.data = data
+
+    def _add_plot(self, data: tuple[ndarray, ...], kind: str, unit: str, count: int) -> None:
+        # The choice above names the quantity; along the axis there is no room for long units too.
+        label = f"{kind} [{unit}]" if len(unit) <= _LONGEST_UNIT else unit
+        grid: Any = {"show": True, "stroke": "rgba(120,130,145,0.2)"}
+        points: Any = {"show": False}
+        with self._folder:
+            self._plot = self._server.gui.add_uplot(
+                data,
+                (
+                    uplot.Series(label="frame"),
+                    uplot.Series(label=kind, stroke=_LINE, width=1.5, points=points),
+                    uplot.Series(label="now", stroke=_NOW, width=1, points=points),
+                ),
+                scales={"x": uplot.Scale(time=False, range=(0.0, float(max(count - 1, 1))))},
+                axes=(
+                    uplot.Axis(stroke=_AXIS, grid=grid, size=26),
+                    uplot.Axis(stroke=_AXIS, grid=grid, size=44, label=label, labelSize=14),
+                ),
+                legend=uplot.Legend(show=False),
+                height=130,
+                order=self._kind.order + 0.1,
+            )
+
+    def _remove_plot(self) -> None:
+        if self._plot is not None:
+            self._plot.remove()
+            self._plot = None
+
+
+def _table(title: str, rows: Rows) -> str:
+    """Lay out names and values; all text is the program's, and escaped all the same."""
+    lines = "".join(
+        '<tr><td style="opacity:0.75;padding:0 0.8em 0 0;vertical-align:top;white-space:nowrap">'
+        f'{html.escape(name)}</td><td style="padding:0;font-variant-numeric:tabular-nums">'
+        f"{html.escape(value)}</td></tr>"
+        for name, value in rows
+    )
+    color = "rgb({},{},{})".format(*MARK)
+    return (
+        '<div style="font-size:0.8em;line-height:1.35;padding:0 0.9em 0.4em" data-reading>'
+        f'<b><span style="color:{color}">●</span> {html.escape(title)}</b>'
+        f"<table>{lines}</table></div>"
+    )
+
+
+class Inspection:
+    """The panels of colors and of what was clicked, and the keys that belong to them."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        guard: Guard,
+        redraw: Callable[[], None],
+        *,
+        reset_view: Callable[[Any], None],
+        snapshot: Callable[[Any], None],
+    ) -> None:
+        """Add the panels where the caller stands.
+
+        Args:
+            server: Where to.
+            guard: Wraps the callbacks.
+            redraw: Draws the current frame again.
+            reset_view: Puts the camera of the client of an event back.
+            snapshot: Saves a picture for the client of an event.
+        """
+        self.colors = ColorPanel(server, guard, redraw)
+        self.inspector = Inspector(server, guard, redraw)
+        self._redraw = redraw
+        bind(server, guard, "reset", lambda event, _: reset_view(event))
+        bind(server, guard, "snapshot", lambda event, _: snapshot(event))
+        bind(server, guard, "clear", lambda _, __: self._clear())
+
+    def replace(self, content: Content, scene: Scene, framing: Framing) -> None:
+        """Get ready for another content."""
+        painter = scene.painter if content.fitted is not None else scene.hand_painter
+        self.colors.replace(content, scene.layers, painter)
+        self.inspector.replace(content, scene, framing)
+
+    def show(
+        self,
+        take: ObjectRollout | None,
+        frame: int,
+        take_frame: int,
+        *,
+        is_playing: bool,
+        is_hidden: bool,
+    ) -> None:
+        """Follow the clock; see `Inspector.show`."""
+        self.colors.show(is_playing=is_playing, is_hidden=is_hidden)
+        self.inspector.show(take, frame, take_frame, is_playing=is_playing, is_hidden=is_hidden)
+
+    def _clear(self) -> None:
+        self.inspector.clear()
+        self._redraw()

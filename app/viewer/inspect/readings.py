@@ -1,0 +1,333 @@
+"""What there is to read of one thing in the scene."""
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from app.viewer.color.coloring import Painter
+from app.viewer.color.hand_coloring import HandPainter
+from app.viewer.color.legend import number
+from app.viewer.content.content import Content
+from app.viewer.content.layers import Coloring
+from app.viewer.content.object_rollout import ObjectRollout
+from app.viewer.inspect.picking import Kind, Pick
+
+History = Literal["speed", "force", "strain", "error", "difference", "height", "length"]
+"""What a chart can show of a thing."""
+HISTORIES: dict[Kind, tuple[History, ...]] = {
+    "node": ("speed", "force", "strain", "error", "difference", "height"),
+    "spring": ("strain", "force", "length"),
+    "control": ("speed", "force", "height"),
+    "hand": ("speed", "height"),
+    "marker": ("speed", "height"),
+}
+"""What a chart can show of each kind of thing."""
+
+
+def follow(
+    pick: Pick, kind: History, take: ObjectRollout | None, content: Content, painter: Painter
+) -> Float[ndarray, " frame"]:
+    """Follow one value of a thing over the frames that are ready, in SI units.
+
+    Args:
+        pick: The thing.
+        kind: One of its `HISTORIES`.
+        take: The rollout; None without an object.
+        content: Hands and control nodes.
+        painter: Measures what colors tell as well.
+    """
+    if pick.kind in {"hand", "marker"} or take is None:
+        return _of_track(track_of(pick, content), kind, content.frame_rate)
+    if kind == "height":
+        of = take.position if pick.kind == "node" else take.control
+        return np.asarray(of[: take.ready, pick.index, 2], dtype=np.float64)
+    if kind == "length":
+        first, second = take.model.spring_nodes[pick.index]
+        point = np.concatenate([take.position[: take.ready], take.control[: take.ready]], axis=1)
+        return np.linalg.norm(point[:, second] - point[:, first], axis=-1).astype(np.float64)
+    part = reduced(take, pick)
+    if pick.kind == "control":
+        return np.array([_of_control(pick.index, kind, part, frame) for frame in range(take.ready)])
+    values = [painter.measure(kind, part, frame) for frame in range(take.ready)]
+    if pick.kind == "spring":
+        return np.array([float(value.spring[0].mean()) for value in values])
+    return np.array([float(value.node[pick.index]) for value in values])
+
+
+def unit_of(kind: History, content: Content, painter: Painter) -> tuple[str, float]:
+    """Tell the unit in which a history is written, and its number in one SI unit."""
+    if kind == "height" or kind == "length":  # noqa: PLR1714  # narrows the type
+        return length_unit(content)
+    quantity = painter.quantity(kind)
+    return quantity.unit, quantity.factor
+
+
+def length_unit(content: Content) -> tuple[str, float]:
+    """Tell the unit of small lengths, and its number in one unit of the content."""
+    return ("mm", 1e3) if content.is_metric else (content.length_unit, 1.0)
+
+
+def track_of(pick: Pick, content: Content) -> Float[ndarray, "frame 3"]:
+    """Find where a vertex of a hand, or a control node without an object, is in every frame [m]."""
+    if pick.kind == "control" and content.control is not None:
+        return np.asarray(content.control[:, pick.index], dtype=np.float64)
+    if pick.kind == "marker" and content.markers is not None:
+        return np.asarray(content.markers.point[:, pick.index], dtype=np.float64)
+    hand = next(hand for hand in content.hands if hand.side == pick.side)
+    return np.asarray(hand.vertex[:, pick.index], dtype=np.float64)
+
+
+def springs_at(take: ObjectRollout, point: int) -> Int[ndarray, " spring"]:
+    """Find the springs that end at an object node, or at a control node counted after them."""
+    return np.flatnonzero((take.model.spring_nodes == point).any(axis=1))
+
+
+def reduced(take: ObjectRollout, pick: Pick) -> ObjectRollout:
+    """Keep only the springs that matter to a thing, so that all its frames are read quickly."""
+    model = take.model
+    if pick.kind == "spring":
+        chosen = np.array([pick.index])
+    else:
+        chosen = springs_at(take, pick.index + (model.node_count if pick.kind == "control" else 0))
+    smaller = replace(
+        model,
+        spring_nodes=model.spring_nodes[chosen],
+        rest_length=model.rest_length[chosen],
+        stiffness=model.stiffness[chosen],
+        damping=model.damping[chosen],
+        object_spring_count=int((chosen < model.object_spring_count).sum()),
+    )
+    return replace(take, model=smaller)
+
+
+def _of_track(
+    track: Float[ndarray, "frame 3"], kind: History, frame_rate: float
+) -> Float[ndarray, " frame"]:
+    if kind == "height":
+        return track[:, 2]
+    return frame_rate * np.linalg.norm(np.diff(track, axis=0, prepend=track[:1]), axis=1)
+
+
+def _of_control(control: int, kind: History, part: ObjectRollout, frame: int) -> float:
+    value = part.state(frame)[3][control] if kind == "speed" else part.spring_forces(frame).sum(0)
+    return float(np.linalg.norm(value))
+
+
+_NAMED = 6
+Rows = list[tuple[str, str]]
+
+
+class Readings:
+    """Reads values from rollouts and hands of one content."""
+
+    def __init__(self, content: Content, painter: Painter) -> None:
+        self._content = content
+        self._painter = painter
+        self._unit = "m" if content.is_metric else content.length_unit
+        self._units = self._unit if content.is_metric else f"{self._unit}s"
+        self._hands = HandPainter(content)
+
+    def settle(self, pick: Pick) -> Pick:
+        """Take a hand's vertex for the control node that it is, if it is one."""
+        first = self._first_control(pick.side) if pick.kind == "hand" else None
+        return pick if first is None else Pick(kind="control", index=first + pick.index)
+
+    def title(self, pick: Pick, take: ObjectRollout | None) -> str:
+        """Name a thing."""
+        if pick.kind == "spring" and take is not None:
+            is_own = pick.index < take.model.object_spring_count
+            return f"{'object' if is_own else 'virtual'} spring {pick.index}"
+        if pick.kind == "marker":
+            return f"marker {pick.index}"
+        if pick.kind == "hand":
+            return f"{pick.side} hand, vertex {pick.index}"
+        if pick.kind == "control":
+            return self._name_of_control(pick)
+        return f"object node {pick.index}"
+
+    def _name_of_control(self, pick: Pick) -> str:
+        for hand in self._content.hands:
+            first = self._first_control(hand.side)
+            if first is not None and 0 <= pick.index - first < hand.vertex.shape[1]:
+                vertex = pick.index - first
+                return f"control node {pick.index} ({hand.side} hand, vertex {vertex})"
+        markers = self._content.markers
+        if markers is not None and pick.index < len(markers.held):
+            return f"gripper, marker {markers.held[pick.index]}"
+        return f"control node {pick.index}"
+
+    def exists(self, pick: Pick, take: ObjectRollout | None) -> bool:
+        """Tell whether a thing is there still, when the springs may be others."""
+        if pick.kind == "hand":
+            return True
+        if pick.kind == "marker":
+            return self._content.markers is not None
+        if take is None:
+            return pick.kind == "control"
+        model = take.model
+        count = {
+            "node": model.node_count,
+            "spring": len(model.spring_nodes),
+            "control": model.control_count,
+        }
+        return pick.index < count.get(pick.kind, 0)
+
+    def place(
+        self, pick: Pick, take: ObjectRollout | None, frame: int, take_frame: int
+    ) -> Float[ndarray, "end 3"]:
+        """Find where a thing is: one point, or both ends of a spring [m]."""
+        if pick.kind in {"hand", "marker"}:
+            return track_of(pick, self._content)[[min(frame, self._content.frame_count - 1)]]
+        if take is None:
+            control = self._content.control
+            return np.zeros((0, 3)) if control is None else np.asarray(control[frame])[[pick.index]]
+        point = np.concatenate([take.position[take_frame], take.control[take_frame]])
+        if pick.kind == "spring":
+            return point[take.model.spring_nodes[pick.index]]
+        offset = take.model.node_count if pick.kind == "control" else 0
+        return point[[pick.index + offset]]
+
+    def links(
+        self, pick: Pick, take: ObjectRollout | None, take_frame: int
+    ) -> Float[ndarray, "segment 2 3"]:
+        """Find the spring itself, or the virtual springs that end at a thing [m]."""
+        if take is None or pick.kind in {"hand", "marker"}:
+            return np.zeros((0, 2, 3), np.float32)
+        point = np.concatenate([take.position[take_frame], take.control[take_frame]])
+        if pick.kind == "spring":
+            return point[take.model.spring_nodes[[pick.index]]]
+        offset = take.model.node_count if pick.kind == "control" else 0
+        joined = springs_at(take, pick.index + offset)
+        return point[take.model.spring_nodes[joined[joined >= take.model.object_spring_count]]]
+
+    def rows(self, pick: Pick, take: ObjectRollout | None, frame: int, take_frame: int) -> Rows:
+        """List names and values of everything that is known of a thing now."""
+        place = self.place(pick, take, frame, take_frame)
+        if pick.kind in {"hand", "marker"} or take is None:
+            where = [("position", self._vector(place[0], self._units))] if len(place) else []
+            return where + self._recorded_rows(pick, frame)
+        if pick.kind == "spring":
+            return self._spring_rows(pick.index, take, take_frame)
+        rows = [("position", self._vector(place[0], self._unit))]
+        node_velocity, control_velocity = (take.state(take_frame)[i] for i in (1, 3))
+        velocity = (node_velocity if pick.kind == "node" else control_velocity)[pick.index]
+        rows.append(("velocity", self._vector(velocity, f"{self._unit}/s", size=True)))
+        own = take.model.object_spring_count
+        offset = take.model.node_count if pick.kind == "control" else 0
+        joined = springs_at(take, pick.index + offset)
+        held = joined[joined >= own]
+        force = take.spring_forces(take_frame)[held - own].sum(axis=0)
+        if pick.kind == "node":
+            rows.append(
+                (
+                    f"force of the {'hand' if self._content.hands else 'controls'}",
+                    self._vector(force, "N", size=True),
+                )
+            )
+            rows += self._node_rows(pick.index, take, take_frame, int((joined < own).sum()))
+            rows.append(("held by", self._partners(take, take_frame, held, is_control=True)))
+        else:
+            rows.append(("force on the object", self._vector(force, "N", size=True)))
+            rows.append(("holds", self._partners(take, take_frame, held, is_control=False)))
+        return rows
+
+    def _recorded_rows(self, pick: Pick, frame: int) -> Rows:
+        """Read what needs no simulation: speeds, lengths to neighbors, errors in the images."""
+        track = track_of(pick, self._content)
+        at = min(frame, len(track) - 1)
+        speed = self._content.frame_rate * np.linalg.norm(track[at] - track[max(at - 1, 0)])
+        rows: Rows = [("speed", f"{number(float(speed))} {self._unit}/s")]
+        hand = next((h for h in self._content.hands if h.side == pick.side), None)
+        if hand is not None:
+            error = float(self._hands.measure("error", hand, at)[pick.index])
+            if np.isfinite(error):
+                rows.append(("reprojection error", f"{number(error)} px"))
+        markers = self._content.markers
+        if markers is None:
+            return rows
+        marker = pick.index
+        if pick.kind == "control":
+            if pick.index >= len(markers.held):
+                return rows
+            marker = markers.held[pick.index]
+        unit, factor = length_unit(self._content)
+        for other in markers.neighbors(marker):
+            length = float(np.linalg.norm(markers.point[at, other] - markers.point[at, marker]))
+            rows.append((f"to marker {other}", f"{number(factor * length)} {unit}"))
+        return rows
+
+    def _spring_rows(self, spring: int, take: ObjectRollout, frame: int) -> Rows:
+        model = take.model
+        point = np.concatenate([take.position[frame], take.control[frame]])
+        a, b = (int(end) for end in model.spring_nodes[spring])
+        length = float(np.linalg.norm(point[b] - point[a]))
+        unit, factor = length_unit(self._content)
+        names = [
+            f"node {end}" if end < model.node_count else f"control node {end - model.node_count}"
+            for end in (a, b)
+        ]
+        stiffness = take.parameters.stiffness_scale * float(model.stiffness[spring])
+        rest = float(model.rest_length[spring])
+        lengths = f"{number(factor * length)} {unit}, at rest {number(factor * rest)} {unit}"
+        return [
+            ("joins", " and ".join(names)),
+            ("length", lengths),
+            ("strain", f"{number(1e2 * float(take.strains(frame)[spring]))} %"),
+            ("pull", f"{number(float(take.tensions(frame)[spring]))} N"),
+            ("stiffness", f"{number(stiffness)} N"),
+            ("damping", f"{number(float(model.damping[spring]))} N·s/m"),
+        ]
+
+    def _node_rows(self, node: int, take: ObjectRollout, frame: int, spring_count: int) -> Rows:
+        rows: Rows = []
+        kinds: tuple[Coloring, ...] = ("stiffness", "damping", "strain", "error", "difference")
+        for kind in kinds:
+            if kind == "error" and not self._painter.errors.is_known:
+                continue
+            quantity = self._painter.quantity(kind)
+            value = float(self._painter.measure(kind, take, frame).node[node]) * quantity.factor
+            shown = f"{number(value)} {quantity.unit}" if np.isfinite(value) else "not known"
+            rows.append((quantity.label.lower(), shown))
+        return [*rows, ("object springs", str(spring_count))]
+
+    def _partners(
+        self, take: ObjectRollout, frame: int, springs: Int[ndarray, " spring"], *, is_control: bool
+    ) -> str:
+        """Name what virtual springs join a thing to, the one that pulls hardest first."""
+        if len(springs) == 0:
+            return "nothing"
+        pull = np.abs(take.tensions(frame)[springs])
+        ends = take.model.spring_nodes[springs]
+        partner = ends.max(axis=1) - take.model.node_count if is_control else ends.min(axis=1)
+        order = np.argsort(-pull, kind="stable")
+        what = "control" if is_control else "node"
+        named = [f"{what} {int(partner[i])} ({number(float(pull[i]))} N)" for i in order[:_NAMED]]
+        more = len(springs) - len(named)
+        return ", ".join(named) + (f" and {more} more" if more else "")
+
+    def _first_control(self, side: str | None) -> int | None:
+        """Find the control node that is the first vertex of a hand; None if they are others."""
+        control = self._content.control
+        total = sum(hand.vertex.shape[1] for hand in self._content.hands)
+        if control is None or total == 0 or control.shape[1] != total:
+            return None
+        for order in (self._content.hands, self._content.hands[::-1]):
+            vertex = np.concatenate([np.asarray(hand.vertex[0]) for hand in order])
+            if not np.allclose(vertex, control[0], rtol=0.0, atol=1e-5):
+                continue
+            first = 0
+            for hand in order:
+                if hand.side == side:
+                    return first
+                first += hand.vertex.shape[1]
+        return None
+
+    @staticmethod
+    def _vector(value: ndarray, unit: str, *, size: bool = False) -> str:
+        parts = ", ".join(number(round(float(v), 6)) for v in value)
+        if not size:
+            return f"{parts} {unit}"
+        return f"{number(float(np.linalg.norm(value)))} {unit} ({parts})"

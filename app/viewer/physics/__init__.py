@@ -1,0 +1,1 @@
+"""What sliders change: parameters, history, presets and the physics panel."""

@@ -1,0 +1,192 @@
+"""The error of every frame: the fit against the tracks, and the re-simulation against the fit."""
+
+import threading
+import time
+from typing import Any
+
+import numpy as np
+import viser
+from jaxtyping import Float
+from numpy import ndarray
+from viser import uplot
+
+from app.viewer.content.content import Content
+from app.viewer.content.object_rollout import ObjectRollout
+from app.viewer.ui.guard import plain
+from physhandi.data.files import named_fields
+from physhandi.data.run import Run
+
+_REFRESH = 0.25
+_STYLE = "font-size:0.8em;line-height:1.5;padding:0 0.6em"
+_FIT, _AGAIN = "rgb(46,160,67)", "rgb(47,111,222)"
+_NOW, _AXIS = "rgba(214,39,40,0.7)", "rgb(120,130,145)"
+
+
+def load_track_error(
+    run: Run, sequence_name: str, frame_count: int
+) -> Float[ndarray, " frame"] | None:
+    """Read how far the fitted object is from its tracks in every frame [m].
+
+    Args:
+        run: The run; an older one may not have measured it.
+        sequence_name: One of its sequences.
+        frame_count: Frames that are wanted; NaN where nothing was measured.
+
+    Returns:
+        The errors, or None if the run has none.
+    """
+    name = f"sequences/{sequence_name}/frame_errors.json"
+    if not run.has(name):
+        return None
+    content = named_fields(run.json(name)) or {}
+    rollout = named_fields(content.get("rollout")) or {}
+    are_lists = isinstance(content.get("frames"), list)
+    if not are_lists or not isinstance(rollout.get("track_error"), list):
+        return None
+    frames: Any = content["frames"]
+    values: Any = rollout["track_error"]
+    error = np.full(frame_count, np.nan)
+    pairs: list[tuple[Any, Any]] = list(zip(frames, values, strict=False))
+    for frame, value in pairs:
+        if isinstance(frame, int) and 0 <= frame < frame_count and isinstance(value, int | float):
+            error[frame] = value
+    return error if np.isfinite(error).any() else None
+
+
+class ErrorPanel:
+    """A small plot over all frames, and the current frame's errors in words.
+
+    The clock's thread tells the frame, the live simulation's thread tells the rollout.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        content: Content,
+        fitted: ObjectRollout,
+        track_error: Float[ndarray, " frame"] | None,
+    ) -> None:
+        """Add the panel.
+
+        Args:
+            server: Where to.
+            content: What is shown.
+            fitted: The fitted rollout.
+            track_error: Its error against the tracks [m]; None if it was not measured.
+        """
+        self._lock = threading.Lock()
+        self._fitted = fitted
+        self._per_unit = 1e3 if content.is_metric else 1.0
+        self._unit = "mm" if content.is_metric else content.length_unit
+        count = fitted.frame_count
+        self._frames = np.arange(count, dtype=np.float64)
+        self._source = "the tracks" if content.tracks is None else content.tracks.name
+        self._track = np.full(count, np.nan) if track_error is None else track_error[:count]
+        self._again = np.zeros(count)
+        self._take: ObjectRollout = fitted
+        self._measured = 0
+        self._frame = 0
+        self._refreshed = 0.0
+        self._is_late = False
+        self._folder = server.gui.add_folder("Error per frame")
+        with self._folder:
+            self._text = server.gui.add_html("")
+            self._plot = server.gui.add_uplot(
+                self._data(), self._series(), **plot_look(self._unit, max(count - 1, 1)), height=120
+            )
+        self._write(at_once=True)
+
+    def remove(self) -> None:
+        """Take the panel away."""
+        self._folder.remove()
+
+    def show(self, frame: int, *, is_playing: bool) -> None:
+        """Tell which frame is on the screen."""
+        with self._lock:
+            # A clock that stops may leave behind what was not worth writing while it ran.
+            if frame != self._frame or (self._is_late and not is_playing):
+                self._frame = frame
+                self._write(at_once=not is_playing)
+
+    def follow(self, take: ObjectRollout, *, at_once: bool) -> None:
+        """Measure the frames of a rollout that have become ready.
+
+        Args:
+            take: The newest rollout.
+            at_once: Whether to show it even if the plot is fresh.
+        """
+        with self._lock:
+            if take is not self._take:
+                self._take, self._measured = take, 0
+                self._again = np.zeros(len(self._frames))
+            is_fit = take is self._fitted
+            for frame in range(self._measured, 0 if is_fit else take.ready):
+                self._again[frame] = take.frame_distance(self._fitted, frame)
+                self._measured = frame + 1
+            self._write(at_once=at_once)
+
+    @property
+    def errors(self) -> tuple[float, float]:
+        """Errors of the current frame [m]: fit against tracks, re-simulation against fit."""
+        frame = min(self._frame, len(self._frames) - 1)
+        is_there = self._take is self._fitted or frame < self._measured
+        return float(self._track[frame]), float(self._again[frame]) if is_there else float("nan")
+
+    def _write(self, *, at_once: bool) -> None:
+        now = time.monotonic()
+        self._is_late = not at_once and now - self._refreshed < _REFRESH
+        if self._is_late:
+            return
+        self._refreshed = now
+        track, again = self.errors
+        fit = self._words(_FIT, "fit", track, f"from {self._source}")
+        new = ""
+        if self._take is not self._fitted:
+            new = self._words(_AGAIN, "re-simulated", again, "from the fit")
+        said = "<br/>".join(text for text in (fit, new) if text) or "Move a slider to compare."
+        self._text.content = f'<div style="{_STYLE}">{said}</div>'
+        self._plot.data = self._data()
+
+    def _words(self, color: str, what: str, error: float, other: str) -> str:
+        if not np.isfinite(error):
+            return ""
+        dot = f'<span style="color:{color}">●</span>'
+        return f"{dot} {what} {error * self._per_unit:.3g} {plain(self._unit)} {other}"
+
+    def _data(self) -> tuple[ndarray, ...]:
+        """Collect the curves, as far as the rollout is simulated; the plot knows no gaps."""
+        has_track = np.isfinite(self._track)
+        shown = np.flatnonzero(has_track if has_track.any() else np.ones(len(self._frames)))
+        if self._take is not self._fitted:
+            # A plot that was empty once does not find its scale again: two points at least.
+            shown = shown[: max(int((shown < self._measured).sum()), 2)]
+        track = np.nan_to_num(self._track) * self._per_unit
+        again = np.nan_to_num(self._again) * self._per_unit
+        # A line along the axis that rises to the curves at the frame on the screen.
+        now = np.zeros(len(self._frames))
+        frame = min(self._frame, len(now) - 1)
+        now[frame] = max(track[frame], again[frame])
+        return tuple(curve[shown] for curve in (self._frames, track, again, now))
+
+    def _series(self) -> tuple[uplot.Series, ...]:
+        points: Any = {"show": False}
+        has_track = bool(np.isfinite(self._track).any())
+        return (
+            uplot.Series(label="frame"),
+            uplot.Series(label="fit", stroke=_FIT, width=1.5, points=points, show=has_track),
+            uplot.Series(label="re-simulated", stroke=_AGAIN, width=1.5, points=points),
+            uplot.Series(label="now", stroke=_NOW, width=1, points=points),
+        )
+
+
+def plot_look(unit: str, last: int) -> dict[str, Any]:
+    """Choose scales and axes of a small plot over the frames up to `last`."""
+    grid: Any = {"show": True, "stroke": "rgba(120,130,145,0.2)"}
+    return {
+        "scales": {"x": uplot.Scale(time=False, range=(0.0, float(last)))},
+        "axes": (
+            uplot.Axis(stroke=_AXIS, grid=grid, size=26),
+            uplot.Axis(stroke=_AXIS, grid=grid, size=38, label=unit, labelSize=14),
+        ),
+        "legend": uplot.Legend(show=False),
+    }

@@ -1,0 +1,358 @@
+"""Choosing a preset, and keeping what sliders have found as a preset or as a run."""
+
+import html
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import viser
+
+from app.viewer.physics.history import History
+from app.viewer.physics.presets import (
+    AS_FITTED,
+    BY_HAND,
+    Preset,
+    PresetStore,
+    builtin_presets,
+    changes_of,
+)
+from app.viewer.ui.followed import FollowedChoice
+from app.viewer.ui.guard import Guard, notify
+from physhandi.data.run import Run, new_run_id
+from physhandi.data.sequence import Sequence
+from physhandi.errors import UsageError
+from physhandi.simulation.model import SimulationParameters
+
+_POLL_S = 0.3
+_MOST_LETTERS = 80
+
+
+class RunCatalog(Protocol):
+    """Finds runs, and the recordings behind them."""
+
+    def run(self, run_id: str, /) -> Run:
+        """Open a run."""
+        ...
+
+    def sequences_of(self, run: Run) -> list[Sequence]:
+        """Open the sequences of a run; raises `SequenceError` if one is gone."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class SavedRun:
+    """How far a run is that was saved from a live scene."""
+
+    id: str
+    """Its id; its page is ``/runs/<id>``."""
+    name: str
+    """What the user calls it."""
+    state: str
+    """``"queued"`` or ``"running"``, in the end ``"succeeded"``, ``"failed"``, ``"cancelled"``."""
+    error: str | None = None
+    """Why it failed, if it did."""
+
+    @property
+    def is_over(self) -> bool:
+        """Whether nothing more will happen to it."""
+        return self.state in {"succeeded", "failed", "cancelled"}
+
+
+class RunSaver:
+    """Makes runs of kind ``simulation``, as `physhandi simulate` does, and has them worked on.
+
+    A worker process simulates again and measures, so that a long object stalls nobody; the same
+    parameters give the same motion.
+    """
+
+    def __init__(self, catalog: RunCatalog, folder: Path, start: Callable[[Run], None]) -> None:
+        """Prepare.
+
+        Args:
+            catalog: Finds the run that was shown, and its recordings.
+            folder: Where runs are made.
+            start: Has a worker begin with a run at once.
+        """
+        self._catalog = catalog
+        self._folder = folder
+        self._start = start
+
+    def save(self, source_id: str, sequence: str, name: str, changes: Mapping[str, Any]) -> Run:
+        """Make a run and have it worked on.
+
+        Args:
+            source_id: Id of the run whose object was simulated.
+            sequence: Which of its sequences.
+            name: What the user calls the new run.
+            changes: Parameters that differ from the source's; see `run_changes`.
+
+        Raises:
+            UsageError: If the name is empty or too long.
+            SequenceError: If the recording is gone, without which nothing can be measured.
+            OSError: If the run cannot be written.
+        """
+        name = " ".join(name.split())
+        if not name or len(name) > _MOST_LETTERS:
+            raise UsageError(f"Type a name of 1 to {_MOST_LETTERS} letters for the run first.")
+        source = self._catalog.run(source_id)
+        recordings = self._catalog.sequences_of(source)
+        recording = recordings[source.sequence_names.index(sequence)]
+        run = Run.create(
+            self._folder / new_run_id(),
+            name=name,
+            kind="simulation",
+            sequences=[str(recording.folder)],
+            config={"source": str(source.folder.resolve()), "parameters": dict(changes)},
+        )
+        self._start(run)
+        return run
+
+    def follow(
+        self, run: Run, tell: Callable[[SavedRun], None], is_over: threading.Event
+    ) -> threading.Thread:
+        """Tell how far a run is whenever that changes, until it ends or nobody listens.
+
+        Args:
+            run: A run that `save` made.
+            tell: Is told, in a thread of its own.
+            is_over: Set when nobody listens any more.
+        """
+
+        def watch() -> None:
+            told: SavedRun | None = None
+            while not is_over.is_set() and not (told is not None and told.is_over):
+                now = SavedRun(id=run.id, name=run.name, state=run.state, error=run.error)
+                if now != told:
+                    tell(now)
+                    told = now
+                time.sleep(_POLL_S)
+
+        thread = threading.Thread(target=watch, name=f"saving-{run.id}", daemon=True)
+        thread.start()
+        return thread
+
+
+def run_changes(
+    source: Run, fitted: SimulationParameters, now: SimulationParameters, *, is_automatic: bool
+) -> dict[str, Any]:
+    """Find what `physhandi simulate` must be told so that it simulates what is on the screen.
+
+    Args:
+        source: The run that is shown; its stored parameters are the ones that are changed.
+        fitted: What the scene began with: those parameters in the world of its recording.
+        now: What is on the screen.
+        is_automatic: Whether its substeps are chosen automatically.
+    """
+    changes = changes_of(fitted, now, is_automatic=is_automatic)
+    stored = SimulationParameters.from_dict(source.yaml("object/parameters.yaml"))
+    # A ground or gravity other than the recording's must not be taken from it again.
+    for field, switch in (
+        ("ground_height", "uses_sequence_ground"),
+        ("gravity", "uses_sequence_gravity"),
+    ):
+        if field in changes and getattr(stored, switch):
+            changes[switch] = False
+    return changes
+
+
+_PRESET, _RUN = "Preset", "Run"
+_PROBLEMS = 3
+
+
+@dataclass(frozen=True)
+class UserStorage:
+    """Where a server keeps what users of its scenes have found."""
+
+    presets: PresetStore
+    """Their presets."""
+    saver: RunSaver
+    """Makes runs."""
+
+
+class PresetChoice:
+    """The list of presets."""
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        guard: Guard,
+        history: History,
+        *,
+        length_unit: str,
+        store: PresetStore | None,
+        moved: Callable[[], None],
+    ) -> None:
+        """Add the list where the caller stands.
+
+        Args:
+            gui: Where to.
+            guard: Wraps the callbacks.
+            history: Keeps the parameters.
+            length_unit: Unit of the scene's lengths.
+            store: The users' presets; None for built-in ones only.
+            moved: Called when a user has chosen one.
+        """
+        self._history = history
+        self._unit = length_unit
+        self._store = store
+        self._moved = moved
+        self._presets: dict[str, Preset] = {}
+        self._wanted = AS_FITTED
+        self._turn = threading.Lock()
+        self.problems: tuple[str, ...] = ()
+        """What is wrong with files among the users' presets."""
+        choice: Any = gui.add_dropdown(
+            "Preset",
+            (AS_FITTED, BY_HAND),
+            hint="Changes made to the fitted parameters, all at once; ★ are your own",
+        )
+        choice.on_update(guard.by_user(lambda _: self._choose()))
+        self._choice = FollowedChoice(choice, guard)
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Read the users' presets again."""
+        own, self.problems = self._store.presets() if self._store is not None else ((), ())
+        fitted = self._history.start
+        suitable = [p for p in (*builtin_presets(), *own) if p.suits(fitted, self._unit)]
+        self._presets = {preset.label: preset for preset in suitable}
+        self._choice.offer((*self._presets, BY_HAND))
+        self.show()
+
+    def show(self) -> None:
+        """Name the preset in force."""
+        with self._turn:  # What is shown last must be what was read last.
+            chosen = self.chosen
+            self._choice.show(BY_HAND if chosen is None else chosen.label)
+
+    @property
+    def chosen(self) -> Preset | None:
+        """The preset whose parameters are in force, if there is one; of several that was chosen."""
+        now = (self._history.current, self._history.is_automatic)
+        fits = {n: p for n, p in self._presets.items() if p.apply(self._history.start) == now}
+        return fits.get(self._wanted, next(iter(fits.values()), None))
+
+    def want(self, label: str) -> None:
+        """Name this preset as long as its parameters are in force."""
+        self._wanted = label
+        self.show()
+
+    def _choose(self) -> None:
+        preset = self._presets.get(self._choice.take())
+        if preset is None:
+            self.show()  # "By hand" is what the list says, nothing to choose.
+            return
+        self._wanted = preset.label
+        parameters, is_automatic = preset.apply(self._history.start)
+        self._history.replace(parameters, is_automatic=is_automatic)
+        self._moved()
+
+
+class KeepPanel:
+    """A name, and buttons that keep the parameters under it."""
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        guard: Guard,
+        history: History,
+        *,
+        choice: PresetChoice,
+        length_unit: str,
+        keeping: UserStorage,
+        save: Callable[[str], None],
+    ) -> None:
+        """Add the folder where the caller stands.
+
+        Args:
+            gui: Where to.
+            guard: Wraps the callbacks.
+            history: Keeps the parameters.
+            choice: The list of presets.
+            length_unit: Unit of the scene's lengths.
+            keeping: Where things are kept.
+            save: Makes a run of a name out of what is on the screen.
+        """
+        self._history = history
+        self._choice = choice
+        self._unit = length_unit
+        self._store = keeping.presets
+        self._save = save
+        with gui.add_folder("Keep", expand_by_default=False):
+            self._name: Any = gui.add_text("name", "", hint="Of the preset or the run")
+            buttons = gui.add_button_group(
+                "Save as",
+                (_PRESET, _RUN),
+                hint="A preset is for every scene of this server; a run keeps motion and metrics",
+            )
+            self._delete: Any = gui.add_button("Delete preset", color="gray", visible=False)
+            self._told: Any = gui.add_html("", visible=False)
+            self._bad: Any = gui.add_html("", visible=False)
+        buttons.on_click(guard(self._press))
+        self._delete.on_click(guard(self._remove))
+        self._unsubscribe = self._store.subscribe(self.refresh)
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Show the users' presets as they are now."""
+        self._choice.refresh()
+        problems = self._choice.problems
+        lines = [f"⚠ {html.escape(problem)}" for problem in problems[:_PROBLEMS]]
+        if len(problems) > _PROBLEMS:
+            lines.append(f"… and {len(problems) - _PROBLEMS} more")
+        _say(self._bad, "<br/>".join(lines))
+        self.show()
+
+    def show(self) -> None:
+        """Offer to delete the preset in force, if it is a user's."""
+        chosen = self._choice.chosen
+        is_own = chosen is not None and chosen.is_own
+        if chosen is not None and is_own:
+            self._delete.label = f"Delete preset “{chosen.name}”"
+        if self._delete.visible != is_own:
+            self._delete.visible = is_own
+
+    def tell(self, run: SavedRun) -> None:
+        """Say how far a saved run is, with a link to it."""
+        name = html.escape(run.name)
+        link = f"<a href='/runs/{run.id}' target='_blank' rel='noopener'>{name}</a>"
+        said = {
+            "queued": f"Saving run {link}…",
+            "running": f"Simulating and measuring run {link}…",
+            "succeeded": f"✓ Saved as run {link}",
+            "cancelled": f"Run {link} was cancelled.",
+        }
+        error = html.escape(run.error or "See its page.")
+        _say(self._told, said.get(run.state, f"✗ Run {link} failed: {error}"))
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._unsubscribe()
+
+    def _press(self, event: Any) -> None:
+        if event.target.value == _RUN:
+            self._save(self._name.value)
+            return
+        history = self._history
+        changes = changes_of(history.start, history.current, is_automatic=history.is_automatic)
+        preset = self._store.save(self._name.value, changes, self._unit)
+        self._choice.want(preset.label)
+        self.show()
+        notify(event.client, "Preset saved", preset.name, color="blue")
+
+    def _remove(self, event: Any) -> None:
+        chosen = self._choice.chosen
+        if chosen is None or not chosen.is_own:
+            raise UsageError("Choose one of your own presets first; the program's stay.")
+        self._store.delete(chosen.name)
+        notify(event.client, "Preset deleted", chosen.name, color="blue")
+
+
+def _say(place: Any, content: str) -> None:
+    """Write small print; without content it takes no room."""
+    style = "font-size:0.8em;line-height:1.4;padding:0 0.5em"
+    place.content = f"<div style='{style}'>{content}</div>"
+    place.visible = bool(content)

@@ -1,0 +1,422 @@
+"""The panel that changes the physics: sliders, undo, pace, and what the simulation says."""
+
+import math
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import viser
+
+from app.keys import Action
+from app.viewer.content.content import Content
+from app.viewer.content.object_rollout import ObjectRollout
+from app.viewer.live.rollouts import STARTING, Readout
+from app.viewer.physics.history import History
+from app.viewer.physics.keep_panel import KeepPanel, PresetChoice, UserStorage
+from app.viewer.physics.parameters import (
+    HeightKnob,
+    Knob,
+    Switch,
+    changes_in,
+    ground_knobs,
+    knobs,
+    self_collision_knobs,
+)
+from app.viewer.ui.followed import FollowedChoice
+from app.viewer.ui.guard import Guard
+from app.viewer.ui.keyboard import bind
+from physhandi.simulation.model import SimulationParameters
+
+_CHANGED = "● "
+
+
+class SliderSet:
+    """One control for each parameter that people may move."""
+
+    def __init__(
+        self, gui: viser.GuiApi, guard: Guard, history: History, moved: Callable[[], None]
+    ) -> None:
+        """Prepare; `add` makes the controls where the caller stands.
+
+        Args:
+            gui: Where to.
+            guard: Wraps the callbacks.
+            history: Keeps the parameters.
+            moved: Called when a user has changed a parameter.
+        """
+        self._gui = gui
+        self._guard = guard
+        self._history = history
+        self._moved = moved
+        # Each slider is heard in a thread of its own.
+        self._lock = threading.Lock()
+        self._controls: list[tuple[Knob | Switch, Any]] = []
+
+    @property
+    def knobs(self) -> tuple[Knob | Switch, ...]:
+        """What can be moved."""
+        return tuple(knob for knob, _ in self._controls)
+
+    def add(self, *knobs: Knob | Switch) -> None:
+        """Add a control for each of some parameters."""
+        for knob in knobs:
+            control = self._make(knob)
+            control.on_update(
+                self._guard.by_user(lambda _, knob=knob, control=control: self._move(knob, control))
+            )
+            self._controls.append((knob, control))
+
+    def show(self) -> None:
+        """Follow the history; what is not as fitted gets a dot before its name."""
+        for knob, control in self._controls:
+            value = knob.to_slider(self._history.current)
+            if control.value != value:
+                control.value = value
+        self.mark()
+
+    def mark(self) -> None:
+        """Put a dot before the name of whatever is not as fitted."""
+        start, now = self._history.start, self._history.current
+        for knob, control in self._controls:
+            label = f"{_CHANGED}{knob.label}" if knob.differs(start, now) else knob.label
+            if control.label != label:
+                control.label = label
+            if isinstance(knob, HeightKnob) and control.disabled != (now.ground_height is None):
+                control.disabled = now.ground_height is None
+
+    def _make(self, knob: Knob | Switch) -> Any:
+        start = knob.to_slider(self._history.start)
+        if isinstance(knob, Switch):
+            return self._gui.add_checkbox(knob.label, bool(start), hint=knob.hint)
+        if knob.is_integer:
+            low, high = int(knob.low), int(knob.high)
+            return self._gui.add_slider(knob.label, low, high, 1, int(start), hint=knob.hint)
+        slider = self._gui.add_slider(
+            knob.label, knob.low, knob.high, knob.step, start, hint=knob.hint
+        )
+        slider.precision = min(slider.precision + 1, 7)  # Typed values may be finer.
+        return slider
+
+    def _move(self, knob: Knob | Switch, control: Any) -> None:
+        with self._lock:  # What is set last must be what was read last.
+            before = self._history.current
+            has_changed = self._history.set(knob.field, knob.from_slider(control.value)) != before
+        if has_changed:
+            self._moved()
+
+
+SUBSTEPS_AS_FITTED, SUBSTEPS_AUTOMATIC, SUBSTEPS_BY_HAND = "as fitted", "automatic", "by hand"
+_MOST = 100_000
+
+
+class SubstepsChoice:
+    """As fitted, automatic, or a number."""
+
+    def __init__(
+        self, gui: viser.GuiApi, guard: Guard, history: History, moved: Callable[[], None]
+    ) -> None:
+        """Add the choice where the caller stands.
+
+        Args:
+            gui: Where to.
+            guard: Wraps the callbacks.
+            history: Keeps the number, and whether it is chosen automatically.
+            moved: Called when a user has chosen another one.
+        """
+        self._history = history
+        self._moved = moved
+        self._in_use = history.start.substeps_per_frame
+        choice: Any = gui.add_dropdown(
+            "substeps",
+            (SUBSTEPS_AS_FITTED, SUBSTEPS_AUTOMATIC, SUBSTEPS_BY_HAND),
+            hint="Integration steps a frame. Automatic takes as few as are stable at frame 0",
+        )
+        self._followed = FollowedChoice(choice, guard)
+        self._number: Any = gui.add_number(
+            "number",
+            self._in_use,
+            min=1,
+            max=_MOST,
+            step=1,
+            visible=False,
+            hint="More are slower and more exact; too few and the object explodes",
+        )
+        choice.on_update(guard.by_user(lambda _: self._choose()))
+        self._number.on_update(guard.by_user(lambda _: self._type()))
+
+    def show(self) -> None:
+        """Follow the history."""
+        history = self._history
+        number = history.current.substeps_per_frame
+        is_other = number != history.start.substeps_per_frame
+        choice = (
+            SUBSTEPS_AUTOMATIC
+            if history.is_automatic
+            else SUBSTEPS_BY_HAND
+            if is_other
+            else SUBSTEPS_AS_FITTED
+        )
+        self._followed.show(choice)
+        if choice == SUBSTEPS_BY_HAND and self._number.value != number:
+            self._number.value = number
+        self._number.visible = choice == SUBSTEPS_BY_HAND
+
+    def hear(self, readout: Readout) -> None:
+        """Remember what is in use, from which typing a number begins."""
+        self._in_use = readout.substeps_per_frame
+
+    def _choose(self) -> None:
+        history, choice = self._history, self._followed.take()
+        if choice == SUBSTEPS_BY_HAND:
+            # Nothing is simulated anew before another number is typed.
+            self._number.value, self._number.visible = self._in_use, True
+            if not history.is_automatic:
+                return
+            number = self._in_use
+        else:
+            number = history.start.substeps_per_frame
+        history.set_substeps(number, is_automatic=choice == SUBSTEPS_AUTOMATIC)
+        self._moved()
+
+    def _type(self) -> None:
+        self._history.set_substeps(min(max(int(self._number.value), 1), _MOST))
+        self._moved()
+
+
+def warning(readout: Readout) -> str:
+    """Say that the substeps are too few to be stable; empty if they are enough or nobody knows."""
+    needed = readout.needed_substeps
+    if needed is None or readout.substeps_per_frame >= needed:
+        return ""
+    return (
+        f"**⚠ Too few substeps: {readout.substeps_per_frame} a frame, at least {needed} are needed "
+        "to be stable.** Choose automatic ones, or less stiffness or damping."
+    )
+
+
+_FIRST_KNOBS = 5
+_REFRESH = 0.2
+_UNDO, _REDO, _RESET = "Undo", "Redo", "Reset"
+HOLD, STEP, GO = "Hold", "1 frame", "Go"
+"""The pace of the simulation: wait, compute one frame, run."""
+_PUT_BACK = "choose…"
+
+
+class PhysicsPanel:
+    """Sliders that re-simulate the object, and the readout above them."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        content: Content,
+        fitted: ObjectRollout,
+        guard: Guard,
+        simulate: Callable[[SimulationParameters, bool], None],
+        *,
+        set_pace: Callable[[str], None],
+        keeping: UserStorage | None = None,
+        save: Callable[[str], None] | None = None,
+    ) -> None:
+        """Add the panel.
+
+        Args:
+            server: Where to.
+            content: What is shown.
+            fitted: The fitted rollout.
+            guard: Wraps the callbacks.
+            simulate: Simulates parameters, with substeps chosen automatically or not.
+            set_pace: Lets the simulation wait, compute one frame or run (`HOLD`, `STEP`, `GO`).
+            keeping: Where presets and runs are kept; None where nothing can be kept.
+            save: Makes a run of a name out of what is on the screen.
+        """
+        self.history = History(fitted.parameters)
+        self._simulate = simulate
+        self._set_pace = set_pace
+        self._is_held = False
+        self._changed: dict[str, tuple[str, ...]] = {}
+        self._is_metric = content.is_metric
+        self._unit = "mm" if content.is_metric else content.length_unit
+        self._refreshed = -math.inf
+        self._lock = threading.Lock()
+        # Each slider is heard in a thread of its own.
+        self._turn = threading.Lock()
+        self.keep: KeepPanel | None = None
+        gui, unit, parameters = server.gui, content.length_unit, fitted.parameters
+        height = np.asarray(fitted.position[0])[:, 2]
+        low, high = float(height.min()), float(height.max())
+        main_knobs = knobs(parameters, length_unit=unit)
+        store = None if keeping is None else keeping.presets
+        self._folder = gui.add_folder("Physics")
+        with self._folder:
+            self._status = gui.add_markdown("")
+            self._presets = PresetChoice(
+                gui, guard, self.history, length_unit=unit, store=store, moved=self._run
+            )
+            self._sliders = SliderSet(gui, guard, self.history, self._moved)
+            self._sliders.add(*main_knobs[:_FIRST_KNOBS])
+            buttons = gui.add_button_group(
+                "History", (_UNDO, _REDO, _RESET), hint="Ctrl+Z and Ctrl+Shift+Z"
+            )
+            buttons.on_click(guard(lambda event: self._press(event.target.value)))
+            pace = gui.add_button_group(
+                "Simulation",
+                (HOLD, STEP, GO),
+                hint="Hold it, compute one frame (N), or let it go on (H)",
+            )
+            pace.on_click(guard(lambda event: set_pace(event.target.value)))
+            self._changes = gui.add_markdown("")
+            self._put_back = FollowedChoice(
+                gui.add_dropdown(
+                    "Put back",
+                    (_PUT_BACK,),
+                    visible=False,
+                    hint="Give one parameter its fitted value again",
+                ),
+                guard,
+            )
+            self._put_back.handle.on_update(guard.by_user(lambda _: self._put_one_back()))
+            with gui.add_folder("More physics", expand_by_default=False):
+                self._sliders.add(*main_knobs[_FIRST_KNOBS:])
+                self._substeps = SubstepsChoice(gui, guard, self.history, self._run)
+            with gui.add_folder("Ground", expand_by_default=False):
+                self._sliders.add(*ground_knobs(parameters, length_unit=unit, low=low, high=high))
+            with gui.add_folder("Self-collision", expand_by_default=False):
+                self._sliders.add(*self_collision_knobs(parameters, length_unit=unit))
+            if keeping is not None and save is not None:
+                self.keep = KeepPanel(
+                    gui,
+                    guard,
+                    self.history,
+                    choice=self._presets,
+                    length_unit=unit,
+                    keeping=keeping,
+                    save=save,
+                )
+        self._commands = self._add_keys(server, guard)
+
+    @property
+    def is_automatic(self) -> bool:
+        """Whether the number of substeps is chosen automatically."""
+        return self.history.is_automatic
+
+    def restore(self, parameters: SimulationParameters, *, is_automatic: bool) -> None:
+        """Simulate what another session of the same object simulates."""
+        self.history.replace(parameters, is_automatic=is_automatic)
+        if self.history.is_changed:
+            self._run()
+
+    def remove(self) -> None:
+        """Take the panel away."""
+        self.close()
+        for command in self._commands:
+            command.remove()
+        self._folder.remove()
+
+    def close(self) -> None:
+        """Stop listening to what others keep."""
+        if self.keep is not None:
+            self.keep.close()
+
+    def show(self, readout: Readout, *, at_once: bool) -> None:
+        """Write the readout, not more often than people can read.
+
+        Args:
+            readout: What to say.
+            at_once: Whether to write it even if the last one is fresh.
+        """
+        now = time.monotonic()
+        with self._lock:
+            if not at_once and now - self._refreshed < _REFRESH:
+                return
+            self._refreshed = now
+        self._is_held = readout.is_held
+        self._substeps.hear(readout)
+        text = self._text(readout)
+        if self._status.content != text:
+            self._status.content = text
+
+    def _text(self, readout: Readout) -> str:
+        pace = ""
+        if math.isfinite(readout.frame_duration):
+            rate = 1.0 / max(readout.frame_duration, 1e-6)
+            pace = f" · {readout.frame_duration * 1e3:.3g} ms a frame · {rate:.0f} frames/s"
+        lines = [
+            f"object springs {readout.object_spring_count} · "
+            f"virtual springs {readout.virtual_spring_count}",
+            f"nodes {readout.node_count} · substeps {readout.substeps_per_frame}",
+            f"simulated {readout.simulated_count}/{readout.frame_count} frames{pace}",
+        ]
+        if readout.is_starting:
+            lines.insert(0, STARTING)
+        if math.isfinite(readout.difference):
+            value = readout.difference * (1e3 if self._is_metric else 1.0)
+            lines.append(f"{value:.3g} {self._unit} from the fitted rollout (mean)")
+        if readout.virtual_spring_count == 0:
+            lines.append("**⚠ No virtual spring: nothing holds the object.** Raise δ virtual.")
+        if unstable := warning(readout):
+            lines.append(unstable)
+        if readout.error is not None:
+            lines.append(f"**Stopped at frame {readout.simulated_count}; last good state shown**")
+        elif readout.is_held and readout.is_busy:
+            lines.append(f"**Held at frame {max(readout.simulated_count - 1, 0)}**")
+        elif readout.is_held:
+            lines.append("**Held: the next simulation waits at frame 0**")
+        return "<br/>".join(lines)
+
+    def _add_keys(self, server: viser.ViserServer, guard: Guard) -> list[viser.CommandHandle]:
+        actions: dict[Action, Callable[[], None]] = {
+            "undo": lambda: self._press(_UNDO),
+            "redo": lambda: self._press(_REDO),
+            "one_frame": lambda: self._set_pace(STEP),
+            "hold": lambda: self._set_pace(GO if self._is_held else HOLD),
+        }
+        return [
+            command
+            for action, act in actions.items()
+            for command in bind(server, guard, action, lambda _, __, act=act: act())
+        ]
+
+    def _press(self, name: str) -> None:
+        history = self.history
+        before = (history.current, history.is_automatic)
+        {_UNDO: history.undo, _REDO: history.redo, _RESET: history.reset}[name]()
+        if (history.current, history.is_automatic) != before or name == _RESET:
+            self._run()
+
+    def _put_one_back(self) -> None:
+        fields = self._changed.get(self._put_back.take())
+        if fields:
+            self.history.put_back(*fields)
+            self._run()
+
+    def _run(self) -> None:
+        """Show the parameters in force and simulate them."""
+        with self._turn:
+            self._sliders.show()
+            self._substeps.show()
+        self._moved()
+
+    def _moved(self) -> None:
+        """Simulate what is in force, leaving the sliders to the user who moves them."""
+        history = self.history
+        with self._turn:  # What is asked for last must be what was read last.
+            self._sliders.mark()
+            self._presets.show()
+            if self.keep is not None:
+                self.keep.show()
+            self._show_changes()
+            self._simulate(history.current, history.is_automatic)
+
+    def _show_changes(self) -> None:
+        history = self.history
+        changes = changes_in(
+            self._sliders.knobs, history.start, history.current, is_automatic=history.is_automatic
+        )
+        self._changed = {change.name: change.fields for change in changes}
+        text = ", ".join(change.text for change in changes)
+        self._put_back.offer((_PUT_BACK, *self._changed))
+        self._put_back.show(_PUT_BACK)
+        self._put_back.handle.visible = bool(changes)
+        self._changes.content = f"Changed: {text or 'nothing: parameters as fitted'}"

@@ -1,0 +1,1 @@
+"""What is drawn: hands, object, springs, forces, cameras and recorded points."""

@@ -1,0 +1,319 @@
+"""Scene nodes that are added when they are first needed and updated in place afterwards."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import viser
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+
+_GRID = {
+    False: ((214, 219, 226), (182, 190, 201)),
+    True: ((42, 45, 50), (62, 67, 75)),
+}
+"""Colors of the grid's thin and thick lines on a light and on a dark background."""
+
+_LINEAR = np.round(
+    255
+    * np.where(
+        np.arange(256) < 11,
+        np.arange(256) / 3294.6,
+        ((np.arange(256) / 255 + 0.055) / 1.055) ** 2.4,
+    )
+).astype(np.uint8)
+"""Brightness of each color value: the viewer takes colors of single line ends for brightness."""
+
+
+class SceneNodes:
+    """The nodes of one scene by their path; a part without content is hidden, not sent."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._scene = server.scene
+        self._nodes: dict[str, Any] = {}
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._nodes
+
+    def clear(self) -> None:
+        """Remove all nodes, those below others first."""
+        for node in reversed(self._nodes.values()):
+            node.remove()
+        self._nodes.clear()
+
+    def hide(self) -> None:
+        """Hide all nodes."""
+        for node in self._nodes.values():
+            node.visible = False
+
+    def show(self, name: str, *, is_visible: bool) -> None:
+        """Show or hide a node, if it is there."""
+        if name in self._nodes:
+            self._nodes[name].visible = is_visible
+
+    def mesh(
+        self,
+        name: str,
+        vertex: Float[ndarray, "vertex 3"],
+        face: Int[ndarray, "face 3"],
+        color: tuple[int, int, int],
+        *,
+        is_visible: bool,
+        opacity: float | None = 0.62,
+        is_flat: bool = False,
+    ) -> None:
+        """Draw a surface: semi-transparent or, without `opacity`, solid; smooth or in facets."""
+        node = self._nodes.get(name)
+        if node is None and is_visible:
+            self._nodes[name] = self._scene.add_mesh_simple(
+                name,
+                vertex,
+                face,
+                color=color,
+                opacity=opacity,
+                side="double",
+                flat_shading=is_flat,
+            )
+        elif node is not None and is_visible:
+            node.vertices, node.color = vertex, color
+            node.faces = np.asarray(face, dtype=np.uint32)
+        self.show(name, is_visible=is_visible)
+
+    def points(
+        self,
+        name: str,
+        point: Float[ndarray, "point 3"],
+        color: Any,
+        size: float,
+        *,
+        is_visible: bool,
+    ) -> None:
+        """Draw points of one color, or of a color each."""
+        node = self._nodes.get(name)
+        is_visible = is_visible and len(point) > 0
+        if node is None and is_visible:
+            self._nodes[name] = self._scene.add_point_cloud(
+                name,
+                np.asarray(point, dtype=np.float32),
+                color,
+                point_size=size,
+                point_shape="circle",
+                precision="float32",
+            )
+        elif node is not None and is_visible:
+            node.points = np.asarray(point, dtype=np.float32)
+            node.colors = np.asarray(color, dtype=np.uint8)
+        self.show(name, is_visible=is_visible)
+
+    def spheres(
+        self,
+        name: str,
+        point: Float[ndarray, "point 3"],
+        color: Any,
+        size: float,
+        *,
+        is_visible: bool,
+    ) -> None:
+        """Draw points as shaded spheres, as large as `points` draws its disks."""
+        node = self._nodes.get(name)
+        is_visible = is_visible and len(point) > 0
+        if node is not None and is_visible and len(node.batched_positions) != len(point):
+            self._nodes.pop(name).remove()
+            node = None
+        if node is None and is_visible:
+            self._nodes[name] = self._scene.add_batched_meshes_simple(
+                name,
+                *_sphere(0.5 * size),
+                np.tile([1.0, 0.0, 0.0, 0.0], (len(point), 1)),
+                np.asarray(point, dtype=np.float32),
+                batched_colors=color,
+                lod="off",
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+        elif node is not None and is_visible:
+            node.batched_positions = np.asarray(point, dtype=np.float32)
+            node.batched_colors = np.asarray(color, dtype=np.uint8)
+        self.show(name, is_visible=is_visible)
+
+    def frame(self, name: str, position: Float[ndarray, " 3"]) -> None:
+        """Place a coordinate frame, below which other nodes can be drawn."""
+        node = self._nodes.get(name)
+        if node is None:
+            self._nodes[name] = self._scene.add_frame(name, show_axes=False, position=position)
+            return
+        node.position = position
+        node.visible = True
+
+    def label(
+        self, name: str, text: str, position: Float[ndarray, " 3"], *, anchor: Any, height: float
+    ) -> None:
+        """Write a text that faces the camera, its lines as high as `height` in the scene."""
+        node = self._nodes.get(name)
+        if node is None:
+            self._nodes[name] = self._scene.add_label(
+                name,
+                text,
+                position=position,
+                anchor=anchor,
+                font_size_mode="scene",
+                font_scene_height=height,
+            )
+            return
+        node.text, node.position, node.visible = text, position, True
+
+    def segments(
+        self,
+        name: str,
+        segment: Float[ndarray, "segment 2 3"],
+        color: Any,
+        width: float,
+        *,
+        is_visible: bool,
+    ) -> None:
+        """Draw lines of a width in pixels, of one color or of a color for each end."""
+        # The viewer's lines do not change from one color to many: these are other lines.
+        painted = f"{name}_painted"
+        is_painted = np.ndim(color) > 1
+        self.show(name if is_painted else painted, is_visible=False)
+        name = painted if is_painted else name
+        color = _LINEAR[np.asarray(color, dtype=np.uint8)] if is_painted else color
+        node = self._nodes.get(name)
+        is_visible = is_visible and len(segment) > 0
+        if node is None and is_visible:
+            self._nodes[name] = self._scene.add_line_segments(
+                name,
+                np.asarray(segment, dtype=np.float32),
+                np.asarray(color, dtype=np.uint8),
+                thickness=width,
+                thickness_units="screen",
+            )
+        elif node is not None and is_visible:
+            node.points = np.asarray(segment, dtype=np.float32)
+            node.colors = np.asarray(color, dtype=np.uint8)
+        self.show(name, is_visible=is_visible)
+
+    def arrows(
+        self,
+        name: str,
+        arrow: Float[ndarray, "arrow 2 3"],
+        color: tuple[int, int, int],
+        width: float,
+    ) -> None:
+        """Draw arrows from their first to their second point, of a width in scene units."""
+        node = self._nodes.get(name)
+        if node is None and len(arrow):
+            self._nodes[name] = self._scene.add_arrows(
+                name,
+                arrow,
+                color,
+                shaft_radius=0.5 * width,
+                head_radius=1.6 * width,
+                head_length=4.0 * width,
+            )
+        elif node is not None and len(arrow):
+            node.points = arrow
+        self.show(name, is_visible=bool(len(arrow)))
+
+    def ground(
+        self, name: str, center: tuple[float, float, float], cell: float, count: int
+    ) -> None:
+        """Draw a horizontal grid that fades into the distance."""
+        self._nodes[name] = self._scene.add_grid(
+            name,
+            width=cell * count,
+            height=cell * count,
+            cell_size=cell / 2,
+            section_size=cell,
+            cell_color=_GRID[False][0],
+            section_color=_GRID[False][1],
+            cell_thickness=0.6,
+            section_thickness=1.0,
+            shadow_opacity=0.15,
+            fade_distance=2.0 * cell * count,
+            position=center,
+        )
+
+    def lift(self, name: str, height: float) -> None:
+        """Put a node at another height."""
+        node = self._nodes.get(name)
+        if node is not None and abs(float(node.position[2]) - height) > 1e-9:
+            node.position = (float(node.position[0]), float(node.position[1]), height)
+
+    def color_ground(self, name: str, *, is_dark: bool) -> None:
+        """Color the grid for a light or a dark background."""
+        node = self._nodes.get(name)
+        cell, section = _GRID[is_dark]
+        if node is not None and tuple(node.cell_color) != cell:
+            node.cell_color, node.section_color = cell, section
+
+
+def _sphere(radius: float) -> tuple[Float[ndarray, "vertex 3"], Int[ndarray, "face 3"]]:
+    """Make a small sphere: an octahedron, each face cut into four twice over."""
+    corner = np.concatenate([np.eye(3), -np.eye(3)])
+    upper = [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2]]
+    face = corner[np.array(upper + [[b, a, 5] for a, b, _ in upper])]
+    for _ in range(2):
+        a, b, c = face[:, 0], face[:, 1], face[:, 2]
+        middle = [(a + b) / 2, (b + c) / 2, (c + a) / 2]
+        ab, bc, ca = (m / np.linalg.norm(m, axis=1, keepdims=True) for m in middle)
+        parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+        face = np.concatenate([np.stack(part, axis=1) for part in parts])
+    vertex, index = np.unique(face.reshape(-1, 3).round(9), axis=0, return_inverse=True)
+    return (radius * vertex).astype(np.float32), index.reshape(-1, 3).astype(np.uint32)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Plane:
+    """A half space: the points whose coordinate along a direction is below a limit."""
+
+    direction: Float[ndarray, " 3"]
+    """Normal of its border, pointing out of it."""
+    limit: float
+    """Coordinate of its border."""
+    has_border: bool
+    """Whether points on the border are in it."""
+
+    def keeps(self, point: Float[ndarray, "point 3"]) -> Bool[ndarray, " point"]:
+        """Tell which points lie in it."""
+        along = point @ self.direction
+        return np.asarray(along <= self.limit if self.has_border else along < self.limit)
+
+
+class ClippedNodes(SceneNodes):
+    """Scene nodes that are cut at a plane; surfaces stay whole.
+
+    Attributes:
+        plane: What is kept; None for everything.
+    """
+
+    plane: Plane | None = None
+
+    def points(self, name: str, point: ndarray, color: Any, size: float, **options: Any) -> None:
+        """Draw the points that are kept, in a size that may change."""
+        if self.plane is not None and len(point):
+            kept = self.plane.keeps(point)
+            color = np.asarray(color)[kept] if np.ndim(color) == 2 else color
+            point = point[kept]
+        super().points(name, point, color, size, **options)
+        node = self._nodes.get(name)
+        if node is not None and node.point_size != size:
+            node.point_size = size
+
+    def segments(
+        self, name: str, segment: ndarray, color: Any, width: float, **options: Any
+    ) -> None:
+        """Draw the lines whose middle is kept."""
+        if self.plane is not None and len(segment):
+            kept = self.plane.keeps(segment.mean(axis=1))
+            color = np.asarray(color)[kept] if np.ndim(color) >= 2 else color
+            segment = segment[kept]
+        super().segments(name, segment, color, width, **options)
+
+    def arrows(self, name: str, arrow: ndarray, color: Any, width: float, **options: Any) -> None:
+        """Draw the arrows whose start is kept."""
+        if self.plane is not None and len(arrow):
+            kept = self.plane.keeps(arrow[:, 0])
+            color = np.asarray(color)[kept] if np.ndim(color) >= 2 else color
+            arrow = arrow[kept]
+        super().arrows(name, arrow, color, width, **options)

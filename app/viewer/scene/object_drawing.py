@@ -1,0 +1,336 @@
+"""One object in the scene: its nodes, the springs that join them, what holds it and how hard."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from app.viewer.color.coloring import Painted
+from app.viewer.color.colormaps import UNKNOWN, table
+from app.viewer.content.layers import BLUE, GREY, PLAYING_SPRINGS, RED, YELLOW, Layers
+from app.viewer.content.object_rollout import ObjectRollout
+from app.viewer.scene.framing import Framing
+from app.viewer.scene.nodes import SceneNodes
+
+STEPS = 24
+"""Colors of a colored surface."""
+_PLAIN = (92, 142, 230)
+_OPACITY = None
+
+
+class SurfaceDrawing:
+    """Draws a surface below one path of the scene; used by one thread."""
+
+    def __init__(self, nodes: SceneNodes, root: str) -> None:
+        self._nodes = nodes
+        self._root = f"{root}/object/surface"
+
+    def draw(
+        self,
+        position: Float[ndarray, "node 3"],
+        faces: Int[ndarray, "face 3"],
+        painted: Painted | None,
+        *,
+        is_visible: bool,
+    ) -> None:
+        """Bring the surface to a frame.
+
+        Args:
+            position: Object nodes [m].
+            faces: Triangles between them.
+            painted: The nodes' colors; None for one color.
+            is_visible: Whether it is shown.
+        """
+        is_visible = is_visible and len(faces) > 0
+        plain = f"{self._root}/plain"
+        is_plain = is_visible and painted is None
+        used, local = _compact(faces) if is_plain else _NOTHING
+        self._nodes.mesh(
+            plain, position[used], local, _PLAIN, is_visible=is_plain, opacity=_OPACITY
+        )
+        step = None if painted is None or not is_visible else face_steps(painted.level, faces)
+        for number in range(STEPS + 1):
+            self._facets(number, position, faces, step, painted)
+
+    def _facets(
+        self,
+        number: int,
+        position: Float[ndarray, "node 3"],
+        faces: Int[ndarray, "face 3"],
+        step: Int[ndarray, " face"] | None,
+        painted: Painted | None,
+    ) -> None:
+        """Draw the triangles of one step of the scale."""
+        name = f"{self._root}/step_{number:02d}"
+        chosen = faces[step == number] if step is not None else faces[:0]
+        if len(chosen) == 0 or painted is None:
+            self._nodes.show(name, is_visible=False)
+            return
+        used, local = _compact(chosen)
+        color = UNKNOWN
+        if number < STEPS:
+            ramp = table(painted.quantity.scale)
+            at = round((number + 0.5) / STEPS * (len(ramp) - 1))
+            color = (int(ramp[at, 0]), int(ramp[at, 1]), int(ramp[at, 2]))
+        self._nodes.mesh(
+            name, position[used], local, color, is_visible=True, opacity=None, is_flat=True
+        )
+
+
+def face_steps(
+    level: Float[ndarray, " node"], faces: Int[ndarray, "face 3"]
+) -> Int[ndarray, " face"]:
+    """Tell which step of the scale each triangle has: the mean of its corners' levels.
+
+    Corners that are not known are left out; a triangle without known corners gets `STEPS`.
+    """
+    corner = level[faces]
+    is_known = np.isfinite(corner)
+    count = is_known.sum(axis=1)
+    mean = np.where(is_known, corner, 0.0).sum(axis=1) / np.maximum(count, 1)
+    step = np.minimum((mean * STEPS).astype(np.int64), STEPS - 1)
+    return np.where(count > 0, step, STEPS)
+
+
+_NOTHING = (np.zeros(0, np.int64), np.zeros((0, 3), np.uint32))
+
+
+def _compact(
+    faces: Int[ndarray, "face 3"],
+) -> tuple[Int[ndarray, " used"], Int[ndarray, "face 3"]]:
+    """Number the corners of triangles anew, without gaps; also gives the old numbers."""
+    used, local = np.unique(faces, return_inverse=True)
+    return used, local.reshape(-1, 3).astype(np.uint32)
+
+
+Color = tuple[int, int, int]
+
+QUIET_FORCE = 1e-6
+"""Weaker forces are no forces [N]."""
+_SAMPLED_FRAMES = 8
+_LEAST_ARROWS = 60
+_OF_RECORDING = 1.4
+"""Diameter of control points where there is no object, as a part of the spacing."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Budget:
+    """How much of an object may be sent in a frame; None for all of it."""
+
+    virtual: int | None = None
+    """Most virtual springs."""
+    springs: int | None = None
+    """Most object springs."""
+    nodes: int | None = None
+    """Most object nodes."""
+    arrows: int = 800
+    """Most force arrows; the weakest are left out."""
+
+
+def share_bytes(left: int, take: ObjectRollout, layers: Layers, arrows: int) -> Budget:
+    """Divide what a playing frame may still weigh between virtual and object springs.
+
+    Args:
+        left: Bytes that are left when all points are sent.
+        take: The rollout.
+        layers: Tells whether there are object springs and arrows at all.
+        arrows: Most force arrows.
+    """
+    each = 24 if layers.color == "plain" else 30
+    arrows = min(arrows, max(left // (2 * 24), _LEAST_ARROWS))
+    count = left // each - (arrows if layers.forces else 0)
+    count = min(max(count, PLAYING_SPRINGS // 10), PLAYING_SPRINGS)
+    virtual = min(take.model.virtual_spring_count, count)
+    if layers.object_springs:
+        virtual = min(virtual, count // 2)
+    return Budget(virtual=max(virtual, 1), springs=max(count - virtual, 1), arrows=arrows)
+
+
+def strengths(take: ObjectRollout) -> Float[ndarray, " node"]:
+    """Sample how hard the virtual springs pull the nodes that they hold, over the frames [N]."""
+    frames = np.unique(np.linspace(0, take.ready - 1, _SAMPLED_FRAMES).astype(int))
+    strength = np.concatenate([np.linalg.norm(take.forces(int(f)), axis=-1) for f in frames])
+    return strength[strength > QUIET_FORCE]
+
+
+def automatic_force_unit(take: ObjectRollout | None, framing: Framing) -> float:
+    """Choose how long an arrow of 1 N is, so that the strong ones of a rollout are seen well."""
+    if take is None:
+        return 0.0
+    strength = strengths(take)
+    strong = float(np.quantile(strength, 0.9)) if len(strength) else 1.0
+    return 0.07 * framing.extent / strong
+
+
+@dataclass(frozen=True, kw_only=True)
+class Style:
+    """How an object is drawn; sizes of nodes are parts of their spacing."""
+
+    is_solid: bool = False
+    """Whether nodes are shaded spheres instead of disks, which is heavier to show."""
+    node: Color = BLUE
+    """Color of object nodes."""
+    control: Color = RED
+    """Color of control nodes."""
+    spring: Color = GREY
+    """Color of object springs."""
+    virtual: Color = YELLOW
+    """Color of virtual springs."""
+    arrow: Color = RED
+    """Color of force arrows."""
+    node_size: float = 0.36
+    """Diameter of object nodes."""
+    control_size: float = 0.3
+    """Diameter of control nodes that hold the object."""
+    spring_width: float = 1.5
+    """Width of object springs in pixels."""
+    virtual_width: float = 2.0
+    """Width of virtual springs in pixels."""
+    arrow_width: float = 0.0022
+    """Width of force arrows as a part of the scene's extent."""
+
+
+class ObjectDrawing:
+    """Draws the frames of rollouts below one path of the scene; used by one thread."""
+
+    def __init__(
+        self, nodes: SceneNodes, framing: Framing, *, root: str = "", style: Style | None = None
+    ) -> None:
+        """Prepare; nothing is drawn yet.
+
+        Args:
+            nodes: The scene's nodes.
+            framing: Sizes.
+            root: Path below which everything is drawn.
+            style: Colors and sizes.
+        """
+        self._nodes = nodes
+        self._framing = framing
+        self._root = root
+        self._style = style or Style()
+        self._balls = nodes.spheres if self._style.is_solid else nodes.points
+        self._surface = SurfaceDrawing(nodes, root)
+        self._model_shown: ObjectRollout | None = None
+        self._attached: Int[ndarray, " control"] = np.zeros(0, np.int64)
+
+    def attached(self, take: ObjectRollout) -> Int[ndarray, " control"]:
+        """Find the control nodes that hold the object by a virtual spring."""
+        if take is not self._model_shown:
+            springs = take.model.spring_nodes[take.model.object_spring_count :]
+            self._attached = np.unique(springs.max(axis=1) - take.model.node_count)
+            self._model_shown = take
+        return self._attached
+
+    def draw(
+        self,
+        take: ObjectRollout,
+        frame: int,
+        layers: Layers,
+        budget: Budget,
+        *,
+        force_unit: float,
+        longest: float,
+        painted: Painted | None = None,
+        faces: Int[ndarray, "face 3"] | None = None,
+    ) -> None:
+        """Bring the object to a frame.
+
+        Args:
+            take: The rollout.
+            frame: One of its frames.
+            layers: What is shown.
+            budget: How much may be sent.
+            force_unit: Length of an arrow of 1 N.
+            longest: No arrow is longer than this.
+            painted: Colors of nodes and springs; None for those of the style.
+            faces: Triangles between the nodes; None without a surface.
+        """
+        root, count = self._root, take.model.object_spring_count
+        position = np.asarray(take.position[frame], dtype=np.float32)
+        control = np.asarray(take.control[frame], dtype=np.float32)
+        style = self._style
+        size = style.node_size * self._framing.spacing
+        shown = _thinned(0, len(position), budget.nodes)
+        color = style.node if painted is None else painted.node[shown]
+        is_visible = layers.nodes
+        self._balls(f"{root}/object/nodes", position[shown], color, size, is_visible=is_visible)
+        self._surface.draw(
+            position,
+            np.zeros((0, 3), np.int32) if faces is None else faces,
+            painted,
+            is_visible=layers.surface,
+        )
+        self.draw_controls(control, self.attached(take), layers)
+        point = np.concatenate([position, control])
+        own = _thinned(0, count, budget.springs)
+        held = _thinned(count, len(take.model.spring_nodes), budget.virtual)
+        for name, chosen, color, width, is_visible in (
+            ("virtual", held, style.virtual, style.virtual_width, layers.virtual_springs),
+            ("object", own, style.spring, style.spring_width, layers.object_springs),
+        ):
+            self._nodes.segments(
+                f"{root}/springs/{name}",
+                point[take.model.spring_nodes[chosen if is_visible else slice(0)]],
+                painted.springs(chosen) if painted is not None else color,
+                width,
+                is_visible=is_visible,
+            )
+        arrows = np.zeros((0, 2, 3), np.float32)
+        if layers.forces:
+            unit = force_unit * layers.force_scale
+            arrows = force_arrows(take, frame, unit, longest, budget.arrows)
+        shortest = 0.004 * self._framing.extent
+        arrows = arrows[np.linalg.norm(arrows[:, 1] - arrows[:, 0], axis=-1) > shortest]
+        width = style.arrow_width * self._framing.extent
+        self._nodes.arrows(f"{root}/forces", arrows, style.arrow, width)
+
+    def draw_controls(
+        self,
+        control: Float[ndarray, "control 3"],
+        attached: Int[ndarray, " attached"] | None,
+        layers: Layers,
+    ) -> None:
+        """Draw the control nodes, those that hold the object larger than the others."""
+        spacing, root, style = self._framing.spacing, self._root, self._style
+        held = control if attached is None else control[attached]
+        size = (style.control_size if attached is not None else _OF_RECORDING) * spacing
+        name = f"{root}/controls/attached"
+        self._balls(name, held, style.control, size, is_visible=layers.controls)
+        is_shown = layers.all_controls and attached is not None
+        free = np.delete(control, attached, axis=0) if is_shown and attached is not None else None
+        if free is not None or f"{root}/controls/free" in self._nodes:
+            point = np.zeros((0, 3), np.float32) if free is None else free
+            name = f"{root}/controls/free"
+            self._nodes.points(name, point, style.control, 0.12 * spacing, is_visible=is_shown)
+
+
+def force_arrows(
+    take: ObjectRollout, frame: int, force_unit: float, longest: float, most: int
+) -> Float[ndarray, "arrow 2 3"]:
+    """Lay out the forces that the hand puts on the object through the virtual springs.
+
+    Args:
+        take: The rollout.
+        frame: One of its frames.
+        force_unit: Length of an arrow of 1 N.
+        longest: No arrow is longer than this.
+        most: The weakest forces beyond this number are left out.
+
+    Returns:
+        Start and end of the arrows, the strongest first.
+    """
+    force = take.forces(frame)
+    strength = np.linalg.norm(force, axis=-1)
+    node = np.flatnonzero(strength > QUIET_FORCE)
+    node = node[np.argsort(-strength[node], kind="stable")[:most]]
+    offset = force[node] * force_unit
+    length = np.linalg.norm(offset, axis=-1, keepdims=True)
+    offset *= np.minimum(1.0, longest / np.maximum(length, 1e-12))
+    start = np.asarray(take.position[frame])[node]
+    return np.stack([start, start + offset], axis=1).astype(np.float32)
+
+
+def _thinned(start: int, stop: int, most: int | None) -> slice:
+    """Choose springs, thinned out evenly to at most `most`."""
+    return slice(start, stop, 1 if most is None else max(1, -(-(stop - start) // most)))

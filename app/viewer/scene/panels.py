@@ -1,0 +1,222 @@
+"""The panel of one session: layers and view."""
+
+import threading
+from collections.abc import Callable
+from dataclasses import fields
+from typing import Any
+
+import viser
+
+from app.keys import LAYER_KEYS
+from app.viewer.clock.timeline_panel import TimelinePanel as TimelinePanel
+from app.viewer.content.content import Content
+from app.viewer.content.layers import BLUE, GREEN, GREY, RED, SKIN, THEMES, YELLOW, Layers, Theme
+from app.viewer.content.observed import DepthCloud
+from app.viewer.scene.cameras import pose_of_view
+from app.viewer.scene.framing import Framing
+from app.viewer.scene.scene import grid_cell
+from app.viewer.ui.guard import Guard
+from app.viewer.ui.keyboard import bind
+from physhandi.data.view import View
+
+
+def set_theme(server: viser.ViserServer, *, dark: bool) -> None:
+    """Dress the page."""
+    server.gui.configure_theme(
+        dark_mode=dark, show_logo=False, show_share_button=False, brand_color=(36, 99, 203)
+    )
+
+
+def add_legend(server: viser.ViserServer, content: Content) -> None:
+    """Tell what the colors mean."""
+    entries: list[tuple[tuple[int, int, int], str]] = []
+    if content.hands or content.skeletons:
+        entries.append((SKIN["right"], "hand"))
+    controls = "control points" if content.hands or content.markers is None else "grippers"
+    if content.fitted is not None:
+        entries += [(BLUE, "object"), (RED, "controls, forces"), (YELLOW, "virtual springs")]
+    elif content.control is not None:
+        entries.append((RED, controls))
+    if content.observed is not None and not isinstance(content.observed, DepthCloud):
+        is_marked = content.markers is not None or (
+            content.tracks is not None and content.tracks.node is not None
+        )
+        entries.append((GREEN, "markers" if is_marked else "observed"))
+    if content.views:
+        entries.append((GREY, "cameras"))
+    dots = "".join(
+        '<span style="white-space:nowrap;margin-right:0.8em">'
+        f'<span style="display:inline-block;width:0.7em;height:0.7em;border-radius:50%;'
+        f'background:rgb{color};margin-right:0.35em"></span>{label}</span>'
+        for color, label in entries
+    )
+    server.gui.add_html(f'<div style="font-size:0.8em;padding:0.2em 0.9em 0.5em">{dots}</div>')
+
+
+_OVERVIEW = "Overview"
+
+
+def _grid_label(content: Content, framing: Framing) -> str:
+    """Name the grid by the distance of its lines, which is the scale of the scene."""
+    cell = grid_cell(framing.extent)
+    if not content.is_metric:
+        return f"Grid, {cell:g} {content.length_unit}{'' if cell == 1 else 's'}"
+    return f"Grid, {cell:g} m" if cell >= 1 else f"Grid, {1e3 * cell:g} mm"
+
+
+class LayersPanel:
+    """What is shown, and from where."""
+
+    def __init__(
+        self, server: viser.ViserServer, content: Content, guard: Guard, redraw: Callable[[], None]
+    ) -> None:
+        self._server = server
+        self._guard = guard
+        self._redraw = redraw
+        self._layers = Layers()
+        self._switches: dict[str, viser.GuiCheckboxHandle] = {}
+        self._views: dict[str, View] = {}
+        self._framing: Framing | None = None
+        # Two quick presses of a key are heard in threads of their own.
+        self._turn = threading.Lock()
+        gui = server.gui
+        with gui.add_folder("Layers", expand_by_default=content.fitted is None):
+            for field, label in (
+                ("hands", "Hands"),
+                ("nodes", "Object nodes"),
+                ("surface", "Surface"),
+                ("controls", "Control nodes"),
+                ("all_controls", "All control nodes"),
+                ("virtual_springs", "Virtual springs"),
+                ("object_springs", "Object springs"),
+                ("forces", "Force arrows"),
+                ("observed", "Observed points"),
+                ("cameras", "Cameras"),
+                ("ground", "Grid"),
+            ):
+                switch = gui.add_checkbox(label, initial_value=True)
+                switch.on_update(guard.by_user(self._switch(field)))
+                self._switches[field] = switch
+            self._scale = gui.add_slider(
+                "Arrow scale", 0.1, 5.0, 0.1, 1.0, hint="Length of the force arrows"
+            )
+            self._scale.on_update(guard.by_user(self._rescale))
+            self._place: Any = gui.add_dropdown("View from", (_OVERVIEW,))
+            self._place.on_update(guard.by_user(self._look))
+            self._theme = gui.add_dropdown("Background", THEMES)
+            self._theme.on_update(guard.by_user(lambda _: self._dress()))
+        bind(server, guard, "layer", lambda _, number: self._press(LAYER_KEYS[number][0]))
+        bind(server, guard, "theme", lambda _, __: self._turn_theme())
+        self._prefers_dark = False
+
+    def replace(
+        self, content: Content, layers: Layers, framing: Framing, *, has_surface: bool = False
+    ) -> None:
+        """Show the switches that a content needs, as its layers stand."""
+        self._layers, self._framing = layers, framing
+        layers.dark, layers.force_scale = self._is_dark, self._scale.value
+        has_object = content.fitted is not None
+        has_control = content.control is not None
+        is_there = {
+            "hands": bool(content.hands or content.skeletons),
+            "nodes": has_object,
+            "surface": has_surface,
+            "controls": has_control,
+            "all_controls": has_object,
+            "virtual_springs": has_object,
+            "object_springs": has_object,
+            "forces": has_object,
+            "observed": content.observed is not None,
+            "cameras": bool(content.views),
+            "ground": True,
+        }
+        for field, switch in self._switches.items():
+            switch.visible = is_there[field]
+            switch.value = getattr(layers, field)
+        is_marked = content.markers is not None
+        self._switches["controls"].label = "Grippers" if is_marked else "Control nodes"
+        has_names = is_marked or (content.tracks is not None and content.tracks.node is not None)
+        self._switches["observed"].label = "Markers" if has_names else "Observed points"
+        self._switches["ground"].label = _grid_label(content, framing)
+        self._scale.visible = has_object
+        self._views = {view.name: view for view in content.views}
+        self._place.options = (_OVERVIEW, *self._views)
+        self._place.visible = bool(self._views)
+
+    @property
+    def theme(self) -> tuple[Theme, bool]:
+        """The background that was chosen, and whether the browser asks for a dark one."""
+        return self._theme.value, self._prefers_dark
+
+    @property
+    def _is_dark(self) -> bool:
+        return self._prefers_dark if self._theme.value == THEMES[0] else self._theme.value == "dark"
+
+    def prefer_dark(self, *, on: bool) -> None:
+        """Follow the browser, unless a background was chosen."""
+        if on != self._prefers_dark:
+            self._prefers_dark = on
+            self._dress()
+
+    def restore(self, layers: Layers, theme: Theme, *, prefers_dark: bool) -> None:
+        """Show what another session shows of the same content."""
+        self._theme.value, self._prefers_dark = theme, prefers_dark
+        self._scale.value = layers.force_scale
+        for field in fields(layers):
+            setattr(self._layers, field.name, getattr(layers, field.name))
+        for field, switch in self._switches.items():
+            switch.value = getattr(layers, field)
+        self._place.value = layers.looks_from or _OVERVIEW
+        self._dress()
+
+    def reset_view(self, event: Any) -> None:
+        """Put the camera of the client that asks for it back to the overview."""
+        self._place.value = _OVERVIEW
+        self._look(event)
+
+    def _press(self, field: str) -> None:
+        """Switch a layer by its key, if there is anything in it."""
+        switch = self._switches[field]
+        with self._turn:
+            if switch.visible:
+                switch.value = not switch.value
+                setattr(self._layers, field, switch.value)
+        self._redraw()
+
+    def _turn_theme(self) -> None:
+        with self._turn:
+            self._theme.value = "light" if self._is_dark else "dark"
+            self._dress()
+
+    def _switch(self, field: str) -> Callable[[Any], None]:
+        def switch(event: Any) -> None:
+            setattr(self._layers, field, event.target.value)
+            self._redraw()
+
+        return switch
+
+    def _dress(self) -> None:
+        self._layers.dark = self._is_dark
+        set_theme(self._server, dark=self._layers.dark)
+        self._redraw()
+
+    def _rescale(self, event: Any) -> None:
+        self._layers.force_scale = event.target.value
+        self._redraw()
+
+    def _look(self, event: Any) -> None:
+        framing, eye = self._framing, event.client.camera
+        if framing is None:
+            return
+        view = self._views.get(self._place.value)
+        self._layers.looks_from = view.name if view is not None else None
+        self._redraw()
+        with event.client.atomic():
+            if view is None:
+                eye.up_direction = (0.0, 0.0, 1.0)
+                eye.fov = framing.fov
+                eye.position, eye.look_at = framing.camera, framing.look_at
+                return
+            pose = pose_of_view(view, framing)
+            eye.fov, eye.up_direction = pose.fov, pose.up
+            eye.position, eye.look_at = pose.position, pose.look_at

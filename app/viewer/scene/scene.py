@@ -1,0 +1,271 @@
+"""The nodes of one session's scene and how they follow the frames."""
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import viser
+from jaxtyping import Int
+from numpy import ndarray
+
+from app.viewer.color.coloring import Painted, Painter
+from app.viewer.color.hand_coloring import HandPainter
+from app.viewer.content.content import Content
+from app.viewer.content.layers import GREEN, GREY, SKIN, default_layers
+from app.viewer.content.object_rollout import ObjectRollout
+from app.viewer.content.skeleton import BONES
+from app.viewer.scene.cameras import CameraNodes
+from app.viewer.scene.framing import Framing
+from app.viewer.scene.nodes import SceneNodes
+from app.viewer.scene.object_drawing import (
+    Budget,
+    ObjectDrawing,
+    SurfaceDrawing,
+    automatic_force_unit,
+    share_bytes,
+)
+from physhandi.simulation.surface import triangulate_nodes
+
+FRAME_BYTES = 92_000
+"""What a frame may weigh while the clock is running; springs and arrows give way."""
+_ARROWS = 800
+_PLAYING_ARROWS = 400
+_PLAYING_OBSERVED = 2_000
+_LEAST_BYTES = 12_000
+"""Springs and arrows get at least this much of a playing frame."""
+_FEW_POINTS = 100
+"""So few observed points are markers, and drawn larger."""
+_MANY_NODES = 2_500
+"""The surface of more nodes is not laid before somebody asks for it."""
+
+
+class Scene:
+    """Draws frames into a viser server; used by one thread."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        content: Content,
+        framing: Framing,
+        *,
+        frame_bytes: int = FRAME_BYTES,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Prepare to draw.
+
+        Args:
+            server: Where to.
+            content: What can be shown.
+            framing: Sizes.
+            frame_bytes: What a frame may weigh while the clock is running.
+            clock: Tells when the pictures of the cameras are due again [s].
+        """
+        self._frame_bytes = frame_bytes
+        self._server = server
+        self._content = content
+        self._framing = framing
+        self.layers = default_layers(content)
+        self._nodes = SceneNodes(server)
+        self._object = ObjectDrawing(self._nodes, framing)
+        self._force_unit = automatic_force_unit(content.fitted, framing)
+        self.painter = Painter(content)
+        self.hand_painter = HandPainter(content)
+        self._skins = {
+            h.side: SurfaceDrawing(self._nodes, f"/skin/{h.side}") for h in content.hands
+        }
+        self._faces: Int[ndarray, "face 3"] | None = None
+        self._cameras = CameraNodes(server, content.views, framing, clock)
+        self._aim()
+        add_ground(self._nodes, content, framing)
+
+    def clear(self) -> None:
+        """Remove everything, to make room for another content."""
+        self._nodes.clear()
+        self._cameras.remove()
+
+    def draw(
+        self, frame: int, take: ObjectRollout | None, take_frame: int, *, is_playing: bool
+    ) -> None:
+        """Bring the scene to a frame.
+
+        Args:
+            frame: Frame of hands, observation and cameras.
+            take: The object's rollout; None without an object.
+            take_frame: Frame of the rollout, which may lag behind while it is being computed.
+            is_playing: Whether the clock is running, so that less may be sent.
+        """
+        take = take if take is not None and take.ready > 0 else None
+        painted = None if take is None else self.painter.paint(take, take_frame, self.layers)
+        with self._server.atomic():
+            self._draw_hands(frame)
+            self._draw_observed(frame, is_playing, painted, take, take_frame)
+            if take is not None:
+                self._object.draw(
+                    take,
+                    take_frame,
+                    self.layers,
+                    self._budget(take) if is_playing else Budget(arrows=_ARROWS),
+                    force_unit=self._force_unit,
+                    longest=0.22 * self._framing.extent,
+                    painted=painted,
+                    faces=self.faces if self.layers.surface else None,
+                )
+            elif self._content.control is not None:
+                control = np.asarray(self._content.control[frame], dtype=np.float32)
+                self._object.draw_controls(control, None, self.layers)
+            self._cameras.draw(
+                frame,
+                is_visible=self.layers.cameras,
+                looks_from=self.layers.looks_from,
+                is_playing=is_playing,
+            )
+            self._draw_ground(take)
+            self._nodes.color_ground("/ground", is_dark=self.layers.dark)
+
+    @property
+    def may_have_surface(self) -> bool:
+        """Whether there are triangles; of many nodes it is not yet known."""
+        fitted = self._content.fitted
+        if fitted is None:
+            return False
+        return fitted.model.node_count > _MANY_NODES or len(self.faces) > 0
+
+    @property
+    def faces(self) -> Int[ndarray, "face 3"]:
+        """Triangles between the object's nodes; none where they have no surface."""
+        if self._faces is None:
+            fitted = self._content.fitted
+            node = np.zeros((0, 3)) if fitted is None else fitted.model.object_node
+            self._faces = triangulate_nodes(node)
+        return self._faces
+
+    def hide(self) -> None:
+        """Hide everything until the next frame is drawn."""
+        with self._server.atomic():
+            self._nodes.hide()
+            self._cameras.hide()
+
+    def _aim(self) -> None:
+        camera = self._server.initial_camera
+        camera.fov = self._framing.fov
+        camera.near = 0.005 * self._framing.extent
+        camera.far = 200.0 * self._framing.extent
+        camera.look_at = self._framing.look_at
+        camera.position = self._framing.camera
+
+    def _draw_ground(self, take: ObjectRollout | None) -> None:
+        """Lay the grid where the rollout's ground is; a grid that is mere decoration stays."""
+        recorded = self._content.ground_height
+        height = recorded if take is None else take.parameters.ground_height
+        is_there = height is not None or recorded is None
+        if height is not None:
+            self._nodes.lift("/ground", height - 0.001 * self._framing.extent)
+        self._nodes.show("/ground", is_visible=self.layers.ground and is_there)
+
+    def _draw_hands(self, frame: int) -> None:
+        is_visible = self.layers.hands
+        painted = self.hand_painter.paint(frame, self.layers)
+        for hand in self._content.hands:
+            vertex = np.asarray(hand.vertex[min(frame, len(hand.vertex) - 1)], dtype=np.float32)
+            name, color = f"/hand/{hand.side}", SKIN[hand.side]
+            if hand.face is None:
+                size = 0.006 * self._framing.extent
+                self._nodes.points(name, vertex, color, size, is_visible=is_visible)
+            else:
+                of_hand = painted.get(hand.side)
+                is_plain = is_visible and of_hand is None
+                self._nodes.mesh(name, vertex, hand.face, color, is_visible=is_plain)
+                is_painted = is_visible and of_hand is not None
+                self._skins[hand.side].draw(vertex, hand.face, of_hand, is_visible=is_painted)
+        for index, skeleton in enumerate(self._content.skeletons):
+            bones = skeleton[frame][BONES]
+            bones = bones[np.isfinite(bones).all(axis=(1, 2))]
+            self._nodes.segments(
+                f"/hand/skeleton_{index}", bones, SKIN["right"], 4.0, is_visible=is_visible
+            )
+
+    def _draw_observed(
+        self,
+        frame: int,
+        is_playing: bool,
+        painted: Painted | None,
+        take: ObjectRollout | None,
+        take_frame: int,
+    ) -> None:
+        """Draw what was seen; colored by error, its points tell their own."""
+        observed = self._content.observed
+        self._draw_lines_of_markers(frame, take, take_frame)
+        if observed is None or not self.layers.observed:
+            self._nodes.show("/observed", is_visible=False)
+            return
+        point = observed.points(frame)
+        color = observed.colors()
+        every = max(1, -(-len(point) // _PLAYING_OBSERVED)) if is_playing else 1
+        color = color[::every] if color.ndim == 2 else color
+        if painted is not None and take is not None and self.layers.color == "error":
+            distance = self.painter.errors.points(point[::every], take, take_frame)
+            color = painted.points(distance)
+        is_few = len(point) <= _FEW_POINTS
+        size = 0.012 * self._framing.extent if is_few else 0.4 * self._framing.spacing
+        self._nodes.points("/observed", point[::every], color, size, is_visible=True)
+
+    def _draw_lines_of_markers(
+        self, frame: int, take: ObjectRollout | None, take_frame: int
+    ) -> None:
+        """Join the markers of a recording, or each one with the node that should be there."""
+        markers, tracks = self._content.markers, self._content.tracks
+        is_visible = self.layers.observed
+        if markers is not None:
+            line = markers.segments(frame)
+            self._nodes.segments("/markers/line", line, GREY, 2.5, is_visible=is_visible)
+        if take is None or tracks is None or tracks.node is None or frame >= len(tracks.point):
+            self._nodes.show("/markers/offset", is_visible=False)
+            return
+        marker = np.asarray(tracks.point[frame], dtype=np.float32)
+        node = np.asarray(take.position[take_frame], dtype=np.float32)[tracks.node]
+        is_seen = np.asarray(tracks.is_visible[frame]) & np.isfinite(marker).all(axis=-1)
+        line = np.stack([marker, node], axis=1)[is_seen]
+        self._nodes.segments("/markers/offset", line, GREEN, 2.0, is_visible=is_visible)
+
+    def _budget(self, take: ObjectRollout) -> Budget:
+        """Share what the points of a playing frame leave of its bytes."""
+        layers = self.layers
+        point_count = len(self._object.attached(take))
+        colored = 0 if layers.color == "plain" else take.model.node_count // 4
+        point_count += take.model.node_count + colored if layers.nodes else 0
+        point_count += take.model.control_count if layers.all_controls else 0
+        point_count += _PLAYING_OBSERVED if layers.observed else 0
+        if layers.hands:
+            point_count += sum(hand.vertex.shape[1] for hand in self._content.hands)
+        if layers.surface:
+            # Where colors divide the surface, triangles are sent as well, and corners twice.
+            node_count = len(np.unique(self.faces))
+            is_plain = layers.color == "plain"
+            point_count += node_count if is_plain else 2 * node_count + len(self.faces)
+        left = self._frame_bytes - 12 * point_count
+        budget = share_bytes(left, take, layers, _PLAYING_ARROWS)
+        if left >= _LEAST_BYTES or not layers.surface:
+            return budget
+        # Nodes on a surface are seen by its color anyway.
+        most = max(take.model.node_count - (_LEAST_BYTES - left) // 12, 1)
+        return replace(budget, nodes=most)
+
+
+def grid_cell(extent: float) -> float:
+    """Choose the distance of the grid's lines: a round number below a third of the scene."""
+    power = 10.0 ** float(np.floor(np.log10(extent / 3)))
+    return max(step * power for step in (1, 2, 5) if step * power <= extent / 3)
+
+
+def add_ground(
+    nodes: SceneNodes, content: Content, framing: Framing, name: str = "/ground"
+) -> None:
+    """Draw a grid on the ground; below everything if the ground is not known."""
+    height, extent = content.ground_height, framing.extent
+    if height is None:
+        height = framing.low - 0.02 * extent
+    cell = grid_cell(extent)
+    x, y = (round(float(framing.center[axis]) / cell) * cell for axis in (0, 1))
+    count = int(np.ceil(4 * extent / cell))
+    nodes.ground(name, (x, y, float(height) - 0.001 * extent), cell, count)

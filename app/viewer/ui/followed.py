@@ -1,0 +1,60 @@
+"""A control that follows what is in force, and never takes away what a user has just chosen."""
+
+import threading
+from typing import Any
+
+from app.viewer.ui.guard import Guard
+
+
+class FollowedChoice:
+    """A list or a field that both the program and a user set.
+
+    Viser stores a user's choice on its event loop before it calls anybody, so a value that was not
+    the last one written or taken here is a user's that is about to be heard. The program writes on
+    the same loop: no user's choice can come between looking and writing.
+
+    Attributes:
+        handle: The control; its value and its options belong to this class.
+    """
+
+    def __init__(self, handle: Any, guard: Guard) -> None:
+        """Follow a control.
+
+        Args:
+            handle: The control as viser gave it, with its first value.
+            guard: Knows the event loop.
+        """
+        self.handle = handle
+        self._guard = guard
+        self._lock = threading.Lock()
+        self._known: Any = handle.value
+
+    def show(self, value: Any) -> None:
+        """Name what is in force, unless a user's choice is about to be heard."""
+
+        def write() -> None:
+            with self._lock:
+                if self.handle.value == self._known != value:
+                    self._known = value
+                    self.handle.value = value
+
+        self._guard.on_event_loop(write)
+
+    def offer(self, options: tuple[str, ...]) -> None:
+        """Change what a list offers; what it no longer offers is no longer chosen."""
+
+        def write() -> None:
+            with self._lock:
+                if tuple(self.handle.options) != options:
+                    is_heard = self.handle.value == self._known
+                    self.handle.options = options
+                    if is_heard:
+                        self._known = self.handle.value
+
+        self._guard.on_event_loop(write)
+
+    def take(self) -> Any:
+        """Read the control, whoever has set it."""
+        with self._lock:
+            self._known = self.handle.value
+            return self._known

@@ -1,0 +1,122 @@
+"""What all live scenes share: a viser server of their own, an owner, and who is looking."""
+
+import threading
+import time
+from abc import ABC, abstractmethod
+from typing import Any, Protocol
+
+import rich
+import viser
+import viser._messages as messages
+
+from app.viewer.content.session_state import Kind, Pose, SessionInfo
+from app.viewer.ui.guard import Guard, plain
+
+
+def start_viser(label: str) -> viser.ViserServer:
+    """Start a viser server on a free loopback port.
+
+    Args:
+        label: Title of its panel; must be harmless as HTML.
+    """
+    rich.get_console().quiet = True  # viser would print its loopback address, which misleads.
+    server = viser.ViserServer(host="127.0.0.1", port=0, label=label, verbose=False)
+    # Any client could ask for a public tunnel with this message.
+    infrastructure: Any = server._websock_server  # pyright: ignore[reportPrivateUsage]  # no other way
+    infrastructure.unregister_handler(messages.ShareUrlRequest)
+    return server
+
+
+class FollowsCameras(Protocol):
+    """Shows something that depends on where a client's camera stands."""
+
+    def welcome(self, client: viser.ClientHandle, /) -> None:
+        """Show it to a client that has just come."""
+        ...
+
+    def turn(self, client: viser.ClientHandle, /) -> None:
+        """Follow a client's camera."""
+        ...
+
+
+class SceneServer(ABC):
+    """A viser server for one browser tab, which closes when nobody looks for long."""
+
+    kind: Kind
+    """What `target` names."""
+
+    def __init__(self, session_id: str, *, owner: str, title: str) -> None:
+        """Start the server; scene and panel are built by the caller.
+
+        Args:
+            session_id: Unguessable id.
+            owner: Whose session it is.
+            title: Of the panel; may be any user's text.
+        """
+        self.id = session_id
+        self.owner = owner
+        self.created = time.time()
+        self._seen = time.monotonic()
+        self._is_closed = False
+        self._lock = threading.RLock()
+        self._server = start_viser(plain(title))
+        self._guard = Guard(self._server)
+
+    @property
+    @abstractmethod
+    def target(self) -> str:
+        """What is shown: an id, or a query."""
+
+    @property
+    @abstractmethod
+    def title(self) -> str:
+        """What is shown, for people."""
+
+    @property
+    def port(self) -> int:
+        """Loopback port of the viser server."""
+        return self._server.get_port()
+
+    @property
+    def info(self) -> SessionInfo:
+        """What a listing says about it."""
+        return SessionInfo(
+            id=self.id,
+            kind=self.kind,
+            target=self.target,
+            owner=self.owner,
+            title=self.title,
+            client_count=len(self._server.get_clients()),
+            created=self.created,
+            idle=self.idle,
+            offers=self.offers,
+        )
+
+    @property
+    def offers(self) -> tuple[str, ...]:
+        """What can be done with it; see `SessionInfo`."""
+        return ()
+
+    @property
+    def idle(self) -> float:
+        """How long nobody has looked at it [s]."""
+        if self._server.get_clients():
+            self._seen = time.monotonic()
+        return time.monotonic() - self._seen
+
+    @abstractmethod
+    def _forget(self, client: viser.ClientHandle) -> Pose:
+        """Forget a client; returns where its camera stood in the scene."""
+
+    def _let_in(self, client: viser.ClientHandle, shown: FollowsCameras) -> None:
+        """Show a new client something that follows its camera from now on."""
+        # Heard before it is aimed: where a browser's camera stood may be told a moment later.
+        client.camera.on_update(self._guard(lambda _: shown.turn(client)))
+        shown.welcome(client)
+
+    def _part(self, client: viser.ClientHandle) -> None:
+        """Keep the camera of a client that leaves, for the tab that is being reloaded."""
+        self._seen = time.monotonic()
+        pose = self._forget(client)
+        if not self._is_closed:
+            pose.give_first(self._server.initial_camera)

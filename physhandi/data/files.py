@@ -1,0 +1,221 @@
+"""Writing files so that a reader sees the old content or the new, never half of it."""
+
+import json
+import math
+import os
+import secrets
+import shutil
+import socket
+import tokenize
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path, PurePath
+from typing import Any, BinaryIO, cast
+
+import numpy as np
+import psutil
+import yaml
+from safetensors import numpy as safetensors_numpy
+
+_MAGIC = b"\x93NUMPY"
+_ODD = (tokenize.TokenError, SyntaxError, TypeError, KeyError, OverflowError, MemoryError)
+_HOST = socket.gethostname().replace("-", "_").replace(".", "_")[:32] or "host"
+
+
+def temporary_name(name: str) -> str:
+    """Name a hidden sibling of a file that tells which process is writing it."""
+    return f".{name}.{_HOST}-{os.getpid()}-{secrets.token_hex(4)}.tmp"
+
+
+def is_abandoned(path: Path) -> bool:
+    """Tell whether a temporary file or folder was left by a process of this host that is gone."""
+    parts = path.name.split(".")
+    if len(parts) < 4 or parts[0] or parts[-1] != "tmp":
+        return False
+    fields = parts[-2].split("-")
+    if len(fields) != 3 or fields[0] != _HOST or not fields[1].isdigit():
+        return False
+    return int(fields[1]) != os.getpid() and not psutil.pid_exists(int(fields[1]))
+
+
+def sweep_temporary(paths: Iterator[Path]) -> int:
+    """Remove temporary files and folders whose process is gone; return how many there were."""
+    count = 0
+    for path in list(paths):
+        if is_abandoned(path):
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
+            count += 1
+    return count
+
+
+def _named(error: OSError, path: Path) -> OSError:
+    """Name what is being written, which a full disk does not."""
+    return OSError(error.errno, error.strerror, str(path))
+
+
+def sync_folder(folder: Path) -> None:
+    """Make a folder's entries durable (a rename is lost in a power cut otherwise)."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        raise _named(error, folder) from error
+    finally:
+        os.close(descriptor)
+
+
+def write_atomically(
+    path: Path, write: Callable[[BinaryIO], Any], *, is_durable: bool = True
+) -> None:
+    """Let `write` fill a temporary file and move it to `path`.
+
+    Args:
+        path: File to replace; its folder must exist.
+        write: Writes the content.
+        is_durable: Whether the content must survive a power cut; costs milliseconds.
+    """
+    temporary = path.with_name(temporary_name(path.name))
+    try:
+        with temporary.open("wb") as stream:
+            write(stream)
+            stream.flush()
+            if is_durable:
+                os.fsync(stream.fileno())
+        temporary.replace(path)
+    except BaseException as error:
+        temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.errno is not None:
+            raise _named(error, path) from error
+        raise
+    if is_durable:
+        sync_folder(path.parent)
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Replace a file's content."""
+    write_atomically(path, lambda stream: stream.write(content))
+
+
+def write_array(path: Path, array: np.ndarray) -> None:
+    """Write an array as ``.npy``; arrays of Python objects are refused (ValueError)."""
+    contiguous = np.asarray(array, order="C")
+    write_atomically(path, lambda stream: np.save(stream, contiguous, allow_pickle=False))
+
+
+def plain(value: Any) -> Any:
+    """Turn NumPy values, paths and tuples into lists, numbers and text, as JSON and YAML have."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in cast("Mapping[Any, Any]", value).items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if value is None or isinstance(value, str | int | float | bool):
+        return value
+    if isinstance(value, PurePath):
+        return str(value)
+    if isinstance(value, list | tuple | set | frozenset | range):
+        return [plain(item) for item in cast("Iterable[Any]", value)]
+    raise TypeError(f"{type(value).__name__} cannot be stored in JSON or YAML")
+
+
+def without_non_finite(value: Any) -> Any:
+    """Replace NaN and infinity, which JSON does not know, by None in `plain` data."""
+    if isinstance(value, dict):
+        return {k: without_non_finite(v) for k, v in cast("dict[str, Any]", value).items()}
+    if isinstance(value, list):
+        return [without_non_finite(item) for item in cast("list[Any]", value)]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def json_line(value: Any) -> str:
+    """Format a value as JSON on one line; NaN and infinity become null."""
+    return json.dumps(without_non_finite(plain(value)), allow_nan=False)
+
+
+def write_json(path: Path, value: Any, *, is_durable: bool = True) -> None:
+    """Write a value as JSON; NaN and infinity become null."""
+    text = json.dumps(without_non_finite(plain(value)), indent=1, allow_nan=False)
+    content = text.encode() + b"\n"
+    write_atomically(path, lambda stream: stream.write(content), is_durable=is_durable)
+
+
+def write_yaml(path: Path, value: Any) -> None:
+    """Write a value as YAML in the given key order (`plain` first)."""
+    text = yaml.safe_dump(plain(value), sort_keys=False, allow_unicode=True, width=100)
+    write_bytes(path, text.encode())
+
+
+def read_array(path: Path, *, mmap: bool = False) -> np.ndarray:
+    """Read an ``.npy`` file without ever unpickling.
+
+    Args:
+        path: File to read.
+        mmap: Map the file instead of reading it; the array is read-only.
+
+    Raises:
+        ValueError: If the file is not a whole array of plain numbers.
+        FileNotFoundError: If there is no such file.
+    """
+    with path.open("rb") as stream:
+        start = stream.read(len(_MAGIC))
+    if start != _MAGIC:
+        kinds = {b"": "the file is empty", b"PK": "it is an archive, not one array"}
+        raise ValueError(kinds.get(start[:2], "it does not begin as one"))
+    try:
+        mapped: Any = np.load(path, mmap_mode="r", allow_pickle=False)
+    except _ODD as error:  # What NumPy lets out of a header that it cannot parse.
+        raise ValueError(f"its header is damaged ({error})") from error
+    return mapped if mmap else np.array(mapped)
+
+
+def read_tensors(path: Path) -> dict[str, np.ndarray]:
+    """Read a ``.safetensors`` file."""
+    return safetensors_numpy.load(path.read_bytes())
+
+
+def named_fields(value: Any) -> dict[str, Any] | None:
+    """Give a mapping as one with text keys; None if it is something else."""
+    if not isinstance(value, dict):
+        return None
+    return {str(key): item for key, item in cast("dict[Any, Any]", value).items()}
+
+
+_ODD_CHARACTER = (ValueError, KeyError, IndexError, AttributeError, TypeError, OverflowError)
+
+
+def parse_yaml(text: str) -> Any:
+    """Read plain data from YAML text; nothing that it names is imported or called.
+
+    Raises:
+        ValueError: If it is not YAML, or a field is there twice; tells the line.
+    """
+    try:
+        return yaml.load(text, Loader=_Loader)  # noqa: S506 - a SafeLoader
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        where = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
+        raise ValueError(f"{where}{error.problem or error.context}") from error
+    except yaml.YAMLError as error:
+        raise ValueError(" ".join(str(error).split())) from error
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+    except _ODD_CHARACTER as error:  # What PyYAML raises for a value that does not fit its own tag.
+        raise ValueError(f"a value is not what its tag says ({error})") from error
+
+
+class _Loader(yaml.SafeLoader):
+    """Refuses a field that is there twice, of which YAML's own reader keeps the last."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        """Check the fields of a mapping, then read it."""
+        seen: set[str] = set()
+        for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
+            if not isinstance(key, yaml.ScalarNode) or key.tag == "tag:yaml.org,2002:merge":
+                continue
+            if key.value in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"field '{key.value}' is there twice; keep one", key.start_mark
+                )
+            seen.add(key.value)
+        return super().construct_mapping(node, deep=deep)

@@ -1,0 +1,1 @@
+"""Ways to run the same substeps: graphs of launches, one launch a frame, threads, batches."""

@@ -1,0 +1,532 @@
+"""Many candidates of one object at once: one launch moves them all by a substep on CUDA."""
+
+from collections.abc import Iterator
+from collections.abc import Sequence as Many
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+from jaxtyping import Float, Float32, Int
+from numpy import ndarray
+
+from physhandi.errors import SimulationDivergedError, UsageError
+from physhandi.simulation.engines.graph import Recording
+from physhandi.simulation.engines.partition import bisect_nodes
+from physhandi.simulation.kernels.batch import (
+    FIELDS,
+    block_threads,
+    make_batch_kernel,
+    note_divergence,
+    place_batch,
+    take_batch,
+)
+from physhandi.simulation.kernels.batch_losses import (
+    NODES,
+    POINTS,
+    add_losses,
+    sum_accelerations,
+    sum_chamfer,
+    sum_tracks,
+)
+from physhandi.simulation.master_topology import MasterTopology
+from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.simulator import SPEED_LIMIT, Simulator, checked_control
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MotionTarget:
+    """What was observed of an object, and how much each observation counts.
+
+    The loss of a frame is the weighted sum over points of the squared distance to the nearest
+    surface node (Chamfer, one way), plus the weighted sum over tracks of the squared distance
+    to where the nodes carried them, plus the weighted acceleration term (physics.md §4.1).
+    The loss of a motion is the mean over the frames after frame 0.
+    """
+
+    cloud: Float[ndarray, "frame point 3"]
+    """Observed points; what counts nothing must still be finite [m]."""
+    cloud_weight: Float[ndarray, "frame point"]
+    """How much each point counts; 0 for none."""
+    surface_count: int | None
+    """Points see only so many of the first nodes; all if None."""
+    track: Float[ndarray, "frame track 3"]
+    """Observed tracks; what counts nothing must still be finite [m]."""
+    track_weight: Float[ndarray, "frame track"]
+    """How much each track counts; 0 for none."""
+    carrier: Int[ndarray, "track carrier"]
+    """Nodes that carry each track."""
+    carrier_weight: Float[ndarray, "track carrier"]
+    """How much each of them counts; rows sum to one."""
+    track_offset: Float[ndarray, "track 3"]
+    """Position of a track less the weighted mean of its carriers [m]."""
+    acceleration_weight: float = 0.0
+    """Weight of PhysTwin's acceleration term."""
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames, frame 0 included."""
+        return len(self.cloud)
+
+
+class LossSum:
+    """Adds up the losses of candidates whose states lie side by side on a device."""
+
+    def __init__(
+        self,
+        target: MotionTarget,
+        node_number: Int[ndarray, " node"],
+        *,
+        lanes: int,
+        width: int,
+        device: Any,
+    ) -> None:
+        """Place the observations on the device.
+
+        Args:
+            target: What was observed.
+            node_number: Place in the states of each of the model's nodes.
+            lanes: Candidates in the states, those included that only fill a group.
+            width: Candidates of a group; see `kernels.batch`.
+            device: Warp device.
+        """
+        self._device, self._lanes = device, lanes
+        self._share = 1.0 / max(target.frame_count - 1, 1)
+        self._acceleration_weight = target.acceleration_weight
+        nodes = len(node_number)
+        self._layout = [width, nodes]
+        surface = node_number[: target.surface_count]
+        points = 0 if len(surface) == 0 else target.cloud.shape[1]
+        chunks = -(-points // POINTS)
+        more = ((0, 0), (0, chunks * POINTS - points))
+        cloud = np.pad(target.cloud[:, :points], (*more, (0, 0)))
+        weight = np.pad(target.cloud_weight[:, :points], more)
+        self._cloud = [
+            self._array(surface, wp.int32),
+            self._array(cloud, wp.vec3),
+            self._array(weight, wp.float32),
+        ]
+        self._track = [
+            self._array(target.track, wp.vec3),
+            self._array(target.track_weight, wp.float32),
+            self._array(node_number[target.carrier], wp.int32),
+            self._array(target.carrier_weight, wp.float32),
+            self._array(target.track_offset, wp.vec3),
+        ]
+        tracks = target.track.shape[1]
+        rest = -(-nodes // NODES) if self._acceleration_weight > 0.0 else 0
+        self._parts = wp.zeros((chunks + tracks + rest, lanes), dtype=wp.float32, device=device)
+        self._rows = np.cumsum([0, chunks, tracks, rest])
+        size = lanes * nodes * 6 if rest else 0
+        self._past = [wp.zeros(size, dtype=wp.float32, device=device) for _ in range(2)]
+        self.loss = wp.zeros(lanes, dtype=wp.float32, device=device)
+        """Loss of each candidate so far [m²]; infinite once it diverged."""
+
+    def add(self, frame: int, state: wp.array, diverged_frame: wp.array) -> None:
+        """Compare the states at the end of a frame with what was observed in it.
+
+        Args:
+            frame: Its number; frame 0 only tells the velocities that others differ from.
+            state: Positions and velocities of all candidates.
+            diverged_frame: Frame in which each candidate diverged; -1 where none was.
+        """
+        if frame > 0:
+            self._launch(sum_chamfer, 0, [frame, *self._layout, *self._cloud, state])
+            self._launch(sum_tracks, 1, [frame, *self._layout, *self._track, state])
+            if frame > 1:
+                inputs = [self._acceleration_weight, *self._layout, *self._past, state]
+                self._launch(sum_accelerations, 2, inputs)
+            wp.launch(
+                add_losses,
+                dim=self._lanes,
+                inputs=[self._share, self._parts, diverged_frame],
+                outputs=[self.loss],
+                device=self._device,
+            )
+        if len(self._past[0]):
+            self._past = self._past[::-1]
+            wp.copy(self._past[1], state)
+
+    def _launch(self, kernel: Any, term: int, inputs: list[Any]) -> None:
+        begin, end = (int(row) for row in self._rows[term : term + 2])
+        if begin < end:
+            wp.launch(
+                kernel,
+                dim=(end - begin, self._lanes),
+                inputs=inputs,
+                outputs=[self._parts[begin:end]],
+                device=self._device,
+            )
+
+    def _array(self, value: ndarray, dtype: Any) -> wp.array:
+        flat = np.int32 if dtype is wp.int32 else np.float32
+        return wp.array(np.ascontiguousarray(value, dtype=flat), dtype=dtype, device=self._device)
+
+
+_BUSY_WARPS = 24
+"""Warps that a multiprocessor needs to be busy."""
+BLOCK_NODES = 4
+"""Nodes are ordered so that so many neighbours in memory are neighbours in space."""
+
+batch_kernel = lru_cache(maxsize=None)(make_batch_kernel)
+
+
+@dataclass(frozen=True, eq=False)
+class BatchRollout:
+    """The motion of every candidate."""
+
+    position: Float32[ndarray, "candidate frame node 3"]
+    """Positions of the object nodes [m]; not finite or far away after a divergence."""
+    diverged_frame: Int[ndarray, " candidate"]
+    """First frame in which a node was not finite or too fast; -1 where none was."""
+
+
+@dataclass(frozen=True, eq=False)
+class BatchLosses:
+    """How far every candidate's motion is from what was observed."""
+
+    loss: Float[ndarray, " candidate"]
+    """Mean over the frames after frame 0 [m²]; infinite where the candidate diverged."""
+    diverged_frame: Int[ndarray, " candidate"]
+    """First frame in which a node was not finite or too fast; -1 where none was."""
+
+
+class Population:
+    """The arrays of a batch of candidates on a CUDA device, where one launch moves them all."""
+
+    def __init__(
+        self,
+        master: MasterTopology,
+        parameters: tuple[SimulationParameters, ...],
+        substeps: int,
+        device: Any,
+    ) -> None:
+        self._device = device
+        self._substeps = substeps
+        self._count = len(parameters)
+        self._nodes = len(master.object_node)
+        # More candidates a thread share more of the reading, but small batches need all threads.
+        self._each = 1 if self._count <= 64 else 2
+        self._width = 32 * self._each
+        self._groups = -(-self._count // self._width)
+        # A few candidates of a small object leave most of the device idle: more warps a node then.
+        wanted = _BUSY_WARPS * device.sm_count / (self._groups * max(self._nodes, 1))
+        self._parts = next((parts for parts in (1, 8, 16) if parts >= wanted), 32)
+        # Candidates with like reach share a group, so that few of them wait for others.
+        reach = np.array([(p.connection_radius, p.virtual_connection_radius) for p in parameters])
+        self._order = np.lexsort(reach.T[::-1])
+        lanes = np.full(self._groups * self._width, self._order[-1])
+        lanes[: self._count] = self._order
+        numbers = [[_number(parameters[i], name, substeps) for i in lanes] for name in FIELDS]
+        table = np.array(numbers, dtype=np.float32).reshape(len(FIELDS), self._groups, self._width)
+        group_reach = reach[lanes].reshape(self._groups, self._width, 2).max(axis=1)
+        limit = np.array([(p.connection_radius, p.max_neighbors) for p in parameters])
+        group_limit = limit[lanes].reshape(self._groups, self._width, 2).min(axis=1)
+        blocks = max(1, self._nodes // BLOCK_NODES)
+        self._model_node = bisect_nodes(master.object_node, blocks)[0]
+        rest_length = master.rest_length(parameters[0])
+        self._inputs = [
+            self._array(table.swapaxes(0, 1).ravel(), wp.float32),
+            self._array(group_reach.T.astype(np.float32), wp.float32),
+            *self._entries(master, rest_length, group_reach[:, 0], group_limit),
+            *self._held(master, rest_length),
+        ]
+        self._node_of = self._array(self._model_node.astype(np.int32), wp.int32)
+        size = len(lanes) * self._nodes * 6
+        self._state = [wp.zeros(size, dtype=wp.float32, device=device) for _ in range(2)]
+        self._controls = [
+            wp.zeros(master.control_count, dtype=wp.vec3, device=device) for _ in range(2)
+        ]
+        self._start = [
+            self._array(value, wp.vec3) for value in (master.object_node, master.initial_velocity)
+        ]
+        self._diverged = wp.zeros(len(lanes), dtype=wp.int32, device=device)
+        self._diverged_frame = wp.zeros(len(lanes), dtype=wp.int32, device=device)
+        self._frame = Recording(self._launch_frame, device)
+
+    def rollout(self, control: Float32[ndarray, "frame control 3"]) -> BatchRollout:
+        """Simulate all frames; the host waits once, at the end."""
+        shape = (len(control), self._count, self._nodes)
+        found = wp.zeros(shape, dtype=wp.vec3, device=self._device)
+        for frame in self._frames(control):
+            self._launch(
+                take_batch,
+                (self._nodes, self._count),
+                [self._width, self._node_of, self._state[0]],
+                [found[frame]],
+            )
+        position = np.empty((self._count, len(control), self._nodes, 3), dtype=np.float32)
+        position[self._order] = found.numpy().swapaxes(0, 1)
+        return BatchRollout(position, self._by_candidate(self._diverged_frame))
+
+    def losses(
+        self, control: Float32[ndarray, "frame control 3"], target: MotionTarget
+    ) -> BatchLosses:
+        """Simulate the frames that were observed and compare; the host waits once, at the end."""
+        number = np.empty(self._nodes, dtype=np.int64)
+        number[self._model_node] = np.arange(self._nodes)
+        lanes = len(self._diverged)
+        losses = LossSum(target, number, lanes=lanes, width=self._width, device=self._device)
+        for frame in self._frames(control[: target.frame_count]):
+            losses.add(frame, self._state[0], self._diverged_frame)
+        return BatchLosses(
+            self._by_candidate(losses.loss), self._by_candidate(self._diverged_frame)
+        )
+
+    def _frames(self, control: Float32[ndarray, "frame control 3"]) -> Iterator[int]:
+        """Simulate frame by frame, without waiting for the device."""
+        path = self._array(control.reshape(-1, 3), wp.vec3)
+        self._diverged_frame.fill_(-1)
+        self._diverged.zero_()
+        self._launch(
+            place_batch,
+            (self._nodes, len(self._diverged)),
+            [self._width, self._node_of, *self._start],
+            [self._state[0]],
+        )
+        for frame in range(len(control)):
+            if frame > 0:
+                for place, source in zip(self._controls, (frame - 1, frame), strict=True):
+                    count = len(place)
+                    if count:
+                        wp.copy(place, path, src_offset=source * count, count=count)
+                self._frame.replay()
+                self._launch(
+                    note_divergence,
+                    len(self._diverged),
+                    [frame, self._diverged],
+                    [self._diverged_frame],
+                )
+            yield frame
+
+    def _by_candidate(self, value: wp.array) -> ndarray:
+        found = value.numpy()[: self._count]
+        ordered = np.empty_like(found)
+        ordered[self._order] = found
+        return ordered
+
+    def _launch_frame(self) -> None:
+        threads = 32 * self._parts * self._groups * self._nodes
+        for substep in range(self._substeps):
+            before, after = self._state[substep % 2], self._state[(substep + 1) % 2]
+            fraction = (substep + 1) / self._substeps
+            self._launch(
+                batch_kernel(self._each, self._parts),
+                threads,
+                [self._groups, fraction, *self._inputs, *self._controls, before],
+                [after, self._diverged],
+            )
+        if self._substeps % 2:
+            wp.copy(self._state[0], self._state[1])
+
+    def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
+        wp.launch(
+            kernel,
+            dim=dim,
+            inputs=inputs,
+            outputs=outputs,
+            block_dim=block_threads(self._parts),
+            device=self._device,
+        )
+
+    def _entries(
+        self,
+        master: MasterTopology,
+        rest_length: ndarray,
+        reach: Float[ndarray, " group"],
+        limit: Float[ndarray, "group 2"],
+    ) -> list[wp.array]:
+        """List object half-edges, the nearest neighbor of a node first, and where groups end.
+
+        Up to a certain one every candidate of a group has all of them: those before the first
+        that is beyond the group's smallest radius or neighbor limit.
+        """
+        ends = self._numbered(master.spring_nodes[: master.object_spring_count])
+        spring = np.tile(np.arange(len(ends)), 2)
+        source, other = np.concatenate([ends, ends[:, ::-1]]).T
+        start, order = self._sorted(source, master.length[spring])
+        other, spring, source = other[order], spring[order], source[order]
+        length, rank = master.length[spring], master.rank[spring]
+        end, certain = [], []
+        for far, (radius, most) in zip(reach, limit, strict=True):
+            end.append(start[:-1] + np.bincount(source[length < far], minlength=self._nodes))
+            doubtful = np.flatnonzero((length >= radius) | (rank >= most))
+            first = end[-1].copy()
+            np.minimum.at(first, source[doubtful], doubtful)
+            certain.append(first)
+        return [
+            self._array(start.astype(np.int32), wp.int32),
+            self._array(np.array(certain, dtype=np.int32), wp.int32),
+            self._array(np.array(end, dtype=np.int32), wp.int32),
+            *self._springs(master, rest_length, other, spring),
+        ]
+
+    def _held(self, master: MasterTopology, rest_length: ndarray) -> list[wp.array]:
+        """List virtual springs by object node, the nearest control node first."""
+        spring = np.arange(master.object_spring_count, len(master.length))
+        ends = np.sort(master.spring_nodes[spring], axis=1)
+        source, control = self._numbered(ends[:, 0]), ends[:, 1] - self._nodes
+        start, order = self._sorted(source, master.length[spring])
+        lists = self._springs(master, rest_length, control[order], spring[order])
+        return [self._array(start.astype(np.int32), wp.int32), *lists]
+
+    def _numbered(self, node: Int[ndarray, "*ends"]) -> Int[ndarray, "*ends"]:
+        """Turn the model's numbers of object nodes into those of the batch."""
+        number = np.empty(self._nodes, dtype=np.int64)
+        number[self._model_node] = np.arange(self._nodes)
+        return number[node]
+
+    def _sorted(
+        self, source: Int[ndarray, " entry"], length: Float[ndarray, " entry"]
+    ) -> tuple[Int[ndarray, " node_1"], Int[ndarray, " entry"]]:
+        """Order entries by node and length; return where each node's entries begin."""
+        order = np.lexsort((length, source))
+        return np.searchsorted(source[order], np.arange(self._nodes + 1)), order
+
+    def _springs(
+        self, master: MasterTopology, rest_length: ndarray, other: ndarray, spring: ndarray
+    ) -> list[wp.array]:
+        """List length, rest length, its inverse and the bits of the other end; then ranks."""
+        rows = np.empty((len(spring), 4), dtype=np.float32)
+        rows[:, 0] = master.length[spring]
+        rows[:, 1] = rest_length[spring]
+        rows[:, 2] = 1.0 / rest_length[spring]
+        rows[:, 3] = other.astype(np.int32).view(np.float32)
+        return [self._array(rows, wp.vec4), self._array(master.rank[spring], wp.int32)]
+
+    def _array(self, value: ndarray, dtype: Any) -> wp.array:
+        return wp.array(np.ascontiguousarray(value), dtype=dtype, device=self._device)
+
+
+def _number(parameters: SimulationParameters, name: str, substeps: int) -> float:
+    """Give one of the kernel's numbers of a candidate."""
+    duration = 1.0 / parameters.simulated_frame_rate
+    height = parameters.ground_height
+    scale = parameters.stiffness_scale
+    derived = {
+        "dt": duration / substeps,
+        "velocity_loss": replace(parameters, substeps_per_frame=substeps).velocity_loss(),
+        "has_ground": float(height is not None),
+        "ground_height": 0.0 if height is None else height,
+        "control_rate": parameters.simulated_frame_rate * parameters.use_control_velocity,
+        "speed_limit": SPEED_LIMIT,
+        "stiffness": scale * parameters.stiffness,
+        "virtual_stiffness": scale * parameters.virtual_stiffness,
+        "damping": parameters.damping * (parameters.stiffness > 0.0),
+        "virtual_damping": parameters.damping * (parameters.virtual_stiffness > 0.0),
+    }
+    return float(derived.get(name, getattr(parameters, name, 0.0)))
+
+
+_COMMON = ("rest_length_floor", "virtual_rest_length_floor", "frame_rate", "frame_duration")
+
+
+class BatchSimulator:
+    """Rolls out many candidates that differ in parameters and in topology.
+
+    On CUDA they share every launch and take the substeps of the one that needs most; on a CPU
+    they take turns. Self-collision is not simulated.
+    """
+
+    def __init__(
+        self, master: MasterTopology, parameters: Many[SimulationParameters], device: str = "cpu"
+    ) -> None:
+        """Place candidates on a device.
+
+        Args:
+            master: Springs of all candidates; see `MasterTopology.of`.
+            parameters: The candidates, at least one.
+            device: Warp device.
+
+        Raises:
+            UsageError: If there is no candidate, or candidates differ in what must be common:
+                rest length floors and frame rate.
+        """
+        if not parameters:
+            raise UsageError("A batch needs at least one candidate.")
+        for name in _COMMON:
+            if len({getattr(p, name) for p in parameters}) > 1:
+                raise UsageError(f"All candidates of a batch must have the same {name}.")
+        if any(p.self_collision for p in parameters):
+            raise UsageError("Self-collision is not simulated in a batch; switch it off.")
+        self.master = master
+        self.parameters = tuple(parameters)
+        self.substeps = max(p.substeps_per_frame for p in parameters)
+        self.device = wp.get_device(device)
+        self._population: Population | None = None
+
+    def rollout(self, control: Float[ndarray, "frame control 3"]) -> BatchRollout:
+        """Simulate all frames of a control trajectory.
+
+        Args:
+            control: Positions of the control nodes in every frame [m].
+
+        Raises:
+            ValueError: If the trajectory does not fit the master topology or is not finite.
+        """
+        control = checked_control(control, self.master.control_count)
+        population = self._on_device()
+        if population is not None:
+            return population.rollout(control)
+        shape = (len(self.parameters), len(control), len(self.master.object_node), 3)
+        position = np.full(shape, np.nan, dtype=np.float32)
+        diverged = np.full(len(self.parameters), -1)
+        for candidate, parameters in enumerate(self.parameters):
+            try:
+                for frame, state, _ in self._alone(parameters, control):
+                    position[candidate, frame] = state
+            except SimulationDivergedError as error:
+                diverged[candidate] = error.frame
+        return BatchRollout(position, diverged)
+
+    def losses(
+        self, control: Float[ndarray, "frame control 3"], target: MotionTarget
+    ) -> BatchLosses:
+        """Simulate the observed frames and compare every candidate with what was observed.
+
+        On CUDA the losses are added up on the device, and the host waits for it once.
+
+        Args:
+            control: Positions of the control nodes, in the observed frames at least [m].
+            target: What was observed.
+
+        Raises:
+            ValueError: If the trajectory does not fit the master topology, is not finite, or is
+                shorter than what was observed.
+        """
+        control = checked_control(control, self.master.control_count)
+        if len(control) < target.frame_count:
+            raise ValueError(
+                f"control has {len(control)} frames, but {target.frame_count} were observed."
+            )
+        population = self._on_device()
+        if population is not None:
+            return population.losses(control, target)
+        loss = np.full(len(self.parameters), np.inf, dtype=np.float32)
+        diverged = np.full(len(self.parameters), -1)
+        nodes = len(self.master.object_node)
+        good = wp.full(1, -1, dtype=wp.int32, device=self.device)
+        for candidate, parameters in enumerate(self.parameters):
+            sums = LossSum(target, np.arange(nodes), lanes=1, width=1, device=self.device)
+            try:
+                for frame, *state in self._alone(parameters, control[: target.frame_count]):
+                    flat = np.concatenate(state, axis=1).ravel()
+                    sums.add(frame, wp.array(flat, dtype=wp.float32, device=self.device), good)
+                loss[candidate] = sums.loss.numpy()[0]
+            except SimulationDivergedError as error:
+                diverged[candidate] = error.frame
+        return BatchLosses(loss, diverged)
+
+    def _on_device(self) -> Population | None:
+        if not self.device.is_cuda or len(self.master.object_node) == 0:
+            return None
+        if self._population is None:
+            self._population = Population(self.master, self.parameters, self.substeps, self.device)
+        return self._population
+
+    def _alone(
+        self, parameters: SimulationParameters, control: Float32[ndarray, "frame control 3"]
+    ) -> Iterator[tuple[int, ndarray, ndarray]]:
+        model = self.master.model(parameters)
+        return Simulator(model, parameters, device=str(self.device)).frames(control)

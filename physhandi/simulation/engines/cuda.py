@@ -1,0 +1,416 @@
+"""Frames and their adjoints in one launch each on CUDA, for models whose blocks fit."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+from jaxtyping import Int32
+from numpy import ndarray
+
+from physhandi.simulation.engines.frame_sums import FrameSums
+from physhandi.simulation.engines.host import EngineHost
+from physhandi.simulation.engines.partition import Partition, partition_model
+from physhandi.simulation.engines.tape import Tape
+from physhandi.simulation.engines.tape import TapeLayout as TapeLayout
+from physhandi.simulation.kernels.dataflow import FORWARD_LOCALS, make_frame_kernel
+from physhandi.simulation.kernels.dataflow_adjoint import (
+    ADJOINT_LOCALS,
+    make_adjoint_kernel,
+    sum_controls,
+)
+from physhandi.simulation.kernels.dataflow_large import (
+    FLOATS_OF_A_LOCAL,
+    make_large_frame_kernel,
+    pack_half_edges,
+)
+
+WARP = 32
+"""Threads that read side by side."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Columns:
+    """Columns of 32 half-edges, one for each thread of a warp, group by group.
+
+    A block's nodes take turns if it has more than rows of threads: each turn is a chunk. A group
+    is what one warp does in one chunk; its columns are as many as its thread with the most needs.
+    """
+
+    chunk_count: int
+    """Turns that each block takes."""
+    start: Int32[ndarray, " group_1"]
+    """Where each group's half-edges begin: block by block, chunk by chunk, warp by warp."""
+    place: Int32[ndarray, " slot"]
+    """Place of the other end in the block's part of `local_node`; padding ends where it begins."""
+    spring: Int32[ndarray, " slot"]
+    """Which spring it is; -1 for padding."""
+
+
+def arrange_columns(partition: Partition, lanes: int, threads: int) -> Columns:
+    """Share out half-edges to threads.
+
+    Args:
+        partition: Blocks and their nodes' half-edges.
+        lanes: Threads that sum one node's springs; divides 32.
+        threads: Threads of a block; a multiple of 32.
+    """
+    rows, warps = threads // lanes, threads // WARP
+    own_count = np.diff(partition.own_start)
+    chunks = -(-partition.most_own // rows)
+    block = np.repeat(np.arange(partition.block_count), own_count)
+    chunk, row = np.divmod(np.arange(len(block)) - partition.own_start[block], rows)
+    group = (block * chunks + chunk) * warps + row * lanes // WARP
+    degree = np.diff(partition.entry_start)
+    count = np.zeros(partition.block_count * chunks * warps, dtype=np.int64)
+    np.maximum.at(count, group, -(-degree // lanes))
+    start = WARP * np.concatenate([[0], np.cumsum(count)])
+
+    turn, warp = np.divmod(np.repeat(np.arange(len(count)), WARP * count), warps)
+    thread = WARP * warp + np.arange(len(turn)) % WARP
+    place = np.minimum(turn % chunks * rows + thread // lanes, own_count[turn // chunks] - 1)
+    spring = np.full(len(place), -1)
+    node = np.repeat(np.arange(len(block)), degree)
+    column, lane = np.divmod(np.arange(len(node)) - partition.entry_start[node], lanes)
+    slot = start[group[node]] + WARP * column + (row[node] * lanes + lane) % WARP
+    place[slot], spring[slot] = partition.entry.T
+    return Columns(
+        chunk_count=chunks,
+        start=start.astype(np.int32),
+        place=place.astype(np.int32),
+        spring=spring.astype(np.int32),
+    )
+
+
+LARGE_BLOCK_SIZES = {512: 14, 768: 6}
+"""Threads of a block, and the most half-edges for which each has registers."""
+LANES_PER_NODE = (8, 4, 2, 1)
+"""Threads that may sum one node's springs."""
+LOCALS_STEP = 512
+"""Room for nodes grows by so many, so that few sizes are compiled."""
+_BYTES_OF_A_LOCAL = 4 * FLOATS_OF_A_LOCAL
+_BYTES_OF_A_THREAD = 4
+"""What Warp's own bookkeeping takes of shared memory."""
+
+large_frame_kernel = lru_cache(maxsize=None)(make_large_frame_kernel)
+
+
+def most_large_locals(device: Any) -> int:
+    """Return how many nodes, its own and its halo, a block of a device has room for."""
+    free = int(device.max_shared_memory_per_block) - _BYTES_OF_A_THREAD * max(LARGE_BLOCK_SIZES)
+    return max(0, free // _BYTES_OF_A_LOCAL)
+
+
+@dataclass(frozen=True)
+class LargeLayout:
+    """How many threads do what."""
+
+    lanes: int
+    """Threads that sum one node's springs."""
+    kept: int
+    """Half-edges that each of them keeps in registers."""
+    threads: int
+    """Threads of a block."""
+    locals: int
+    """Nodes that a block has room for."""
+
+    @classmethod
+    def of(cls, partition: Partition, most_locals: int) -> "LargeLayout":
+        """Use as many lanes as leave no node waiting for a turn.
+
+        Args:
+            partition: Blocks of nodes.
+            most_locals: Nodes for which the device has room.
+        """
+        own = partition.most_own
+        lanes = next(
+            (n for n in LANES_PER_NODE if own * n <= max(LARGE_BLOCK_SIZES)), LANES_PER_NODE[-1]
+        )
+        threads = next((n for n in LARGE_BLOCK_SIZES if own * lanes <= n), max(LARGE_BLOCK_SIZES))
+        kept = max(1, min(LARGE_BLOCK_SIZES[threads], -(-partition.most_entries // lanes)))
+        steps = -(-partition.most_locals // LOCALS_STEP)
+        return cls(lanes, kept, threads, min(steps * LOCALS_STEP, most_locals))
+
+
+class LargeFrames:
+    """The half-edges of one model as the large frame kernel reads them."""
+
+    def __init__(self, simulator: EngineHost, partition: Partition) -> None:
+        """Place half-edges on the device.
+
+        Args:
+            simulator: Whose state, controls, material and world are read and written.
+            partition: Of its model; its blocks must fit the device.
+        """
+        self._simulator = simulator
+        self._block_count = partition.block_count
+        self.layout = LargeLayout.of(partition, most_large_locals(simulator.device))
+        columns = arrange_columns(partition, self.layout.lanes, self.layout.threads)
+        self._chunk_count = columns.chunk_count
+        self._start = simulator.array(columns.start, wp.int32)
+        self._place = simulator.array(columns.place, wp.int32)
+        self._spring = simulator.array(columns.spring, wp.int32)
+        self._packed = wp.zeros(len(columns.place), dtype=wp.vec4, device=simulator.device)
+
+    def advance(
+        self,
+        blocks: list[wp.array],
+        relay: wp.array,
+        tag: int,
+        before: tuple[wp.array, wp.array],
+        after: tuple[wp.array, wp.array],
+    ) -> None:
+        """Launch one frame, from one state (position, velocity) to another.
+
+        Args:
+            blocks: The partition's `own_start`, `local_start`, `local_node` and `model_node`.
+            relay: Where blocks publish their nodes.
+            tag: First of as many unused tags as substeps, and one more.
+            before: State at its start.
+            after: Where the state at its end goes; may be the same arrays.
+        """
+        simulator, layout = self._simulator, self.layout
+        # Material and world may have changed on the device, unseen from here; a frame costs more.
+        wp.launch(
+            pack_half_edges,
+            dim=len(self._place),
+            inputs=[simulator.world, self._place, self._spring, *simulator.material],
+            outputs=[self._packed],
+            device=simulator.device,
+        )
+        inputs: list[Any] = [self._chunk_count, simulator.parameters.substeps_per_frame, tag]
+        inputs += [simulator.world, *blocks, self._start, self._packed]
+        wp.launch(
+            large_frame_kernel(layout.lanes, layout.kept, layout.threads, layout.locals),
+            dim=self._block_count * layout.threads,
+            inputs=[*inputs, *simulator.controls, *before],
+            outputs=[relay, *after, simulator.first_divergence],
+            block_dim=layout.threads,
+            device=simulator.device,
+        )
+
+
+LEAST_OWN = 4
+"""Fewer nodes in a block cost more waiting than they save work."""
+MOST_LANES = 576
+"""A block's nodes get as many threads each as keep them below this sum."""
+MOST_KEPT = 6
+"""Most half-edges that a thread keeps in registers."""
+BLOCK_SIZES = (256, 384, 576, 768)
+"""Threads of a block; few sizes, because each is compiled on its own."""
+_LAST_TAG = 2**31 - 2**20
+
+frame_kernel = lru_cache(maxsize=None)(make_frame_kernel)
+adjoint_kernel = lru_cache(maxsize=None)(make_adjoint_kernel)
+
+
+@dataclass(frozen=True)
+class BlockLayout:
+    """How many threads do what."""
+
+    lanes: int
+    """Threads that sum one node's springs."""
+    kept: int
+    """Half-edges that each of them keeps in registers."""
+    threads: int
+    """Threads of a block."""
+
+    @classmethod
+    def of(cls, partition: Partition) -> "BlockLayout":
+        """Choose by measurement (docs/benchmarks): many lanes, but few idle threads."""
+        wide = (n for n in (32, 16) if partition.most_own * n <= MOST_LANES)
+        lanes = next((n for n in wide if n < 2 * partition.most_entries), 8)
+        kept = max(1, min(MOST_KEPT, -(-partition.most_entries // lanes)))
+        needed = partition.most_own * lanes
+        return cls(lanes, kept, next((n for n in BLOCK_SIZES if n >= needed), BLOCK_SIZES[-1]))
+
+
+class Dataflow:
+    """The arrays of one model that blocks of nodes work on."""
+
+    def __init__(self, simulator: EngineHost, partition: Partition) -> None:
+        """Place a partition on the device.
+
+        Args:
+            simulator: Whose state, controls, material and world are read and written.
+            partition: Of its model.
+        """
+        self._simulator = simulator
+        self.partition = partition
+        self.layout = BlockLayout.of(partition)
+        names = ("own_start", "local_start", "local_node", "model_node", "entry_start")
+        self._map = [simulator.array(getattr(partition, name), wp.int32) for name in names]
+        self._map.append(simulator.array(partition.entry, wp.vec2i))
+        count = simulator.model.node_count
+        self._relay = wp.zeros(4 * count, dtype=wp.vec4, device=simulator.device)
+        self._no_tape = wp.zeros((0, 0), dtype=wp.vec4, device=simulator.device)
+        self._tag = 1
+        is_large = partition.most_locals > FORWARD_LOCALS
+        self.large = LargeFrames(simulator, partition) if is_large else None
+
+    @staticmethod
+    def of(simulator: EngineHost) -> "Dataflow | None":
+        """Make one for a simulator; none on a CPU, or if the model's blocks do not fit.
+
+        Blocks that fit static shared memory are moved by the kernel that keeps all in registers,
+        others by the one of `LargeFrames`, as far as the device has shared memory for them.
+        """
+        model, device = simulator.model, simulator.device
+        if not device.is_cuda or model.node_count == 0:
+            return None
+        blocks = max(1, min(int(device.sm_count), model.node_count // LEAST_OWN))
+        partition = partition_model(model, blocks)
+        fits = partition.most_locals <= max(FORWARD_LOCALS, most_large_locals(device))
+        return Dataflow(simulator, partition) if fits else None
+
+    def next_tags(self, count: int) -> int:
+        """Reserve tags that no value in the relay bears."""
+        if self._tag > _LAST_TAG:
+            self._relay.zero_()
+            self._tag = 1
+        self._tag += count
+        return self._tag - count
+
+    def advance(
+        self,
+        before: tuple[wp.array, wp.array],
+        after: tuple[wp.array, wp.array],
+        tape: wp.array | None = None,
+    ) -> None:
+        """Launch one frame, from one state (position, velocity) to another.
+
+        Args:
+            before: State at its start.
+            after: Where the state at its end goes; may be the same arrays.
+            tape: Where each substep's position, velocity and velocity before contact go.
+
+        Raises:
+            ValueError: If a tape is wanted of blocks whose adjoint does not fit.
+        """
+        simulator = self._simulator
+        substeps = simulator.parameters.substeps_per_frame
+        if self.large is not None:
+            if tape is not None:
+                raise ValueError("Blocks in dynamic shared memory keep no tape.")
+            tag = self.next_tags(substeps + 1)
+            self.large.advance(self._map[:4], self._relay, tag, before, after)
+            return
+        self._launch(
+            frame_kernel(self.layout.lanes, self.layout.kept),
+            [self.layout.threads, substeps, self.next_tags(substeps + 1), simulator.world],
+            [*self._map, *simulator.material],
+            [*simulator.controls, *before],
+            [
+                self._relay,
+                self._no_tape if tape is None else tape,
+                *after,
+                simulator.first_divergence,
+            ],
+        )
+
+    def walk_back(
+        self, tape: wp.array, is_first: wp.array, state_bars: list[wp.array], bars: list[wp.array]
+    ) -> None:
+        """Launch the adjoint of one frame.
+
+        Args:
+            tape: What `advance` recorded of it.
+            is_first: Which half-edges speak for their springs.
+            state_bars: Adjoints of position and velocity, from the frame's end to its start.
+            bars: Where the other adjoints go, in the kernel's order.
+        """
+        simulator = self._simulator
+        substeps = simulator.parameters.substeps_per_frame
+        self._launch(
+            adjoint_kernel(self.layout.lanes, self.layout.kept),
+            [self.layout.threads, substeps, self.next_tags(substeps), simulator.world],
+            [*self._map, is_first, simulator.model.object_spring_count],
+            [*simulator.material, *simulator.controls, tape],
+            [*state_bars, self._relay, *bars],
+        )
+
+    def _launch(self, kernel: Any, *arguments: list[Any]) -> None:
+        *inputs, outputs = arguments
+        wp.launch(
+            kernel,
+            dim=self.partition.block_count * self.layout.threads,
+            inputs=[value for part in inputs for value in part],
+            outputs=outputs,
+            block_dim=self.layout.threads,
+            device=self._simulator.device,
+        )
+
+
+def tape_layout(nodes: int, substeps: int) -> TapeLayout:
+    """Say what is kept of a frame: position, velocity and velocity before contact, side by side."""
+    return (((substeps, 3 * nodes), wp.vec4),)
+
+
+class DataflowAdjoint:
+    """Simulates frames and carries derivatives back; as `FrameAdjoint`, in a launch each."""
+
+    def __init__(self, simulator: EngineHost, dataflow: Dataflow) -> None:
+        """Make room for the derivatives.
+
+        Args:
+            simulator: Whose frames; its controls, material and world are read, its state moved.
+            dataflow: The simulator's.
+        """
+        self._dataflow = dataflow
+        model, device = simulator.model, simulator.device
+        nodes = model.node_count
+        held = len(model.spring_nodes) - model.object_spring_count
+
+        def zeros(count: int, dtype: Any) -> wp.array:
+            return wp.zeros(count, dtype=dtype, device=device)
+
+        self.layout = tape_layout(nodes, simulator.parameters.substeps_per_frame)
+        self._state = simulator.position, simulator.velocity
+        self.position_bar, self.velocity_bar = zeros(nodes, wp.vec3), zeros(nodes, wp.vec3)
+        self._held_bars = [zeros(held, wp.vec3) for _ in range(2)]
+        self.sums = FrameSums.zeros(model, device)
+        self._is_first = simulator.array(dataflow.partition.is_first, wp.int32)
+        control = model.spring_nodes[model.object_spring_count :].max(axis=1, initial=0) - nodes
+        by_control = np.argsort(control, kind="stable")
+        start = np.searchsorted(control[by_control], np.arange(model.control_count + 1))
+        self._held = [
+            simulator.array(start.astype(np.int32), wp.int32),
+            simulator.array(by_control.astype(np.int32), wp.int32),
+        ]
+
+    @staticmethod
+    def of(simulator: EngineHost, dataflow: Any) -> "DataflowAdjoint | None":
+        """Make one for a simulator; none if its engine is another or its blocks do not fit."""
+        if not isinstance(dataflow, Dataflow) or simulator.parameters.self_collision:
+            return None
+        partition, layout = dataflow.partition, dataflow.layout
+        fits = (
+            partition.most_locals <= ADJOINT_LOCALS
+            and partition.most_own * layout.lanes <= layout.threads
+            and partition.most_entries <= layout.lanes * layout.kept
+        )
+        return DataflowAdjoint(simulator, dataflow) if fits else None
+
+    def record(self, tape: Tape) -> None:
+        """Advance the simulator by one frame and keep its substeps in `tape`."""
+        self._dataflow.advance(self._state, self._state, *tape)
+
+    def carry(self, tape: Tape) -> None:
+        """Carry `position_bar` and `velocity_bar` back; see `FrameAdjoint.carry`."""
+        sums, (substeps,) = self.sums, tape
+        for value in self._held_bars:
+            value.zero_()
+        self._dataflow.walk_back(
+            substeps,
+            self._is_first,
+            [self.position_bar, self.velocity_bar],
+            [*sums.material, sums.drag, *sums.ground, *self._held_bars],
+        )
+        wp.launch(
+            sum_controls,
+            dim=len(sums.control_start),
+            inputs=[*self._held, *self._held_bars],
+            outputs=[*sums.controls],
+            device=sums.control_start.device,
+        )

@@ -1,0 +1,34 @@
+"""What the fast engines need of a simulator."""
+
+from typing import Any, Protocol
+
+import warp as wp
+from numpy import ndarray
+
+from physhandi.simulation.model import SimulationParameters, SpringMassModel
+
+
+class EngineHost(Protocol):
+    """A simulator, as an engine sees it."""
+
+    model: SpringMassModel
+    parameters: SimulationParameters
+    device: Any
+    world: wp.array
+    first_divergence: wp.array
+    position: wp.array
+    velocity: wp.array
+
+    @property
+    def material(self) -> tuple[wp.array, wp.array, wp.array]:
+        """Rest length, stiffness and damping of every spring."""
+        ...
+
+    @property
+    def controls(self) -> tuple[wp.array, wp.array]:
+        """Where the control nodes are at the start and the end of the frame."""
+        ...
+
+    def array(self, value: ndarray, dtype: Any) -> wp.array:
+        """Copy an array to the device."""
+        ...

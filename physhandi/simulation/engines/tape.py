@@ -1,0 +1,191 @@
+"""The substeps of a rollout, kept so that the way back need not simulate them again.
+
+As many of the last frames are kept as memory allows. The others are simulated again one by one
+on the way back, from their start, in the place of a frame that is done with. The bits are the
+same either way, because the same kernels write them down.
+"""
+
+import math
+from pathlib import Path
+from threading import Lock
+from typing import Any, Protocol
+
+import numpy as np
+import warp as wp
+
+_CGROUP = Path("/sys/fs/cgroup")
+_FILES = (
+    ("memory.max", "memory.current", "memory.stat", "inactive_file"),
+    (
+        "memory/memory.limit_in_bytes",
+        "memory/memory.usage_in_bytes",
+        "memory/memory.stat",
+        "total_inactive_file",
+    ),
+)
+"""Limit, use, statistics and the name of what could be dropped at once, of cgroups 2 and 1."""
+
+
+def free_memory(device: Any) -> int:
+    """Return how much memory a Warp device has left [B], to this process's container if in one."""
+    if device.is_cuda:
+        return int(device.free_memory)
+    # A machine with a GPU can do without it.
+    import psutil
+
+    left = int(psutil.virtual_memory().available)
+    within = container_memory(_CGROUP)
+    return left if within is None else min(left, within)
+
+
+def container_memory(folder: Path) -> int | None:
+    """Return how much memory a container has left [B]; none if it has no limit.
+
+    Args:
+        folder: Where its control groups are told of.
+    """
+    for limit, used, statistics, droppable in _FILES:
+        try:
+            told = (folder / limit).read_text().strip()
+            if told == "max":
+                return None
+            fields = dict(line.split() for line in (folder / statistics).read_text().splitlines())
+            use = int((folder / used).read_text()) - int(fields.get(droppable, 0))
+            return max(0, int(told) - use)
+        except FileNotFoundError:
+            continue
+    return None
+
+
+CUDA_SHARE, CPU_SHARE = 0.5, 0.25
+"""Part of a device's free memory that one trajectory may take."""
+
+TapeLayout = tuple[tuple[tuple[int, ...], Any], ...]
+"""Shape of each array that keeps the substeps of one frame, and its type, a vector of floats."""
+Tape = tuple[wp.array, ...]
+"""These arrays."""
+
+
+class Recorder(Protocol):
+    """The adjoint of a frame, as a trajectory sees it."""
+
+    @property
+    def layout(self) -> TapeLayout:
+        """What it needs to keep of a frame."""
+        ...
+
+    def record(self, tape: Tape) -> None:
+        """Advance the simulator by one frame and write its substeps down."""
+        ...
+
+
+def frame_bytes(layout: TapeLayout) -> int:
+    """Return how much memory the substeps of one frame take [B]."""
+    return sum(math.prod(shape) * wp.types.type_size_in_bytes(dtype) for shape, dtype in layout)
+
+
+def stored_frames(layout: TapeLayout, frame_count: int, memory: int) -> int:
+    """Return of how many frames the substeps are kept: as many as fit, but one at least.
+
+    Args:
+        layout: What is kept of a frame.
+        frame_count: Frames of the rollout, frame 0 not counted.
+        memory: That the trajectory may take [B].
+    """
+    return min(frame_count, max(1, memory // max(1, frame_bytes(layout))))
+
+
+def memory_budget(device: Any) -> int:
+    """Return how much memory a trajectory may take on a Warp device now [B]."""
+    device = wp.get_device(device)
+    with _lock:
+        layout, tapes = _spare.get(device.alias, ((), []))
+        free = free_memory(device) + len(tapes) * frame_bytes(layout)
+    return int((CUDA_SHARE if device.is_cuda else CPU_SHARE) * free)
+
+
+class Trajectory:
+    """Substeps of the frames of one rollout; frames are counted from 1."""
+
+    def __init__(
+        self, recorder: Recorder, device: Any, frame_count: int, memory: int | None = None
+    ) -> None:
+        """Decide how many frames to keep; the memory itself is taken when it is written to.
+
+        Args:
+            recorder: Simulates frames and writes them down.
+            device: Warp device that this happens on.
+            frame_count: Frames of the rollout, frame 0 not counted.
+            memory: That may be taken [B]; if none, as `memory_budget` says. One frame's is
+                always taken.
+        """
+        self._recorder = recorder
+        self._device = device
+        self._frame_count = frame_count
+        memory = memory_budget(device) if memory is None else memory
+        self._count = stored_frames(recorder.layout, frame_count, memory)
+        self._tapes: list[Tape] = []
+        self._held: dict[int, int] = {}
+
+    def keeps(self, frame: int) -> bool:
+        """Tell whether a frame is to be recorded on the way forward."""
+        return frame > self._frame_count - self._count
+
+    def holds(self, frame: int) -> bool:
+        """Tell whether a frame's substeps are there."""
+        return self._held.get(frame % self._count) == frame
+
+    def record(self, frame: int) -> None:
+        """Advance the simulator by a frame and keep its substeps, in the place of a later one's."""
+        if not self._tapes:
+            self._tapes = _take(self._device, self._recorder.layout, self._count)
+        place = frame % self._count
+        self._held[place] = 0
+        self._recorder.record(self._tapes[place])
+        self._held[place] = frame
+
+    def tape(self, frame: int) -> Tape:
+        """Return the substeps of a frame that is held."""
+        if not self.holds(frame):
+            raise KeyError(f"frame {frame} is not held")
+        return self._tapes[frame % self._count]
+
+    def release(self) -> None:
+        """Let the next trajectory have the memory; this one goes on with one frame's."""
+        _give_back(self._device, self._recorder.layout, self._tapes)
+        self._tapes, self._count = [], min(1, self._count)
+        self._held.clear()
+
+
+# Writing to fresh memory can cost a CPU as much as simulating the frame, so what a trajectory no
+# longer needs is kept for the next.
+_spare: dict[str, tuple[TapeLayout, list[Tape]]] = {}
+_lock = Lock()
+
+
+def _take(device: Any, layout: TapeLayout, count: int) -> list[Tape]:
+    """Take room for some frames from what was given back, the rest from the device."""
+    with _lock:
+        known, spare = _spare.pop(device.alias, (layout, []))
+        taken = spare[:count] if known == layout else []
+        if known == layout and spare[count:]:
+            _spare[device.alias] = layout, spare[count:]
+    del spare
+    for _ in range(count - len(taken)):
+        taken.append(tuple(_room(device, shape, dtype) for shape, dtype in layout))
+    return taken
+
+
+def _room(device: Any, shape: tuple[int, ...], dtype: Any) -> wp.array:
+    if device.is_cuda:
+        return wp.empty(shape, dtype=dtype, device=device)
+    # NumPy asks the system for large pages, which cost a tenth when they are written to first.
+    room = np.empty((*shape, wp.types.type_size_in_bytes(dtype) // 4), dtype=np.float32)
+    return wp.array(room, dtype=dtype, device=device, copy=False)
+
+
+def _give_back(device: Any, layout: TapeLayout, tapes: list[Tape]) -> None:
+    """Keep the room of some frames for the next trajectory; forget that of another layout."""
+    with _lock:
+        known, spare = _spare.pop(device.alias, (layout, []))
+        _spare[device.alias] = layout, (spare if known == layout else []) + tapes

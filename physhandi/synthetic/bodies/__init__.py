@@ -1,0 +1,1 @@
+"""The soft bodies of SynthHDI and what they are made of."""

@@ -1,0 +1,102 @@
+"""Hash of the code and libraries that a result depends on.
+
+What is stored under it is found again only as long as they are the same.
+"""
+
+import hashlib
+from functools import lru_cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import cv2
+
+import physhandi
+from physhandi.data.sequence import Sequence
+
+INPUTS = ("synthetic/suite/variants.py", "data/sequence_writer.py", "data/truth.py")
+"""Makes what methods are given."""
+PREDICTIONS = (
+    *("pipeline.py", "data", "hand", "perception", "simulation", "fitting"),
+    *("metrics/baselines.py", "metrics/alignment.py", "metrics/geometry.py"),
+    *("synthetic/suite/methods.py", "synthetic/suite/cells.py"),
+    *INPUTS[:1],
+)
+"""Makes what methods predict: fits, rules, corrections and disturbances."""
+SCORES = ("metrics", "synthetic/suite/cells.py", "data", "hand")
+"""Makes figures of predictions."""
+PACKAGES = ("torch", "warp-lang", "numpy", "scipy", "cma", "safetensors")
+"""Libraries that predictions and figures are computed with, beside OpenCV."""
+
+_KINDS = {".py", ".npz", ".yaml", ".tflite", ".glb"}
+
+
+@lru_cache(maxsize=8)
+def code_version(parts: tuple[str, ...]) -> str:
+    """Hash modules and folders of this library, and the versions of what it computes with.
+
+    Args:
+        parts: Files and folders, relative to the library.
+
+    Raises:
+        FileNotFoundError: If one is not there, for then nothing would tell that it has changed.
+    """
+    code = code_hash(Path(physhandi.__file__).parent, parts)
+    # Several distributions carry OpenCV.
+    versions = [f"opencv {cv2.__version__}", *(f"{name} {version(name)}" for name in PACKAGES)]
+    return hashlib.sha256("\0".join([code, *versions]).encode()).hexdigest()[:16]
+
+
+def code_hash(folder: Path, parts: tuple[str, ...]) -> str:
+    """Hash files, and all sources and assets in folders.
+
+    Args:
+        folder: Where they lie.
+        parts: Names of files and folders in it.
+
+    Raises:
+        FileNotFoundError: If a part does not exist.
+    """
+    digest = hashlib.sha256()
+    for part in parts:
+        path = folder / part
+        files = sorted(path.rglob("*")) if path.is_dir() else [path]
+        for file in files:
+            if file == path or file.suffix in _KINDS:
+                digest.update(f"{file.relative_to(folder).as_posix()}\0".encode())
+                digest.update(file.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+_PARTS = ("assets", "bodies", "engines", "film", "hands", "synthesize.py")
+
+
+@lru_cache(maxsize=1)
+def generator_version() -> str:
+    """Name the version of the generator, ``CODE-mujoco-VERSION``.
+
+    Any change of its code counts, for which sequences of other code may differ.
+    """
+    try:
+        engine = version("mujoco")
+    except PackageNotFoundError:
+        engine = "none"
+    return f"{code_hash(Path(__file__).parent, _PARTS)}-mujoco-{engine}"
+
+
+def told_version(recording: Sequence) -> str:
+    """Give the version of the generator that made a recording; empty if it does not tell."""
+    return str(recording.provenance.get("generator") or "")
+
+
+def outdated(recording: Sequence) -> str:
+    """Say that a made recording comes of another generator than this one; empty if it does not."""
+    if "synthesize" not in recording.provenance:
+        return ""
+    made, present = told_version(recording), generator_version()
+    if made == present or (present.endswith("-none") and made.startswith(present[:12])):
+        return ""
+    by = f"another version of the generator ({made})" if made else "an unknown generator"
+    return (
+        f"Sequence '{recording.name}' was made by {by}; the present one ({present}) may make it "
+        f"otherwise. To have it made anew, delete {recording.folder} first."
+    )

@@ -1,0 +1,1 @@
+"""Cameras, sensors and detectors that record a simulated scene."""

@@ -1,0 +1,321 @@
+"""A made-up recording: what cameras, detectors and trackers deliver of a stage, and the truth."""
+
+from collections.abc import Iterator, Sequence
+from typing import Literal
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from numpy import ndarray
+from numpy.random import Generator
+
+from physhandi.data.camera import PinholeCamera
+from physhandi.data.sequence_writer import SequenceWriter
+from physhandi.perception.tracks import motion_validity
+from physhandi.progress import Progress
+from physhandi.synthetic.film.cameras import Viewpoint, window_around
+from physhandi.synthetic.film.degradations import Degradations, depth_sensor
+from physhandi.synthetic.film.filmed_scene import FilmedScene, spread_points, surface_area
+from physhandi.synthetic.film.filming import (
+    SurfacePoints,
+    is_covered,
+    is_shown,
+    sample_image,
+    save_video,
+)
+from physhandi.synthetic.film.rendering import (
+    Picture,
+    Scene,
+    compose,
+    paint,
+    photograph,
+    resized,
+    shadow_points,
+)
+from physhandi.synthetic.film.sensors import detect_keypoints, segment, track
+
+_BODY = 1
+_BIAS_PERIOD = 25.0
+_KEYPOINTS_LOST = 0.01
+_POOL = 3
+
+
+class Shot:
+    """A camera in front of a stage; `look` at every frame in turn, then ask for what was found."""
+
+    def __init__(
+        self, stage: FilmedScene, view: Viewpoint, level: Degradations, random: Generator
+    ) -> None:
+        self.stage = stage
+        self.view = view
+        self.level = level
+        self.random = random
+        self.sensor = depth_sensor(level)
+        self.surface = SurfacePoints(np.zeros((0, 3), dtype=np.int64), np.zeros((0, 3)))
+        """Points of the body that are followed."""
+        self._bias = random.uniform(-0.7, 0.7), random.uniform(0, 2 * np.pi)
+        self._is_covered: list[ndarray] = []
+        self._is_seen: list[ndarray] = []
+
+    def time(self, frame: int) -> float:
+        """Give the frame, and the part of one, at which the camera takes a picture."""
+        return frame + self.view.delay * self.stage.frame_rate
+
+    def offset(self, frame: int) -> float:
+        """Give the slow offset of depth as a part of its largest."""
+        mean, phase = self._bias
+        return mean + 0.3 * float(np.sin(phase + frame / _BIAS_PERIOD))
+
+    def choose_tracks(self, camera: PinholeCamera, picture: Picture, count: int) -> None:
+        """Follow points that the first picture shows, spread over what it shows.
+
+        Args:
+            camera: What the picture was taken with.
+            picture: A perfect picture of frame 0.
+            count: Most points to follow.
+        """
+        skin = self.stage.skin_at(self.time(0))
+        pool = spread_points(skin, self.stage.faces, _POOL * count, self.random)
+        point = pool.at(skin)
+        shown = is_shown(camera, picture, point) & pool.face_camera(skin, camera)
+        shown &= sample_image(picture.label, camera.project(point)) == _BODY
+        self.surface = pool.pick(np.flatnonzero(shown)[:count])
+
+    def look(self, frame: int, camera: PinholeCamera, picture: Picture) -> None:
+        """Note what a picture shows.
+
+        Args:
+            frame: Number of the frame.
+            camera: What the picture was taken with; may see a part of what the view's does.
+            picture: A perfect picture.
+        """
+        skin = self.stage.skin_at(self.time(frame))
+        keypoint = self.stage.keypoints_at(self.time(frame))
+        covered = np.zeros(keypoint.shape[:2], dtype=bool)
+        for hand, joints in enumerate(keypoint):
+            covered[hand] = is_covered(camera, picture, joints)
+        self._is_covered.append(covered)
+        seen = is_shown(camera, picture, self.surface.at(skin))
+        self._is_seen.append(seen & self.surface.face_camera(skin, camera))
+
+    def keypoints(self) -> Float[ndarray, "frame hand 21 3"]:
+        """Give what a detector finds of the hands: pixel x, pixel y and confidence."""
+        camera, noise = self.view.camera, self.level.keypoint_noise
+        joint = np.stack([self.stage.keypoints_at(time) for time in self._times()])
+        pixel, is_hidden = camera.project(joint), np.stack(self._is_covered)
+        found = [
+            detect_keypoints(
+                pixel[:, hand],
+                is_hidden[:, hand],
+                (camera.width, camera.height),
+                self.random,
+                error=noise,
+                loss_rate=_KEYPOINTS_LOST if noise > 0 else 0.0,
+            )
+            for hand in range(joint.shape[1])
+        ]
+        return np.stack(found, axis=1)
+
+    def tracks(self) -> tuple[Float[ndarray, "frame point 2"], Bool[ndarray, "frame point"]]:
+        """Give what a tracker finds of the points that are followed: pixels and visibility."""
+        point = self._path()
+        return track(
+            self.view.camera.project(point),
+            np.stack(self._is_seen),
+            self.random,
+            error=self.level.track_noise,
+            wander=self.level.track_drift,
+            dropout_rate=self.level.track_loss,
+        )
+
+    def lifted_tracks(self) -> Float[ndarray, "frame point 3"]:
+        """Lift the tracks by the depth that the camera measures [m]; NaN where not seen.
+
+        The pose is what calibration says, so its error is in the points.
+        """
+        reported, visible = self.tracks()
+        true_depth = self.view.camera.camera_depth(self._path())
+        depth = np.stack(
+            [
+                self.sensor.measure_points(row, self.random, offset=self.offset(frame))
+                for frame, row in enumerate(true_depth)
+            ]
+        )
+        lifted = self.view.told.unproject(reported.astype(np.float64), depth)
+        lifted[~visible] = np.nan
+        return lifted
+
+    def _path(self) -> Float[ndarray, "frame point 3"]:
+        return np.stack([self.surface.at(self.stage.skin_at(time)) for time in self._times()])
+
+    def _times(self) -> list[float]:
+        return [self.time(frame) for frame in range(self.stage.frame_count)]
+
+
+Images = Literal["all", "none"]
+"""Whether a recording has images, or only what was found in them."""
+FILMING = "filming"
+"""Name under which filming reports its progress."""
+KEPT_AROUND = 8
+"""Depth is kept this far around body and hands, to keep files small [px]."""
+TRACK_COUNT = 300
+"""Tracks of each view, at most."""
+MARKER_SPACING = 0.011
+"""Distance between the points that each view follows where there are no images [m]."""
+MARKER_COUNTS = 150, 800
+"""Fewest and most points that each view follows there."""
+VALIDATION_COUNT = 200
+"""Points whose true path is told for scoring, at most."""
+_CROP_MARGIN = 48
+_SHADOW_MARGIN = 16
+_COARSE = 0.5
+_EMPTY = np.zeros((0, 3))
+
+
+def record(
+    writer: SequenceWriter,
+    stage: FilmedScene,
+    views: Sequence[Viewpoint],
+    level: Degradations,
+    *,
+    seed: int,
+    images: Images,
+    progress: Progress,
+) -> None:
+    """Write everything of a recording but its description.
+
+    Args:
+        writer: Sequence that is being written.
+        stage: What happens.
+        views: Cameras.
+        level: How imperfect everything is.
+        seed: Decides all errors; those of one kind do not depend on the levels of others.
+        images: ``all`` writes color, depth, masks and pixel tracks; ``none`` leaves the images out
+            and writes the tracks lifted into the world as markers.
+        progress: Told after every frame of every view; may ask to stop.
+
+    Raises:
+        CancelledError: If the user asked to stop.
+        OSError: If the disk does not take it.
+    """
+    lifted: list[ndarray] = []
+    for number, view in enumerate(views):
+        shot = Shot(stage, view, level, np.random.default_rng([seed, 30, number]))
+        folder = f"views/{view.name}"
+        counter = _Counter(progress, number * stage.frame_count, len(views) * stage.frame_count)
+        if images == "all":
+            colors = _film(writer, folder, shot, counter)
+            save_video(writer, f"{folder}/color.mp4", colors, stage.frame_rate)
+            reported, visible = shot.tracks()
+            writer.save_array(f"{folder}/track.npy", reported)
+            writer.save_array(f"{folder}/track_visible.npy", visible)
+        else:
+            lifted.append(_follow(shot, counter))
+        if stage.hands:
+            writer.save_array(f"{folder}/keypoint.npy", shot.keypoints())
+        else:
+            writer.make_folder(folder)
+    if lifted:
+        marker = np.concatenate(lifted, axis=1)
+        is_visible = np.asarray(np.isfinite(marker).all(axis=-1))
+        writer.save_array("marker.npy", marker.astype(np.float32))
+        writer.save_array("marker_motion_valid.npy", motion_validity(marker, is_visible))
+    _write_truth(writer, stage)
+    _write_validation(writer, stage, views, seed)
+
+
+class _Counter:
+    """Tells how many frames of all views are done."""
+
+    def __init__(self, progress: Progress, before: int, total: int) -> None:
+        self._progress, self._before, self._total = progress, before, total
+
+    def check(self) -> None:
+        self._progress.check_cancelled()
+
+    def done(self, frame: int, name: str) -> None:
+        self._progress.report(FILMING, self._before + frame + 1, self._total, message=name)
+
+
+def _film(
+    writer: SequenceWriter, folder: str, shot: Shot, counter: _Counter
+) -> Iterator[UInt8[ndarray, "row column 3"]]:
+    """Write depth and masks of a view frame by frame, and give its color images."""
+    camera = shot.view.camera
+    background = paint(camera, compose(_EMPTY, _EMPTY.astype(np.int64), _EMPTY[:, :2], []))
+    around = np.ones((2 * KEPT_AROUND + 1,) * 2, dtype=np.uint8)
+    for frame in range(shot.stage.frame_count):
+        counter.check()
+        scene = shot.stage.scene_at(shot.time(frame))
+        window = window_around(camera, scene.vertex, _CROP_MARGIN)
+        picture = photograph(window.camera, scene)
+        if frame == 0:
+            shot.choose_tracks(window.camera, picture, TRACK_COUNT)
+        shot.look(frame, window.camera, picture)
+        depth = shot.sensor.measure(
+            picture.depth, picture.cosine, shot.random, offset=shot.offset(frame), scale=1.0
+        )
+        limit = shot.level.mask_error
+        mask = segment(picture.label, shot.random, error=limit / 2, largest=limit)
+        depth[cv2.dilate((mask > 0).astype(np.uint8), around) == 0] = 0
+        for kind, part in (("depth", depth), ("mask", mask)):
+            whole = np.zeros((camera.height, camera.width), dtype=part.dtype)
+            whole[window.rows, window.columns] = part
+            writer.save_image(f"{folder}/{kind}/{frame:05d}.png", whole)
+        counter.done(frame, shot.view.name)
+        yield _color(shot, scene, background)
+
+
+def _color(
+    shot: Shot, scene: Scene, background: UInt8[ndarray, "row column 3"]
+) -> UInt8[ndarray, "row column 3"]:
+    """Paint body, hands and their shadows over the empty table."""
+    touched = np.concatenate([scene.vertex, shadow_points(scene.vertex)])
+    window = window_around(shot.view.camera, touched, _SHADOW_MARGIN)
+    image = background.copy()
+    image[window.rows, window.columns] = paint(window.camera, scene)
+    return image
+
+
+def _follow(shot: Shot, counter: _Counter) -> Float[ndarray, "frame point 3"]:
+    """Lift the tracks of a view into the world, as its images would allow [m]; NaN if not seen."""
+    skin, faces = shot.stage.skin[0].astype(np.float64), shot.stage.faces
+    count = int(np.clip(surface_area(skin, faces) / MARKER_SPACING**2, *MARKER_COUNTS))
+    shot.surface = spread_points(skin, faces, count, shot.random)
+    coarse = resized(shot.view.camera, _COARSE)
+    for frame in range(shot.stage.frame_count):
+        counter.check()
+        scene = shot.stage.scene_at(shot.time(frame))
+        window = window_around(coarse, scene.vertex, 2)
+        shot.look(frame, window.camera, photograph(window.camera, scene))
+        counter.done(frame, shot.view.name)
+    return shot.lifted_tracks()
+
+
+def _write_truth(writer: SequenceWriter, stage: FilmedScene) -> None:
+    """Write what really happened to hands and body."""
+    for hand in stage.hands:
+        writer.save_array(f"truth/hand_{hand.side}_keypoint.npy", hand.keypoint.astype(np.float32))
+        writer.save_array(f"truth/hand_{hand.side}_vertex.npy", hand.vertex.astype(np.float32))
+    writer.save_array("truth/contact_point.npy", stage.skin[0].astype(np.float32))
+    writer.save_array("truth/contact.npy", stage.contact)
+    writer.save_array("truth/object_point.npy", stage.skin.astype(np.float32))
+    writer.save_array("truth/object_face.npy", stage.faces.astype(np.int32))
+
+
+def _write_validation(
+    writer: SequenceWriter, stage: FilmedScene, views: Sequence[Viewpoint], seed: int
+) -> None:
+    """Tell the true paths of points that a camera sees in frame 0."""
+    skin, scene = stage.skin_at(0.0), stage.scene_at(0.0)
+    random = np.random.default_rng([seed, 31])
+    surface = spread_points(skin, stage.faces, 2 * VALIDATION_COUNT, random)
+    point, is_seen = surface.at(skin), np.zeros(len(surface), dtype=bool)
+    for view in views:
+        window = window_around(resized(view.camera, _COARSE), scene.vertex, 2)
+        picture = photograph(window.camera, scene)
+        is_seen |= is_shown(window.camera, picture, point)
+    path = surface.pick(np.flatnonzero(is_seen)[:VALIDATION_COUNT]).at(
+        stage.skin.astype(np.float64)
+    )
+    writer.save_array("validation_track.npy", path.astype(np.float32))

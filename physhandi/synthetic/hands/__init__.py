@@ -1,0 +1,1 @@
+"""The true hand of SynthHDI and how it handles objects."""

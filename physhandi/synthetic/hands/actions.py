@@ -1,0 +1,194 @@
+"""Six things that hands do with soft objects: where they grasp, which way they move, how long."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy import ndarray
+from numpy.random import Generator
+
+from physhandi.data.sequence_meta import Side
+from physhandi.errors import UsageError
+from physhandi.synthetic.hands.handling import Graspable, Handler
+from physhandi.synthetic.hands.script import HandScript
+from physhandi.synthetic.hands.true_hand import TrueHand, load_true_hand
+
+Action = Literal["lift", "fold", "stretch", "squeeze", "wipe", "push"]
+ACTIONS: tuple[Action, ...] = ("lift", "fold", "stretch", "squeeze", "wipe", "push")
+"""What hands can do."""
+_UP = np.array([0.0, 0.0, 1.0])
+# How far hands pull each body beyond its length: as far as friction holds it.
+_STRETCH = {"cloth": 0.02, "towel": 0.05, "rope": -0.01, "plush": 0.08, "pouch": 0.05}
+# Shortest recording in which hands go the whole way, so that they are as slow in shorter ones [s].
+_WHOLE_WAY = 3.0
+DURATION = 3.0
+"""How long an action is recorded if nothing else is asked for [s]."""
+
+
+def script_action(
+    action: str,
+    body: Graspable,
+    random: Generator,
+    *,
+    duration: float = DURATION,
+    side: Side = "right",
+    hands: Mapping[Side, TrueHand] | None = None,
+) -> tuple[HandScript, ...]:
+    """Write the script of one action on one object.
+
+    Every script reaches for the object before time 0 (see `HandScript.begin`), touches it at time
+    0 and goes on to move until `duration`, so that its last part cannot be guessed from rest.
+
+    Args:
+        action: One of `ACTIONS`.
+        body: The object as it lies on the ground.
+        random: Decides where it is grasped, which way and how far it is moved, and the tremor.
+        duration: Length of the recording [s].
+        side: Hand that does one-handed actions; stretching takes both.
+        hands: The hands that will do it, so that their soft tissue is counted; None for bare ones.
+
+    Returns:
+        One script, or the right hand's and the left hand's.
+
+    Raises:
+        UsageError: There is no such action.
+        SequenceError: The object is too large for the hand.
+    """
+    if action not in _WRITERS:
+        raise UsageError(f"There is no action {action!r}. Choose one of {', '.join(ACTIONS)}.")
+    hands = hands or {side: load_true_hand(side) for side in ("right", "left")}
+    return _WRITERS[action](_Task(body, random, duration, side, hands))
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """What an action is asked for."""
+
+    body: Graspable
+    random: Generator
+    duration: float
+    side: Side
+    hands: Mapping[Side, TrueHand]
+
+    @property
+    def extent(self) -> float:
+        """Share of the whole way that there is time for; hands move no faster in short ones."""
+        return min(self.duration / _WHOLE_WAY, 1.0)
+
+    def handler(self, side: Side | None = None) -> Handler:
+        return Handler(self.hands[side or self.side], self.body, self.random)
+
+
+def _lift(task: _Task) -> tuple[HandScript, ...]:
+    """Pinch the object near its rim and raise it, a little sideways and turned."""
+    handler, random, duration = task.handler(), task.random, task.duration
+    grasp = handler.take()
+    height = task.extent * random.uniform(0.12, 0.18)
+    aside = random.uniform(-0.04, 0.04) * grasp.across + random.uniform(0.0, 0.05) * grasp.forward
+    aside = task.extent * aside
+    turn = random.uniform(-0.3, 0.3)
+
+    def carry(phase: float) -> tuple[ndarray, ndarray]:
+        up = np.array([0.0, 0.0, height * phase])
+        return up + aside * phase**2, np.array([0.0, 0.0, turn * phase])
+
+    return (handler.script(grasp, [(0.0, duration, carry)]),)
+
+
+def _fold(task: _Task) -> tuple[HandScript, ...]:
+    """Pinch the object near its rim and lay it over towards the other side."""
+    handler, random, duration = task.handler(), task.random, task.duration
+    grasp = handler.take()
+    radius = handler.distance_to_middle(grasp) * random.uniform(0.75, 0.95)
+    angle = task.extent * random.uniform(2.45, 2.8)
+
+    def carry(phase: float) -> tuple[ndarray, ndarray]:
+        along = radius * (1 - np.cos(angle * phase))
+        up = radius * np.sin(angle * phase)
+        tilt = 0.35 * phase * np.cross(_UP, grasp.place.inwards)
+        return along * grasp.place.inwards + np.array([0.0, 0.0, up]), tilt
+
+    return (handler.script(grasp, [(0.0, duration, carry)]),)
+
+
+def _stretch(task: _Task) -> tuple[HandScript, ...]:
+    """Pinch the object at both ends, raise it with some slack, and pull it apart."""
+    random, duration = task.random, task.duration
+    slack = task.extent * random.uniform(0.025, 0.04)
+    height = task.extent * random.uniform(0.04, 0.08)
+    slacken = random.uniform(0.3, 0.4) * duration
+    strain = task.extent * _STRETCH[task.body.name] * random.uniform(0.7, 1.3)
+    scripts = []
+    sides: tuple[Side, Side] = ("right", "left")
+    for hand_side in sides:
+        handler = task.handler(hand_side)
+        grasp = handler.take(end=1.0 if hand_side == "right" else -1.0)
+        outwards = -grasp.place.inwards
+        pull = slack + strain * handler.distance_to_middle(grasp)
+
+        def gather(phase: float, outwards: ndarray = outwards) -> tuple[ndarray, ndarray]:
+            return phase * (height * _UP - slack * outwards), np.zeros(3)
+
+        def part(
+            phase: float, outwards: ndarray = outwards, pull: float = pull
+        ) -> tuple[ndarray, ndarray]:
+            return height * _UP + (phase * pull - slack) * outwards, np.zeros(3)
+
+        moves = [(0.0, slacken, gather), (slacken, duration, part)]
+        scripts.append(handler.script(grasp, moves))
+    return tuple(scripts)
+
+
+def _squeeze(task: _Task) -> tuple[HandScript, ...]:
+    """Close all fingers, let go by half, and close them again, while the hand drifts aside."""
+    handler, random = task.handler(), task.random
+    grasp = handler.embrace()
+    drift = random.uniform(0.03, 0.06) * grasp.forward + random.uniform(-0.03, 0.03) * grasp.across
+    drift = task.extent * drift
+    times = np.array([0.0, 0.4, 0.6, 1.0]) * task.duration
+    return (handler.squeeze_script(grasp, times, ease=random.uniform(0.4, 0.6), drift=drift),)
+
+
+def _wipe(task: _Task) -> tuple[HandScript, ...]:
+    """Press the flat hand on the object and rub it to and fro."""
+    handler, random, duration = task.handler(), task.random, task.duration
+    grasp = handler.lay_flat()
+    reach = task.extent * random.uniform(0.05, 0.08)
+    # A rope is rolled, anything else rubbed from side to side.
+    way = grasp.forward if task.body.dimension == 1 else grasp.across
+    turn = random.uniform(-0.25, 0.25)
+    legs = [(0.0, 0.3, 0.0, 1.0), (0.3, 0.7, 1.0, -0.6), (0.7, 1.0, -0.6, 0.7)]
+
+    def rub(first: float, last: float) -> Callable[[float], tuple[ndarray, ndarray]]:
+        def carry(phase: float) -> tuple[ndarray, ndarray]:
+            share = first + phase * (last - first)
+            return reach * share * way, np.array([0.0, 0.0, turn * share])
+
+        return carry
+
+    moves = [(a * duration, b * duration, rub(first, last)) for a, b, first, last in legs]
+    return (handler.script(grasp, moves),)
+
+
+def _push(task: _Task) -> tuple[HandScript, ...]:
+    """Push the object over the ground with the index finger."""
+    handler, random, duration = task.handler(), task.random, task.duration
+    grasp = handler.point_at()
+    distance = task.extent * random.uniform(0.08, 0.12)
+    bow = task.extent * random.uniform(-0.02, 0.02)
+
+    def carry(phase: float) -> tuple[ndarray, ndarray]:
+        return phase * distance * grasp.forward + bow * phase**2 * grasp.across, np.zeros(3)
+
+    return (handler.script(grasp, [(0.0, duration, carry)]),)
+
+
+_WRITERS: dict[str, Callable[[_Task], tuple[HandScript, ...]]] = {
+    "lift": _lift,
+    "fold": _fold,
+    "stretch": _stretch,
+    "squeeze": _squeeze,
+    "wipe": _wipe,
+    "push": _push,
+}

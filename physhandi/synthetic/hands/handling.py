@@ -1,0 +1,269 @@
+"""Where a hand takes hold of an object that lies on the ground, and how it gets there."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from numpy.random import Generator
+
+from physhandi.errors import SequenceError
+from physhandi.synthetic.hands.grasp import (
+    FLAT,
+    INDEX,
+    POINTING,
+    bend_of,
+    fingertip,
+    orientation_towards,
+    reach,
+)
+from physhandi.synthetic.hands.places import (
+    Place,
+    handful_place,
+    height_range,
+    narrow_places,
+    rim_place,
+)
+from physhandi.synthetic.hands.script import HandScript, Move, Tremor
+from physhandi.synthetic.hands.shapes import claw, lowest_skin, moved, pinch, turned
+from physhandi.synthetic.hands.true_hand import HandPose, TrueHand
+
+Carry = Callable[[float], tuple[Float[ndarray, " 3"], Float[ndarray, " 3"]]]
+"""Where a grasp has gone after a share of a move: shift [m] and rotation vector [rad]."""
+
+_UP = np.array([0.0, 0.0, 1.0])
+# Times of reaching, touching, closing and being ready, before the recording starts [s].
+_BEGIN, _TOUCH, _CLOSED, _READY = -1.5, -1.1, -0.6, -0.15
+_HOVER, _ASIDE = 0.06, 0.08
+_CLEARANCE = 0.004
+_POSES_PER_MOVE = 9
+_POINT_PITCH = 0.75
+
+
+class Graspable(Protocol):
+    """What hands must know of an object."""
+
+    @property
+    def name(self) -> str:
+        """What kind of object it is."""
+        ...
+
+    @property
+    def node(self) -> Float[ndarray, "node 3"]:
+        """Nodes of the object lying on the ground, which is z = 0 [m]."""
+        ...
+
+    @property
+    def radius(self) -> float:
+        """Distance at which others touch it, about its nodes [m]."""
+        ...
+
+    @property
+    def dimension(self) -> int:
+        """1 for a rod, 2 for a shell, 3 for a solid."""
+        ...
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Grasp:
+    """A hand at an object: its way from open to closed."""
+
+    poses: Sequence[HandPose]
+    """Poses from the one that first touches the object to the one that holds it."""
+    place: Place
+    """Where the object is grasped, and which way the hand faces."""
+    approach: Sequence[Move]
+    """How the hand gets there before the recording starts, from far away to the last pose."""
+
+    @property
+    def forward(self) -> Float[ndarray, " 3"]:
+        """Horizontal direction in which the fingers reach."""
+        return self.place.forward
+
+    @property
+    def across(self) -> Float[ndarray, " 3"]:
+        """Horizontal direction to the left of `forward`."""
+        return np.cross(_UP, self.place.forward)
+
+
+class Handler:
+    """One hand that is about to do something with one object."""
+
+    def __init__(self, hand: TrueHand, body: Graspable, random: Generator) -> None:
+        """Remember who does what.
+
+        Args:
+            hand: The hand.
+            body: The object as it lies on the ground.
+            random: Decides places, directions and the tremor.
+        """
+        self._hand = hand
+        self._body = body
+        self._random = random
+
+    def take(self, *, end: float = 0.0) -> Grasp:
+        """Take hold of the object so that it can be carried.
+
+        Args:
+            end: 1 or -1 for a place on that side of the object; 0 for any.
+        """
+        # What is heavy hangs down: it must be able to turn about the line between the fingers.
+        return self._take_limb(end) if self._body.dimension == 3 else self._pinch_rim(end)
+
+    def _pinch_rim(self, end: float) -> Grasp:
+        """Take the rim between the thumb below and two fingers above, a little off the ground."""
+        place = rim_place(self._body, self._random, end=end)
+        closed = pinch(self._hand, place, place.closed_gap, None)
+        raised = max(_CLEARANCE - lowest_skin(self._hand, closed)[0], 0.0) * _UP
+        lower = [closed]
+        for gap in np.linspace(place.closed_gap, place.open_gap, 4)[1:]:
+            lower.append(pinch(self._hand, place, float(gap), lower[-1]))
+        lower.reverse()
+        held = replace(place, point=place.point + raised)
+        outside = moved(lower[0], -_ASIDE * place.forward)
+        return Grasp(
+            place=held,
+            poses=(moved(closed, raised),),
+            approach=(
+                Move(_BEGIN, _TOUCH, (outside, lower[0])),
+                Move(_TOUCH, _CLOSED, lower),
+                Move(_CLOSED, _READY, (closed, moved(closed, raised))),
+            ),
+        )
+
+    def _take_limb(self, end: float) -> Grasp:
+        """Take a limb between the thumb on one side and all fingers on the other."""
+        places = narrow_places(self._body, self._random, end=end)
+        if not places:
+            raise SequenceError(
+                f"The {self._body.name} has no part that a hand can span. Choose another seed."
+            )
+        places.sort(key=lambda place: 0.5 * (place.width or 0.0) - place.remoteness)
+        place = places[self._random.integers(max(len(places) // 6, 1))]
+        place = replace(place, closed_gap=0.5 * (place.width or 0.0))
+        gaps = np.linspace((place.width or 0.0) + 0.012, place.closed_gap, 5)
+        poses = self._close(place, gaps)
+        return Grasp(poses=poses, place=place, approach=_from_above(poses[0], poses))
+
+    def embrace(self) -> Grasp:
+        """Close all fingers around a part of the object, or around a handful of it."""
+        places = narrow_places(self._body, self._random)
+        if places:
+            places.sort(key=lambda place: -(place.width or 0.0))
+            place = places[self._random.integers(max(len(places) // 5, 1))]
+            gaps = np.linspace((place.width or 0.0) + 0.012, place.closed_gap, 5)
+        else:
+            place = handful_place(self._body, self._random)
+            gaps = np.linspace(place.open_gap, place.closed_gap, 7)
+        poses = self._close(place, gaps)
+        return Grasp(poses=poses, place=place, approach=_from_above(poses[0], poses))
+
+    def lay_flat(self) -> Grasp:
+        """Press the flat hand on the middle of the object."""
+        angle = np.pi / 2 + self._random.uniform(-0.4, 0.4)
+        forward = np.array([np.cos(angle), np.sin(angle), 0.0])
+        middle = self._body.node.mean(axis=0)
+        _, top = height_range(self._body, middle, 0.06)
+        place = Place(point=np.array([*middle[:2], top]), forward=forward, inwards=forward)
+        pose = HandPose(
+            orientation=orientation_towards(forward, pitch=0.06),
+            position=np.zeros(3),
+            bend=bend_of(FLAT),
+        )
+        low, center = lowest_skin(self._hand, pose)
+        is_soft = height_range(self._body, middle, 0.06)[1] > 0.02
+        press = 0.010 if is_soft else 0.003
+        shift = np.array([*(place.point - center)[:2], top - press - low])
+        above = moved(pose, shift + (press + 0.004) * _UP)
+        poses = (above, moved(pose, shift))
+        return Grasp(poses=poses, place=place, approach=_from_above(above, poses))
+
+    def point_at(self) -> Grasp:
+        """Put the index finger beside the object, or on it where it is flat."""
+        body, tip = self._body, fingertip(self._hand, INDEX)
+        angle = np.pi / 2 + self._random.uniform(-0.35, 0.35)
+        forward = np.array([np.cos(angle), np.sin(angle), 0.0])
+        middle = body.node.mean(axis=0)
+        across = np.cross(_UP, forward)
+        aside = self._random.uniform(-0.03, 0.03)
+        beside = np.abs((body.node - middle) @ across - aside) < 0.02
+        nodes = body.node[beside]
+        near = nodes[((nodes - middle) @ forward).argmin()]
+        bottom, top = height_range(body, middle, 0.05)
+        is_flat = top - bottom < 0.008 + 2 * body.radius and top < 0.009
+        if is_flat:
+            inside = near + 0.05 * forward
+            target = np.array([*inside[:2], top + tip.radius - 0.002])
+        else:
+            outside = near - (tip.radius + body.radius - 0.001) * forward
+            height = max(tip.radius + 0.002, 0.45 * (bottom + top))
+            target = np.array([*outside[:2], height])
+        place = Place(point=target, forward=forward, inwards=forward)
+        orientation = orientation_towards(forward, pitch=_POINT_PITCH)
+        touch = reach(self._hand, {INDEX: target}, orientation=orientation, joints=POINTING)
+        back = 0.01 * _UP if is_flat else -0.01 * forward
+        poses = (moved(touch, back), touch)
+        return Grasp(poses=poses, place=place, approach=_from_above(poses[0], poses))
+
+    def script(self, grasp: Grasp, moves: Sequence[tuple[float, float, Carry]]) -> HandScript:
+        """Reach for the object, close the hand, and carry what it holds.
+
+        Args:
+            grasp: Where and how to take hold.
+            moves: Start, end [s] and way of each move after that.
+        """
+        held = grasp.poses[-1]
+        chain = list(grasp.approach)
+        for start, end, carry in moves:
+            phases = np.linspace(0.0, 1.0, _POSES_PER_MOVE)
+            poses = [turned(held, grasp.place.point, *carry(float(p))) for p in phases]
+            chain.append(Move(start, end, poses))
+        return HandScript(self._hand.side, chain, Tremor(self._random))
+
+    def squeeze_script(
+        self,
+        grasp: Grasp,
+        times: Float[ndarray, " 4"],
+        *,
+        ease: float,
+        drift: Float[ndarray, " 3"],
+    ) -> HandScript:
+        """Close the hand further, ease it, and close it again.
+
+        Args:
+            grasp: Where and how to take hold.
+            times: Begin and end of closing, end of easing and of closing again [s].
+            ease: Share of the way to the open hand by which the grip is eased.
+            drift: How far the hand moves aside in the end [m].
+        """
+        poses = list(grasp.poses)
+        half = len(poses) // 2
+        eased = poses[max(round((1 - ease) * (len(poses) - 1)), 0) :]
+        chain = _from_above(poses[0], poses[: half + 1])
+        legs = (poses[half:], 0.0, 0.2), (eased[::-1], 0.2, 0.4), (eased, 0.4, 1.0)
+        for number, (leg, first, last) in enumerate(legs):
+            shares = np.linspace(first, last, len(leg))
+            drifting = [moved(p, share * drift) for p, share in zip(leg, shares, strict=True)]
+            chain.append(Move(times[number], times[number + 1], drifting))
+        return HandScript(self._hand.side, chain, Tremor(self._random))
+
+    def distance_to_middle(self, grasp: Grasp) -> float:
+        """How far the grasp is from the object's middle along the way the hand faces [m]."""
+        return abs(float((self._body.node.mean(axis=0) - grasp.place.point) @ grasp.place.inwards))
+
+    def _close(self, place: Place, gaps: Float[ndarray, " step"]) -> list[HandPose]:
+        """Close thumb and fingers in steps, the wrist almost at rest."""
+        poses: list[HandPose] = []
+        for gap in gaps:
+            poses.append(claw(self._hand, place, float(gap), poses[-1] if poses else None))
+        return poses
+
+
+def _from_above(first: HandPose, closing: Sequence[HandPose]) -> list[Move]:
+    """Come down to where a hand touches first, then close it."""
+    return [
+        Move(_BEGIN, _TOUCH, (moved(first, _HOVER * _UP), first)),
+        Move(_TOUCH, _READY, closing),
+    ]

@@ -1,0 +1,1 @@
+"""Suites of sequences: methods, the cells they fill, and their scores."""

@@ -1,0 +1,451 @@
+"""Cells of a suite: one method on one sequence, a run folder that is filled once and kept.
+
+A cell's folder is named by a hash of its sequence, method and code, so that a suite that is run
+again goes on where it stopped, and anything that changed is computed anew. Several processes may
+fill cells of one folder: who needs a cell that another one is filling waits for it.
+"""
+
+import hashlib
+import json
+import tempfile
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+from jaxtyping import Float
+from numpy import ndarray
+
+from physhandi.data.environment import processor_name
+from physhandi.data.files import write_array, write_json
+from physhandi.data.lease import locked_file
+from physhandi.data.run import Run
+from physhandi.data.run_folder import EXIT, artefacts, read_json, read_mapping
+from physhandi.data.sequence import Sequence
+from physhandi.data.truth import read_truth
+from physhandi.errors import (
+    FitError,
+    MissingInputError,
+    PhysHandiError,
+    SimulationDivergedError,
+    SimulationError,
+    UsageError,
+)
+from physhandi.metrics.photometric import photometric_curves
+from physhandi.metrics.report import measure_run
+from physhandi.progress import Progress
+from physhandi.synthetic.code_version import PREDICTIONS, SCORES, code_version
+from physhandi.synthetic.suite.methods import (
+    HAND_NOISE,
+    METHODS,
+    HandNoise,
+    Method,
+    correct,
+    execute,
+    settings_of,
+    shared_stages,
+    simulate_in,
+)
+from physhandi.synthetic.suite.variants import DISTURBED_HAND, make_variant, noise_seed
+
+
+def measure_cell(
+    run: Run | None, reference: Run, recording: Sequence
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Measure what a run predicted.
+
+    The run brings its motion, hands and springs; observations are the reference's, whatever
+    the run itself was given. Without a run the static object stands in.
+
+    Args:
+        run: What is scored.
+        reference: The static object on the same recording.
+        recording: The whole recording, with its truth.
+
+    Returns:
+        The report and the errors of the rollout frame by frame.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        assemble(Path(folder), run, reference, recording)
+        report, frames = measure_run(Path(folder), recording, with_baselines=False)
+    curves: dict[str, Any] = frames.get("rollout", {})
+    add_photometric(report, curves, run, reference, recording)
+    return report, curves
+
+
+def assemble(folder: Path, run: Run | None, reference: Run, recording: Sequence) -> None:
+    """Lay out what is scored: the run's motion beside the reference's observations."""
+    inside = f"sequences/{recording.name}"
+    observed = (f"{inside}/observation/", f"{inside}/keypoint.npy")
+    left_out = ("rollout.npy", "control.npy") if run is None else ()
+    chosen = {r: path for r, path in artefacts(reference.out) if r.startswith(observed)} | {
+        rel: path
+        for rel, path in artefacts((reference if run is None else run).out)
+        if not rel.startswith(observed) and not rel.endswith(left_out)
+    }
+    for rel, path in chosen.items():
+        target = folder / rel
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.symlink_to(path.resolve())
+    truth = read_truth(recording.folder).hand_vertex
+    if run is not None and not any("_vertex.npy" in rel for rel in chosen):
+        for side in recording.hands:  # An oracle moves the object with the true hand itself.
+            if side in truth:
+                write_array(folder / inside / f"hand_{side}_vertex.npy", truth[side])
+
+
+def add_photometric(
+    report: dict[str, Any],
+    curves: dict[str, Any],
+    run: Run | None,
+    reference: Run,
+    recording: Sequence,
+) -> None:
+    """Put IoU and PSNR beside the other figures of the rollout.
+
+    Nodes are the run's own, however many they are, in the colors that frame 0 shows where it has
+    them there. Frames that it lacks show its object as it was in frame 0.
+    """
+    rollout = _complete(run or reference, recording)
+    found = photometric_curves(recording.views, rollout[:, : recording.surface_node_count])
+    splits = {
+        "reconstruction": recording.reconstruction_frames,
+        "future": recording.future_frames,
+    }
+    for metric, curve in found.items():
+        curves[metric] = [float(value) if np.isfinite(value) else None for value in curve]
+        for split, scored in splits.items():
+            known = [float(curve[f]) for f in scored if f > 0 and np.isfinite(curve[f])]
+            if known and split in report:
+                report[split]["rollout"][metric] = sum(known) / len(known)
+
+
+def _complete(run: Run, recording: Sequence) -> Float[ndarray, "frame node 3"]:
+    """Give a run's rollout in every frame; where it is missing or not finite, nothing moves."""
+    inside = f"sequences/{recording.name}"
+    rollout = run.array(f"{inside}/rollout.npy")
+    known = f"{inside}/object_node.npy"
+    still = run.array(known) if run.has(known) else rollout[0]
+    complete = np.repeat(still[None].astype(rollout.dtype), recording.frame_count, axis=0)
+    count = min(len(rollout), recording.frame_count)
+    is_usable = np.isfinite(rollout[:count]).all(axis=(1, 2))
+    complete[:count][is_usable] = rollout[:count][is_usable]
+    return complete
+
+
+FAILURES = (FitError, MissingInputError, SimulationDivergedError, SimulationError)
+"""What a method may fail with; its output then counts as missing. Anything else stops the suite,
+a setting that only a fit finds wrong too."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What came out of a cell."""
+
+    method: str
+    """Name of the method."""
+    case: str
+    """Name of the sequence."""
+    variant: str
+    """What the method was given."""
+    run: str
+    """Name of the run folder below ``cells/``; empty if the method could not even begin."""
+    error: str = ""
+    """Why there is no output, so that the static object stands in; empty if there is one."""
+    seconds: Mapping[str, float] = field(default_factory=dict[str, float])
+    """Time of each stage [s]."""
+    report: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    """What `physhandi.metrics.report.score_run` says of it, against the whole recording."""
+    curves: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    """Its errors frame by frame."""
+
+
+class Bench:
+    """Fills the cells of one suite folder."""
+
+    def __init__(
+        self, out: Path, *, common: Mapping[str, Any], device: str, progress: Progress
+    ) -> None:
+        """Prepare; nothing is written yet.
+
+        Args:
+            out: Folder of the suite.
+            common: Settings that all methods share.
+            device: Warp device.
+            progress: Told about every iteration.
+        """
+        self.out = out
+        self.common = dict(common)
+        self.device = device
+        name = processor_name() if device == "cpu" else wp.get_device(device).name
+        self.device_name = f"{device} {name}"
+        self.progress = progress
+        self._settings: dict[str, dict[str, Any]] = {}
+        self._finished: dict[Path, Run] = {}
+
+    def reference(self, recording: Sequence) -> Run:
+        """Give the run of the static object on a recording: its observations are scored against.
+
+        Raises:
+            PhysHandiError: If hands or observations cannot be found; then nothing can be scored.
+        """
+        return self._run(METHODS["static"], recording, "recording")
+
+    def outcome(self, method: Method, recording: Sequence, variant: str = "recording") -> Outcome:
+        """Run a method on a recording, or find what it gave before, and score it.
+
+        Args:
+            method: The method.
+            recording: The whole recording, which it is scored against.
+            variant: What it is given; an oracle gets what its nature asks for.
+
+        Raises:
+            UsageError: If the fit finds that a setting makes no sense.
+        """
+        variant = _given(method, variant)
+        reference = self.reference(recording)
+        folder = self._folder(method, recording, variant)
+        try:
+            run = self._run(method, recording, variant)
+        except FAILURES as error:
+            report, curves = self.score(None, reference, recording)
+            ran = folder.name if folder.is_dir() else ""
+            return Outcome(
+                method=method.name,
+                case=recording.name,
+                variant=variant,
+                run=ran,
+                error=str(error),
+                report=report,
+                curves=curves,
+            )
+        report, curves = self.score(run, reference, recording)
+        return Outcome(
+            method=method.name,
+            case=recording.name,
+            variant=variant,
+            run=folder.name,
+            seconds=self._seconds(method, recording, variant, run),
+            report=report,
+            curves=curves,
+        )
+
+    def lacks(self, method: Method, recording: Sequence, variant: str = "recording") -> str:
+        """Say what a recording lacks for a variant of it to be given; empty if nothing."""
+        try:
+            self._make_variant(recording, _given(method, variant))
+        except MissingInputError as error:
+            return str(error)
+        return ""
+
+    def unseen(self, method: Method, fitted: Sequence, recording: Sequence) -> Outcome:
+        """Simulate the object that was fitted in one recording in another one.
+
+        The object is laid into the new first frame, keeps its rest lengths, and is joined to the
+        hands anew; no frame after the first one is fitted. A rule needs no fit.
+
+        Args:
+            method: The method, not corrected.
+            fitted: Where its object is fitted.
+            recording: Where it is simulated and scored, over all frames.
+        """
+        whole = _as_one_split(recording)
+        reference = self.reference(recording)
+        if method.rule is not None:
+            run = self._run(method, recording, "recording")
+            report, curves = self.score(run, reference, whole)
+            return Outcome(
+                method=method.name,
+                case=recording.name,
+                variant="unseen",
+                run=run.folder.name,
+                report=report,
+                curves=curves,
+            )
+        given = "true_hand" if method.gets == "true_hand" else "recording"
+        name, error = "", ""
+        run: Run | None = None
+        try:
+            source = self._run(method, fitted, method.gets)
+            target = self._make_variant(recording, given)
+            folder = self._cell(
+                recording.name, f"{method.name}_unseen", [source.folder.name, given], recording
+            )
+            name = folder.name
+            run = self._simulated(
+                source,
+                target,
+                folder,
+                title=f"{method.name}, fitted on {fitted.name}, on {recording.name}",
+            )
+        except FAILURES as failure:
+            error = str(failure)
+        report, curves = self.score(run, reference, whole)
+        return Outcome(
+            method=method.name,
+            case=recording.name,
+            variant="unseen",
+            run=name,
+            error=error,
+            report=report,
+            curves=curves,
+        )
+
+    def score(
+        self, run: Run | None, reference: Run, recording: Sequence
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Measure what a run predicted against what the whole recording shows.
+
+        The run brings its motion, hands and springs; observations are the reference's, whatever
+        the run itself was given. Without a run the static object stands in.
+
+        Returns:
+            The report and the errors frame by frame.
+        """
+        parts = [reference.folder.name, "" if run is None else run.folder.name]
+        parts += [str(len(recording.reconstruction_frames)), code_version(SCORES)]
+        key = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
+        path = self.out / "scores" / f"{key}.json"
+        if not path.is_file():
+            report, curves = measure_cell(run, reference, recording)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_json(path, {"report": report, "curves": curves})
+        known = read_json(path)
+        return known["report"], known["curves"]
+
+    def _run(self, method: Method, recording: Sequence, variant: str) -> Run:
+        folder = self._folder(method, recording, variant)
+        if folder not in self._finished:
+            with self._alone(folder.name):
+                self._finished[folder] = self._filled(method, recording, variant, folder)
+        return self._finished[folder]
+
+    def _make_variant(self, recording: Sequence, variant: str) -> Sequence:
+        with self._alone(f"{recording.name}-{variant}"):
+            return make_variant(recording, variant, self.out / "inputs")
+
+    @contextmanager
+    def _alone(self, name: str) -> Generator[None]:
+        """Make sure that no other process works on something; wait until that one is finished.
+
+        Who holds one only waits for what it is made from, so none waits for itself.
+        """
+        folder = self.out / "locks"
+        folder.mkdir(parents=True, exist_ok=True)
+        with locked_file(folder / name):
+            yield
+
+    def _filled(self, method: Method, recording: Sequence, variant: str, folder: Path) -> Run:
+        _raise_again(folder)
+        given = self._make_variant(recording, variant)
+        title = f"{method.name} on {recording.name}"
+        if method.is_corrected:
+            base = self._run(method.base, recording, variant)
+            return correct(base, given, folder, title=title, method=method)
+        still, hands, noise = self._still(method), None, None
+        if method.name != still.name:
+            hands = self._run(still, recording, variant)
+        elif variant == DISTURBED_HAND:
+            hands = self._run(still, recording, "recording")
+            noise = HandNoise(error=HAND_NOISE, seed=noise_seed(recording, variant))
+        try:
+            return execute(
+                method,
+                given,
+                folder,
+                title=title,
+                common=self.common,
+                hands=hands,
+                noise=noise,
+                device=self.device,
+                progress=self.progress,
+            )
+        except UsageError as error:
+            told = f"Method '{method.name}' on sequence '{recording.name}': {error}"
+            raise UsageError(told) from error
+
+    def _simulated(self, source: Run, target: Sequence, folder: Path, *, title: str) -> Run:
+        """Simulate what was fitted elsewhere; a radius that reaches nothing there is no misuse."""
+        try:
+            with self._alone(folder.name):
+                _raise_again(folder, also=UsageError)
+                return simulate_in(
+                    source, target, folder, title=title, device=self.device, progress=self.progress
+                )
+        except UsageError as error:
+            raise FitError(str(error)) from error
+
+    def _still(self, method: Method) -> Method:
+        """Give the method whose run has the hands of a method: the static one, if they agree."""
+        static, own = METHODS["static"], method.base
+        if shared_stages(self._settings_of(static), self._settings_of(method)):
+            return static
+        if own.rule == "static":
+            return own
+        return replace(own, name=f"static for {own.name}", rule="static", gets="recording")
+
+    def _seconds(
+        self, method: Method, recording: Sequence, variant: str, run: Run
+    ) -> dict[str, float]:
+        """Give the time of each stage; one that was taken over took as long as where it was run.
+
+        A run that was stopped and went on does not know how long it took, so it has no times.
+        """
+        if run.attempt != 1:
+            return {}
+        seconds = {s["name"]: float(s.get("seconds", 0.0)) for s in run.stages()}
+        base = method.base
+        if method.is_corrected:
+            before = self._seconds(base, recording, variant, self._run(base, recording, variant))
+            return {**before, **seconds} if before else {}
+        still = self._still(base)
+        if base.name != still.name:
+            first = self._run(still, recording, variant)
+            taken = self._seconds(still, recording, variant, first)
+            shared = shared_stages(first.config["profile"], self._settings_of(base))
+            if not taken:
+                return {}
+            seconds |= {name: taken[name] for name in shared if name in taken}
+        return seconds
+
+    def _settings_of(self, method: Method) -> dict[str, Any]:
+        key = json.dumps([method.profile, dict(method.overrides)], sort_keys=True)
+        if key not in self._settings:
+            self._settings[key] = settings_of(method, self.common)
+        return self._settings[key]
+
+    def _folder(self, method: Method, recording: Sequence, variant: str) -> Path:
+        about = [variant, method.rule, method.is_corrected, self._settings_of(method)]
+        return self._cell(recording.name, method.name, about, recording)
+
+    def _cell(self, case: str, method: str, about: Any, recording: Sequence) -> Path:
+        parts = [
+            recording.fingerprint(),
+            method,
+            about,
+            self.device_name,
+            code_version(PREDICTIONS),
+        ]
+        key = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:12]
+        name = "".join(c if c.isalnum() else "_" for c in method)
+        return self.out / "cells" / f"{case[:28]}-{name[:20]}-{key}"
+
+
+def _raise_again(folder: Path, *, also: type[PhysHandiError] | None = None) -> None:
+    """Repeat how a cell failed before, rather than failing again for as long."""
+    found = read_mapping(folder / EXIT) if (folder / EXIT).is_file() else {}
+    kinds = {kind.__name__ for kind in (*FAILURES, also) if kind is not None}
+    if found.get("state") == "failed" and str(found.get("error_type", "")) in kinds:
+        raise FitError(str(found.get("error")))
+
+
+def _given(method: Method, variant: str) -> str:
+    return method.gets if variant == "recording" else variant
+
+
+def _as_one_split(recording: Sequence) -> Sequence:
+    meta = replace(recording.meta, reconstruction=recording.frame_count)
+    return Sequence(recording.folder, meta)

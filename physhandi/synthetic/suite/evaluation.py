@@ -1,0 +1,368 @@
+"""Evaluating methods on sequences: fills the cells of an order, and has tables written."""
+
+import logging
+import time
+from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Sequence as Many
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import warp as wp
+
+from physhandi.data.environment import describe_environment
+from physhandi.data.files import named_fields
+from physhandi.data.sequence import Sequence
+from physhandi.errors import MissingInputError, SequenceError, UsageError
+from physhandi.progress import NullProgress, Progress
+from physhandi.synthetic.code_version import (
+    PREDICTIONS,
+    SCORES,
+    code_version,
+    outdated,
+    told_version,
+)
+from physhandi.synthetic.suite.cells import FAILURES, Bench, Outcome
+from physhandi.synthetic.suite.folder import SuiteFolder, contact_kind, figures_of
+from physhandi.synthetic.suite.methods import METHODS, Method, parse_method, settings_of
+from physhandi.synthetic.suite.suite import RESERVED_SEED, Protocol
+
+SENSITIVITY = ((0.001, 3), (0.002, 3), (0.02, 3), (0.04, 3), (0.002, 1), (0.002, 10), (0.002, 50))
+"""Start values of virtual δ [m] and d_max: the rows of the paper's sensitivity table."""
+ROBUSTNESS = ("noisy_depth", "noisy_tracks", "noisy_hand")
+"""The paper's three disturbances."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Order:
+    """What is to be evaluated."""
+
+    title: str
+    """What the report is called."""
+    recordings: tuple[Sequence, ...]
+    """Sequences that methods are scored on."""
+    methods: tuple[str, ...]
+    """Names of methods."""
+    protocols: tuple[Protocol, ...] = ("main",)
+    """Which protocols are run."""
+    settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    """Settings that all methods share."""
+    device: str = "cpu"
+    """Warp device."""
+    command: str = ""
+    """The command that asks for it, which the report repeats."""
+    at_once: int = 1
+    """How many cells are computed side by side, which share the machine."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """One cell that a protocol asks for."""
+
+    protocol: Protocol
+    """What asks for it."""
+    split: str
+    """What the protocol calls it."""
+    method: Method
+    """Who is to fill it."""
+    recording: Sequence
+    """What it is scored against."""
+    variant: str = "recording"
+    """What the method is given."""
+    fitted: Sequence | None = None
+    """Where the object is fitted, if that is another recording."""
+
+
+def list_tasks(order: Order, methods: Many[Method]) -> Iterator[Task]:
+    """List the cells of an order, protocol by protocol and sequence by sequence.
+
+    Args:
+        order: What is to be evaluated.
+        methods: Its methods, read.
+
+    Yields:
+        Cells; an unseen interaction without `fitted` lacks another recording of the same body.
+    """
+    for protocol in order.protocols:
+        for recording in order.recordings:
+            for method in methods:
+                yield from _asked(protocol, order, method, recording)
+
+
+def _asked(protocol: Protocol, order: Order, method: Method, recording: Sequence) -> Iterator[Task]:
+    task = Task(protocol=protocol, split=protocol, method=method, recording=recording)
+    is_plain = method.gets == "recording"
+    if protocol == "main":
+        yield task
+    elif protocol == "single_view" and is_plain:
+        yield replace(task, variant="one_view")
+    elif protocol == "robustness" and is_plain:
+        for variant in ROBUSTNESS:
+            yield replace(task, variant=variant, split=variant)
+    elif protocol == "unseen" and not method.is_corrected:
+        yield replace(task, fitted=_other_of_same_object(recording, order.recordings))
+    elif protocol == "sensitivity" and is_plain and recording is order.recordings[0]:
+        starts = () if method.rule else SENSITIVITY
+        yield from (_started(task, *start) for start in starts)
+
+
+def _started(task: Task, radius: float, most: int) -> Task:
+    """Start a method's search elsewhere; it keeps its name, and the split tells where."""
+    start = {
+        "simulation.virtual_connection_radius": radius,
+        "simulation.virtual_max_neighbors": most,
+    }
+    method = replace(task.method, overrides={**task.method.overrides, **start})
+    return replace(task, method=method, split=f"start δ={1000 * radius:g} mm d_max={most}")
+
+
+def _other_of_same_object(recording: Sequence, others: Many[Sequence]) -> Sequence | None:
+    """Find the next recording of the same body in another action; around the end of the list."""
+    own, action = _body(recording)
+    order = list(others)
+    place = order.index(recording)
+    if own is None or action is None:
+        return None
+    for other in order[place + 1 :] + order[:place]:
+        body, done = _body(other)
+        if body == own and done is not None and done != action:
+            return other
+    return None
+
+
+def _body(recording: Sequence) -> tuple[tuple[Any, ...] | None, Any]:
+    """Identify the made body of a recording, and what is done with it.
+
+    Seed and object decide a body's size and material, for one version of the generator.
+    """
+    made = named_fields(recording.provenance.get("synthesize"))
+    if made is None:
+        return None, None
+    body = tuple(made.get(name) for name in ("object", "seed", "resolution"))
+    return (*body, told_version(recording)), made.get("action")
+
+
+_LOG = logging.getLogger(__name__)
+
+Fill = Callable[[Many[Task]], Iterator[int]]
+"""Has cells filled, and yields their numbers as they are finished, each once."""
+WRITE_EVERY = 600.0
+"""Tables are written after every protocol, and after this time [s]."""
+_SCORES = "synthetic/suite/folder.py"
+
+
+def evaluate(
+    order: Order, out: Path, progress: Progress | None = None, *, fill: Fill | None = None
+) -> dict[str, Any]:
+    """Run what is missing of an order, and write its tables.
+
+    Tables are written on the way too, and when the user stops it or something fails. What an
+    earlier order found out about the same sequences with the same code stays in them.
+
+    Args:
+        order: What is to be evaluated.
+        out: Folder of the suite; finished cells in it are not computed again.
+        progress: Told about every cell, and about every iteration in it.
+        fill: Has others fill the cells ahead, by `filler`; without it they are filled here, one
+            after the other.
+
+    Returns:
+        ``out``, ``table`` and ``report`` (paths), ``cells`` and ``failed`` (numbers of cells),
+        ``skipped`` (why some could not be asked for) and ``notes`` (what to know of the data).
+
+    Raises:
+        UsageError: If a method is unknown, there is nothing to evaluate, or the folder holds the
+            table of other sequences.
+        MissingInputError: If no recording can be observed at all.
+        CancelledError: If the user asked to stop; what is finished stays.
+    """
+    progress = progress or NullProgress()
+    order, methods, tasks = _read(order)
+    folder = SuiteFolder(out, _about(order, methods))
+    for note in folder.about["notes"]:
+        _LOG.warning("%s", note)
+    work = _Work(order, out, progress)
+    finished, paths, written = 0, dict[str, Any](), time.monotonic()
+    before = ""
+
+    def write() -> dict[str, Any]:
+        return folder.write(_environment(order), work.skipped, len(tasks) - finished)
+
+    try:
+        for number in range(len(tasks)) if fill is None else fill(tasks):
+            task = tasks[number]
+            is_other, before = task.protocol != before, task.protocol
+            if folder.done and (is_other or time.monotonic() - written > WRITE_EVERY):
+                paths, written = write(), time.monotonic()
+            progress.check_cancelled()
+            told = f"{task.method.name}, {task.recording.name}"
+            progress.report("suite", finished, len(tasks), message=told)
+            cell = work.cell(task)
+            finished += 1
+            if cell is not None:
+                folder.done.append(cell)
+        progress.report("suite", len(tasks), len(tasks))
+    finally:
+        if folder.done:
+            paths = write()
+    work.raise_if_blind()
+    return (paths or write()) | {
+        "cells": len(folder.done),
+        "failed": sum(bool(cell["error"]) for cell in folder.done),
+        "skipped": work.skipped,
+        "notes": [*folder.about["notes"], *folder.notes],
+    }
+
+
+def filler(order: Order, out: Path, progress: Progress) -> Callable[[int], None]:
+    """Prepare to fill single cells of an order, beside other processes that fill others.
+
+    Args:
+        order: The order, the same for all of them.
+        out: Folder of the suite.
+        progress: Told about every iteration.
+
+    Returns:
+        Fills the cell of a number, as `evaluate` counts them; nothing is to be done for one that
+        nobody could fill.
+    """
+    order, _, tasks = _read(order)
+    work = _Work(order, out, progress)
+
+    def fill(number: int) -> None:
+        work.outcome(tasks[number])
+
+    return fill
+
+
+class _Work:
+    """Fills cells, and remembers which could not be asked for."""
+
+    def __init__(self, order: Order, out: Path, progress: Progress) -> None:
+        self.bench = Bench(out, common=order.settings, device=order.device, progress=progress)
+        self.recordings = order.recordings
+        self.skipped: list[str] = []
+        self._blind: dict[str, str] = {}
+
+    def cell(self, task: Task) -> dict[str, Any] | None:
+        """Fill a cell and describe it; None if it cannot be asked for."""
+        outcome = self.outcome(task)
+        return None if outcome is None else self._described(task, outcome)
+
+    def outcome(self, task: Task) -> Outcome | None:
+        """Fill a cell; None if it cannot be asked for."""
+        for recording in filter(None, (task.recording, task.fitted)):
+            reason = self._why_blind(recording)
+            if reason:
+                self._skip(f"{recording.name}: {reason}")
+                return None
+        if task.protocol == "unseen" and task.fitted is None:
+            self._skip(
+                f"{task.recording.name}, unseen: no other sequence shows the same body in another "
+                "action."
+            )
+            return None
+        for recording in filter(None, (task.recording, task.fitted)):
+            reason = self.bench.lacks(task.method, recording, task.variant)
+            if reason:
+                self._skip(f"{task.method.name}, {task.recording.name}, {task.split}: {reason}")
+                return None
+        if task.fitted is not None:
+            return self.bench.unseen(task.method, task.fitted, task.recording)
+        return self.bench.outcome(task.method, task.recording, task.variant)
+
+    def raise_if_blind(self) -> None:
+        """Tell that nothing can be scored at all.
+
+        Raises:
+            MissingInputError: If no recording can be observed.
+        """
+        if self._blind and all(self._blind.get(r.name) for r in self.recordings):
+            raise MissingInputError(f"No sequence can be evaluated. {' '.join(self.skipped)}")
+
+    def _why_blind(self, recording: Sequence) -> str:
+        """Say why nothing of a recording can be scored, whatever the method; empty if it can."""
+        if recording.name not in self._blind:
+            reason = ""
+            try:
+                self.bench.outcome(METHODS["static"], recording)
+            except (*FAILURES, SequenceError) as error:
+                reason = str(error)
+            self._blind[recording.name] = reason
+        return self._blind[recording.name]
+
+    def _skip(self, reason: str) -> None:
+        if reason not in self.skipped:
+            self.skipped.append(reason)
+
+    def _described(self, task: Task, outcome: Outcome) -> dict[str, Any]:
+        unmoved = None
+        if outcome.error and task.method.rule is None:
+            static = self.bench.reference(task.recording)
+            unmoved = static.array(f"sequences/{task.recording.name}/rollout.npy")[0]
+        figures = figures_of(outcome, task.recording, task.protocol, task.split, unmoved)
+        return {
+            "protocol": task.protocol,
+            "split": task.split,
+            "method": outcome.method,
+            "case": outcome.case,
+            "variant": outcome.variant,
+            "run": outcome.run,
+            "error": outcome.error,
+            "contact": contact_kind(task.recording),
+            "seconds": dict(outcome.seconds),
+            "figures": figures,
+            "curves": dict(outcome.curves),
+        }
+
+
+def _environment(order: Order) -> dict[str, Any]:
+    return describe_environment(order.device, wp.get_device(order.device).name)
+
+
+def _about(order: Order, methods: Many[Method]) -> dict[str, Any]:
+    environment = _environment(order)
+    made = [named_fields(r.provenance.get("synthesize")) or {} for r in order.recordings]
+    seeds = sorted({one["seed"] for one in made if isinstance(one.get("seed"), int)})
+    told = [told_version(recording) for recording in order.recordings]
+    return {
+        "title": order.title,
+        "command": order.command,
+        "methods": {method.name: method.about for method in methods},
+        "oracles": [method.name for method in methods if method.gets != "recording"],
+        "cases": [recording.name for recording in order.recordings],
+        "protocols": list(order.protocols),
+        "settings": dict(order.settings),
+        "at_once": order.at_once,
+        "seeds": seeds,
+        "is_verification": any(seed >= RESERVED_SEED for seed in seeds),
+        "presets": sorted({str(one["preset"]) for one in made if "preset" in one}),
+        "generators": sorted({version for version in told if version}),
+        "notes": [note for recording in order.recordings if (note := outdated(recording))],
+        "made_from": {
+            "code": code_version((*PREDICTIONS, *SCORES, _SCORES)),
+            "settings": dict(order.settings),
+            "device": [environment["device"], environment["device_name"]],
+            "packages": environment["packages"],
+            "sequences": {r.name: r.fingerprint() for r in order.recordings},
+        },
+    }
+
+
+def _read(order: Order) -> tuple[Order, tuple[Method, ...], list[Task]]:
+    """Read an order: each protocol once, its methods, and the cells that it asks for."""
+    methods = tuple(parse_method(name) for name in dict.fromkeys(order.methods))
+    order = replace(order, protocols=tuple(dict.fromkeys(order.protocols)))
+    _check(order, methods)
+    return order, methods, list(list_tasks(order, methods))
+
+
+def _check(order: Order, methods: Many[Method]) -> None:
+    names = [recording.name for recording in order.recordings]
+    if not names or not methods:
+        raise UsageError("There is nothing to evaluate: name at least one sequence and one method.")
+    doubled = [name for name in names if names.count(name) > 1]
+    if doubled:
+        raise UsageError(f"Two sequences are named '{doubled[0]}'. Rename one of them.")
+    for method in methods:
+        settings_of(method, order.settings)

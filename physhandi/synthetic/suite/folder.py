@@ -1,0 +1,326 @@
+"""What a suite's folder tells: its cells, and the tables made of them.
+
+Tables are made of cells alone, so that they can be written while others are still computed, and so
+that cells of an earlier order for the same sequences stay in them.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Sequence as Many
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from physhandi.data.files import named_fields, write_bytes, write_json
+from physhandi.data.run_folder import read_json
+from physhandi.data.sequence import Sequence
+from physhandi.data.truth import read_truth
+from physhandi.errors import UsageError
+from physhandi.metrics.contact import THRESHOLDS, ContactLabels, contact_scores, true_labels
+from physhandi.metrics.report import CONTACT_METRICS, METRICS
+from physhandi.metrics.suite_report import (
+    PAIRED_COLUMNS,
+    Score,
+    compare,
+    summarise,
+    to_csv,
+    write_report,
+)
+from physhandi.synthetic.suite.cells import Outcome
+
+DENSE_ACTIONS = ("squeeze", "wipe")
+"""Actions of made recordings in which the whole hand is on the body; others use fingertips."""
+DENSE = 0.05
+"""Of other recordings contact is dense if a hand touches more than this share of the object's
+places on average, in the frames in which it touches any."""
+_SPLITS = ("reconstruction", "future")
+_HANDS = {"chamfer_symmetric": "hand_chamfer", "mpjpe": "mpjpe", "surface_error": "hand_surface"}
+_SHADED = ("iou", "psnr")
+_TOPOLOGY = ("rrd_object", "rrd_virtual")
+
+Figures = dict[str, dict[str, float]]
+"""Figures by split and metric."""
+
+
+def contact_kind(recording: Sequence) -> Literal["dense", "point"] | None:
+    """Tell by its action, else by its true contact, how much is held; None if unknown."""
+    made = named_fields(recording.provenance.get("synthesize")) or {}
+    if made.get("action") is not None:
+        return "dense" if made["action"] in DENSE_ACTIONS else "point"
+    contact = read_truth(recording.folder).contact
+    if contact is None or not contact.any():
+        return None
+    share = contact.mean(axis=1)
+    return "dense" if share[share > 0].mean() > DENSE else "point"
+
+
+def figures_of(
+    outcome: Outcome,
+    recording: Sequence,
+    protocol: str,
+    name: str,
+    unmoved: Float[ndarray, "node 3"] | None = None,
+) -> Figures:
+    """Collect the figures of a cell.
+
+    Args:
+        outcome: What came out of it.
+        recording: What it was scored against.
+        protocol: Protocol that asked for it.
+        name: What the protocol calls it; the first part of every split but those of ``main``.
+        unmoved: Object nodes of frame 0, if the method predicts contact [m].
+
+    Returns:
+        Every figure that is known. A method without output has those of the static object, which
+        touches nothing; and none of hands, topology and time. Nor has an object in a sequence that
+        it was not fitted in.
+    """
+
+    def named(split: str) -> str:
+        return split if protocol == "main" else f"{name}/{split}"
+
+    found: dict[str, Mapping[str, Any]] = {}
+    for split in _SPLITS[:1] if protocol == "unseen" else _SPLITS:
+        rollout = outcome.report.get(split, {}).get("rollout", {})
+        figures = {metric: rollout.get(metric) for metric in (*METRICS, *_SHADED)}
+        if outcome.error and rollout and unmoved is not None:
+            figures |= no_contact_scores(recording, unmoved, _frames(recording, protocol, split))
+        # All frames of an unseen interaction are in the first split.
+        found["unseen" if protocol == "unseen" else named(split)] = figures
+    if not outcome.error and protocol != "unseen":
+        found[named("hands")] = _hand_figures(outcome.report.get("hands", {}))
+        topology = outcome.report.get("topology", {})
+        found[named("topology")] = {metric: topology.get(metric) for metric in _TOPOLOGY}
+        if protocol == "main":
+            found["runtime"] = _times(outcome.seconds, recording.frame_count)
+    known = {
+        split: {m: float(v) for m, v in figures.items() if isinstance(v, int | float)}
+        for split, figures in found.items()
+    }
+    return {split: figures for split, figures in known.items() if figures}
+
+
+def scores_of(cells: Iterable[Mapping[str, Any]]) -> Iterator[Score]:
+    """List the figures of cells; those of the protocol ``main`` also by their kind of contact.
+
+    Args:
+        cells: Entries with ``method case protocol contact figures``.
+    """
+    for cell in cells:
+        figures = dict(cell["figures"])
+        if cell["protocol"] == "main" and cell["contact"]:
+            kind = cell["contact"]
+            figures |= {f"{s}/{kind}": figures[s] for s in _SPLITS if s in figures}
+        for split, by_metric in figures.items():
+            for metric, value in by_metric.items():
+                yield Score(
+                    method=cell["method"],
+                    case=cell["case"],
+                    split=split,
+                    metric=metric,
+                    value=float(value),
+                )
+
+
+def no_contact_scores(
+    recording: Sequence, node: Float[ndarray, "node 3"], frames: Iterable[int]
+) -> dict[str, float | None]:
+    """Score a prediction that nothing is ever touched, where the true contact is known.
+
+    Without it a method that fails where contact is hard would be averaged over what is easy.
+
+    Args:
+        recording: The recording; without true contact there is no figure.
+        node: Object nodes of frame 0 [m].
+        frames: Frames to score; frame 0 is left out.
+    """
+    labels = true_labels(read_truth(recording.folder), node)
+    chosen = [frame for frame in frames if frame > 0]
+    if labels is None or not chosen:
+        return {}
+    in_frames = ContactLabels(
+        is_contact=labels.is_contact[chosen], is_known=labels.is_known[chosen]
+    )
+    nothing = np.zeros_like(in_frames.is_contact)
+    scores: dict[str, float | None] = {}
+    for threshold in THRESHOLDS:
+        scores |= contact_scores(nothing, in_frames, threshold)
+    return {metric: scores.get(metric.removeprefix("contact_")) for metric in CONTACT_METRICS}
+
+
+def _frames(recording: Sequence, protocol: str, split: str) -> range:
+    if protocol == "unseen":
+        return range(recording.frame_count)
+    is_fitted = split == "reconstruction"
+    return recording.reconstruction_frames if is_fitted else recording.future_frames
+
+
+def _hand_figures(hands: Mapping[str, Any]) -> dict[str, Any]:
+    """Average over the hands that have a figure."""
+    found: dict[str, Any] = {}
+    for key, name in _HANDS.items():
+        known = [hand[key] for hand in hands.values() if isinstance(hand.get(key), float)]
+        if known:
+            found[name] = sum(known) / len(known)
+    return found
+
+
+def _times(seconds: Mapping[str, float], frame_count: int) -> dict[str, Any]:
+    """Give the time that a video frame took in each stage, and in all of them."""
+    times = {f"seconds_per_frame_{stage}": s / frame_count for stage, s in seconds.items()}
+    return times | ({"seconds_per_frame": sum(times.values())} if times else {})
+
+
+CELLS = "cells.json"
+"""What was asked for, and every cell with its figures."""
+CURVES = "curves.json"
+"""Errors frame by frame of the same cells, in the same order."""
+_KEY = ("protocol", "split", "method", "case")
+
+Cell = dict[str, Any]
+
+
+class SuiteFolder:
+    """The tables in a folder, which grow with every cell."""
+
+    def __init__(self, out: Path, about: Mapping[str, Any]) -> None:
+        """Read what is there; nothing is written yet.
+
+        Args:
+            out: The folder.
+            about: What is asked for now: ``title methods oracles cases protocols made_from`` and
+                more.
+
+        Raises:
+            UsageError: If the folder holds the table of another order.
+        """
+        self.out = out
+        self.about = dict(about)
+        self.done: list[Cell] = []
+        before = check_folder(out, about["title"], about["cases"])
+        self._earlier: list[Cell] = []
+        self._skipped: list[str] = []
+        self.notes: list[str] = []
+        if before is None:
+            return
+        told = before["about"]
+        methods = {n: text for n, text in told["methods"].items() if n not in about["methods"]}
+        if told.get("made_from") == about["made_from"]:
+            self._earlier = _with_curves(out, before["cells"])
+            self._skipped = list(told["skipped"])
+            self.about["methods"] = {**told["methods"], **about["methods"]}
+            self.about["oracles"] = list(dict.fromkeys([*told["oracles"], *about["oracles"]]))
+            self.about["protocols"] = list(dict.fromkeys([*told["protocols"], *about["protocols"]]))
+        elif methods:
+            self.notes.append(
+                "Left out, because they were computed with other code, settings or data: "
+                f"{', '.join(methods)}. Evaluate them again to have them in this table."
+            )
+
+    def write(
+        self, environment: Mapping[str, Any], skipped: Many[str], missing: int
+    ) -> dict[str, Any]:
+        """Write cells, tables, report and charts of what is known by now.
+
+        Args:
+            environment: What it was computed with.
+            skipped: What could not be asked for, and why.
+            missing: Number of cells that are asked for and not finished.
+
+        Returns:
+            ``out``, ``table`` and ``report``: paths.
+        """
+        cells = self._all_cells()
+        shown = {cell["method"] for cell in cells}
+        about = self.about | {
+            "methods": {n: text for n, text in self.about["methods"].items() if n in shown},
+            "notes": [*self.about["notes"], *self.notes],
+            "skipped": list(dict.fromkeys([*self._skipped, *skipped])),
+            "missing": missing,
+            "environment": dict(environment),
+        }
+        scores = list(scores_of(cells))
+        rows = summarise(scores)
+        methods = list(about["methods"])
+        against = "phystwin" if "phystwin" in methods else (methods or [""])[0]
+        differences = compare(scores, against)
+        files = write_report(about, rows, differences, cells)
+        about["charts"] = [Path(file).name for file in files if file.startswith("charts/")]
+        files |= {"table.csv": to_csv(rows), "paired.csv": to_csv(differences, PAIRED_COLUMNS)}
+        for file, content in files.items():
+            (self.out / file).parent.mkdir(parents=True, exist_ok=True)
+            write_bytes(self.out / file, content.encode())
+        write_json(self.out / CURVES, {"curves": [cell["curves"] for cell in cells]})
+        plain = [{name: v for name, v in cell.items() if name != "curves"} for cell in cells]
+        write_json(self.out / CELLS, {"about": about, "cells": plain})
+        return {
+            "out": str(self.out),
+            "table": str(self.out / "table.csv"),
+            "report": str(self.out / "report.md"),
+        }
+
+    def _all_cells(self) -> list[Cell]:
+        """Put what is finished beside what is kept of earlier orders, in the order of tables."""
+        new = {_key(cell) for cell in self.done}
+        kept = [
+            cell
+            for cell in self._earlier
+            if _key(cell) not in new and (not cell["run"] or self._has_run(cell["run"]))
+        ]
+        places = [list(self.about[name]) for name in ("protocols", "cases", "methods")]
+
+        def place(cell: Cell) -> tuple[int, ...]:
+            named = (cell["protocol"], cell["case"], cell["method"])
+            return tuple(known.index(name) for known, name in zip(places, named, strict=True))
+
+        return sorted([*kept, *self.done], key=place)
+
+    def _has_run(self, name: str) -> bool:
+        return (self.out / "cells" / name / "run.yaml").is_file()
+
+
+def check_folder(out: Path, title: str, cases: Iterable[str]) -> dict[str, Any] | None:
+    """Read what a folder holds, and refuse it if that is the table of another order.
+
+    Args:
+        out: The folder.
+        title: Title of what is asked for now.
+        cases: Names of its sequences.
+
+    Returns:
+        ``about`` and ``cells``; None if there is no table.
+
+    Raises:
+        UsageError: If the table is of other sequences, or cannot be read.
+    """
+    path = out / CELLS
+    if not path.is_file():
+        return None
+    content = named_fields(read_json(path)) or {}
+    about = named_fields(content.get("about"))
+    cells = content.get("cells")
+    wanted = ("title", "methods", "cases", "protocols", "skipped")
+    if about is None or not isinstance(cells, list) or any(name not in about for name in wanted):
+        raise UsageError(f"{path} is damaged. Delete it; finished cells are kept without it.")
+    wanted_cases = list(cases)
+    if about["title"] != title or set(about["cases"]) != set(wanted_cases):
+        raise UsageError(
+            f"{out} holds the table '{about['title']}' of {', '.join(about['cases'])}, which "
+            f"'{title}' of {', '.join(wanted_cases)} would replace. Choose another --out."
+        )
+    return {"about": about, "cells": cast("list[Cell]", cells)}
+
+
+def _with_curves(out: Path, cells: Many[Cell]) -> list[Cell]:
+    path = out / CURVES
+    curves = (named_fields(read_json(path)) or {}).get("curves") if path.is_file() else None
+    if not isinstance(curves, list) or len(cast("list[Any]", curves)) != len(cells):
+        curves = [{} for _ in cells]
+    both = zip(cells, cast("list[Any]", curves), strict=True)
+    return [{**cell, "curves": curve} for cell, curve in both]
+
+
+def _key(cell: Cell) -> tuple[str, ...]:
+    return tuple(cell[name] for name in _KEY)

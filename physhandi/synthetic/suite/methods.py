@@ -1,0 +1,409 @@
+"""Methods of a suite: every baseline and every profile as one kind of run of the pipeline.
+
+A method is written ``BASE[@SETTING=VALUE,…][+last_residual]``: `METHODS` has the bases, and the
+settings are those of a profile.
+"""
+
+import re
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import warp as wp
+import yaml
+from safetensors.numpy import load_file
+from scipy.spatial.transform import Rotation
+
+from physhandi import pipeline
+from physhandi.data.attempt import Attempt
+from physhandi.data.environment import ENVIRONMENT, describe_environment
+from physhandi.data.run import Run
+from physhandi.data.run_folder import artefacts
+from physhandi.data.sequence import Sequence
+from physhandi.errors import MissingInputError, UsageError
+from physhandi.hand.model import load_hand_model
+from physhandi.hand.motion import HandMotion
+from physhandi.metrics.baselines import (
+    last_residual_baseline,
+    rigid_follow_baseline,
+    static_baseline,
+)
+from physhandi.metrics.report import measure_run
+from physhandi.progress import Progress
+
+HAND_NOISE = 0.010
+"""Mean joint error of the paper's disturbed hands [m]."""
+_PLACE, _TURN, _POSE = 0.01, 0.1, 0.1
+_HALVINGS = 30
+_MOST = 8.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class HandNoise:
+    """How hands are made wrong."""
+
+    error: float
+    """Mean distance of the joints from where they were [m]."""
+    seed: int
+    """Of the noise; another one for every recording, or all would be wrong in the same way."""
+
+
+def disturb_hands(attempt: Attempt, folder: str, noise: HandNoise) -> None:
+    """Replace the stored hands of a sequence by wrong ones; twice would be too much.
+
+    Args:
+        attempt: Holds hands as they were fitted.
+        folder: Folder of the sequence in it.
+        noise: How wrong they become.
+
+    Raises:
+        MissingInputError: If there is no hand.
+    """
+    paths = sorted((attempt.out / folder).glob("hand_*.safetensors"))
+    if not paths:
+        raise MissingInputError(f"{attempt.out / folder} has no hand to disturb.")
+    for number, path in enumerate(paths):
+        motion = HandMotion.from_tensors(load_file(path))
+        wrong = disturbed(motion, noise.error, seed=(noise.seed, number))
+        attempt.save_tensors(f"{folder}/{path.name}", wrong.to_tensors())
+
+
+def disturbed(motion: HandMotion, error: float, *, seed: tuple[int, ...]) -> HandMotion:
+    """Disturb place, turn and pose of a hand in every frame by itself.
+
+    Each wrist coordinate gets normal noise of 10 mm, wrist and joints 0.1 rad about each axis;
+    everything is then scaled by one factor, so that the mean joint error is what was asked for.
+
+    Args:
+        motion: The hand.
+        error: Mean distance of its 21 joints from where they were [m].
+        seed: Of the noise.
+    """
+    random = np.random.default_rng([4, *seed])
+    count = motion.frame_count
+    place = _PLACE * random.standard_normal((count, 3))
+    turn = _TURN * random.standard_normal((count, 3))
+    pose = _POSE * random.standard_normal((count, 15, 3))
+    model = load_hand_model(motion.side, motion.model)
+    before = motion.keypoints(model)
+
+    def moved(share: float) -> HandMotion:
+        rotation = Rotation.from_rotvec(motion.wrist_rotation) * Rotation.from_rotvec(share * turn)
+        return replace(
+            motion,
+            articulation=(motion.articulation + share * pose).astype(np.float32),
+            wrist_rotation=rotation.as_rotvec().astype(np.float32),
+            wrist_translation=(motion.wrist_translation + share * place).astype(np.float32),
+        )
+
+    low, high = 0.0, _MOST
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        gap = np.linalg.norm(moved(middle).keypoints(model) - before, axis=2).mean()
+        low, high = (middle, high) if gap < error else (low, middle)
+    return moved(high)
+
+
+Given = Literal["recording", "true_hand", "all_frames"]
+CORRECTION = "last_residual"
+"""Ends the name of a method whose predicted frames are shifted by its last residual."""
+_NAME = re.compile(
+    r"(?P<base>[^@+]*)(@(?P<settings>.*?))?(\+(?P<correction>[A-Za-z]\w*))?", re.DOTALL
+)
+_OPENING, _CLOSING = "[{(", "]})"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Method:
+    """How the object's motion is predicted."""
+
+    name: str
+    """What it is called in tables."""
+    about: str
+    """What it does, in one sentence."""
+    profile: str = "default"
+    """Settings of the hands and, if there is no rule, of the object."""
+    rule: Literal["static", "rigid_follow"] | None = None
+    """What moves the object in place of a fit."""
+    gets: Given = "recording"
+    """What it is given: an oracle gets what no real method can have."""
+    overrides: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    """Settings that differ from the profile's."""
+    is_corrected: bool = False
+    """Whether the last residual is added to the predicted frames."""
+
+    @property
+    def base(self) -> "Method":
+        """The same without the correction."""
+        name = self.name.removesuffix(f"+{CORRECTION}")
+        return replace(self, name=name, is_corrected=False)
+
+
+METHODS = {
+    method.name: method
+    for method in (
+        Method(name="static", rule="static", about="The object of frame 0, unmoved."),
+        Method(
+            name="rigid_follow",
+            rule="rigid_follow",
+            about="The object of frame 0, moved rigidly with the hands.",
+        ),
+        Method(
+            name="phystwin",
+            profile="phystwin",
+            about="PhysTwin's choices: 30 visible hand points, far from each other, at rest "
+            "velocity; one global dashpot.",
+        ),
+        Method(name="paper", profile="paper", about="The paper's method as it states it."),
+        Method(name="ours", about="The default profile."),
+        Method(name="quick", profile="quick", about="The default profile, cut down."),
+        Method(
+            name="oracle_hand",
+            gets="true_hand",
+            about="The default profile, given the true hands: what remains is the object's error.",
+        ),
+        Method(
+            name="oracle_parameters",
+            gets="all_frames",
+            about="The default profile, fitted to the future frames too: one optimisation in "
+            "hindsight; other parameters might do better still.",
+        ),
+    )
+}
+"""Bases that a method can start from."""
+
+
+def parse_method(text: str) -> Method:
+    """Read the name of a method.
+
+    Raises:
+        UsageError: If there is no such base, setting or correction, or nothing to be corrected;
+            names it.
+    """
+    found = _NAME.fullmatch(text)
+    base, settings, correction = (
+        found.group("base", "settings", "correction") if found else (text,) * 3
+    )
+    if base not in METHODS:
+        raise UsageError(f"There is no method '{base}'. Choose from: {', '.join(METHODS)}.")
+    if correction not in (None, CORRECTION):
+        raise UsageError(f"Method '{text}' ends in '+{correction}'; only '+{CORRECTION}' exists.")
+    overrides: dict[str, Any] = {}
+    for part in () if settings is None else _split(settings):
+        path, equals, value = part.partition("=")
+        if not equals:
+            raise UsageError(f"Method '{text}': '{part}' is not SETTING=VALUE.")
+        try:
+            overrides[path] = yaml.safe_load(value)
+        except yaml.YAMLError:
+            raise UsageError(f"Method '{text}': '{value}' is not a value of YAML.") from None
+    start, is_corrected = METHODS[base], correction is not None
+    if is_corrected and start.gets == "all_frames":
+        raise UsageError(
+            f"Method '{text}' has no predicted frames, since '{base}' is fitted to all of them: "
+            f"leave '+{CORRECTION}' out."
+        )
+    about = f"{start.about} The last residual is added." if is_corrected else start.about
+    method = replace(start, name=text, about=about, overrides=overrides, is_corrected=is_corrected)
+    settings_of(method, {})
+    return method
+
+
+def settings_of(method: Method, common: Mapping[str, Any]) -> dict[str, Any]:
+    """Give all settings of a method, in plain data.
+
+    Args:
+        method: The method; its own settings win.
+        common: Settings that all methods of a suite share.
+
+    Raises:
+        UsageError: If a setting is unknown or out of bounds.
+    """
+    return pipeline.settings_of(method.profile, {**common, **method.overrides})
+
+
+def execute(
+    method: Method,
+    recording: Sequence,
+    folder: Path,
+    *,
+    title: str,
+    common: Mapping[str, Any],
+    hands: Run | None = None,
+    noise: HandNoise | None = None,
+    device: str = "cpu",
+    progress: Progress,
+) -> Run:
+    """Let a method fill a run folder; a finished one is left as it is, another one goes on.
+
+    Args:
+        method: The method, not corrected.
+        recording: What it is given.
+        folder: The run folder.
+        title: What the run is called.
+        common: Settings that all methods of a suite share.
+        hands: A finished run on the same recording, whose stages are taken over as far as the
+            settings that they depend on are the same.
+        noise: Makes the hands that are taken over wrong, and nothing but hands is taken over.
+        device: Warp device.
+        progress: Told about every iteration.
+
+    Raises:
+        PhysHandiError: If the method has no result; the run folder then says why.
+    """
+    settings = settings_of(method, common)
+    run = open_run(folder, title, recording, {"profile": settings, "method": method.name})
+    if run.is_published:
+        return run
+    with run.begin_attempt() as attempt:
+        watched = attempt.progress(progress)
+        save_environment(attempt, device)
+        if hands is not None and noise is not None:
+            take_disturbed_hands(hands, attempt, recording.name, noise)
+        elif hands is not None:
+            take_stages(hands, attempt, shared_stages(hands.config["profile"], settings))
+        config = pipeline.config_from_dict(settings)
+        if method.rule is None:
+            pipeline.reconstruct([recording], config, attempt, watched, device=device)
+        else:
+            rule = partial(_moved, rule=method.rule)
+            pipeline.predict(recording, config, rule, attempt, watched)
+        attempt.publish()
+    return Run.open(folder)
+
+
+def correct(base: Run, recording: Sequence, folder: Path, *, title: str, method: Method) -> Run:
+    """Copy a finished run with its last residual added to the predicted frames.
+
+    Raises:
+        MissingInputError: If no track is seen in the last frame that was fitted.
+    """
+    config = {**base.config, "method": method.name, "source": str(base.folder.resolve())}
+    run = open_run(folder, title, recording, config)
+    if run.is_published:
+        return run
+    inside = f"sequences/{recording.name}"
+    with run.begin_attempt() as attempt:
+        for rel, path in artefacts(base.out):
+            _copy(path, attempt.out / rel)
+        seen = {n: base.array(f"{inside}/observation/{n}.npy") for n in ("point", "is_visible")}
+        name = f"{inside}/observation/node_of_track.npy"
+        try:
+            rollout = last_residual_baseline(
+                base.array(f"{inside}/rollout.npy"),
+                **seen,
+                first_future=len(recording.reconstruction_frames),
+                node_of_track=base.array(name) if base.has(name) else None,
+            )
+        except ValueError as error:
+            raise MissingInputError(f"Sequence '{recording.name}': {error}.") from error
+        attempt.save_array(f"{inside}/rollout.npy", rollout.astype(np.float32))
+        scores, frames = measure_run(attempt.out, recording)
+        attempt.save_json(f"{inside}/frame_errors.json", frames)
+        attempt.save_json("metrics.json", {recording.name: scores})
+        attempt.finish_stage(CORRECTION)
+        attempt.publish()
+    return Run.open(folder)
+
+
+def simulate_in(
+    source: Run, target: Sequence, folder: Path, *, title: str, device: str, progress: Progress
+) -> Run:
+    """Simulate a fitted object in a sequence that it was not fitted in.
+
+    Raises:
+        PhysHandiError: If there is no result; the run folder then says why.
+    """
+    if (folder / "run.yaml").is_file():
+        run = Run.open(folder)
+    else:
+        run = Run.create(
+            folder,
+            name=title,
+            kind="simulation",
+            sequences=[str(target.folder)],
+            config={"source": str(source.folder.resolve()), "parameters": {}},
+        )
+    if not run.is_published:
+        pipeline.run_job(run, progress, device=device)
+    return Run.open(folder)
+
+
+def open_run(folder: Path, title: str, recording: Sequence, config: Mapping[str, Any]) -> Run:
+    """Open the run in a folder, or make it."""
+    if (folder / "run.yaml").is_file():
+        return Run.open(folder)
+    return Run.create(
+        folder,
+        name=title,
+        kind="reconstruction",
+        sequences=[str(recording.folder)],
+        config=config,
+    )
+
+
+def save_environment(attempt: Attempt, device: str) -> None:
+    """Note what a run was computed with."""
+    about = describe_environment(device, wp.get_device(device).name)
+    attempt.save_json(ENVIRONMENT, about)
+
+
+def shared_stages(one: Mapping[str, Any], other: Mapping[str, Any]) -> tuple[str, ...]:
+    """Name the first stages whose result is the same under two settings of the pipeline."""
+    if one["hand"] != other["hand"]:
+        return ()
+    nodes = ("node_spacing", "control_nodes", "control_count")
+    if any(one[name] != other[name] for name in nodes):
+        return (pipeline.HANDS,)
+    return (pipeline.HANDS, pipeline.OBSERVATION)
+
+
+def take_stages(source: Run, attempt: Attempt, names: tuple[str, ...]) -> None:
+    """Take over finished stages of another run on the same recording."""
+    for stage in source.stages():
+        if stage["name"] in names and not attempt.stage_done(stage["name"]):
+            for rel in stage["files"]:
+                _copy(source.out / rel, attempt.out / rel)
+            attempt.finish_stage(stage["name"], stage["summary"])
+
+
+def take_disturbed_hands(source: Run, attempt: Attempt, name: str, noise: HandNoise) -> None:
+    """Take over the hands of another run on the same recording, and make them wrong once.
+
+    The stage counts as finished only when they are wrong: what a kill leaves before that is not
+    taken over by the next attempt, and what is finished is left as it is.
+    """
+    if attempt.stage_done(pipeline.HANDS):
+        return
+    (stage,) = (stage for stage in source.stages() if stage["name"] == pipeline.HANDS)
+    for rel in stage["files"]:
+        _copy(source.out / rel, attempt.out / rel)
+    disturb_hands(attempt, f"sequences/{name}", noise)
+    attempt.finish_stage(pipeline.HANDS, stage["summary"])
+
+
+def _split(settings: str) -> list[str]:
+    """Split at commas, but not inside of brackets."""
+    parts, depth = [""], 0
+    for letter in settings:
+        depth += (letter in _OPENING) - (letter in _CLOSING)
+        if letter == "," and depth == 0:
+            parts.append("")
+        else:
+            parts[-1] += letter
+    return parts
+
+
+def _moved(node: np.ndarray, control: np.ndarray, *, rule: str) -> np.ndarray:
+    if rule == "static":
+        return static_baseline(node, len(control))
+    return rigid_follow_baseline(node, control)
+
+
+def _copy(source: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(source, target)

@@ -1,0 +1,253 @@
+"""What the suites hold: scenes, seeds, effort and methods.
+
+Difficulty is set here and in the scenes, once, before any method is tuned. Seeds from
+`RESERVED_SEED` on are kept for verification; nothing may be tuned on them.
+"""
+
+import inspect
+from collections.abc import Callable, Mapping
+from collections.abc import Sequence as Many
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from physhandi.data.files import named_fields
+from physhandi.data.sequence import Sequence
+from physhandi.errors import UsageError
+from physhandi.progress import Progress
+
+SuiteName = Literal["tiny", "dev", "full"]
+Protocol = Literal["main", "single_view", "unseen", "robustness", "sensitivity"]
+Making = Mapping[str, Any]
+"""What the generator is told of one sequence."""
+RESERVED_SEED = 1000
+"""Seeds from here on are reserved for verification."""
+BASELINES = ("static", "rigid_follow", "phystwin")
+"""Methods that every table carries."""
+ORACLES = ("oracle_hand", "oracle_parameters")
+"""Methods that are given what no real method can have."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """One scene of a suite; with a seed it becomes a sequence."""
+
+    object_: str
+    """What is handled: cloth, towel, rope, plush or pouch."""
+    action: str
+    """What is done with it: lift, fold, stretch, squeeze, wipe or push."""
+
+    @property
+    def hold(self) -> Literal["friction", "attachment"]:
+        """How hands hold it: by friction, but by attachment where two of them pull."""
+        return "attachment" if self.action == "stretch" else "friction"
+
+    def name(self, seed: int) -> str:
+        """Name the sequence of a seed."""
+        return f"{self.object_}_{self.action}_{seed}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Suite:
+    """A list of scenes, and how much effort every method may take."""
+
+    name: SuiteName
+    """What it is called."""
+    about: str
+    """What it is for, in one sentence."""
+    scenes: tuple[Scene, ...]
+    """Scenes, in order."""
+    seeds: tuple[int, ...]
+    """Seeds of each scene."""
+    methods: tuple[str, ...]
+    """Methods that are compared if none are named."""
+    protocols: tuple[Protocol, ...] = ("main",)
+    """Protocols that are run if none are named."""
+    settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    """Settings that all methods share: one node spacing, so that Chamfer distances compare."""
+    recording: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    """What the generator is told of every sequence: preset, frames, images, resolution."""
+
+
+def _scenes(*pairs: str) -> tuple[Scene, ...]:
+    split = [pair.split() for pair in pairs]
+    return tuple(Scene(object_=object_, action=action) for object_, action in split)
+
+
+SUITES: dict[str, Suite] = {
+    suite.name: suite
+    for suite in (
+        Suite(
+            name="tiny",
+            about="One small sequence and little effort: shows that everything works.",
+            scenes=_scenes("cloth lift"),
+            seeds=(0,),
+            methods=("static", "rigid_follow", "phystwin", "quick", "quick+last_residual"),
+            settings={
+                "node_spacing": 0.022,
+                "simulation.connection_radius": 0.03,
+                "hand.iterations": 60,
+                "hand.depth_iterations": 0,
+                "object_.search.generations": 2,
+                "object_.search.population": 4,
+                "object_.first_order.iterations": 2,
+                "refinement.iterations": 0,
+            },
+            recording={"preset": "clean", "resolution": "tiny", "images": "none", "frames": 30},
+        ),
+        Suite(
+            name="dev",
+            about="Six sequences without images, and 80 first-order steps in every fit so that all "
+            "methods take a quarter of an hour on a fast GPU: for daily work on methods.",
+            scenes=_scenes(
+                "cloth lift", "cloth fold", "rope lift", "rope push", "plush squeeze", "pouch lift"
+            ),
+            seeds=(0,),
+            methods=(
+                *BASELINES,
+                "phystwin+last_residual",
+                *("ours", "ours+last_residual"),
+                *ORACLES,
+            ),
+            protocols=("main", "unseen"),
+            settings={"node_spacing": 0.011, "object_.first_order.iterations": 80},
+            recording={"preset": "default", "images": "none", "frames": 60},
+        ),
+        Suite(
+            name="full",
+            about="Five objects, four actions each, five seeds, with images: the paper's tables.",
+            scenes=_scenes(
+                *("cloth lift", "cloth fold", "cloth stretch", "cloth wipe"),
+                *("towel lift", "towel fold", "towel wipe", "towel push"),
+                *("rope lift", "rope stretch", "rope fold", "rope push"),
+                *("plush lift", "plush squeeze", "plush stretch", "plush push"),
+                *("pouch lift", "pouch squeeze", "pouch stretch", "pouch push"),
+            ),
+            seeds=(0, 1, 2, 3, 4),
+            methods=(
+                *BASELINES,
+                "phystwin+last_residual",
+                *("paper", "ours", "ours+last_residual"),
+                *("ours@refinement.iterations=0", *ORACLES),
+            ),
+            protocols=("main", "single_view", "unseen", "robustness", "sensitivity"),
+            settings={"node_spacing": 0.01},
+            recording={"preset": "default"},
+        ),
+    )
+}
+"""All suites by name."""
+
+
+NAMED_SETTINGS: Mapping[str, Any] = {"node_spacing": 0.01}
+"""Settings that all methods share on sequences that belong to no suite."""
+
+
+def find_suite(name: str) -> Suite:
+    """Find a suite by name.
+
+    Raises:
+        UsageError: If there is no such suite.
+    """
+    if name not in SUITES:
+        raise UsageError(f"There is no suite '{name}'. Choose from: {', '.join(SUITES)}.")
+    return SUITES[name]
+
+
+def check_seeds(seeds: Many[int]) -> None:
+    """Refuse seeds that no sequence can have, or that come twice.
+
+    Raises:
+        UsageError: If a seed is negative or named twice.
+    """
+    for seed in seeds:
+        if seed < 0:
+            raise UsageError(f"Seed {seed} is negative; seeds count from 0.")
+        if list(seeds).count(seed) > 1:
+            raise UsageError(f"Seed {seed} is named twice.")
+
+
+def make_recordings(
+    suite: Suite, seeds: Many[int], folder: Path, make: Callable[[Mapping[Path, Making]], None]
+) -> tuple[Sequence, ...]:
+    """Make the sequences of a suite; those that are there already are opened.
+
+    Args:
+        suite: The suite.
+        seeds: Seeds of every scene.
+        folder: Where the sequences lie.
+        make: Makes those that are missing: `make_one_by_one`, or several at a time by
+            `make_recording`.
+
+    Raises:
+        UsageError: If a seed makes no sense, or a sequence that is there was made otherwise; then
+            nothing is made.
+        SequenceError: If a sequence that is there is damaged; delete its folder to make it anew.
+    """
+    check_seeds(seeds)
+    makings = {
+        folder / scene.name(seed): _making(suite, scene, seed)
+        for scene in suite.scenes
+        for seed in seeds
+    }
+    found = {target: Sequence.load(target) for target in makings if target.is_dir()}
+    for target, recording in found.items():
+        _check_made(suite, recording, makings[target])
+    make({target: making for target, making in makings.items() if target not in found})
+    return tuple(found.get(target) or Sequence.load(target) for target in makings)
+
+
+def make_one_by_one(makings: Mapping[Path, Making], progress: Progress) -> None:
+    """Make sequences of a suite, one after the other.
+
+    Args:
+        makings: What the generator is told of each, by its folder.
+        progress: Told about every frame.
+    """
+    for target, making in makings.items():
+        make_recording(making, target, progress)
+
+
+def make_recording(making: Making, target: Path, progress: Progress) -> None:
+    """Make one sequence of a suite.
+
+    Args:
+        making: Its object, and what else `synthesize` is told.
+        target: Its folder.
+        progress: Told about every frame.
+    """
+    from physhandi.synthetic.synthesize import synthesize
+
+    others = {name: value for name, value in making.items() if name != "object"}
+    synthesize(making["object"], **others, out=target, progress=progress)
+
+
+def _making(suite: Suite, scene: Scene, seed: int) -> dict[str, Any]:
+    scripted = {"object": scene.object_, "action": scene.action, "seed": seed, "hold": scene.hold}
+    return scripted | dict(suite.recording)
+
+
+def _check_made(suite: Suite, recording: Sequence, making: Making) -> None:
+    """Refuse a sequence that is not the one that would be made.
+
+    Raises:
+        UsageError: If it was made with other settings, or by something else.
+    """
+    from physhandi.synthetic.synthesize import synthesize
+
+    known = inspect.signature(synthesize).parameters.values()
+    wanted = {p.name: p.default for p in known if p.default is not inspect.Parameter.empty}
+    wanted |= {"changes": {}} | dict(making)
+    made = named_fields(recording.provenance.get("synthesize"))
+    if made is None or not {"object", "action", "seed"} <= made.keys():
+        differs = "was not made by `physhandi synthesize`"
+    else:
+        # Settings that did not exist yet when it was made belong to another generator.
+        others = [n for n in wanted if n in made and made[n] != wanted[n]]
+        listed = ", ".join(f"{name} {made[name]} in place of {wanted[name]}" for name in others)
+        differs = f"was made with {listed}" if others else ""
+    if differs:
+        raise UsageError(
+            f"{recording.folder} {differs}, so it is no sequence of the suite '{suite.name}'. "
+            "Choose another --out, or delete that folder to have it made anew."
+        )

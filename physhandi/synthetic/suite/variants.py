@@ -1,0 +1,215 @@
+"""What a method is given in place of a whole recording: less, noisier, or the truth.
+
+A variant is a sequence folder of its own, of the same name. It has nothing of what is kept for
+scoring, and nothing that tells how the recording was made, by which it could be made again with its
+truth. Methods run on it; scores are always taken against the recording itself.
+"""
+
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from numpy.random import Generator
+
+from physhandi.data.files import named_fields
+from physhandi.data.sequence import ARRAYS, Sequence
+from physhandi.data.sequence_meta import SequenceMeta
+from physhandi.data.sequence_writer import SequenceWriter
+from physhandi.data.truth import read_truth
+from physhandi.errors import MissingInputError
+from physhandi.synthetic.code_version import INPUTS, code_version
+
+DEPTH_NOISE = 0.001
+"""Standard deviation of the paper's disturbed depth [m]."""
+TRACK_NOISE = 1.0
+"""Standard deviation of the paper's disturbed tracks [px]."""
+DISTURBED_HAND = "noisy_hand"
+"""The variant whose fitted hands are disturbed."""
+SCORING_ONLY = "validation_track.npy"
+"""True paths of points, of the future too, that no stage may fit."""
+_GIVEN = ("views/", *(file for file in ARRAYS if file != SCORING_ONLY))
+"""Beginnings of the names of all that a method may be given."""
+_MILLIMETRES = 1000.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Change:
+    """How a variant differs from its recording; everything else is copied."""
+
+    meta: SequenceMeta
+    """Content of its ``sequence.yaml``; what tells how it was made is taken out of it."""
+    arrays: Mapping[str, ndarray] = field(default_factory=dict[str, ndarray])
+    """Arrays that are other ones or new, by file."""
+    images: Mapping[str, ndarray] = field(default_factory=dict[str, ndarray])
+    """Images that are other ones, by file."""
+    without: tuple[str, ...] = ()
+    """Beginnings of the names of files that are left out."""
+
+
+def unchanged(recording: Sequence, _random: Generator) -> Change:
+    """Give everything that a method may have."""
+    return Change(meta=recording.meta)
+
+
+def true_hand(recording: Sequence, _random: Generator) -> Change:
+    """Give the vertices of the true hands as point controllers, and no hand to fit.
+
+    Raises:
+        MissingInputError: If the recording does not tell its true hands.
+    """
+    vertices = read_truth(recording.folder).hand_vertex
+    missing = [side for side in recording.hands if side not in vertices]
+    if missing or not recording.hands:
+        which = f"truth/hand_{missing[0]}_vertex.npy" if missing else "hands"
+        raise MissingInputError(
+            f"Sequence '{recording.name}' has no {which}, so the true hand cannot be given."
+        )
+    control = np.concatenate([vertices[side] for side in recording.hands], axis=1)
+    keypoints = tuple(f"views/{view.name}/keypoint.npy" for view in recording.views)
+    return Change(
+        meta=replace(recording.meta, hands=()),
+        arrays={"control.npy": control.astype(np.float32)},
+        without=keypoints,
+    )
+
+
+def all_frames(recording: Sequence, _random: Generator) -> Change:
+    """Give every frame to the fit, the held-out ones too."""
+    return Change(meta=replace(recording.meta, reconstruction=recording.frame_count))
+
+
+def one_view(recording: Sequence, _random: Generator) -> Change:
+    """Give the first camera alone.
+
+    Raises:
+        MissingInputError: If the object is observed by markers, which no single camera sees, or
+            there are not several views.
+    """
+    if recording.marker is not None or len(recording.views) < 2:
+        raise MissingInputError(
+            f"Sequence '{recording.name}' has {len(recording.views)} views and "
+            f"{'markers' if recording.marker is not None else 'no markers'}: one view alone needs "
+            "several views with depth and masks, and no markers."
+        )
+    first, *others = recording.meta.views
+    return Change(
+        meta=replace(recording.meta, views=(first,)),
+        without=tuple(f"views/{view.name}/" for view in others),
+    )
+
+
+def noisy_depth(recording: Sequence, random: Generator) -> Change:
+    """Add the paper's noise to every depth, or along no special axis to markers."""
+    images: dict[str, ndarray] = {}
+    for view in recording.views:
+        for path in sorted((view.folder / "depth").glob("*.png")):
+            depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+            if depth is None:
+                raise MissingInputError(f"{path} is not a readable image.")
+            noise = random.normal(0.0, DEPTH_NOISE * _MILLIMETRES, depth.shape)
+            moved = np.clip(np.rint(depth + noise), 1, np.iinfo(np.uint16).max)
+            rel = path.relative_to(recording.folder).as_posix()
+            images[rel] = np.where(depth > 0, moved, 0).astype(np.uint16)
+    arrays: dict[str, ndarray] = {}
+    if recording.marker is not None:
+        arrays["marker.npy"] = _disturbed(recording.marker, DEPTH_NOISE, random)
+    return Change(meta=recording.meta, arrays=arrays, images=images)
+
+
+def noisy_tracks(recording: Sequence, random: Generator) -> Change:
+    """Add the paper's noise to every track; markers move by as much as a pixel is wide there.
+
+    Raises:
+        MissingInputError: If there are neither tracks nor markers with a view to tell pixels by.
+    """
+    arrays = {
+        f"views/{view.name}/track.npy": _disturbed(view.track, TRACK_NOISE, random)
+        for view in recording.views
+        if view.track is not None
+    }
+    if recording.marker is not None and recording.views:
+        camera = recording.views[0].camera
+        place = recording.marker[np.isfinite(recording.marker).all(axis=2)].astype(np.float64)
+        pixel = float(np.median(camera.camera_depth(place))) / float(camera.K[0, 0])
+        arrays["marker.npy"] = _disturbed(recording.marker, TRACK_NOISE * pixel, random)
+    if not arrays:
+        raise MissingInputError(f"Sequence '{recording.name}' has no tracks to disturb.")
+    return Change(meta=recording.meta, arrays=arrays)
+
+
+def noisy_hand(recording: Sequence, random: Generator) -> Change:
+    """Give everything; the hands are disturbed after they were fitted.
+
+    Raises:
+        MissingInputError: If there is no hand to fit.
+    """
+    if not recording.hands:
+        raise MissingInputError(f"Sequence '{recording.name}' has no hands to disturb.")
+    return unchanged(recording, random)
+
+
+VARIANTS: dict[str, Callable[[Sequence, Generator], Change]] = {
+    "recording": unchanged,
+    "true_hand": true_hand,
+    "all_frames": all_frames,
+    "one_view": one_view,
+    "noisy_depth": noisy_depth,
+    "noisy_tracks": noisy_tracks,
+    "noisy_hand": noisy_hand,
+}
+"""What a method can be given, by name."""
+
+
+def make_variant(recording: Sequence, name: str, folder: Path) -> Sequence:
+    """Write a variant of a recording, or open it if it is there.
+
+    Args:
+        recording: The whole recording.
+        name: One of `VARIANTS`.
+        folder: Where variants of this recording lie; it gets a folder for each.
+
+    Raises:
+        MissingInputError: If the recording lacks what the variant needs.
+    """
+    key = f"{recording.fingerprint()[:12]}_{name}_{code_version(INPUTS)}"
+    target = folder / key / recording.folder.name
+    if target.is_dir():
+        return Sequence.load(target)
+    change = VARIANTS[name](recording, np.random.default_rng(noise_seed(recording, name)))
+    left_out = (*change.without, *change.arrays, *change.images)
+    with SequenceWriter(target) as writer:
+        for path in sorted(recording.folder.rglob("*")):
+            rel = path.relative_to(recording.folder).as_posix()
+            is_hidden = any(part.startswith(".") for part in rel.split("/"))
+            is_given = rel.startswith(_GIVEN) and not rel.startswith(left_out)
+            if path.is_file() and not is_hidden and is_given:
+                writer.copy(rel, path)
+        for view in change.meta.views:  # A view may have held nothing but what is left out.
+            writer.make_folder(f"views/{view.name}")
+        for rel, array in change.arrays.items():
+            writer.save_array(rel, array)
+        for rel, image in change.images.items():
+            writer.save_image(rel, image)
+        # A description tells sizes, a provenance the seed and all levels.
+        return writer.finish(replace(change.meta, description="", provenance={}))
+
+
+def noise_seed(recording: Sequence, variant: str) -> int:
+    """Draw a seed from what a recording is: its name, and the seed that it was made with if any.
+
+    Recordings made wrong by the same noise would not be independent.
+    """
+    made = named_fields(recording.provenance.get("synthesize")) or {}
+    parts = [variant, recording.name, str(made.get("seed", ""))]
+    return int.from_bytes(hashlib.sha256("\0".join(parts).encode()).digest()[:8])
+
+
+def _disturbed(
+    value: Float[ndarray, "frame item _"], deviation: float, random: Generator
+) -> Float[ndarray, "frame item _"]:
+    return (value + random.normal(0.0, deviation, value.shape)).astype(value.dtype)
