@@ -4,10 +4,6 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 PORT ?= 8080
-# How often a test of files, processes, sockets or browsers may be tried again; each new try is listed.
-RERUNS ?= 0
-# Tests of what only computes get no second try: they give the same result every time.
-COMPUTING := benchmarks fitting hand metrics perception simulation synthetic test_pipeline.py test_rope.py
 DATA ?= data
 # Without an NVIDIA GPU install torch's CPU build first (README, "Installing torch"); this variable is passed to pip.
 TORCH ?= torch==2.13.0
@@ -38,8 +34,7 @@ fmt: install
 
 test: install browser
 	rm -f .coverage .coverage.*
-	$(BIN)/python -m pytest -n 2 --dist loadfile --cov --cov-report=term --reruns $(RERUNS) --max-suite-reruns 3 \
-	  --rerun-show-tracebacks $(COMPUTING:%=--rerun-exclude-path tests/physhandi/%)
+	$(BIN)/python -m pytest -n 2 --dist loadfile --cov --cov-report=term
 
 # Live scenes, jobs and pages while their threads are held up at random.
 races: install

@@ -1,8 +1,20 @@
 """Fixtures that all tests share."""
 
+import os
+
 import pytest
 import warp as wp
 from recordings import recording
+
+
+def pytest_configure(config):
+    """Give each test process and its children one thread for linear algebra.
+
+    Several workers that start one for every processor wait for each other longer than they work.
+    """
+    for library in ("OMP", "OPENBLAS", "MKL"):
+        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+
 
 DEVICES = ["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)]
 
