@@ -19,7 +19,8 @@ from physhandi.data.sequence_writer import SequenceWriter
 from physhandi.hand.model import load_hand_model
 from physhandi.hand.motion import HandMotion
 from physhandi.progress import NullProgress, Progress
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.synthetic.bodies.sheets import Sheet, fold_motion, make_sheet, simulate_sheet
 from physhandi.synthetic.film.filming import (
     SurfacePoints,

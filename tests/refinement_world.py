@@ -12,7 +12,7 @@ from physhandi.fitting.object_problem import build_problem
 from physhandi.hand.control_nodes import control_trajectory
 from physhandi.hand.model import HandModel, load_hand_model
 from physhandi.hand.motion import HandMotion
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.topology import build_model
 

@@ -4,7 +4,8 @@ import numpy as np
 
 from app.viewer.content.content import Content
 from app.viewer.content.object_rollout import ObjectRollout
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
 
 
 def two_springs(frames: int = 4) -> ObjectRollout:

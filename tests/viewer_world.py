@@ -18,7 +18,7 @@ from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import SequenceMeta, ViewMeta
 from physhandi.data.sequence_writer import SequenceWriter
 from physhandi.data.view import View
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.topology import build_model
 

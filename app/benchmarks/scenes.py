@@ -9,7 +9,7 @@ from numpy import ndarray
 
 from physhandi.data.run import Run
 from physhandi.hand.model import load_hand_model
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.topology import build_model
 
 HEAVY = "heavy_scene"

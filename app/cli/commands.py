@@ -16,7 +16,7 @@ from physhandi.data.sequence import Sequence
 from physhandi.errors import RunError, UsageError
 from physhandi.fitting.config import changed_parameters, config_to_dict, load_profile
 from physhandi.progress import Progress
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 
 OVERRIDES = (
     "connection_radius",

@@ -33,7 +33,7 @@ def _probes(data_dir: Path | None) -> Iterator[tuple[str, Callable[[], str]]]:
     def simulation() -> str:
         import numpy as np
 
-        from physhandi.simulation.model import SimulationParameters
+        from physhandi.simulation.parameters import SimulationParameters
         from physhandi.simulation.simulator import Simulator
         from physhandi.simulation.topology import build_model
 

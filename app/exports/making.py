@@ -30,7 +30,8 @@ from physhandi.data.files import write_atomically, write_bytes, write_json
 from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.errors import PhysHandiError, UsageError, describe
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
 
 _ARRAYS, _PARAMETERS, _MODEL = "take.npz", "parameters.json", "model_"
 

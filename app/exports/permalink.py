@@ -29,7 +29,7 @@ import numpy as np
 from app.viewer.content.layers import THEMES, Layers
 from app.viewer.content.session_state import Pose, SessionState
 from physhandi.errors import UsageError
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 
 AUTOMATIC = "auto"
 """Instead of a number of substeps: as few as are stable."""

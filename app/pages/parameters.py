@@ -12,7 +12,7 @@ from physhandi.data.files import named_fields
 from physhandi.data.run import Run
 from physhandi.errors import PhysHandiError
 from physhandi.fitting.config import notes_of
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 
 _FOUND = "object/parameters.yaml"
 

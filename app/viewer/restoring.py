@@ -9,7 +9,7 @@ from app.viewer.content.session_state import SessionState
 from app.viewer.scene.cameras import pose_of_view
 from app.viewer.scene.framing import frame_content
 from physhandi.errors import UsageError
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 
 
 def complete_state(state: SessionState, content: Content) -> SessionState:

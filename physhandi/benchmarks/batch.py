@@ -19,7 +19,7 @@ from physhandi.benchmarks.timing import (
 )
 from physhandi.simulation.engines.batch import BatchSimulator, MotionTarget
 from physhandi.simulation.master_topology import MasterTopology
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 
 _COST = (0, 48, 0)
 """Bytes of a substep and candidate: position and velocity of each node in and out. What the

@@ -19,7 +19,8 @@ from physhandi.simulation.kernels.baseline import (
     sum_heights,
     update_velocity,
 )
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
 
 
 class PhysTwinLike:

@@ -10,7 +10,8 @@ from numpy import ndarray
 from scipy.spatial import KDTree
 
 from physhandi.errors import UsageError
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.topology import build_model
 
 SPRINGS_AT_NODE = 18

@@ -12,7 +12,8 @@ from numpy import ndarray
 from physhandi.benchmarks.scenes import SUBSTEPS, Scene
 from physhandi.benchmarks.timing import describe_scene, time_in_turns
 from physhandi.errors import UsageError
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.stability import with_stable_substeps
 

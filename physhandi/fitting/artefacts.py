@@ -23,7 +23,8 @@ from physhandi.hand.motion import HandMotion
 from physhandi.hand.skin import hand_skin
 from physhandi.perception.lifting import hand_points
 from physhandi.progress import Progress
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
 
 STORED_CLOUD = 500
 """Most points of one frame's cloud that a run keeps, evenly picked, unless they are markers."""

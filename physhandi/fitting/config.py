@@ -17,7 +17,7 @@ import yaml
 
 from physhandi.errors import SettingsError, UsageError
 from physhandi.fitting.search import SearchConfig
-from physhandi.simulation.model import BOUNDS, SimulationParameters
+from physhandi.simulation.parameters import BOUNDS, SimulationParameters
 
 
 @dataclass(frozen=True, kw_only=True)

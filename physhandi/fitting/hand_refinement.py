@@ -24,7 +24,8 @@ from physhandi.hand.motion import HandMotion
 from physhandi.hand.rotation import rotation_matrix
 from physhandi.progress import Progress
 from physhandi.simulation import differentiable
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
 
 Offset = dict[str, Tensor]

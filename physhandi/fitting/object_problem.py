@@ -16,7 +16,8 @@ from torch import Tensor
 from physhandi.data.observation import ObjectObservation
 from physhandi.errors import FitError, SimulationDivergedError
 from physhandi.fitting.config import ObjectFitConfig
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.stability import stable_substeps
 from physhandi.simulation.topology import build_model

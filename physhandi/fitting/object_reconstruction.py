@@ -23,7 +23,8 @@ from physhandi.fitting.search import STAGE, SearchConfig, SearchResult, search_p
 from physhandi.progress import Progress
 from physhandi.simulation.engines.batch import BatchSimulator, MotionTarget
 from physhandi.simulation.master_topology import MasterTopology
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.topology import MINIMUM_LENGTH
 
 

@@ -31,7 +31,8 @@ from physhandi.fitting.rollouts import simulate_sequence
 from physhandi.metrics.report import measure_run
 from physhandi.perception.lifting import observe_object
 from physhandi.progress import NullProgress, Progress
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.topology import MINIMUM_LENGTH, build_model
 
 STIFFEST = 1e5

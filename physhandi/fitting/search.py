@@ -12,7 +12,7 @@ from numpy import ndarray
 
 from physhandi.errors import FitError
 from physhandi.progress import Progress
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 
 STAGE = "zeroth_order"
 

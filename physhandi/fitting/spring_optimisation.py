@@ -25,7 +25,8 @@ from physhandi.fitting.object_problem import (
 from physhandi.fitting.preview import RolloutPreview
 from physhandi.progress import Progress
 from physhandi.simulation import differentiable
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
 
 CONTACT = {
     "restitution": (0.0, 1.0),

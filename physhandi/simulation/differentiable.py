@@ -21,7 +21,8 @@ from physhandi.simulation.engines.cuda import DataflowAdjoint
 from physhandi.simulation.engines.frame_sums import SCALARS
 from physhandi.simulation.engines.graph_adjoint import FrameAdjoint
 from physhandi.simulation.engines.tape import TapeLayout, Trajectory
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
 
 CACHED_SIMULATORS = 16

@@ -4,7 +4,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
 
 
 def spring_strains(

@@ -8,7 +8,8 @@ from jaxtyping import Bool, Float, Float32, Int, Int32
 from numpy import ndarray
 from scipy.spatial import KDTree
 
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.topology import MINIMUM_LENGTH, MINIMUM_VIRTUAL_REST_LENGTH
 
 

@@ -17,7 +17,8 @@ from physhandi.simulation.engines.graph import Recording, SpringSums
 from physhandi.simulation.kernels.integration import integrate_nodes
 from physhandi.simulation.kernels.springs import pull_springs
 from physhandi.simulation.kernels.world import World
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.self_collision import SelfCollision
 from physhandi.simulation.stability import explain_divergence
 

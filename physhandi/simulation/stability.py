@@ -9,7 +9,8 @@ from numpy import ndarray
 from scipy.linalg import eigh_tridiagonal
 from scipy.sparse import csr_array
 
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
 
 SAFETY = 1.25
 """Factor on the number of substeps that is just stable, for motion away from frame 0."""

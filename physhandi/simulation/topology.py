@@ -7,7 +7,8 @@ from jaxtyping import Float, Int32
 from numpy import ndarray
 from scipy.spatial import KDTree
 
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
 
 MINIMUM_LENGTH = 1e-4
 """Object nodes this near to each other are not joined [m]."""

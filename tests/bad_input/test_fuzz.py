@@ -21,7 +21,7 @@ from physhandi import pipeline
 from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.errors import FitError, RunError, SequenceError, UsageError
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.topology import build_model
 
 QUICK = settings(SAME_EVERYWHERE, max_examples=25)

@@ -7,7 +7,7 @@ import torch
 from reference.spring_mass import Scene
 
 from physhandi.simulation import differentiable
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.topology import build_model
 

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 from reference.spring_mass import Scene
 
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
 
 
 def cube_scene(**changes):

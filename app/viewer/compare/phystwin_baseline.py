@@ -12,7 +12,7 @@ from app.viewer.content.content import Content, HandSurface
 from app.viewer.content.object_rollout import ObjectRollout
 from physhandi.fitting.config import load_profile
 from physhandi.fitting.rollouts import farthest_points, visible_vertices
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 
 PROFILE = "phystwin"
 """Profile that the rival's values come from."""

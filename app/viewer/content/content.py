@@ -18,7 +18,8 @@ from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
 from physhandi.errors import MissingInputError, PhysHandiError, UsageError
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
 
 logger = logging.getLogger(__name__)
 

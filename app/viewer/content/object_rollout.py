@@ -12,7 +12,8 @@ from physhandi.simulation.forces import (
     virtual_forces,
     virtual_spring_forces,
 )
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
 
 
 @dataclass(eq=False, kw_only=True)

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from app.viewer.content.layers import Layers, Theme
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 
 Kind = Literal["run", "sequence", "comparison"]
 

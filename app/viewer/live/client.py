@@ -15,7 +15,7 @@ from typing import Any
 
 from app.child import start_module
 from app.viewer.live.wire import PAUSE, RESUME, STEP, Message, WireError, receive, send
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 
 logger = logging.getLogger(__name__)
 

@@ -13,7 +13,8 @@ from app.viewer.content.content import load_fitted
 from app.viewer.content.object_rollout import ObjectRollout
 from physhandi.data.run import Run
 from physhandi.errors import MissingInputError
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.stability import largest_stable_step
 from physhandi.simulation.topology import MINIMUM_VIRTUAL_REST_LENGTH, retopologize, virtual_springs

@@ -10,7 +10,8 @@ import numpy as np
 from app.viewer.content.object_rollout import ObjectRollout
 from app.viewer.live.client import LiveRequest, SimulationClient
 from app.viewer.live.wire import Message
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
 
 STARTING = "**The simulation is starting …** The first time on a machine this takes a while."
 """What a panel says until the live simulation has loaded or compiled what it needs."""

@@ -24,7 +24,7 @@ from app.viewer.ui.guard import Guard, notify
 from physhandi.data.run import Run, new_run_id
 from physhandi.data.sequence import Sequence
 from physhandi.errors import UsageError
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 
 _POLL_S = 0.3
 _MOST_LETTERS = 80

@@ -16,7 +16,7 @@ from app.viewer.physics.panel import GO, STEP, PhysicsPanel
 from app.viewer.ui.guard import Guard, notify
 from physhandi.data.run import Run
 from physhandi.errors import UsageError
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 
 
 class ObjectSession:

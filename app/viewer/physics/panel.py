@@ -27,7 +27,7 @@ from app.viewer.physics.parameters import (
 from app.viewer.ui.followed import FollowedChoice
 from app.viewer.ui.guard import Guard
 from app.viewer.ui.keyboard import bind
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 
 _CHANGED = "● "
 

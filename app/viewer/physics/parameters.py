@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 
 _DIGITS = 3
 _OTHERS = {

@@ -13,7 +13,7 @@ from app.viewer.ui.guard import plain
 from physhandi.data.files import named_fields, parse_yaml, write_json, write_yaml
 from physhandi.errors import PhysHandiError, UsageError, describe
 from physhandi.fitting.config import AUTOMATIC, changed_parameters, load_profile
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 
 AS_FITTED = "as fitted"
 BY_HAND = "by hand"

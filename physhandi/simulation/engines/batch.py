@@ -31,7 +31,7 @@ from physhandi.simulation.kernels.batch_losses import (
     sum_tracks,
 )
 from physhandi.simulation.master_topology import MasterTopology
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import SPEED_LIMIT, Simulator, checked_control
 
 

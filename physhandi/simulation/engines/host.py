@@ -5,7 +5,8 @@ from typing import Any, Protocol
 import warp as wp
 from numpy import ndarray
 
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
 
 
 class EngineHost(Protocol):

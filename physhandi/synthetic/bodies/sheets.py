@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from physhandi.hand.model import HandModel
 from physhandi.hand.motion import HandMotion
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.topology import build_model
 from physhandi.synthetic.hands.script import minimum_jerk

@@ -4,7 +4,7 @@ import pytest
 
 from app.viewer.physics.history import History
 from app.viewer.physics.parameters import changes_in, ground_knobs, knobs, self_collision_knobs
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 
 
 def what_changed(*arguments, **options) -> str:

@@ -20,7 +20,7 @@ from app.viewer.physics.presets import (
 )
 from app.viewer.ui.guard import Guard
 from physhandi.errors import UsageError
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 
 FITTED = SimulationParameters(connection_radius=0.035, drag=2.0, substeps_per_frame=230)
 

@@ -11,7 +11,7 @@ from app.viewer.content.layers import PLAYING_SPRINGS
 from app.viewer.content.object_rollout import ObjectRollout
 from app.viewer.scene.framing import frame_content
 from app.viewer.scene.scene import Scene
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.topology import build_model
 
 FRAMES = 8

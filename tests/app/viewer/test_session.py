@@ -13,7 +13,7 @@ from app.viewer.export.snapshot import write_csv, write_npz, write_ply, write_ya
 from app.viewer.sessions import Sessions, TooManySessionsError
 from physhandi.data.run import Run
 from physhandi.errors import MissingInputError, PhysHandiError, RunError, UsageError
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 
 
 def watch(sessions: Sessions, kind="run", target="sheet") -> ViewerClient:

@@ -18,7 +18,7 @@ from app.viewer.sessions import Sessions
 from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.errors import UsageError
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 
 
 class RecordedCatalog(FolderCatalog):

@@ -11,7 +11,8 @@ from safetensors.numpy import load_file
 
 from physhandi.benchmarks.substeps import benchmark_substeps
 from physhandi.errors import SimulationDivergedError, UsageError
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.stability import stable_substeps
 
 RUN = Path(__file__).resolve().parents[3] / "sequences/runs/towel_fold_quick/attempts/1/out"

@@ -18,7 +18,7 @@ from physhandi.fitting.object_problem import (
 )
 from physhandi.fitting.object_reconstruction import Judge
 from physhandi.progress import NullProgress, Preview, Progress
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 
 PARAMETERS = SimulationParameters(
     connection_radius=0.16,

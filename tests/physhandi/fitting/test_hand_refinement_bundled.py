@@ -29,7 +29,7 @@ from physhandi.fitting.object_problem import build_problem
 from physhandi.hand.model import load_hand_model
 from physhandi.hand.motion import HandMotion
 from physhandi.progress import NullProgress, Progress
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.topology import build_model
 from physhandi.synthetic.bodies.sheets import fold_motion
 

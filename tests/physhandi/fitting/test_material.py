@@ -10,7 +10,8 @@ import torch
 from physhandi.errors import FitError
 from physhandi.fitting.config import FirstOrderConfig
 from physhandi.fitting.spring_optimisation import Material
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
 
 PARAMETERS = SimulationParameters(
     restitution=0.4, friction=0.9, self_restitution=0.2, self_friction=1.1

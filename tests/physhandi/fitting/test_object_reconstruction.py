@@ -13,7 +13,7 @@ from physhandi.fitting.object_reconstruction import search_object
 from physhandi.fitting.search import SearchConfig, SearchVariable
 from physhandi.fitting.spring_optimisation import optimise_springs
 from physhandi.progress import NullProgress, Progress
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.topology import build_model
 

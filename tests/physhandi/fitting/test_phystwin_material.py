@@ -11,7 +11,7 @@ from physhandi.data.importers.phystwin_experiment import Checkpoint, Contact, Op
 from physhandi.errors import ImportFailedError
 from physhandi.fitting.config import load_profile
 from physhandi.fitting.phystwin_run import phystwin_model, phystwin_parameters, spring_numbers
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.topology import build_model
 
 CONTACT = Contact(restitution=0.5, friction=0.3, self_restitution=0.7, self_friction=0.3)

@@ -20,7 +20,7 @@ from physhandi.fitting.search import SearchConfig, SearchVariable
 from physhandi.fitting.spring_optimisation import optimise_springs
 from physhandi.hand.model import load_hand_model
 from physhandi.progress import Preview, Progress
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 
 PARAMETERS = SimulationParameters(
     connection_radius=0.16,

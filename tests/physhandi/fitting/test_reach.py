@@ -10,7 +10,7 @@ from physhandi.errors import FitError, UsageError
 from physhandi.fitting.object_problem import ObjectProblem, build_problem
 from physhandi.fitting.object_reconstruction import check_problem, check_springs
 from physhandi.fitting.search import SearchConfig, SearchVariable
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.topology import build_model
 
 NODE = np.array([[0.0, 0, 0], [0.01, 0, 0], [0.03, 0, 0]], np.float32)

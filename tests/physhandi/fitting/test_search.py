@@ -16,7 +16,7 @@ from physhandi.fitting.search import (
     search_parameters,
 )
 from physhandi.progress import NullProgress, Progress
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 
 VARIABLES = {
     "stiffness": SearchVariable(low=1e2, high=1e5, scale="log"),

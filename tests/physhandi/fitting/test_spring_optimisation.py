@@ -26,7 +26,7 @@ from physhandi.fitting.spring_optimisation import (
     optimise_springs,
 )
 from physhandi.progress import NullProgress
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 
 FRAMES = 4
 PARAMETERS = SimulationParameters(

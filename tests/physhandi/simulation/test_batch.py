@@ -8,7 +8,7 @@ import pytest
 from physhandi.errors import UsageError
 from physhandi.simulation.engines.batch import BatchSimulator
 from physhandi.simulation.master_topology import MasterTopology
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.topology import build_model
 

@@ -8,7 +8,7 @@ from scipy.spatial import KDTree
 
 from physhandi.simulation.engines.batch import BatchSimulator, MotionTarget
 from physhandi.simulation.master_topology import MasterTopology
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
 
 BASE = SimulationParameters(damping=2.0, substeps_per_frame=60, ground_height=0.0)

@@ -8,7 +8,7 @@ from reference.scenes import as_model, star_scene
 
 from physhandi.simulation.engines.cuda import arrange_columns
 from physhandi.simulation.engines.partition import partition_model
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.topology import build_model
 
 

@@ -18,7 +18,7 @@ from physhandi.simulation.engines.cpu import Threaded, ThreadedAdjoint
 from physhandi.simulation.engines.cuda import Dataflow, DataflowAdjoint
 from physhandi.simulation.engines.graph_adjoint import FrameAdjoint
 from physhandi.simulation.master_topology import MasterTopology
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
 
 WAYS = [

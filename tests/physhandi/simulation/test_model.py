@@ -8,7 +8,8 @@ from reference.scenes import as_model, cube_scene
 from safetensors.numpy import load, save
 
 from physhandi.errors import UsageError
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
 
 
 def test_parameters_survive_a_round_trip():

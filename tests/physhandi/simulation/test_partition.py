@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from physhandi.simulation.engines.partition import bisect_nodes, group_springs, partition_model
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.topology import build_model
 
 

@@ -7,7 +7,8 @@ import pytest
 from reference.scenes import as_model, bare_scene, cube_scene
 
 from physhandi.errors import SimulationDivergedError
-from physhandi.simulation.model import SimulationParameters, SpringMassModel
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.stability import (
     SAFETY,

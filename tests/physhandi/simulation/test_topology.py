@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from jaxtyping import TypeCheckError
 from property_tests import SAME_EVERYWHERE
 
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.topology import (
     build_model,
     half_edges,

@@ -14,7 +14,7 @@ from physhandi.errors import CancelledError, SequenceError
 from physhandi.perception.lifting import hand_points, observe_object
 from physhandi.perception.shape import object_nodes_from_observation
 from physhandi.progress import Progress
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.topology import virtual_springs
 
 SMALL = Recipe(

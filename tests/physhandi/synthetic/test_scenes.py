@@ -3,7 +3,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from physhandi.hand.model import load_hand_model
-from physhandi.simulation.model import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.topology import build_model
 from physhandi.synthetic.bodies.sheets import (
     FINGERTIPS,
