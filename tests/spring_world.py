@@ -3,7 +3,7 @@
 import numpy as np
 
 from app.viewer.content.content import Content
-from app.viewer.content.object_rollout import ObjectRollout
+from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 

@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from app.viewer.content.content import load_fitted
-from app.viewer.content.object_rollout import ObjectRollout
 from app.viewer.live.client import LiveRequest, SimulationClient
 from app.viewer.live.wire import Message
 from physhandi.benchmarks.timing import describe_machine
 from physhandi.data.run import Run
 from physhandi.errors import MissingInputError, SimulationError
+from physhandi.object_rollout import ObjectRollout, load_fitted
 
 _SESSION = "latency"
 _PATIENCE = 120.0

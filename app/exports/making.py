@@ -20,7 +20,6 @@ from app.exports.recording import record_scene
 from app.exports.request import SUFFIXES, FileRequest
 from app.exports.scale_bar import draw_scale
 from app.viewer.content.content import Content, open_run, open_sequence
-from app.viewer.content.object_rollout import ObjectRollout
 from app.viewer.content.session_state import Pose, SessionState
 from app.viewer.export.bundle import Picture, bundle
 from app.viewer.export.snapshot import Snapshot, scene_data
@@ -30,6 +29,7 @@ from physhandi.data.files import write_atomically, write_bytes, write_json
 from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.errors import PhysHandiError, UsageError, describe
+from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 
@@ -159,7 +159,7 @@ def _simulate(
     is_automatic: bool,
 ) -> ObjectRollout:
     # These load the simulator, which takes longer than most files that need none.
-    from app.viewer.live.fitted_object import FittedObject
+    from physhandi.fitted_object import FittedObject
     from physhandi.simulation.stability import with_stable_substeps
 
     fitted = FittedObject(order.folder, content.sequence_name)

@@ -11,12 +11,12 @@ from numpy import ndarray
 
 from app.viewer.color.coloring import Legend
 from app.viewer.content.content import Content
-from app.viewer.content.object_rollout import ObjectRollout
 from app.viewer.content.session_state import Pose, SessionState
 from app.viewer.scene.framing import frame_content
 from app.viewer.scene.scene import FRAME_BYTES, Scene
 from app.viewer.ui.guard import plain
 from app.viewer.ui.scene_server import start_viser
+from physhandi.object_rollout import ObjectRollout
 
 GRID = 2.0**-14
 """Positions of recordings are rounded to a multiple of this part of the scene's size."""

@@ -5,9 +5,9 @@ from html import escape
 
 from app.exports.offscreen import Offscreen
 from app.viewer.content.content import Content
-from app.viewer.content.object_rollout import ObjectRollout
 from app.viewer.content.session_state import SessionState
 from physhandi.errors import UsageError
+from physhandi.object_rollout import ObjectRollout
 
 MOST_FRAMES = 3_000
 """Longer sequences are not recorded."""

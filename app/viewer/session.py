@@ -11,7 +11,6 @@ from app.viewer.clock.playback import TURN, Playback
 from app.viewer.compare.figure_mode import FigureMode
 from app.viewer.compare.pin_mode import PinMode
 from app.viewer.content.content import Catalog, Content, open_run, open_sequence
-from app.viewer.content.object_rollout import ObjectRollout
 from app.viewer.content.session_state import Kind, Pose, SessionState
 from app.viewer.export.export_panel import ExportPanel
 from app.viewer.export.snapshot import Snapshot
@@ -25,6 +24,7 @@ from app.viewer.scene.framing import frame_content
 from app.viewer.scene.panels import LayersPanel, TimelinePanel, add_legend, set_theme
 from app.viewer.scene.scene import Scene
 from app.viewer.ui.scene_server import SceneServer
+from physhandi.object_rollout import ObjectRollout
 
 
 class ViewSwitch:

@@ -13,8 +13,8 @@ from app.viewer.color.quantities import QUANTITIES, Quantity, Values, measure
 from app.viewer.compare.difference import surface_difference
 from app.viewer.content.content import Content
 from app.viewer.content.layers import COLORINGS, Coloring, Layers
-from app.viewer.content.object_rollout import ObjectRollout
 from physhandi.metrics.alignment import carried_points
+from physhandi.object_rollout import ObjectRollout
 
 _SHARERS = 4
 """Tracks that tell the error of a node."""

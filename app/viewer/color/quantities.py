@@ -10,7 +10,7 @@ from numpy import ndarray
 from app.viewer.color.colormaps import Scale
 from app.viewer.compare.difference import take_difference
 from app.viewer.content.layers import Coloring
-from app.viewer.content.object_rollout import ObjectRollout
+from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.forces import node_means
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from app.viewer.compare.difference import FrameDifference, Way, compare_frames, way_of
-from app.viewer.content.object_rollout import ObjectRollout
+from physhandi.object_rollout import ObjectRollout
 
 logger = logging.getLogger(__name__)
 

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial import KDTree  # pyright: ignore[reportMissingTypeStubs]  # it has none
 
-from app.viewer.content.object_rollout import ObjectRollout
+from physhandi.object_rollout import ObjectRollout
 
 Way = Literal["nodes", "surface"]
 """Whether a node is compared with the same node, or with the other object's surface."""

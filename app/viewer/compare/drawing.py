@@ -16,11 +16,11 @@ from app.viewer.compare.look import GHOST, SIDES, STYLES, Look, difference_paint
 from app.viewer.compare.recorded import PLAYING_OBSERVED, Halves, RecordedDrawing, have_same_hands
 from app.viewer.content.content import Content
 from app.viewer.content.layers import Layers
-from app.viewer.content.object_rollout import ObjectRollout
 from app.viewer.scene.framing import Framing
 from app.viewer.scene.nodes import ClippedNodes, Plane
 from app.viewer.scene.object_drawing import ObjectDrawing, share_bytes, strengths
 from app.viewer.scene.scene import add_ground
+from physhandi.object_rollout import ObjectRollout
 
 _NARROWEST = 13.0
 _ABOVE, _BELOW = 4.0, 0.6

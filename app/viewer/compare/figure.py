@@ -12,10 +12,10 @@ from numpy import ndarray
 from app.viewer.compare.figure_camera import Eye
 from app.viewer.content.content import Content
 from app.viewer.content.layers import SKIN, YELLOW, Layers
-from app.viewer.content.object_rollout import ObjectRollout
 from app.viewer.scene.framing import Framing
 from app.viewer.scene.nodes import SceneNodes
 from app.viewer.scene.object_drawing import ObjectDrawing, Style, share_bytes, strengths
+from physhandi.object_rollout import ObjectRollout
 
 GAP = 1.08
 """Distance of the middles of two halves, as a multiple of a half's width."""

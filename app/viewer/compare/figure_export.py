@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from app.viewer.compare.figure import Side
-from app.viewer.content.object_rollout import ObjectRollout
+from physhandi.object_rollout import ObjectRollout
 
 _COLUMNS = (
     *("side", "frame", "kind", "node", "control"),

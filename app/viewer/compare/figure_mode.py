@@ -13,7 +13,6 @@ from app.viewer.compare.figure_camera import Eye, FigureCameras, picture_of_figu
 from app.viewer.compare.phystwin_baseline import PhysTwinBaseline
 from app.viewer.content.content import Content
 from app.viewer.content.layers import Layers
-from app.viewer.content.object_rollout import ObjectRollout
 from app.viewer.content.session_state import Pose
 from app.viewer.live.client import SimulationClient
 from app.viewer.live.rollouts import LiveRollouts
@@ -21,6 +20,7 @@ from app.viewer.scene.framing import Framing
 from app.viewer.ui.guard import Guard, notify
 from app.viewer.ui.keyboard import bind
 from physhandi.errors import MissingInputError
+from physhandi.object_rollout import ObjectRollout
 
 _ON, _OFF = "Back to the scene", "Compare with PhysTwin"
 

@@ -10,8 +10,8 @@ from app.comparison import Mode, Tint
 from app.viewer.color.coloring import Painted
 from app.viewer.color.colormaps import levels, paint
 from app.viewer.color.quantities import QUANTITIES, Values, from_nodes
-from app.viewer.content.object_rollout import ObjectRollout
 from app.viewer.scene.object_drawing import Color, Style
+from physhandi.object_rollout import ObjectRollout
 
 MODES: dict[Mode, str] = {"side": "side by side", "overlay": "overlay", "wipe": "wipe"}
 """What the modes are called on the panel."""

@@ -9,9 +9,9 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from app.viewer.content.content import Content, HandSurface
-from app.viewer.content.object_rollout import ObjectRollout
 from physhandi.fitting.config import load_profile
 from physhandi.fitting.rollouts import farthest_points, visible_vertices
+from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.parameters import SimulationParameters
 
 PROFILE = "phystwin"

@@ -15,12 +15,12 @@ from app.viewer.compare.recorded import Half, Halves
 from app.viewer.compare.view import CompareView
 from app.viewer.content.content import Content
 from app.viewer.content.layers import Layers
-from app.viewer.content.object_rollout import ObjectRollout
 from app.viewer.physics.parameters import changes_in, knobs
 from app.viewer.scene.framing import Framing
 from app.viewer.ui.guard import Guard
 from app.viewer.ui.keyboard import bind
 from physhandi.errors import MissingInputError
+from physhandi.object_rollout import ObjectRollout
 
 _THIS, _FIT, _STOP = "this rollout", "the fit", "stop"
 _LONGEST_TEXT = 70

@@ -11,15 +11,13 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from app.viewer.content.markers import Markers
-from app.viewer.content.object_rollout import ObjectRollout
 from app.viewer.content.observed import CloudSet, DepthCloud, Observed, PointSet, Tracks
 from app.viewer.content.skeleton import lift_keypoints
 from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
 from physhandi.errors import MissingInputError, PhysHandiError, UsageError
-from physhandi.simulation.model import SpringMassModel
-from physhandi.simulation.parameters import SimulationParameters
+from physhandi.object_rollout import ObjectRollout, load_fitted
 
 logger = logging.getLogger(__name__)
 
@@ -158,31 +156,6 @@ def open_sequence(catalog: Catalog, sequence_id: str) -> Content:
         observed=_observation(sequence),
         markers=Markers.of(sequence),
         views=sequence.views,
-    )
-
-
-def load_fitted(run: Run, sequence_name: str) -> ObjectRollout | None:
-    """Load the fitted rollout of a run with its model; None if the run has no object."""
-    folder = f"sequences/{sequence_name}"
-    needed = (f"{folder}/rollout.npy", f"{folder}/control.npy", f"{folder}/model.safetensors")
-    if not all(run.has(name) for name in needed):
-        return None
-    position = run.array(needed[0])
-    parameters = SimulationParameters.from_dict(run.yaml("object/parameters.yaml"))
-    if run.has(f"{folder}/meta.yaml"):
-        # As the rollout was simulated: what is stored of the world is the profile's, not this one.
-        meta = run.yaml(f"{folder}/meta.yaml")
-        parameters = parameters.in_world(
-            frame_rate=float(meta["frame_rate"]),
-            ground_height=meta.get("ground_height"),
-            gravity=float(meta.get("gravity", parameters.gravity)),
-        )
-    return ObjectRollout(
-        model=SpringMassModel.from_tensors(run.tensors(needed[2])),
-        parameters=parameters,
-        control=run.array(needed[1])[: len(position)],
-        position=position,
-        ready=len(position),
     )
 
 

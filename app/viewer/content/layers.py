@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from app.viewer.content.content import Content
-from app.viewer.content.object_rollout import ObjectRollout
+from physhandi.object_rollout import ObjectRollout
 
 BLUE = (47, 111, 222)
 RED = (214, 39, 40)

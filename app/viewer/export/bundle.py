@@ -15,12 +15,12 @@ import yaml
 
 from app.viewer.compare.figure import Side
 from app.viewer.content.content import Content
-from app.viewer.content.object_rollout import ObjectRollout
 from app.viewer.content.session_state import Pose
 from app.viewer.export.snapshot import Snapshot, write_ply
 from physhandi import __version__
 from physhandi.data.files import plain, without_non_finite
 from physhandi.errors import MissingInputError
+from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.forces import spring_strains
 
 logger = logging.getLogger(__name__)

@@ -14,7 +14,6 @@ from viser import uplot
 
 from app.viewer.color.color_panel import ColorPanel
 from app.viewer.content.content import Content
-from app.viewer.content.object_rollout import ObjectRollout
 from app.viewer.inspect.picking import Pick, Ray, Target, pick
 from app.viewer.inspect.readings import HISTORIES, History, Readings, Rows, follow, unit_of
 from app.viewer.scene.framing import Framing
@@ -22,6 +21,7 @@ from app.viewer.scene.nodes import SceneNodes
 from app.viewer.scene.scene import Scene
 from app.viewer.ui.guard import Guard
 from app.viewer.ui.keyboard import bind
+from physhandi.object_rollout import ObjectRollout
 
 MARK = (233, 30, 180)
 """Color of what was clicked, which no scale has."""

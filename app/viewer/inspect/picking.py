@@ -9,7 +9,7 @@ from numpy import ndarray
 
 from app.viewer.content.content import Content
 from app.viewer.content.layers import Layers
-from app.viewer.content.object_rollout import ObjectRollout
+from physhandi.object_rollout import ObjectRollout
 
 Kind = Literal["node", "spring", "control", "hand", "marker"]
 

@@ -12,8 +12,8 @@ from app.viewer.color.hand_coloring import HandPainter
 from app.viewer.color.legend import number
 from app.viewer.content.content import Content
 from app.viewer.content.layers import Coloring
-from app.viewer.content.object_rollout import ObjectRollout
 from app.viewer.inspect.picking import Kind, Pick
+from physhandi.object_rollout import ObjectRollout
 
 History = Literal["speed", "force", "strain", "error", "difference", "height", "length"]
 """What a chart can show of a thing."""

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from app.viewer.content.object_rollout import ObjectRollout
 from app.viewer.live.client import LiveRequest, SimulationClient
 from app.viewer.live.wire import Message
+from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 

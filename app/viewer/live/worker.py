@@ -18,9 +18,9 @@ import numpy as np
 import warp as wp
 
 from app.child import die_with_parent
-from app.viewer.live.fitted_object import FittedObject
 from app.viewer.live.wire import CONTROLS, Holds, Message, receive, send
 from physhandi.errors import PhysHandiError, SimulationDivergedError
+from physhandi.fitted_object import FittedObject
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.stability import stable_substeps, with_stable_substeps

@@ -6,7 +6,6 @@ import viser
 
 from app.viewer.clock.playback import Playback
 from app.viewer.content.content import Content
-from app.viewer.content.object_rollout import ObjectRollout
 from app.viewer.live.client import SimulationClient
 from app.viewer.live.rollouts import LiveRollouts, Readout
 from app.viewer.physics.error_panel import ErrorPanel, load_track_error
@@ -16,6 +15,7 @@ from app.viewer.physics.panel import GO, STEP, PhysicsPanel
 from app.viewer.ui.guard import Guard, notify
 from physhandi.data.run import Run
 from physhandi.errors import UsageError
+from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.parameters import SimulationParameters
 
 

@@ -11,7 +11,6 @@ import viser
 
 from app.keys import Action
 from app.viewer.content.content import Content
-from app.viewer.content.object_rollout import ObjectRollout
 from app.viewer.live.rollouts import STARTING, Readout
 from app.viewer.physics.history import History
 from app.viewer.physics.keep_panel import KeepPanel, PresetChoice, UserStorage
@@ -27,6 +26,7 @@ from app.viewer.physics.parameters import (
 from app.viewer.ui.followed import FollowedChoice
 from app.viewer.ui.guard import Guard
 from app.viewer.ui.keyboard import bind
+from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.parameters import SimulationParameters
 
 _CHANGED = "● "

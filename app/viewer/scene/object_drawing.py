@@ -9,9 +9,9 @@ from numpy import ndarray
 from app.viewer.color.coloring import Painted
 from app.viewer.color.colormaps import UNKNOWN, table
 from app.viewer.content.layers import BLUE, GREY, PLAYING_SPRINGS, RED, YELLOW, Layers
-from app.viewer.content.object_rollout import ObjectRollout
 from app.viewer.scene.framing import Framing
 from app.viewer.scene.nodes import SceneNodes
+from physhandi.object_rollout import ObjectRollout
 
 STEPS = 24
 """Colors of a colored surface."""

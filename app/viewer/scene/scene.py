@@ -13,7 +13,6 @@ from app.viewer.color.coloring import Painted, Painter
 from app.viewer.color.hand_coloring import HandPainter
 from app.viewer.content.content import Content
 from app.viewer.content.layers import GREEN, GREY, SKIN, default_layers
-from app.viewer.content.object_rollout import ObjectRollout
 from app.viewer.content.skeleton import BONES
 from app.viewer.scene.cameras import CameraNodes
 from app.viewer.scene.framing import Framing
@@ -25,6 +24,7 @@ from app.viewer.scene.object_drawing import (
     automatic_force_unit,
     share_bytes,
 )
+from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.surface import triangulate_nodes
 
 FRAME_BYTES = 92_000

@@ -16,7 +16,7 @@ from app.viewer.compare.difference import (
     triangle_distance,
     way_of,
 )
-from app.viewer.content.object_rollout import ObjectRollout
+from physhandi.object_rollout import ObjectRollout
 
 
 def moved(offset: ndarray) -> tuple[ObjectRollout, ObjectRollout]:

@@ -18,10 +18,10 @@ from viewer_world import (
     rest_at,
 )
 
-from app.viewer.content.object_rollout import ObjectRollout
 from app.viewer.physics.error_panel import ErrorPanel, load_track_error
 from app.viewer.sessions import Sessions
 from physhandi.data.run import Run
+from physhandi.object_rollout import ObjectRollout
 
 ERRORS = [None, *[0.001 * frame for frame in range(1, FRAMES)]]
 

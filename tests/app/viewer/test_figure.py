@@ -13,11 +13,11 @@ from app.viewer.compare.figure import ARROWS, Figure, Side
 from app.viewer.compare.figure_camera import Eye, picture_of_figure
 from app.viewer.compare.figure_export import write_figure_csv, write_figure_npz
 from app.viewer.content.layers import Layers
-from app.viewer.content.object_rollout import ObjectRollout
-from app.viewer.live.fitted_object import FittedObject
 from app.viewer.scene.framing import frame_content
 from app.viewer.sessions import Sessions
 from physhandi.data.run import Run
+from physhandi.fitted_object import FittedObject
+from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.topology import build_model
 

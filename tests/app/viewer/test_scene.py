@@ -8,9 +8,9 @@ from viewer_world import hear_all
 
 from app.viewer.content.content import Content, HandSurface
 from app.viewer.content.layers import PLAYING_SPRINGS
-from app.viewer.content.object_rollout import ObjectRollout
 from app.viewer.scene.framing import frame_content
 from app.viewer.scene.scene import Scene
+from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.topology import build_model
 

@@ -9,10 +9,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from app.viewer.content.content import load_fitted
-from app.viewer.content.object_rollout import ObjectRollout
 from physhandi.data.run import Run
 from physhandi.errors import MissingInputError
+from physhandi.object_rollout import ObjectRollout, load_fitted
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator

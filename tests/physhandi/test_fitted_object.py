@@ -6,9 +6,15 @@ import pytest
 import yaml
 from viewer_world import PARAMETERS, make_run
 
-from app.viewer.content.content import load_fitted
-from app.viewer.live.fitted_object import FittedObject
+from physhandi.data.run import Run
+from physhandi.fitted_object import FittedObject
+from physhandi.object_rollout import load_fitted
 from physhandi.simulation.topology import retopologize
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Run:
+    return make_run(tmp_path_factory.mktemp("runs") / "sheet")
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from physhandi.data.run import Run
 from physhandi.simulation.forces import (
     spring_strains,
     spring_tensions,
@@ -105,6 +106,31 @@ class ObjectRollout:
             return float("nan")
         offset = np.asarray(self.position[:count]) - np.asarray(other.position[:count])
         return float(np.linalg.norm(offset, axis=-1).mean())
+
+
+def load_fitted(run: Run, sequence_name: str) -> ObjectRollout | None:
+    """Load the fitted rollout of a run with its model; None if the run has no object."""
+    folder = f"sequences/{sequence_name}"
+    needed = (f"{folder}/rollout.npy", f"{folder}/control.npy", f"{folder}/model.safetensors")
+    if not all(run.has(name) for name in needed):
+        return None
+    position = run.array(needed[0])
+    parameters = SimulationParameters.from_dict(run.yaml("object/parameters.yaml"))
+    if run.has(f"{folder}/meta.yaml"):
+        # As the rollout was simulated: what is stored of the world is the profile's, not this one.
+        meta = run.yaml(f"{folder}/meta.yaml")
+        parameters = parameters.in_world(
+            frame_rate=float(meta["frame_rate"]),
+            ground_height=meta.get("ground_height"),
+            gravity=float(meta.get("gravity", parameters.gravity)),
+        )
+    return ObjectRollout(
+        model=SpringMassModel.from_tensors(run.tensors(needed[2])),
+        parameters=parameters,
+        control=run.array(needed[1])[: len(position)],
+        position=position,
+        ready=len(position),
+    )
 
 
 def _difference(
