@@ -8,7 +8,8 @@ from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence import Sequence, ViewMeta
 from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import SequenceWriter
-from physhandi.hand.model import HandKind, Side, load_hand_model
+from physhandi.hand.loading import load_hand_model
+from physhandi.hand.model import HandKind, Side
 from physhandi.hand.motion import HandMotion
 
 SIZE = 240

@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from physhandi.data.observation import ObjectObservation
 from physhandi.fitting.hand_refinement import RefinementProblem
 from physhandi.fitting.object_problem import build_problem
-from physhandi.hand.control_nodes import control_trajectory
-from physhandi.hand.model import HandModel, load_hand_model
-from physhandi.hand.motion import HandMotion
+from physhandi.hand.loading import load_hand_model
+from physhandi.hand.model import HandModel
+from physhandi.hand.motion import HandMotion, control_trajectory
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.topology import build_model

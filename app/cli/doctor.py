@@ -58,8 +58,8 @@ def _probes(data_dir: Path | None) -> Iterator[tuple[str, Callable[[], str]]]:
         return ", ".join(entry.id for entry in entries)
 
     def hand() -> str:
+        from physhandi.hand.loading import load_hand_model
         from physhandi.hand.mano import hands_folder
-        from physhandi.hand.model import load_hand_model
 
         found = [f"{s} hand {load_hand_model(s).vertex_count} vertices" for s in ("right", "left")]
         mano = [s for s in ("right", "left") if (hands_folder() / f"mano_{s}.npz").is_file()]

@@ -18,7 +18,7 @@ from physhandi.data.run import Run
 from physhandi.data.run_folder import reading
 from physhandi.data.sequence import Sequence
 from physhandi.errors import RunError
-from physhandi.hand.model import load_hand_model
+from physhandi.hand.loading import load_hand_model
 from physhandi.hand.motion import HandMotion
 from physhandi.hand.skin import hand_skin
 from physhandi.perception.lifting import hand_points

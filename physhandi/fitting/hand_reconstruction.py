@@ -19,7 +19,8 @@ from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence import Sequence
 from physhandi.errors import FitError, MissingInputError
 from physhandi.fitting.config import HandFitConfig
-from physhandi.hand.model import HandModel, Side, load_hand_model
+from physhandi.hand.loading import load_hand_model
+from physhandi.hand.model import HandModel, Side
 from physhandi.hand.motion import HandMotion
 from physhandi.hand.rotation import quaternion_matrix
 from physhandi.perception.keypoints import detect_sequence

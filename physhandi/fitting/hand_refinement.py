@@ -18,9 +18,8 @@ from physhandi.fitting.config import RefinementConfig as RefinementConfig
 from physhandi.fitting.hand_reconstruction import KeypointTarget, reprojection_loss
 from physhandi.fitting.object_problem import ObjectProblem, problem_parameters
 from physhandi.fitting.preview import RolloutPreview
-from physhandi.hand.control_nodes import control_trajectory
 from physhandi.hand.model import HandModel, HandPose
-from physhandi.hand.motion import HandMotion
+from physhandi.hand.motion import HandMotion, control_trajectory
 from physhandi.hand.rotation import rotation_matrix
 from physhandi.progress import Progress
 from physhandi.simulation import differentiable

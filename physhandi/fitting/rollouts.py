@@ -18,9 +18,9 @@ from physhandi.fitting.config import PipelineConfig
 from physhandi.fitting.hand_reconstruction import keypoint_target
 from physhandi.fitting.hand_refinement import RefinedHands, RefinementProblem, refine_hands
 from physhandi.fitting.object_problem import ObjectProblem
-from physhandi.hand.control_nodes import control_trajectory
-from physhandi.hand.model import HandModel, load_hand_model
-from physhandi.hand.motion import HandMotion
+from physhandi.hand.loading import load_hand_model
+from physhandi.hand.model import HandModel
+from physhandi.hand.motion import HandMotion, control_trajectory
 from physhandi.perception.shape import object_nodes_from_observation
 from physhandi.progress import Progress
 from physhandi.simulation.simulator import Simulator

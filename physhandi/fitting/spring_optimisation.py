@@ -176,7 +176,9 @@ class Descent:
         )
         self._reach: dict[str, int] = {}
 
-    def walk(self, problem: ObjectProblem, model: SpringMassModel, horizon: int) -> float | None:
+    def fit_pass(
+        self, problem: ObjectProblem, model: SpringMassModel, horizon: int
+    ) -> float | None:
         """Walk once through a sequence and update after every window of frames.
 
         Each window starts where the last one ended, with the material that has since changed
@@ -185,7 +187,7 @@ class Descent:
         Args:
             problem: The sequence.
             model: Its springs, as they were at the start.
-            horizon: Frames to walk, frame 0 included.
+            horizon: Frames of the pass, frame 0 included.
 
         Returns:
             Mean loss met on the way [m²], or none if a window had no usable gradient; the rest of
@@ -198,7 +200,9 @@ class Descent:
         state = torch.from_numpy(model.object_node), torch.from_numpy(model.initial_velocity)
         losses = []
         for begin in range(0, horizon - 1, length):
-            window = self.look(problem, model, (begin, min(begin + length, horizon - 1)), state)
+            window = self.fit_window(
+                problem, model, (begin, min(begin + length, horizon - 1)), state
+            )
             if window is None:
                 return None
             self._optimizer.step()
@@ -206,7 +210,7 @@ class Descent:
             state = window.state
         return float(torch.cat(losses).double().mean())
 
-    def look(
+    def fit_window(
         self,
         problem: ObjectProblem,
         model: SpringMassModel,
@@ -346,7 +350,7 @@ def optimise_springs(
         progress.check_cancelled()
         try:
             met = [
-                descent.walk(p, models[p.name], _horizon(iteration, settings, p.frame_count))
+                descent.fit_pass(p, models[p.name], _horizon(iteration, settings, p.frame_count))
                 for p in problems
             ]
             note = _tell(problems, met)

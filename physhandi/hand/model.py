@@ -114,19 +114,3 @@ class HandModel(ABC):
         scale: float | Float[Tensor, ""] = 1.0,
     ) -> Float[Tensor, "batch 21 3"]:
         """Compute the keypoints alone, as `__call__` does but without the surface."""
-
-
-def load_hand_model(side: Side, kind: HandKind = "open") -> HandModel:
-    """Load a hand model; repeated calls return the same object.
-
-    Args:
-        side: Which hand.
-        kind: ``open`` for the built-in hand, ``mano`` for the user's imported MANO.
-
-    Raises:
-        MissingInputError: If MANO was not imported; says how to.
-    """
-    from physhandi.hand.mano import ManoHand
-    from physhandi.hand.open_hand import OpenHand
-
-    return ManoHand.load(side) if kind == "mano" else OpenHand.load(side)

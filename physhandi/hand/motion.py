@@ -1,5 +1,6 @@
 """A hand's motion: one shape, and the pose of every frame."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import cast
 
@@ -119,3 +120,25 @@ class HandMotion:
             wrist_translation=tensors["wrist_translation"],
             scale=float(tensors["scale"]),
         )
+
+
+def control_trajectory(
+    motions: Sequence[HandMotion], models: Sequence[HandModel]
+) -> Float[ndarray, "frame control 3"]:
+    """Join the vertices of all hands into one trajectory of control nodes.
+
+    Args:
+        motions: Motion of each hand, in the order of the sequence's hands.
+        models: Model of each hand, in the same order.
+
+    Returns:
+        Positions of the control nodes, hands in order [length unit of the sequence].
+
+    Raises:
+        ValueError: If there is no hand, or the hands cover different numbers of frames.
+    """
+    frames = [motion.frame_count for motion in motions]
+    if not frames or min(frames) != max(frames):
+        raise ValueError(f"control nodes need hands that cover the same frames, not {frames}")
+    vertices = [motion.vertices(model) for motion, model in zip(motions, models, strict=True)]
+    return np.concatenate(vertices, axis=1)

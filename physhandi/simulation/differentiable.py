@@ -16,10 +16,10 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from physhandi.simulation.engines.cpu import ThreadedAdjoint
-from physhandi.simulation.engines.cuda import DataflowAdjoint
+from physhandi.simulation.engines.cpu import CpuAdjoint
+from physhandi.simulation.engines.cuda import CudaAdjoint
 from physhandi.simulation.engines.frame_sums import SCALARS
-from physhandi.simulation.engines.graph_adjoint import FrameAdjoint
+from physhandi.simulation.engines.graph_adjoint import GraphAdjoint
 from physhandi.simulation.engines.tape import TapeLayout, Trajectory
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
@@ -162,14 +162,14 @@ class _DifferentiableSimulator:
         self.torch_device = torch.device(wp.device_to_torch(self.simulator.device))
 
     @cached_property
-    def adjoint(self) -> FrameAdjoint | DataflowAdjoint | ThreadedAdjoint:
+    def adjoint(self) -> GraphAdjoint | CudaAdjoint | CpuAdjoint:
         """The adjoint of one frame; made on first use, since many rollouts never walk back."""
         simulator = self.simulator
         if simulator.collision is not None:
-            return FrameAdjoint(simulator)
+            return GraphAdjoint(simulator)
         engine = simulator.engine
-        fast = DataflowAdjoint.of(simulator, engine) or ThreadedAdjoint.of(simulator, engine)
-        return fast or FrameAdjoint(simulator)
+        fast = CudaAdjoint.of(simulator, engine) or CpuAdjoint.of(simulator, engine)
+        return fast or GraphAdjoint(simulator)
 
     def trajectory(self, tensors: list[Tensor], memory: int | None) -> Trajectory | None:
         """Decide which frames to keep; none if nobody can ask for a gradient."""
@@ -251,7 +251,7 @@ class _DifferentiableSimulator:
                 for place, state in zip(begin, states, strict=True):
                     _copy_in(place, state[frame - 1])
                 trajectory.record(frame)
-            adjoint.carry(trajectory.tape(frame))
+            adjoint.backward(trajectory.tape(frame))
             start, end, *rest = (_copy_out(value) for value in adjoint.sums)
             sums[0][frame - 1] += start
             sums[0][frame] += end

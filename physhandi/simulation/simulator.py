@@ -11,9 +11,9 @@ from jaxtyping import Float, Float32
 from numpy import ndarray
 
 from physhandi.errors import SimulationDivergedError
-from physhandi.simulation.engines.cpu import Threaded
-from physhandi.simulation.engines.cuda import Dataflow
-from physhandi.simulation.engines.graph import Recording, SpringSums
+from physhandi.simulation.engines.cpu import CpuEngine
+from physhandi.simulation.engines.cuda import CudaEngine
+from physhandi.simulation.engines.graph import LaunchGraph, SpringSums
 from physhandi.simulation.kernels.integration import integrate_nodes
 from physhandi.simulation.kernels.springs import pull_springs
 from physhandi.simulation.kernels.world import World
@@ -74,7 +74,7 @@ class Simulator:
         self._no_tape = wp.zeros(0, dtype=wp.vec3, device=self.device)
         self._collision: SelfCollision | None = None
         self._recordings = {
-            collides: Recording(self._launch_frame, self.device) for collides in (False, True)
+            collides: LaunchGraph(self._launch_frame, self.device) for collides in (False, True)
         }
         self.set_parameters(parameters)
 
@@ -227,9 +227,9 @@ class Simulator:
         self._recordings[self.parameters.self_collision].replay(version)
 
     @cached_property
-    def engine(self) -> Dataflow | Threaded | None:
+    def engine(self) -> CudaEngine | CpuEngine | None:
         """Moves frames without self-collision, where it can; laid out when it is first asked to."""
-        return Dataflow.of(self) or Threaded.of(self)
+        return CudaEngine.of(self) or CpuEngine.of(self)
 
     @cached_property
     def sums(self) -> SpringSums:

@@ -120,7 +120,7 @@ def test_the_doctor_names_what_is_wrong(
     def absent(side: str) -> None:
         raise FileNotFoundError(f"{side} hand is not there")
 
-    monkeypatch.setattr("physhandi.hand.model.load_hand_model", absent)
+    monkeypatch.setattr("physhandi.hand.loading.load_hand_model", absent)
     assert terminal("doctor") == 1
     assert "FAIL  hand: right hand is not there" in terminal.out
 

@@ -9,7 +9,7 @@ from phystwin_experiment import write_experiment
 from app import cli
 from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
-from physhandi.hand.model import load_hand_model
+from physhandi.hand.loading import load_hand_model
 
 
 def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:

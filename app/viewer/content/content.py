@@ -192,7 +192,7 @@ def _hands(run: Run, folder: str, recorded: Listing[str]) -> tuple[HandSurface, 
 
 def _faces(side: Literal["right", "left"], vertex_count: int) -> Int[ndarray, "face 3"] | None:
     """Give the open hand's faces to a run that stored none."""
-    from physhandi.hand.model import load_hand_model
+    from physhandi.hand.loading import load_hand_model
 
     model = load_hand_model(side)
     if model.vertex_count != vertex_count:

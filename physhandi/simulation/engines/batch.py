@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32, Int
 from numpy import ndarray
 
 from physhandi.errors import SimulationDivergedError, UsageError
-from physhandi.simulation.engines.graph import Recording
+from physhandi.simulation.engines.graph import LaunchGraph
 from physhandi.simulation.engines.partition import bisect_nodes
 from physhandi.simulation.kernels.batch import (
     FIELDS,
@@ -243,7 +243,7 @@ class Population:
         ]
         self._diverged = wp.zeros(len(lanes), dtype=wp.int32, device=device)
         self._diverged_frame = wp.zeros(len(lanes), dtype=wp.int32, device=device)
-        self._frame = Recording(self._launch_frame, device)
+        self._frame = LaunchGraph(self._launch_frame, device)
 
     def rollout(self, control: Float32[ndarray, "frame control 3"]) -> BatchRollout:
         """Simulate all frames; the host waits once, at the end."""

@@ -18,10 +18,10 @@ from physhandi.simulation.engines.frame_sums import FrameSums
 from physhandi.simulation.engines.host import EngineHost
 from physhandi.simulation.engines.partition import SpringParts, group_springs
 from physhandi.simulation.engines.tape import Tape, TapeLayout
-from physhandi.simulation.kernels.meeting import ABORT, NO_STOP
-from physhandi.simulation.kernels.simd import LANES, Bars, Material, Parts, Record
-from physhandi.simulation.kernels.threaded import advance_parts
-from physhandi.simulation.kernels.threaded_adjoint import retract_parts
+from physhandi.simulation.kernels.barrier import ABORT, NO_STOP
+from physhandi.simulation.kernels.cpu_adjoint import parts_adjoint
+from physhandi.simulation.kernels.cpu_frame import advance_parts
+from physhandi.simulation.kernels.simd import LANES, Bars, Parts, Record, SpringMaterial
 
 TRIAL = 64
 """Substeps by which a number of threads is judged."""
@@ -80,7 +80,7 @@ class Pace:
         return min(self._cost, key=self._cost.__getitem__)
 
 
-class Walk:
+class SubstepLoop:
     """A kernel of `kernels.threaded` with its arguments."""
 
     def __init__(self, kernel: Any, substeps: int, inputs: list[Any], device: Any) -> None:
@@ -194,14 +194,14 @@ LEAST_SPRINGS = 512
 _NEVER = np.iinfo(np.int32).max
 _RECORD: Any = Record
 _PARTS: Any = Parts
-_MATERIAL: Any = Material
+_MATERIAL: Any = SpringMaterial
 _BARS: Any = Bars
 
 PartState = tuple[wp.array, wp.array]
 """Positions and velocities."""
 
 
-class Threaded:
+class CpuEngine:
     """The arrays of one model that a CPU's threads work on."""
 
     def __init__(self, simulator: EngineHost, parts: SpringParts) -> None:
@@ -227,14 +227,14 @@ class Threaded:
         self._force = self.zeros(parts.place_count, wp.vec4)
         self.no_tape = self.zeros((0, 0), wp.vec4)
         self._first = self.zeros(len(parts.own_start) - 1, wp.int32)
-        self._walks: dict[bool, Walk] = {}
+        self._loops: dict[bool, SubstepLoop] = {}
 
     @staticmethod
-    def of(simulator: EngineHost) -> "Threaded | None":
+    def of(simulator: EngineHost) -> "CpuEngine | None":
         """Make one for a simulator; none on a GPU, or if there is no node."""
         if simulator.device.is_cuda or simulator.model.node_count == 0:
             return None
-        return Threaded(simulator, group_springs(simulator.model, PART_COUNTS, LANES))
+        return CpuEngine(simulator, group_springs(simulator.model, PART_COUNTS, LANES))
 
     def zeros(self, shape: int | tuple[int, ...], dtype: Any) -> wp.array:
         """Make an array of zeros in the processor's memory."""
@@ -249,15 +249,15 @@ class Threaded:
             tape: Where each substep's state and velocity before contact go.
         """
         simulator = self._simulator
-        walk = self._walks.get(tape is None)
-        if walk is None:
-            walk = self._walks[tape is None] = self.walk(
+        loop = self._loops.get(tape is None)
+        if loop is None:
+            loop = self._loops[tape is None] = self.substep_loop(
                 advance_parts,
                 [simulator.world, self.parts, *simulator.material, *simulator.controls, *before],
                 [self.material, self.state, self._force, self.no_tape, *after, self._first],
             )
         state, free_tape = (self.state, self.no_tape) if tape is None else tape
-        walk.aim(
+        loop.aim(
             position=before[0],
             velocity=before[1],
             state_out=state,
@@ -265,15 +265,17 @@ class Threaded:
             position_out=after[0],
             velocity_out=after[1],
         )
-        walk.run(self.threads)
+        loop.run(self.threads)
         told = simulator.first_divergence.numpy()
         told[0] = min(told[0], *self._first.numpy())
 
-    def walk(self, kernel: Any, *arguments: list[Any]) -> Walk:
+    def substep_loop(self, kernel: Any, *arguments: list[Any]) -> SubstepLoop:
         """Prepare the launches of a kernel over the substeps of a frame."""
         simulator = self._simulator
         inputs = [value for part in arguments for value in part]
-        return Walk(kernel, simulator.parameters.substeps_per_frame, inputs, simulator.device)
+        return SubstepLoop(
+            kernel, simulator.parameters.substeps_per_frame, inputs, simulator.device
+        )
 
 
 def tape_layout(places: int, nodes: int, substeps: int) -> TapeLayout:
@@ -287,10 +289,10 @@ def tape_layout(places: int, nodes: int, substeps: int) -> TapeLayout:
     return ((substeps + 1, places), _RECORD), ((substeps, nodes), wp.vec4)
 
 
-class ThreadedAdjoint:
+class CpuAdjoint:
     """Simulates frames and carries derivatives back; as `FrameAdjoint`, by threads."""
 
-    def __init__(self, simulator: EngineHost, engine: Threaded) -> None:
+    def __init__(self, simulator: EngineHost, engine: CpuEngine) -> None:
         """Make room for the derivatives.
 
         Args:
@@ -317,30 +319,30 @@ class ThreadedAdjoint:
             ("end", held, wp.vec3),
         ):
             setattr(self._bars, name, engine.zeros(shape, dtype))
-        self._walk_back = engine.walk(
-            retract_parts,
+        self._adjoint = engine.substep_loop(
+            parts_adjoint,
             [simulator.world, engine.parts, *simulator.material, engine.material],
             [engine.state, engine.no_tape, self._bars, self.position_bar, self.velocity_bar],
             [*self.sums.material, self.sums.drag, *self.sums.ground],
         )
 
     @staticmethod
-    def of(simulator: EngineHost, engine: Any) -> "ThreadedAdjoint | None":
+    def of(simulator: EngineHost, engine: Any) -> "CpuAdjoint | None":
         """Make one for a simulator; none if its engine is another, or nodes collide."""
-        if not isinstance(engine, Threaded) or simulator.parameters.self_collision:
+        if not isinstance(engine, CpuEngine) or simulator.parameters.self_collision:
             return None
-        return ThreadedAdjoint(simulator, engine)
+        return CpuAdjoint(simulator, engine)
 
     def record(self, tape: Tape) -> None:
         """Advance the simulator by one frame and keep its substeps in `tape`."""
         self._engine.advance(self._state, self._state, tape)
 
-    def carry(self, tape: Tape) -> None:
-        """Carry `position_bar` and `velocity_bar` back; see `FrameAdjoint.carry`."""
+    def backward(self, tape: Tape) -> None:
+        """Carry `position_bar` and `velocity_bar` back; see `FrameAdjoint.backward`."""
         engine = self._engine
         state, free_tape = tape
-        self._walk_back.aim(state=state, free_tape=free_tape)
-        self._walk_back.run(engine.threads)
+        self._adjoint.aim(state=state, free_tape=free_tape)
+        self._adjoint.run(engine.threads)
         # A control node has a place in each part that it holds.
         for bar, held in zip(self.sums.controls, (self._bars.start, self._bars.end), strict=True):
             bar.zero_()

@@ -14,13 +14,13 @@ from physhandi.simulation.engines.host import EngineHost
 from physhandi.simulation.engines.partition import Partition, partition_model
 from physhandi.simulation.engines.tape import Tape
 from physhandi.simulation.engines.tape import TapeLayout as TapeLayout
-from physhandi.simulation.kernels.dataflow import FORWARD_LOCALS, make_frame_kernel
-from physhandi.simulation.kernels.dataflow_adjoint import (
+from physhandi.simulation.kernels.cuda_adjoint import (
     ADJOINT_LOCALS,
     make_adjoint_kernel,
     sum_controls,
 )
-from physhandi.simulation.kernels.dataflow_large import (
+from physhandi.simulation.kernels.cuda_frame import FORWARD_LOCALS, make_frame_kernel
+from physhandi.simulation.kernels.cuda_large_frame import (
     FLOATS_OF_A_LOCAL,
     make_large_frame_kernel,
     pack_half_edges,
@@ -31,7 +31,7 @@ WARP = 32
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Columns:
+class HalfEdgeColumns:
     """Columns of 32 half-edges, one for each thread of a warp, group by group.
 
     A block's nodes take turns if it has more than rows of threads: each turn is a chunk. A group
@@ -48,7 +48,7 @@ class Columns:
     """Which spring it is; -1 for padding."""
 
 
-def arrange_columns(partition: Partition, lanes: int, threads: int) -> Columns:
+def arrange_columns(partition: Partition, lanes: int, threads: int) -> HalfEdgeColumns:
     """Share out half-edges to threads.
 
     Args:
@@ -75,7 +75,7 @@ def arrange_columns(partition: Partition, lanes: int, threads: int) -> Columns:
     column, lane = np.divmod(np.arange(len(node)) - partition.entry_start[node], lanes)
     slot = start[group[node]] + WARP * column + (row[node] * lanes + lane) % WARP
     place[slot], spring[slot] = partition.entry.T
-    return Columns(
+    return HalfEdgeColumns(
         chunk_count=chunks,
         start=start.astype(np.int32),
         place=place.astype(np.int32),
@@ -226,7 +226,7 @@ class BlockLayout:
         return cls(lanes, kept, next((n for n in BLOCK_SIZES if n >= needed), BLOCK_SIZES[-1]))
 
 
-class Dataflow:
+class CudaEngine:
     """The arrays of one model that blocks of nodes work on."""
 
     def __init__(self, simulator: EngineHost, partition: Partition) -> None:
@@ -250,7 +250,7 @@ class Dataflow:
         self.large = LargeFrames(simulator, partition) if is_large else None
 
     @staticmethod
-    def of(simulator: EngineHost) -> "Dataflow | None":
+    def of(simulator: EngineHost) -> "CudaEngine | None":
         """Make one for a simulator; none on a CPU, or if the model's blocks do not fit.
 
         Blocks that fit static shared memory are moved by the kernel that keeps all in registers,
@@ -262,7 +262,7 @@ class Dataflow:
         blocks = max(1, min(int(device.sm_count), model.node_count // LEAST_OWN))
         partition = partition_model(model, blocks)
         fits = partition.most_locals <= max(FORWARD_LOCALS, most_large_locals(device))
-        return Dataflow(simulator, partition) if fits else None
+        return CudaEngine(simulator, partition) if fits else None
 
     def next_tags(self, count: int) -> int:
         """Reserve tags that no value in the relay bears."""
@@ -309,7 +309,7 @@ class Dataflow:
             ],
         )
 
-    def walk_back(
+    def launch_adjoint(
         self, tape: wp.array, is_first: wp.array, state_bars: list[wp.array], bars: list[wp.array]
     ) -> None:
         """Launch the adjoint of one frame.
@@ -347,17 +347,17 @@ def tape_layout(nodes: int, substeps: int) -> TapeLayout:
     return (((substeps, 3 * nodes), wp.vec4),)
 
 
-class DataflowAdjoint:
+class CudaAdjoint:
     """Simulates frames and carries derivatives back; as `FrameAdjoint`, in a launch each."""
 
-    def __init__(self, simulator: EngineHost, dataflow: Dataflow) -> None:
+    def __init__(self, simulator: EngineHost, engine: CudaEngine) -> None:
         """Make room for the derivatives.
 
         Args:
             simulator: Whose frames; its controls, material and world are read, its state moved.
-            dataflow: The simulator's.
+            engine: The simulator's.
         """
-        self._dataflow = dataflow
+        self._engine = engine
         model, device = simulator.model, simulator.device
         nodes = model.node_count
         held = len(model.spring_nodes) - model.object_spring_count
@@ -370,7 +370,7 @@ class DataflowAdjoint:
         self.position_bar, self.velocity_bar = zeros(nodes, wp.vec3), zeros(nodes, wp.vec3)
         self._held_bars = [zeros(held, wp.vec3) for _ in range(2)]
         self.sums = FrameSums.zeros(model, device)
-        self._is_first = simulator.array(dataflow.partition.is_first, wp.int32)
+        self._is_first = simulator.array(engine.partition.is_first, wp.int32)
         control = model.spring_nodes[model.object_spring_count :].max(axis=1, initial=0) - nodes
         by_control = np.argsort(control, kind="stable")
         start = np.searchsorted(control[by_control], np.arange(model.control_count + 1))
@@ -380,28 +380,28 @@ class DataflowAdjoint:
         ]
 
     @staticmethod
-    def of(simulator: EngineHost, dataflow: Any) -> "DataflowAdjoint | None":
+    def of(simulator: EngineHost, engine: Any) -> "CudaAdjoint | None":
         """Make one for a simulator; none if its engine is another or its blocks do not fit."""
-        if not isinstance(dataflow, Dataflow) or simulator.parameters.self_collision:
+        if not isinstance(engine, CudaEngine) or simulator.parameters.self_collision:
             return None
-        partition, layout = dataflow.partition, dataflow.layout
+        partition, layout = engine.partition, engine.layout
         fits = (
             partition.most_locals <= ADJOINT_LOCALS
             and partition.most_own * layout.lanes <= layout.threads
             and partition.most_entries <= layout.lanes * layout.kept
         )
-        return DataflowAdjoint(simulator, dataflow) if fits else None
+        return CudaAdjoint(simulator, engine) if fits else None
 
     def record(self, tape: Tape) -> None:
         """Advance the simulator by one frame and keep its substeps in `tape`."""
-        self._dataflow.advance(self._state, self._state, *tape)
+        self._engine.advance(self._state, self._state, *tape)
 
-    def carry(self, tape: Tape) -> None:
-        """Carry `position_bar` and `velocity_bar` back; see `FrameAdjoint.carry`."""
+    def backward(self, tape: Tape) -> None:
+        """Carry `position_bar` and `velocity_bar` back; see `FrameAdjoint.backward`."""
         sums, (substeps,) = self.sums, tape
         for value in self._held_bars:
             value.zero_()
-        self._dataflow.walk_back(
+        self._engine.launch_adjoint(
             substeps,
             self._is_first,
             [self.position_bar, self.velocity_bar],

@@ -11,7 +11,7 @@ from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.topology import half_edges, split_rows
 
 
-class Recording:
+class LaunchGraph:
     """What a function launches, captured on first use and when told that arrays have moved."""
 
     def __init__(self, launches: Callable[[], None], device: Any) -> None:

@@ -5,10 +5,10 @@ from typing import Any
 import warp as wp
 
 from physhandi.simulation.engines.frame_sums import FrameSums
-from physhandi.simulation.engines.graph import Recording
+from physhandi.simulation.engines.graph import LaunchGraph
 from physhandi.simulation.engines.tape import Tape, TapeLayout
-from physhandi.simulation.kernels.adjoint import gather_nodes, retract_nodes, retract_springs
-from physhandi.simulation.kernels.self_collision_adjoint import retract_collisions, retract_ground
+from physhandi.simulation.kernels.adjoint import gather_nodes, nodes_adjoint, springs_adjoint
+from physhandi.simulation.kernels.self_collision_adjoint import collisions_adjoint, ground_adjoint
 from physhandi.simulation.self_collision import SelfCollision
 from physhandi.simulation.simulator import Simulator
 
@@ -19,7 +19,7 @@ def tape_layout(nodes: int, substeps: int, *, collides: bool) -> TapeLayout:
     return (states, states, steps, steps) if collides else (states, states, steps)
 
 
-class FrameAdjoint:
+class GraphAdjoint:
     """Simulates frames and carries a loss's derivatives from a frame's end to its start.
 
     The attributes named after a value and `bar` hold the derivative of the loss by it. The
@@ -53,8 +53,8 @@ class FrameAdjoint:
         self._row_offset_bar = simulator.sums.scratch()
         self._row_stretch_bar = simulator.sums.scratch()
         self.sums = FrameSums.zeros(model, device, collides=collides)
-        self._fill = Recording(self._launch_fill, device)
-        self._walk_back = Recording(self._launch_walk_back, device)
+        self._fill = LaunchGraph(self._launch_fill, device)
+        self._adjoint = LaunchGraph(self._launch_adjoint, device)
 
     def record(self, tape: Tape) -> None:
         """Advance the simulator by one frame and keep its substeps in `tape`."""
@@ -69,7 +69,7 @@ class FrameAdjoint:
             wp.copy(kept, own)
         self._copied = tape
 
-    def carry(self, tape: Tape) -> None:
+    def backward(self, tape: Tape) -> None:
         """Carry `position_bar` and `velocity_bar` from the end of the frame in `tape` to its start.
 
         Its controls and material must be those of the simulator; `sums` is what it gives.
@@ -80,7 +80,7 @@ class FrameAdjoint:
             self._copied = tape
         for value in self.sums:
             value.zero_()
-        self._walk_back.replay(self._simulator.find_candidates(self._position[0]))
+        self._adjoint.replay(self._simulator.find_candidates(self._position[0]))
 
     def _launch_fill(self) -> None:
         for substep, tapes in enumerate(
@@ -93,7 +93,7 @@ class FrameAdjoint:
                 *tapes,
             )
 
-    def _launch_walk_back(self) -> None:
+    def _launch_adjoint(self) -> None:
         simulator, model = self._simulator, self._simulator.model
         collision = simulator.collision
         state_bars = [self.position_bar, self.velocity_bar]
@@ -102,7 +102,7 @@ class FrameAdjoint:
             fraction = (substep + 1) / len(self._free_velocity)
             if collision is None:
                 wp.launch(
-                    retract_nodes,
+                    nodes_adjoint,
                     dim=model.node_count,
                     inputs=[simulator.world, state[0], self._free_velocity[substep]],
                     outputs=[*state_bars, self.sums.drag, *self.sums.ground, self._force_bar],
@@ -111,7 +111,7 @@ class FrameAdjoint:
             else:
                 self._launch_contacts(substep, collision)
             wp.launch(
-                retract_springs,
+                springs_adjoint,
                 dim=len(model.spring_nodes),
                 inputs=[*simulator.spring_inputs(fraction, state), self._force_bar],
                 outputs=[*self.sums.material, self._offset_bar, self._stretch_bar],
@@ -128,20 +128,20 @@ class FrameAdjoint:
             )
 
     def _launch_contacts(self, substep: int, collision: SelfCollision) -> None:
-        """Launch what `retract_nodes` does, with the collisions between ground and drag."""
+        """Launch what `nodes_adjoint` does, with the collisions between ground and drag."""
         simulator = self._simulator
         state_bars = [self.position_bar, self.velocity_bar]
         candidates = [simulator.world, collision.start, collision.candidate]
         inputs = [*candidates, self._position[substep], self._free_velocity[substep]]
         wp.launch(
-            retract_ground,
+            ground_adjoint,
             dim=simulator.model.node_count,
             inputs=[*inputs, self._contact_velocity[substep]],
             outputs=[*state_bars, *self.sums.ground, self._gain_bar],
             device=simulator.device,
         )
         wp.launch(
-            retract_collisions,
+            collisions_adjoint,
             dim=simulator.model.node_count,
             inputs=[*inputs, self._gain_bar],
             outputs=[*state_bars, self.sums.drag, *self.sums.collision, self._force_bar],

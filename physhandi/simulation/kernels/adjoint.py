@@ -1,7 +1,7 @@
 """Hand-written adjoint of one substep; a bar (as in x̄) is the derivative of the loss by x.
 
-Backwards through a substep: `retract_nodes` undoes contact, drag and integration,
-`retract_springs` the spring forces, `gather_nodes` hands the result to the springs' ends.
+Backwards through a substep: `nodes_adjoint` undoes contact, drag and integration,
+`springs_adjoint` the spring forces, `gather_nodes` hands the result to the springs' ends.
 """
 
 import warp as wp
@@ -24,7 +24,7 @@ class ContactAdjoint:
 
 
 @wp.func
-def retract(world: World, position: wp.vec3, velocity: wp.vec3, after: Motion):
+def node_adjoint(world: World, position: wp.vec3, velocity: wp.vec3, after: Motion):
     """Carry adjoints (`after`) back through `contacts.advance`.
 
     With impact time τ = -z/v_z and kept sliding s = 1 + μ (1 + e) v_z / |v_t|:
@@ -74,7 +74,7 @@ def before_drag(world: World, free_bar: wp.vec3):
 
 
 @wp.kernel
-def retract_nodes(
+def nodes_adjoint(
     # Model:
     world: wp.array[World],
     # State in:
@@ -94,7 +94,7 @@ def retract_nodes(
     after = Motion()
     after.position = position_bar_out[node]
     after.velocity = velocity_bar_out[node]
-    before = retract(world[0], position[node], free_velocity[node], after)
+    before = node_adjoint(world[0], position[node], free_velocity[node], after)
     free_bar = before.motion.velocity
     old_bar = before_drag(world[0], free_bar)
     position_bar_out[node] = before.motion.position
@@ -114,7 +114,7 @@ def force_bar_at(node: int, force_bar: wp.array[wp.vec3]):
 
 
 @wp.kernel
-def retract_springs(
+def springs_adjoint(
     fraction: float,
     # Model:
     world: wp.array[World],

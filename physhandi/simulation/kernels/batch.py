@@ -8,7 +8,7 @@ nothing. State is laid out as [group][node][x y z vx vy vz][candidate of the gro
 import warp as wp
 
 from physhandi.simulation.kernels.contacts import advance
-from physhandi.simulation.kernels.dataflow import control_position, control_velocity, pull
+from physhandi.simulation.kernels.cuda_frame import control_position, control_velocity, pull
 from physhandi.simulation.kernels.integration import free_velocity, is_too_fast
 from physhandi.simulation.kernels.world import World
 
@@ -37,7 +37,7 @@ FIELDS = (
 _LEAST_THREADS = 256
 
 
-# What follows is `dataflow.pull` summed over a node's springs, for several candidates a thread.
+# What follows is `cuda_frame.pull` summed over a node's springs, for several candidates a thread.
 # Wide loads at fixed offsets, which Warp's strided arrays do not give, make it 2.5 times as fast.
 # Springs that all candidates of the group have come first and need no question. The root of
 # `intrinsics` is inlined with the sum of squares kept away from zero.

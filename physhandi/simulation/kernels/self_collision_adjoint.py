@@ -6,7 +6,7 @@ list each other, so that each node gathers what its pairs say of both.
 
 import warp as wp
 
-from physhandi.simulation.kernels.adjoint import before_drag, retract
+from physhandi.simulation.kernels.adjoint import before_drag, node_adjoint
 from physhandi.simulation.kernels.contacts import SLIDING_SPEED, Motion
 from physhandi.simulation.kernels.self_collision import collision_count, is_colliding
 from physhandi.simulation.kernels.world import World
@@ -25,7 +25,7 @@ class BounceAdjoint:
 
 
 @wp.func
-def retract_bounce(world: World, offset: wp.vec3, rate: wp.vec3, gain_bar: wp.vec3):
+def bounce_adjoint(world: World, offset: wp.vec3, rate: wp.vec3, gain_bar: wp.vec3):
     """Carry the adjoint of a gain back through `self_collision.bounce`.
 
     The gain is h v_n n + q v_t with h = (1 + e) / 2, and q = -μ h v_n / |v_t| while the pair
@@ -69,7 +69,7 @@ def retract_bounce(world: World, offset: wp.vec3, rate: wp.vec3, gain_bar: wp.ve
 
 
 @wp.kernel
-def retract_ground(
+def ground_adjoint(
     # Model:
     world: wp.array[World],
     start: wp.array[int],
@@ -94,7 +94,7 @@ def retract_ground(
     after = Motion()
     after.position = position_bar_out[node]
     after.velocity = velocity_bar_out[node]
-    before = retract(world[0], position[node], contact_velocity[node], after)
+    before = node_adjoint(world[0], position[node], contact_velocity[node], after)
     position_bar_out[node] = before.motion.position
     velocity_bar_out[node] = before.motion.velocity
     restitution_bar_out[node] += before.restitution
@@ -104,7 +104,7 @@ def retract_ground(
 
 
 @wp.kernel
-def retract_collisions(
+def collisions_adjoint(
     # Model:
     world: wp.array[World],
     start: wp.array[int],
@@ -135,7 +135,7 @@ def retract_collisions(
         rate = free_velocity[other] - free_velocity[node]
         if is_colliding(world[0], offset, rate):
             pair_bar = gain_bar[node] - gain_bar[other]
-            before = retract_bounce(world[0], offset, rate, pair_bar)
+            before = bounce_adjoint(world[0], offset, rate, pair_bar)
             place_bar -= before.offset
             speed_bar -= before.rate
             # Both nodes of a pair count it.

@@ -7,7 +7,7 @@ Warp's own arrays have strides known only at run time, so its compiler cannot do
 hence native snippets, in the vector types that Clang has for every processor. The ends of a
 spring are given as four times the node, which is where its force begins.
 
-The laws are those of `springs.pull_springs` and `adjoint.retract_springs`.
+The laws are those of `springs.pull_springs` and `adjoint.springs_adjoint`.
 """
 
 import warp as wp
@@ -36,7 +36,7 @@ class Parts:
 
 
 @wp.struct
-class Material:
+class SpringMaterial:
     """Rest length [m], scaled stiffness [N], damping [N·s/m] of the springs part by part."""
 
     rest: wp.array[wp.float32]
@@ -173,7 +173,7 @@ def pull_inner(
     part: int,
     row: int,
     parts: Parts,
-    material: Material,
+    material: SpringMaterial,
     state: wp.array2d[Record],
     force: wp.array[wp.vec4],
 ):
@@ -185,7 +185,7 @@ def pull_cut(
     part: int,
     row: int,
     parts: Parts,
-    material: Material,
+    material: SpringMaterial,
     state: wp.array2d[Record],
     force: wp.array[wp.vec4],
 ):
@@ -193,11 +193,11 @@ def pull_cut(
 
 
 @wp.func_native(snippet=_springs(_RETRACT, is_cut=False))
-def retract_inner(
+def inner_springs_adjoint(
     part: int,
     row: int,
     parts: Parts,
-    material: Material,
+    material: SpringMaterial,
     state: wp.array2d[Record],
     bars: Bars,
 ):
@@ -205,11 +205,11 @@ def retract_inner(
 
 
 @wp.func_native(snippet=_springs(_RETRACT, is_cut=True))
-def retract_cut(
+def cut_springs_adjoint(
     part: int,
     row: int,
     parts: Parts,
-    material: Material,
+    material: SpringMaterial,
     state: wp.array2d[Record],
     bars: Bars,
 ):

@@ -25,7 +25,7 @@ from physhandi.data.run import Run
 from physhandi.data.run_folder import artefacts
 from physhandi.data.sequence import Sequence
 from physhandi.errors import MissingInputError, UsageError
-from physhandi.hand.model import load_hand_model
+from physhandi.hand.loading import load_hand_model
 from physhandi.hand.motion import HandMotion
 from physhandi.metrics.baselines import (
     last_residual_baseline,

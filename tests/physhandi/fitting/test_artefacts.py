@@ -19,7 +19,7 @@ from physhandi.fitting.artefacts import (
     save_hand_points,
     save_observation,
 )
-from physhandi.hand.model import load_hand_model
+from physhandi.hand.loading import load_hand_model
 from physhandi.progress import NullProgress
 
 

@@ -19,7 +19,7 @@ from physhandi.fitting.hand_reconstruction import (
     velocity_loss,
     vertex_normals,
 )
-from physhandi.hand.model import load_hand_model
+from physhandi.hand.loading import load_hand_model
 
 
 def _camera(x: float, distortion: float = 0.0) -> PinholeCamera:

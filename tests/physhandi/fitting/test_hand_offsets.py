@@ -9,7 +9,7 @@ from hand_scene import grasping
 from scipy.spatial.transform import Rotation
 
 from physhandi.fitting.hand_refinement import HandOffsets, OffsetDescent, control_nodes
-from physhandi.hand.model import load_hand_model
+from physhandi.hand.loading import load_hand_model
 
 RATES = {"articulation": 0.01, "rotation": 0.02, "translation": 1e-3}
 

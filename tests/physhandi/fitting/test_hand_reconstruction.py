@@ -12,7 +12,7 @@ from recordings import recording
 from physhandi.data.importers.stereo import import_stereo
 from physhandi.errors import CancelledError, FitError, MissingInputError
 from physhandi.fitting.hand_reconstruction import HandFit, HandFitConfig, reconstruct_hands
-from physhandi.hand.model import load_hand_model
+from physhandi.hand.loading import load_hand_model
 from physhandi.hand.motion import HandMotion
 from physhandi.metrics.hands import evaluate_hands, hide_keypoints
 from physhandi.perception.keypoints import detect_sequence

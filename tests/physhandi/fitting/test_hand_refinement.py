@@ -20,8 +20,7 @@ from physhandi.fitting.hand_refinement import (
     RefinementProblem,
     refine_hands,
 )
-from physhandi.hand.control_nodes import control_trajectory
-from physhandi.hand.motion import HandMotion
+from physhandi.hand.motion import HandMotion, control_trajectory
 from physhandi.progress import NullProgress, Progress
 from physhandi.simulation.simulator import Simulator
 

@@ -26,7 +26,7 @@ from physhandi.fitting.hand_refinement import (
     refine_hands,
 )
 from physhandi.fitting.object_problem import build_problem
-from physhandi.hand.model import load_hand_model
+from physhandi.hand.loading import load_hand_model
 from physhandi.hand.motion import HandMotion
 from physhandi.progress import NullProgress, Progress
 from physhandi.simulation.parameters import SimulationParameters

@@ -17,7 +17,8 @@ from physhandi.errors import MissingInputError, UsageError
 from physhandi.fitting.artefacts import load_motions
 from physhandi.fitting.config import HandFitConfig, config_from_dict, config_to_dict, load_profile
 from physhandi.fitting.hand_reconstruction import reconstruct_hands
-from physhandi.hand.model import Side, load_hand_model
+from physhandi.hand.loading import load_hand_model
+from physhandi.hand.model import Side
 
 BUNDLED = Path(__file__).parents[3] / "sequences"
 CAMERAS = [scene.looking_at_hand(angle) for angle in (0.0, 1.2, 2.6)]

@@ -154,7 +154,7 @@ def test_one_frame_gradients_agree_with_phystwin(device: str, made: Any, start: 
     for frame, expected in enumerate(case["grad_log_stiffness"]):
         if start == "recorded":
             state = tuple(torch.from_numpy(case[k][frame] * UP) for k in ("position", "velocity"))
-        window = descent.look(problem, model, (frame, frame + 1), state)
+        window = descent.fit_window(problem, model, (frame, frame + 1), state)
         assert window is not None
         state = window.state
         total = case["loss"][frame, :2].sum()

@@ -18,7 +18,7 @@ from physhandi.fitting.object_problem import ObjectProblem, build_problem
 from physhandi.fitting.object_reconstruction import search_object
 from physhandi.fitting.search import SearchConfig, SearchVariable
 from physhandi.fitting.spring_optimisation import optimise_springs
-from physhandi.hand.model import load_hand_model
+from physhandi.hand.loading import load_hand_model
 from physhandi.progress import Preview, Progress
 from physhandi.simulation.parameters import SimulationParameters
 

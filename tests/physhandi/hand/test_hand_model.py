@@ -8,14 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from physhandi.hand.model import (
-    JOINT_NAMES,
-    KEYPOINT_NAMES,
-    HandKind,
-    HandModel,
-    HandPose,
-    load_hand_model,
-)
+from physhandi.hand.loading import load_hand_model
+from physhandi.hand.model import JOINT_NAMES, KEYPOINT_NAMES, HandKind, HandModel, HandPose
 from physhandi.hand.open_hand import OpenHand
 
 PALM_SIDE = {

@@ -9,8 +9,9 @@ from mano_file import JOINTS, PARENT, TO_MANO, mano_arrays
 from scipy.spatial.transform import Rotation
 
 from physhandi.errors import MissingInputError
+from physhandi.hand.loading import load_hand_model
 from physhandi.hand.mano import FINGERTIP_VERTEX, ManoHand, hands_folder
-from physhandi.hand.model import JOINT_NAMES, KEYPOINT_NAMES, load_hand_model
+from physhandi.hand.model import JOINT_NAMES, KEYPOINT_NAMES
 
 MANO_NAMES = [
     f"{finger}_{joint}"

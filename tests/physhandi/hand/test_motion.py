@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from physhandi.hand.control_nodes import control_trajectory
-from physhandi.hand.model import Side, load_hand_model
-from physhandi.hand.motion import HandMotion
+from physhandi.hand.loading import load_hand_model
+from physhandi.hand.model import Side
+from physhandi.hand.motion import HandMotion, control_trajectory
 
 
 def _motion(side: Side = "right", frame_count: int = 200) -> HandMotion:

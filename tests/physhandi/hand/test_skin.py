@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from physhandi.hand.model import JOINT_NAMES, HandKind, Side, load_hand_model
+from physhandi.hand.loading import load_hand_model
+from physhandi.hand.model import JOINT_NAMES, HandKind, Side
 from physhandi.hand.motion import HandMotion
 from physhandi.hand.skin import HandSkin, hand_skin
 

@@ -14,7 +14,7 @@ from physhandi.data.sequence import Sequence, ViewMeta
 from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import SequenceWriter
 from physhandi.errors import CancelledError, MissingInputError
-from physhandi.hand.model import load_hand_model
+from physhandi.hand.loading import load_hand_model
 from physhandi.hand.open_hand import KEYPOINT_OFFSET, OpenHand
 from physhandi.perception.keypoints import (
     DetectedHand,

@@ -9,8 +9,8 @@ from reference.scenes import as_model, bare_scene, star_scene
 from reference.spring_mass import simulate
 
 from physhandi.errors import SimulationDivergedError
-from physhandi.simulation.engines.cuda import Dataflow, DataflowAdjoint
-from physhandi.simulation.engines.graph_adjoint import FrameAdjoint
+from physhandi.simulation.engines.cuda import CudaAdjoint, CudaEngine
+from physhandi.simulation.engines.graph_adjoint import GraphAdjoint
 from physhandi.simulation.simulator import Simulator
 
 
@@ -42,7 +42,7 @@ def test_gradients_are_those_of_the_recorded_adjoint(side, monkeypatch):
     needs_cuda()
     model, control = thrown_block(side, frames=3)
     fast = block_gradients(model, control, PARAMETERS, "cuda:0")
-    monkeypatch.setattr(DataflowAdjoint, "of", lambda *_: None)
+    monkeypatch.setattr(CudaAdjoint, "of", lambda *_: None)
     # Other parameters, so that another simulator is made; the difference is far below rounding.
     slow = block_gradients(model, control, replace(PARAMETERS, frame_rate=30.0 + 1e-9), "cuda:0")
     for name, theirs in slow.items():
@@ -109,6 +109,6 @@ def test_tags_begin_again_before_they_run_out(monkeypatch):
 
 def test_a_processor_has_another_engine():
     model, _ = thrown_block(3)
-    assert not isinstance(Simulator(model, PARAMETERS, device="cpu").engine, Dataflow)
-    assert DataflowAdjoint.of(Simulator(model, PARAMETERS), None) is None
-    assert FrameAdjoint(Simulator(model, PARAMETERS)).position_bar.shape == (27,)
+    assert not isinstance(Simulator(model, PARAMETERS, device="cpu").engine, CudaEngine)
+    assert CudaAdjoint.of(Simulator(model, PARAMETERS), None) is None
+    assert GraphAdjoint(Simulator(model, PARAMETERS)).position_bar.shape == (27,)

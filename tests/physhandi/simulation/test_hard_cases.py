@@ -14,9 +14,9 @@ from physhandi.errors import SimulationDivergedError
 from physhandi.simulation import differentiable
 from physhandi.simulation.engines import cuda
 from physhandi.simulation.engines.batch import BatchSimulator
-from physhandi.simulation.engines.cpu import Threaded, ThreadedAdjoint
-from physhandi.simulation.engines.cuda import Dataflow, DataflowAdjoint
-from physhandi.simulation.engines.graph_adjoint import FrameAdjoint
+from physhandi.simulation.engines.cpu import CpuAdjoint, CpuEngine
+from physhandi.simulation.engines.cuda import CudaAdjoint, CudaEngine
+from physhandi.simulation.engines.graph_adjoint import GraphAdjoint
 from physhandi.simulation.master_topology import MasterTopology
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
@@ -56,7 +56,7 @@ def simulator_of(way, model, parameters):
     if name == "recorded":
         return recorded(model, device, parameters)
     simulator = Simulator(model, parameters, device=device)
-    assert isinstance(simulator.engine, Threaded if name == "threaded" else Dataflow)
+    assert isinstance(simulator.engine, CpuEngine if name == "threaded" else CudaEngine)
     if name != "threaded":
         assert (simulator.engine.large is not None) == (name == "large frame")
     return simulator
@@ -80,8 +80,8 @@ def test_every_adjoint_agrees_with_central_differences_of_the_oracle(
     device, adjoint, case, monkeypatch
 ):
     if adjoint == "recorded":
-        monkeypatch.setattr(DataflowAdjoint, "of", lambda *_: None)
-        monkeypatch.setattr(ThreadedAdjoint, "of", lambda *_: None)
+        monkeypatch.setattr(CudaAdjoint, "of", lambda *_: None)
+        monkeypatch.setattr(CpuAdjoint, "of", lambda *_: None)
     scene = SCENES[case][0]()
     scene = replace(scene, control=scene.control[:2], substeps=min(scene.substeps, 30))
     weights = loss_weights(scene)
@@ -103,12 +103,12 @@ def test_a_rollout_with_gradients_tells_where_it_diverges(device, adjoint, monke
     import torch
 
     if adjoint == "recorded":
-        monkeypatch.setattr(DataflowAdjoint, "of", lambda *_: None)
-        monkeypatch.setattr(ThreadedAdjoint, "of", lambda *_: None)
+        monkeypatch.setattr(CudaAdjoint, "of", lambda *_: None)
+        monkeypatch.setattr(CpuAdjoint, "of", lambda *_: None)
     model, control = thrown_block(5)
     stiff = replace(model, stiffness=(model.stiffness * 3e4).astype(np.float32))
     bridge = differentiable._bridge(stiff, PARAMETERS, device)
-    assert isinstance(bridge.adjoint, FrameAdjoint) == (adjoint == "recorded")
+    assert isinstance(bridge.adjoint, GraphAdjoint) == (adjoint == "recorded")
     told = []
     with pytest.raises(SimulationDivergedError) as caught:
         recorded(stiff, device).rollout(control)

@@ -12,7 +12,7 @@ from physhandi.errors import SimulationDivergedError
 from physhandi.simulation.engines import cuda
 from physhandi.simulation.engines.cuda import LargeLayout, most_large_locals
 from physhandi.simulation.engines.partition import Partition
-from physhandi.simulation.kernels.dataflow import FORWARD_LOCALS
+from physhandi.simulation.kernels.cuda_frame import FORWARD_LOCALS
 from physhandi.simulation.simulator import Simulator
 
 H200_BYTES = 232448

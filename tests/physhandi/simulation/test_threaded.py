@@ -12,7 +12,7 @@ from reference.spring_mass import simulate
 
 from physhandi.errors import SimulationDivergedError
 from physhandi.simulation import differentiable
-from physhandi.simulation.engines.cpu import Threaded, ThreadedAdjoint
+from physhandi.simulation.engines.cpu import CpuAdjoint, CpuEngine
 from physhandi.simulation.simulator import Simulator
 
 pytestmark = pytest.mark.skipif(not wp.is_cpu_available(), reason="this Warp has no CPU device")
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.skipif(not wp.is_cpu_available(), reason="this Warp has
 
 def simulator_of(model, parameters=PARAMETERS, threads=None):
     simulator = Simulator(model, parameters, device="cpu")
-    assert isinstance(simulator.engine, Threaded)
+    assert isinstance(simulator.engine, CpuEngine)
     if threads is not None:
         simulator.engine.threads = threads
     return simulator
@@ -55,7 +55,7 @@ def test_parts_move_as_the_recorded_kernels_do(side):
 def test_gradients_are_those_of_the_recorded_adjoint(side, monkeypatch):
     model, control = thrown_block(side, frames=3)
     fast = block_gradients(model, control, PARAMETERS, "cpu")
-    monkeypatch.setattr(ThreadedAdjoint, "of", lambda *_: None)
+    monkeypatch.setattr(CpuAdjoint, "of", lambda *_: None)
     # Other parameters, so that another simulator is made; the difference is far below rounding.
     slow = block_gradients(model, control, replace(PARAMETERS, frame_rate=30.0 + 1e-9), "cpu")
     for name, theirs in slow.items():
@@ -174,6 +174,6 @@ def test_self_collision_goes_the_recorded_way():
     simulator.set_parameters(collides)
     wanted = recorded(model, "cpu", collides).rollout(control).position
     assert np.array_equal(simulator.rollout(control).position, wanted)
-    assert ThreadedAdjoint.of(simulator, simulator.engine) is None
+    assert CpuAdjoint.of(simulator, simulator.engine) is None
     simulator.set_parameters(PARAMETERS)
     assert np.array_equal(simulator.rollout(control).position, plain)

@@ -155,7 +155,7 @@ def adjoint_of(kind, scene, device, monkeypatch):
     if kind == "recorded":
         bridge.simulator.engine = None
     monkeypatch.setattr(differentiable, "_bridge", lambda *_: bridge)
-    calls = {"record": 0, "carry": 0}
+    calls = {"record": 0, "backward": 0}
 
     def counted(name, real):
         def call(tape):
@@ -179,9 +179,9 @@ def test_stored_and_simulated_again_give_the_same_bits(device, kind, monkeypatch
     found = {}
     for stored in (FRAMES, 1, 2, 3, FRAMES):
         for window in (None, 3):
-            calls.update(record=0, carry=0)
+            calls.update(record=0, backward=0)
             result = gradients(scene, device, weights, window, memory=stored * size)
-            assert calls == {"record": FRAMES, "carry": FRAMES}
+            assert calls == {"record": FRAMES, "backward": FRAMES}
             bits = {name: value.tobytes() for name, value in result.items()}
             assert found.setdefault(window, bits) == bits, stored
     assert found[None]["log_stiffness"] != found[3]["log_stiffness"]
@@ -210,9 +210,9 @@ def test_only_frames_that_do_not_fit_are_simulated_again(device, stored, monkeyp
     position, _ = differentiable.rollout(
         *as_model(scene), torch.tensor(scene.control), log_stiffness=log, device=device
     )
-    assert calls == {"record": stored, "carry": 0}
+    assert calls == {"record": stored, "backward": 0}
     position[-1].sum().backward()
-    assert calls == {"record": FRAMES, "carry": FRAMES}
+    assert calls == {"record": FRAMES, "backward": FRAMES}
     assert float(log.grad.abs().max()) > 1e-4
 
 

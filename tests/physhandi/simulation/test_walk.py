@@ -9,7 +9,7 @@ from reference.blocks import PARAMETERS, thrown_block
 
 from physhandi.simulation.engines import cpu
 from physhandi.simulation.engines.cpu import FIRST_PAUSE, TRIAL, Pace
-from physhandi.simulation.kernels.meeting import ABORT, NO_STOP, meet
+from physhandi.simulation.kernels.barrier import ABORT, NO_STOP, meet
 from physhandi.simulation.simulator import Simulator
 
 needs_processor = pytest.mark.skipif(
@@ -91,7 +91,7 @@ def block():
     wanted = simulator.rollout(control).position
     simulator.engine.threads = 2
     simulator.rollout(control)
-    return simulator, control, wanted, simulator.engine._walks[True]
+    return simulator, control, wanted, simulator.engine._loops[True]
 
 
 @needs_processor

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from physhandi.hand.model import load_hand_model
+from physhandi.hand.loading import load_hand_model
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.topology import build_model
 from physhandi.synthetic.bodies.sheets import (

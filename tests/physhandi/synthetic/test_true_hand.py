@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from physhandi.data.sequence_meta import Side
-from physhandi.hand.model import load_hand_model
+from physhandi.hand.loading import load_hand_model
 from physhandi.synthetic.film.rasterizer import vertex_normals
 from physhandi.synthetic.hands.true_hand import (
     ASSET,

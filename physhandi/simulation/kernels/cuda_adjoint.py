@@ -1,4 +1,4 @@
-"""The adjoint of `dataflow`: one launch walks a frame's tape back, substep by substep.
+"""The adjoint of `cuda_frame`: one launch walks a frame's tape back, substep by substep.
 
 A node's owner undoes contact, drag and integration, publishes the adjoint of the node's force,
 and then sums what the springs say of its old state. A bar is the derivative of the loss.
@@ -6,9 +6,9 @@ and then sums what the springs say of its old state. A bar is the derivative of 
 
 import warp as wp
 
-from physhandi.simulation.kernels.adjoint import before_drag, retract
+from physhandi.simulation.kernels.adjoint import before_drag, node_adjoint
 from physhandi.simulation.kernels.contacts import Motion
-from physhandi.simulation.kernels.dataflow import control_position, control_velocity
+from physhandi.simulation.kernels.cuda_frame import control_position, control_velocity
 from physhandi.simulation.kernels.half_edges import entries_of, make_loader
 from physhandi.simulation.kernels.intrinsics import (
     block_barrier,
@@ -37,7 +37,7 @@ class SpringAdjoint:
 
 
 @wp.func
-def retract_pull(
+def pull_adjoint(
     offset: wp.vec3,
     stretch: wp.vec3,
     pull_bar: wp.vec3,
@@ -45,7 +45,7 @@ def retract_pull(
     stiffness: float,
     damping: float,
 ):
-    """Carry the adjoint of a spring's force back; see `adjoint.retract_springs`.
+    """Carry the adjoint of a spring's force back; see `adjoint.springs_adjoint`.
 
     Args:
         offset: From this end to the other.
@@ -106,7 +106,7 @@ def make_adjoint_kernel(lanes: int, kept: int) -> wp.Kernel:
     load_half_edges = make_loader(lanes, kept)
 
     @wp.kernel(enable_backward=False, module="unique", launch_bounds=768)
-    def retract_frame(
+    def frame_adjoint(
         threads: int,
         substeps: int,
         tag: int,
@@ -194,7 +194,7 @@ def make_adjoint_kernel(lanes: int, kept: int) -> wp.Kernel:
             fraction = float(substep + 1) / float(substeps)
             if is_owner:
                 free = xyz(own_free)
-                before = retract(here, xyz(own_position), free, after)
+                before = node_adjoint(here, xyz(own_position), free, after)
                 free_bar = before.motion.velocity
                 after.position = before.motion.position
                 after.velocity = before_drag(here, free_bar)
@@ -246,7 +246,7 @@ def make_adjoint_kernel(lanes: int, kept: int) -> wp.Kernel:
                     offset = shared_read(now + index[k]) - x
                     stretch = shared_read(now + wp.static(ADJOINT_LOCALS) + index[k]) - v
                     other_bar = shared_read(now + 2 * wp.static(ADJOINT_LOCALS) + index[k])
-                    bar = retract_pull(
+                    bar = pull_adjoint(
                         offset, stretch, force_bar - other_bar, rest[k], hooke[k], dashpot[k]
                     )
                     place_bar -= bar.offset
@@ -279,7 +279,7 @@ def make_adjoint_kernel(lanes: int, kept: int) -> wp.Kernel:
                 log_stiffness_bar_out[spring[k]] = log_stiffness_bar[k]
                 damping_bar_out[spring[k]] = damping_bar[k]
 
-    return retract_frame
+    return frame_adjoint
 
 
 @wp.kernel

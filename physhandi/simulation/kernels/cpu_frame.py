@@ -8,10 +8,10 @@ bit, is the same.
 
 import warp as wp
 
+from physhandi.simulation.kernels.barrier import meet
 from physhandi.simulation.kernels.contacts import advance
 from physhandi.simulation.kernels.integration import free_velocity, is_too_fast
-from physhandi.simulation.kernels.meeting import meet
-from physhandi.simulation.kernels.simd import Material, Parts, Record, pull_cut, pull_inner
+from physhandi.simulation.kernels.simd import Parts, Record, SpringMaterial, pull_cut, pull_inner
 from physhandi.simulation.kernels.world import World
 
 wp.set_module_options({"enable_backward": False})
@@ -45,7 +45,7 @@ def gather_material(
     rest_length: wp.array[float],
     stiffness: wp.array[float],
     damping: wp.array[float],
-    material: Material,
+    material: SpringMaterial,
 ):
     """Copy what a part's springs are made of, as it is now; padding pulls at nothing."""
     for group in range(2):
@@ -135,7 +135,7 @@ def advance_parts(
     position: wp.array[wp.vec3],
     velocity: wp.array[wp.vec3],
     # Scratch:
-    material_out: Material,
+    material_out: SpringMaterial,
     state_out: wp.array2d[Record],
     force_out: wp.array[wp.vec4],
     # State out:

@@ -1,6 +1,6 @@
 """The frame kernel for blocks that need more than static shared memory.
 
-It moves nodes as `dataflow` does; two things differ. Nodes lie in dynamic shared memory, and
+It moves nodes as `cuda_frame` does; two things differ. Nodes lie in dynamic shared memory, and
 half-edges are packed in the order in which threads read them: the same column of neighbouring
 threads lies side by side, 16 bytes each, and the first columns stay in registers.
 """
@@ -8,7 +8,7 @@ threads lies side by side, 16 bytes each, and the first columns stay in register
 import warp as wp
 
 from physhandi.simulation.kernels.contacts import advance
-from physhandi.simulation.kernels.dataflow import control_position, control_velocity, pull
+from physhandi.simulation.kernels.cuda_frame import control_position, control_velocity, pull
 from physhandi.simulation.kernels.integration import free_velocity, is_too_fast
 from physhandi.simulation.kernels.intrinsics import (
     bits_to_float,

@@ -1,4 +1,4 @@
-"""The adjoint of `threaded`: threads walk a frame's tape back, meeting once a substep.
+"""The adjoint of `cpu_frame`: threads walk a frame's tape back, meeting once a substep.
 
 A part undoes contact, drag and integration of its own nodes and writes the adjoints of their
 forces; after the meeting its springs read those of both ends. A bar is the derivative of the
@@ -7,22 +7,22 @@ loss.
 
 import warp as wp
 
-from physhandi.simulation.kernels.adjoint import before_drag, retract
+from physhandi.simulation.kernels.adjoint import before_drag, node_adjoint
+from physhandi.simulation.kernels.barrier import meet
 from physhandi.simulation.kernels.contacts import Motion
-from physhandi.simulation.kernels.meeting import meet
-from physhandi.simulation.kernels.simd import (
-    Bars,
-    Material,
-    Parts,
-    Record,
-    retract_cut,
-    retract_inner,
-)
-from physhandi.simulation.kernels.threaded import (
+from physhandi.simulation.kernels.cpu_frame import (
     as_record,
     gather_material,
     record_position,
     record_velocity,
+)
+from physhandi.simulation.kernels.simd import (
+    Bars,
+    Parts,
+    Record,
+    SpringMaterial,
+    cut_springs_adjoint,
+    inner_springs_adjoint,
 )
 from physhandi.simulation.kernels.world import World
 
@@ -61,7 +61,7 @@ def begin_part(
 
 
 @wp.func
-def retract_nodes_of(
+def part_nodes_adjoint(
     part: int,
     substep: int,
     world: World,
@@ -78,7 +78,7 @@ def retract_nodes_of(
         after.velocity = record_velocity(record)
         taped = free_tape[substep, own]
         free = wp.vec3(taped[0], taped[1], taped[2])
-        before = retract(world, record_position(state[substep, own]), free, after)
+        before = node_adjoint(world, record_position(state[substep, own]), free, after)
         free_bar = before.motion.velocity
         old_bar = before_drag(world, free_bar)
         bars.state[own] = as_record(before.motion.position, old_bar)
@@ -121,7 +121,7 @@ def give_springs(
 
 
 @wp.kernel
-def retract_parts(
+def parts_adjoint(
     thread: int,
     threads: int,
     substeps: int,
@@ -135,7 +135,7 @@ def retract_parts(
     stiffness: wp.array[float],
     damping: wp.array[float],
     # Scratch:
-    material_out: Material,
+    material_out: SpringMaterial,
     # State in:
     state: wp.array2d[Record],
     free_tape: wp.array2d[wp.vec4],
@@ -170,11 +170,11 @@ def retract_parts(
         substep = substeps - 1 - step
         fraction = float(substep + 1) / float(substeps)
         for part in range(part_first, part_last):
-            retract_nodes_of(part, substep, here, parts, state, free_tape, bars_out)
+            part_nodes_adjoint(part, substep, here, parts, state, free_tape, bars_out)
         waited = meet(meeting_out, step - first + 1, threads, waited, give_way)
         for part in range(part_first, part_last):
-            retract_inner(part, substep, parts, material_out, state, bars_out)
-            retract_cut(part, substep, parts, material_out, state, bars_out)
+            inner_springs_adjoint(part, substep, parts, material_out, state, bars_out)
+            cut_springs_adjoint(part, substep, parts, material_out, state, bars_out)
             collect_controls(part, fraction, here.control_rate, parts, bars_out)
         step += 1
     if thread == 0:

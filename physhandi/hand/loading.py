@@ -1,0 +1,18 @@
+"""Which hand model a hand is fitted with: the built-in open hand, or the user's MANO."""
+
+from physhandi.hand.mano import ManoHand
+from physhandi.hand.model import HandKind, HandModel, Side
+from physhandi.hand.open_hand import OpenHand
+
+
+def load_hand_model(side: Side, kind: HandKind = "open") -> HandModel:
+    """Load a hand model; repeated calls return the same object.
+
+    Args:
+        side: Which hand.
+        kind: ``open`` for the built-in hand, ``mano`` for the user's imported MANO.
+
+    Raises:
+        MissingInputError: If MANO was not imported; says how to.
+    """
+    return ManoHand.load(side) if kind == "mano" else OpenHand.load(side)
