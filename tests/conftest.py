@@ -1,6 +1,7 @@
 """Fixtures that all tests share."""
 
 import os
+import sys
 
 import pytest
 import warp as wp
@@ -8,12 +9,13 @@ from recordings import recording
 
 
 def pytest_configure(config):
-    """Give each test process and its children one thread for linear algebra.
-
-    Several workers that start one for every processor wait for each other longer than they work.
-    """
+    """Spare test processes and their children what costs time and proves nothing."""
+    # Several processes with a thread for every processor wait for each other longer than they work.
     for library in ("OMP", "OPENBLAS", "MKL"):
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+    # Servers and workers start by the hundred; each would compile all modules again.
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    sys.dont_write_bytecode = False
 
 
 DEVICES = ["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)]
