@@ -290,7 +290,7 @@ def tape_layout(places: int, nodes: int, substeps: int) -> TapeLayout:
 
 
 class CpuAdjoint:
-    """Simulates frames and carries derivatives back; as `FrameAdjoint`, by threads."""
+    """Simulates frames and carries derivatives back; as `GraphAdjoint`, by threads."""
 
     def __init__(self, simulator: EngineHost, engine: CpuEngine) -> None:
         """Make room for the derivatives.
@@ -338,7 +338,7 @@ class CpuAdjoint:
         self._engine.advance(self._state, self._state, tape)
 
     def backward(self, tape: Tape) -> None:
-        """Carry `position_bar` and `velocity_bar` back; see `FrameAdjoint.backward`."""
+        """Carry `position_bar` and `velocity_bar` back; see `GraphAdjoint.backward`."""
         engine = self._engine
         state, free_tape = tape
         self._adjoint.aim(state=state, free_tape=free_tape)

@@ -348,7 +348,7 @@ def tape_layout(nodes: int, substeps: int) -> TapeLayout:
 
 
 class CudaAdjoint:
-    """Simulates frames and carries derivatives back; as `FrameAdjoint`, in a launch each."""
+    """Simulates frames and carries derivatives back; as `GraphAdjoint`, in a launch each."""
 
     def __init__(self, simulator: EngineHost, engine: CudaEngine) -> None:
         """Make room for the derivatives.
@@ -397,7 +397,7 @@ class CudaAdjoint:
         self._engine.advance(self._state, self._state, *tape)
 
     def backward(self, tape: Tape) -> None:
-        """Carry `position_bar` and `velocity_bar` back; see `FrameAdjoint.backward`."""
+        """Carry `position_bar` and `velocity_bar` back; see `GraphAdjoint.backward`."""
         sums, (substeps,) = self.sums, tape
         for value in self._held_bars:
             value.zero_()

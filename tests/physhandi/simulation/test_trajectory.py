@@ -166,7 +166,7 @@ def adjoint_of(kind, scene, device, monkeypatch):
 
     for name in calls:
         monkeypatch.setattr(bridge.adjoint, name, counted(name, getattr(bridge.adjoint, name)))
-    is_recorded = isinstance(bridge.adjoint, graph_adjoint.FrameAdjoint)
+    is_recorded = isinstance(bridge.adjoint, graph_adjoint.GraphAdjoint)
     assert is_recorded == (kind != "engine")
     return bridge.adjoint, calls
 
