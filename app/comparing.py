@@ -15,8 +15,8 @@ from app.viewer.compare.curve import Pairing
 from app.viewer.compare.difference import compare_frames, way_of
 from app.viewer.compare.pair import chosen_sequences, open_pair, pairing_of
 from physhandi.data.files import named_fields
-from physhandi.data.run import Run
 from physhandi.errors import RunError
+from physhandi.run import Run
 
 _ASIDES = ("Settings", "Computed with")
 _QUANTITIES = ("track_error", "chamfer_l2")

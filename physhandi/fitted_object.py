@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from physhandi.data.run import Run
+from physhandi.data.run import RunFolder
 from physhandi.errors import MissingInputError
 from physhandi.object_rollout import ObjectRollout, load_fitted
 from physhandi.simulation.model import SpringMassModel
@@ -35,7 +35,7 @@ class FittedObject:
     """The fitted object of one sequence of a run, from which sliders start."""
 
     def __init__(self, folder: str, sequence: str) -> None:
-        run = Run.open(Path(folder))
+        run = RunFolder.open(Path(folder))
         take = load_fitted(run, sequence)
         if take is None:
             raise MissingInputError(

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from physhandi.data.run import Run
+from physhandi.data.run import RunFolder
 from physhandi.simulation.forces import (
     spring_strains,
     spring_tensions,
@@ -108,7 +108,7 @@ class ObjectRollout:
         return float(np.linalg.norm(offset, axis=-1).mean())
 
 
-def load_fitted(run: Run, sequence_name: str) -> ObjectRollout | None:
+def load_fitted(run: RunFolder, sequence_name: str) -> ObjectRollout | None:
     """Load the fitted rollout of a run with its model; None if the run has no object."""
     folder = f"sequences/{sequence_name}"
     needed = (f"{folder}/rollout.npy", f"{folder}/control.npy", f"{folder}/model.safetensors")

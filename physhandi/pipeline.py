@@ -16,7 +16,7 @@ from numpy import ndarray
 
 from physhandi.data.attempt import Attempt
 from physhandi.data.environment import ENVIRONMENT, describe_environment
-from physhandi.data.run import Run
+from physhandi.data.run import RunFolder
 from physhandi.data.sequence import Sequence
 from physhandi.errors import MissingInputError
 from physhandi.fitting import artefacts
@@ -126,7 +126,7 @@ def predict(
 
 
 def simulate(
-    source: Run,
+    source: RunFolder,
     sequence: Sequence,
     changes: dict[str, float],
     attempt: Attempt,
@@ -150,7 +150,7 @@ def simulate(
     attempt.save_json("metrics.json", {sequence.name: _measure(sequence, attempt)})
 
 
-def evaluate(run: Run, sequences: Many[Sequence]) -> dict[str, Any]:
+def evaluate(run: RunFolder, sequences: Many[Sequence]) -> dict[str, Any]:
     """Measure a finished run against its sequences again."""
     scores = {}
     for sequence in sequences:
@@ -373,7 +373,7 @@ def _nothing_to_fit(sequences: Many[Sequence]) -> str:
     return f"There is nothing to fit: {'; '.join(told)}."
 
 
-def run_job(run: Run, progress: Progress | None = None, *, device: str = "cpu") -> None:
+def run_job(run: RunFolder, progress: Progress | None = None, *, device: str = "cpu") -> None:
     """Execute what a run folder asks for, and publish the result.
 
     Args:
@@ -392,7 +392,7 @@ def run_job(run: Run, progress: Progress | None = None, *, device: str = "cpu") 
         for sequence in sequences:
             sequence.validate(reads_color=False)
         if run.kind == "simulation":
-            source = Run.open(Path(run.config["source"]))
+            source = RunFolder.open(Path(run.config["source"]))
             simulate(
                 source, sequences[0], run.config["parameters"], attempt, watched, device=device
             )

@@ -13,10 +13,10 @@ import yaml
 
 from app import cli
 from physhandi.data.camera import PinholeCamera
-from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence, ViewMeta
 from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import SequenceWriter
+from physhandi.run import Run
 
 FILMED_FRAMES, WIDTH, HEIGHT = 4, 48, 36
 

@@ -10,8 +10,8 @@ import time
 from pathlib import Path
 
 from physhandi.data.attempt import Attempt
-from physhandi.data.run import Run
 from physhandi.errors import MissingInputError
+from physhandi.run import Run
 
 STEP_S = 0.02
 

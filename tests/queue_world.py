@@ -20,7 +20,7 @@ from app.security import Security
 from app.server import create_app
 from app.settings import Settings
 from app.viewer.sessions import TooManySessionsError
-from physhandi.data.run import read_events
+from physhandi.data.run_folder import read_events
 
 HOSTILE = "<img src=x onerror=alert(1)>\u202e"
 

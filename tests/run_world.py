@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from physhandi.data.run import Run
+from physhandi.run import Run
 
 
 def make_run(folder: Path, **changes: object) -> Run:

@@ -15,8 +15,8 @@ from app.server import create_app
 from app.settings import BUNDLED, Settings
 from app.viewer.sessions import Sessions
 from physhandi import pipeline
-from physhandi.data.run import Run
 from physhandi.fitting.config import PipelineConfig, config_to_dict
+from physhandi.run import Run
 
 TOKEN = "a-token-that-only-the-tests-know"  # noqa: S105
 HOST = "127.0.0.1:8080"

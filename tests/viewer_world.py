@@ -12,12 +12,12 @@ from numpy import ndarray
 from app.benchmarks.viewer_client import ViewerClient
 from app.viewer.content.content import Content, HandSurface
 from physhandi.data.camera import PinholeCamera
-from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import SequenceMeta, ViewMeta
 from physhandi.data.sequence_writer import SequenceWriter
 from physhandi.data.view import View
 from physhandi.object_rollout import ObjectRollout
+from physhandi.run import Run
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.topology import build_model

@@ -13,9 +13,9 @@ import warp as wp
 from app.viewer.live.client import LiveRequest, SimulationClient
 from app.viewer.live.wire import Message
 from physhandi.benchmarks.timing import describe_machine
-from physhandi.data.run import Run
 from physhandi.errors import MissingInputError, SimulationError
 from physhandi.object_rollout import ObjectRollout, load_fitted
+from physhandi.run import Run
 
 _SESSION = "latency"
 _PATIENCE = 120.0

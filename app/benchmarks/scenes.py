@@ -7,8 +7,8 @@ from typing import Literal
 import numpy as np
 from numpy import ndarray
 
-from physhandi.data.run import Run
 from physhandi.hand.loading import load_hand_model
+from physhandi.run import Run
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.topology import build_model
 

@@ -12,8 +12,8 @@ from app.benchmarks.served import Served
 from app.benchmarks.streams import Screen, percentiles
 from app.viewer.live.rollouts import STARTING
 from app.viewer.physics.parameters import Knob, knobs
-from physhandi.data.run import Run
 from physhandi.fitted_object import FittedObject
+from physhandi.run import Run
 
 FIELDS = ("stiffness_scale", "connection_radius")
 """Parameters whose sliders are moved."""

@@ -29,8 +29,8 @@ from app.benchmarks.sliders import FIELDS, Slider, measure_first_move, measure_s
 from app.benchmarks.streams import measure_scrub, measure_sessions, percentiles
 from app.settings import BUNDLED
 from physhandi.benchmarks.timing import describe_machine
-from physhandi.data.run import Run
 from physhandi.errors import MissingInputError
+from physhandi.run import Run
 
 _RATE = 30.0
 _SESSIONS = 10

@@ -11,11 +11,12 @@ from app.cli.arguments import ImportMano, ImportMocap, ImportPhystwin, ImportSte
 from app.jobs.catalog import Catalog
 from app.settings import Settings
 from physhandi.data.files import plain, without_non_finite
-from physhandi.data.run import Run, RunKind
+from physhandi.data.run import RunKind
 from physhandi.data.sequence import Sequence
 from physhandi.errors import RunError, UsageError
 from physhandi.fitting.config import changed_parameters, config_to_dict, load_profile
 from physhandi.progress import Progress
+from physhandi.run import Run
 from physhandi.simulation.parameters import SimulationParameters
 
 OVERRIDES = (

@@ -25,8 +25,8 @@ from app.viewer.export.snapshot import write_yaml
 from app.viewer.session import Session
 from app.viewer.sessions import Sessions
 from physhandi.data.exporters import export_run
-from physhandi.data.run import Run
 from physhandi.errors import PhysHandiError, RunError, UsageError
+from physhandi.run import Run
 
 _OWN_FIELDS = ("format", "width", "height", "download")
 _SIMPLE = ("ply", "gltf", "npz", "csv", "yaml")

@@ -26,10 +26,10 @@ from app.viewer.export.snapshot import Snapshot, scene_data
 from app.viewer.restoring import complete_state
 from physhandi.data.exporters import export_scene
 from physhandi.data.files import write_atomically, write_bytes, write_json
-from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.errors import PhysHandiError, UsageError, describe
 from physhandi.object_rollout import ObjectRollout
+from physhandi.run import Run
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 

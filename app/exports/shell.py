@@ -12,8 +12,8 @@ from app.exports.permalink import state_from_query
 from app.exports.request import SUFFIXES, FileRequest
 from app.jobs.catalog import Catalog
 from physhandi.data.exporters import FORMATS, export_run
-from physhandi.data.run import Run
 from physhandi.errors import UsageError
+from physhandi.run import Run
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,11 +12,11 @@ from typing import Any, Generic, TypeVar
 
 from app.settings import BUNDLED, Settings
 from physhandi.data.files import named_fields, write_atomically
-from physhandi.data.run import Run
 from physhandi.data.run_folder import JOB, RUN
 from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import FILE
 from physhandi.errors import PhysHandiError, RunError, SequenceError
+from physhandi.run import Run
 
 logger = logging.getLogger(__name__)
 

@@ -13,9 +13,9 @@ from app.jobs.reference import Reference, scaled_plan
 from app.jobs.timeline import Timeline
 from physhandi.data.environment import ENVIRONMENT
 from physhandi.data.files import named_fields
-from physhandi.data.run import Run, read_events
-from physhandi.data.run_folder import ATTEMPTS, CURRENT, EXIT, OUT, read_mapping
+from physhandi.data.run_folder import ATTEMPTS, CURRENT, EXIT, OUT, read_events, read_mapping
 from physhandi.errors import PhysHandiError
+from physhandi.run import Run
 
 _REFERENCES = 5
 """Most earlier fits that one plan is made of."""

@@ -6,7 +6,6 @@ from typing import Any
 
 from app.jobs.catalog import Catalog, RunItem, UnknownRunError
 from physhandi.data.files import named_fields
-from physhandi.data.run import Run
 from physhandi.errors import UsageError
 from physhandi.fitting.config import (
     GROUPS,
@@ -21,6 +20,7 @@ from physhandi.fitting.config import (
     profile_names,
     values_of,
 )
+from physhandi.run import Run
 
 
 def fit_config(

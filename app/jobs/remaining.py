@@ -5,7 +5,7 @@ from typing import Any
 from app.jobs.estimate import Estimate
 from app.jobs.forecast import Forecast
 from app.jobs.scheduler import JobView, Scheduler
-from physhandi.data.run import Run
+from physhandi.run import Run
 
 
 def with_time(

@@ -27,9 +27,9 @@ from app.jobs.supervise import note_end
 from app.settings import Settings
 from physhandi.data.files import write_json
 from physhandi.data.lease import live_holder
-from physhandi.data.run import Run, new_run_id
-from physhandi.data.run_folder import EXIT
+from physhandi.data.run_folder import EXIT, new_run_id
 from physhandi.errors import PhysHandiError, RunError, UsageError
+from physhandi.run import Run
 
 _LOCK = ".server.lock"
 

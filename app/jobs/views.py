@@ -19,10 +19,10 @@ from app.jobs.scheduler import AT_WORK, JobView, Scheduler
 from physhandi import errors
 from physhandi.data.environment import ENVIRONMENT
 from physhandi.data.files import named_fields
-from physhandi.data.run import Run, read_events
-from physhandi.data.run_folder import EXIT, read_mapping
+from physhandi.data.run_folder import EXIT, read_events, read_mapping
 from physhandi.errors import PhysHandiError, UsageError
 from physhandi.fitting.config import SIMULATION, STAGES
+from physhandi.run import Run
 
 _METRICS = "metrics.json"
 

@@ -11,7 +11,7 @@ from app.jobs.log import read_log
 from app.jobs.scheduler import AT_WORK, ENDED
 from app.jobs.streams import News
 from physhandi.data.attempt import PREVIEW
-from physhandi.data.run import read_events
+from physhandi.data.run_folder import read_events
 from physhandi.errors import PhysHandiError
 
 _MOST_BYTES = 2**20

@@ -9,9 +9,9 @@ from pathlib import Path
 from types import FrameType
 
 from app.child import die_with_parent
-from physhandi.data.run import Run
 from physhandi.errors import CancelledError, PhysHandiError, describe
 from physhandi.progress import Progress
+from physhandi.run import Run
 
 logger = logging.getLogger(__name__)
 _LOG_INTERVAL_S = 5.0

@@ -9,9 +9,9 @@ from typing import Any
 from app.pages.metrics import scaled
 from app.pages.render import short
 from physhandi.data.files import named_fields
-from physhandi.data.run import Run
 from physhandi.errors import PhysHandiError
 from physhandi.fitting.config import notes_of
+from physhandi.run import Run
 from physhandi.simulation.parameters import SimulationParameters
 
 _FOUND = "object/parameters.yaml"

@@ -12,9 +12,9 @@ from numpy import ndarray
 from app.previews.draw import HEIGHT, WIDTH, Motion, draw_motion
 from app.previews.links import marker_links
 from physhandi.data.files import named_fields, temporary_name
-from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
+from physhandi.run import Run
 
 _FRAMES = 28
 _USUAL_RATE = 30.0

@@ -5,46 +5,68 @@ import secrets
 import shutil
 from collections.abc import Mapping
 from collections.abc import Sequence as Many
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeVar, cast, get_args
+
+from numpy import ndarray
+from safetensors import SafetensorError
 
 from physhandi.data.attempt import Attempt
-from physhandi.data.attempt import RunProgress as RunProgress
-from physhandi.data.files import named_fields, plain, temporary_name, write_bytes, write_yaml
+from physhandi.data.files import (
+    named_fields,
+    plain,
+    read_array,
+    read_tensors,
+    temporary_name,
+    write_bytes,
+    write_yaml,
+)
 from physhandi.data.lease import Lease, live_holder, locked
-from physhandi.data.result import RunOutputs
-from physhandi.data.result import RunState as RunState
 from physhandi.data.run_folder import (
     ATTEMPTS,
     CANCEL,
+    CURRENT,
+    EXIT,
     JOB,
     LOG,
+    MANIFEST,
+    OUT,
     PROGRESS,
     RUN,
     RUN_FORMAT,
     SAFE_ID,
+    STAGES,
+    artefacts,
+    attempt_numbers,
+    find_damage,
+    inside,
     now,
+    read_json,
     read_mapping,
     read_yaml,
 )
-from physhandi.data.run_folder import new_run_id as new_run_id
-from physhandi.data.run_folder import read_events as read_events
 from physhandi.data.sequence_meta import FILE, read_meta
 from physhandi.errors import RunError
 
 RunKind = Literal["reconstruction", "simulation"]
+RunState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
+_Kind = TypeVar("_Kind", bound="RunFolder")
+_ENDS: tuple[RunState, ...] = ("succeeded", "failed", "cancelled")
+_VANISHED = "The process that worked on this run is gone without a word. Start it again to go on."
 
 
-class Run(RunOutputs):
-    """One execution of the pipeline, as its folder tells it. Use `Run.create` or `Run.open`.
+class RunFolder:
+    """One execution of the pipeline, as its folder tells it; read anew each time it is asked.
+
+    Use `RunFolder.create` or `RunFolder.open`.
 
     Relative paths of sequences in ``job.yaml`` start at the run's folder, so that a run and its
     sequences can be moved together.
     """
 
     def __init__(self, folder: Path, job: Mapping[str, Any], about: Mapping[str, Any]) -> None:
-        super().__init__(folder)
+        self.folder = folder
+        self.id = folder.name
         self.kind: RunKind = job["kind"]
         self.sequences: list[str] = [str(_absolute(folder / path)) for path in job["sequences"]]
         self.sequence_names: list[str] = list(job["sequence_names"])
@@ -55,18 +77,18 @@ class Run(RunOutputs):
         self.created: str = about["created"]
 
     def __repr__(self) -> str:
-        return f"Run({str(self.folder)!r})"
+        return f"{type(self).__name__}({str(self.folder)!r})"
 
     @classmethod
     def create(
-        cls,
+        cls: type[_Kind],
         folder: Path | str,
         *,
         name: str,
         kind: RunKind,
         sequences: Many[str],
         config: Mapping[str, Any],
-    ) -> "Run":
+    ) -> _Kind:
         """Make a run that waits for its first attempt.
 
         Args:
@@ -115,7 +137,7 @@ class Run(RunOutputs):
         return cls(target, job, about)
 
     @classmethod
-    def open(cls, folder: Path | str) -> "Run":
+    def open(cls: type[_Kind], folder: Path | str) -> _Kind:
         """Open a run's folder.
 
         Raises:
@@ -139,6 +161,141 @@ class Run(RunOutputs):
             known = " or ".join(get_args(RunKind))
             raise RunError(f"{path / JOB}: kind is {job['kind']!r}; expected {known}.")
         return cls(path, job, about)
+
+    @property
+    def state(self) -> RunState:
+        """How far the run is."""
+        if live_holder(self.folder) is not None:
+            return "running"
+        state = read_mapping(self.folder / EXIT).get("state")
+        for end in _ENDS:
+            if state == end:
+                return end
+        numbers = attempt_numbers(self.folder)
+        if numbers and self._published() == numbers[-1]:
+            return "succeeded"
+        if (self.folder / CANCEL).exists():
+            return "cancelled"
+        return "failed" if numbers else "queued"
+
+    @property
+    def error(self) -> str | None:
+        """What went wrong in a failed run."""
+        if self.state != "failed":
+            return None
+        return str(read_mapping(self.folder / EXIT).get("error", _VANISHED))
+
+    @property
+    def is_published(self) -> bool:
+        """Whether there are published results."""
+        return self._published() is not None
+
+    @property
+    def attempt(self) -> int | None:
+        """Number of the latest attempt; none if no attempt was begun yet."""
+        return max(attempt_numbers(self.folder), default=None)
+
+    def stages(self) -> list[dict[str, Any]]:
+        """Give the finished stages of the latest attempt, in the order in which they ended.
+
+        Returns:
+            For each stage ``name``, ``time`` of its end, ``seconds`` that it took (where they were
+            measured), ``summary`` (what `Attempt.finish_stage` was told) and ``files``.
+
+        Raises:
+            RunError: If their list is damaged.
+        """
+        path = self.folder / ATTEMPTS / str(self.attempt) / STAGES
+        content: Any = read_json(path) if path.is_file() else []
+        if not isinstance(content, list):
+            raise RunError(f"{path} must list stages; it is damaged.")
+        stages = [named_fields(entry) or {} for entry in cast("list[Any]", content)]
+        if any("name" not in stage for stage in stages):
+            raise RunError(f"{path} must name its stages; it is damaged.")
+        return stages
+
+    @property
+    def out(self) -> Path:
+        """Folder of the published outputs, else of the latest attempt.
+
+        Raises:
+            RunError: If no attempt was begun yet.
+        """
+        number = self._published() or max(attempt_numbers(self.folder), default=None)
+        if number is None:
+            raise RunError(f"Run '{self.id}' has no outputs yet: it is {self.state}.")
+        return self.folder / ATTEMPTS / str(number) / OUT
+
+    def has(self, rel: str) -> bool:
+        """Tell whether there is an output of that name."""
+        if self._published() is None and not attempt_numbers(self.folder):
+            return False
+        return inside(self.out, rel).is_file()
+
+    def array(self, rel: str, *, mmap: bool = True) -> ndarray:
+        """Open an array; mapped ones are read-only.
+
+        Raises:
+            RunError: If it is missing or damaged.
+        """
+        path = self._existing(rel)
+        try:
+            return read_array(path, mmap=mmap)
+        except (ValueError, OSError) as error:
+            raise RunError(f"Run '{self.id}': {rel} is not a readable array: {error}.") from error
+
+    def tensors(self, rel: str) -> dict[str, ndarray]:
+        """Read named arrays.
+
+        Raises:
+            RunError: If the file is missing or damaged.
+        """
+        path = self._existing(rel)
+        try:
+            return read_tensors(path)
+        except (SafetensorError, ValueError, OSError) as error:
+            raise RunError(f"Run '{self.id}': {rel} is not readable: {error}.") from error
+
+    def yaml(self, rel: str) -> Any:
+        """Read plain data from YAML."""
+        return read_yaml(self._existing(rel))
+
+    def json(self, rel: str) -> Any:
+        """Read plain data from JSON."""
+        return read_json(self._existing(rel))
+
+    def verify(self, *, allows_more: bool = False) -> None:
+        """Compare all published files with the hashes of their manifest.
+
+        Args:
+            allows_more: Whether files may lie among the results that the manifest does not know,
+                such as a user's notes.
+
+        Raises:
+            RunError: If nothing is published, or a file is missing, changed or unknown; names it.
+        """
+        number = self._published()
+        if number is None:
+            if self.state == "succeeded":
+                raise RunError(
+                    f"Run '{self.id}' has ended, but its results are not whole: '{CURRENT}' does "
+                    f"not lead to an attempt with a {MANIFEST}. Run it again."
+                )
+            raise RunError(
+                f"Run '{self.id}' is {self.state}: there is nothing published to read yet."
+            )
+        folder = self.folder / ATTEMPTS / str(number)
+        files = named_fields(read_mapping(folder / MANIFEST).get("files"))
+        if files is None:
+            raise RunError(f"{folder / MANIFEST} lists no files; it is damaged. Run it again.")
+        damage = find_damage(folder / OUT, files)
+        if damage is None and not allows_more:
+            unknown = [rel for rel, _ in artefacts(folder / OUT) if rel not in files]
+            damage = f"{unknown[0]} is not in {MANIFEST}" if unknown else None
+        if damage is not None:
+            raise RunError(
+                f"Run '{self.id}': {damage}. Its results cannot be trusted; run it again."
+            )
 
     @property
     def progress(self) -> dict[str, Any]:
@@ -198,33 +355,17 @@ class Run(RunOutputs):
         self.folder.replace(trash)
         shutil.rmtree(trash, ignore_errors=True)
 
+    def _published(self) -> int | None:
+        path = self.folder / CURRENT
+        text = path.read_text().strip() if path.is_file() else ""
+        is_whole = text.isdigit() and (self.folder / ATTEMPTS / text / MANIFEST).is_file()
+        return int(text) if is_whole else None
 
-@dataclass(frozen=True)
-class RunEntry:
-    """One folder of a listing: its run, or why it cannot be used."""
-
-    folder: Path
-    run: Run | None
-    error: str | None
-
-
-def find_runs(folder: Path | str) -> list[RunEntry]:
-    """List the runs directly below a folder, by name.
-
-    A damaged run is listed with its error; nothing is raised because of one.
-    """
-    root = Path(folder)
-    entries: list[RunEntry] = []
-    if not root.is_dir():
-        return entries
-    for path in sorted(root.iterdir()):
-        if path.name.startswith(".") or not ((path / RUN).is_file() or (path / JOB).is_file()):
-            continue
-        try:
-            entries.append(RunEntry(path, Run.open(path), None))
-        except (RunError, OSError) as error:
-            entries.append(RunEntry(path, None, str(error)))
-    return entries
+    def _existing(self, rel: str) -> Path:
+        path = inside(self.out, rel)
+        if not path.is_file():
+            raise RunError(f"Run '{self.id}' has no {rel}; it is {self.state}.")
+        return path
 
 
 def _sequence_name(folder: Path) -> str:

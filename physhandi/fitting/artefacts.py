@@ -14,7 +14,7 @@ from safetensors.numpy import load_file
 from physhandi.data.attempt import Attempt
 from physhandi.data.files import named_fields, parse_yaml, read_array
 from physhandi.data.observation import ObjectObservation
-from physhandi.data.run import Run
+from physhandi.data.run import RunFolder
 from physhandi.data.run_folder import reading
 from physhandi.data.sequence import Sequence
 from physhandi.errors import RunError
@@ -256,7 +256,7 @@ def save_hand_observation(
     output.save_array(f"{sequence_folder(name)}/keypoint.npy", keypoint.astype(np.float32))
 
 
-def copy_hand_observation(source: Run, name: str, output: Attempt) -> None:
+def copy_hand_observation(source: RunFolder, name: str, output: Attempt) -> None:
     """Take over what another run keeps of what the views saw of the hands."""
     folder = sequence_folder(name)
     for file in ("keypoint.npy", "observation/hand_point.npy", "observation/hand_point_end.npy"):
@@ -275,7 +275,7 @@ def save_hand_vertices(output: Attempt, name: str) -> None:
         output.save_tensors(f"{stem}_skin.safetensors", hand_skin(model, motion).to_tensors())
 
 
-def copy_hand_vertices(source: Run, name: str, output: Attempt) -> None:
+def copy_hand_vertices(source: RunFolder, name: str, output: Attempt) -> None:
     """Take over what `save_hand_vertices` stored in another run, which needs no hand model."""
     for motion in load_motions(output.out, name):
         stem = f"{sequence_folder(name)}/hand_{motion.side}"

@@ -22,7 +22,7 @@ from physhandi.data.importers.phystwin_experiment import (
     read_inference,
     read_optimum,
 )
-from physhandi.data.run import Run
+from physhandi.data.run import RunFolder
 from physhandi.data.sequence import Sequence
 from physhandi.errors import ImportFailedError
 from physhandi.fitting import artefacts
@@ -232,7 +232,7 @@ def import_phystwin_run(
     truncates_damping: bool | None = None,
     self_collision: bool | None = None,
     progress: Progress | None = None,
-) -> Run:
+) -> RunFolder:
     """Make a finished run of what PhysTwin optimised for a case, simulated by our simulator.
 
     Args:
@@ -293,7 +293,7 @@ def import_phystwin_run(
         "changed": notes + more,
         "springs": _springs(model, optimum, stored),
     }
-    run = Run.create(
+    run = RunFolder.create(
         out,
         name=f"PhysTwin: {case}",
         kind="reconstruction",
@@ -312,7 +312,7 @@ def import_phystwin_run(
     except BaseException:
         run.delete()
         raise
-    return Run.open(run.folder)
+    return RunFolder.open(run.folder)
 
 
 def _parts(sequence: Sequence) -> tuple[ndarray, ndarray, str]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from physhandi.data.attempt import Attempt
-from physhandi.data.run import Run
+from physhandi.data.run import RunFolder
 from physhandi.data.sequence import Sequence
 from physhandi.errors import RunError
 from physhandi.fitting import artefacts
@@ -24,7 +24,7 @@ from physhandi.simulation.topology import retopologize
 
 
 def simulate_again(
-    source: Run,
+    source: RunFolder,
     sequence: Sequence,
     changes: Mapping[str, Any],
     output: Attempt,
@@ -93,7 +93,7 @@ def simulate_again(
     simulate_sequence(output, sequence, device=device, progress=progress)
 
 
-def _copy_known(source: Run, name: str, output: Attempt) -> np.ndarray:
+def _copy_known(source: RunFolder, name: str, output: Attempt) -> np.ndarray:
     """Take over what the source run already found out about one of its sequences."""
     artefacts.save_observation(output, name, artefacts.load_observation(source.out, name))
     artefacts.save_motions(output, name, artefacts.load_motions(source.out, name))
@@ -102,7 +102,7 @@ def _copy_known(source: Run, name: str, output: Attempt) -> np.ndarray:
 
 
 def _prepare(
-    source: Run,
+    source: RunFolder,
     sequence: Sequence,
     output: Attempt,
     template: tuple[np.ndarray, np.ndarray],
@@ -110,7 +110,7 @@ def _prepare(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Reconstruct the hands of another sequence and lay the known object into it."""
     while source.kind == "simulation":
-        source = Run.open(Path(source.config["source"]))
+        source = RunFolder.open(Path(source.config["source"]))
     config = config_from_dict(source.config["profile"])
     motions = ()
     if sequence.hands:

@@ -8,7 +8,7 @@ from server_world import World
 from starlette.testclient import TestClient
 
 from physhandi.data import files
-from physhandi.data.run import Run
+from physhandi.run import Run
 
 ADDRESS = "/api/v1/runs/fitted"
 HOSTILE = "</textarea><script>alert('note')</script>\nsecond line: {{ 7 * 7 }}"

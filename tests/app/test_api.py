@@ -13,8 +13,8 @@ from server_world import World
 from sheet_sequence import FITTED, FRAMES, NODE
 from starlette.testclient import TestClient
 
-from physhandi.data.run import Run
 from physhandi.fitting.config import STAGES
+from physhandi.run import Run
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import pytest
 from server_world import World
 
 from app.pages.diff import Section, compare_runs, flatten
-from physhandi.data.run import Run
+from physhandi.run import Run
 
 
 def described(**fields: Any) -> dict[str, Any]:

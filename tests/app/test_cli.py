@@ -13,9 +13,9 @@ from sheet_sequence import FRAMES, NODE
 from app import cli
 from app.cli import commands
 from physhandi import pipeline
-from physhandi.data.run import Run
 from physhandi.fitting.artefacts import load_model, load_parameters
 from physhandi.fitting.config import PipelineConfig
+from physhandi.run import Run
 from physhandi.simulation.stability import LONGEST_STEP, SAFETY, largest_stable_step
 
 

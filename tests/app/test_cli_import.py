@@ -7,9 +7,9 @@ from phystwin_case import write_case
 from phystwin_experiment import write_experiment
 
 from app import cli
-from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.hand.loading import load_hand_model
+from physhandi.run import Run
 
 
 def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:

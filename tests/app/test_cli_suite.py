@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from app import cli
-from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.data.truth import read_truth
+from physhandi.run import Run
 from physhandi.synthetic.code_version import generator_version
 from physhandi.synthetic.suite.suite import find_suite
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from server_world import World
 
-from physhandi.data.run import Run
 from physhandi.data.run_folder import RUN
+from physhandi.run import Run
 
 HOSTILE = "<img src=x onerror=alert(1)>"
 LIFT = 0.004

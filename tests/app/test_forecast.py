@@ -13,8 +13,8 @@ import yaml
 from server_world import World
 
 from app.jobs.forecast import Forecast
-from physhandi.data.run import Run
 from physhandi.data.run_folder import read_mapping
+from physhandi.run import Run
 
 ENVIRONMENT = "attempts/1/out/environment.json"
 

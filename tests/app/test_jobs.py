@@ -19,8 +19,9 @@ from app.jobs.processes import end_processes, processes_of, supervisor_of
 from app.jobs.scheduler import JobView, Scheduler
 from app.settings import Settings
 from physhandi.data.lease import live_holder
-from physhandi.data.run import Run, read_events
+from physhandi.data.run_folder import read_events
 from physhandi.errors import PhysHandiError, RunError, SequenceError, UsageError
+from physhandi.run import Run
 
 TESTS = Path(__file__).parent.parent
 GRACE_S = 0.4

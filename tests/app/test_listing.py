@@ -13,8 +13,8 @@ from app.jobs import catalog
 from app.jobs.catalog import Catalog, UnknownRunError
 from app.jobs.views import SORTS, RunQuery, page_of, select_runs, summarize, tags_of
 from app.settings import Settings
-from physhandi.data.run import Run
 from physhandi.errors import UsageError
+from physhandi.run import Run
 
 
 def entry(run_id: str, **fields: Any) -> dict[str, Any]:

@@ -7,8 +7,8 @@ from run_world import make_run
 
 from app.jobs.views import explain, stage_views, stages_of
 from physhandi.data.files import write_json
-from physhandi.data.run import Run
 from physhandi.fitting.config import STAGES
+from physhandi.run import Run
 
 NAMES = ["hands", "observation", "search", "springs", "evaluation"]
 DONE = [{"name": "hands", "seconds": 3.5, "summary": {"before": 2.0, "after": 1.0}}]

@@ -8,7 +8,7 @@ from run_world import make_run
 
 from app.pages.metrics import tabulate
 from app.pages.parameters import field_notes, parameter_rows
-from physhandi.data.run import Run
+from physhandi.run import Run
 from physhandi.simulation.parameters import SimulationParameters
 
 DASH = "\N{EN DASH}"

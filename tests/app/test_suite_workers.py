@@ -15,10 +15,10 @@ from suite_world import METHODS, order_of, table, write_told
 from app.cli import suite_workers
 from app.cli.suite_workers import SuiteWorkers, order_from_json, order_to_json
 from physhandi.data.lease import locked_file
-from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.errors import CancelledError, RunError, UsageError
 from physhandi.progress import NullProgress, Progress
+from physhandi.run import Run
 from physhandi.synthetic.suite.evaluation import Order, evaluate, filler, list_tasks
 from physhandi.synthetic.suite.methods import parse_method
 

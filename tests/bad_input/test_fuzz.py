@@ -18,9 +18,9 @@ from starlette.testclient import TestClient
 
 from app.cli.commands import OVERRIDES
 from physhandi import pipeline
-from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.errors import FitError, RunError, SequenceError, UsageError
+from physhandi.run import Run
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.topology import build_model
 

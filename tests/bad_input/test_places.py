@@ -15,7 +15,7 @@ import pytest
 from bad_input_world import Terminal, table, tree
 
 from physhandi import pipeline
-from physhandi.data.run import Run
+from physhandi.run import Run
 
 ROOT = Path(__file__).parents[2]
 RECONSTRUCT = ("reconstruct", "sheet", "--device", "cpu", "--out")

@@ -11,8 +11,8 @@ import pytest
 from bad_input_world import Bad, Terminal, array, bad, put, removed, table, text, truncated
 from sheet_sequence import write_sheet
 
-from physhandi.data.run import Run
 from physhandi.data.run_folder import artefacts, file_record
+from physhandi.run import Run
 
 OUT = "attempts/1/out"
 SHEET = f"{OUT}/sequences/sheet"

@@ -14,7 +14,7 @@ from server_world import World, make_world
 from starlette.testclient import TestClient
 
 from app.jobs.worker import work
-from physhandi.data.run import Run
+from physhandi.run import Run
 
 OUT = "attempts/1/out"
 SHEET = f"{OUT}/sequences/sheet"

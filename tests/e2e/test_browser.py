@@ -15,7 +15,7 @@ from playwright.sync_api import Page, expect
 from scene_page import ScenePage, object_springs, virtual_springs
 
 from app.jobs.processes import COOKIE
-from physhandi.data.run import Run
+from physhandi.run import Run
 
 pytestmark = pytest.mark.e2e
 BUNDLED = Path(__file__).parents[2] / "sequences"

@@ -10,7 +10,7 @@ from playwright.sync_api import Page, expect
 from scene_page import ScenePage
 
 from app.settings import BUNDLED
-from physhandi.data.run import Run
+from physhandi.run import Run
 
 pytestmark = pytest.mark.e2e
 FRAME = 40

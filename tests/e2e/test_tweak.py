@@ -8,7 +8,7 @@ import yaml
 from playwright.sync_api import expect
 from scene_page import ScenePage
 
-from physhandi.data.run import Run
+from physhandi.run import Run
 
 pytestmark = [pytest.mark.e2e, pytest.mark.slow]
 

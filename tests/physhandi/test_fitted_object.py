@@ -6,9 +6,9 @@ import pytest
 import yaml
 from viewer_world import PARAMETERS, make_run
 
-from physhandi.data.run import Run
 from physhandi.fitted_object import FittedObject
 from physhandi.object_rollout import load_fitted
+from physhandi.run import Run
 from physhandi.simulation.topology import retopologize
 
 

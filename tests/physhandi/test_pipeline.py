@@ -10,12 +10,13 @@ from scipy.spatial import cKDTree
 from sheet_sequence import FITTED, FRAMES, NODE, sheet_config, write_sheet
 
 from physhandi import pipeline
-from physhandi.data.run import Run, read_events
+from physhandi.data.run_folder import read_events
 from physhandi.data.sequence import Sequence
 from physhandi.errors import CancelledError, MissingInputError, RunError, UsageError
 from physhandi.fitting.artefacts import load_model, load_parameters
 from physhandi.fitting.config import PipelineConfig, config_to_dict
 from physhandi.progress import Progress
+from physhandi.run import Run
 
 
 def small_config() -> PipelineConfig:

@@ -9,8 +9,8 @@ from recordings import recording
 
 from physhandi import pipeline
 from physhandi.data.importers.mocap import import_mocap
-from physhandi.data.run import Run
 from physhandi.fitting.config import config_to_dict, load_profile
+from physhandi.run import Run
 
 
 @pytest.mark.slow

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from app.comparison import CompareAsk
 from app.viewer.compare.curve import Pairing
 from app.viewer.content.content import Catalog, Content, open_run
-from physhandi.data.run import Run
 from physhandi.errors import UsageError
+from physhandi.run import Run
 
 _ROUNDING = 1e-6
 

@@ -13,11 +13,11 @@ from numpy import ndarray
 from app.viewer.content.markers import Markers
 from app.viewer.content.observed import CloudSet, DepthCloud, Observed, PointSet, Tracks
 from app.viewer.content.skeleton import lift_keypoints
-from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
 from physhandi.errors import MissingInputError, PhysHandiError, UsageError
 from physhandi.object_rollout import ObjectRollout, load_fitted
+from physhandi.run import Run
 
 logger = logging.getLogger(__name__)
 

@@ -19,9 +19,9 @@ from app.viewer.content.layers import GREEN, RED, SKIN, Layers
 from physhandi.data.exporters import export_scene
 from physhandi.data.exporters.mesh import frame_to_ply, ply_bytes
 from physhandi.data.exporters.scene_data import HandSurface, SceneData, read_skins
-from physhandi.data.run import Run
 from physhandi.errors import MissingInputError
 from physhandi.object_rollout import ObjectRollout
+from physhandi.run import Run
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -13,8 +13,8 @@ from viser import uplot
 from app.viewer.content.content import Content
 from app.viewer.ui.guard import plain
 from physhandi.data.files import named_fields
-from physhandi.data.run import Run
 from physhandi.object_rollout import ObjectRollout
+from physhandi.run import Run
 
 _REFRESH = 0.25
 _STYLE = "font-size:0.8em;line-height:1.5;padding:0 0.6em"

@@ -21,9 +21,10 @@ from app.viewer.physics.presets import (
 )
 from app.viewer.ui.followed import FollowedChoice
 from app.viewer.ui.guard import Guard, notify
-from physhandi.data.run import Run, new_run_id
+from physhandi.data.run_folder import new_run_id
 from physhandi.data.sequence import Sequence
 from physhandi.errors import UsageError
+from physhandi.run import Run
 from physhandi.simulation.parameters import SimulationParameters
 
 _POLL_S = 0.3

@@ -13,9 +13,9 @@ from app.viewer.physics.frame_strip import FrameStrip
 from app.viewer.physics.keep_panel import UserStorage, run_changes
 from app.viewer.physics.panel import GO, STEP, PhysicsPanel
 from app.viewer.ui.guard import Guard, notify
-from physhandi.data.run import Run
 from physhandi.errors import UsageError
 from physhandi.object_rollout import ObjectRollout
+from physhandi.run import Run
 from physhandi.simulation.parameters import SimulationParameters
 
 

@@ -17,7 +17,7 @@ from physhandi.data.exporters.table import (
     write_trajectories,
 )
 from physhandi.data.files import temporary_name
-from physhandi.data.run import Run
+from physhandi.data.run import RunFolder
 from physhandi.errors import UsageError
 
 FORMATS = ("ply", "npz", "csv", "yaml", "gltf")
@@ -25,7 +25,7 @@ SCENE_FORMATS = ("ply", "npz", "csv", "gltf")
 
 
 def export_run(
-    run: Run,
+    run: RunFolder,
     format: str,  # noqa: A002 - the command line's name for it
     out_path: Path | str,
     *,

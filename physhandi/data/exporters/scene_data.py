@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from physhandi.data.run import Run
+from physhandi.data.run import RunFolder
 from physhandi.errors import RunError, UsageError
 
 SIDES = ("right", "left")
@@ -67,7 +67,7 @@ class SceneData:
 
 
 def read_scene(
-    run: Run, sequence: str | None, faces: Mapping[str, Int[ndarray, "face 3"]] | None = None
+    run: RunFolder, sequence: str | None, faces: Mapping[str, Int[ndarray, "face 3"]] | None = None
 ) -> SceneData:
     """Collect the motion of one sequence of a run.
 
@@ -124,13 +124,13 @@ def read_scene(
     )
 
 
-def read_joints(run: Run, sequence: str) -> dict[str, ndarray]:
+def read_joints(run: RunFolder, sequence: str) -> dict[str, ndarray]:
     """Read where the joints of the hands are, by side (frame joint 3) [m]."""
     stored = {side: f"sequences/{sequence}/hand_{side}_keypoint.npy" for side in SIDES}
     return {side: run.array(rel) for side, rel in stored.items() if run.has(rel)}
 
 
-def read_skins(run: Run, sequence: str) -> dict[str, Mapping[str, ndarray]]:
+def read_skins(run: RunFolder, sequence: str) -> dict[str, Mapping[str, ndarray]]:
     """Read what moves the hands' surfaces; runs of version 0.1 do not hold it.
 
     Args:

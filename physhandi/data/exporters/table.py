@@ -18,7 +18,7 @@ from physhandi.data.files import (
     write_bytes,
     write_yaml,
 )
-from physhandi.data.run import Run
+from physhandi.data.run import RunFolder
 
 _FORMULA_START = ("=", "+", "-", "@", "\t", "\r")
 _SHARED_FILES = (
@@ -51,7 +51,7 @@ def write_trajectories(path: Path, scene: SceneData) -> None:
     write_csv(path, TRAJECTORY_COLUMNS, _trajectory_rows(scene))
 
 
-def write_tables(folder: Path, run: Run, scene: SceneData) -> None:
+def write_tables(folder: Path, run: RunFolder, scene: SceneData) -> None:
     """Write ``trajectories.csv``, ``parameters.csv`` and ``metrics.csv``."""
     write_trajectories(folder / "trajectories.csv", scene)
     for name, rel in (_SHARED_FILES[0], _SHARED_FILES[2]):
@@ -60,7 +60,7 @@ def write_tables(folder: Path, run: Run, scene: SceneData) -> None:
             write_csv(folder / f"{name}.csv", ("name", "value"), flat(content))
 
 
-def write_summary(path: Path, run: Run) -> None:
+def write_summary(path: Path, run: RunFolder) -> None:
     """Write settings, fitted parameters, losses and metrics of a run as YAML."""
     content: dict[str, Any] = {
         "run": run.id,

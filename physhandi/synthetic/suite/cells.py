@@ -22,7 +22,7 @@ from numpy import ndarray
 from physhandi.data.environment import processor_name
 from physhandi.data.files import write_array, write_json
 from physhandi.data.lease import locked_file
-from physhandi.data.run import Run
+from physhandi.data.run import RunFolder
 from physhandi.data.run_folder import EXIT, artefacts, read_json, read_mapping
 from physhandi.data.sequence import Sequence
 from physhandi.data.truth import read_truth
@@ -53,7 +53,7 @@ from physhandi.synthetic.suite.variants import DISTURBED_HAND, make_variant, noi
 
 
 def measure_cell(
-    run: Run | None, reference: Run, recording: Sequence
+    run: RunFolder | None, reference: RunFolder, recording: Sequence
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Measure what a run predicted.
 
@@ -76,7 +76,9 @@ def measure_cell(
     return report, curves
 
 
-def assemble(folder: Path, run: Run | None, reference: Run, recording: Sequence) -> None:
+def assemble(
+    folder: Path, run: RunFolder | None, reference: RunFolder, recording: Sequence
+) -> None:
     """Lay out what is scored: the run's motion beside the reference's observations."""
     inside = f"sequences/{recording.name}"
     observed = (f"{inside}/observation/", f"{inside}/keypoint.npy")
@@ -100,8 +102,8 @@ def assemble(folder: Path, run: Run | None, reference: Run, recording: Sequence)
 def add_photometric(
     report: dict[str, Any],
     curves: dict[str, Any],
-    run: Run | None,
-    reference: Run,
+    run: RunFolder | None,
+    reference: RunFolder,
     recording: Sequence,
 ) -> None:
     """Put IoU and PSNR beside the other figures of the rollout.
@@ -123,7 +125,7 @@ def add_photometric(
                 report[split]["rollout"][metric] = sum(known) / len(known)
 
 
-def _complete(run: Run, recording: Sequence) -> Float[ndarray, "frame node 3"]:
+def _complete(run: RunFolder, recording: Sequence) -> Float[ndarray, "frame node 3"]:
     """Give a run's rollout in every frame; where it is missing or not finite, nothing moves."""
     inside = f"sequences/{recording.name}"
     rollout = run.array(f"{inside}/rollout.npy")
@@ -184,9 +186,9 @@ class Bench:
         self.device_name = f"{device} {name}"
         self.progress = progress
         self._settings: dict[str, dict[str, Any]] = {}
-        self._finished: dict[Path, Run] = {}
+        self._finished: dict[Path, RunFolder] = {}
 
-    def reference(self, recording: Sequence) -> Run:
+    def reference(self, recording: Sequence) -> RunFolder:
         """Give the run of the static object on a recording: its observations are scored against.
 
         Raises:
@@ -267,7 +269,7 @@ class Bench:
             )
         given = "true_hand" if method.gets == "true_hand" else "recording"
         name, error = "", ""
-        run: Run | None = None
+        run: RunFolder | None = None
         try:
             source = self._run(method, fitted, method.gets)
             target = self._make_variant(recording, given)
@@ -295,7 +297,7 @@ class Bench:
         )
 
     def score(
-        self, run: Run | None, reference: Run, recording: Sequence
+        self, run: RunFolder | None, reference: RunFolder, recording: Sequence
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Measure what a run predicted against what the whole recording shows.
 
@@ -316,7 +318,7 @@ class Bench:
         known = read_json(path)
         return known["report"], known["curves"]
 
-    def _run(self, method: Method, recording: Sequence, variant: str) -> Run:
+    def _run(self, method: Method, recording: Sequence, variant: str) -> RunFolder:
         folder = self._folder(method, recording, variant)
         if folder not in self._finished:
             with self._alone(folder.name):
@@ -338,7 +340,7 @@ class Bench:
         with locked_file(folder / name):
             yield
 
-    def _filled(self, method: Method, recording: Sequence, variant: str, folder: Path) -> Run:
+    def _filled(self, method: Method, recording: Sequence, variant: str, folder: Path) -> RunFolder:
         _raise_again(folder)
         given = self._make_variant(recording, variant)
         title = f"{method.name} on {recording.name}"
@@ -367,7 +369,9 @@ class Bench:
             told = f"Method '{method.name}' on sequence '{recording.name}': {error}"
             raise UsageError(told) from error
 
-    def _simulated(self, source: Run, target: Sequence, folder: Path, *, title: str) -> Run:
+    def _simulated(
+        self, source: RunFolder, target: Sequence, folder: Path, *, title: str
+    ) -> RunFolder:
         """Simulate what was fitted elsewhere; a radius that reaches nothing there is no misuse."""
         try:
             with self._alone(folder.name):
@@ -388,7 +392,7 @@ class Bench:
         return replace(own, name=f"static for {own.name}", rule="static", gets="recording")
 
     def _seconds(
-        self, method: Method, recording: Sequence, variant: str, run: Run
+        self, method: Method, recording: Sequence, variant: str, run: RunFolder
     ) -> dict[str, float]:
         """Give the time of each stage; one that was taken over took as long as where it was run.
 

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from physhandi import pipeline
 from physhandi.data.attempt import Attempt
 from physhandi.data.environment import ENVIRONMENT, describe_environment
-from physhandi.data.run import Run
+from physhandi.data.run import RunFolder
 from physhandi.data.run_folder import artefacts
 from physhandi.data.sequence import Sequence
 from physhandi.errors import MissingInputError, UsageError
@@ -233,11 +233,11 @@ def execute(
     *,
     title: str,
     common: Mapping[str, Any],
-    hands: Run | None = None,
+    hands: RunFolder | None = None,
     noise: HandNoise | None = None,
     device: str = "cpu",
     progress: Progress,
-) -> Run:
+) -> RunFolder:
     """Let a method fill a run folder; a finished one is left as it is, another one goes on.
 
     Args:
@@ -273,10 +273,12 @@ def execute(
             rule = partial(_moved, rule=method.rule)
             pipeline.predict(recording, config, rule, attempt, watched)
         attempt.publish()
-    return Run.open(folder)
+    return RunFolder.open(folder)
 
 
-def correct(base: Run, recording: Sequence, folder: Path, *, title: str, method: Method) -> Run:
+def correct(
+    base: RunFolder, recording: Sequence, folder: Path, *, title: str, method: Method
+) -> RunFolder:
     """Copy a finished run with its last residual added to the predicted frames.
 
     Raises:
@@ -307,21 +309,27 @@ def correct(base: Run, recording: Sequence, folder: Path, *, title: str, method:
         attempt.save_json("metrics.json", {recording.name: scores})
         attempt.finish_stage(CORRECTION)
         attempt.publish()
-    return Run.open(folder)
+    return RunFolder.open(folder)
 
 
 def simulate_in(
-    source: Run, target: Sequence, folder: Path, *, title: str, device: str, progress: Progress
-) -> Run:
+    source: RunFolder,
+    target: Sequence,
+    folder: Path,
+    *,
+    title: str,
+    device: str,
+    progress: Progress,
+) -> RunFolder:
     """Simulate a fitted object in a sequence that it was not fitted in.
 
     Raises:
         PhysHandiError: If there is no result; the run folder then says why.
     """
     if (folder / "run.yaml").is_file():
-        run = Run.open(folder)
+        run = RunFolder.open(folder)
     else:
-        run = Run.create(
+        run = RunFolder.create(
             folder,
             name=title,
             kind="simulation",
@@ -330,14 +338,14 @@ def simulate_in(
         )
     if not run.is_published:
         pipeline.run_job(run, progress, device=device)
-    return Run.open(folder)
+    return RunFolder.open(folder)
 
 
-def open_run(folder: Path, title: str, recording: Sequence, config: Mapping[str, Any]) -> Run:
+def open_run(folder: Path, title: str, recording: Sequence, config: Mapping[str, Any]) -> RunFolder:
     """Open the run in a folder, or make it."""
     if (folder / "run.yaml").is_file():
-        return Run.open(folder)
-    return Run.create(
+        return RunFolder.open(folder)
+    return RunFolder.create(
         folder,
         name=title,
         kind="reconstruction",
@@ -362,7 +370,7 @@ def shared_stages(one: Mapping[str, Any], other: Mapping[str, Any]) -> tuple[str
     return (pipeline.HANDS, pipeline.OBSERVATION)
 
 
-def take_stages(source: Run, attempt: Attempt, names: tuple[str, ...]) -> None:
+def take_stages(source: RunFolder, attempt: Attempt, names: tuple[str, ...]) -> None:
     """Take over finished stages of another run on the same recording."""
     for stage in source.stages():
         if stage["name"] in names and not attempt.stage_done(stage["name"]):
@@ -371,7 +379,7 @@ def take_stages(source: Run, attempt: Attempt, names: tuple[str, ...]) -> None:
             attempt.finish_stage(stage["name"], stage["summary"])
 
 
-def take_disturbed_hands(source: Run, attempt: Attempt, name: str, noise: HandNoise) -> None:
+def take_disturbed_hands(source: RunFolder, attempt: Attempt, name: str, noise: HandNoise) -> None:
     """Take over the hands of another run on the same recording, and make them wrong once.
 
     The stage counts as finished only when they are wrong: what a kill leaves before that is not

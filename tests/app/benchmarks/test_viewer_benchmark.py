@@ -17,9 +17,9 @@ from app.benchmarks.viewer import GOALS, compare_with_goals, measure_viewer
 from app.jobs.catalog import Catalog
 from app.settings import BUNDLED, Settings
 from app.viewer.scene.object_drawing import QUIET_FORCE
-from physhandi.data.run import Run
 from physhandi.errors import MissingInputError
 from physhandi.object_rollout import load_fitted
+from physhandi.run import Run
 
 BUNDLED_RUN = "towel_fold_quick"
 pytestmark = pytest.mark.timeout(900)

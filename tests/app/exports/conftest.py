@@ -9,7 +9,7 @@ from server_world import World
 from app.exports.cache import FileCache, FileJob
 from app.exports.making import make
 from app.exports.request import FileRequest
-from physhandi.data.run import Run
+from physhandi.run import Run
 
 
 @pytest.fixture

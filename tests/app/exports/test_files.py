@@ -17,8 +17,8 @@ from viser_file import Recording
 
 from app.exports.request import FileRequest
 from app.exports.schema import MEDIA_TYPES
-from physhandi.data.run import Run
 from physhandi.fitted_object import FittedObject
+from physhandi.run import Run
 from physhandi.simulation.simulator import Simulator
 
 RUN = "/api/v1/runs/fitted/export"

@@ -11,8 +11,8 @@ from viser_file import Recording
 
 from app.cli import main
 from app.exports.shell import Wish, export, read_link
-from physhandi.data.run import Run
 from physhandi.errors import UsageError
+from physhandi.run import Run
 
 
 def test_the_command_paints_what_a_link_shows(world: World, tmp_path: Path) -> None:

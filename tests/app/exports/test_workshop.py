@@ -16,8 +16,8 @@ from app.exports import cache as workshop_module
 from app.exports.cache import FileCache, FileJob, TooManyFilesError
 from app.exports.files import request_of
 from app.exports.request import FileRequest
-from physhandi.data.run import Run
 from physhandi.errors import RunError, UsageError
+from physhandi.run import Run
 
 
 @pytest.fixture

@@ -9,8 +9,8 @@ import pytest
 import yaml
 from queue_world import HOSTILE, QueueWorld
 
-from physhandi.data.run import Run
 from physhandi.fitting.config import config_from_dict, load_profile
+from physhandi.run import Run
 
 OVERRIDES = {
     "object_.search.generations": 12,

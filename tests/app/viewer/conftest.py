@@ -7,7 +7,7 @@ from viewer_client import ViewerClient
 from viewer_world import FakeSettings, FolderCatalog, Recording, make_run, make_sequence
 
 from app.viewer.sessions import Sessions
-from physhandi.data.run import Run
+from physhandi.run import Run
 
 
 @pytest.fixture(scope="session")

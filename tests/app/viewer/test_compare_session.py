@@ -13,8 +13,8 @@ from app.comparison import CompareAsk
 from app.viewer.compare.figure_export import write_figure_npz
 from app.viewer.compare.pair import open_pair
 from app.viewer.sessions import Sessions
-from physhandi.data.run import Run
 from physhandi.errors import MissingInputError, PhysHandiError, UsageError
+from physhandi.run import Run
 
 OFFSET = np.array([0.0, 0.003, 0.004])
 """By how much B's nodes are elsewhere: 5 mm."""

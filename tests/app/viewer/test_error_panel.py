@@ -20,8 +20,8 @@ from viewer_world import (
 
 from app.viewer.physics.error_panel import ErrorPanel, load_track_error
 from app.viewer.sessions import Sessions
-from physhandi.data.run import Run
 from physhandi.object_rollout import ObjectRollout
+from physhandi.run import Run
 
 ERRORS = [None, *[0.001 * frame for frame in range(1, FRAMES)]]
 

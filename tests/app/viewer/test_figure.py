@@ -15,9 +15,9 @@ from app.viewer.compare.figure_export import write_figure_csv, write_figure_npz
 from app.viewer.content.layers import Layers
 from app.viewer.scene.framing import frame_content
 from app.viewer.sessions import Sessions
-from physhandi.data.run import Run
 from physhandi.fitted_object import FittedObject
 from physhandi.object_rollout import ObjectRollout
+from physhandi.run import Run
 from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.topology import build_model
 

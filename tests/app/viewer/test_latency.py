@@ -11,8 +11,8 @@ from viewer_world import FRAMES
 
 from app.benchmarks import latency
 from app.benchmarks.latency import measure_latency
-from physhandi.data.run import Run
 from physhandi.errors import MissingInputError, SimulationError
+from physhandi.run import Run
 
 ROOT = Path(__file__).parents[3]
 KINDS = {

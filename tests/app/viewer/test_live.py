@@ -20,7 +20,7 @@ from waiting import WatchedLock, until
 from app.viewer.live.client import LiveRequest, SimulationClient
 from app.viewer.live.wire import Message
 from app.viewer.live.worker import Mailboxes, SimulationWorker
-from physhandi.data.run import Run
+from physhandi.run import Run
 
 SECONDS = 60.0
 TESTS = Path(__file__).parents[2]

@@ -7,7 +7,7 @@ from viewer_client import ViewerClient
 from viewer_world import FRAMES, rest_at
 
 from app.viewer.sessions import Sessions
-from physhandi.data.run import Run
+from physhandi.run import Run
 
 FRAME = 15
 

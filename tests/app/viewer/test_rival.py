@@ -8,7 +8,7 @@ from viewer_world import FRAMES, PARAMETERS, Recording, content_of, controls
 
 from app.viewer.compare.phystwin_baseline import PhysTwinBaseline
 from app.viewer.content.content import Content
-from physhandi.data.run import Run
+from physhandi.run import Run
 
 
 def ball(center: tuple[float, float, float], subdivisions: int = 3) -> tuple[ndarray, ndarray]:

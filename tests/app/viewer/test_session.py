@@ -11,8 +11,8 @@ from viewer_world import FRAMES, FakeSettings
 from app.viewer.compare.figure_mode import FigureMode
 from app.viewer.export.snapshot import write_csv, write_npz, write_ply, write_yaml
 from app.viewer.sessions import Sessions, TooManySessionsError
-from physhandi.data.run import Run
 from physhandi.errors import MissingInputError, PhysHandiError, RunError, UsageError
+from physhandi.run import Run
 from physhandi.simulation.parameters import SimulationParameters
 
 

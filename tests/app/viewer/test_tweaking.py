@@ -15,9 +15,9 @@ from waiting import until
 from app.viewer.physics.keep_panel import RunSaver, SavedRun, UserStorage, run_changes
 from app.viewer.physics.presets import PresetStore
 from app.viewer.sessions import Sessions
-from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.errors import UsageError
+from physhandi.run import Run
 from physhandi.simulation.parameters import SimulationParameters
 
 

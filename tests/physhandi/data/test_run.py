@@ -10,9 +10,10 @@ import pytest
 from run_world import fill, make_run
 from safetensors.numpy import load_file
 
-from physhandi.data.run import Run, read_events
+from physhandi.data.run_folder import read_events
 from physhandi.errors import CancelledError, RunError
 from physhandi.progress import Progress
+from physhandi.run import Run
 
 
 def test_everything_written_comes_back(tmp_path: Path) -> None:

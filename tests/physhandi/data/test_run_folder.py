@@ -7,8 +7,9 @@ import pytest
 import yaml
 from run_world import fill, make_run
 
-from physhandi.data.run import Run, find_runs, new_run_id
+from physhandi.data.run_folder import new_run_id
 from physhandi.errors import RunError
+from physhandi.run import Run
 
 
 @pytest.mark.parametrize("rel", ["../x.npy", "/x.npy", "a/../../x", ".x", "a b", ""])
@@ -54,18 +55,18 @@ def test_unusable_folders_are_refused_by_name(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["fit"]
 
 
-def test_a_damaged_run_does_not_hide_the_others(tmp_path: Path) -> None:
-    fill(make_run(tmp_path / "good"))
-    for name, text in (("bad1", "kind: ["), ("bad2", "format: physhandi-run/1\nkind: 3")):
-        run = make_run(tmp_path / name)
-        (run.folder / "job.yaml").write_text(text)
-    (tmp_path / "notes").mkdir()
-    entries = {entry.folder.name: entry for entry in find_runs(tmp_path)}
-    assert list(entries) == ["bad1", "bad2", "good"]
-    assert "job.yaml cannot be read as YAML" in (entries["bad1"].error or "")
-    assert "field 'kind' is missing or wrong" in (entries["bad2"].error or "")
-    assert entries["good"].run is not None
-    assert entries["good"].run.state == "succeeded"
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        ("kind: [", r"job\.yaml cannot be read as YAML"),
+        ("format: physhandi-run/1\nkind: 3", "field 'kind' is missing or wrong"),
+    ],
+)
+def test_a_damaged_run_is_refused_by_file_and_field(tmp_path: Path, text: str, error: str) -> None:
+    run = make_run(tmp_path / "bad")
+    (run.folder / "job.yaml").write_text(text)
+    with pytest.raises(RunError, match=error):
+        Run.open(run.folder)
 
 
 def test_rename_and_delete(tmp_path: Path) -> None:

@@ -15,8 +15,8 @@ from safetensors.numpy import load_file
 from waiting import until
 
 from physhandi.data.attempt import read_checkpoint
-from physhandi.data.run import Run, read_events
-from physhandi.data.run_folder import attempt_numbers
+from physhandi.data.run_folder import attempt_numbers, read_events
+from physhandi.run import Run
 
 KILLS = 30
 MOST_WRITTEN = 40

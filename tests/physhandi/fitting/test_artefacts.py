@@ -9,7 +9,6 @@ from run_world import make_run
 from scipy.spatial import cKDTree
 
 from physhandi.data.observation import ObjectObservation
-from physhandi.data.run import Run
 from physhandi.fitting.artefacts import (
     STORED_CLOUD,
     STORED_HAND,
@@ -21,6 +20,7 @@ from physhandi.fitting.artefacts import (
 )
 from physhandi.hand.loading import load_hand_model
 from physhandi.progress import NullProgress
+from physhandi.run import Run
 
 
 @pytest.mark.parametrize("is_identified", [True, False])

@@ -15,7 +15,6 @@ from bundled_sequence import FRAME_RATE
 from refinement_world import mpjpe, mpvpe, with_error
 
 from physhandi import pipeline
-from physhandi.data.run import Run
 from physhandi.errors import CancelledError
 from physhandi.fitting import artefacts, hand_refinement
 from physhandi.fitting.config import config_from_dict, config_to_dict
@@ -29,6 +28,7 @@ from physhandi.fitting.object_problem import build_problem
 from physhandi.hand.loading import load_hand_model
 from physhandi.hand.motion import HandMotion
 from physhandi.progress import NullProgress, Progress
+from physhandi.run import Run
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.topology import build_model
 from physhandi.synthetic.bodies.sheets import fold_motion

@@ -11,7 +11,6 @@ from scipy.spatial import cKDTree
 
 from physhandi import pipeline
 from physhandi.data.exporters import export_run
-from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.errors import MissingInputError, UsageError
 from physhandi.fitting.artefacts import load_motions
@@ -19,6 +18,7 @@ from physhandi.fitting.config import HandFitConfig, config_from_dict, config_to_
 from physhandi.fitting.hand_reconstruction import reconstruct_hands
 from physhandi.hand.loading import load_hand_model
 from physhandi.hand.model import Side
+from physhandi.run import Run
 
 BUNDLED = Path(__file__).parents[3] / "sequences"
 CAMERAS = [scene.looking_at_hand(angle) for angle in (0.0, 1.2, 2.6)]

@@ -13,12 +13,12 @@ from sheet_sequence import write_sheet
 from app.viewer.content.content import open_run
 from physhandi import pipeline
 from physhandi.data.importers.phystwin import import_phystwin
-from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.errors import CancelledError, ImportFailedError, RunError
 from physhandi.fitting.artefacts import load_model, load_observation, load_parameters
 from physhandi.fitting.phystwin_run import REPORT, compare_rollouts, import_phystwin_run
 from physhandi.progress import Progress
+from physhandi.run import Run
 
 
 @pytest.fixture(scope="module")

@@ -12,12 +12,12 @@ from sheet_sequence import FITTED, NODE, write_sheet
 import physhandi
 from physhandi import pipeline
 from physhandi.data.camera import PinholeCamera
-from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence, ViewMeta
 from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import write_sequence
 from physhandi.errors import CancelledError, UsageError
 from physhandi.progress import NullProgress, Progress
+from physhandi.run import Run
 from physhandi.synthetic.code_version import INPUTS, PREDICTIONS, SCORES, code_version
 from physhandi.synthetic.suite import cells
 from physhandi.synthetic.suite.cells import Bench, add_photometric

@@ -10,10 +10,10 @@ import pytest
 from sheet_sequence import FITTED
 from suite_world import SETTINGS, order_of, table, write_told
 
-from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence
 from physhandi.errors import MissingInputError, UsageError
 from physhandi.progress import Progress
+from physhandi.run import Run
 from physhandi.synthetic.suite.cells import Bench
 from physhandi.synthetic.suite.evaluation import evaluate, list_tasks
 from physhandi.synthetic.suite.folder import contact_kind

@@ -12,7 +12,6 @@ from sheet_sequence import FRAMES, write_sheet
 
 from physhandi import pipeline
 from physhandi.data.camera import PinholeCamera
-from physhandi.data.run import Run
 from physhandi.data.sequence import Sequence, ViewMeta
 from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import write_sequence
@@ -20,6 +19,7 @@ from physhandi.errors import CancelledError
 from physhandi.hand.loading import load_hand_model
 from physhandi.hand.motion import HandMotion
 from physhandi.progress import NullProgress, Progress
+from physhandi.run import Run
 from physhandi.synthetic.bodies.sheets import fold_motion
 from physhandi.synthetic.suite import methods
 from physhandi.synthetic.suite.cells import Bench

@@ -11,8 +11,8 @@ import yaml
 from physhandi.data.exporters import export_run
 from physhandi.data.exporters.scene_data import SceneData
 from physhandi.data.exporters.table import flat, safe_cell, write_csv, write_trajectories
-from physhandi.data.run import Run
 from physhandi.errors import RunError, UsageError
+from physhandi.run import Run
 
 FRAMES, NODES, VERTICES = 3, 4, 5
 FACE = np.array([[0, 1, 2], [2, 3, 4]])

@@ -8,10 +8,10 @@ from gltf_player import Player
 from pygltflib import GLTF2
 
 from physhandi.data.exporters import export_run
-from physhandi.data.run import Run
 from physhandi.errors import UsageError
 from physhandi.fitting.artefacts import save_hand_vertices, save_motions
 from physhandi.hand.motion import HandMotion
+from physhandi.run import Run
 
 FRAMES, NODES, RATE = 4, 5, 25.0
 SPRINGS = np.array([[0, 1], [1, 2], [3, 4], [NODES + 3, 0]], np.int32)
