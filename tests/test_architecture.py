@@ -14,7 +14,10 @@ PACKAGES = ("app", "physhandi")
 SOURCE_FILES = sorted(
     path for part in (*PACKAGES, "web_assets") for path in (ROOT / part).rglob("*.py")
 )
-KERNEL_FILES = sorted((ROOT / "physhandi/simulation/kernels").glob("*.py"))
+KERNEL_FILES = [
+    ROOT / "physhandi/rendering/kernels.py",
+    *sorted((ROOT / "physhandi/simulation/kernels").glob("*.py")),
+]
 READABLE = 20
 """Files of a folder that a person reads at a glance."""
 

@@ -1,0 +1,420 @@
+"""Which shape every sample of a picture sees, and what color that gives.
+
+Samples are a grid of rays through the camera's pinhole. A triangle or ball asks those within its
+bounds, so no search structure is built: for whole pictures this is far less work than tracing each
+ray through a hierarchy. A sample holds the nearest depth and the number of the shape in one
+integer, of which the least is kept; so the order of threads does not matter. Contractions are off
+for the same bits on every processor.
+"""
+
+# Warp's types are no classes to a type checker.
+# pyright: reportUntypedFunctionDecorator=false, reportGeneralTypeIssues=false
+# pyright: reportIndexIssue=false, reportOperatorIssue=false, reportArgumentType=false
+# pyright: reportCallIssue=false, reportAttributeAccessIssue=false, reportInvalidTypeForm=false
+# pyright: reportReturnType=false, reportAssignmentType=false
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+NOTHING = wp.constant(wp.int64(0x7FFFFFFFFFFFFFFF))
+"""Of a sample that sees no shape."""
+_EDGE = wp.constant(wp.float64(1e-9))
+"""How far outside of a triangle a sample still counts, so that no seam is left [px]."""
+
+
+@wp.struct
+class Grid:
+    """Some rows of samples; whole coordinates are their centres."""
+
+    K: wp.mat33d
+    """Camera matrix of the whole grid."""
+    inverse: wp.mat33d
+    """Its inverse."""
+    near: wp.float64
+    """Least depth that is seen."""
+    width: wp.int32
+    """Samples in a row."""
+    first: wp.int32
+    """First row."""
+    end: wp.int32
+    """Row after the last one."""
+
+
+@wp.func
+def _key(depth: wp.float64, number: wp.int32) -> wp.int64:
+    # Positive floats are in the order of their bits.
+    bits = wp.cast(wp.float32(depth), wp.int32)
+    return (wp.int64(bits) << wp.int64(32)) | wp.int64(number)
+
+
+@wp.func
+def _number(key: wp.int64) -> wp.int32:
+    return wp.int32(key & wp.int64(0x7FFFFFFF))
+
+
+@wp.func
+def _whole(value: wp.float64, low: wp.int32, high: wp.int32) -> wp.int32:
+    """Round down and limit; the limits come first, as not every float is an integer."""
+    return wp.int32(wp.clamp(wp.floor(value), wp.float64(low), wp.float64(high)))
+
+
+@wp.kernel
+def cover_triangles(
+    # Shapes: pixel x times depth, pixel y times depth, depth
+    corner: wp.array2d[wp.vec3d],
+    first_number: wp.int32,
+    # Samples
+    grid: Grid,
+    band: wp.int32,
+    # Nearest
+    key_out: wp.array2d[wp.int64],
+):
+    triangle, part = wp.tid()
+    a = corner[triangle, 0]
+    b = corner[triangle, 1]
+    c = corner[triangle, 2]
+    top = grid.first + part * band
+    bottom = wp.min(top + band, grid.end) - 1
+    left = wp.int32(0)
+    right = grid.width - 1
+    x0 = wp.float64(0.0)
+    y0 = wp.float64(0.0)
+    if a[2] >= grid.near and b[2] >= grid.near and c[2] >= grid.near:
+        low = wp.min(wp.min(a[1] / a[2], b[1] / b[2]), c[1] / c[2]) - _EDGE
+        high = wp.max(wp.max(a[1] / a[2], b[1] / b[2]), c[1] / c[2]) + _EDGE
+        if high < wp.float64(top) or low > wp.float64(bottom):
+            return
+        y0 = wp.ceil(low)
+        top = _whole(y0, top, bottom)
+        bottom = _whole(high, top - 1, bottom)
+        low = wp.min(wp.min(a[0] / a[2], b[0] / b[2]), c[0] / c[2]) - _EDGE
+        high = wp.max(wp.max(a[0] / a[2], b[0] / b[2]), c[0] / c[2]) + _EDGE
+        if high < wp.float64(left) or low > wp.float64(right):
+            return
+        x0 = wp.ceil(low)
+        left = _whole(x0, left, right)
+        right = _whole(high, left - 1, right)
+    # Coordinates count from a sample at the triangle on, so that few digits are lost.
+    a = wp.vec3d(a[0] - x0 * a[2], a[1] - y0 * a[2], a[2])
+    b = wp.vec3d(b[0] - x0 * b[2], b[1] - y0 * b[2], b[2])
+    c = wp.vec3d(c[0] - x0 * c[2], c[1] - y0 * c[2], c[2])
+    # A corner's weight at a sample (x, y) is edge . (x, y, 1) over the sum of all three.
+    edge_a = wp.cross(b, c)
+    edge_b = wp.cross(c, a)
+    edge_c = wp.cross(a, b)
+    volume = wp.dot(a, edge_a)
+    if volume == wp.float64(0.0):
+        return
+    if volume < wp.float64(0.0):
+        volume = -volume
+        edge_a = -edge_a
+        edge_b = -edge_b
+        edge_c = -edge_c
+    total = edge_a + edge_b + edge_c
+    ahead = wp.vec3d(-total[0], -total[1], volume / grid.near - total[2])
+    number = first_number + triangle
+    for row in range(top, bottom + 1):
+        y = wp.float64(row) - y0
+        low = wp.float64(left) - x0
+        high = wp.float64(right) - x0
+        for side in range(4):
+            edge = ahead
+            if side == 0:
+                edge = edge_a
+            elif side == 1:
+                edge = edge_b
+            elif side == 2:
+                edge = edge_c
+            slope = edge[0]
+            rest = edge[1] * y + edge[2] + _EDGE * (wp.abs(slope) + wp.abs(edge[1]))
+            if slope > wp.float64(0.0):
+                low = wp.max(low, wp.ceil(-rest / slope))
+            elif slope < wp.float64(0.0):
+                high = wp.min(high, wp.floor(-rest / slope))
+            elif rest < wp.float64(0.0):
+                high = wp.float64(-1.0)
+        if low <= high:
+            start = wp.int32(low + x0)
+            stop = wp.int32(high + x0) + 1
+            for column in range(start, stop):
+                x = wp.float64(column) - x0
+                size = total[0] * x + total[1] * y + total[2]
+                if size > wp.float64(0.0):
+                    wp.atomic_min(key_out, row - grid.first, column, _key(volume / size, number))
+
+
+@wp.func
+def _reach(ahead: wp.float64, across: wp.float64, radius: wp.float64) -> wp.vec2d:
+    """Find the least and greatest tangent of the angles at which a ball is seen."""
+    size = ahead * ahead - radius * radius
+    middle = across * ahead
+    half = radius * wp.sqrt(wp.max(across * across + size, wp.float64(0.0)))
+    return wp.vec2d((middle - half) / size, (middle + half) / size)
+
+
+@wp.func
+def _ball_depth(center: wp.vec3d, radius: wp.float64, ray: wp.vec3d) -> wp.float64:
+    """Find where a ray of depth one meets a ball first; negative if it does not."""
+    along = wp.dot(ray, center)
+    size = wp.dot(ray, ray)
+    # Of the difference of squares, the offset from the ray loses fewer digits.
+    offset = center - ray * (along / size)
+    within = radius * radius - wp.dot(offset, offset)
+    if within < wp.float64(0.0):
+        return wp.float64(-1.0)
+    return (along - wp.sqrt(within * size)) / size
+
+
+@wp.kernel
+def cover_balls(
+    # Shapes: in the camera's axes
+    center: wp.array[wp.vec3d],
+    radius: wp.array[wp.float64],
+    first_number: wp.int32,
+    # Samples
+    grid: Grid,
+    band: wp.int32,
+    # Nearest
+    key_out: wp.array2d[wp.int64],
+):
+    ball, part = wp.tid()
+    place = center[ball]
+    size = radius[ball]
+    if place[2] - size <= grid.near:
+        return
+    across = _reach(place[2], place[0], size)
+    down = _reach(place[2], place[1], size)
+    skew = grid.K[0, 1]
+    x_low = grid.K[0, 0] * across[0] + wp.min(skew * down[0], skew * down[1]) + grid.K[0, 2]
+    x_high = grid.K[0, 0] * across[1] + wp.max(skew * down[0], skew * down[1]) + grid.K[0, 2]
+    y_low = grid.K[1, 1] * down[0] + grid.K[1, 2]
+    y_high = grid.K[1, 1] * down[1] + grid.K[1, 2]
+    top = grid.first + part * band
+    bottom = wp.min(top + band, grid.end) - 1
+    if y_high < wp.float64(top) or y_low > wp.float64(bottom):
+        return
+    if x_high < wp.float64(0.0) or x_low > wp.float64(grid.width - 1):
+        return
+    top = _whole(wp.ceil(y_low), top, bottom)
+    bottom = _whole(y_high, top - 1, bottom)
+    left = _whole(wp.ceil(x_low), 0, grid.width - 1)
+    right = _whole(x_high, left - 1, grid.width - 1)
+    for row in range(top, bottom + 1):
+        for column in range(left, right + 1):
+            ray = grid.inverse * wp.vec3d(wp.float64(column), wp.float64(row), wp.float64(1.0))
+            depth = _ball_depth(place, size, ray)
+            if depth > wp.float64(0.0):
+                key = _key(depth, first_number + ball)
+                wp.atomic_min(key_out, row - grid.first, column, key)
+
+
+@wp.func
+def _weights(corner: wp.array2d[wp.vec3d], triangle: wp.int32, x: wp.float64, y: wp.float64):
+    """Weigh a triangle's corners at a sample; on the surface, not in the picture."""
+    a = corner[triangle, 0]
+    b = corner[triangle, 1]
+    c = corner[triangle, 2]
+    a = wp.vec3d(a[0] - x * a[2], a[1] - y * a[2], a[2])
+    b = wp.vec3d(b[0] - x * b[2], b[1] - y * b[2], b[2])
+    c = wp.vec3d(c[0] - x * c[2], c[1] - y * c[2], c[2])
+    weight = wp.vec3d(
+        b[0] * c[1] - b[1] * c[0], c[0] * a[1] - c[1] * a[0], a[0] * b[1] - a[1] * b[0]
+    )
+    return weight / (weight[0] + weight[1] + weight[2])
+
+
+@wp.kernel
+def describe_samples(
+    # Shapes: triangles are numbered first, then balls
+    corner: wp.array2d[wp.vec3d],
+    center: wp.array[wp.vec3d],
+    radius: wp.array[wp.float64],
+    # Samples
+    grid: Grid,
+    key: wp.array2d[wp.int64],
+    # What they see
+    depth_out: wp.array2d[wp.float64],
+    number_out: wp.array2d[wp.int32],
+    weight_out: wp.array2d[wp.vec3d],
+):
+    row, column = wp.tid()
+    if key[row, column] == NOTHING:
+        return
+    number = _number(key[row, column])
+    x = wp.float64(column)
+    y = wp.float64(row + grid.first)
+    number_out[row, column] = number
+    if number < corner.shape[0]:
+        weight = _weights(corner, number, x, y)
+        weight_out[row, column] = weight
+        depth_out[row, column] = (
+            weight[0] * corner[number, 0][2]
+            + weight[1] * corner[number, 1][2]
+            + weight[2] * corner[number, 2][2]
+        )
+    else:
+        ball = number - corner.shape[0]
+        ray = grid.inverse * wp.vec3d(x, y, wp.float64(1.0))
+        depth_out[row, column] = _ball_depth(center[ball], radius[ball], ray)
+
+
+@wp.func
+def _texel(picture: wp.vec3i, u: wp.float32, v: wp.float32, texel: wp.array[wp.vec3ub]) -> wp.vec3:
+    """Read an image between its pixels; `picture` is its first texel, columns and rows."""
+    columns = picture[1]
+    rows = picture[2]
+    x = wp.clamp(u * wp.float32(columns) - 0.5, 0.0, wp.float32(columns - 1))
+    y = wp.clamp(v * wp.float32(rows) - 0.5, 0.0, wp.float32(rows - 1))
+    left = wp.int32(x)
+    top = wp.int32(y)
+    right = wp.min(left + 1, columns - 1)
+    bottom = wp.min(top + 1, rows - 1)
+    a = x - wp.float32(left)
+    b = y - wp.float32(top)
+    value = wp.vec3(0.0, 0.0, 0.0)
+    for place in range(4):
+        column = left
+        row = top
+        share = (1.0 - a) * (1.0 - b)
+        if place == 1:
+            column = right
+            share = a * (1.0 - b)
+        elif place == 2:
+            row = bottom
+            share = (1.0 - a) * b
+        elif place == 3:
+            column = right
+            row = bottom
+            share = a * b
+        one = texel[picture[0] + row * columns + column]
+        value += share * wp.vec3(wp.float32(one[0]), wp.float32(one[1]), wp.float32(one[2]))
+    return value
+
+
+@wp.func
+def _color(
+    corner: wp.array2d[wp.vec3d],
+    corner_color: wp.array2d[wp.vec3],
+    picture: wp.array[wp.vec3i],
+    texel: wp.array[wp.vec3ub],
+    center: wp.array[wp.vec3d],
+    radius: wp.array[wp.float64],
+    ball_color: wp.array[wp.vec3],
+    shading: wp.array[wp.float32],
+    light: wp.vec3d,
+    grid: Grid,
+    number: wp.int32,
+    column: wp.int32,
+    row: wp.int32,
+) -> wp.vec3:
+    x = wp.float64(column)
+    y = wp.float64(row)
+    if number >= corner.shape[0]:
+        ball = number - corner.shape[0]
+        if shading[ball] == 0.0:
+            return ball_color[ball]
+        ray = grid.inverse * wp.vec3d(x, y, wp.float64(1.0))
+        normal = (_ball_depth(center[ball], radius[ball], ray) * ray - center[ball]) / radius[ball]
+        facing = wp.float32(wp.dot(normal, light))
+        return ball_color[ball] * (1.0 - 0.5 * shading[ball] * (1.0 - facing))
+    first = corner_color[number, 0]
+    second = corner_color[number, 1]
+    third = corner_color[number, 2]
+    if first == second and second == third:
+        return first
+    exact = _weights(corner, number, x, y)
+    weight = wp.vec3(wp.float32(exact[0]), wp.float32(exact[1]), wp.float32(exact[2]))
+    value = weight[0] * first + weight[1] * second + weight[2] * third
+    if picture[number][1] > 0:
+        return _texel(picture[number], value[0], value[1], texel)
+    return value
+
+
+@wp.kernel
+def color_pixels(
+    # Shapes: triangles are numbered first, then balls
+    corner: wp.array2d[wp.vec3d],
+    corner_color: wp.array2d[wp.vec3],
+    picture: wp.array[wp.vec3i],
+    texel: wp.array[wp.vec3ub],
+    center: wp.array[wp.vec3d],
+    radius: wp.array[wp.float64],
+    ball_color: wp.array[wp.vec3],
+    shading: wp.array[wp.float32],
+    light: wp.vec3d,
+    # Samples: one layer of solid shapes, then one for each sheer one
+    grid: Grid,
+    key: wp.array3d[wp.int64],
+    opacity: wp.array[wp.float32],
+    samples: wp.int32,
+    background: wp.vec4,
+    # Pixels: red, green, blue and opacity
+    color_out: wp.array3d[wp.uint8],
+):
+    row, column = wp.tid()
+    total = wp.vec3(0.0, 0.0, 0.0)
+    covered = wp.float32(0.0)
+    ground = wp.vec3(background[0], background[1], background[2]) * background[3]
+    for sample in range(samples * samples):
+        y = row * samples + sample // samples
+        x = column * samples + sample % samples
+        limit = key[0, y, x]
+        value = ground
+        cover = background[3]
+        if limit != NOTHING:
+            value = _color(
+                corner,
+                corner_color,
+                picture,
+                texel,
+                center,
+                radius,
+                ball_color,
+                shading,
+                light,
+                grid,
+                _number(limit),
+                x,
+                y + grid.first,
+            )
+            cover = wp.float32(1.0)
+        for _ in range(1, key.shape[0]):
+            # The farthest of the sheer shapes that are nearer than the last one.
+            layer = wp.int32(0)
+            farthest = wp.int64(0)
+            for other in range(1, key.shape[0]):
+                one = key[other, y, x]
+                if one < limit and one > farthest:
+                    layer = other
+                    farthest = one
+            if layer > 0:
+                share = opacity[layer]
+                over = _color(
+                    corner,
+                    corner_color,
+                    picture,
+                    texel,
+                    center,
+                    radius,
+                    ball_color,
+                    shading,
+                    light,
+                    grid,
+                    _number(farthest),
+                    x,
+                    y + grid.first,
+                )
+                value = share * over + (1.0 - share) * value
+                cover = share + (1.0 - share) * cover
+                limit = farthest
+        total += value
+        covered += cover
+    count = wp.float32(samples * samples)
+    # Colors are weighted by the opacity: clear places are black, not dark.
+    for channel in range(3):
+        shown = wp.float32(0.0)
+        if covered > 0.0:
+            shown = wp.clamp(total[channel] / covered, 0.0, 255.0)
+        color_out[row, column, channel] = wp.uint8(shown + 0.5)
+    color_out[row, column, 3] = wp.uint8(255.0 * covered / count + 0.5)
