@@ -11,7 +11,7 @@ from fastapi.responses import HTMLResponse, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 from app.jobs.catalog import Catalog, NotFoundError
-from app.jobs.forecast import Forecast
+from app.jobs.eta import Forecast
 from app.jobs.machine import Machine
 from app.jobs.order import settings_of_run, shown_value
 from app.jobs.scheduler import Scheduler
@@ -157,14 +157,13 @@ def check_order(
         SequenceError: If a sequence is unknown or damaged.
     """
     base = load_profile(profile)
-    frames = [catalog.sequence(sequence_id).frame_count for sequence_id in sequence_ids]
+    sequences = [catalog.sequence(sequence_id) for sequence_id in sequence_ids]
     try:
         config = apply_overrides(base, overrides)
     except SettingsError as error:
         problems = [{"field": path, "message": told} for path, told in error.fields.items()]
         return {"problems": problems, "overrides": {}, "expected": None}
-    plan = forecast.of_order(config_to_dict(config), frames) if frames else None
-    expected = plan and {"seconds": float(round(plan.seconds)), "basis": plan.basis}
+    expected = forecast.of_order(config_to_dict(config), sequences)
     return {"problems": [], "overrides": changes(config, base), "expected": expected}
 
 

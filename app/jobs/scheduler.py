@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from app.jobs.catalog import Catalog, RunItem
-from app.jobs.forecast import Forecast
+from app.jobs.eta import Forecast
 from app.jobs.order import default_name, fit_config
 from app.jobs.processes import (
     WORKER,

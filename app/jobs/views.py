@@ -14,7 +14,6 @@ from weakref import WeakKeyDictionary
 from pydantic import BaseModel, ConfigDict, Field
 
 from app.jobs.catalog import RunItem, SequenceItem
-from app.jobs.remaining import with_time
 from app.jobs.scheduler import AT_WORK, JobView, Scheduler
 from physhandi import errors
 from physhandi.data.environment import ENVIRONMENT
@@ -499,7 +498,30 @@ def describe_run(item: RunItem, scheduler: Scheduler) -> dict[str, Any]:
         known = (view, _describe(item, view))
         if item.run is not None:
             _described[item.run] = known
-    return with_time(known[1], item.run, view, scheduler)
+    return _with_time_left(known[1], item.run, view, scheduler)
+
+
+def _with_time_left(
+    described: dict[str, Any], run: Run | None, view: JobView, scheduler: Scheduler
+) -> dict[str, Any]:
+    """Add ``estimate``: `Forecast.of_running` or `Forecast.of_waiting`, else none.
+
+    Of a run at work, ``eta_s`` of its ``progress`` becomes the time that its stage still takes.
+    """
+    estimate = None
+    if run is not None and view.state in {"starting", "running"}:
+        estimate = scheduler.forecast.of_running(run)
+    elif run is not None and view.state == "queued":
+        line = scheduler.in_line()
+        place = next((number for number, other in enumerate(line) if other.id == run.id), None)
+        if place is not None:
+            estimate = scheduler.forecast.of_waiting(
+                run, line[:place], scheduler.at_work(), scheduler.slots
+            )
+    progress = dict(described["progress"])
+    if progress and estimate and "stage_left_s" in estimate:
+        progress["eta_s"] = estimate["stage_left_s"]
+    return described | {"estimate": estimate, "progress": progress}
 
 
 def _describe(item: RunItem, view: JobView) -> dict[str, Any]:
