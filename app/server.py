@@ -82,11 +82,11 @@ def create_app(
     security = security or Security(settings)
     catalog = catalog or Catalog(settings)
     scheduler = scheduler or Scheduler(settings, catalog)
-    keeping = UserStorage(
+    storage = UserStorage(
         PresetStore(settings.data_dir / "presets"),
         RunSaver(catalog, settings.run_dir, scheduler.start_now),
     )
-    sessions = sessions or Sessions(settings, catalog, keeping)
+    sessions = sessions or Sessions(settings, catalog, storage)
     machine = Machine(settings.data_dir)
     feed = Feed(lambda: [describe_run(item, scheduler) for item in catalog.runs()])
     pages = Pages()

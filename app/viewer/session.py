@@ -94,7 +94,7 @@ class Session(SceneServer):
         catalog: Catalog,
         live: SimulationClient,
         state: SessionState | None = None,
-        keeping: UserStorage | None = None,
+        storage: UserStorage | None = None,
     ) -> None:
         """Open a run or a sequence; raises the catalog's errors before a server is started.
 
@@ -106,14 +106,14 @@ class Session(SceneServer):
             catalog: Finds runs and sequences.
             live: The process that simulates.
             state: What to begin with, as `state` of another session told it.
-            keeping: Where presets and runs are kept.
+            storage: Where presets and runs are kept.
         """
         self.kind: Kind = kind
         self._target = target
         self.link_of: Callable[[Session], str] = lambda _: ""
         self._catalog = catalog
         self._live = live
-        self._keeping = keeping
+        self._storage = storage
         self._has_played = False
         self._names: tuple[str, ...] = ()
         if kind == "run":
@@ -146,7 +146,7 @@ class Session(SceneServer):
     def state(self) -> SessionState:
         """What the user has set up, for a copy of this session."""
         with self._lock:
-            panel = self._object.panel if self._object is not None else None
+            history = self._object.panel.history if self._object is not None else None
             theme, prefers_dark = self._layers.theme
             return SessionState(
                 sequence_name=self._content.sequence_name,
@@ -157,12 +157,12 @@ class Session(SceneServer):
                 layers=replace(self._stage.scene.layers),
                 theme=theme,
                 prefers_dark=prefers_dark,
-                parameters=panel.history.current if panel is not None else None,
-                automatic_substeps=panel is not None and panel.is_automatic,
+                parameters=history.current if history is not None else None,
+                automatic_substeps=history is not None and history.is_automatic,
                 is_figure=self._figure.is_on,
                 pose=self._figure.pose(),
-                parameter_changes=differences(panel.history.start, panel.history.current)
-                if panel is not None
+                parameter_changes=differences(history.start, history.current)
+                if history is not None
                 else {},
             )
 
@@ -261,7 +261,7 @@ class Session(SceneServer):
                 fitted=content.fitted,
                 run=run,
                 strip=self._strip,
-                keeping=self._keeping,
+                storage=self._storage,
             )
 
     def _restore(self, state: SessionState) -> None:
@@ -271,7 +271,7 @@ class Session(SceneServer):
         if state.layers is not None:
             self._layers.restore(state.layers, state.theme, prefers_dark=state.prefers_dark)
             self._inspection.colors.restore()
-        if self._object is not None and self._object.panel is not None and state.parameters:
+        if self._object is not None and state.parameters:
             self._object.panel.restore(state.parameters, is_automatic=state.automatic_substeps)
         if state.pose is not None:
             state.pose.give_first(self._server.initial_camera)

@@ -75,16 +75,16 @@ class Sessions:
         self,
         settings: ViewerSettings,
         catalog: Catalog,
-        keeping: UserStorage | None = None,
+        storage: UserStorage | None = None,
     ) -> None:
         """Prepare; nothing is started before the first session.
 
         Args:
             settings: Limits and device.
             catalog: Finds runs and sequences.
-            keeping: Where users keep presets and runs; None if they cannot.
+            storage: Where users keep presets and runs; None if they cannot.
         """
-        self._keeping = keeping
+        self._storage = storage
         self._settings = settings
         self._catalog = catalog
         self._lock = threading.Lock()
@@ -213,7 +213,7 @@ class Sessions:
             catalog=self._catalog,
             live=self.live,
             state=state,
-            keeping=self._keeping,
+            storage=self._storage,
         )
 
     def _reserve(self, owner: str) -> None:

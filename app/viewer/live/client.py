@@ -8,7 +8,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,15 @@ class LiveRequest:
     """Which of the run's control nodes may hold the object; None for all."""
 
 
+@dataclass(frozen=True)
+class _Unfinished:
+    """What a session asked for and has not got yet."""
+
+    message: Message
+    has_crashed: bool = False
+    """Whether the process ended while it worked on it; the second time it is dropped."""
+
+
 class SimulationClient:
     """Owns the live simulation process; one for all sessions.
 
@@ -48,6 +57,9 @@ class SimulationClient:
     process has warmed up, ``started``, ``frame``, ``stability``, ``finished``, ``diverged``,
     ``failed`` of the process, and ``crashed`` when it is gone. After a crash it is started again,
     and a request that was cut off is sent once more.
+
+    One lock is held from the number of a request until it is written, so that messages reach the
+    process in the order of the calls.
     """
 
     def __init__(self, device: str = "cpu") -> None:
@@ -60,8 +72,7 @@ class SimulationClient:
         self._lock = threading.Lock()
         self._wake = threading.Condition(self._lock)
         self._listeners: dict[str, Listener] = {}
-        self._pending: dict[str, tuple[Message, bool]] = {}
-        self._early: dict[str, Message] = {}
+        self._unfinished: dict[str, _Unfinished] = {}
         self._held: set[str] = set()
         self._numbers = count(1)
         self._connection: socket.socket | None = None
@@ -70,7 +81,6 @@ class SimulationClient:
         self._is_closed = False
         self._is_ready = False
         self._thread: threading.Thread | None = None
-        self._write_lock = threading.Lock()
 
     @property
     def process_id(self) -> int | None:
@@ -98,24 +108,21 @@ class SimulationClient:
             self._listeners[session] = listener
         self.start()
 
-    def prepare(self, session: str, request: LiveRequest) -> None:
-        """Have loaded what a session's first request will need; a request goes before it."""
-        message = Message("prepare", {"session": session, **_described(request)})
-        with self._lock:
-            is_early = self._connection is None
-            if is_early:
-                self._early[session] = message
-        if not is_early:
-            self._send(message)
-
     def unsubscribe(self, session: str) -> None:
         """Forget a session and stop what is simulated for it."""
         with self._lock:
             self._listeners.pop(session, None)
-            self._pending.pop(session, None)
-            self._early.pop(session, None)
+            self._unfinished.pop(session, None)
             self._held.discard(session)
-        self._send(Message("close", {"session": session}))
+            self._write(Message("close", {"session": session}))
+
+    def prepare(self, session: str, request: LiveRequest) -> None:
+        """Load what a session's first request will need."""
+        message = Message("prepare", {"session": session, **_to_fields(request)})
+        with self._lock:
+            if self._connection is None:
+                self._unfinished[session] = _Unfinished(message)
+            self._write(message)
 
     def request(self, session: str, request: LiveRequest) -> int:
         """Ask for a rollout; an unfinished earlier request of the session is dropped.
@@ -127,40 +134,37 @@ class SimulationClient:
         Returns:
             Number of the request, which its answers carry.
         """
-        number = next(self._numbers)
-        message = Message(
-            "simulate",
-            {
-                "session": session,
-                "request": number,
-                **_described(request),
-                "is_held": session in self._held,
-            },
-        )
         with self._lock:
-            self._pending[session] = (message, True)
+            number = next(self._numbers)
+            about = {"session": session, "request": number, "is_held": session in self._held}
+            message = Message("simulate", about | _to_fields(request))
+            self._unfinished[session] = _Unfinished(message)
             if self._connection is None:
                 self._crashes.clear()
             self._wake.notify_all()
-        self._send(message)
+            self._write(message)
         return number
 
     def hold(self, session: str, *, on: bool) -> None:
         """Hold the session's simulation, this one and those to come, or let it go on."""
         with self._lock:
             (self._held.add if on else self._held.discard)(session)
-            self._hold_pending(session, is_held=on)
-        self._send(Message(PAUSE if on else RESUME, {"session": session}))
+            if session in self._unfinished:  # It may be sent again, to another process.
+                item = self._unfinished[session]
+                message = Message(item.message.kind, {**item.message.fields, "is_held": on})
+                self._unfinished[session] = replace(item, message=message)
+            self._write(Message(PAUSE if on else RESUME, {"session": session}))
 
     def step(self, session: str) -> None:
         """Let a held simulation go on by one frame."""
-        self._send(Message(STEP, {"session": session}))
+        with self._lock:
+            self._write(Message(STEP, {"session": session}))
 
     def cancel(self, session: str) -> None:
         """Stop what is being simulated for a session."""
         with self._lock:
-            self._pending.pop(session, None)
-        self._send(Message("cancel", {"session": session}))
+            self._unfinished.pop(session, None)
+            self._write(Message("cancel", {"session": session}))
 
     def close(self) -> None:
         """End the process."""
@@ -179,23 +183,11 @@ class SimulationClient:
         if self._thread is not None:
             self._thread.join(timeout=5)
 
-    def _hold_pending(self, session: str, *, is_held: bool) -> None:
-        """Let an unfinished request, should it be sent again, be held or not as it is now."""
-        if session in self._pending:
-            message, is_new = self._pending[session]
-            message = Message(message.kind, {**message.fields, "is_held": is_held})
-            self._pending[session] = (message, is_new)
-
-    def _send(self, message: Message) -> None:
-        """Write a message; a broken connection is the supervisor's business."""
-        with self._write_lock:
-            self._write(message)
-
     def _write(self, message: Message) -> None:
-        connection = self._connection
-        if connection is not None:
+        """Write a message under the lock; a broken connection is the supervisor's business."""
+        if self._connection is not None:
             try:
-                send(connection, message)
+                send(self._connection, message)
             except OSError:
                 logger.info("the live simulation process is gone; message not sent")
 
@@ -204,13 +196,13 @@ class SimulationClient:
         # process must be started by a thread that lives as long as the server: this one.
         while not self._is_closed:
             connection = self._spawn()
-            self._resend()
+            self._connect(connection)
             try:
                 while (message := receive(connection)) is not None:
                     self._deliver(message)
             except (WireError, OSError) as error:
                 logger.warning("the live simulation process broke off: %s", error)
-            self._bury(connection)
+            self._disconnect()
             self._wait_after_crash()
 
     def _spawn(self) -> socket.socket:
@@ -223,20 +215,18 @@ class SimulationClient:
                 self._device,
                 pass_fds=[theirs.fileno()],
             )
-        with self._write_lock:
-            self._connection = ours
-        if self._is_closed:
-            _shut(ours)
         return ours
 
-    def _resend(self) -> None:
-        # Nobody else writes meanwhile: what is newer, or changes the pace, must come after it.
-        with self._write_lock:
-            with self._lock:
-                early, self._early = self._early, {}
-                early |= {session: message for session, (message, _) in self._pending.items()}
-            for message in early.values():
-                self._write(message)
+    def _connect(self, connection: socket.socket) -> None:
+        """Write to a new process from now on, first what was asked for before it was there."""
+        with self._lock:
+            self._connection = connection
+            for session, item in list(self._unfinished.items()):
+                self._write(item.message)
+                if item.message.kind == "prepare":
+                    del self._unfinished[session]
+            if self._is_closed:
+                _shut(connection)
 
     def _deliver(self, message: Message) -> None:
         if message.kind == "ready":
@@ -244,23 +234,36 @@ class SimulationClient:
             with self._lock:
                 listeners = list(self._listeners.values())
             for listener in listeners:
-                self._tell(listener, message)
+                _notify(listener, message)
             return
         session = message["session"]
         with self._lock:
             listener = self._listeners.get(session)
-            pending = self._pending.get(session)
-            is_current = pending is not None and pending[0]["request"] == message["request"]
-            if is_current and message.kind in {"finished", "diverged", "failed"}:
-                del self._pending[session]
+            if message.kind in {"finished", "diverged", "failed"}:
+                self._forget(session, message["request"])
         if listener is not None:
-            self._tell(listener, message)
+            _notify(listener, message)
 
-    def _bury(self, connection: socket.socket) -> None:
-        self._is_ready = False
-        with self._write_lock:
-            self._connection = None
-            connection.close()
+    def _forget(self, session: str, number: int) -> None:
+        """Forget a request that was answered, unless a newer one came meanwhile."""
+        item = self._unfinished.get(session)
+        if item is not None and item.message.fields.get("request") == number:
+            del self._unfinished[session]
+
+    def _disconnect(self) -> None:
+        """Bury the process, and tell every session if nobody has ended it."""
+        with self._lock:
+            self._is_ready = False
+            connection, self._connection = self._connection, None
+            if connection is not None:
+                connection.close()
+            self._unfinished = {
+                session: replace(item, has_crashed=True)
+                for session, item in self._unfinished.items()
+                if not item.has_crashed
+            }
+            retried = set(self._unfinished)
+            listeners = list(self._listeners.items())
         process = self._process
         if process is None:
             return
@@ -272,12 +275,9 @@ class SimulationClient:
         logger.error("the live simulation process ended with code %d", code)
         with self._lock:
             self._crashes.append(time.monotonic())
-            cut_off = {s: m for s, (m, is_new) in self._pending.items() if is_new}
-            self._pending = {s: (m, False) for s, m in cut_off.items()}
-            listeners = list(self._listeners.items())
         for session, listener in listeners:
-            about = {"session": session, "code": code, "is_retried": session in cut_off}
-            self._tell(listener, Message("crashed", about))
+            about = {"session": session, "code": code, "is_retried": session in retried}
+            _notify(listener, Message("crashed", about))
 
     def _wait_after_crash(self) -> None:
         """Do not start the process over and over if it crashes at once; wait for a request."""
@@ -289,16 +289,9 @@ class SimulationClient:
             ):
                 self._wake.wait(timeout=5)
 
-    @staticmethod
-    def _tell(listener: Listener, message: Message) -> None:
-        try:
-            listener(message)
-        except Exception:
-            logger.exception("a session could not take a %s message", message.kind)
 
-
-def _described(request: LiveRequest) -> dict[str, Any]:
-    """Give a request as plain fields of a message."""
+def _to_fields(request: LiveRequest) -> dict[str, Any]:
+    """Write a request as plain fields of a message."""
     return {
         "run": str(request.run),
         "sequence": request.sequence,
@@ -306,6 +299,13 @@ def _described(request: LiveRequest) -> dict[str, Any]:
         "automatic_substeps": request.automatic_substeps,
         "controls": None if request.controls is None else list(request.controls),
     }
+
+
+def _notify(listener: Listener, message: Message) -> None:
+    try:
+        listener(message)
+    except Exception:
+        logger.exception("a session could not take a %s message", message.kind)
 
 
 def _shut(connection: socket.socket) -> None:

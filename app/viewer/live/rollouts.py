@@ -54,8 +54,10 @@ class Readout:
 class LiveRollouts:
     """Turns parameter changes into rollouts; the latest request wins.
 
-    The rollout shown before stays on the screen, frame by frame, until its frame has been
-    simulated anew. If the object diverges, the last good state stays.
+    The worker drops what a newer request of the session replaces, and what it had sent before is
+    refused here by the number of its request. The rollout shown before stays on the screen, frame
+    by frame, until its frame has been simulated anew. If the object diverges, the last good state
+    stays.
     """
 
     def __init__(
@@ -78,67 +80,76 @@ class LiveRollouts:
             run: Run folder.
             sequence: The run's sequence.
             controls: Which of the run's control nodes hold the object; None for all.
-            on_change: Called with the kind of each message and the number of ready frames.
+            on_change: Called with ``"requested"`` or the kind of a message of the process, and
+                the number of ready frames.
         """
         self.fitted = fitted
         self._session = session
         self._live = live
-        self._run = run
-        self._sequence = sequence
-        self._controls = controls
         self._on_change = on_change
         self._lock = threading.Lock()
+        self._wanted = LiveRequest(
+            run=run, sequence=sequence, parameters=fitted.parameters, controls=controls
+        )
+        self._number = 0
         self._shown = fitted
         self._incoming: ObjectRollout | None = None
-        self._request = 0
-        self._parameters = fitted.parameters
         self._durations: list[float] = []
         self._is_busy = False
         self._is_held = False
         self._needed: int | None = None
         live.subscribe(session, self._hear)
         if controls is None:
-            live.prepare(
-                session, LiveRequest(run=run, sequence=sequence, parameters=fitted.parameters)
-            )
+            live.prepare(session, self._wanted)
 
     def request(self, parameters: SimulationParameters, *, automatic_substeps: bool) -> None:
-        """Ask for a rollout with other parameters."""
+        """Ask for the rollout of other parameters; the fitted one is there already."""
         with self._lock:
-            self._parameters = parameters
-            self._is_busy = True
-            self._incoming = None
-            self._durations, self._needed = [], None
-            # Answers to earlier requests are refused from here on.
-            self._request = self._live.request(
-                self._session,
-                LiveRequest(
-                    run=self._run,
-                    sequence=self._sequence,
-                    parameters=parameters,
-                    automatic_substeps=automatic_substeps,
-                    controls=self._controls,
-                ),
+            self._wanted = replace(
+                self._wanted, parameters=parameters, automatic_substeps=automatic_substeps
             )
+            is_fitted = (
+                parameters == self.fitted.parameters
+                and not automatic_substeps
+                and self._wanted.controls is None
+            )
+            if is_fitted:
+                self._live.cancel(self._session)
+                self._number, self._is_busy = 0, False
+                self._shown, self._incoming = self.fitted, None
+                self._durations, self._needed = [], None
+            else:
+                self._simulate()
+        if is_fitted:
+            self._on_change("finished", self.fitted.ready)
+        else:
+            self._on_change("requested", 0)
 
     def hold(self, *, on: bool) -> None:
         """Hold the simulation, and those asked for from now on, or let it go on."""
         with self._lock:
             self._is_held = on
             self._live.hold(self._session, on=on)
+        self._on_change("requested", 0)
 
     def step(self) -> None:
-        """Let the held simulation go on by one frame."""
-        self._live.step(self._session)
-
-    def show_fitted(self) -> None:
-        """Go back to the fitted rollout without simulating it."""
+        """Hold the simulation and compute one frame of it; one that is over begins anew."""
         with self._lock:
-            self._live.cancel(self._session)
-            self._request = 0
-            self._shown, self._incoming = self.fitted, None
-            self._durations, self._is_busy, self._needed = [], False, None
-        self._on_change("finished", self.fitted.ready)
+            if not self._is_held:
+                self._is_held = True
+                self._live.hold(self._session, on=True)
+            if not self._is_busy:
+                self._simulate()
+            self._live.step(self._session)
+        self._on_change("requested", 0)
+
+    def _simulate(self) -> None:
+        """Have what is wanted simulated, even if it is the fitted rollout."""
+        self._is_busy = True
+        self._incoming = None
+        self._durations, self._needed = [], None
+        # Answers to earlier requests are refused from here on.
+        self._number = self._live.request(self._session, self._wanted)
 
     def close(self) -> None:
         """Stop listening."""
@@ -171,40 +182,44 @@ class LiveRollouts:
     def readout(self) -> Readout:
         """What there is to say about the newest rollout."""
         with self._lock:
-            take = self._incoming or self._shown
+            rollout = self._incoming or self._shown
             durations = self._durations
             is_waiting = self._is_busy and self._incoming is None
             return Readout(
-                object_spring_count=take.model.object_spring_count,
-                virtual_spring_count=take.model.virtual_spring_count,
-                node_count=take.model.node_count,
-                substeps_per_frame=take.parameters.substeps_per_frame,
-                simulated_count=0 if is_waiting else take.ready,
-                frame_count=take.frame_count,
+                object_spring_count=rollout.model.object_spring_count,
+                virtual_spring_count=rollout.model.virtual_spring_count,
+                node_count=rollout.model.node_count,
+                substeps_per_frame=rollout.parameters.substeps_per_frame,
+                simulated_count=0 if is_waiting else rollout.ready,
+                frame_count=rollout.frame_count,
                 frame_duration=float(np.mean(durations)) if durations else float("nan"),
-                difference=take.mean_distance(self.fitted) if not self._is_busy else float("nan"),
+                difference=rollout.mean_distance(self.fitted)
+                if not self._is_busy
+                else float("nan"),
                 is_busy=self._is_busy,
                 is_starting=not self._live.is_ready,
                 is_held=self._is_held,
-                is_fitted=take is self.fitted and not self._is_busy,
+                is_fitted=rollout is self.fitted and not self._is_busy,
                 needed_substeps=self._needed,
-                error=take.error,
+                error=rollout.error,
             )
 
     def _hear(self, message: Message) -> None:
         with self._lock:
-            if message.kind not in {"crashed", "ready"} and message["request"] != self._request:
+            if message.kind not in {"crashed", "ready"} and message["request"] != self._number:
                 return
-            self._take_in(message)
+            self._update(message)
             ready = self._incoming.ready if self._incoming is not None else 0
             if message.kind == "finished" and self._incoming is not None:
                 self._shown, self._incoming = self._incoming, None
         self._on_change(message.kind, ready)
 
-    def _take_in(self, message: Message) -> None:
+    def _update(self, message: Message) -> None:
         if message.kind == "started":
             model = SpringMassModel.from_tensors(message.arrays)
-            parameters = replace(self._parameters, substeps_per_frame=message["substeps_per_frame"])
+            parameters = replace(
+                self._wanted.parameters, substeps_per_frame=message["substeps_per_frame"]
+            )
             self._incoming = ObjectRollout.empty(model, parameters, self.fitted.control)
             self._durations = []
         elif message.kind == "frame" and self._incoming is not None:
@@ -216,12 +231,12 @@ class LiveRollouts:
             if frame > 0:
                 self._durations.append(float(message["duration"]))
         elif message.kind in {"diverged", "failed"}:
-            take = self._incoming
-            if take is None:
-                take = self._incoming = ObjectRollout.empty(
-                    self.fitted.model, self._parameters, self.fitted.control
+            rollout = self._incoming
+            if rollout is None:
+                rollout = self._incoming = ObjectRollout.empty(
+                    self.fitted.model, self._wanted.parameters, self.fitted.control
                 )
-            take.error = str(message["error"])
+            rollout.error = str(message["error"])
             self._is_busy = False
         elif message.kind == "stability":
             self._needed = int(message["needed"])

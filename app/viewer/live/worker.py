@@ -1,9 +1,8 @@
 """The live simulation process: simulates what the sliders of all sessions ask for.
 
 Started as ``python -m app.viewer.live.worker FD`` with one end of a socket pair. One thread
-reads requests into one mailbox per session, where a newer request replaces an older one; the
-main thread simulates one frame of each active session in turn. The process ends when its parent
-does.
+reads requests into a mailbox, where a session's newer request replaces its older one; the main
+thread simulates one frame of each active session in turn. The process ends when its parent does.
 """
 
 import logging
@@ -18,7 +17,7 @@ import numpy as np
 import warp as wp
 
 from app.child import die_with_parent
-from app.viewer.live.wire import CONTROLS, Holds, Message, receive, send
+from app.viewer.live.wire import PAUSE, RESUME, STEP, Message, receive, send
 from physhandi.errors import PhysHandiError, SimulationDivergedError
 from physhandi.fitted_object import FittedObject
 from physhandi.simulation.parameters import SimulationParameters
@@ -26,89 +25,43 @@ from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.stability import stable_substeps, with_stable_substeps
 from physhandi.simulation.topology import build_model
 
-_PARAMETERS = SimulationParameters(
-    connection_radius=0.015,
-    virtual_connection_radius=0.015,
-    stiffness=10.0,
-    virtual_stiffness=10.0,
-    damping=0.1,
-    substeps_per_frame=100,
-)
-
-
-def warm_up(device: str) -> None:
-    """Simulate a small cube for a frame, which loads the kernels or compiles them.
-
-    What fails here fails again when somebody asks for a rollout, who is then told.
-
-    Args:
-        device: Warp device.
-    """
-    node = 0.01 * np.stack(np.meshgrid(*3 * [np.arange(3.0)]), axis=-1).reshape(-1, 3)
-    node = node.astype(np.float32)
-    control = np.repeat(node[None, :4], 2, axis=0)
-    try:
-        model = build_model(node, control[0], _PARAMETERS)
-        Simulator(model, _PARAMETERS, device).rollout(control)
-        stable_substeps(model, _PARAMETERS, control[0])
-    except (PhysHandiError, ValueError, OSError, RuntimeError):
-        logger.exception("the live simulation could not be prepared")
-
-
 logger = logging.getLogger(__name__)
 
 
-class Mailboxes:
-    """The latest request of each session; older ones are forgotten."""
+class Mailbox:
+    """What is to be done next for each session: its newest request, then changes of its pace."""
 
     def __init__(self) -> None:
         self._condition = threading.Condition()
-        self._latest: dict[str, Message] = {}
-        self._controls: list[Message] = []
-        self._newest: dict[str, int] = {}
+        self._messages: dict[str, list[Message]] = {}
         self._is_closed = False
 
     def put(self, message: Message) -> None:
-        """Replace the request of the message's session; what changes its pace is kept beside it.
-
-        What was overtaken on its way by a newer request of the session is ignored.
-        """
-        session = message["session"]
+        """Add a message; a request replaces everything that the session has asked for before."""
         with self._condition:
-            if message.kind in CONTROLS:
-                self._controls.append(message)
-            elif not self._is_overtaken(message):
-                if message.kind == "simulate":
-                    self._newest[session] = message["request"]
-                elif message.kind == "close":
-                    self._newest.pop(session, None)
-                self._latest[session] = message
+            if message.kind in {PAUSE, RESUME, STEP}:
+                self._messages.setdefault(message["session"], []).append(message)
+            else:
+                self._messages[message["session"]] = [message]
             self._condition.notify()
 
-    def _is_overtaken(self, message: Message) -> bool:
-        # Several threads of the server send, one of them what it noted before a crash or a start.
-        newest = self._newest.get(message["session"], 0)
-        if message.kind == "simulate":
-            return message["request"] < newest
-        return message.kind == "prepare" and newest > 0
-
     def take(self, *, wait: bool) -> list[Message] | None:
-        """Empty all mailboxes.
+        """Empty the mailbox.
 
         Args:
-            wait: Whether to wait for a request if there is none.
+            wait: Whether to wait for a message if there is none.
 
         Returns:
-            Requests of different sessions, then what changes their pace, or None after `close`.
+            The messages, those of one session in their order, or None after `close`.
         """
         with self._condition:
-            while wait and not (self._latest or self._controls or self._is_closed):
+            while wait and not (self._messages or self._is_closed):
                 self._condition.wait()
             if self._is_closed:
                 return None
-            taken = [*self._latest.values(), *self._controls]
-            self._latest, self._controls = {}, []
-            return taken
+            messages = [message for of_session in self._messages.values() for message in of_session]
+            self._messages = {}
+            return messages
 
     def close(self) -> None:
         """Let `take` return None from now on."""
@@ -117,17 +70,55 @@ class Mailboxes:
             self._condition.notify()
 
 
+class PacedFrames:
+    """The simulation of one session, frame by frame, and whether the next one may be computed.
+
+    A held one computes its first frame, the state it starts from, and then one frame a step.
+    """
+
+    def __init__(self, counts: Iterator[int], *, is_held: bool = False) -> None:
+        """Prepare.
+
+        Args:
+            counts: Computes a frame at a time and gives the number of frames computed so far.
+            is_held: Whether to wait for steps.
+        """
+        self._counts = counts
+        self._computed = 0
+        self._steps: int | None = 0 if is_held else None
+
+    @property
+    def may_advance(self) -> bool:
+        """Whether the next frame may be computed."""
+        return self._steps is None or self._steps > 0 or self._computed == 0
+
+    def set_pace(self, kind: str) -> None:
+        """Wait (`PAUSE`), run (`RESUME`) or compute one more frame (`STEP`)."""
+        if kind == RESUME:
+            self._steps = None
+        else:
+            self._steps = (self._steps or 0) + 1 if kind == STEP else 0
+
+    def advance(self) -> bool:
+        """Compute the next frame; returns whether there was one."""
+        count = next(self._counts, None)
+        if count is None:
+            return False
+        if self._steps is not None and self._computed > 0:
+            self._steps = max(self._steps - (count - self._computed), 0)
+        self._computed = count
+        return True
+
+
 class SimulationWorker:
     """Answers requests, one frame of each session in turn."""
 
     def __init__(self, connection: socket.socket, device: str) -> None:
         self._connection = connection
         self._device = device
-        self._mailboxes = Mailboxes()
+        self._mailbox = Mailbox()
         self._objects: dict[str, tuple[tuple[str, str], FittedObject]] = {}
-        self._active: dict[str, Iterator[int]] = {}
-        self._holds = Holds()
-        self._newest: dict[str, int] = {}
+        self._active: dict[str, PacedFrames] = {}
 
     def run(self) -> None:
         """Work until the parent closes the connection."""
@@ -135,47 +126,38 @@ class SimulationWorker:
         warm_up(self._device)
         send(self._connection, Message("ready", {"session": "", "request": 0}))
         while True:
-            is_idle = not any(self._holds.may_go_on(session) for session in self._active)
-            requests = self._mailboxes.take(wait=is_idle)
-            if requests is None:
+            is_idle = not any(frames.may_advance for frames in self._active.values())
+            messages = self._mailbox.take(wait=is_idle)
+            if messages is None:
                 return
-            for request in requests:
-                self._start(request)
+            for message in messages:
+                self._handle(message)
             for session, frames in list(self._active.items()):
-                if not self._holds.may_go_on(session):
-                    continue
-                try:
-                    self._holds.count(session, next(frames))
-                except StopIteration:
+                if frames.may_advance and not frames.advance():
                     del self._active[session]
 
     def _read(self) -> None:
         try:
             while (message := receive(self._connection)) is not None:
                 arrived = {**message.fields, "arrived": time.perf_counter()}
-                self._mailboxes.put(Message(message.kind, arrived))
+                self._mailbox.put(Message(message.kind, arrived))
         finally:
-            self._mailboxes.close()
+            self._mailbox.close()
 
-    def _start(self, request: Message) -> None:
-        session = request["session"]
-        if request.kind in CONTROLS:
-            self._holds.hear(request)
+    def _handle(self, message: Message) -> None:
+        session = message["session"]
+        if message.kind in {PAUSE, RESUME, STEP}:
+            if session in self._active:
+                self._active[session].set_pace(message.kind)
             return
-        if request.kind == "simulate":
-            if request["request"] <= self._newest.get(session, 0):
-                return  # The server repeats a request if it is not sure that it arrived.
-            self._newest[session] = request["request"]
         self._active.pop(session, None)
-        if request.kind == "simulate":
-            self._active[session] = self._answer(request)
-            self._holds.start(session, is_held=bool(request["is_held"]))
-        elif request.kind == "prepare":
-            self._active[session] = self._prepare(request)
-        elif request.kind == "close":
+        if message.kind == "simulate":
+            is_held = bool(message["is_held"])
+            self._active[session] = PacedFrames(self._answer(message), is_held=is_held)
+        elif message.kind == "prepare":
+            self._active[session] = PacedFrames(self._prepare(message))
+        elif message.kind == "close":
             self._objects.pop(session, None)
-            self._newest.pop(session, None)
-            self._holds.forget(session)
 
     def _answer(self, request: Message) -> Iterator[int]:
         """Simulate one request; pauses after each frame and gives the number of frames."""
@@ -245,16 +227,16 @@ class SimulationWorker:
                     ),
                 )
                 if frame == 1:  # Not before the user sees the first frame that moves.
-                    self._tell_needed(about, fitted.needed_substeps(model, parameters))
+                    self._send_stability(about, fitted.needed_substeps(model, parameters))
                 yield int(frame) + 1
                 clock = time.perf_counter()
         except SimulationDivergedError:
             if frame == 0:
-                self._tell_needed(about, fitted.needed_substeps(model, parameters))
+                self._send_stability(about, fitted.needed_substeps(model, parameters))
             raise
         send(self._connection, Message("finished", about))
 
-    def _tell_needed(self, about: dict[str, object], substeps: int) -> None:
+    def _send_stability(self, about: dict[str, object], substeps: int) -> None:
         send(self._connection, Message("stability", {**about, "needed": substeps}))
 
     def _object(self, request: Message) -> FittedObject:
@@ -264,6 +246,35 @@ class SimulationWorker:
             known = (key, FittedObject(*key))
             self._objects[request["session"]] = known
         return known[1]
+
+
+_CUBE = SimulationParameters(
+    connection_radius=0.015,
+    virtual_connection_radius=0.015,
+    stiffness=10.0,
+    virtual_stiffness=10.0,
+    damping=0.1,
+    substeps_per_frame=100,
+)
+
+
+def warm_up(device: str) -> None:
+    """Simulate a small cube for a frame, which loads the kernels or compiles them.
+
+    What fails here fails again when somebody asks for a rollout, who is then told.
+
+    Args:
+        device: Warp device.
+    """
+    node = 0.01 * np.stack(np.meshgrid(*3 * [np.arange(3.0)]), axis=-1).reshape(-1, 3)
+    node = node.astype(np.float32)
+    control = np.repeat(node[None, :4], 2, axis=0)
+    try:
+        model = build_model(node, control[0], _CUBE)
+        Simulator(model, _CUBE, device).rollout(control)
+        stable_substeps(model, _CUBE, control[0])
+    except (PhysHandiError, ValueError, OSError, RuntimeError):
+        logger.exception("the live simulation could not be prepared")
 
 
 def main(arguments: list[str]) -> None:

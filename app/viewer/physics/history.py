@@ -1,18 +1,31 @@
 """The parameters that were tried in a session, with undo and redo."""
 
-import math
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any, NamedTuple
 
 from physhandi.simulation.parameters import SimulationParameters
 
-_COALESCE = 1.0
+_REST = 3.0
+"""A slider that rested for longer is moved by another gesture [s]."""
+
+
+class Setting(NamedTuple):
+    """What is simulated."""
+
+    parameters: SimulationParameters
+    """Their number of substeps is that in force before the automatic choice."""
+    is_automatic: bool = False
+    """Whether the number of substeps is chosen automatically."""
 
 
 class History:
-    """The parameters that were tried, with undo and redo."""
+    """The settings that were tried; one gesture is one step.
+
+    A gesture moves one slider, however far and slowly, until another control is used or the slider
+    rests. Changed by one thread at a time; `setting` may be read by any.
+    """
 
     def __init__(
         self, start: SimulationParameters, clock: Callable[[], float] = time.monotonic
@@ -24,92 +37,74 @@ class History:
             clock: Tells the time [s].
         """
         self.start = start
+        self.setting = Setting(start)
+        """What is in force."""
         self._clock = clock
-        self._entries = [(start, False)]
+        self._steps = [self.setting]
         self._index = 0
-        self._last: tuple[str, float] = ("", -math.inf)
-        # Each slider is heard in a thread of its own.
-        self._lock = threading.RLock()
+        self._moved: str | None = None
+        self._moved_at = 0.0
 
     @property
     def current(self) -> SimulationParameters:
         """The parameters in force."""
-        return self._entries[self._index][0]
+        return self.setting.parameters
 
     @property
     def is_automatic(self) -> bool:
         """Whether the number of substeps is chosen automatically."""
-        return self._entries[self._index][1]
+        return self.setting.is_automatic
 
-    @property
-    def is_changed(self) -> bool:
-        """Whether anything is not as fitted."""
-        return self._entries[self._index] != (self.start, False)
-
-    @property
-    def can_undo(self) -> bool:
-        """Whether there is something to take back."""
-        return self._index > 0
-
-    @property
-    def can_redo(self) -> bool:
-        """Whether something was taken back."""
-        return self._index < len(self._entries) - 1
-
-    def set(self, field: str, value: float | None) -> SimulationParameters:
-        """Change one parameter; changes of the same one in quick succession count as one."""
+    def set(self, field: str, value: Any) -> Setting:
+        """Change one parameter, as a slider does that is being moved."""
         now = self._clock()
-        with self._lock:
-            changed = replace(self.current, **{field: value})
-            is_same_drag = self._last[0] == field and now - self._last[1] < _COALESCE
-            self._last = (field, now)
-            if is_same_drag and self._index > 0:
-                self._entries[self._index :] = [(changed, self.is_automatic)]
-            elif changed != self.current:
-                self._add(changed, self.is_automatic)
-            return self.current
+        setting = self.setting._replace(parameters=replace(self.current, **{field: value}))
+        is_same_gesture = field == self._moved and now - self._moved_at < _REST
+        if is_same_gesture and self._index > 0:
+            self._steps[self._index :] = [setting]
+            self.setting = setting
+        else:
+            self._add(setting)
+        self._moved, self._moved_at = field, now
+        return self.setting
 
-    def replace(
-        self, parameters: SimulationParameters, *, is_automatic: bool = False
-    ) -> SimulationParameters:
+    def replace(self, parameters: SimulationParameters, *, is_automatic: bool = False) -> Setting:
         """Change all parameters at once."""
-        with self._lock:
-            self._last = ("", -math.inf)
-            if self._entries[self._index] != (parameters, is_automatic):
-                self._add(parameters, is_automatic)
-            return self.current
+        self._moved = None
+        self._add(Setting(parameters, is_automatic))
+        return self.setting
 
-    def set_substeps(self, number: int, *, is_automatic: bool = False) -> SimulationParameters:
+    def set_substeps(self, number: int, *, is_automatic: bool = False) -> Setting:
         """Change the number of substeps, and whether it is chosen automatically."""
-        with self._lock:
-            changed = replace(self.current, substeps_per_frame=number)
-            return self.replace(changed, is_automatic=is_automatic)
+        changed = replace(self.current, substeps_per_frame=number)
+        return self.replace(changed, is_automatic=is_automatic)
 
-    def put_back(self, *fields: str) -> SimulationParameters:
+    def put_back(self, *fields: str) -> Setting:
         """Give some parameters their fitted values again."""
         fitted = {field: getattr(self.start, field) for field in fields}
-        with self._lock:
-            is_automatic = self.is_automatic and "substeps_per_frame" not in fields
-            return self.replace(replace(self.current, **fitted), is_automatic=is_automatic)
+        is_automatic = self.is_automatic and "substeps_per_frame" not in fields
+        return self.replace(replace(self.current, **fitted), is_automatic=is_automatic)
 
-    def undo(self) -> SimulationParameters:
+    def undo(self) -> Setting:
         """Take the last change back."""
         return self._go(self._index - 1)
 
-    def redo(self) -> SimulationParameters:
+    def redo(self) -> Setting:
         """Make the change again that was taken back last."""
         return self._go(self._index + 1)
 
-    def reset(self) -> SimulationParameters:
+    def reset(self) -> Setting:
         """Return to the fitted parameters; this can be undone."""
         return self.replace(self.start)
 
-    def _add(self, parameters: SimulationParameters, is_automatic: bool) -> None:
-        self._entries[self._index + 1 :] = [(parameters, is_automatic)]
-        self._index += 1
+    def _add(self, setting: Setting) -> None:
+        if setting != self.setting:
+            self._steps[self._index + 1 :] = [setting]
+            self._index += 1
+            self.setting = setting
 
-    def _go(self, index: int) -> SimulationParameters:
-        with self._lock:
-            self._last = ("", -math.inf)
-            self._index = min(max(index, 0), len(self._entries) - 1)
-            return self.current
+    def _go(self, index: int) -> Setting:
+        self._moved = None
+        self._index = min(max(index, 0), len(self._steps) - 1)
+        self.setting = self._steps[self._index]
+        return self.setting

@@ -10,6 +10,8 @@ from typing import Any, Protocol
 
 import viser
 
+from app.viewer.content.content import Content
+from app.viewer.live.rollouts import LiveRollouts
 from app.viewer.physics.history import History
 from app.viewer.physics.presets import (
     AS_FITTED,
@@ -184,7 +186,7 @@ class PresetChoice:
         *,
         length_unit: str,
         store: PresetStore | None,
-        moved: Callable[[], None],
+        choose: Callable[[SimulationParameters, bool], None],
     ) -> None:
         """Add the list where the caller stands.
 
@@ -194,12 +196,13 @@ class PresetChoice:
             history: Keeps the parameters.
             length_unit: Unit of the scene's lengths.
             store: The users' presets; None for built-in ones only.
-            moved: Called when a user has chosen one.
+            choose: Called with the parameters of the preset that a user chose, and whether their
+                substeps are automatic.
         """
         self._history = history
         self._unit = length_unit
         self._store = store
-        self._moved = moved
+        self._choose = choose
         self._presets: dict[str, Preset] = {}
         self._wanted = AS_FITTED
         self._turn = threading.Lock()
@@ -210,7 +213,7 @@ class PresetChoice:
             (AS_FITTED, BY_HAND),
             hint="Changes made to the fitted parameters, all at once; ★ are your own",
         )
-        choice.on_update(guard.by_user(lambda _: self._choose()))
+        choice.on_update(guard.by_user(lambda _: self._hear()))
         self._choice = FollowedChoice(choice, guard)
         self.refresh()
 
@@ -232,7 +235,7 @@ class PresetChoice:
     @property
     def chosen(self) -> Preset | None:
         """The preset whose parameters are in force, if there is one; of several that was chosen."""
-        now = (self._history.current, self._history.is_automatic)
+        now = self._history.setting
         fits = {n: p for n, p in self._presets.items() if p.apply(self._history.start) == now}
         return fits.get(self._wanted, next(iter(fits.values()), None))
 
@@ -241,30 +244,29 @@ class PresetChoice:
         self._wanted = label
         self.show()
 
-    def _choose(self) -> None:
+    def _hear(self) -> None:
         preset = self._presets.get(self._choice.take())
         if preset is None:
             self.show()  # "By hand" is what the list says, nothing to choose.
             return
         self._wanted = preset.label
-        parameters, is_automatic = preset.apply(self._history.start)
-        self._history.replace(parameters, is_automatic=is_automatic)
-        self._moved()
+        self._choose(*preset.apply(self._history.start))
 
 
 class KeepPanel:
-    """A name, and buttons that keep the parameters under it."""
+    """A name, and buttons that keep the parameters under it as a preset or as a run."""
 
     def __init__(
         self,
         gui: viser.GuiApi,
         guard: Guard,
         history: History,
+        rollouts: LiveRollouts,
         *,
         choice: PresetChoice,
-        length_unit: str,
-        keeping: UserStorage,
-        save: Callable[[str], None],
+        content: Content,
+        run: Run,
+        storage: UserStorage,
     ) -> None:
         """Add the folder where the caller stands.
 
@@ -272,16 +274,21 @@ class KeepPanel:
             gui: Where to.
             guard: Wraps the callbacks.
             history: Keeps the parameters.
+            rollouts: What is on the screen.
             choice: The list of presets.
-            length_unit: Unit of the scene's lengths.
-            keeping: Where things are kept.
-            save: Makes a run of a name out of what is on the screen.
+            content: What is shown.
+            run: The run whose object is simulated.
+            storage: Where things are kept.
         """
         self._history = history
+        self._rollouts = rollouts
         self._choice = choice
-        self._unit = length_unit
-        self._store = keeping.presets
-        self._save = save
+        self._unit = content.length_unit
+        self._sequence = content.sequence_name
+        self._source = run
+        self._store = storage.presets
+        self._saver = storage.saver
+        self._closed = threading.Event()
         with gui.add_folder("Keep", expand_by_default=False):
             self._name: Any = gui.add_text("name", "", hint="Of the preset or the run")
             buttons = gui.add_button_group(
@@ -290,8 +297,8 @@ class KeepPanel:
                 hint="A preset is for every scene of this server; a run keeps motion and metrics",
             )
             self._delete: Any = gui.add_button("Delete preset", color="gray", visible=False)
-            self._told: Any = gui.add_html("", visible=False)
-            self._bad: Any = gui.add_html("", visible=False)
+            self._progress: Any = gui.add_html("", visible=False)
+            self._problems: Any = gui.add_html("", visible=False)
         buttons.on_click(guard(self._press))
         self._delete.on_click(guard(self._remove))
         self._unsubscribe = self._store.subscribe(self.refresh)
@@ -304,7 +311,7 @@ class KeepPanel:
         lines = [f"⚠ {html.escape(problem)}" for problem in problems[:_PROBLEMS]]
         if len(problems) > _PROBLEMS:
             lines.append(f"… and {len(problems) - _PROBLEMS} more")
-        _say(self._bad, "<br/>".join(lines))
+        _write(self._problems, "<br/>".join(lines))
         self.show()
 
     def show(self) -> None:
@@ -316,27 +323,48 @@ class KeepPanel:
         if self._delete.visible != is_own:
             self._delete.visible = is_own
 
-    def tell(self, run: SavedRun) -> None:
-        """Say how far a saved run is, with a link to it."""
+    def show_run(self, run: SavedRun) -> None:
+        """Write how far a saved run is, with a link to it."""
         name = html.escape(run.name)
         link = f"<a href='/runs/{run.id}' target='_blank' rel='noopener'>{name}</a>"
-        said = {
+        texts = {
             "queued": f"Saving run {link}…",
             "running": f"Simulating and measuring run {link}…",
             "succeeded": f"✓ Saved as run {link}",
             "cancelled": f"Run {link} was cancelled.",
         }
         error = html.escape(run.error or "See its page.")
-        _say(self._told, said.get(run.state, f"✗ Run {link} failed: {error}"))
+        _write(self._progress, texts.get(run.state, f"✗ Run {link} failed: {error}"))
 
     def close(self) -> None:
         """Stop listening."""
+        self._closed.set()
         self._unsubscribe()
 
     def _press(self, event: Any) -> None:
         if event.target.value == _RUN:
-            self._save(self._name.value)
-            return
+            self._save_run(self._name.value)
+        else:
+            self._save_preset(event)
+
+    def _save_run(self, name: str) -> None:
+        """Have what is on the screen simulated and measured as a run of its own."""
+        readout, setting = self._rollouts.readout, self._history.setting
+        if readout.error is not None:
+            raise UsageError(
+                f"The simulation stopped at frame {readout.simulated_count}, and as a run it would "
+                "too. Change the parameters until it reaches the end."
+            )
+        changes = run_changes(
+            self._source,
+            self._history.start,
+            setting.parameters,
+            is_automatic=setting.is_automatic,
+        )
+        run = self._saver.save(self._source.id, self._sequence, name, changes)
+        self._saver.follow(run, self.show_run, self._closed)
+
+    def _save_preset(self, event: Any) -> None:
         history = self._history
         changes = changes_of(history.start, history.current, is_automatic=history.is_automatic)
         preset = self._store.save(self._name.value, changes, self._unit)
@@ -352,7 +380,7 @@ class KeepPanel:
         notify(event.client, "Preset deleted", chosen.name, color="blue")
 
 
-def _say(place: Any, content: str) -> None:
+def _write(place: Any, content: str) -> None:
     """Write small print; without content it takes no room."""
     style = "font-size:0.8em;line-height:1.4;padding:0 0.5em"
     place.content = f"<div style='{style}'>{content}</div>"

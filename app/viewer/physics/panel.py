@@ -11,8 +11,8 @@ import viser
 
 from app.keys import Action
 from app.viewer.content.content import Content
-from app.viewer.live.rollouts import STARTING, Readout
-from app.viewer.physics.history import History
+from app.viewer.live.rollouts import STARTING, LiveRollouts, Readout
+from app.viewer.physics.history import History, Setting
 from app.viewer.physics.keep_panel import KeepPanel, PresetChoice, UserStorage
 from app.viewer.physics.parameters import (
     HeightKnob,
@@ -26,7 +26,7 @@ from app.viewer.physics.parameters import (
 from app.viewer.ui.followed import FollowedChoice
 from app.viewer.ui.guard import Guard
 from app.viewer.ui.keyboard import bind
-from physhandi.object_rollout import ObjectRollout
+from physhandi.run import Run
 from physhandi.simulation.parameters import SimulationParameters
 
 _CHANGED = "● "
@@ -36,7 +36,11 @@ class SliderSet:
     """One control for each parameter that people may move."""
 
     def __init__(
-        self, gui: viser.GuiApi, guard: Guard, history: History, moved: Callable[[], None]
+        self,
+        gui: viser.GuiApi,
+        guard: Guard,
+        history: History,
+        move: Callable[[Knob | Switch, Any], None],
     ) -> None:
         """Prepare; `add` makes the controls where the caller stands.
 
@@ -44,14 +48,12 @@ class SliderSet:
             gui: Where to.
             guard: Wraps the callbacks.
             history: Keeps the parameters.
-            moved: Called when a user has changed a parameter.
+            move: Called with a parameter and its control when a user has moved it.
         """
         self._gui = gui
         self._guard = guard
         self._history = history
-        self._moved = moved
-        # Each slider is heard in a thread of its own.
-        self._lock = threading.Lock()
+        self._move = move
         self._controls: list[tuple[Knob | Switch, Any]] = []
 
     @property
@@ -69,12 +71,11 @@ class SliderSet:
             self._controls.append((knob, control))
 
     def show(self) -> None:
-        """Follow the history; what is not as fitted gets a dot before its name."""
+        """Move the controls to the parameters in force."""
         for knob, control in self._controls:
             value = knob.to_slider(self._history.current)
             if control.value != value:
                 control.value = value
-        self.mark()
 
     def mark(self) -> None:
         """Put a dot before the name of whatever is not as fitted."""
@@ -99,13 +100,6 @@ class SliderSet:
         slider.precision = min(slider.precision + 1, 7)  # Typed values may be finer.
         return slider
 
-    def _move(self, knob: Knob | Switch, control: Any) -> None:
-        with self._lock:  # What is set last must be what was read last.
-            before = self._history.current
-            has_changed = self._history.set(knob.field, knob.from_slider(control.value)) != before
-        if has_changed:
-            self._moved()
-
 
 SUBSTEPS_AS_FITTED, SUBSTEPS_AUTOMATIC, SUBSTEPS_BY_HAND = "as fitted", "automatic", "by hand"
 _MOST = 100_000
@@ -115,7 +109,11 @@ class SubstepsChoice:
     """As fitted, automatic, or a number."""
 
     def __init__(
-        self, gui: viser.GuiApi, guard: Guard, history: History, moved: Callable[[], None]
+        self,
+        gui: viser.GuiApi,
+        guard: Guard,
+        history: History,
+        choose: Callable[[int, bool], None],
     ) -> None:
         """Add the choice where the caller stands.
 
@@ -123,10 +121,10 @@ class SubstepsChoice:
             gui: Where to.
             guard: Wraps the callbacks.
             history: Keeps the number, and whether it is chosen automatically.
-            moved: Called when a user has chosen another one.
+            choose: Called with the number that a user chose, and whether it is automatic.
         """
         self._history = history
-        self._moved = moved
+        self._choose = choose
         self._in_use = history.start.substeps_per_frame
         choice: Any = gui.add_dropdown(
             "substeps",
@@ -143,8 +141,8 @@ class SubstepsChoice:
             visible=False,
             hint="More are slower and more exact; too few and the object explodes",
         )
-        choice.on_update(guard.by_user(lambda _: self._choose()))
-        self._number.on_update(guard.by_user(lambda _: self._type()))
+        choice.on_update(guard.by_user(lambda _: self._hear_choice()))
+        self._number.on_update(guard.by_user(lambda _: self._hear_number()))
 
     def show(self) -> None:
         """Follow the history."""
@@ -163,11 +161,11 @@ class SubstepsChoice:
             self._number.value = number
         self._number.visible = choice == SUBSTEPS_BY_HAND
 
-    def hear(self, readout: Readout) -> None:
+    def follow(self, readout: Readout) -> None:
         """Remember what is in use, from which typing a number begins."""
         self._in_use = readout.substeps_per_frame
 
-    def _choose(self) -> None:
+    def _hear_choice(self) -> None:
         history, choice = self._history, self._followed.take()
         if choice == SUBSTEPS_BY_HAND:
             # Nothing is simulated anew before another number is typed.
@@ -177,12 +175,10 @@ class SubstepsChoice:
             number = self._in_use
         else:
             number = history.start.substeps_per_frame
-        history.set_substeps(number, is_automatic=choice == SUBSTEPS_AUTOMATIC)
-        self._moved()
+        self._choose(number, choice == SUBSTEPS_AUTOMATIC)
 
-    def _type(self) -> None:
-        self._history.set_substeps(min(max(int(self._number.value), 1), _MOST))
-        self._moved()
+    def _hear_number(self) -> None:
+        self._choose(min(max(int(self._number.value), 1), _MOST), False)
 
 
 def warning(readout: Readout) -> str:
@@ -199,62 +195,61 @@ def warning(readout: Readout) -> str:
 _FIRST_KNOBS = 5
 _REFRESH = 0.2
 _UNDO, _REDO, _RESET = "Undo", "Redo", "Reset"
-HOLD, STEP, GO = "Hold", "1 frame", "Go"
-"""The pace of the simulation: wait, compute one frame, run."""
+_HOLD, _STEP, _GO = "Hold", "1 frame", "Go"
 _PUT_BACK = "choose…"
 
 
 class PhysicsPanel:
-    """Sliders that re-simulate the object, and the readout above them."""
+    """Sliders that re-simulate the object, and the readout above them.
+
+    A value goes straight down: the control, the history, the rollouts, the process that simulates.
+    One lock is held on this way, so that what is asked for last is what was moved last: viser calls
+    every control in a thread of its own.
+    """
 
     def __init__(
         self,
         server: viser.ViserServer,
-        content: Content,
-        fitted: ObjectRollout,
         guard: Guard,
-        simulate: Callable[[SimulationParameters, bool], None],
+        content: Content,
+        rollouts: LiveRollouts,
         *,
-        set_pace: Callable[[str], None],
-        keeping: UserStorage | None = None,
-        save: Callable[[str], None] | None = None,
+        run: Run,
+        storage: UserStorage | None = None,
     ) -> None:
         """Add the panel.
 
         Args:
             server: Where to.
-            content: What is shown.
-            fitted: The fitted rollout.
             guard: Wraps the callbacks.
-            simulate: Simulates parameters, with substeps chosen automatically or not.
-            set_pace: Lets the simulation wait, compute one frame or run (`HOLD`, `STEP`, `GO`).
-            keeping: Where presets and runs are kept; None where nothing can be kept.
-            save: Makes a run of a name out of what is on the screen.
+            content: What is shown.
+            rollouts: Simulate what the sliders say.
+            run: The run whose object is simulated.
+            storage: Where presets and runs are kept; None where nothing can be kept.
         """
+        fitted = rollouts.fitted
         self.history = History(fitted.parameters)
-        self._simulate = simulate
-        self._set_pace = set_pace
+        self._rollouts = rollouts
         self._is_held = False
         self._changed: dict[str, tuple[str, ...]] = {}
         self._is_metric = content.is_metric
         self._unit = "mm" if content.is_metric else content.length_unit
         self._refreshed = -math.inf
         self._lock = threading.Lock()
-        # Each slider is heard in a thread of its own.
-        self._turn = threading.Lock()
+        self._readout_lock = threading.Lock()
         self.keep: KeepPanel | None = None
         gui, unit, parameters = server.gui, content.length_unit, fitted.parameters
         height = np.asarray(fitted.position[0])[:, 2]
         low, high = float(height.min()), float(height.max())
         main_knobs = knobs(parameters, length_unit=unit)
-        store = None if keeping is None else keeping.presets
+        store = None if storage is None else storage.presets
         self._folder = gui.add_folder("Physics")
         with self._folder:
             self._status = gui.add_markdown("")
             self._presets = PresetChoice(
-                gui, guard, self.history, length_unit=unit, store=store, moved=self._run
+                gui, guard, self.history, length_unit=unit, store=store, choose=self._replace
             )
-            self._sliders = SliderSet(gui, guard, self.history, self._moved)
+            self._sliders = SliderSet(gui, guard, self.history, self._move)
             self._sliders.add(*main_knobs[:_FIRST_KNOBS])
             buttons = gui.add_button_group(
                 "History", (_UNDO, _REDO, _RESET), hint="Ctrl+Z and Ctrl+Shift+Z"
@@ -262,10 +257,10 @@ class PhysicsPanel:
             buttons.on_click(guard(lambda event: self._press(event.target.value)))
             pace = gui.add_button_group(
                 "Simulation",
-                (HOLD, STEP, GO),
+                (_HOLD, _STEP, _GO),
                 hint="Hold it, compute one frame (N), or let it go on (H)",
             )
-            pace.on_click(guard(lambda event: set_pace(event.target.value)))
+            pace.on_click(guard(lambda event: self._set_pace(event.target.value)))
             self._changes = gui.add_markdown("")
             self._put_back = FollowedChoice(
                 gui.add_dropdown(
@@ -279,33 +274,27 @@ class PhysicsPanel:
             self._put_back.handle.on_update(guard.by_user(lambda _: self._put_one_back()))
             with gui.add_folder("More physics", expand_by_default=False):
                 self._sliders.add(*main_knobs[_FIRST_KNOBS:])
-                self._substeps = SubstepsChoice(gui, guard, self.history, self._run)
+                self._substeps = SubstepsChoice(gui, guard, self.history, self._set_substeps)
             with gui.add_folder("Ground", expand_by_default=False):
                 self._sliders.add(*ground_knobs(parameters, length_unit=unit, low=low, high=high))
             with gui.add_folder("Self-collision", expand_by_default=False):
                 self._sliders.add(*self_collision_knobs(parameters, length_unit=unit))
-            if keeping is not None and save is not None:
+            if storage is not None:
                 self.keep = KeepPanel(
                     gui,
                     guard,
                     self.history,
+                    rollouts,
                     choice=self._presets,
-                    length_unit=unit,
-                    keeping=keeping,
-                    save=save,
+                    content=content,
+                    run=run,
+                    storage=storage,
                 )
         self._commands = self._add_keys(server, guard)
 
-    @property
-    def is_automatic(self) -> bool:
-        """Whether the number of substeps is chosen automatically."""
-        return self.history.is_automatic
-
     def restore(self, parameters: SimulationParameters, *, is_automatic: bool) -> None:
         """Simulate what another session of the same object simulates."""
-        self.history.replace(parameters, is_automatic=is_automatic)
-        if self.history.is_changed:
-            self._run()
+        self._replace(parameters, is_automatic)
 
     def remove(self) -> None:
         """Take the panel away."""
@@ -327,12 +316,12 @@ class PhysicsPanel:
             at_once: Whether to write it even if the last one is fresh.
         """
         now = time.monotonic()
-        with self._lock:
+        with self._readout_lock:
             if not at_once and now - self._refreshed < _REFRESH:
                 return
             self._refreshed = now
         self._is_held = readout.is_held
-        self._substeps.hear(readout)
+        self._substeps.follow(readout)
         text = self._text(readout)
         if self._status.content != text:
             self._status.content = text
@@ -369,8 +358,8 @@ class PhysicsPanel:
         actions: dict[Action, Callable[[], None]] = {
             "undo": lambda: self._press(_UNDO),
             "redo": lambda: self._press(_REDO),
-            "one_frame": lambda: self._set_pace(STEP),
-            "hold": lambda: self._set_pace(GO if self._is_held else HOLD),
+            "one_frame": lambda: self._set_pace(_STEP),
+            "hold": lambda: self._set_pace(_GO if self._is_held else _HOLD),
         }
         return [
             command
@@ -378,36 +367,56 @@ class PhysicsPanel:
             for command in bind(server, guard, action, lambda _, __, act=act: act())
         ]
 
-    def _press(self, name: str) -> None:
-        history = self.history
-        before = (history.current, history.is_automatic)
-        {_UNDO: history.undo, _REDO: history.redo, _RESET: history.reset}[name]()
-        if (history.current, history.is_automatic) != before or name == _RESET:
-            self._run()
+    def _move(self, knob: Knob | Switch, control: Any) -> None:
+        with self._lock:
+            before = self.history.setting
+            setting = self.history.set(knob.field, knob.from_slider(control.value))
+            if setting != before:
+                self._simulate(setting)
+
+    def _replace(self, parameters: SimulationParameters, is_automatic: bool) -> None:
+        self._change(lambda: self.history.replace(parameters, is_automatic=is_automatic))
+
+    def _set_substeps(self, number: int, is_automatic: bool) -> None:
+        self._change(lambda: self.history.set_substeps(number, is_automatic=is_automatic))
 
     def _put_one_back(self) -> None:
         fields = self._changed.get(self._put_back.take())
         if fields:
-            self.history.put_back(*fields)
-            self._run()
+            self._change(lambda: self.history.put_back(*fields))
 
-    def _run(self) -> None:
-        """Show the parameters in force and simulate them."""
-        with self._turn:
+    def _press(self, name: str) -> None:
+        history = self.history
+        change = {_UNDO: history.undo, _REDO: history.redo, _RESET: history.reset}[name]
+        # Stepping simulates the fitted parameters, too: a reset shows what was stored of them.
+        self._change(change, always=name == _RESET)
+
+    def _change(self, change: Callable[[], Setting], *, always: bool = False) -> None:
+        """Simulate what a change of the history puts in force, and move the controls to it."""
+        with self._lock:
+            before = self.history.setting
+            setting = change()
+            if setting != before or always:
+                self._simulate(setting)
             self._sliders.show()
             self._substeps.show()
-        self._moved()
 
-    def _moved(self) -> None:
-        """Simulate what is in force, leaving the sliders to the user who moves them."""
-        history = self.history
-        with self._turn:  # What is asked for last must be what was read last.
-            self._sliders.mark()
-            self._presets.show()
-            if self.keep is not None:
-                self.keep.show()
-            self._show_changes()
-            self._simulate(history.current, history.is_automatic)
+    def _simulate(self, setting: Setting) -> None:
+        """Simulate a setting and say what it changes, leaving the controls alone."""
+        self._rollouts.request(setting.parameters, automatic_substeps=setting.is_automatic)
+        self._sliders.mark()
+        self._presets.show()
+        if self.keep is not None:
+            self.keep.show()
+        self._show_changes()
+
+    def _set_pace(self, name: str) -> None:
+        """Hold the simulation, compute one frame of it or let it run."""
+        with self._lock:
+            if name == _STEP:
+                self._rollouts.step()
+            else:
+                self._rollouts.hold(on=name == _HOLD)
 
     def _show_changes(self) -> None:
         history = self.history

@@ -121,7 +121,7 @@ def test_a_live_scene_gives_the_rollout_of_its_sliders(
     session: Any = world.sessions.get(scene)
     take = session.snapshot().take
     moved = take.position + np.float32(0.25)
-    session._object._resimulation.newest.position = moved
+    session._object._rollouts.newest.position = moved
     session._playback.seek(2)
     path = f"/api/v1/sessions/{scene}/export"
     with np.load(io.BytesIO(fetch(world, "npz", path))) as arrays:

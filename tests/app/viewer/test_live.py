@@ -1,10 +1,8 @@
 import os
 import queue
 import signal
-import socket
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -15,11 +13,10 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 from viewer_world import FRAMES, PARAMETERS, controls, sheet
-from waiting import WatchedLock, until
+from waiting import until
 
 from app.viewer.live.client import LiveRequest, SimulationClient
 from app.viewer.live.wire import Message
-from app.viewer.live.worker import Mailboxes, SimulationWorker
 from physhandi.run import Run
 
 SECONDS = 60.0
@@ -229,84 +226,12 @@ def test_a_killed_process_comes_back_and_finishes_the_work(live, mailbox, run) -
     assert live.process_id not in {None, process}
 
 
-def test_what_is_repeated_after_a_crash_does_not_overtake_a_newer_request(
-    live, mailbox, run, monkeypatch
-) -> None:
-    live.hold("a", on=True)  # So that it is not done before it is killed.
-    older, newer = live.request("a", ask(run)), []
-    mailbox.until("frame")
-    write, lock = live._write, WatchedLock()
-    monkeypatch.setattr(live, "_write_lock", lock)
-
-    def write_late(message: Message) -> None:
-        if message.kind == "simulate" and message["request"] == older:
-            ask_again = threading.Thread(
-                target=lambda: newer.append(live.request("a", ask(run, drag=9.0)))
-            )
-            ask_again.start()
-            until(lambda: newer or ask_again.ident in lock.waiting)
-        write(message)
-
-    monkeypatch.setattr(live, "_write", write_late)
-    os.kill(live.process_id, signal.SIGKILL)
-    while mailbox.until("frame")[-1]["request"] == older:
-        pass  # It may have begun before the newer one came.
-    (newer,) = newer
-    assert newer > older
-    live.hold("a", on=False)
-    assert {m["request"] for m in mailbox.until("finished") if m.kind != "ready"} == {newer}
-
-
-def simulate(number: int) -> Message:
-    return Message("simulate", {"session": "a", "request": number, "is_held": False})
-
-
-def of_session(kind: str) -> Message:
-    return Message(kind, {"session": "a"})
-
-
-@pytest.mark.parametrize("is_taken", [False, True])
-def test_a_mailbox_ignores_what_was_overtaken_on_its_way(is_taken: bool) -> None:
-    boxes = Mailboxes()
-
-    def put(message: Message) -> list[Message] | None:
-        boxes.put(message)
-        return boxes.take(wait=False) if is_taken else [*boxes._latest.values()]
-
-    kept = [] if is_taken else [simulate(5)]
-    assert put(simulate(5)) == [simulate(5)]
-    assert put(simulate(4)) == kept
-    assert put(of_session("prepare")) == kept
-    assert put(simulate(5)) == [simulate(5)]  # It may tell anew whether it is held.
-    assert put(of_session("cancel")) == [of_session("cancel")]
-    assert put(simulate(4)) == ([] if is_taken else [of_session("cancel")])
-    assert put(of_session("close")) == [of_session("close")]
-    assert put(of_session("prepare")) == [of_session("prepare")]
-    assert put(simulate(1)) == [simulate(1)]
-
-
-def test_an_older_request_does_not_replace_the_active_one() -> None:
-    with socket.socket() as connection:
-        simulator = SimulationWorker(connection, "cpu")
-        simulator._start(simulate(2))
-        active = simulator._active["a"]
-        for number in (1, 2):
-            simulator._start(simulate(number))
-            assert simulator._active["a"] is active
-        simulator._start(simulate(3))
-        assert simulator._active["a"] is not active
-        simulator._start(of_session("close"))
-        assert (simulator._active, simulator._newest) == ({}, {})
-        simulator._start(simulate(1))
-        assert "a" in simulator._active
-
-
 def test_the_process_dies_with_its_parent() -> None:
     script = (
         "import os\n"
-        "from app.viewer.live.client import LiveSimulation\n"
+        "from app.viewer.live.client import SimulationClient\n"
         "from waiting import until\n"
-        "live = LiveSimulation()\n"
+        "live = SimulationClient()\n"
         "live.subscribe('a', lambda message: None)\n"
         "until(lambda: live.process_id)\n"
         "os.write(1, str(live.process_id).encode())\n"

@@ -2,7 +2,6 @@ from dataclasses import replace
 
 import pytest
 
-from app.viewer.physics.history import History
 from app.viewer.physics.parameters import changes_in, ground_knobs, knobs, self_collision_knobs
 from physhandi.simulation.parameters import SimulationParameters
 
@@ -12,13 +11,6 @@ def what_changed(*arguments, **options) -> str:
 
 
 START = SimulationParameters(connection_radius=0.0237, damping=20.0)
-
-
-class Clock:
-    now = 0.0
-
-    def __call__(self) -> float:
-        return self.now
 
 
 def test_every_slider_shows_the_fitted_value_and_gives_it_back() -> None:
@@ -53,51 +45,6 @@ def test_stiffness_is_moved_by_powers_of_ten() -> None:
     assert knob.from_slider(-1.0) == pytest.approx(0.1)
 
 
-def test_undo_redo_and_reset() -> None:
-    clock = Clock()
-    history = History(START, clock)
-    history.set("drag", 5.0)
-    clock.now += 10
-    history.set("max_neighbors", 40)
-    assert history.undo().max_neighbors == START.max_neighbors
-    assert history.current.drag == 5.0
-    assert history.redo().max_neighbors == 40
-    assert history.reset() == START
-    assert history.undo().max_neighbors == 40
-    history.undo()
-    clock.now += 10
-    history.set("drag", 9.0)
-    assert not history.can_redo
-
-
-def test_one_parameter_is_put_back_and_automatic_substeps_are_undone() -> None:
-    history = History(START, Clock())
-    history.set("drag", 5.0)
-    history.replace(history.current, is_automatic=True)
-    history.set("gravity", 1.0)
-    assert (history.is_automatic, history.is_changed) == (True, True)
-    history.put_back("drag")
-    assert (history.current.drag, history.current.gravity) == (START.drag, 1.0)
-    assert history.is_automatic
-    history.put_back("substeps_per_frame")
-    assert not history.is_automatic
-    assert history.undo().drag == START.drag
-    assert history.is_automatic
-    history.reset()
-    assert not history.is_changed
-
-
-def test_one_drag_of_a_slider_is_one_step_of_the_history() -> None:
-    clock = Clock()
-    history = History(START, clock)
-    for value in (4.0, 5.0, 6.0):
-        history.set("drag", value)
-        clock.now += 0.1
-    assert history.current.drag == 6.0
-    assert history.undo() == START
-    assert not history.can_undo
-
-
 def test_what_changed_is_said_in_the_sliders_units() -> None:
     now = SimulationParameters(connection_radius=0.035, damping=20.0, stiffness_scale=0.5)
     text = what_changed(knobs(START, length_unit="m"), START, now)
@@ -121,8 +68,6 @@ def test_self_collision_is_a_box_and_its_sliders() -> None:
     assert (box.from_slider(True), box.from_slider(False)) == (True, False)
     assert (distance.label, distance.to_slider(on)) == ("distance [mm]", pytest.approx(8.0))
     assert distance.from_slider(12.0) == pytest.approx(0.012)
-    history = History(SimulationParameters())
-    assert history.set("self_collision", box.from_slider(True)).self_collision is True
     text = what_changed(tuple(controls.values()), SimulationParameters(), on)
     assert text == "nodes collide off → on, distance [mm] 5 → 8, friction of nodes 0.3 → 1"
 

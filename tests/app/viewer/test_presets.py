@@ -209,6 +209,10 @@ class Loop:
             self._waiting.pop(0)()
 
 
+def take(history: History, parameters: SimulationParameters, is_automatic: bool) -> None:
+    history.replace(parameters, is_automatic=is_automatic)
+
+
 @pytest.fixture
 def shown_list() -> tuple[History, PresetChoice, SharedList, Loop]:
     """A history, the list of its presets, the control and its event loop."""
@@ -221,7 +225,12 @@ def shown_list() -> tuple[History, PresetChoice, SharedList, Loop]:
     gui: Any = SimpleNamespace(add_dropdown=add_dropdown)
     server: Any = SimpleNamespace(get_event_loop=lambda: loop)
     choice = PresetChoice(
-        gui, Guard(server), history, length_unit="m", store=None, moved=lambda: None
+        gui,
+        Guard(server),
+        history,
+        length_unit="m",
+        store=None,
+        choose=lambda *setting: take(history, *setting),
     )
     loop.work()
     return history, choice, lists[0], loop

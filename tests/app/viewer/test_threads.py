@@ -1,5 +1,6 @@
 """What users, clock and simulation do at the same moment ends right, whichever comes last."""
 
+import socket
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -11,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import viser
 from viewer_client import ViewerClient
 from viewer_world import FRAMES, PARAMETERS, rest_at
 
@@ -19,12 +19,8 @@ from app.viewer.compare.figure_camera import Eye
 from app.viewer.content.content import Content
 from app.viewer.live.client import LiveRequest, SimulationClient
 from app.viewer.live.wire import Message
-from app.viewer.physics.history import History
-from app.viewer.physics.panel import SliderSet
-from app.viewer.physics.parameters import Knob, knobs
 from app.viewer.session import Session
 from app.viewer.sessions import Sessions
-from app.viewer.ui.guard import Guard
 
 PATIENCE = 30.0
 SHORT = 0.3
@@ -95,11 +91,11 @@ def test_frames_that_came_while_the_clock_stood_do_not_throw_it_back(sessions: S
     with watched(sessions) as (session, client):
         simulated, playback = session._object, session._playback
         assert simulated is not None
-        simulated._resimulation._is_busy = True
-        simulated._follow(2, is_held=False)
+        simulated._rollouts._is_busy = True
+        simulated._follow_frame(2, is_held=False)
         rest_at(client, 12)
         client.until(lambda: playback.frame == 12 and not playback.is_playing)
-        simulated._follow(15, is_held=False)
+        simulated._follow_frame(15, is_held=False)
         playback.play()
         client.until(lambda: playback.frame == 14)
 
@@ -112,8 +108,8 @@ def test_a_frame_that_is_heard_after_the_way_back_does_not_hold_the_clock(
         assert simulated is not None
         playback.seek(0)
         assert playback.is_playing
-        assert not simulated._resimulation.is_busy
-        simulated._follow(3, is_held=False)
+        assert not simulated._rollouts.is_busy
+        simulated._follow_frame(3, is_held=False)
         client.until(lambda: playback.frame > 6)
 
 
@@ -134,14 +130,14 @@ def test_the_errors_are_those_of_the_rollout_that_was_read_last(
             followed.append(take)
 
         monkeypatch.setattr(simulated._errors, "follow", follow)
-        monkeypatch.setattr(simulated, "_show_readout", lambda **_: simulated._resimulation.readout)
-        resimulation = type(simulated._resimulation)
+        monkeypatch.setattr(simulated, "_show_readout", lambda **_: simulated._rollouts.readout)
+        rollouts = type(simulated._rollouts)
         monkeypatch.setattr(
-            resimulation, "newest", property(lambda _: new if has_begun.is_set() else old)
+            rollouts, "newest", property(lambda _: new if has_begun.is_set() else old)
         )
-        late = beside(lambda: simulated._hear("frame", 1))
+        late = beside(lambda: simulated._follow("frame", 1))
         assert has_begun.wait(PATIENCE)
-        simulated._hear("finished", FRAMES)
+        simulated._follow("finished", FRAMES)
         is_past.set()
         late.join(PATIENCE)
         assert followed == [old, new]
@@ -175,32 +171,45 @@ def test_typed_ends_of_the_colors_are_not_replaced_before_they_are_heard(
         assert colors._range.handle.value == pytest.approx((0.0, 40.0 * factor))
 
 
-def test_the_last_value_of_a_slider_is_in_force(
-    server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    history = History(PARAMETERS)
-    sliders = SliderSet(server.gui, Guard(server), history, lambda: None)
-    knob = next(k for k in knobs(PARAMETERS, length_unit="m") if k.field == "drag")
-    assert isinstance(knob, Knob)
-    sliders.add(knob)
-    ((_, control),) = sliders._controls
-    from_slider, has_read, is_set = Knob.from_slider, threading.Event(), threading.Event()
+class SlowRollouts:
+    """Takes its time with the first request, and notes what was asked for last."""
 
-    def slow(knob: Knob, value: float) -> float | int:
-        if value == 7.0:
-            has_read.set()
-            is_set.wait(SHORT)
-        return from_slider(knob, value)
+    def __init__(self, session: Session) -> None:
+        assert session._object is not None
+        self._rollouts = session._object._rollouts
+        self.fitted = self._rollouts.fitted
+        self.asked: list[Any] = []
+        self.has_begun, self.may_end = threading.Event(), threading.Event()
 
-    monkeypatch.setattr(Knob, "from_slider", slow)
-    control._impl.value = 7.0
-    first = beside(lambda: sliders._move(knob, control))
-    assert has_read.wait(PATIENCE)
-    control._impl.value = 9.0
-    sliders._move(knob, control)
-    is_set.set()
-    first.join(PATIENCE)
-    assert history.current.drag == 9.0
+    def request(self, parameters: Any, *, automatic_substeps: bool) -> None:
+        assert not automatic_substeps
+        if not self.has_begun.is_set():
+            self.has_begun.set()
+            self.may_end.wait(SHORT)
+        self.asked.append(parameters)
+
+
+def test_what_is_moved_last_is_asked_for_last(sessions: Sessions) -> None:
+    with watched(sessions) as (session, _):
+        assert session._object is not None
+        panel, rollouts = session._object.panel, SlowRollouts(session)
+        panel._rollouts = rollouts  # pyright: ignore[reportAttributeAccessIssue]
+        controls = {knob.field: (knob, control) for knob, control in panel._sliders._controls}
+        knob, control = controls["drag"]
+        control._impl.value = 7.0
+        first = beside(lambda: panel._move(knob, control))
+        assert rollouts.has_begun.wait(PATIENCE)
+        control._impl.value = 9.0
+        others = [
+            beside(lambda: panel._move(knob, control)),
+            beside(lambda: panel._set_substeps(77, False)),
+        ]
+        rollouts.may_end.set()
+        for thread in (first, *others):
+            thread.join(PATIENCE)
+        now = panel.history.current
+        assert (now.drag, now.substeps_per_frame) == (9.0, 77)
+        assert rollouts.asked[-1] == now
 
 
 def test_a_camera_is_not_aimed_at_a_figure_that_is_being_left(
@@ -237,33 +246,12 @@ def test_a_camera_that_is_heard_late_brings_no_comparison_back(sessions: Session
         assert "/compare/a" not in view.drawing._nodes
 
 
-def test_a_slider_and_the_number_of_substeps_do_not_take_each_other_back(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    history = History(PARAMETERS)
-    has_read, is_set = threading.Event(), threading.Event()
-
-    def slow(parameters: Any, **values: Any) -> Any:
-        if "substeps_per_frame" in values:
-            has_read.set()
-            is_set.wait(SHORT)
-        return replace(parameters, **values)
-
-    monkeypatch.setattr("app.viewer.physics.history.replace", slow)
-    late = beside(lambda: history.set_substeps(77))
-    assert has_read.wait(PATIENCE)
-    history.set("drag", 9.0)
-    is_set.set()
-    late.join(PATIENCE)
-    assert (history.current.drag, history.current.substeps_per_frame) == (9.0, 77)
-
-
 def test_a_parameter_to_be_put_back_is_not_forgotten_before_it_is_heard(
     sessions: Sessions,
 ) -> None:
     with watched(sessions) as (session, client):
-        panel = session._object.panel if session._object is not None else None
-        assert panel is not None
+        assert session._object is not None
+        panel = session._object.panel
         client.set("drag [1/s]", 9.0)
         client.until(lambda: "drag [1/s]" in panel._changed)
         # As viser keeps what a user has chosen, before it is told to anybody.
@@ -274,28 +262,40 @@ def test_a_parameter_to_be_put_back_is_not_forgotten_before_it_is_heard(
         client.until(lambda: client.value("Put back") == panel._put_back.handle.options[0])
 
 
-def test_a_simulation_that_is_let_go_while_it_is_sent_again_goes_on(
+def test_what_is_sent_again_to_a_new_process_comes_before_what_is_newer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     live = SimulationClient("cpu")
     monkeypatch.setattr(live, "start", lambda: None)
+    request = LiveRequest(run=tmp_path, sequence="lift", parameters=PARAMETERS)
     live.hold("a", on=True)
-    live.request("a", LiveRequest(run=tmp_path, sequence="lift", parameters=PARAMETERS))
+    live.request("a", request)
     arrived: list[Message] = []
-
     threads: list[threading.Thread] = []
 
     def write(message: Message) -> None:
-        if message.kind == "simulate" and not threads:
-            threads.append(beside(lambda: live.hold("a", on=False)))
-            threads[0].join(SHORT)  # It would overtake the message if it could.
+        if live._connection is None:
+            return
+        if not threads:
+            for act in (
+                lambda: live.hold("a", on=False),
+                lambda: live.request("a", replace(request, sequence="drag")),
+            ):
+                threads.append(beside(act))
+                threads[-1].join(SHORT)  # It would overtake the message if it could.
         arrived.append(message)
 
     monkeypatch.setattr(live, "_write", write)
-    live._resend()
-    threads[0].join(PATIENCE)
-    assert [message.kind for message in arrived] == ["simulate", "resume"]
-    assert arrived[0]["is_held"]
-    live._resend()
-    assert [message.kind for message in arrived[2:]] == ["simulate"]
-    assert not arrived[2]["is_held"]
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        live._connect(ours)
+        for thread in threads:
+            thread.join(PATIENCE)
+    kinds = [message.kind for message in arrived]
+    assert kinds[0] == "simulate"
+    assert sorted(kinds[1:]) == ["resume", "simulate"]
+    requests = [message for message in arrived if message.kind == "simulate"]
+    assert [message["sequence"] for message in requests] == ["lift", "drag"]
+    assert requests[0]["is_held"]
+    assert live._unfinished["a"].message["sequence"] == "drag"
+    assert not live._unfinished["a"].message["is_held"]

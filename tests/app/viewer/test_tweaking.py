@@ -35,14 +35,14 @@ def begun() -> list[Run]:
 
 
 @pytest.fixture
-def kept(root: Path, recording, tmp_path: Path, begun: list[Run]) -> UserStorage:
+def storage(root: Path, recording, tmp_path: Path, begun: list[Run]) -> UserStorage:
     saver = RunSaver(RecordedCatalog(root), tmp_path / "runs", begun.append)
     return UserStorage(PresetStore(tmp_path / "presets"), saver)
 
 
 @pytest.fixture
-def sessions(catalog, kept: UserStorage) -> Iterator[Sessions]:
-    sessions = Sessions(FakeSettings(), catalog, kept)
+def sessions(catalog, storage: UserStorage) -> Iterator[Sessions]:
+    sessions = Sessions(FakeSettings(), catalog, storage)
     yield sessions
     sessions.shutdown()
 
@@ -127,7 +127,7 @@ def test_presets_are_chosen_and_one_parameter_is_put_back(sessions) -> None:
         client.until(lambda: client.value("stiffness 10^") == 0.0)
 
 
-def test_own_presets_are_shared_by_all_scenes_and_deleted(sessions, kept) -> None:
+def test_own_presets_are_shared_by_all_scenes_and_deleted(sessions, storage) -> None:
     with watch(sessions) as client, watch(sessions) as other:
         # Each slider is heard in a thread of its own: one after the other.
         client.set("drag [1/s]", 11.0)
@@ -142,12 +142,12 @@ def test_own_presets_are_shared_by_all_scenes_and_deleted(sessions, kept) -> Non
         other.set("Preset", "★ Wet sheet")
         other.until(lambda: "substeps 30 → automatic" in other.texts())
         other.until(lambda: other.value("drag [1/s]") == 11.0)
-        kept.presets.folder.joinpath("bad.yaml").write_text("format: <i>nothing</i>")
+        storage.presets.folder.joinpath("bad.yaml").write_text("format: <i>nothing</i>")
         other.until(lambda: other.find("Delete preset “Wet sheet”"))
         other.set("Delete preset “Wet sheet”", True)
         client.until(lambda: client.value("Preset") == "by hand")
         client.until(lambda: "presets/bad.yaml: format is missing" in drawn(client))
-        assert [path.name for path in kept.presets.folder.iterdir()] == ["bad.yaml"]
+        assert [path.name for path in storage.presets.folder.iterdir()] == ["bad.yaml"]
 
 
 def test_the_ground_is_lowered_and_taken_away(sessions) -> None:
@@ -186,7 +186,7 @@ def test_too_few_substeps_are_warned_of_with_the_number_that_is_needed(sessions)
         client.until(lambda: "No virtual spring: nothing holds the object" in client.texts())
 
 
-def test_a_run_is_saved_with_what_the_sliders_changed(sessions, kept, begun) -> None:
+def test_a_run_is_saved_with_what_the_sliders_changed(sessions, begun) -> None:
     with watch(sessions) as client:
         client.set("drag [1/s]", 11.0)
         client.until(lambda: "drag [1/s] 3 → 11" in client.texts())
@@ -242,11 +242,11 @@ def test_what_a_run_is_told_gives_the_parameters_of_the_scene(run) -> None:
     assert run_changes(run, fitted, fitted, is_automatic=True) == {"substeps_per_frame": "auto"}
 
 
-def test_a_saved_run_is_followed_until_it_ends(kept, begun) -> None:
-    run = kept.saver.save("sheet", "lift", "  A   name ", {"drag": 1.0})
+def test_a_saved_run_is_followed_until_it_ends(storage, begun) -> None:
+    run = storage.saver.save("sheet", "lift", "  A   name ", {"drag": 1.0})
     assert (run.name, begun) == ("A name", [run])
     told: list[SavedRun] = []
-    thread = kept.saver.follow(run, told.append, threading.Event())
+    thread = storage.saver.follow(run, told.append, threading.Event())
     until(lambda: len(told) == 1)
     with run.begin_attempt() as attempt:
         until(lambda: len(told) == 2)
@@ -256,4 +256,4 @@ def test_a_saved_run_is_followed_until_it_ends(kept, begun) -> None:
     assert [saved.state for saved in told] == ["queued", "running", "succeeded"]
     for name in ("", "x" * 81):
         with pytest.raises(UsageError, match="Type a name"):
-            kept.saver.save("sheet", "lift", name, {})
+            storage.saver.save("sheet", "lift", name, {})

@@ -58,7 +58,7 @@ def changes() -> list[tuple[str, int]]:
 
 
 @pytest.fixture
-def resimulation(live, run, changes) -> LiveRollouts:
+def rollouts(live, run, changes) -> LiveRollouts:
     fitted = load_fitted(run, "lift")
     assert fitted is not None
     return LiveRollouts(
@@ -71,10 +71,10 @@ def resimulation(live, run, changes) -> LiveRollouts:
     )
 
 
-def start(resimulation: LiveRollouts, live: FakeLive, count: int) -> int:
-    resimulation.request(replace(PARAMETERS, drag=7.0), automatic_substeps=False)
+def start(rollouts: LiveRollouts, live: FakeLive, count: int) -> int:
+    rollouts.request(replace(PARAMETERS, drag=7.0), automatic_substeps=False)
     number = len(live.requests)
-    tensors = resimulation.fitted.model.to_tensors()
+    tensors = rollouts.fitted.model.to_tensors()
     live.say("started", number, tensors, substeps_per_frame=30)
     for frame in range(count):
         node = np.full((81, 3), float(frame), np.float32)
@@ -83,70 +83,70 @@ def start(resimulation: LiveRollouts, live: FakeLive, count: int) -> int:
     return number
 
 
-def test_frames_that_are_not_simulated_yet_show_the_rollout_before(resimulation, live) -> None:
-    start(resimulation, live, 3)
-    take, frame = resimulation.at(2)
+def test_frames_that_are_not_simulated_yet_show_the_rollout_before(rollouts, live) -> None:
+    start(rollouts, live, 3)
+    take, frame = rollouts.at(2)
     assert (take.position[frame] == 2.0).all()
-    take, frame = resimulation.at(3)
-    assert (take, frame) == (resimulation.fitted, 3)
-    readout = resimulation.readout
+    take, frame = rollouts.at(3)
+    assert (take, frame) == (rollouts.fitted, 3)
+    readout = rollouts.readout
     assert (readout.simulated_count, readout.frame_count, readout.is_busy) == (3, FRAMES, True)
     assert readout.frame_duration == pytest.approx(0.25)
 
 
-def test_answers_to_an_older_request_are_refused(resimulation, live, changes) -> None:
-    old = start(resimulation, live, 2)
-    new = start(resimulation, live, 1)
+def test_answers_to_an_older_request_are_refused(rollouts, live, changes) -> None:
+    old = start(rollouts, live, 2)
+    new = start(rollouts, live, 1)
     heard = len(changes)
     live.say("frame", old, {"position": np.ones((81, 3)), "velocity": np.ones((81, 3))}, frame=2)
     live.say("finished", old)
     assert len(changes) == heard
     assert new == old + 1
-    assert resimulation.readout.simulated_count == 1
+    assert rollouts.readout.simulated_count == 1
 
 
-def test_divergence_keeps_the_last_good_state(resimulation, live, changes) -> None:
-    number = start(resimulation, live, 5)
+def test_divergence_keeps_the_last_good_state(rollouts, live, changes) -> None:
+    number = start(rollouts, live, 5)
     live.say("diverged", number, error="Simulation diverged at frame 5.", frame=5)
-    take, frame = resimulation.at(FRAMES - 1)
+    take, frame = rollouts.at(FRAMES - 1)
     assert frame == 4
     assert (take.position[frame] == 4.0).all()
-    assert resimulation.readout.error == "Simulation diverged at frame 5."
-    assert not resimulation.readout.is_busy
+    assert rollouts.readout.error == "Simulation diverged at frame 5."
+    assert not rollouts.readout.is_busy
     assert changes[-1] == ("diverged", 5)
 
 
-def test_divergence_before_the_first_frame_keeps_the_rollout_before(resimulation, live) -> None:
-    resimulation.request(PARAMETERS, automatic_substeps=False)
+def test_divergence_before_the_first_frame_keeps_the_rollout_before(rollouts, live) -> None:
+    rollouts.request(replace(PARAMETERS, drag=7.0), automatic_substeps=False)
     live.say("failed", 1, error="no")
-    take, frame = resimulation.at(6)
-    assert (take, frame) == (resimulation.fitted, 6)
-    assert resimulation.readout.error == "no"
+    take, frame = rollouts.at(6)
+    assert (take, frame) == (rollouts.fitted, 6)
+    assert rollouts.readout.error == "no"
 
 
-def test_a_finished_rollout_is_measured_against_the_fitted_one(resimulation, live) -> None:
-    number = start(resimulation, live, FRAMES)
+def test_a_finished_rollout_is_measured_against_the_fitted_one(rollouts, live) -> None:
+    number = start(rollouts, live, FRAMES)
     live.say("finished", number)
-    fitted = np.asarray(resimulation.fitted.position, dtype=np.float64)
+    fitted = np.asarray(rollouts.fitted.position, dtype=np.float64)
     expected = np.linalg.norm(fitted - np.arange(FRAMES)[:, None, None], axis=-1).mean()
-    assert resimulation.readout.difference == pytest.approx(expected, rel=1e-5)
-    assert resimulation.newest is resimulation.at(0)[0]
-    resimulation.show_fitted()
-    assert resimulation.at(0)[0] is resimulation.fitted
-    assert resimulation.readout.difference == 0.0
+    assert rollouts.readout.difference == pytest.approx(expected, rel=1e-5)
+    assert rollouts.newest is rollouts.at(0)[0]
+    rollouts.request(PARAMETERS, automatic_substeps=False)
+    assert rollouts.at(0)[0] is rollouts.fitted
+    assert rollouts.readout.difference == 0.0
     assert live.cancelled == 1
     live.say("finished", number)
-    assert resimulation.at(0)[0] is resimulation.fitted
+    assert rollouts.at(0)[0] is rollouts.fitted
 
 
-def test_a_crash_without_retry_ends_the_waiting(resimulation, live) -> None:
-    start(resimulation, live, 2)
+def test_a_crash_without_retry_ends_the_waiting(rollouts, live) -> None:
+    start(rollouts, live, 2)
     live.listener(Message("crashed", {"session": "s", "code": -9, "is_retried": False}))
-    assert not resimulation.readout.is_busy
+    assert not rollouts.readout.is_busy
 
 
-def test_forces_are_those_of_the_virtual_springs(resimulation) -> None:
-    take, frame = resimulation.at(10)
+def test_forces_are_those_of_the_virtual_springs(rollouts) -> None:
+    take, frame = rollouts.at(10)
     force = take.forces(frame)
     model = take.model
     held = np.unique(model.spring_nodes[model.object_spring_count :, 0])
@@ -154,16 +154,41 @@ def test_forces_are_those_of_the_virtual_springs(resimulation) -> None:
     assert force[held].sum(axis=0)[2] > 10.0
 
 
-def test_the_run_is_prepared_before_anybody_asks(resimulation, live, run) -> None:
+def test_the_run_is_prepared_before_anybody_asks(rollouts, live, run) -> None:
     assert live.prepared == LiveRequest(run=run.folder, sequence="lift", parameters=PARAMETERS)
     assert live.requests == []
 
 
-def test_that_the_process_is_starting_is_told(resimulation, live, changes) -> None:
+def test_that_the_process_is_starting_is_told(rollouts, live, changes) -> None:
     live.is_ready = False
-    assert resimulation.readout.is_starting
+    assert rollouts.readout.is_starting
     live.is_ready = True
     live.listener(Message("ready", {"session": "", "request": 0}))
     assert changes == [("ready", 0)]
-    assert not resimulation.readout.is_starting
-    assert resimulation.at(3) == (resimulation.fitted, 3)
+    assert not rollouts.readout.is_starting
+    assert rollouts.at(3) == (rollouts.fitted, 3)
+
+
+def test_stepping_simulates_what_is_wanted_even_the_fitted_parameters(rollouts, live) -> None:
+    rollouts.step()
+    assert [request.parameters for request in live.requests] == [PARAMETERS]
+    rollouts.step()
+    rollouts.hold(on=False)
+    assert len(live.requests) == 1
+    assert live.paces == ["hold", "step", "step", "go"]
+
+
+def test_fitted_parameters_held_by_other_controls_are_simulated(live, run, changes) -> None:
+    fitted = load_fitted(run, "lift")
+    other = LiveRollouts(
+        "s",
+        live,
+        fitted,
+        run=run.folder,
+        sequence="lift",
+        controls=(1, 2),
+        on_change=lambda kind, ready: changes.append((kind, ready)),
+    )
+    other.request(PARAMETERS, automatic_substeps=False)
+    assert [request.controls for request in live.requests] == [(1, 2)]
+    assert changes == [("requested", 0)]
