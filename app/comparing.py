@@ -11,8 +11,8 @@ from app.jobs.scheduler import Scheduler
 from app.jobs.views import describe_results, describe_run, frame_errors
 from app.pages import Pages
 from app.pages.diff import compare_runs
+from app.viewer.color.difference import compare_frames, way_of
 from app.viewer.compare.curve import Pairing
-from app.viewer.compare.difference import compare_frames, way_of
 from app.viewer.compare.pair import chosen_sequences, open_pair, pairing_of
 from physhandi.data.files import named_fields
 from physhandi.errors import RunError

@@ -111,7 +111,7 @@ def create_files(catalog: Catalog, sessions: Sessions, workshop: FileCache) -> A
             query["theme"] = "dark"
         order = _order_of_scene(catalog, session, kind, query)
         order = replace(order, width=width, height=height, link=snapshot.link)
-        take = snapshot.take
+        take = snapshot.rollout
         if take is None:
             return _answer(workshop.make(order), session.target, kind, query)
         with workshop.once(order, lambda folder: store_take(folder, take)) as path:

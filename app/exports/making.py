@@ -18,10 +18,10 @@ from app.exports.painter import paint_scene, visible_from
 from app.exports.primitives import parts_of
 from app.exports.recording import record_scene
 from app.exports.request import SUFFIXES, FileRequest
-from app.exports.scale_bar import draw_scale
+from app.viewer.color.legend import draw_legend
 from app.viewer.content.content import Content, open_run, open_sequence
 from app.viewer.content.session_state import Pose, SessionState
-from app.viewer.export.bundle import Picture, bundle
+from app.viewer.export.bundle import Screenshot, bundle
 from app.viewer.export.snapshot import Snapshot, scene_data
 from app.viewer.restoring import complete_state
 from physhandi.data.exporters import export_scene
@@ -101,8 +101,8 @@ def make(order: FileRequest, out: Path, report: Report = lambda _done, _of: None
     snapshot = Snapshot(
         content=content,
         frame=state.frame,
-        take=take,
-        take_frame=state.frame if take is None else min(state.frame, take.ready - 1),
+        rollout=take,
+        rollout_frame=state.frame if take is None else min(state.frame, take.ready - 1),
         run=run,
         layers=state.layers,
         link=order.link,
@@ -178,18 +178,18 @@ def _simulate(
     return take
 
 
-def _picture(order: FileRequest, snapshot: Snapshot, state: SessionState) -> Picture:
-    with Offscreen(snapshot.content, snapshot.take, state) as scene:
+def _picture(order: FileRequest, snapshot: Snapshot, state: SessionState) -> Screenshot:
+    with Offscreen(snapshot.content, snapshot.rollout, state) as scene:
         scene.draw(snapshot.frame, is_playing=False)
         pose: Pose = scene.pose
         parts = visible_from(parts_of(scene.server), pose)
         image = paint_scene(parts, pose, order.width, order.height, is_dark=scene.is_dark)
         if scene.legend is not None:
-            image = draw_scale(image, scene.legend, is_dark=scene.is_dark)
+            image = draw_legend(image, scene.legend, is_dark=scene.is_dark)
     is_written, content = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))
     if not is_written:
         raise UsageError("The picture could not be encoded; choose a smaller size.")
-    return Picture(content=content.tobytes(), pose=pose, width=order.width, height=order.height)
+    return Screenshot(content=content.tobytes(), pose=pose, width=order.width, height=order.height)
 
 
 def _write_motion(order: FileRequest, snapshot: Snapshot, out: Path) -> None:

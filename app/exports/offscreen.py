@@ -9,11 +9,11 @@ import viser
 from jaxtyping import Float
 from numpy import ndarray
 
-from app.viewer.color.coloring import Legend
+from app.viewer.color.legend import Legend
 from app.viewer.content.content import Content
 from app.viewer.content.session_state import Pose, SessionState
 from app.viewer.scene.framing import frame_content
-from app.viewer.scene.scene import FRAME_BYTES, Scene
+from app.viewer.scene.scene import FRAME_BYTES, SceneDrawing
 from app.viewer.ui.guard import plain
 from app.viewer.ui.scene_server import start_viser
 from physhandi.object_rollout import ObjectRollout
@@ -52,7 +52,7 @@ class Offscreen:
         self._take = take
         self.server: viser.ViserServer = start_viser(plain(content.title))
         try:
-            self._scene = Scene(
+            self._scene = SceneDrawing(
                 self.server,
                 self.content,
                 framing,

@@ -21,8 +21,8 @@ from app.viewer.physics.keep_panel import UserStorage
 from app.viewer.physics.object_session import ObjectSession
 from app.viewer.restoring import complete_state, differences
 from app.viewer.scene.framing import frame_content
-from app.viewer.scene.panels import LayersPanel, TimelinePanel, add_legend, set_theme
-from app.viewer.scene.scene import Scene
+from app.viewer.scene.layers_panel import LayersPanel, TimelinePanel, add_legend, set_theme
+from app.viewer.scene.scene import SceneDrawing
 from app.viewer.ui.scene_server import SceneServer
 from physhandi.object_rollout import ObjectRollout
 
@@ -30,11 +30,11 @@ from physhandi.object_rollout import ObjectRollout
 class ViewSwitch:
     """Draws the scene, the figure or two rollouts, and hides the others; used by the clock."""
 
-    def __init__(self, scene: Scene, figure: FigureMode, pin: PinMode) -> None:
+    def __init__(self, scene: SceneDrawing, figure: FigureMode, pin: PinMode) -> None:
         self.scene = scene
         self._figure = figure
         self._pin = pin
-        self._shown: Scene | FigureMode | PinMode = scene
+        self._shown: SceneDrawing | FigureMode | PinMode = scene
 
     def draw(
         self, frame: int, take: ObjectRollout | None, take_frame: int, *, is_playing: bool
@@ -61,7 +61,7 @@ class ViewSwitch:
         self, content: Content, frame: int, take: ObjectRollout | None, take_frame: int
     ) -> Snapshot:
         """Collect what is seen, for the export panel."""
-        snapshot = Snapshot(content=content, frame=frame, take=take, take_frame=take_frame)
+        snapshot = Snapshot(content=content, frame=frame, rollout=take, rollout_frame=take_frame)
         mode = self._mode(take)
         if mode is None or take is None:
             return snapshot
@@ -240,7 +240,7 @@ class Session(SceneServer):
         """Build what belongs to the content: scene, switches and physics."""
         content = self._content
         framing = frame_content(content)
-        scene = Scene(self._server, content, framing)
+        scene = SceneDrawing(self._server, content, framing)
         self._stage = ViewSwitch(scene, self._figure, self._pin)
         self._layers.replace(content, scene.layers, framing, has_surface=scene.may_have_surface)
         self._inspection.replace(content, scene, framing)

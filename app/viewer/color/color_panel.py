@@ -1,4 +1,4 @@
-"""Chooses what colors tell, shows the legend and holds the range."""
+"""The panel that chooses the coloring, shows its legend and holds its range."""
 
 import math
 import threading
@@ -7,8 +7,7 @@ from typing import Any, Protocol
 
 import viser
 
-from app.viewer.color.coloring import Legend
-from app.viewer.color.legend import legend_html
+from app.viewer.color.legend import Legend, legend_html
 from app.viewer.color.quantities import Quantity
 from app.viewer.content.content import Content
 from app.viewer.content.layers import Coloring, Layers
@@ -22,12 +21,12 @@ class Paints(Protocol):
 
     @property
     def legend(self) -> Legend | None:
-        """What the colors painted last mean; None if they are plain."""
+        """Legend of the colors painted last; None if they are plain."""
         ...
 
     @property
     def offered(self) -> tuple[Coloring, ...]:
-        """What can be told."""
+        """Colorings to choose from, besides ``plain``."""
         ...
 
     def quantity(self, coloring: Coloring, /) -> Quantity:
@@ -50,7 +49,7 @@ class ColorPanel:
         self._layers = Layers()
         self._painter: Paints | None = None
         self._is_metric = True
-        self._said = ""
+        self._written = ""
         self._turn = threading.Lock()
         gui = server.gui
         self._folder = gui.add_folder("Colors", visible=False)
@@ -76,7 +75,7 @@ class ColorPanel:
         self._show_range_fields()
 
     def replace(self, content: Content, layers: Layers, painter: Paints) -> None:
-        """Offer what a content can tell."""
+        """Offer the colorings of a content."""
         before = self._layers
         self._layers, self._painter = layers, painter
         self._is_metric = content.is_metric
@@ -116,22 +115,22 @@ class ColorPanel:
         """Follow what was painted last, or say nothing while something else is shown."""
         painter = self._painter
         legend = painter.legend if painter is not None and not is_hidden else None
-        said = "" if legend is None else legend_html(legend, highest=not is_playing)
-        if is_playing and self._legend_head(said) == self._legend_head(self._said):
+        written = "" if legend is None else legend_html(legend, highest=not is_playing)
+        if is_playing and self._legend_head(written) == self._legend_head(self._written):
             return
-        if said != self._said:
-            self._said = said
-            self._legend.content = said
+        if written != self._written:
+            self._written = written
+            self._legend.content = written
         if legend is None or painter is None:
             return
         factor = painter.quantity(self._layers.color).factor
-        low, high = (_rounded(end * factor) for end in legend.limits)
+        low, high = (_rounded(end * factor) for end in legend.scale.limits)
         self._range.show((low, high))
 
     @staticmethod
-    def _legend_head(said: str) -> str:
+    def _legend_head(written: str) -> str:
         """Cut off what changes with every frame."""
-        return said.partition(" · highest ")[0]
+        return written.partition(" · highest ")[0]
 
     def _follow(self) -> None:
         self._choice.value = self._layers.color
@@ -146,7 +145,7 @@ class ColorPanel:
     def _toggle_hold(self) -> None:
         legend = self._painter.legend if self._painter is not None else None
         if self._hold.value and legend is not None:
-            self._layers.color_range = legend.limits
+            self._layers.color_range = legend.scale.limits
         else:
             self._layers.color_range = None
         self._redraw()

@@ -8,9 +8,9 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 from scipy.spatial import KDTree  # pyright: ignore[reportMissingTypeStubs]  # it has none
 
-from app.viewer.color.colormaps import levels, paint
-from app.viewer.color.quantities import QUANTITIES, Quantity, Values, measure
-from app.viewer.compare.difference import surface_difference
+from app.viewer.color.difference import surface_difference
+from app.viewer.color.legend import ColorScale, Legend, Limits
+from app.viewer.color.quantities import QUANTITIES, Quantity, Values, in_length_unit, measure
 from app.viewer.content.content import Content
 from app.viewer.content.layers import COLORINGS, Coloring, Layers
 from physhandi.metrics.alignment import carried_points
@@ -63,20 +63,20 @@ class ObservedError:
             return "the nearest observed point"
         return self._tracks.name
 
-    def nodes(self, take: ObjectRollout, frame: int) -> Float[ndarray, " node"]:
+    def nodes(self, rollout: ObjectRollout, frame: int) -> Float[ndarray, " node"]:
         """Measure the error of each node [m]; NaN where nothing was observed."""
         if self._tracks is None:
-            return self._from_points(take, frame)
-        error, is_seen = self.tracks(take, frame)
-        if len(self._near) != take.model.node_count:
-            return np.full(take.model.node_count, np.nan)
+            return self._from_points(rollout, frame)
+        error, is_seen = self.tracks(rollout, frame)
+        if len(self._near) != rollout.model.node_count:
+            return np.full(rollout.model.node_count, np.nan)
         counts = self._is_near & is_seen[self._near]
         total = np.where(counts, error[self._near], 0.0).sum(axis=1)
         number = counts.sum(axis=1)
         return np.where(number > 0, total / np.maximum(number, 1), np.nan)
 
     def tracks(
-        self, take: ObjectRollout, frame: int
+        self, rollout: ObjectRollout, frame: int
     ) -> tuple[Float[ndarray, " known"], Bool[ndarray, " known"]]:
         """Measure the error of each track that frame 0 shows [m], and tell whether it is seen."""
         tracks, known = self._tracks, self._known
@@ -85,29 +85,29 @@ class ObservedError:
         point = np.asarray(tracks.point[frame, known], dtype=np.float64)
         is_seen = np.asarray(tracks.is_visible[frame, known]) & np.isfinite(point).all(axis=1)
         if tracks.node is not None:
-            predicted = np.asarray(take.position[frame], dtype=np.float64)[tracks.node[known]]
+            predicted = np.asarray(rollout.position[frame], dtype=np.float64)[tracks.node[known]]
         else:
-            both = np.stack([take.position[0], take.position[frame]]).astype(np.float64)
+            both = np.stack([rollout.position[0], rollout.position[frame]]).astype(np.float64)
             start = np.asarray(tracks.point[0, known], dtype=np.float64)
             predicted = carried_points(start, both)[1]
         return np.linalg.norm(point - predicted, axis=1), is_seen
 
     def points(
-        self, point: Float[ndarray, "point 3"], take: ObjectRollout, frame: int
+        self, point: Float[ndarray, "point 3"], rollout: ObjectRollout, frame: int
     ) -> Float[ndarray, " point"]:
         """Measure how far observed points are from the object's surface [m]."""
-        node = np.asarray(take.position[frame], dtype=np.float64)
+        node = np.asarray(rollout.position[frame], dtype=np.float64)
         if len(point) == 0:
             return np.zeros(0)
         return surface_difference(np.asarray(point, dtype=np.float64), node)
 
-    def _from_points(self, take: ObjectRollout, frame: int) -> Float[ndarray, " node"]:
+    def _from_points(self, rollout: ObjectRollout, frame: int) -> Float[ndarray, " node"]:
         observed = self._content.observed
         point = observed.points(frame) if observed is not None else np.zeros((0, 3))
         if len(point) == 0:
-            return np.full(take.model.node_count, np.nan)
+            return np.full(rollout.model.node_count, np.nan)
         tree: Any = KDTree(point[:: max(1, len(point) // _MOST_POINTS)])
-        distance, _ = tree.query(np.asarray(take.position[frame], dtype=np.float64))
+        distance, _ = tree.query(np.asarray(rollout.position[frame], dtype=np.float64))
         return np.asarray(distance, dtype=np.float64)
 
 
@@ -124,51 +124,29 @@ _STRONG = 0.98
 """Part of the values that the range covers; the strongest few are shown as its end."""
 _LEAST = 1e-12
 
-Range = tuple[float, float]
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Legend:
-    """What has to be said about the colors on the screen."""
-
-    quantity: Quantity
-    """What they tell; its unit fits the content."""
-    limits: Range
-    """Values at the ends, in SI units."""
-    is_fixed: bool
-    """Whether the user has fixed the ends."""
-    unknown: int
-    """Nodes of which nothing is known in this frame."""
-    is_known: bool
-    """Whether any value is known in this frame."""
-    highest: float
-    """Highest value on the screen, in SI units."""
-    thing: str = "node"
-    """What has the values."""
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Painted:
     """An object's colors in one frame."""
 
     values: Values
-    """What they tell."""
-    node: UInt8[ndarray, "node 3"]
-    """Of object nodes."""
-    level: Float[ndarray, " node"]
-    """Where on the scale the nodes lie, from 0 to 1; NaN where nothing is known."""
-    quantity: Quantity
-    """Which quantity it is."""
-    limits: Range
-    """Values at the ends of the scale, in SI units."""
+    """The quantity at nodes and springs."""
+    scale: ColorScale
+    """Which color means which value."""
+
+    @property
+    def node(self) -> UInt8[ndarray, "node 3"]:
+        """Colors of the nodes."""
+        return self.scale.paint(self.values.node)
+
+    @property
+    def level(self) -> Float[ndarray, " node"]:
+        """Places of the nodes on the scale, from 0 to 1; NaN where nothing is known."""
+        return self.scale.levels(self.values.node)
 
     def springs(self, chosen: slice | ndarray) -> UInt8[ndarray, "segment 2 3"]:
         """Give the colors of both ends of some springs."""
-        return paint_values(self.values.spring[chosen], self.quantity, self.limits)
-
-    def points(self, value: Float[ndarray, " point"]) -> UInt8[ndarray, "point 3"]:
-        """Give the colors of other points that have this quantity."""
-        return paint_values(value, self.quantity, self.limits)
+        return self.scale.paint(self.values.spring[chosen])
 
 
 class Painter:
@@ -186,14 +164,13 @@ class Painter:
         self.errors = ObservedError(content)
         self._has_object = content.fitted is not None
         self._has_hands = bool(content.hands)
-        self._is_metric = content.is_metric
         self._length_unit = content.length_unit
-        self._ranges: dict[Coloring, tuple[ObjectRollout, ObjectRollout | None, int, Range]] = {}
+        self._ranges: dict[Coloring, tuple[ObjectRollout, ObjectRollout | None, int, Limits]] = {}
         self._legend: Legend | None = None
 
     @property
     def legend(self) -> Legend | None:
-        """What the colors painted last mean; None if they are plain."""
+        """Legend of the colors painted last; None if they are plain."""
         return self._legend
 
     @property
@@ -216,18 +193,13 @@ class Painter:
                     "by which the hand holds it", "that hold it from outside"
                 ),
             )
-        if self._is_metric:
-            return quantity
-        length = self._length_unit
-        units = {"mm": (length, 1.0), "m/s": (f"{length}/s", quantity.factor)}
-        unit, factor = units.get(quantity.unit, (quantity.unit, quantity.factor))
-        return replace(quantity, unit=unit, factor=factor)
+        return in_length_unit(quantity, self._length_unit)
 
-    def paint(self, take: ObjectRollout, frame: int, layers: Layers) -> Painted | None:
+    def paint(self, rollout: ObjectRollout, frame: int, layers: Layers) -> Painted | None:
         """Give nodes and springs their colors; None if they are plain.
 
         Args:
-            take: The rollout.
+            rollout: The rollout.
             frame: One of its frames that is ready.
             layers: Which quantity, and in which range.
         """
@@ -235,56 +207,49 @@ class Painter:
             self._legend = None
             return None
         quantity = self.quantity(layers.color)
-        values = self.measure(layers.color, take, frame)
-        limits = layers.color_range or self.limits(layers.color, take)
+        values = self.measure(layers.color, rollout, frame)
+        limits = layers.color_range or self.limits(layers.color, rollout)
+        scale = ColorScale(quantity=quantity, limits=limits)
         known = values.node[np.isfinite(values.node)]
         self._legend = Legend(
-            quantity=quantity,
-            limits=limits,
-            is_fixed=layers.color_range is not None,
+            scale=scale,
             unknown=len(values.node) - len(known),
             is_known=bool(len(known)),
             highest=float(known.max(initial=0.0)),
         )
-        return Painted(
-            values=values,
-            node=paint_values(values.node, quantity, limits),
-            level=levels(values.node, limits, is_logarithmic=quantity.is_logarithmic),
-            quantity=quantity,
-            limits=limits,
-        )
+        return Painted(values=values, scale=scale)
 
-    def measure(self, coloring: Coloring, take: ObjectRollout, frame: int) -> Values:
+    def measure(self, coloring: Coloring, rollout: ObjectRollout, frame: int) -> Values:
         """Measure a quantity in one frame of a rollout."""
         error_of = self.errors.nodes if self.errors.is_known else None
-        return measure(coloring, take, frame, error_of=error_of, reference=self.reference)
+        return measure(coloring, rollout, frame, error_of=error_of, reference=self.reference)
 
-    def limits(self, coloring: Coloring, take: ObjectRollout) -> Range:
+    def limits(self, coloring: Coloring, rollout: ObjectRollout) -> Limits:
         """Find the range of a quantity over a rollout.
 
         While a rollout is being computed, the range is measured anew each time that twice as many
         frames are ready.
         """
         known = self._ranges.get(coloring)
-        if known is not None and known[0] is take and known[1] is self.reference:
-            is_enough = take.ready == known[2] or (
-                not take.is_complete and take.ready < 2 * known[2]
+        if known is not None and known[0] is rollout and known[1] is self.reference:
+            is_enough = rollout.ready == known[2] or (
+                not rollout.is_complete and rollout.ready < 2 * known[2]
             )
             if is_enough:
                 return known[3]
-        found = self._measure_range(coloring, take)
-        self._ranges[coloring] = (take, self.reference, take.ready, found)
+        found = self._measure_range(coloring, rollout)
+        self._ranges[coloring] = (rollout, self.reference, rollout.ready, found)
         return found
 
-    def _measure_range(self, coloring: Coloring, take: ObjectRollout) -> Range:
+    def _measure_range(self, coloring: Coloring, rollout: ObjectRollout) -> Limits:
         quantity = QUANTITIES[coloring]
-        count = 1 if quantity.is_static else min(_SAMPLED_FRAMES, take.ready)
-        frames = np.unique(np.linspace(0, take.ready - 1, count).astype(int))
+        count = 1 if quantity.is_static else min(_SAMPLED_FRAMES, rollout.ready)
+        frames = np.unique(np.linspace(0, rollout.ready - 1, count).astype(int))
         # The virtual springs are so short that their strain would hide that of all others.
-        springs = slice(0, take.model.object_spring_count if coloring == "strain" else None)
+        springs = slice(0, rollout.model.object_spring_count if coloring == "strain" else None)
         parts: list[list[ndarray]] = [[], []]
         for frame in frames:
-            values = self.measure(coloring, take, int(frame))
+            values = self.measure(coloring, rollout, int(frame))
             for part, value in zip(parts, (values.node, values.spring[springs]), strict=True):
                 part.append(value[np.isfinite(value)])
         ends = [nearly_all(np.concatenate(part), quantity) for part in parts]
@@ -295,7 +260,7 @@ class Painter:
         return (low, high) if high > low else (low, low + (abs(low) or 1.0 / quantity.factor))
 
 
-def nearly_all(value: Float[ndarray, " value"], quantity: Quantity) -> Range | None:
+def nearly_all(value: Float[ndarray, " value"], quantity: Quantity) -> Limits | None:
     """Find a range that nearly all values lie in; None if there are none."""
     if len(value) == 0:
         return None
@@ -315,10 +280,3 @@ def _rounded_up(value: float) -> float:
         return 0.0
     step = 10.0 ** (np.floor(np.log10(value)) - 1)
     return float(np.ceil(value / step - 1e-9) * step)
-
-
-def paint_values(
-    value: Float[ndarray, "*item"], quantity: Quantity, limits: Range
-) -> UInt8[ndarray, "*item 3"]:
-    """Give values the colors of a quantity's scale."""
-    return paint(value, limits, quantity.scale, is_logarithmic=quantity.is_logarithmic)

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from app.viewer.color.coloring import Legend, Painted, Range, nearly_all, paint_values
-from app.viewer.color.colormaps import levels
+from app.viewer.color.coloring import Painted, nearly_all
+from app.viewer.color.legend import ColorScale, Legend, Limits
 from app.viewer.color.quantities import Quantity, Values
 from app.viewer.content.content import Content, HandSurface
 from app.viewer.content.layers import Coloring, Layers
@@ -36,9 +36,9 @@ class HandPainter:
         self._hands = content.hands if content.fitted is None else ()
         self._errors: dict[str, Float[ndarray, "frame joint"] | None] = {}
         self._weights: dict[str, Float[ndarray, "vertex joint"]] = {}
-        self._ranges: dict[Coloring, Range] = {}
+        self._ranges: dict[Coloring, Limits] = {}
         self.legend: Legend | None = None
-        """What the colors painted last mean; None if they are plain."""
+        """Legend of the colors painted last; None if they are plain."""
 
     @property
     def offered(self) -> tuple[Coloring, ...]:
@@ -83,28 +83,22 @@ class HandPainter:
         if layers.color not in self.offered:
             self.legend = None
             return {}
-        quantity = self.quantity(layers.color)
         limits = layers.color_range or self._limits(layers.color)
+        scale = ColorScale(quantity=self.quantity(layers.color), limits=limits)
         painted: dict[str, Painted] = {}
         for hand in self._hands:
             value = self.measure(layers.color, hand, frame)
             painted[hand.side] = Painted(
-                values=Values(node=value, spring=np.zeros((0, 2))),
-                node=paint_values(value, quantity, limits),
-                level=levels(value, limits, is_logarithmic=False),
-                quantity=quantity,
-                limits=limits,
+                values=Values(node=value, spring=np.zeros((0, 2))), scale=scale
             )
         value = np.concatenate([painted[hand.side].values.node for hand in self._hands])
         known = value[np.isfinite(value)]
         self.legend = Legend(
-            quantity=quantity,
-            limits=limits,
-            is_fixed=layers.color_range is not None,
+            scale=scale,
             unknown=len(value) - len(known),
             is_known=bool(len(known)),
             highest=float(known.max(initial=0.0)),
-            thing="vertex",
+            item="vertex",
         )
         return painted
 
@@ -114,7 +108,7 @@ class HandPainter:
             self._errors[hand.side] = reprojection_errors(self._content, hand)
         return self._errors[hand.side]
 
-    def _limits(self, coloring: Coloring) -> Range:
+    def _limits(self, coloring: Coloring) -> Limits:
         """Find the range of a quantity over all frames."""
         if coloring not in self._ranges:
             last = self._content.frame_count - 1

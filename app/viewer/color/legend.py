@@ -1,26 +1,86 @@
-"""The color scale with its numbers, as HTML that suits a light and a dark panel."""
+"""The color scale of a quantity, and its legend: in a panel as HTML, in a picture as pixels."""
 
 import html
+from collections.abc import Iterable
+from dataclasses import dataclass
 
+import cv2
 import numpy as np
+from jaxtyping import Float, UInt8
+from numpy import ndarray
 
-from app.viewer.color.coloring import Legend
-from app.viewer.color.colormaps import UNKNOWN, table
+from app.viewer.color.colormaps import UNKNOWN, levels, paint, table
+from app.viewer.color.quantities import Quantity
 
 TICKS = 5
 """Numbers below the scale."""
 _STOPS = 17
+_INK = {False: (30, 36, 44), True: (226, 230, 236)}
+"""Color of the numbers in a picture on a light and on a dark background."""
+_SMALLEST_PICTURE = 160
+"""Smaller pictures have no room for a legend [px]."""
+
+Limits = tuple[float, float]
+"""Values at the low and the high end of a color scale, in SI units."""
 
 
-def tick_values(legend: Legend) -> list[float]:
-    """Choose the values that are written below the scale, in the unit of the legend."""
-    low, high = legend.limits
-    place = np.linspace(0.0, 1.0, TICKS)
-    if legend.quantity.is_logarithmic and low > 0:
-        value = np.exp(np.log(low) + place * (np.log(high) - np.log(low)))
-    else:
-        value = low + place * (high - low)
-    return [float(v) for v in value * legend.quantity.factor]
+@dataclass(frozen=True, kw_only=True)
+class ColorScale:
+    """Which color means which value of a quantity."""
+
+    quantity: Quantity
+    """The quantity, in the units of the content."""
+    limits: Limits
+    """Values at both ends."""
+    is_open: bool = False
+    """Whether the color of the high end also means larger values, and the legend says so."""
+
+    def levels(self, value: Float[ndarray, "*item"]) -> Float[ndarray, "*item"]:
+        """Find where values lie on the scale, from 0 to 1; NaN stays NaN."""
+        return levels(value, self.limits, is_logarithmic=self.quantity.is_logarithmic)
+
+    def paint(self, value: Float[ndarray, "*item"]) -> UInt8[ndarray, "*item 3"]:
+        """Give values their colors; NaN gets `UNKNOWN`."""
+        quantity = self.quantity
+        return paint(value, self.limits, quantity.scale, is_logarithmic=quantity.is_logarithmic)
+
+    @property
+    def ramp(self) -> UInt8[ndarray, "step 3"]:
+        """All colors from the low to the high end."""
+        return table(self.quantity.scale)
+
+    @property
+    def ticks(self) -> list[float]:
+        """Values that are written below the scale, in the quantity's unit."""
+        low, high = self.limits
+        place = np.linspace(0.0, 1.0, TICKS)
+        if self.quantity.is_logarithmic and low > 0:
+            value = np.exp(np.log(low) + place * (np.log(high) - np.log(low)))
+        else:
+            value = low + place * (high - low)
+        return [float(v) for v in value * self.quantity.factor]
+
+    @property
+    def tick_labels(self) -> list[str]:
+        """The ticks as text."""
+        labels = [number(value) for value in self.ticks]
+        return [*labels[:-1], f"≥{labels[-1]}"] if self.is_open else labels
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Legend:
+    """Legend of the current coloring: its scale, and what the frame on the screen has of it."""
+
+    scale: ColorScale
+    """Which color means which value."""
+    unknown: int = 0
+    """Items without a value in this frame."""
+    is_known: bool = True
+    """Whether any item has a value in this frame."""
+    highest: float | None = None
+    """Highest value in this frame, in SI units; None if it is not written."""
+    item: str = "node"
+    """What has the values: ``node`` or ``vertex``."""
 
 
 def number(value: float) -> str:
@@ -33,28 +93,28 @@ def number(value: float) -> str:
     return text.replace("e-0", "e-").replace("e+0", "e")
 
 
-def legend_html(legend: Legend, *, highest: bool) -> str:
-    """Draw the scale with its numbers, and say what it tells.
+def legend_html(legend: Legend, *, highest: bool = True) -> str:
+    """Draw the scale with its numbers and a description, for light and dark panels.
 
     Args:
-        legend: What is painted.
-        highest: Whether to add the highest value of the frame.
+        legend: The legend.
+        highest: Whether to write the highest value of the frame, if the legend has one.
     """
-    quantity = legend.quantity
-    ramp = table(quantity.scale)
+    quantity = legend.scale.quantity
+    ramp = legend.scale.ramp
     at = np.round(np.linspace(0, len(ramp) - 1, _STOPS)).astype(int)
     stops = ",".join(f"rgb({r},{g},{b})" for r, g, b in ramp[at].tolist())
-    ticks = "".join(f"<span>{number(value)}</span>" for value in tick_values(legend))
+    ticks = "".join(f"<span>{label}</span>" for label in legend.scale.tick_labels)
     notes = [html.escape(quantity.about)]
     if quantity.is_logarithmic:
         notes.append("logarithmic")
     if not legend.is_known:
         notes.append("<b>not known in this frame</b>")
-    elif highest:
+    elif highest and legend.highest is not None:
         top = number(legend.highest * quantity.factor)
-        notes.append(f"highest {legend.thing} now {top}&nbsp;{html.escape(quantity.unit)}")
+        notes.append(f"highest {legend.item} now {top}&nbsp;{html.escape(quantity.unit)}")
         if legend.unknown:
-            plural = {"vertex": "vertices"}.get(legend.thing, f"{legend.thing}s")
+            plural = {"vertex": "vertices"}.get(legend.item, f"{legend.item}s")
             gray = "rgb({},{},{})".format(*UNKNOWN)
             notes.append(f'<span style="color:{gray}">■</span> {legend.unknown} {plural} not known')
     return (
@@ -68,3 +128,59 @@ def legend_html(legend: Legend, *, highest: bool) -> str:
         f'<div style="opacity:0.8;line-height:1.35;margin-top:0.2em">{" · ".join(notes)}</div>'
         "</div>"
     )
+
+
+def swatches_html(swatches: Iterable[tuple[tuple[int, int, int], str]], *, is_list: bool) -> str:
+    """Draw a legend of parts: a dot of its color before each name.
+
+    Args:
+        swatches: Color and name; names are escaped.
+        is_list: Whether each has a line of its own, which may be broken, instead of one row.
+    """
+    dots: list[str] = []
+    for color, name in swatches:
+        dot = (
+            '<span style="display:inline-block;width:0.7em;height:0.7em;border-radius:50%;'
+            f'background:rgb{tuple(color)};margin-right:0.35em"></span>{html.escape(name)}'
+        )
+        if is_list:
+            dots.append(f'<div style="overflow-wrap:anywhere">{dot}</div>')
+        else:
+            dots.append(f'<span style="white-space:nowrap;margin-right:0.8em">{dot}</span>')
+    return f'<div style="font-size:0.8em;padding:0.2em 0.9em 0.5em">{"".join(dots)}</div>'
+
+
+def draw_legend(
+    image: UInt8[ndarray, "row column 3"], legend: Legend, *, is_dark: bool
+) -> UInt8[ndarray, "row column 3"]:
+    """Draw the scale with its name, unit and numbers into the lower left corner of a picture.
+
+    Args:
+        image: The picture; a small one has no room and stays as it is.
+        legend: The legend.
+        is_dark: Whether the background is dark.
+
+    Returns:
+        The picture with the legend.
+    """
+    rows, columns = image.shape[:2]
+    if min(rows, columns) < _SMALLEST_PICTURE:
+        return image
+    image = image.copy()
+    unit = max(round(min(rows, columns) / 45), 4)
+    wide, high = min(16 * unit, columns - 4 * unit), unit
+    left, top = 2 * unit, rows - 5 * unit
+    ramp = legend.scale.ramp
+    place = np.linspace(0, len(ramp) - 1, wide).round().astype(int)
+    image[top : top + high, left : left + wide] = ramp[place][None]
+    font, size, ink = cv2.FontFace("sans"), unit, _INK[is_dark]
+    quantity = legend.scale.quantity
+    title = f"{quantity.label} [{quantity.unit}]" if quantity.unit else quantity.label
+    title += ", logarithmic" if quantity.is_logarithmic else ""
+    cv2.putText(image, title, (left, top - unit // 2), ink, font, size)
+    labels = legend.scale.tick_labels
+    for index, label in enumerate(labels):
+        box = cv2.getTextSize((0, 0), label, (0, 0), font, size)
+        x = left + round(wide * index / (len(labels) - 1)) - box[2] // 2
+        cv2.putText(image, label, (max(x, 0), top + high + round(1.3 * unit)), ink, font, size)
+    return image

@@ -1,14 +1,14 @@
-"""What colors can tell of an object: values of its nodes and springs in one frame."""
+"""The quantities that color an object: their names, units and values in one frame."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
 from app.viewer.color.colormaps import Scale
-from app.viewer.compare.difference import take_difference
+from app.viewer.color.difference import rollout_difference
 from app.viewer.content.layers import Coloring
 from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.forces import node_means
@@ -87,13 +87,23 @@ QUANTITIES: Mapping[Coloring, Quantity] = {
 }
 """Every coloring but ``plain``."""
 
+
+def in_length_unit(quantity: Quantity, unit: str) -> Quantity:
+    """Write a quantity in the units of a content whose lengths are in `unit`, ``"m"`` if metric."""
+    if unit == "m" or quantity.unit not in {"mm", "m/s"}:
+        return quantity
+    if quantity.unit == "mm":
+        return replace(quantity, unit=unit, factor=1.0)
+    return replace(quantity, unit=f"{unit}/s")
+
+
 ErrorOf = Callable[[ObjectRollout, int], Float[ndarray, " node"]]
 """Measures how far each node of a frame is from what was observed [m]."""
 
 
 def measure(
     coloring: Coloring,
-    take: ObjectRollout,
+    rollout: ObjectRollout,
     frame: int,
     *,
     error_of: ErrorOf | None = None,
@@ -103,61 +113,61 @@ def measure(
 
     Args:
         coloring: Which one, not ``plain``.
-        take: The rollout.
+        rollout: The rollout.
         frame: One of its frames that is ready.
         error_of: Measures the error; without it the error is unknown.
         reference: What ``difference`` compares with; without it the difference is unknown.
     """
-    model = take.model
+    model = rollout.model
     match coloring:
         case "stiffness":
-            value = take.parameters.stiffness_scale * model.stiffness.astype(np.float64)
+            value = rollout.parameters.stiffness_scale * model.stiffness.astype(np.float64)
             mean = np.exp(node_means(model, np.log(np.maximum(value, 1e-300))))
             return Values(node=mean, spring=_both_ends(value))
         case "damping":
             value = model.damping.astype(np.float64)
             return Values(node=node_means(model, value), spring=_both_ends(value))
         case "strain":
-            value = take.strains(frame)
+            value = rollout.strains(frame)
             return Values(node=node_means(model, value), spring=_both_ends(value))
         case "force":
-            pull = np.linalg.norm(take.forces(frame), axis=1)
-            return Values(node=pull, spring=_both_ends(np.abs(take.tensions(frame))))
+            pull = np.linalg.norm(rollout.forces(frame), axis=1)
+            return Values(node=pull, spring=_both_ends(np.abs(rollout.tensions(frame))))
         case "speed":
-            _, velocity, _, control_velocity = take.state(frame)
+            _, velocity, _, control_velocity = rollout.state(frame)
             node, control = (np.linalg.norm(v, axis=1) for v in (velocity, control_velocity))
             return Values(node=node, spring=np.concatenate([node, control])[model.spring_nodes])
         case "error" | "difference":
-            node = _distance(coloring, take, frame, error_of, reference)
-            return Values(node=node, spring=from_nodes(take, node))
+            node = _distance(coloring, rollout, frame, error_of, reference)
+            return Values(node=node, spring=from_nodes(rollout, node))
         case "plain":
-            raise ValueError("plain colors tell nothing that could be measured")
+            raise ValueError("plain colors have no quantity to measure")
 
 
 def _distance(
     coloring: Coloring,
-    take: ObjectRollout,
+    rollout: ObjectRollout,
     frame: int,
     error_of: ErrorOf | None,
     reference: ObjectRollout | None,
 ) -> Float[ndarray, " node"]:
     """Measure the distance from the observation or from the reference; NaN without them."""
     if coloring == "error" and error_of is not None:
-        return error_of(take, frame)
+        return error_of(rollout, frame)
     if coloring == "difference" and reference is not None and reference.ready > 0:
-        return take_difference(take, frame, reference, min(frame, reference.ready - 1))
-    return np.full(take.model.node_count, np.nan)
+        return rollout_difference(rollout, frame, reference, min(frame, reference.ready - 1))
+    return np.full(rollout.model.node_count, np.nan)
 
 
 def _both_ends(value: Float[ndarray, " spring"]) -> Float[ndarray, "spring 2"]:
     return np.repeat(value[:, None], 2, axis=1)
 
 
-def from_nodes(take: ObjectRollout, node: Float[ndarray, " node"]) -> Float[ndarray, "spring 2"]:
+def from_nodes(rollout: ObjectRollout, node: Float[ndarray, " node"]) -> Float[ndarray, "spring 2"]:
     """Give spring ends their node's value; a control node has none, so it gets the other end's."""
-    ends = np.sort(take.model.spring_nodes, axis=1)
-    swapped = take.model.spring_nodes[:, 0] > take.model.spring_nodes[:, 1]
-    is_control = ends[:, 1] >= take.model.node_count
+    ends = np.sort(rollout.model.spring_nodes, axis=1)
+    swapped = rollout.model.spring_nodes[:, 0] > rollout.model.spring_nodes[:, 1]
+    is_control = ends[:, 1] >= rollout.model.node_count
     ends[is_control, 1] = ends[is_control, 0]
     ends[swapped] = ends[swapped][:, ::-1]
     return node[ends]

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from app.viewer.compare.difference import FrameDifference, Way, compare_frames, way_of
+from app.viewer.color.difference import FrameDifference, Way, compare_frames, way_of
 from physhandi.object_rollout import ObjectRollout
 
 logger = logging.getLogger(__name__)

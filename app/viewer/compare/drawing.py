@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from app.viewer.color.coloring import Painted
-from app.viewer.compare.difference import Way, take_difference
+from app.viewer.color.difference import Way, rollout_difference
 from app.viewer.compare.figure import ARROWS, FIGURE_BYTES, GAP, Extents, Side
 from app.viewer.compare.figure_camera import Box, Eye
 from app.viewer.compare.look import GHOST, SIDES, STYLES, Look, difference_paint, shade
@@ -41,7 +41,7 @@ class CompareDrawing:
         server: viser.ViserServer,
         content: Content,
         framing: Framing,
-        takes: list[ObjectRollout],
+        rollouts: list[ObjectRollout],
     ) -> None:
         """Measure what has to fit; nothing is drawn yet.
 
@@ -49,7 +49,7 @@ class CompareDrawing:
             server: Where to.
             content: Tells the ground, and what has to fit if there are no rollouts.
             framing: Sizes.
-            takes: The rollouts that are complete.
+            rollouts: The rollouts that are complete.
         """
         self._server = server
         self._content = content
@@ -62,14 +62,14 @@ class CompareDrawing:
         self._recorded = {
             name: RecordedDrawing(self._nodes, framing, f"{_ROOT}/{name}") for name in SIDES
         }
-        self._extents = _measure(content, framing, takes)
+        self._extents = _measure(content, framing, rollouts)
         self._eye = Eye(right=np.array([1.0, 0.0, 0.0]), up=np.array([0.0, 0.0, 1.0]))
         self._lock = threading.RLock()
         self._captions = dict.fromkeys(SIDES, "")
         self._shown: Float[ndarray, "node 3"] = np.zeros((0, 3))
         self._look = Look()
         self._way: Way | None = None
-        known = [float(np.quantile(s, 0.9)) for s in map(strengths, takes) if len(s)]
+        known = [float(np.quantile(s, 0.9)) for s in map(strengths, rollouts) if len(s)]
         self._force_unit = 0.07 * framing.extent / max(known, default=1.0)
         self._is_ground_laid = False
 
@@ -138,8 +138,12 @@ class CompareDrawing:
 
     def _draw_object(self, name: str, halves: Halves, layers: Layers, *, is_playing: bool) -> None:
         half, other = halves[name], halves["b" if name == "a" else "a"].side
-        take, drawing, strength = half.side.take, self._drawings[name], self._look.strength(name)
-        if take is None or take.ready == 0:
+        rollout, drawing, strength = (
+            half.side.rollout,
+            self._drawings[name],
+            self._look.strength(name),
+        )
+        if rollout is None or rollout.ready == 0:
             return
         # Springs would hide the other side long before they have faded.
         is_strong = strength > 0.5 and not self._look.is_ghost(name)
@@ -156,13 +160,13 @@ class CompareDrawing:
         )
         hands = sum(hand.vertex.shape[1] for hand in half.content.hands) if layers.hands else 0
         observed = PLAYING_OBSERVED if layers.observed else 0
-        points = take.model.node_count + len(drawing.attached(take)) + hands + observed
-        budget = share_bytes(FIGURE_BYTES // 2 - 15 * points, take, layers, ARROWS)
+        points = rollout.model.node_count + len(drawing.attached(rollout)) + hands + observed
+        budget = share_bytes(FIGURE_BYTES // 2 - 15 * points, rollout, layers, ARROWS)
         if not is_playing:
             budget = replace(budget, virtual=None, springs=None)
         painted = self._painted(name, half.side, other)
         drawing.draw(
-            take,
+            rollout,
             half.side.frame,
             shown,
             budget,
@@ -170,7 +174,7 @@ class CompareDrawing:
             longest=_LONGEST * self._framing.extent,
             painted=painted,
         )
-        point = np.asarray(take.position[half.side.frame], dtype=np.float32)
+        point = np.asarray(rollout.position[half.side.frame], dtype=np.float32)
         color = self._colors(name, half.side, painted, is_dark=layers.dark)
         size = self._look.node_size(name) * self._framing.spacing
         is_visible = layers.nodes and strength > 0.0
@@ -179,13 +183,13 @@ class CompareDrawing:
 
     def _painted(self, name: str, side: Side, other: Side) -> Painted | None:
         """Choose the colors that tell the difference; None for those of the side."""
-        take, look, way = side.take, self._look, self._way
-        if take is None or other.take is None or other.take.ready == 0 or way is None:
+        rollout, look, way = side.rollout, self._look, self._way
+        if rollout is None or other.rollout is None or other.rollout.ready == 0 or way is None:
             return None
         if look.tint != "difference" or look.is_ghost(name):
             return None
-        distance = take_difference(take, side.frame, other.take, other.frame, way)
-        return difference_paint(take, distance, look.scale)
+        distance = rollout_difference(rollout, side.frame, other.rollout, other.frame, way)
+        return difference_paint(rollout, distance, look.scale)
 
     def _colors(
         self, name: str, side: Side, painted: Painted | None, *, is_dark: bool
@@ -195,7 +199,7 @@ class CompareDrawing:
         if painted is not None:
             return shade(painted.node, strength, is_dark=is_dark)
         color = GHOST if self._look.is_ghost(name) else STYLES[name].node
-        count = 0 if side.take is None else side.take.model.node_count
+        count = 0 if side.rollout is None else side.rollout.model.node_count
         return shade(np.tile(np.array(color, np.uint8), (count, 1)), strength, is_dark=is_dark)
 
     @property
@@ -225,7 +229,9 @@ class CompareDrawing:
     def _remember(self, halves: Halves) -> None:
         """Keep the nodes of a moment, over which the line of the wipe moves."""
         sides = [half.side for half in halves.values()]
-        shown = [s.take.position[s.frame] for s in sides if s.take is not None and s.take.ready]
+        shown = [
+            s.rollout.position[s.frame] for s in sides if s.rollout is not None and s.rollout.ready
+        ]
         self._shown = np.concatenate([np.zeros((0, 3)), *map(np.asarray, shown)])
 
     def _place(self) -> None:
@@ -255,10 +261,10 @@ class CompareDrawing:
         nodes.segments(f"{_ROOT}/wipe", segment, GHOST, 2.0, is_visible=look.mode == "wipe")
 
 
-def _measure(content: Content, framing: Framing, takes: list[ObjectRollout]) -> Extents:
+def _measure(content: Content, framing: Framing, rollouts: list[ObjectRollout]) -> Extents:
     tracks: list[Float[ndarray, "frame point 3"]] = []
-    for take in takes:
-        tracks += [take.position, take.control]
+    for rollout in rollouts:
+        tracks += [rollout.position, rollout.control]
     if not tracks:
         tracks = [hand.vertex for hand in content.hands]
     count = min((len(track) for track in tracks), default=0)

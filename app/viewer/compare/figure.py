@@ -76,7 +76,7 @@ _STYLE = Style(
 class Side:
     """One half of the figure in one frame."""
 
-    take: ObjectRollout | None
+    rollout: ObjectRollout | None
     """The rollout; None while it is not there."""
     frame: int
     """One of its frames."""
@@ -112,9 +112,11 @@ class Figure:
         self._force_scale = 1.0
         self.measure_forces(fitted)
 
-    def measure_forces(self, *takes: ObjectRollout) -> None:
+    def measure_forces(self, *rollouts: ObjectRollout) -> None:
         """Choose one arrow scale, in which the strongest force of all rollouts is seen whole."""
-        strongest = max((float(strengths(take).max(initial=0.0)) for take in takes), default=0.0)
+        strongest = max(
+            (float(strengths(rollout).max(initial=0.0)) for rollout in rollouts), default=0.0
+        )
         self.force_unit = _LONGEST * self._framing.extent / strongest if strongest > 0 else 0.0
 
     @property
@@ -177,14 +179,16 @@ class Figure:
             self._place()
             for name, side in sides.items():
                 self._draw_hands(f"/figure/{name}", frame, layers)
-                if side.take is None:
+                if side.rollout is None:
                     continue
-                points = 12 * (side.take.model.node_count + len(self._attached(name, side.take)))
-                budget = share_bytes(left - points, side.take, layers, ARROWS)
+                points = 12 * (
+                    side.rollout.model.node_count + len(self._attached(name, side.rollout))
+                )
+                budget = share_bytes(left - points, side.rollout, layers, ARROWS)
                 if not is_playing:
                     budget = replace(budget, virtual=None, springs=None)
                 self._drawings[name].draw(
-                    side.take,
+                    side.rollout,
                     side.frame,
                     layers,
                     budget,
@@ -192,8 +196,8 @@ class Figure:
                     longest=self._framing.extent,
                 )
 
-    def _attached(self, name: str, take: ObjectRollout) -> ndarray:
-        return self._drawings[name].attached(take)
+    def _attached(self, name: str, rollout: ObjectRollout) -> ndarray:
+        return self._drawings[name].attached(rollout)
 
     def _hand_size(self) -> int:
         return sum(hand.vertex.shape[1] for hand in self._content.hands)

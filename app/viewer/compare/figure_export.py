@@ -29,17 +29,17 @@ def write_figure_npz(sides: Mapping[str, Side]) -> bytes:
     """
     arrays: dict[str, Any] = {}
     for name, side in sides.items():
-        take = side.take
-        if take is None:
+        rollout = side.rollout
+        if rollout is None:
             continue
         values = {
-            "position": take.position[: take.ready],
-            "control": take.control[: take.ready],
-            "spring_nodes": take.model.spring_nodes,
-            "rest_length": take.model.rest_length,
-            "stiffness": take.parameters.stiffness_scale * take.model.stiffness,
-            "object_spring_count": np.int64(take.model.object_spring_count),
-            "force": np.stack([take.forces(frame) for frame in range(take.ready)]),
+            "position": rollout.position[: rollout.ready],
+            "control": rollout.control[: rollout.ready],
+            "spring_nodes": rollout.model.spring_nodes,
+            "rest_length": rollout.model.rest_length,
+            "stiffness": rollout.parameters.stiffness_scale * rollout.model.stiffness,
+            "object_spring_count": np.int64(rollout.model.object_spring_count),
+            "force": np.stack([rollout.forces(frame) for frame in range(rollout.ready)]),
             "frame": np.int64(side.frame),
         }
         arrays |= {f"{name}_{key}": value for key, value in values.items()}
@@ -62,21 +62,21 @@ def write_figure_csv(sides: Mapping[str, Side]) -> bytes:
     table = csv.writer(stream)
     table.writerow(_COLUMNS)
     for name, side in sides.items():
-        if side.take is not None:
-            table.writerows(_rows(name, side.take, side.frame))
+        if side.rollout is not None:
+            table.writerows(_rows(name, side.rollout, side.frame))
     return stream.getvalue().encode()
 
 
-def _rows(name: str, take: ObjectRollout, frame: int) -> list[list[Any]]:
-    position, control = np.asarray(take.position[frame]), np.asarray(take.control[frame])
+def _rows(name: str, rollout: ObjectRollout, frame: int) -> list[list[Any]]:
+    position, control = np.asarray(rollout.position[frame]), np.asarray(rollout.control[frame])
     rows: list[list[Any]] = []
-    for node, (place, force) in enumerate(zip(position, take.forces(frame), strict=True)):
+    for node, (place, force) in enumerate(zip(position, rollout.forces(frame), strict=True)):
         rows.append([name, frame, "node", node, "", *_texts(place), *_texts(force), "", ""])
-    first = take.model.object_spring_count
-    springs = np.sort(take.model.spring_nodes[first:], axis=1)
-    rest = take.model.rest_length[first:]
-    for ends, force, length in zip(springs, take.spring_forces(frame), rest, strict=True):
-        node, holder = int(ends[0]), int(ends[1]) - take.model.node_count
+    first = rollout.model.object_spring_count
+    springs = np.sort(rollout.model.spring_nodes[first:], axis=1)
+    rest = rollout.model.rest_length[first:]
+    for ends, force, length in zip(springs, rollout.spring_forces(frame), rest, strict=True):
+        node, holder = int(ends[0]), int(ends[1]) - rollout.model.node_count
         stretched = float(np.linalg.norm(control[holder] - position[node]))
         texts = [*_texts(control[holder]), *_texts(force), *_texts([stretched, length])]
         rows.append([name, frame, "virtual_spring", node, holder, *texts])

@@ -136,14 +136,16 @@ class FigureMode:
 
     def sides(self, ours: ObjectRollout, ours_frame: int, frame: int) -> dict[str, Side]:
         """Collect what both halves show in a frame."""
-        left = Side(take=ours, frame=ours_frame, caption=self._caption("ours", ours))
-        rollout = self._rollout
-        if rollout is None or rollout.newest.ready == 0:
-            right = Side(take=None, frame=0, caption="PhysTwin-style\nsimulating …")
+        left = Side(rollout=ours, frame=ours_frame, caption=self._caption("ours", ours))
+        simulated = self._rollout
+        if simulated is None or simulated.newest.ready == 0:
+            right = Side(rollout=None, frame=0, caption="PhysTwin-style\nsimulating …")
         else:
-            take = rollout.newest
-            at = min(frame, take.ready - 1)
-            right = Side(take=take, frame=at, caption=self._caption("PhysTwin-style", take))
+            rollout = simulated.newest
+            at = min(frame, rollout.ready - 1)
+            right = Side(
+                rollout=rollout, frame=at, caption=self._caption("PhysTwin-style", rollout)
+            )
         return {"ours": left, "phystwin": right}
 
     def part(self, client: viser.ClientHandle) -> Pose:
@@ -190,14 +192,14 @@ class FigureMode:
         """Finds the picture's camera; the figure always has one of its own."""
         return self.picture
 
-    def _caption(self, name: str, take: ObjectRollout) -> str:
-        parameters, content = take.parameters, self._content
+    def _caption(self, name: str, rollout: ObjectRollout) -> str:
+        parameters, content = rollout.parameters, self._content
         is_metric = content is None or content.is_metric
         radius = parameters.virtual_connection_radius
         shown = f"{1e3 * radius:.3g} mm" if is_metric else f"{radius:.3g}"
         return (
             f"{name}\nδ {shown} · d_max {parameters.virtual_max_neighbors} · "
-            f"{take.model.virtual_spring_count} virtual springs"
+            f"{rollout.model.virtual_spring_count} virtual springs"
         )
 
     def _enter(self) -> None:

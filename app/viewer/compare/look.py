@@ -1,6 +1,6 @@
 """How two rollouts are shown together: side by side, one over the other, and in which colors."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -8,9 +8,9 @@ from numpy import ndarray
 
 from app.comparison import Mode, Tint
 from app.viewer.color.coloring import Painted
-from app.viewer.color.colormaps import levels, paint
-from app.viewer.color.quantities import QUANTITIES, Values, from_nodes
-from app.viewer.scene.object_drawing import Color, Style
+from app.viewer.color.legend import ColorScale
+from app.viewer.color.quantities import QUANTITIES, Values, from_nodes, in_length_unit
+from app.viewer.scene.object_drawing import RGB, Style
 from physhandi.object_rollout import ObjectRollout
 
 MODES: dict[Mode, str] = {"side": "side by side", "overlay": "overlay", "wipe": "wipe"}
@@ -35,7 +35,7 @@ STYLES = {
     ),
 }
 """Colors of both sides, told apart by people who confuse red and green too."""
-GHOST: Color = (140, 148, 160)
+GHOST: RGB = (140, 148, 160)
 """Color of A's nodes where B shows the difference from them."""
 _BACKGROUND = {False: (255, 255, 255), True: (24, 25, 28)}
 
@@ -84,27 +84,29 @@ def shade(
     return np.round(mixed).astype(np.uint8)
 
 
-def scale_end(value: float) -> float:
-    """Choose a round end of a color scale: the next of 1, 2, 5 times a power of ten."""
-    if not np.isfinite(value) or value <= 0.0:
-        return 0.0
-    power = 10.0 ** np.floor(np.log10(value))
-    return float(next(step * power for step in (1, 2, 5, 10) if step * power >= 0.999999 * value))
+def difference_scale(end: float, length_unit: str) -> ColorScale:
+    """Color scale of the difference of A and B.
+
+    Args:
+        end: Distance at the end of the scale [m].
+        length_unit: Unit of the content's lengths.
+    """
+    quantity = in_length_unit(QUANTITIES["difference"], length_unit)
+    quantity = replace(quantity, about="Distance of a node from the other side")
+    return ColorScale(quantity=quantity, limits=(0.0, end), is_open=True)
 
 
-def difference_paint(take: ObjectRollout, distance: Float[ndarray, " node"], end: float) -> Painted:
+def difference_paint(
+    rollout: ObjectRollout, distance: Float[ndarray, " node"], end: float
+) -> Painted:
     """Color nodes and springs by distances, from dark blue (none) to yellow (`end` and more).
 
     Args:
-        take: Whose nodes and springs.
+        rollout: Whose nodes and springs.
         distance: How far each node is from the other side [m].
         end: Distance at the end of the scale [m].
     """
-    limits = (0.0, end)
     return Painted(
-        values=Values(node=distance, spring=from_nodes(take, distance)),
-        node=paint(distance, limits),
-        level=levels(distance, limits),
-        quantity=QUANTITIES["difference"],
-        limits=limits,
+        values=Values(node=distance, spring=from_nodes(rollout, distance)),
+        scale=difference_scale(end, "m"),
     )

@@ -5,21 +5,20 @@ from collections.abc import Callable
 from html import escape
 from typing import Any
 
-import numpy as np
 import viser
-from viser import uplot
 
 from app.comparison import Mode
-from app.viewer.color.colormaps import table
+from app.viewer.color.legend import Legend, legend_html, swatches_html
 from app.viewer.compare.curve import DifferenceCurve
-from app.viewer.compare.look import MODES, SIDES, STYLES, Look, scale_end
-from app.viewer.physics.error_panel import plot_look
+from app.viewer.compare.look import MODES, SIDES, STYLES, Look, difference_scale
 from app.viewer.ui.guard import Guard, plain
 from app.viewer.ui.keyboard import bind
+from app.viewer.ui.plot import Curve, FramePlot, rounded_up
 
 _STYLE = "font-size:0.8em;line-height:1.5;padding:0 0.6em"
 _MEAN, _LARGEST = "rgb(132,94,194)", "rgb(200,70,120)"
 _NOW = "rgba(120,130,145,0.9)"
+_CURVES = (Curve(label="mean", color=_MEAN), Curve(label="max", color=_LARGEST))
 _COMPARED = {
     "nodes": "Each node of A from the same node of B.",
     "surface": "Each node from the other's surface: A and B are made of different nodes.",
@@ -57,10 +56,9 @@ class ComparePanel:
         self._change = change
         self._names = dict.fromkeys(SIDES, "")
         self._notes: tuple[str, ...] = ()
-        self._unit, self._factor = "mm", 1e3
-        self._tick, self._tick_count = 0, 1
+        self._length_unit, self._unit, self._factor = "m", "mm", 1e3
+        self._tick = 0
         self._plotted = 0
-        self._scales = (0.0, 0.0)
         # What is written must not be older than what it replaces.
         self._lock = threading.RLock()
         gui = server.gui
@@ -87,7 +85,7 @@ class ComparePanel:
                 "Swap sides", icon=viser.Icon.ARROWS_LEFT_RIGHT, color="gray", hint="X"
             )
             self._text = gui.add_html("")
-            self._plot = gui.add_uplot(self._data(), _series(), **plot_look("", 1), height=120)
+            self._plot = FramePlot(gui, _CURVES, frame_count=1, unit="", mark_color=_NOW)
         self._mode.on_update(guard.by_user(lambda _: self._choose()))
         self._tint.on_update(guard.by_user(lambda _: self._choose()))
         self._fade.on_update(guard.by_user(lambda _: self._choose()))
@@ -118,8 +116,8 @@ class ComparePanel:
         """
         self._names, self._notes = names, notes
         self._unit, self._factor = ("mm", 1e3) if unit == "m" else (unit, 1.0)
-        self._tick_count = tick_count
-        self._plot.axes = plot_look(self._unit, 1)["axes"]
+        self._length_unit = unit
+        self._plot.measure_in(self._unit, tick_count)
         self._dress()
         self.follow()
 
@@ -127,9 +125,8 @@ class ComparePanel:
         """Show what is measured by now; for any thread. Tells whether the color scale changed."""
         with self._lock:
             before = self._look.scale
-            self._look.scale = scale_end(self._curve.strong * self._factor) / self._factor
+            self._look.scale = rounded_up(self._curve.strong * self._factor) / self._factor
             self._draw_plot()
-            self._fit_scales()
             self._write()
             return self._look.scale != before
 
@@ -181,14 +178,14 @@ class ComparePanel:
 
     def _write(self) -> None:
         """Write the legend and the difference of the tick on the screen."""
-        lines = [
-            _dot(STYLES[name].node, f"{name.upper()} {escape(self._names[name])}") for name in SIDES
-        ]
+        names = [(STYLES[name].node, f"{name.upper()} {self._names[name]}") for name in SIDES]
         if self._look.is_swapped:
-            lines.reverse()
+            names.reverse()
+        written = swatches_html(names, is_list=True)
         if self._look.tint == "difference" and self._curve.way is not None:
-            lines.append(self._ramp())
-        self._set(self._legend, f'<div style="{_STYLE}">{"".join(lines)}</div>')
+            scale = difference_scale(self._look.scale, self._length_unit)
+            written += legend_html(Legend(scale=scale))
+        self._set(self._legend, written)
         self._set(self._text, f'<div style="{_STYLE}">{"<br/>".join(self._said())}</div>')
 
     def _said(self) -> list[str]:
@@ -205,67 +202,15 @@ class ComparePanel:
         said += [plain(_COMPARED[self._curve.way])] if self._curve.way else []
         return said + [f"<em>{escape(note)}</em>" for note in self._notes]
 
-    def _ramp(self) -> str:
-        """Draw the color scale with numbers below it."""
-        stops = ",".join(f"rgb({r},{g},{b})" for r, g, b in table("sequential")[::51])
-        end = self._look.scale * self._factor
-        marks = "".join(f"<span>{end * part:.3g}</span>" for part in (0, 0.25, 0.5, 0.75))
-        marks += f"<span>≥{end:.3g} {plain(self._unit)}</span>"
-        return (
-            '<div style="margin-top:0.4em">difference</div>'
-            '<div style="height:0.7em;border-radius:0.2em;'
-            f'background:linear-gradient(to right,{stops})"></div>'
-            f'<div style="display:flex;justify-content:space-between">{marks}</div>'
-        )
-
     @staticmethod
     def _set(place: Any, content: str) -> None:
         if place.content != content:
             place.content = content
 
-    def _fit_scales(self) -> None:
-        """Let the plot show all curves; it finds no scale of its own after it was empty."""
-        _, largest = self._curve.columns()
-        top = scale_end(float(np.nan_to_num(largest).max(initial=0.0)) * self._factor) or 1.0
-        last = float(max(self._tick_count - 1, 1))
-        if (last, top) != self._scales:
-            self._scales = (last, top)
-            y = uplot.Scale(range=(0.0, top))
-            self._plot.scales = {"x": uplot.Scale(time=False, range=(0.0, last)), "y": y}
-
     def _draw_plot(self) -> None:
         self._plotted = self._tick
-        self._plot.data = self._data()
-
-    def _data(self) -> tuple[np.ndarray, ...]:
-        """Collect the curves; the plot needs two points at least, and knows no gaps."""
-        count = max(self._tick_count, 2)
-        tick = np.arange(count, dtype=np.float64)
-        mean, largest = (np.nan_to_num(c[:count]) * self._factor for c in self._curve.columns())
-        shown = max(len(mean), 2)
-        padded = [np.pad(curve, (0, count - len(curve))) for curve in (mean, largest)]
-        now = np.zeros(count)
-        at = min(self._tick, count - 1)
-        now[at] = max(padded[1][at], float(padded[1].max(initial=0.0)) * 0.5)
-        return tuple(curve[:shown] for curve in (tick, *padded, now))
+        self._plot.show([curve * self._factor for curve in self._curve.columns()], self._tick)
 
 
 def _mark(color: str) -> str:
     return f'<span style="color:{color}">●</span>'
-
-
-def _dot(color: tuple[int, int, int], label: str) -> str:
-    return (
-        '<div style="overflow-wrap:anywhere"><span style="display:inline-block;width:0.7em;'
-        f'height:0.7em;border-radius:50%;background:rgb{color};margin-right:0.35em"></span>{label}</div>'
-    )
-
-
-def _series() -> tuple[uplot.Series, ...]:
-    points: Any = {"show": False}
-    return (
-        uplot.Series(label="frame"),
-        uplot.Series(label="mean", stroke=_MEAN, width=1.5, points=points),
-        uplot.Series(label="max", stroke=_LARGEST, width=1.5, points=points),
-        uplot.Series(label="now", stroke=_NOW, width=1, points=points),
-    )

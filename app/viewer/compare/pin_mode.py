@@ -105,12 +105,12 @@ class PinMode:
         with self._lock:
             content = self._content
             fitted = content.fitted if content is not None else None
-            take = fitted if is_fit else self._newest()
-            if content is None or self._framing is None or take is None or take.ready == 0:
+            rollout = fitted if is_fit else self._newest()
+            if content is None or self._framing is None or rollout is None or rollout.ready == 0:
                 raise MissingInputError("There is no simulated frame to keep yet.")
-            self._pinned, self._told = take, None
+            self._pinned, self._told = rollout, None
             if self._view is None:
-                self._enter(content, self._framing, take)
+                self._enter(content, self._framing, rollout)
         self._redraw()
 
     def stop(self) -> None:
@@ -138,13 +138,19 @@ class PinMode:
                 self._view.drawing.hide()
 
     def draw(
-        self, take: ObjectRollout, take_frame: int, frame: int, layers: Layers, *, is_playing: bool
+        self,
+        rollout: ObjectRollout,
+        rollout_frame: int,
+        frame: int,
+        layers: Layers,
+        *,
+        is_playing: bool,
     ) -> None:
         """Bring both sides to a frame.
 
         Args:
-            take: The rollout that the session shows, B.
-            take_frame: Its frame.
+            rollout: The rollout that the session shows, B.
+            rollout_frame: Its frame.
             frame: Frame of the hands.
             layers: What is shown.
             is_playing: Whether the clock is running.
@@ -153,28 +159,30 @@ class PinMode:
             view, pinned = self._view, self._pinned
             if view is None or pinned is None:
                 return
-            self._tell(view, pinned, self._newest() or take)
-            halves = self.halves(take, take_frame, frame)
+            self._tell(view, pinned, self._newest() or rollout)
+            halves = self.halves(rollout, rollout_frame, frame)
             view.draw(frame, halves, layers, is_playing=is_playing)
 
-    def halves(self, take: ObjectRollout, take_frame: int, frame: int) -> Halves:
+    def halves(self, rollout: ObjectRollout, rollout_frame: int, frame: int) -> Halves:
         """Collect what both sides show in a frame."""
         content, pinned = self._content, self._pinned
         if content is None or pinned is None:
             return {}
         sides = {
             "a": Side(
-                take=pinned,
+                rollout=pinned,
                 frame=min(frame, pinned.ready - 1),
                 caption=f"A · kept\n{self._changes(pinned)}",
             ),
-            "b": Side(take=take, frame=take_frame, caption=f"B · now\n{self._changes(take)}"),
+            "b": Side(
+                rollout=rollout, frame=rollout_frame, caption=f"B · now\n{self._changes(rollout)}"
+            ),
         }
         return {name: Half(side=side, content=content, frame=frame) for name, side in sides.items()}
 
-    def sides(self, take: ObjectRollout, take_frame: int, frame: int) -> dict[str, Side]:
+    def sides(self, rollout: ObjectRollout, rollout_frame: int, frame: int) -> dict[str, Side]:
         """Collect the rollouts of both sides in a frame, to be saved."""
-        halves = self.halves(take, take_frame, frame)
+        halves = self.halves(rollout, rollout_frame, frame)
         return {name: half.side for name, half in halves.items()}
 
     @property
@@ -199,8 +207,8 @@ class PinMode:
         with self._lock:
             return self._view is not None and self._view.reset_view(client)
 
-    def _enter(self, content: Content, framing: Framing, take: ObjectRollout) -> None:
-        drawing = CompareDrawing(self._server, content, framing, [take])
+    def _enter(self, content: Content, framing: Framing, rollout: ObjectRollout) -> None:
+        drawing = CompareDrawing(self._server, content, framing, [rollout])
         with self._place:
             self._view = CompareView(
                 self._server,
@@ -240,13 +248,13 @@ class PinMode:
         count = min(pinned.frame_count, newest.frame_count)
         return Pairing(first=pinned, second=newest, frames=tuple((f, f) for f in range(count)))
 
-    def _changes(self, take: ObjectRollout) -> str:
+    def _changes(self, rollout: ObjectRollout) -> str:
         """Say what a rollout has that the fit has not."""
         content = self._content
         fitted = content.fitted if content is not None else None
-        if content is None or fitted is None or take is fitted:
+        if content is None or fitted is None or rollout is fitted:
             return "the fit"
         sliders = knobs(fitted.parameters, length_unit=content.length_unit)
-        told = changes_in(sliders, fitted.parameters, take.parameters)
+        told = changes_in(sliders, fitted.parameters, rollout.parameters)
         text = ", ".join(change.text for change in told) or "as fitted"
         return text if len(text) <= _LONGEST_TEXT else f"{text[:_LONGEST_TEXT]} …"

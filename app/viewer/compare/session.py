@@ -22,7 +22,7 @@ from app.viewer.content.session_state import Kind, Pose, SessionState
 from app.viewer.export.export_panel import ExportPanel
 from app.viewer.export.snapshot import Snapshot
 from app.viewer.scene.framing import Framing, frame_content
-from app.viewer.scene.panels import LayersPanel, TimelinePanel, set_theme
+from app.viewer.scene.layers_panel import LayersPanel, TimelinePanel, set_theme
 from app.viewer.ui.guard import plain
 from app.viewer.ui.keyboard import bind
 from app.viewer.ui.scene_server import SceneServer
@@ -120,8 +120,8 @@ class CompareSession(SceneServer):
             return Snapshot(
                 content=first.content,
                 frame=first.frame,
-                take=first.side.take,
-                take_frame=first.side.frame,
+                rollout=first.side.rollout,
+                rollout_frame=first.side.frame,
                 sides={name: half.side for name, half in halves.items()},
                 picture=self._view.picture(),
                 layers=replace(self._layers),
@@ -144,8 +144,8 @@ class CompareSession(SceneServer):
         framing = frame_content(shown)
         self._layers = _first_layers(shown)
         _place_first(server, framing)
-        takes = [content.fitted for content in pair.contents if content.fitted is not None]
-        drawing = CompareDrawing(server, shown, framing, takes)
+        rollouts = [content.fitted for content in pair.contents if content.fitted is not None]
+        drawing = CompareDrawing(server, shown, framing, rollouts)
         self._timeline = TimelinePanel(server, self._playback, guard)
         self._view = CompareView(
             server,
@@ -210,11 +210,11 @@ class CompareSession(SceneServer):
 
 
 def _half(name: str, content: Content, frame: int) -> Half:
-    take = content.fitted
-    detail = "no object" if take is None else f"{take.model.node_count} nodes · frame {frame}"
+    rollout = content.fitted
+    detail = "no object" if rollout is None else f"{rollout.model.node_count} nodes · frame {frame}"
     side = Side(
-        take=take,
-        frame=min(frame, take.ready - 1) if take is not None else 0,
+        rollout=rollout,
+        frame=min(frame, rollout.ready - 1) if rollout is not None else 0,
         caption=f"{name.upper()} · {content.title}\n{detail}",
     )
     return Half(side=side, content=content, frame=frame)

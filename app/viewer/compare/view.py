@@ -73,7 +73,7 @@ class CompareView:
         self._cameras.restore(self._server)
 
     def close(self) -> None:
-        """Stop measuring, and take scene and panel away."""
+        """Stop measuring, and rollout scene and panel away."""
         self.curve.close()
         self.drawing.clear()
         self.panel.remove()

@@ -36,7 +36,7 @@ _ALWAYS_THE_SAME = (1980, 1, 1, 0, 0, 0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Picture:
+class Screenshot:
     """A picture of the scene."""
 
     content: bytes
@@ -49,13 +49,13 @@ class Picture:
     """Height [px]."""
 
     @classmethod
-    def of(cls, content: bytes, pose: Pose) -> "Picture":
+    def of(cls, content: bytes, pose: Pose) -> "Screenshot":
         """Read the size from a PNG file."""
         width, height = (int.from_bytes(content[at : at + 4], "big") for at in (16, 20))
         return cls(content=content, pose=pose, width=width, height=height)
 
 
-def bundle(snapshot: Snapshot, picture: Picture) -> bytes:
+def bundle(snapshot: Snapshot, picture: Screenshot) -> bytes:
     """Collect pictures, geometry, springs, forces, parameters, cameras and the link of a view.
 
     Args:
@@ -94,8 +94,8 @@ def _sides(snapshot: Snapshot) -> dict[str, tuple[ObjectRollout, int]]:
     """Name the rollouts that are shown, each with its frame."""
     if snapshot.sides is not None:
         sides: dict[str, Side] = dict(snapshot.sides)
-        return {n: (s.take, s.frame) for n, s in sides.items() if s.take is not None}
-    return {} if snapshot.take is None else {"shown": (snapshot.take, snapshot.take_frame)}
+        return {n: (s.rollout, s.frame) for n, s in sides.items() if s.rollout is not None}
+    return {} if snapshot.rollout is None else {"shown": (snapshot.rollout, snapshot.rollout_frame)}
 
 
 def _tables(sides: dict[str, tuple[ObjectRollout, int]]) -> dict[str, bytes]:
@@ -103,10 +103,10 @@ def _tables(sides: dict[str, tuple[ObjectRollout, int]]) -> dict[str, bytes]:
     controls: list[list[Any]] = []
     springs: list[list[Any]] = []
     forces: list[list[Any]] = []
-    for side, (take, frame) in sides.items():
-        model, first = take.model, take.model.object_spring_count
-        position, control = np.asarray(take.position[frame]), np.asarray(take.control[frame])
-        for node, (place, force) in enumerate(zip(position, take.forces(frame), strict=True)):
+    for side, (rollout, frame) in sides.items():
+        model, first = rollout.model, rollout.model.object_spring_count
+        position, control = np.asarray(rollout.position[frame]), np.asarray(rollout.control[frame])
+        for node, (place, force) in enumerate(zip(position, rollout.forces(frame), strict=True)):
             nodes.append([side, node, *_texts(place), *_texts(force)])
         ends = np.sort(model.spring_nodes, axis=1)
         held = np.bincount(ends[first:, 1] - model.node_count, minlength=len(control))
@@ -116,13 +116,13 @@ def _tables(sides: dict[str, tuple[ObjectRollout, int]]) -> dict[str, bytes]:
         for number, (node, other) in enumerate(ends.tolist()):
             is_virtual = number >= first
             rest = float(model.rest_length[number])
-            stiffness = take.parameters.stiffness_scale * float(model.stiffness[number])
+            stiffness = rollout.parameters.stiffness_scale * float(model.stiffness[number])
             about = [(1 + strain[number]) * rest, rest, strain[number], stiffness]
             kind = "virtual" if is_virtual else "object"
             end = other - model.node_count if is_virtual else other
             texts = _texts([*about, float(model.damping[number])])
             springs.append([side, number, kind, node, end, *texts])
-        for number, force in enumerate(take.spring_forces(frame), first):
+        for number, force in enumerate(rollout.spring_forces(frame), first):
             node, other = ends[number].tolist()
             forces.append([side, number, node, other - model.node_count, *_texts(force)])
     return {
@@ -135,15 +135,15 @@ def _tables(sides: dict[str, tuple[ObjectRollout, int]]) -> dict[str, bytes]:
 
 def _arrays(sides: dict[str, tuple[ObjectRollout, int]], snapshot: Snapshot) -> bytes:
     arrays: dict[str, Any] = {}
-    for side, (take, frame) in sides.items():
+    for side, (rollout, frame) in sides.items():
         prefix = "" if side == "shown" else f"{side}_"
         arrays |= {
-            f"{prefix}position": np.asarray(take.position[frame]),
-            f"{prefix}control": np.asarray(take.control[frame]),
-            f"{prefix}force": take.forces(frame),
-            f"{prefix}virtual_spring_force": take.spring_forces(frame),
+            f"{prefix}position": np.asarray(rollout.position[frame]),
+            f"{prefix}control": np.asarray(rollout.control[frame]),
+            f"{prefix}force": rollout.forces(frame),
+            f"{prefix}virtual_spring_force": rollout.spring_forces(frame),
         }
-        arrays |= {f"{prefix}{name}": array for name, array in take.model.to_tensors().items()}
+        arrays |= {f"{prefix}{name}": array for name, array in rollout.model.to_tensors().items()}
     for hand in snapshot.content.hands:
         vertex = hand.vertex[min(snapshot.frame, len(hand.vertex) - 1)]
         arrays[f"hand_{hand.side}_vertex"] = np.asarray(vertex)
@@ -155,7 +155,7 @@ def _arrays(sides: dict[str, tuple[ObjectRollout, int]], snapshot: Snapshot) -> 
 
 
 def _parameters(sides: dict[str, tuple[ObjectRollout, int]]) -> bytes:
-    content = {side: take.parameters.to_dict() for side, (take, _) in sides.items()}
+    content = {side: rollout.parameters.to_dict() for side, (rollout, _) in sides.items()}
     return yaml.safe_dump(plain(content.get("shown", content)), sort_keys=False).encode()
 
 
@@ -169,7 +169,7 @@ def _views(snapshot: Snapshot) -> Iterator[tuple[str, bytes]]:
                 yield f"views/{view.name}.png", content.tobytes()
 
 
-def _camera(picture: Picture, snapshot: Snapshot) -> dict[str, Any]:
+def _camera(picture: Screenshot, snapshot: Snapshot) -> dict[str, Any]:
     pose = picture.pose
     ahead = pose.look_at - pose.position
     ahead = ahead / np.linalg.norm(ahead)

@@ -10,7 +10,7 @@ import viser
 from app.viewer.compare.figure_export import write_figure_csv, write_figure_npz
 from app.viewer.content.content import Content
 from app.viewer.content.session_state import Pose
-from app.viewer.export.bundle import Picture, bundle
+from app.viewer.export.bundle import Screenshot, bundle
 from app.viewer.export.snapshot import (
     Snapshot,
     write_csv,
@@ -61,7 +61,11 @@ class ExportPanel:
         gui = server.gui
         with gui.add_folder("Export", expand_by_default=False):
             for label, options, hint in (
-                ("Frame", _FRAME, "Picture of this view; points; a ZIP with all data of this view"),
+                (
+                    "Frame",
+                    _FRAME,
+                    "Picture of this view; points; a ZIP with all data of this view",
+                ),
                 ("Motion", _MOTION, "All simulated frames as glTF, PLY files or arrays"),
                 ("Tables", _TABLES, "Means and forces of each frame; parameters"),
             ):
@@ -102,7 +106,7 @@ class ExportPanel:
             size = self._picture_size()
             content = write_png(client, snapshot.picture, size)
             if kind == "ZIP":
-                picture = Picture.of(content, Pose.of(client.camera))
+                picture = Screenshot.of(content, Pose.of(client.camera))
                 content = bundle(snapshot, picture)
         elif sides is not None and kind in {"NPZ", "CSV"}:
             content = write_figure_npz(sides) if kind == "NPZ" else write_figure_csv(sides)

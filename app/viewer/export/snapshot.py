@@ -32,9 +32,9 @@ class Snapshot:
     """What is shown."""
     frame: int
     """The frame."""
-    take: ObjectRollout | None
+    rollout: ObjectRollout | None
     """The object's rollout."""
-    take_frame: int
+    rollout_frame: int
     """Frame of the rollout."""
     sides: Mapping[str, Side] | None = None
     """Both halves of the figure, if the figure is shown."""
@@ -57,36 +57,36 @@ def scene_data(snapshot: Snapshot) -> SceneData:
     Raises:
         MissingInputError: If it is a recording, in which nothing was reconstructed.
     """
-    content, take, run = snapshot.content, snapshot.take, snapshot.run
-    if take is None and not content.hands:
+    content, rollout, run = snapshot.content, snapshot.rollout, snapshot.run
+    if rollout is None and not content.hands:
         raise MissingInputError("There is no rollout to save; this is a recording only.")
-    count = content.frame_count if take is None else take.ready
+    count = content.frame_count if rollout is None else rollout.ready
     nothing = np.zeros((count, 0, 3), np.float32)
-    control = content.control if take is None else take.control
+    control = content.control if rollout is None else rollout.control
     return SceneData(
         sequence=content.sequence_name,
         frame_rate=content.frame_rate,
         length_unit=content.length_unit,
-        rollout=nothing if take is None else np.asarray(take.position[:count]),
+        rollout=nothing if rollout is None else np.asarray(rollout.position[:count]),
         control=nothing if control is None else np.asarray(control[:count]),
-        spring_nodes=np.zeros((0, 2), np.int32) if take is None else take.model.spring_nodes,
-        object_spring_count=0 if take is None else take.model.object_spring_count,
+        spring_nodes=np.zeros((0, 2), np.int32) if rollout is None else rollout.model.spring_nodes,
+        object_spring_count=0 if rollout is None else rollout.model.object_spring_count,
         hands={
             hand.side: HandSurface(vertex=hand.vertex[:count], face=hand.face)
             for hand in content.hands
         },
         joints={hand.side: hand.joint[:count] for hand in content.hands if hand.joint is not None},
         run="" if run is None else run.id,
-        model={} if take is None else take.model.to_tensors(),
+        model={} if rollout is None else rollout.model.to_tensors(),
         skins={} if run is None else read_skins(run, content.sequence_name),
     )
 
 
 def write_ply(snapshot: Snapshot) -> bytes:
     """Write the frame: the object with its controls and hands, or else what is there of them."""
-    content, take = snapshot.content, snapshot.take
-    if take is not None:
-        return frame_to_ply(scene_data(snapshot), snapshot.take_frame)
+    content, rollout = snapshot.content, snapshot.rollout
+    if rollout is not None:
+        return frame_to_ply(scene_data(snapshot), snapshot.rollout_frame)
     frame = snapshot.frame
     parts: list[tuple[Any, tuple[int, int, int]]]
     parts = [(hand.vertex[frame], SKIN[hand.side]) for hand in content.hands]
@@ -107,16 +107,16 @@ def write_ply(snapshot: Snapshot) -> bytes:
 
 def write_npz(snapshot: Snapshot) -> bytes:
     """Write all frames: rollout, springs and controls, as they are on the screen."""
-    take, content = snapshot.take, snapshot.content
+    rollout, content = snapshot.rollout, snapshot.content
     arrays: dict[str, Any] = {}
-    if take is not None:
+    if rollout is not None:
         arrays = {
-            "position": take.position[: take.ready],
-            "control": take.control[: take.ready],
-            "spring_nodes": take.model.spring_nodes,
-            "rest_length": take.model.rest_length,
-            "stiffness": take.model.stiffness,
-            "object_spring_count": np.int64(take.model.object_spring_count),
+            "position": rollout.position[: rollout.ready],
+            "control": rollout.control[: rollout.ready],
+            "spring_nodes": rollout.model.spring_nodes,
+            "rest_length": rollout.model.rest_length,
+            "stiffness": rollout.model.stiffness,
+            "object_spring_count": np.int64(rollout.model.object_spring_count),
         }
     elif content.control is not None:
         arrays["control"] = content.control
@@ -131,29 +131,29 @@ def write_npz(snapshot: Snapshot) -> bytes:
 
 def write_csv(snapshot: Snapshot) -> bytes:
     """Write a table with one row a frame: mean position and force, largest speed."""
-    take = _take(snapshot)
+    rollout = _rollout(snapshot)
     stream = io.StringIO()
     table = csv.writer(stream)
     table.writerow(
         ["frame", "time_s", "mean_x", "mean_y", "mean_z", "force_x", "force_y", "force_z"]
     )
-    for frame in range(take.ready):
-        mean = np.asarray(take.position[frame]).mean(axis=0)
-        force = take.forces(frame).sum(axis=0)
-        seconds = frame / take.parameters.frame_rate
+    for frame in range(rollout.ready):
+        mean = np.asarray(rollout.position[frame]).mean(axis=0)
+        force = rollout.forces(frame).sum(axis=0)
+        seconds = frame / rollout.parameters.frame_rate
         table.writerow([frame, f"{seconds:.6g}", *(f"{v:.6g}" for v in (*mean, *force))])
     return stream.getvalue().encode()
 
 
 def write_yaml(snapshot: Snapshot) -> bytes:
     """Write the parameters of the rollout that is on the screen."""
-    return yaml.safe_dump(_take(snapshot).parameters.to_dict(), sort_keys=False).encode()
+    return yaml.safe_dump(_rollout(snapshot).parameters.to_dict(), sort_keys=False).encode()
 
 
-def _take(snapshot: Snapshot) -> ObjectRollout:
-    if snapshot.take is None:
+def _rollout(snapshot: Snapshot) -> ObjectRollout:
+    if snapshot.rollout is None:
         raise MissingInputError("There is no simulated object here to save.")
-    return snapshot.take
+    return snapshot.rollout
 
 
 def write_gltf(snapshot: Snapshot) -> bytes:

@@ -10,24 +10,23 @@ import numpy as np
 import viser
 from jaxtyping import Float
 from numpy import ndarray
-from viser import uplot
 
 from app.viewer.color.color_panel import ColorPanel
 from app.viewer.content.content import Content
 from app.viewer.inspect.picking import Pick, Ray, Target, pick
-from app.viewer.inspect.readings import HISTORIES, History, Readings, Rows, follow, unit_of
+from app.viewer.inspect.readings import HISTORIES, HistoryQuantity, Readings, Rows, follow, unit_of
 from app.viewer.scene.framing import Framing
 from app.viewer.scene.nodes import SceneNodes
-from app.viewer.scene.scene import Scene
+from app.viewer.scene.scene import SceneDrawing
 from app.viewer.ui.guard import Guard
 from app.viewer.ui.keyboard import bind
+from app.viewer.ui.plot import Curve, FramePlot
 from physhandi.object_rollout import ObjectRollout
 
 MARK = (233, 30, 180)
 """Color of what was clicked, which no scale has."""
 _REFRESH = 0.25
-_LONGEST_UNIT = 8
-_AXIS, _LINE, _NOW = "rgb(120,130,145)", "rgb(47,111,222)", "rgba(233,30,180,0.9)"
+_LINE, _NOW = "rgb(47,111,222)", "rgba(233,30,180,0.9)"
 _NONE = '<div style="font-size:0.8em;padding:0 0.9em 0.4em;opacity:0.8">Click {} to read it.</div>'
 
 
@@ -60,7 +59,7 @@ class Inspector:
         self._lock = threading.RLock()
         self._nodes = SceneNodes(server)
         self._content: Content | None = None
-        self._scene: Scene | None = None
+        self._scene: SceneDrawing | None = None
         self._readings: Readings | None = None
         self._framing: Framing | None = None
         self._pick: Pick | None = None
@@ -74,7 +73,7 @@ class Inspector:
         with self._folder:
             self._text = gui.add_html("")
             self._kind: Any = gui.add_dropdown("History of", ("speed",), visible=False)
-            self._plot: Any = None
+            self._plot: FramePlot | None = None
             self._clear = gui.add_button("Clear", color="gray", hint="Esc", visible=False)
         self._kind.on_update(guard.by_user(lambda _: self._choose_history()))
         self._clear.on_click(guard(lambda _: self.clear()))
@@ -88,7 +87,7 @@ class Inspector:
         """What was clicked."""
         return self._pick
 
-    def replace(self, content: Content, scene: Scene, framing: Framing) -> None:
+    def replace(self, content: Content, scene: SceneDrawing, framing: Framing) -> None:
         """Get ready for another content."""
         with self._lock:
             things = clickable(content)
@@ -127,9 +126,9 @@ class Inspector:
 
     def show(
         self,
-        take: ObjectRollout | None,
+        rollout: ObjectRollout | None,
         frame: int,
-        take_frame: int,
+        rollout_frame: int,
         *,
         is_playing: bool,
         is_hidden: bool,
@@ -137,36 +136,36 @@ class Inspector:
         """Follow the clock.
 
         Args:
-            take: The rollout that is drawn.
+            rollout: The rollout that is drawn.
             frame: Frame of the hands.
-            take_frame: Frame of the rollout.
+            rollout_frame: Frame of the rollout.
             is_playing: Whether the clock is running, so that less may be sent.
             is_hidden: Whether something else is shown instead of the scene.
         """
         with self._lock:
-            self._shown = (take, frame, take_frame)
+            self._shown = (rollout, frame, rollout_frame)
             chosen, readings = self._pick, self._readings
             if chosen is None or readings is None:
                 return
-            if not readings.exists(chosen, take):
+            if not readings.exists(chosen, rollout):
                 self.clear()
                 return
-            self._mark(chosen, readings, take, frame, take_frame, is_hidden=is_hidden)
+            self._mark(chosen, readings, rollout, frame, rollout_frame, is_hidden=is_hidden)
             now = time.monotonic()
             if is_playing and now - self._refreshed < _REFRESH:
                 return
             self._refreshed = now
-            title = readings.title(chosen, take)
-            rows = readings.rows(chosen, take, frame, take_frame)
+            title = readings.title(chosen, rollout)
+            rows = readings.rows(chosen, rollout, frame, rollout_frame)
             self._text.content = _table(title, rows)
-            self._draw_history(chosen, take, take_frame if chosen.kind != "hand" else frame)
+            self._draw_history(chosen, rollout, rollout_frame if chosen.kind != "hand" else frame)
 
     def _click(self, event: viser.SceneClickEvent, *, prefers_hand: bool) -> None:
         with self._lock:
             content, scene, framing = self._content, self._scene, self._framing
             if content is None or scene is None or framing is None:
                 return
-            take, frame, take_frame = self._shown
+            rollout, frame, rollout_frame = self._shown
             camera = event.client.camera
             ray = Ray(
                 origin=np.asarray(event.ray_origin, dtype=np.float64),
@@ -175,9 +174,9 @@ class Inspector:
             )
             target = Target(
                 content=content,
-                take=take,
+                rollout=rollout,
                 frame=frame,
-                take_frame=take_frame,
+                rollout_frame=rollout_frame,
                 layers=scene.layers,
                 spacing=framing.spacing,
                 faces=scene.faces,
@@ -190,9 +189,9 @@ class Inspector:
         self,
         chosen: Pick,
         readings: Readings,
-        take: ObjectRollout | None,
+        rollout: ObjectRollout | None,
         frame: int,
-        take_frame: int,
+        rollout_frame: int,
         *,
         is_hidden: bool,
     ) -> None:
@@ -200,15 +199,15 @@ class Inspector:
         framing = self._framing
         if framing is None:
             return
-        place = readings.place(chosen, take, frame, take_frame)
-        links = readings.links(chosen, take, take_frame)
-        size = 1.6 if take is None and chosen.kind != "hand" else 0.46
+        place = readings.place(chosen, rollout, frame, rollout_frame)
+        links = readings.links(chosen, rollout, rollout_frame)
+        size = 1.6 if rollout is None and chosen.kind != "hand" else 0.46
         with self._server.atomic():
             self._nodes.points(
                 "/picked/point", place, MARK, size * framing.spacing, is_visible=not is_hidden
             )
             self._nodes.segments("/picked/links", links, MARK, 3.0, is_visible=not is_hidden)
-            name = readings.title(chosen, take).partition(" (")[0]
+            name = readings.title(chosen, rollout).partition(" (")[0]
             if is_hidden:
                 self._nodes.show("/picked/name", is_visible=False)
                 return
@@ -227,52 +226,37 @@ class Inspector:
             self._remove_plot()
         self._redraw()
 
-    def _draw_history(self, chosen: Pick, take: ObjectRollout | None, frame: int) -> None:
+    def _draw_history(self, chosen: Pick, rollout: ObjectRollout | None, frame: int) -> None:
         """Bring the curve to what is simulated, and its mark to the frame on the screen."""
         content, scene = self._content, self._scene
         if content is None or scene is None:
             return
-        kind: History = self._kind.value
-        state = (chosen, kind, take, take.ready if take is not None else 0, scene.painter.reference)
+        kind: HistoryQuantity = self._kind.value
+        state = (
+            chosen,
+            kind,
+            rollout,
+            rollout.ready if rollout is not None else 0,
+            scene.painter.reference,
+        )
         unit, factor = unit_of(kind, content, scene.painter)
         if state != self._measured:
-            self._curve = factor * follow(chosen, kind, take, content, scene.painter)
+            self._curve = factor * follow(chosen, kind, rollout, content, scene.painter)
             self._measured = state
-        shown = np.flatnonzero(np.isfinite(self._curve))
-        if len(shown) < 2:  # A plot without points does not find its scale again.
-            shown, curve = np.arange(2), np.zeros(max(len(self._curve), 2))
-        else:
-            curve = self._curve
-        now = np.full(len(curve), float(np.min(curve[shown], initial=0.0)))
-        now[min(frame, len(now) - 1)] = float(np.max(curve[shown]))
-        data = tuple(np.asarray(part[shown]) for part in (np.arange(len(curve)) * 1.0, curve, now))
         if self._plot is None:
-            self._add_plot(data, kind, unit, content.frame_count)
-        else:
-            self._plot.data = data
-
-    def _add_plot(self, data: tuple[ndarray, ...], kind: str, unit: str, count: int) -> None:
-        # The choice above names the quantity; along the axis there is no room for long units too.
-        label = f"{kind} [{unit}]" if len(unit) <= _LONGEST_UNIT else unit
-        grid: Any = {"show": True, "stroke": "rgba(120,130,145,0.2)"}
-        points: Any = {"show": False}
-        with self._folder:
-            self._plot = self._server.gui.add_uplot(
-                data,
-                (
-                    uplot.Series(label="frame"),
-                    uplot.Series(label=kind, stroke=_LINE, width=1.5, points=points),
-                    uplot.Series(label="now", stroke=_NOW, width=1, points=points),
-                ),
-                scales={"x": uplot.Scale(time=False, range=(0.0, float(max(count - 1, 1))))},
-                axes=(
-                    uplot.Axis(stroke=_AXIS, grid=grid, size=26),
-                    uplot.Axis(stroke=_AXIS, grid=grid, size=44, label=label, labelSize=14),
-                ),
-                legend=uplot.Legend(show=False),
-                height=130,
-                order=self._kind.order + 0.1,
-            )
+            with self._folder:
+                self._plot = FramePlot(
+                    self._server.gui,
+                    (Curve(label=kind, color=_LINE),),
+                    frame_count=content.frame_count,
+                    unit=unit,
+                    quantity=kind,
+                    mark_color=_NOW,
+                    starts_at_zero=False,
+                    height=130,
+                    order=self._kind.order + 0.1,
+                )
+        self._plot.show((self._curve,), frame)
 
     def _remove_plot(self) -> None:
         if self._plot is not None:
@@ -324,7 +308,7 @@ class Inspection:
         bind(server, guard, "snapshot", lambda event, _: snapshot(event))
         bind(server, guard, "clear", lambda _, __: self._clear())
 
-    def replace(self, content: Content, scene: Scene, framing: Framing) -> None:
+    def replace(self, content: Content, scene: SceneDrawing, framing: Framing) -> None:
         """Get ready for another content."""
         painter = scene.painter if content.fitted is not None else scene.hand_painter
         self.colors.replace(content, scene.layers, painter)
@@ -332,16 +316,18 @@ class Inspection:
 
     def show(
         self,
-        take: ObjectRollout | None,
+        rollout: ObjectRollout | None,
         frame: int,
-        take_frame: int,
+        rollout_frame: int,
         *,
         is_playing: bool,
         is_hidden: bool,
     ) -> None:
         """Follow the clock; see `Inspector.show`."""
         self.colors.show(is_playing=is_playing, is_hidden=is_hidden)
-        self.inspector.show(take, frame, take_frame, is_playing=is_playing, is_hidden=is_hidden)
+        self.inspector.show(
+            rollout, frame, rollout_frame, is_playing=is_playing, is_hidden=is_hidden
+        )
 
     def _clear(self) -> None:
         self.inspector.clear()

@@ -11,7 +11,7 @@ from app.viewer.content.content import Content
 from app.viewer.content.layers import Layers
 from physhandi.object_rollout import ObjectRollout
 
-Kind = Literal["node", "spring", "control", "hand", "marker"]
+PickKind = Literal["node", "spring", "control", "hand", "marker"]
 
 NEAR_PIXELS = 9.0
 """Farther from a click than this, nothing is meant."""
@@ -24,7 +24,7 @@ _DEPTH = 2.5
 class Pick:
     """One thing in the scene."""
 
-    kind: Kind
+    kind: PickKind
     """What it is."""
     index: int
     """Number of the object node, of the spring in the model's order, of the control node, of
@@ -65,11 +65,11 @@ class Target:
 
     content: Content
     """Hands and control nodes."""
-    take: ObjectRollout | None
+    rollout: ObjectRollout | None
     """The rollout; None without an object."""
     frame: int
     """Frame of the hands."""
-    take_frame: int
+    rollout_frame: int
     """Frame of the rollout."""
     layers: Layers
     """Which parts are drawn."""
@@ -94,8 +94,8 @@ def pick(ray: Ray, target: Target, *, prefers_hand: bool = False) -> Pick | None
     if prefers_hand and hand is not None:
         return hand
     found = None
-    if target.take is not None:
-        found = _pick_object(ray, target, target.take)
+    if target.rollout is not None:
+        found = _pick_object(ray, target, target.rollout)
     elif content.control is not None and layers.controls:
         at = _nearest(ray, np.asarray(content.control[frame]), target.spacing)
         found = None if at is None else Pick(kind="control", index=at[0])
@@ -112,12 +112,12 @@ def _pick_marker(ray: Ray, target: Target) -> Pick | None:
     return None if at is None else Pick(kind="marker", index=at[0])
 
 
-def _pick_object(ray: Ray, target: Target, take: ObjectRollout) -> Pick | None:
-    frame, layers = target.take_frame, target.layers
+def _pick_object(ray: Ray, target: Target, rollout: ObjectRollout) -> Pick | None:
+    frame, layers = target.rollout_frame, target.layers
     spacing, faces = target.spacing, target.faces
-    position = np.asarray(take.position[frame], dtype=np.float64)
-    control = np.asarray(take.control[frame], dtype=np.float64)
-    count, own = take.model.node_count, take.model.object_spring_count
+    position = np.asarray(rollout.position[frame], dtype=np.float64)
+    control = np.asarray(rollout.control[frame], dtype=np.float64)
+    count, own = rollout.model.node_count, rollout.model.object_spring_count
     point = np.concatenate([position, control])
     offers: list[Int[ndarray, " point"]] = []
     if layers.nodes:
@@ -125,7 +125,7 @@ def _pick_object(ray: Ray, target: Target, take: ObjectRollout) -> Pick | None:
     if layers.all_controls:
         offers.append(count + np.arange(len(control)))
     elif layers.controls:
-        offers.append(np.unique(take.model.spring_nodes[own:].max(axis=1)))
+        offers.append(np.unique(rollout.model.spring_nodes[own:].max(axis=1)))
     if offers:
         number = np.concatenate(offers)
         at = _nearest(ray, point[number], spacing)
@@ -134,7 +134,7 @@ def _pick_object(ray: Ray, target: Target, take: ObjectRollout) -> Pick | None:
             if chosen < count:
                 return Pick(kind="node", index=chosen)
             return Pick(kind="control", index=chosen - count)
-    spring = _pick_spring(ray, point[take.model.spring_nodes], own, layers, spacing)
+    spring = _pick_spring(ray, point[rollout.model.spring_nodes], own, layers, spacing)
     if spring is not None:
         return Pick(kind="spring", index=spring)
     hit = first_triangle(ray, position, faces) if layers.surface else None

@@ -12,12 +12,12 @@ from app.viewer.color.hand_coloring import HandPainter
 from app.viewer.color.legend import number
 from app.viewer.content.content import Content
 from app.viewer.content.layers import Coloring
-from app.viewer.inspect.picking import Kind, Pick
+from app.viewer.inspect.picking import Pick, PickKind
 from physhandi.object_rollout import ObjectRollout
 
-History = Literal["speed", "force", "strain", "error", "difference", "height", "length"]
+HistoryQuantity = Literal["speed", "force", "strain", "error", "difference", "height", "length"]
 """What a chart can show of a thing."""
-HISTORIES: dict[Kind, tuple[History, ...]] = {
+HISTORIES: dict[PickKind, tuple[HistoryQuantity, ...]] = {
     "node": ("speed", "force", "strain", "error", "difference", "height"),
     "spring": ("strain", "force", "length"),
     "control": ("speed", "force", "height"),
@@ -28,36 +28,44 @@ HISTORIES: dict[Kind, tuple[History, ...]] = {
 
 
 def follow(
-    pick: Pick, kind: History, take: ObjectRollout | None, content: Content, painter: Painter
+    pick: Pick,
+    kind: HistoryQuantity,
+    rollout: ObjectRollout | None,
+    content: Content,
+    painter: Painter,
 ) -> Float[ndarray, " frame"]:
     """Follow one value of a thing over the frames that are ready, in SI units.
 
     Args:
         pick: The thing.
         kind: One of its `HISTORIES`.
-        take: The rollout; None without an object.
+        rollout: The rollout; None without an object.
         content: Hands and control nodes.
         painter: Measures what colors tell as well.
     """
-    if pick.kind in {"hand", "marker"} or take is None:
+    if pick.kind in {"hand", "marker"} or rollout is None:
         return _of_track(track_of(pick, content), kind, content.frame_rate)
     if kind == "height":
-        of = take.position if pick.kind == "node" else take.control
-        return np.asarray(of[: take.ready, pick.index, 2], dtype=np.float64)
+        of = rollout.position if pick.kind == "node" else rollout.control
+        return np.asarray(of[: rollout.ready, pick.index, 2], dtype=np.float64)
     if kind == "length":
-        first, second = take.model.spring_nodes[pick.index]
-        point = np.concatenate([take.position[: take.ready], take.control[: take.ready]], axis=1)
+        first, second = rollout.model.spring_nodes[pick.index]
+        point = np.concatenate(
+            [rollout.position[: rollout.ready], rollout.control[: rollout.ready]], axis=1
+        )
         return np.linalg.norm(point[:, second] - point[:, first], axis=-1).astype(np.float64)
-    part = reduced(take, pick)
+    part = reduced(rollout, pick)
     if pick.kind == "control":
-        return np.array([_of_control(pick.index, kind, part, frame) for frame in range(take.ready)])
-    values = [painter.measure(kind, part, frame) for frame in range(take.ready)]
+        return np.array(
+            [_of_control(pick.index, kind, part, frame) for frame in range(rollout.ready)]
+        )
+    values = [painter.measure(kind, part, frame) for frame in range(rollout.ready)]
     if pick.kind == "spring":
         return np.array([float(value.spring[0].mean()) for value in values])
     return np.array([float(value.node[pick.index]) for value in values])
 
 
-def unit_of(kind: History, content: Content, painter: Painter) -> tuple[str, float]:
+def unit_of(kind: HistoryQuantity, content: Content, painter: Painter) -> tuple[str, float]:
     """Tell the unit in which a history is written, and its number in one SI unit."""
     if kind == "height" or kind == "length":  # noqa: PLR1714  # narrows the type
         return length_unit(content)
@@ -80,18 +88,20 @@ def track_of(pick: Pick, content: Content) -> Float[ndarray, "frame 3"]:
     return np.asarray(hand.vertex[:, pick.index], dtype=np.float64)
 
 
-def springs_at(take: ObjectRollout, point: int) -> Int[ndarray, " spring"]:
+def springs_at(rollout: ObjectRollout, point: int) -> Int[ndarray, " spring"]:
     """Find the springs that end at an object node, or at a control node counted after them."""
-    return np.flatnonzero((take.model.spring_nodes == point).any(axis=1))
+    return np.flatnonzero((rollout.model.spring_nodes == point).any(axis=1))
 
 
-def reduced(take: ObjectRollout, pick: Pick) -> ObjectRollout:
+def reduced(rollout: ObjectRollout, pick: Pick) -> ObjectRollout:
     """Keep only the springs that matter to a thing, so that all its frames are read quickly."""
-    model = take.model
+    model = rollout.model
     if pick.kind == "spring":
         chosen = np.array([pick.index])
     else:
-        chosen = springs_at(take, pick.index + (model.node_count if pick.kind == "control" else 0))
+        chosen = springs_at(
+            rollout, pick.index + (model.node_count if pick.kind == "control" else 0)
+        )
     smaller = replace(
         model,
         spring_nodes=model.spring_nodes[chosen],
@@ -100,18 +110,18 @@ def reduced(take: ObjectRollout, pick: Pick) -> ObjectRollout:
         damping=model.damping[chosen],
         object_spring_count=int((chosen < model.object_spring_count).sum()),
     )
-    return replace(take, model=smaller)
+    return replace(rollout, model=smaller)
 
 
 def _of_track(
-    track: Float[ndarray, "frame 3"], kind: History, frame_rate: float
+    track: Float[ndarray, "frame 3"], kind: HistoryQuantity, frame_rate: float
 ) -> Float[ndarray, " frame"]:
     if kind == "height":
         return track[:, 2]
     return frame_rate * np.linalg.norm(np.diff(track, axis=0, prepend=track[:1]), axis=1)
 
 
-def _of_control(control: int, kind: History, part: ObjectRollout, frame: int) -> float:
+def _of_control(control: int, kind: HistoryQuantity, part: ObjectRollout, frame: int) -> float:
     value = part.state(frame)[3][control] if kind == "speed" else part.spring_forces(frame).sum(0)
     return float(np.linalg.norm(value))
 
@@ -135,10 +145,10 @@ class Readings:
         first = self._first_control(pick.side) if pick.kind == "hand" else None
         return pick if first is None else Pick(kind="control", index=first + pick.index)
 
-    def title(self, pick: Pick, take: ObjectRollout | None) -> str:
+    def title(self, pick: Pick, rollout: ObjectRollout | None) -> str:
         """Name a thing."""
-        if pick.kind == "spring" and take is not None:
-            is_own = pick.index < take.model.object_spring_count
+        if pick.kind == "spring" and rollout is not None:
+            is_own = pick.index < rollout.model.object_spring_count
             return f"{'object' if is_own else 'virtual'} spring {pick.index}"
         if pick.kind == "marker":
             return f"marker {pick.index}"
@@ -159,15 +169,15 @@ class Readings:
             return f"gripper, marker {markers.held[pick.index]}"
         return f"control node {pick.index}"
 
-    def exists(self, pick: Pick, take: ObjectRollout | None) -> bool:
+    def exists(self, pick: Pick, rollout: ObjectRollout | None) -> bool:
         """Tell whether a thing is there still, when the springs may be others."""
         if pick.kind == "hand":
             return True
         if pick.kind == "marker":
             return self._content.markers is not None
-        if take is None:
+        if rollout is None:
             return pick.kind == "control"
-        model = take.model
+        model = rollout.model
         count = {
             "node": model.node_count,
             "spring": len(model.spring_nodes),
@@ -176,50 +186,54 @@ class Readings:
         return pick.index < count.get(pick.kind, 0)
 
     def place(
-        self, pick: Pick, take: ObjectRollout | None, frame: int, take_frame: int
+        self, pick: Pick, rollout: ObjectRollout | None, frame: int, rollout_frame: int
     ) -> Float[ndarray, "end 3"]:
         """Find where a thing is: one point, or both ends of a spring [m]."""
         if pick.kind in {"hand", "marker"}:
             return track_of(pick, self._content)[[min(frame, self._content.frame_count - 1)]]
-        if take is None:
+        if rollout is None:
             control = self._content.control
             return np.zeros((0, 3)) if control is None else np.asarray(control[frame])[[pick.index]]
-        point = np.concatenate([take.position[take_frame], take.control[take_frame]])
+        point = np.concatenate([rollout.position[rollout_frame], rollout.control[rollout_frame]])
         if pick.kind == "spring":
-            return point[take.model.spring_nodes[pick.index]]
-        offset = take.model.node_count if pick.kind == "control" else 0
+            return point[rollout.model.spring_nodes[pick.index]]
+        offset = rollout.model.node_count if pick.kind == "control" else 0
         return point[[pick.index + offset]]
 
     def links(
-        self, pick: Pick, take: ObjectRollout | None, take_frame: int
+        self, pick: Pick, rollout: ObjectRollout | None, rollout_frame: int
     ) -> Float[ndarray, "segment 2 3"]:
         """Find the spring itself, or the virtual springs that end at a thing [m]."""
-        if take is None or pick.kind in {"hand", "marker"}:
+        if rollout is None or pick.kind in {"hand", "marker"}:
             return np.zeros((0, 2, 3), np.float32)
-        point = np.concatenate([take.position[take_frame], take.control[take_frame]])
+        point = np.concatenate([rollout.position[rollout_frame], rollout.control[rollout_frame]])
         if pick.kind == "spring":
-            return point[take.model.spring_nodes[[pick.index]]]
-        offset = take.model.node_count if pick.kind == "control" else 0
-        joined = springs_at(take, pick.index + offset)
-        return point[take.model.spring_nodes[joined[joined >= take.model.object_spring_count]]]
+            return point[rollout.model.spring_nodes[[pick.index]]]
+        offset = rollout.model.node_count if pick.kind == "control" else 0
+        joined = springs_at(rollout, pick.index + offset)
+        return point[
+            rollout.model.spring_nodes[joined[joined >= rollout.model.object_spring_count]]
+        ]
 
-    def rows(self, pick: Pick, take: ObjectRollout | None, frame: int, take_frame: int) -> Rows:
+    def rows(
+        self, pick: Pick, rollout: ObjectRollout | None, frame: int, rollout_frame: int
+    ) -> Rows:
         """List names and values of everything that is known of a thing now."""
-        place = self.place(pick, take, frame, take_frame)
-        if pick.kind in {"hand", "marker"} or take is None:
+        place = self.place(pick, rollout, frame, rollout_frame)
+        if pick.kind in {"hand", "marker"} or rollout is None:
             where = [("position", self._vector(place[0], self._units))] if len(place) else []
             return where + self._recorded_rows(pick, frame)
         if pick.kind == "spring":
-            return self._spring_rows(pick.index, take, take_frame)
+            return self._spring_rows(pick.index, rollout, rollout_frame)
         rows = [("position", self._vector(place[0], self._unit))]
-        node_velocity, control_velocity = (take.state(take_frame)[i] for i in (1, 3))
+        node_velocity, control_velocity = (rollout.state(rollout_frame)[i] for i in (1, 3))
         velocity = (node_velocity if pick.kind == "node" else control_velocity)[pick.index]
         rows.append(("velocity", self._vector(velocity, f"{self._unit}/s", size=True)))
-        own = take.model.object_spring_count
-        offset = take.model.node_count if pick.kind == "control" else 0
-        joined = springs_at(take, pick.index + offset)
+        own = rollout.model.object_spring_count
+        offset = rollout.model.node_count if pick.kind == "control" else 0
+        joined = springs_at(rollout, pick.index + offset)
         held = joined[joined >= own]
-        force = take.spring_forces(take_frame)[held - own].sum(axis=0)
+        force = rollout.spring_forces(rollout_frame)[held - own].sum(axis=0)
         if pick.kind == "node":
             rows.append(
                 (
@@ -227,11 +241,11 @@ class Readings:
                     self._vector(force, "N", size=True),
                 )
             )
-            rows += self._node_rows(pick.index, take, take_frame, int((joined < own).sum()))
-            rows.append(("held by", self._partners(take, take_frame, held, is_control=True)))
+            rows += self._node_rows(pick.index, rollout, rollout_frame, int((joined < own).sum()))
+            rows.append(("held by", self._partners(rollout, rollout_frame, held, is_control=True)))
         else:
             rows.append(("force on the object", self._vector(force, "N", size=True)))
-            rows.append(("holds", self._partners(take, take_frame, held, is_control=False)))
+            rows.append(("holds", self._partners(rollout, rollout_frame, held, is_control=False)))
         return rows
 
     def _recorded_rows(self, pick: Pick, frame: int) -> Rows:
@@ -259,9 +273,9 @@ class Readings:
             rows.append((f"to marker {other}", f"{number(factor * length)} {unit}"))
         return rows
 
-    def _spring_rows(self, spring: int, take: ObjectRollout, frame: int) -> Rows:
-        model = take.model
-        point = np.concatenate([take.position[frame], take.control[frame]])
+    def _spring_rows(self, spring: int, rollout: ObjectRollout, frame: int) -> Rows:
+        model = rollout.model
+        point = np.concatenate([rollout.position[frame], rollout.control[frame]])
         a, b = (int(end) for end in model.spring_nodes[spring])
         length = float(np.linalg.norm(point[b] - point[a]))
         unit, factor = length_unit(self._content)
@@ -269,39 +283,44 @@ class Readings:
             f"node {end}" if end < model.node_count else f"control node {end - model.node_count}"
             for end in (a, b)
         ]
-        stiffness = take.parameters.stiffness_scale * float(model.stiffness[spring])
+        stiffness = rollout.parameters.stiffness_scale * float(model.stiffness[spring])
         rest = float(model.rest_length[spring])
         lengths = f"{number(factor * length)} {unit}, at rest {number(factor * rest)} {unit}"
         return [
             ("joins", " and ".join(names)),
             ("length", lengths),
-            ("strain", f"{number(1e2 * float(take.strains(frame)[spring]))} %"),
-            ("pull", f"{number(float(take.tensions(frame)[spring]))} N"),
+            ("strain", f"{number(1e2 * float(rollout.strains(frame)[spring]))} %"),
+            ("pull", f"{number(float(rollout.tensions(frame)[spring]))} N"),
             ("stiffness", f"{number(stiffness)} N"),
             ("damping", f"{number(float(model.damping[spring]))} N·s/m"),
         ]
 
-    def _node_rows(self, node: int, take: ObjectRollout, frame: int, spring_count: int) -> Rows:
+    def _node_rows(self, node: int, rollout: ObjectRollout, frame: int, spring_count: int) -> Rows:
         rows: Rows = []
         kinds: tuple[Coloring, ...] = ("stiffness", "damping", "strain", "error", "difference")
         for kind in kinds:
             if kind == "error" and not self._painter.errors.is_known:
                 continue
             quantity = self._painter.quantity(kind)
-            value = float(self._painter.measure(kind, take, frame).node[node]) * quantity.factor
+            value = float(self._painter.measure(kind, rollout, frame).node[node]) * quantity.factor
             shown = f"{number(value)} {quantity.unit}" if np.isfinite(value) else "not known"
             rows.append((quantity.label.lower(), shown))
         return [*rows, ("object springs", str(spring_count))]
 
     def _partners(
-        self, take: ObjectRollout, frame: int, springs: Int[ndarray, " spring"], *, is_control: bool
+        self,
+        rollout: ObjectRollout,
+        frame: int,
+        springs: Int[ndarray, " spring"],
+        *,
+        is_control: bool,
     ) -> str:
         """Name what virtual springs join a thing to, the one that pulls hardest first."""
         if len(springs) == 0:
             return "nothing"
-        pull = np.abs(take.tensions(frame)[springs])
-        ends = take.model.spring_nodes[springs]
-        partner = ends.max(axis=1) - take.model.node_count if is_control else ends.min(axis=1)
+        pull = np.abs(rollout.tensions(frame)[springs])
+        ends = rollout.model.spring_nodes[springs]
+        partner = ends.max(axis=1) - rollout.model.node_count if is_control else ends.min(axis=1)
         order = np.argsort(-pull, kind="stable")
         what = "control" if is_control else "node"
         named = [f"{what} {int(partner[i])} ({number(float(pull[i]))} N)" for i in order[:_NAMED]]

@@ -8,10 +8,10 @@ import numpy as np
 import viser
 from jaxtyping import Float
 from numpy import ndarray
-from viser import uplot
 
 from app.viewer.content.content import Content
 from app.viewer.ui.guard import plain
+from app.viewer.ui.plot import Curve, FramePlot
 from physhandi.data.files import named_fields
 from physhandi.object_rollout import ObjectRollout
 from physhandi.run import Run
@@ -19,7 +19,6 @@ from physhandi.run import Run
 _REFRESH = 0.25
 _STYLE = "font-size:0.8em;line-height:1.5;padding:0 0.6em"
 _FIT, _AGAIN = "rgb(46,160,67)", "rgb(47,111,222)"
-_NOW, _AXIS = "rgba(214,39,40,0.7)", "rgb(120,130,145)"
 
 
 def load_track_error(
@@ -79,7 +78,6 @@ class ErrorPanel:
         self._per_unit = 1e3 if content.is_metric else 1.0
         self._unit = "mm" if content.is_metric else content.length_unit
         count = fitted.frame_count
-        self._frames = np.arange(count, dtype=np.float64)
         self._source = "the tracks" if content.tracks is None else content.tracks.name
         self._track = np.full(count, np.nan) if track_error is None else track_error[:count]
         self._again = np.zeros(count)
@@ -91,8 +89,12 @@ class ErrorPanel:
         self._folder = server.gui.add_folder("Error per frame")
         with self._folder:
             self._text = server.gui.add_html("")
-            self._plot = server.gui.add_uplot(
-                self._data(), self._series(), **plot_look(self._unit, max(count - 1, 1)), height=120
+            fit = [Curve(label="fit", color=_FIT)] if np.isfinite(self._track).any() else []
+            self._plot = FramePlot(
+                server.gui,
+                [*fit, Curve(label="re-simulated", color=_AGAIN)],
+                frame_count=count,
+                unit=self._unit,
             )
         self._write(at_once=True)
 
@@ -118,7 +120,7 @@ class ErrorPanel:
         with self._lock:
             if take is not self._take:
                 self._take, self._measured = take, 0
-                self._again = np.zeros(len(self._frames))
+                self._again = np.zeros(len(self._track))
             is_fit = take is self._fitted
             for frame in range(self._measured, 0 if is_fit else take.ready):
                 self._again[frame] = take.frame_distance(self._fitted, frame)
@@ -128,7 +130,7 @@ class ErrorPanel:
     @property
     def errors(self) -> tuple[float, float]:
         """Errors of the current frame [m]: fit against tracks, re-simulation against fit."""
-        frame = min(self._frame, len(self._frames) - 1)
+        frame = min(self._frame, len(self._track) - 1)
         is_there = self._take is self._fitted or frame < self._measured
         return float(self._track[frame]), float(self._again[frame]) if is_there else float("nan")
 
@@ -145,7 +147,7 @@ class ErrorPanel:
             new = self._words(_AGAIN, "re-simulated", again, "from the fit")
         said = "<br/>".join(text for text in (fit, new) if text) or "Move a slider to compare."
         self._text.content = f'<div style="{_STYLE}">{said}</div>'
-        self._plot.data = self._data()
+        self._plot.show(self._curves(), self._frame)
 
     def _words(self, color: str, what: str, error: float, other: str) -> str:
         if not np.isfinite(error):
@@ -153,40 +155,10 @@ class ErrorPanel:
         dot = f'<span style="color:{color}">●</span>'
         return f"{dot} {what} {error * self._per_unit:.3g} {plain(self._unit)} {other}"
 
-    def _data(self) -> tuple[ndarray, ...]:
-        """Collect the curves, as far as the rollout is simulated; the plot knows no gaps."""
-        has_track = np.isfinite(self._track)
-        shown = np.flatnonzero(has_track if has_track.any() else np.ones(len(self._frames)))
+    def _curves(self) -> list[Float[ndarray, " frame"]]:
+        """Collect the curves, as far as the rollout is simulated."""
+        again = self._again.copy()
         if self._take is not self._fitted:
-            # A plot that was empty once does not find its scale again: two points at least.
-            shown = shown[: max(int((shown < self._measured).sum()), 2)]
-        track = np.nan_to_num(self._track) * self._per_unit
-        again = np.nan_to_num(self._again) * self._per_unit
-        # A line along the axis that rises to the curves at the frame on the screen.
-        now = np.zeros(len(self._frames))
-        frame = min(self._frame, len(now) - 1)
-        now[frame] = max(track[frame], again[frame])
-        return tuple(curve[shown] for curve in (self._frames, track, again, now))
-
-    def _series(self) -> tuple[uplot.Series, ...]:
-        points: Any = {"show": False}
-        has_track = bool(np.isfinite(self._track).any())
-        return (
-            uplot.Series(label="frame"),
-            uplot.Series(label="fit", stroke=_FIT, width=1.5, points=points, show=has_track),
-            uplot.Series(label="re-simulated", stroke=_AGAIN, width=1.5, points=points),
-            uplot.Series(label="now", stroke=_NOW, width=1, points=points),
-        )
-
-
-def plot_look(unit: str, last: int) -> dict[str, Any]:
-    """Choose scales and axes of a small plot over the frames up to `last`."""
-    grid: Any = {"show": True, "stroke": "rgba(120,130,145,0.2)"}
-    return {
-        "scales": {"x": uplot.Scale(time=False, range=(0.0, float(last)))},
-        "axes": (
-            uplot.Axis(stroke=_AXIS, grid=grid, size=26),
-            uplot.Axis(stroke=_AXIS, grid=grid, size=38, label=unit, labelSize=14),
-        ),
-        "legend": uplot.Legend(show=False),
-    }
+            again[self._measured :] = np.nan
+        tracks = [self._track] if np.isfinite(self._track).any() else []
+        return [curve * self._per_unit for curve in (*tracks, again)]

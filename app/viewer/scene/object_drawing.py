@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from app.viewer.color.coloring import Painted
-from app.viewer.color.colormaps import UNKNOWN, table
+from app.viewer.color.colormaps import UNKNOWN
 from app.viewer.content.layers import BLUE, GREY, PLAYING_SPRINGS, RED, YELLOW, Layers
 from app.viewer.scene.framing import Framing
 from app.viewer.scene.nodes import SceneNodes
@@ -70,7 +70,7 @@ class SurfaceDrawing:
         used, local = _compact(chosen)
         color = UNKNOWN
         if number < STEPS:
-            ramp = table(painted.quantity.scale)
+            ramp = painted.scale.ramp
             at = round((number + 0.5) / STEPS * (len(ramp) - 1))
             color = (int(ramp[at, 0]), int(ramp[at, 1]), int(ramp[at, 2]))
         self._nodes.mesh(
@@ -104,7 +104,7 @@ def _compact(
     return used, local.reshape(-1, 3).astype(np.uint32)
 
 
-Color = tuple[int, int, int]
+RGB = tuple[int, int, int]
 
 QUIET_FORCE = 1e-6
 """Weaker forces are no forces [N]."""
@@ -128,12 +128,12 @@ class Budget:
     """Most force arrows; the weakest are left out."""
 
 
-def share_bytes(left: int, take: ObjectRollout, layers: Layers, arrows: int) -> Budget:
+def share_bytes(left: int, rollout: ObjectRollout, layers: Layers, arrows: int) -> Budget:
     """Divide what a playing frame may still weigh between virtual and object springs.
 
     Args:
         left: Bytes that are left when all points are sent.
-        take: The rollout.
+        rollout: The rollout.
         layers: Tells whether there are object springs and arrows at all.
         arrows: Most force arrows.
     """
@@ -141,24 +141,24 @@ def share_bytes(left: int, take: ObjectRollout, layers: Layers, arrows: int) -> 
     arrows = min(arrows, max(left // (2 * 24), _LEAST_ARROWS))
     count = left // each - (arrows if layers.forces else 0)
     count = min(max(count, PLAYING_SPRINGS // 10), PLAYING_SPRINGS)
-    virtual = min(take.model.virtual_spring_count, count)
+    virtual = min(rollout.model.virtual_spring_count, count)
     if layers.object_springs:
         virtual = min(virtual, count // 2)
     return Budget(virtual=max(virtual, 1), springs=max(count - virtual, 1), arrows=arrows)
 
 
-def strengths(take: ObjectRollout) -> Float[ndarray, " node"]:
+def strengths(rollout: ObjectRollout) -> Float[ndarray, " node"]:
     """Sample how hard the virtual springs pull the nodes that they hold, over the frames [N]."""
-    frames = np.unique(np.linspace(0, take.ready - 1, _SAMPLED_FRAMES).astype(int))
-    strength = np.concatenate([np.linalg.norm(take.forces(int(f)), axis=-1) for f in frames])
+    frames = np.unique(np.linspace(0, rollout.ready - 1, _SAMPLED_FRAMES).astype(int))
+    strength = np.concatenate([np.linalg.norm(rollout.forces(int(f)), axis=-1) for f in frames])
     return strength[strength > QUIET_FORCE]
 
 
-def automatic_force_unit(take: ObjectRollout | None, framing: Framing) -> float:
+def automatic_force_unit(rollout: ObjectRollout | None, framing: Framing) -> float:
     """Choose how long an arrow of 1 N is, so that the strong ones of a rollout are seen well."""
-    if take is None:
+    if rollout is None:
         return 0.0
-    strength = strengths(take)
+    strength = strengths(rollout)
     strong = float(np.quantile(strength, 0.9)) if len(strength) else 1.0
     return 0.07 * framing.extent / strong
 
@@ -169,15 +169,15 @@ class Style:
 
     is_solid: bool = False
     """Whether nodes are shaded spheres instead of disks, which is heavier to show."""
-    node: Color = BLUE
+    node: RGB = BLUE
     """Color of object nodes."""
-    control: Color = RED
+    control: RGB = RED
     """Color of control nodes."""
-    spring: Color = GREY
+    spring: RGB = GREY
     """Color of object springs."""
-    virtual: Color = YELLOW
+    virtual: RGB = YELLOW
     """Color of virtual springs."""
-    arrow: Color = RED
+    arrow: RGB = RED
     """Color of force arrows."""
     node_size: float = 0.36
     """Diameter of object nodes."""
@@ -214,17 +214,17 @@ class ObjectDrawing:
         self._model_shown: ObjectRollout | None = None
         self._attached: Int[ndarray, " control"] = np.zeros(0, np.int64)
 
-    def attached(self, take: ObjectRollout) -> Int[ndarray, " control"]:
+    def attached(self, rollout: ObjectRollout) -> Int[ndarray, " control"]:
         """Find the control nodes that hold the object by a virtual spring."""
-        if take is not self._model_shown:
-            springs = take.model.spring_nodes[take.model.object_spring_count :]
-            self._attached = np.unique(springs.max(axis=1) - take.model.node_count)
-            self._model_shown = take
+        if rollout is not self._model_shown:
+            springs = rollout.model.spring_nodes[rollout.model.object_spring_count :]
+            self._attached = np.unique(springs.max(axis=1) - rollout.model.node_count)
+            self._model_shown = rollout
         return self._attached
 
     def draw(
         self,
-        take: ObjectRollout,
+        rollout: ObjectRollout,
         frame: int,
         layers: Layers,
         budget: Budget,
@@ -237,7 +237,7 @@ class ObjectDrawing:
         """Bring the object to a frame.
 
         Args:
-            take: The rollout.
+            rollout: The rollout.
             frame: One of its frames.
             layers: What is shown.
             budget: How much may be sent.
@@ -246,9 +246,9 @@ class ObjectDrawing:
             painted: Colors of nodes and springs; None for those of the style.
             faces: Triangles between the nodes; None without a surface.
         """
-        root, count = self._root, take.model.object_spring_count
-        position = np.asarray(take.position[frame], dtype=np.float32)
-        control = np.asarray(take.control[frame], dtype=np.float32)
+        root, count = self._root, rollout.model.object_spring_count
+        position = np.asarray(rollout.position[frame], dtype=np.float32)
+        control = np.asarray(rollout.control[frame], dtype=np.float32)
         style = self._style
         size = style.node_size * self._framing.spacing
         shown = _thinned(0, len(position), budget.nodes)
@@ -261,17 +261,17 @@ class ObjectDrawing:
             painted,
             is_visible=layers.surface,
         )
-        self.draw_controls(control, self.attached(take), layers)
+        self.draw_controls(control, self.attached(rollout), layers)
         point = np.concatenate([position, control])
         own = _thinned(0, count, budget.springs)
-        held = _thinned(count, len(take.model.spring_nodes), budget.virtual)
+        held = _thinned(count, len(rollout.model.spring_nodes), budget.virtual)
         for name, chosen, color, width, is_visible in (
             ("virtual", held, style.virtual, style.virtual_width, layers.virtual_springs),
             ("object", own, style.spring, style.spring_width, layers.object_springs),
         ):
             self._nodes.segments(
                 f"{root}/springs/{name}",
-                point[take.model.spring_nodes[chosen if is_visible else slice(0)]],
+                point[rollout.model.spring_nodes[chosen if is_visible else slice(0)]],
                 painted.springs(chosen) if painted is not None else color,
                 width,
                 is_visible=is_visible,
@@ -279,7 +279,7 @@ class ObjectDrawing:
         arrows = np.zeros((0, 2, 3), np.float32)
         if layers.forces:
             unit = force_unit * layers.force_scale
-            arrows = force_arrows(take, frame, unit, longest, budget.arrows)
+            arrows = force_arrows(rollout, frame, unit, longest, budget.arrows)
         shortest = 0.004 * self._framing.extent
         arrows = arrows[np.linalg.norm(arrows[:, 1] - arrows[:, 0], axis=-1) > shortest]
         width = style.arrow_width * self._framing.extent
@@ -306,12 +306,12 @@ class ObjectDrawing:
 
 
 def force_arrows(
-    take: ObjectRollout, frame: int, force_unit: float, longest: float, most: int
+    rollout: ObjectRollout, frame: int, force_unit: float, longest: float, most: int
 ) -> Float[ndarray, "arrow 2 3"]:
     """Lay out the forces that the hand puts on the object through the virtual springs.
 
     Args:
-        take: The rollout.
+        rollout: The rollout.
         frame: One of its frames.
         force_unit: Length of an arrow of 1 N.
         longest: No arrow is longer than this.
@@ -320,14 +320,14 @@ def force_arrows(
     Returns:
         Start and end of the arrows, the strongest first.
     """
-    force = take.forces(frame)
+    force = rollout.forces(frame)
     strength = np.linalg.norm(force, axis=-1)
     node = np.flatnonzero(strength > QUIET_FORCE)
     node = node[np.argsort(-strength[node], kind="stable")[:most]]
     offset = force[node] * force_unit
     length = np.linalg.norm(offset, axis=-1, keepdims=True)
     offset *= np.minimum(1.0, longest / np.maximum(length, 1e-12))
-    start = np.asarray(take.position[frame])[node]
+    start = np.asarray(rollout.position[frame])[node]
     return np.stack([start, start + offset], axis=1).astype(np.float32)
 
 

@@ -40,7 +40,7 @@ _MANY_NODES = 2_500
 """The surface of more nodes is not laid before somebody asks for it."""
 
 
-class Scene:
+class SceneDrawing:
     """Draws frames into a viser server; used by one thread."""
 
     def __init__(
@@ -85,27 +85,29 @@ class Scene:
         self._cameras.remove()
 
     def draw(
-        self, frame: int, take: ObjectRollout | None, take_frame: int, *, is_playing: bool
+        self, frame: int, rollout: ObjectRollout | None, rollout_frame: int, *, is_playing: bool
     ) -> None:
         """Bring the scene to a frame.
 
         Args:
             frame: Frame of hands, observation and cameras.
-            take: The object's rollout; None without an object.
-            take_frame: Frame of the rollout, which may lag behind while it is being computed.
+            rollout: The object's rollout; None without an object.
+            rollout_frame: Frame of the rollout, which may lag behind while it is being computed.
             is_playing: Whether the clock is running, so that less may be sent.
         """
-        take = take if take is not None and take.ready > 0 else None
-        painted = None if take is None else self.painter.paint(take, take_frame, self.layers)
+        rollout = rollout if rollout is not None and rollout.ready > 0 else None
+        painted = (
+            None if rollout is None else self.painter.paint(rollout, rollout_frame, self.layers)
+        )
         with self._server.atomic():
             self._draw_hands(frame)
-            self._draw_observed(frame, is_playing, painted, take, take_frame)
-            if take is not None:
+            self._draw_observed(frame, is_playing, painted, rollout, rollout_frame)
+            if rollout is not None:
                 self._object.draw(
-                    take,
-                    take_frame,
+                    rollout,
+                    rollout_frame,
                     self.layers,
-                    self._budget(take) if is_playing else Budget(arrows=_ARROWS),
+                    self._budget(rollout) if is_playing else Budget(arrows=_ARROWS),
                     force_unit=self._force_unit,
                     longest=0.22 * self._framing.extent,
                     painted=painted,
@@ -120,7 +122,7 @@ class Scene:
                 looks_from=self.layers.looks_from,
                 is_playing=is_playing,
             )
-            self._draw_ground(take)
+            self._draw_ground(rollout)
             self._nodes.color_ground("/ground", is_dark=self.layers.dark)
 
     @property
@@ -154,10 +156,10 @@ class Scene:
         camera.look_at = self._framing.look_at
         camera.position = self._framing.camera
 
-    def _draw_ground(self, take: ObjectRollout | None) -> None:
+    def _draw_ground(self, rollout: ObjectRollout | None) -> None:
         """Lay the grid where the rollout's ground is; a grid that is mere decoration stays."""
         recorded = self._content.ground_height
-        height = recorded if take is None else take.parameters.ground_height
+        height = recorded if rollout is None else rollout.parameters.ground_height
         is_there = height is not None or recorded is None
         if height is not None:
             self._nodes.lift("/ground", height - 0.001 * self._framing.extent)
@@ -190,12 +192,12 @@ class Scene:
         frame: int,
         is_playing: bool,
         painted: Painted | None,
-        take: ObjectRollout | None,
-        take_frame: int,
+        rollout: ObjectRollout | None,
+        rollout_frame: int,
     ) -> None:
         """Draw what was seen; colored by error, its points tell their own."""
         observed = self._content.observed
-        self._draw_lines_of_markers(frame, take, take_frame)
+        self._draw_lines_of_markers(frame, rollout, rollout_frame)
         if observed is None or not self.layers.observed:
             self._nodes.show("/observed", is_visible=False)
             return
@@ -203,15 +205,15 @@ class Scene:
         color = observed.colors()
         every = max(1, -(-len(point) // _PLAYING_OBSERVED)) if is_playing else 1
         color = color[::every] if color.ndim == 2 else color
-        if painted is not None and take is not None and self.layers.color == "error":
-            distance = self.painter.errors.points(point[::every], take, take_frame)
-            color = painted.points(distance)
+        if painted is not None and rollout is not None and self.layers.color == "error":
+            distance = self.painter.errors.points(point[::every], rollout, rollout_frame)
+            color = painted.scale.paint(distance)
         is_few = len(point) <= _FEW_POINTS
         size = 0.012 * self._framing.extent if is_few else 0.4 * self._framing.spacing
         self._nodes.points("/observed", point[::every], color, size, is_visible=True)
 
     def _draw_lines_of_markers(
-        self, frame: int, take: ObjectRollout | None, take_frame: int
+        self, frame: int, rollout: ObjectRollout | None, rollout_frame: int
     ) -> None:
         """Join the markers of a recording, or each one with the node that should be there."""
         markers, tracks = self._content.markers, self._content.tracks
@@ -219,22 +221,22 @@ class Scene:
         if markers is not None:
             line = markers.segments(frame)
             self._nodes.segments("/markers/line", line, GREY, 2.5, is_visible=is_visible)
-        if take is None or tracks is None or tracks.node is None or frame >= len(tracks.point):
+        if rollout is None or tracks is None or tracks.node is None or frame >= len(tracks.point):
             self._nodes.show("/markers/offset", is_visible=False)
             return
         marker = np.asarray(tracks.point[frame], dtype=np.float32)
-        node = np.asarray(take.position[take_frame], dtype=np.float32)[tracks.node]
+        node = np.asarray(rollout.position[rollout_frame], dtype=np.float32)[tracks.node]
         is_seen = np.asarray(tracks.is_visible[frame]) & np.isfinite(marker).all(axis=-1)
         line = np.stack([marker, node], axis=1)[is_seen]
         self._nodes.segments("/markers/offset", line, GREEN, 2.0, is_visible=is_visible)
 
-    def _budget(self, take: ObjectRollout) -> Budget:
+    def _budget(self, rollout: ObjectRollout) -> Budget:
         """Share what the points of a playing frame leave of its bytes."""
         layers = self.layers
-        point_count = len(self._object.attached(take))
-        colored = 0 if layers.color == "plain" else take.model.node_count // 4
-        point_count += take.model.node_count + colored if layers.nodes else 0
-        point_count += take.model.control_count if layers.all_controls else 0
+        point_count = len(self._object.attached(rollout))
+        colored = 0 if layers.color == "plain" else rollout.model.node_count // 4
+        point_count += rollout.model.node_count + colored if layers.nodes else 0
+        point_count += rollout.model.control_count if layers.all_controls else 0
         point_count += _PLAYING_OBSERVED if layers.observed else 0
         if layers.hands:
             point_count += sum(hand.vertex.shape[1] for hand in self._content.hands)
@@ -244,11 +246,11 @@ class Scene:
             is_plain = layers.color == "plain"
             point_count += node_count if is_plain else 2 * node_count + len(self.faces)
         left = self._frame_bytes - 12 * point_count
-        budget = share_bytes(left, take, layers, _PLAYING_ARROWS)
+        budget = share_bytes(left, rollout, layers, _PLAYING_ARROWS)
         if left >= _LEAST_BYTES or not layers.surface:
             return budget
         # Nodes on a surface are seen by its color anyway.
-        most = max(take.model.node_count - (_LEAST_BYTES - left) // 12, 1)
+        most = max(rollout.model.node_count - (_LEAST_BYTES - left) // 12, 1)
         return replace(budget, nodes=most)
 
 

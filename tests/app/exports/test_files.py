@@ -119,7 +119,7 @@ def test_a_live_scene_gives_the_rollout_of_its_sliders(
     order = {"kind": "run", "id": "fitted"}
     scene = script.post("/api/v1/sessions", json=order).json()["id"]
     session: Any = world.sessions.get(scene)
-    take = session.snapshot().take
+    take = session.snapshot().rollout
     moved = take.position + np.float32(0.25)
     session._object._rollouts.newest.position = moved
     session._playback.seek(2)

@@ -16,7 +16,7 @@ from viewer_world import FRAMES, PARAMETERS, content_of, controls, look_at
 from app.viewer.compare.figure import Side
 from app.viewer.content.layers import Layers
 from app.viewer.content.session_state import Pose
-from app.viewer.export.bundle import Picture, bundle
+from app.viewer.export.bundle import Screenshot, bundle
 from app.viewer.export.snapshot import Snapshot
 
 
@@ -41,11 +41,16 @@ def snapshot() -> Snapshot:
     position = content.fitted.position + rng.normal(0, 0.002, content.fitted.position.shape)
     take = replace(content.fitted, position=position.astype(np.float32))
     return Snapshot(
-        content=content, frame=4, take=take, take_frame=4, layers=Layers(), link="/runs/x/view?f=4"
+        content=content,
+        frame=4,
+        rollout=take,
+        rollout_frame=4,
+        layers=Layers(),
+        link="/runs/x/view?f=4",
     )
 
 
-def picture() -> Picture:
+def picture() -> Screenshot:
     image = np.zeros((30, 40, 3), np.uint8)
     pose = Pose(
         position=np.array([1.0, -2.0, 0.5]),
@@ -53,7 +58,7 @@ def picture() -> Picture:
         up=np.array([0.0, 0.0, 1.0]),
         fov=0.8,
     )
-    return Picture.of(cv2.imencode(".png", image)[1].tobytes(), pose)
+    return Screenshot.of(cv2.imencode(".png", image)[1].tobytes(), pose)
 
 
 def unpack(content: bytes) -> dict[str, bytes]:
@@ -73,7 +78,7 @@ def column(table: list[dict[str, str]], *names: str) -> np.ndarray:
 def test_the_archive_holds_every_number_of_the_frame(snapshot: Snapshot) -> None:
     files = unpack(bundle(snapshot, picture()))
     assert next(iter(files)) == "README.txt"
-    take = snapshot.take
+    take = snapshot.rollout
     assert take is not None
     model, first = take.model, take.model.object_spring_count
     nodes = rows(files["nodes.csv"])
@@ -130,12 +135,12 @@ def test_cameras_and_images_are_those_of_the_frame(snapshot: Snapshot) -> None:
 
 
 def test_both_halves_of_a_figure_are_told_apart(snapshot: Snapshot) -> None:
-    take = snapshot.take
+    take = snapshot.rollout
     assert take is not None
     other = replace(take, position=take.position + np.float32(1.0))
     sides = {
-        "ours": Side(take=take, frame=4, caption=""),
-        "phystwin": Side(take=other, frame=5, caption=""),
+        "ours": Side(rollout=take, frame=4, caption=""),
+        "phystwin": Side(rollout=other, frame=5, caption=""),
     }
     files = unpack(bundle(replace(snapshot, sides=sides), picture()))
     table = rows(files["nodes.csv"])
@@ -155,7 +160,7 @@ def test_the_readme_explains_each_file_that_is_there_and_no_other(snapshot: Snap
     assert "frame 4" in readme
     assert "views/" in readme
     recording = replace(
-        snapshot, take=None, link="", content=replace(snapshot.content, fitted=None, hands=())
+        snapshot, rollout=None, link="", content=replace(snapshot.content, fitted=None, hands=())
     )
     few = unpack(bundle(recording, picture()))
     assert set(few) == {"README.txt", "picture.png", "views/view0.png", "camera.json", "frame.ply"}
@@ -165,9 +170,9 @@ def test_the_readme_explains_each_file_that_is_there_and_no_other(snapshot: Snap
 
 
 def test_takes_that_are_not_ready_yet_are_left_out(snapshot: Snapshot) -> None:
-    take = snapshot.take
+    take = snapshot.rollout
     assert take is not None
-    waiting = Side(take=None, frame=0, caption="simulating")
-    sides = {"ours": Side(take=take, frame=4, caption=""), "phystwin": waiting}
+    waiting = Side(rollout=None, frame=0, caption="simulating")
+    sides = {"ours": Side(rollout=take, frame=4, caption=""), "phystwin": waiting}
     table = rows(unpack(bundle(replace(snapshot, sides=sides), picture()))["nodes.csv"])
     assert {row["side"] for row in table} == {"ours"}

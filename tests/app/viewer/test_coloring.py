@@ -106,15 +106,14 @@ def test_the_range_is_that_of_the_sequence_until_it_is_fixed():
     painter = Painter(content_of(take))
     first = painter.paint(take, 1, Layers(color="strain"))
     last = painter.paint(take, 19, Layers(color="strain"))
-    assert first.limits == last.limits
-    low, high = last.limits
+    assert first.scale.limits == last.scale.limits
+    low, high = last.scale.limits
     assert low == -high
     assert 1.7 < high <= 2.0
     assert painter.legend.highest == pytest.approx(1.9, rel=1e-5)
-    assert not painter.legend.is_fixed
     fixed = painter.paint(take, 1, Layers(color="strain", color_range=(0.0, 0.1)))
-    assert fixed.limits == (0.0, 0.1)
-    assert painter.legend.is_fixed
+    assert fixed.scale.limits == (0.0, 0.1)
+    assert painter.legend.scale.limits == (0.0, 0.1)
     # At 0.1 the scale ends; the third node has no spring.
     np.testing.assert_array_equal(fixed.node[0], table("diverging")[-1])
     np.testing.assert_array_equal(fixed.node[2], UNKNOWN)

@@ -5,8 +5,8 @@ import threading
 import numpy as np
 import viser
 
+from app.viewer.color.difference import FrameDifference, Way
 from app.viewer.compare.curve import DifferenceCurve
-from app.viewer.compare.difference import FrameDifference, Way
 from app.viewer.compare.look import Look
 from app.viewer.compare.panel import ComparePanel
 from app.viewer.ui.guard import Guard

@@ -8,11 +8,11 @@ from numpy import ndarray
 from scipy.optimize import minimize
 from viewer_world import FRAMES, PARAMETERS, content_of, controls, sheet
 
-from app.viewer.compare.difference import (
+from app.viewer.color.difference import (
     compare_frames,
+    rollout_difference,
     summarize,
     surface_difference,
-    take_difference,
     triangle_distance,
     way_of,
 )
@@ -37,10 +37,10 @@ def test_nodes_of_one_object_are_compared_with_themselves() -> None:
         [np.sqrt(sum((7 * offset[n, axis]) ** 2 for axis in range(3))) for n in range(len(sheet()))]
     )
     assert expected.mean() > 0.01
-    found = take_difference(first, 3, second, 7)
+    found = rollout_difference(first, 3, second, 7)
     np.testing.assert_allclose(found, expected, rtol=1e-5)
     # The frame counts: another one is not the same.
-    assert abs(take_difference(first, 3, second, 6) - expected).max() > 1e-3
+    assert abs(rollout_difference(first, 3, second, 6) - expected).max() > 1e-3
     told = compare_frames(first, 3, second, 7, "nodes")
     np.testing.assert_allclose(told.mean, expected.mean(), rtol=1e-5)
     np.testing.assert_allclose(told.largest, max(expected), rtol=1e-5)
@@ -74,11 +74,11 @@ def test_other_nodes_are_compared_with_the_surface() -> None:
     )
     assert way_of(first, second) == "surface"
     # Above the inside of a flat sheet the surface is right below, however it is sampled.
-    found = take_difference(second, 0, first, 0)
+    found = rollout_difference(second, 0, first, 0)
     np.testing.assert_allclose(found, abs(height), atol=1e-6)
     assert abs(found).max() > 5e-3
     # Both ways count: the sheet's own nodes are farther from the few points.
-    there = take_difference(first, 0, second, 0)
+    there = rollout_difference(first, 0, second, 0)
     told = compare_frames(first, 0, second, 0, "surface")
     assert told.largest == max(found.max(), there.max())
     assert told.mean == pytest.approx(np.concatenate([found, there]).mean())

@@ -189,8 +189,8 @@ def test_the_downloads_hold_positions_springs_and_forces_of_both_sides(run) -> N
     content = content_of({}, run.array("sequences/lift/control.npy"))
     ours, rival = replace_rollout(content.fitted, run), rolled_out(run)
     sides = {
-        "ours": Side(take=ours, frame=FRAME, caption=""),
-        "phystwin": Side(take=rival, frame=FRAME, caption=""),
+        "ours": Side(rollout=ours, frame=FRAME, caption=""),
+        "phystwin": Side(rollout=rival, frame=FRAME, caption=""),
     }
     with np.load(io.BytesIO(write_figure_npz(sides))) as saved:
         for name, take in (("ours", ours), ("phystwin", rival)):
@@ -242,7 +242,7 @@ def test_no_side_streams_more_than_300_arrows_or_too_many_bytes(server_client) -
     assert (np.linalg.norm(take.forces(2), axis=1) > 1e-6).sum() > 2 * ARROWS
     server, client = server_client
     figure = Figure(server, content, take, frame_content(content))
-    sides = {name: Side(take=take, frame=1, caption=name) for name in SIDES}
+    sides = {name: Side(rollout=take, frame=1, caption=name) for name in SIDES}
     layers = Layers(object_springs=True)
     figure.draw(sides, 1, layers, is_playing=True)
     hear_all(server, client)

@@ -64,7 +64,7 @@ def test_reprojection_is_the_mean_of_the_views_that_see_a_joint(content):
     assert painter.measure("error", hand, 2) == pytest.approx(np.full(21, 3.0), abs=1e-3)
     assert np.isnan(painter.measure("error", hand, 1)).all()
     painted = painter.paint(0, Layers(color="error"))
-    assert painted["right"].limits == (0.0, 4.0)
+    assert painted["right"].scale.limits == (0.0, 4.0)
     assert painter.legend is not None
     said = legend_html(painter.legend, highest=True)
     assert "<b>Reprojection error</b><span>px</span>" in said

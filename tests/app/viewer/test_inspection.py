@@ -175,7 +175,7 @@ def test_a_click_reads_a_node_and_its_history_until_escape(paused, run) -> None:
     for name in ("position", "velocity", "stiffness", "damping", "strain", "held by"):
         assert name in said
     client.set("History of", "height")
-    client.until(lambda: history(client, "height"))
+    client.until(lambda: history(client, "height") and len(history(client, "height")[0]) > 2)
     _, height, now = history(client, "height")
     np.testing.assert_allclose(height, 1e3 * position[:, 40, 2], rtol=1e-6)
     # The frame on the screen is marked.

@@ -45,9 +45,9 @@ def test_a_click_tells_a_marker_and_how_far_its_neighbors_are(content):
     ray = Ray(origin=np.array([0.1, -2.0, 0.3]), direction=np.array([0.0, 1.0, 0.0]), pixel=1e-3)
     target = Target(
         content=content,
-        take=None,
+        rollout=None,
         frame=0,
-        take_frame=0,
+        rollout_frame=0,
         layers=Layers(observed=True),
         spacing=0.02,
         faces=np.zeros((0, 3), np.int32),

@@ -27,9 +27,9 @@ def world():
 def target_of(world, layers, faces=NO_FACES, spacing=0.025):
     return Target(
         content=world,
-        take=world.fitted,
+        rollout=world.fitted,
         frame=0,
-        take_frame=0,
+        rollout_frame=0,
         layers=layers,
         spacing=spacing,
         faces=faces,

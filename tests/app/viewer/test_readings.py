@@ -8,8 +8,8 @@ from spring_world import content_of, two_springs
 from viewer_world import content_of as sheet_with_hands
 from viewer_world import controls
 
-from app.viewer.color.coloring import Legend, Painter
-from app.viewer.color.legend import legend_html, number, tick_values
+from app.viewer.color.coloring import Painter
+from app.viewer.color.legend import ColorScale, Legend, legend_html, number
 from app.viewer.color.quantities import QUANTITIES
 from app.viewer.inspect.picking import Pick
 from app.viewer.inspect.readings import HISTORIES, Readings, follow, unit_of
@@ -129,16 +129,20 @@ def test_a_hand_s_vertex_is_the_control_node_that_it_is():
     np.testing.assert_array_equal(speed, np.zeros(len(control)))
 
 
+def scale(coloring, limits, **fields):
+    return ColorScale(quantity=QUANTITIES[coloring], limits=limits, **fields)
+
+
 def legend(coloring, limits, **fields):
-    values = {"is_fixed": False, "unknown": 0, "is_known": True, "highest": 0.0, **fields}
-    return Legend(quantity=QUANTITIES[coloring], limits=limits, **values)
+    return Legend(scale=scale(coloring, limits), **fields)
 
 
-def test_the_legend_has_even_ticks_in_the_quantity_s_unit():
-    assert tick_values(legend("error", (0.0, 0.02))) == pytest.approx([0, 5, 10, 15, 20])
-    assert tick_values(legend("strain", (-0.1, 0.1))) == pytest.approx([-10, -5, 0, 5, 10])
-    logarithmic = tick_values(legend("stiffness", (10.0, 1e5)))
+def test_the_scale_has_even_ticks_in_the_quantity_s_unit():
+    assert scale("error", (0.0, 0.02)).ticks == pytest.approx([0, 5, 10, 15, 20])
+    assert scale("strain", (-0.1, 0.1)).ticks == pytest.approx([-10, -5, 0, 5, 10])
+    logarithmic = scale("stiffness", (10.0, 1e5)).ticks
     assert logarithmic == pytest.approx([10, 100, 1000, 1e4, 1e5])
+    assert scale("error", (0.0, 0.02), is_open=True).tick_labels[-2:] == ["15", "≥20"]
 
 
 def test_the_legend_says_what_is_not_known_and_what_is_highest():
@@ -150,7 +154,7 @@ def test_the_legend_says_what_is_not_known_and_what_is_highest():
     assert "rgb(72,23,105)" in said
     nothing = legend_html(legend("error", (0.0, 0.02), is_known=False), highest=True)
     assert "not known in this frame" in nothing
-    assert "highest" not in legend_html(legend("speed", (0.0, 1.0)), highest=False)
+    assert "highest" not in legend_html(legend("speed", (0.0, 1.0), highest=0.5), highest=False)
     assert "color:black" not in said  # It takes the panel's own color of text.
 
 

@@ -9,7 +9,7 @@ from viewer_world import hear_all
 from app.viewer.content.content import Content, HandSurface
 from app.viewer.content.layers import PLAYING_SPRINGS
 from app.viewer.scene.framing import frame_content
-from app.viewer.scene.scene import Scene
+from app.viewer.scene.scene import SceneDrawing
 from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.topology import build_model
@@ -63,7 +63,7 @@ def test_a_large_scene_is_thinned_while_it_plays_and_whole_when_it_rests(
     take = content.fitted
     assert take is not None
     assert take.model.object_spring_count > 10 * PLAYING_SPRINGS
-    scene = Scene(server, content, frame_content(content))
+    scene = SceneDrawing(server, content, frame_content(content))
     scene.layers.object_springs = True
     scene.layers.color, scene.layers.surface = color, surface
     springs = "/springs/object" if color == "plain" else "/springs/object_painted"

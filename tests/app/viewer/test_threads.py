@@ -157,7 +157,8 @@ def test_typed_ends_of_the_colors_are_not_replaced_before_they_are_heard(
         # As viser keeps what a user has typed, before it is told to anybody.
         colors._range.handle._impl.value = (0.25, 0.75)
         grown = SimpleNamespace(
-            legend=replace(painter.legend, limits=(0.0, 40.0)), quantity=painter.quantity
+            legend=replace(painter.legend, scale=replace(painter.legend.scale, limits=(0.0, 40.0))),
+            quantity=painter.quantity,
         )
         monkeypatch.setattr(colors, "_painter", grown)
         colors.show(is_playing=False, is_hidden=False)

@@ -1,4 +1,4 @@
-"""The color scale in the corner of a picture."""
+"""The legend in the corner of a picture."""
 
 from dataclasses import replace
 
@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from viewer_world import content_of, controls
 
-from app.exports.scale_bar import draw_scale
-from app.viewer.color.coloring import Legend, Painter
-from app.viewer.color.colormaps import table
+from app.viewer.color.coloring import Painter
+from app.viewer.color.legend import Legend, draw_legend
 from app.viewer.content.layers import Layers
 
 
@@ -24,9 +23,9 @@ def legend() -> Legend:
 
 def test_the_scale_runs_from_its_low_to_its_high_color(legend: Legend) -> None:
     image = np.full((360, 640, 3), 255, np.uint8)
-    drawn = draw_scale(image, legend, is_dark=False)
+    drawn = draw_legend(image, legend, is_dark=False)
     assert (image == 255).all()
-    ramp = table(legend.quantity.scale)
+    ramp = legend.scale.ramp
     bar = drawn[np.flatnonzero((drawn == ramp[0]).all(axis=-1).any(axis=1))[2]]
     colored = np.flatnonzero((bar != 255).any(axis=1))
     np.testing.assert_array_equal(bar[colored[0]], ramp[0])
@@ -40,7 +39,7 @@ def test_the_scale_runs_from_its_low_to_its_high_color(legend: Legend) -> None:
 
 def test_a_small_picture_keeps_its_room(legend: Legend) -> None:
     image = np.zeros((100, 640, 3), np.uint8)
-    assert draw_scale(image, legend, is_dark=True) is image
-    other = replace(legend, limits=(0.0, 1.0))
+    assert draw_legend(image, legend, is_dark=True) is image
+    other = replace(legend, scale=replace(legend.scale, limits=(0.0, 1.0)))
     big = np.zeros((400, 400, 3), np.uint8)
-    assert (draw_scale(big, legend, is_dark=True) != draw_scale(big, other, is_dark=True)).any()
+    assert (draw_legend(big, legend, is_dark=True) != draw_legend(big, other, is_dark=True)).any()

@@ -1,7 +1,7 @@
 """How far apart two rollouts are: node by node if they are of one object, else to the surface.
 
 The one place where this is computed. The comparison of two runs uses it, and so does the color
-"difference" of a re-simulated object: ``take_difference(take, frame, fitted, frame)``.
+"difference" of a re-simulated object: ``take_difference(rollout, frame, fitted, frame)``.
 """
 
 from dataclasses import dataclass
@@ -52,21 +52,25 @@ def way_of(first: ObjectRollout, second: ObjectRollout) -> Way:
     return "nodes" if is_same else "surface"
 
 
-def take_difference(
-    take: ObjectRollout, frame: int, other: ObjectRollout, other_frame: int, way: Way | None = None
+def rollout_difference(
+    rollout: ObjectRollout,
+    frame: int,
+    other: ObjectRollout,
+    other_frame: int,
+    way: Way | None = None,
 ) -> Float[ndarray, " node"]:
     """Measure how far each node of a rollout's frame is from a frame of another rollout [m].
 
     Args:
-        take: Whose nodes are measured.
+        rollout: Whose nodes are measured.
         frame: One of its frames that is ready.
         other: The rollout that it is compared with.
         other_frame: One of its frames that is ready.
         way: What `way_of` says of the two; None to ask it.
     """
-    point = np.asarray(take.position[frame], dtype=np.float64)
+    point = np.asarray(rollout.position[frame], dtype=np.float64)
     compared = np.asarray(other.position[other_frame], dtype=np.float64)
-    if (way or way_of(take, other)) == "nodes":
+    if (way or way_of(rollout, other)) == "nodes":
         return node_difference(point, compared)
     return surface_difference(point, compared)
 
@@ -86,9 +90,9 @@ def compare_frames(
     first: ObjectRollout, first_frame: int, second: ObjectRollout, second_frame: int, way: Way
 ) -> FrameDifference:
     """Measure how far apart two rollouts are in a frame; by surface, over the nodes of both."""
-    distance = take_difference(first, first_frame, second, second_frame, way)
+    distance = rollout_difference(first, first_frame, second, second_frame, way)
     if way == "surface":
-        back = take_difference(second, second_frame, first, first_frame, way)
+        back = rollout_difference(second, second_frame, first, first_frame, way)
         distance = np.concatenate([distance, back])
     return summarize(distance)
 

@@ -9,6 +9,7 @@ import viser
 
 from app.keys import LAYER_KEYS
 from app.viewer.clock.timeline_panel import TimelinePanel as TimelinePanel
+from app.viewer.color.legend import swatches_html
 from app.viewer.content.content import Content
 from app.viewer.content.layers import BLUE, GREEN, GREY, RED, SKIN, THEMES, YELLOW, Layers, Theme
 from app.viewer.content.observed import DepthCloud
@@ -28,7 +29,7 @@ def set_theme(server: viser.ViserServer, *, dark: bool) -> None:
 
 
 def add_legend(server: viser.ViserServer, content: Content) -> None:
-    """Tell what the colors mean."""
+    """Add the legend of the parts that a content has."""
     entries: list[tuple[tuple[int, int, int], str]] = []
     if content.hands or content.skeletons:
         entries.append((SKIN["right"], "hand"))
@@ -44,13 +45,7 @@ def add_legend(server: viser.ViserServer, content: Content) -> None:
         entries.append((GREEN, "markers" if is_marked else "observed"))
     if content.views:
         entries.append((GREY, "cameras"))
-    dots = "".join(
-        '<span style="white-space:nowrap;margin-right:0.8em">'
-        f'<span style="display:inline-block;width:0.7em;height:0.7em;border-radius:50%;'
-        f'background:rgb{color};margin-right:0.35em"></span>{label}</span>'
-        for color, label in entries
-    )
-    server.gui.add_html(f'<div style="font-size:0.8em;padding:0.2em 0.9em 0.5em">{dots}</div>')
+    server.gui.add_html(swatches_html(entries, is_list=False))
 
 
 _OVERVIEW = "Overview"
