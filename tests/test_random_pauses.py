@@ -3,7 +3,7 @@ import sys
 
 from random_pauses import Pauses
 
-from app.viewer.compare.look import scale_end
+from app.viewer.ui.plot import rounded_up
 
 
 def test_only_functions_of_the_application_are_held_up() -> None:
@@ -13,7 +13,7 @@ def test_only_functions_of_the_application_are_held_up() -> None:
     try:
         shlex.split("a b")
         elsewhere = len(pauses)
-        end = scale_end(0.055)
+        end = rounded_up(0.055)
     finally:
         sys.setprofile(before)
     assert elsewhere == 0
