@@ -9,7 +9,7 @@ import warp as wp
 from jaxtyping import Float
 from numpy import ndarray
 
-from physhandi.benchmarks.scenes import SUBSTEPS, Scene
+from physhandi.benchmarks.scenes import SUBSTEPS, BenchmarkScene
 from physhandi.benchmarks.timing import describe_scene, time_in_turns
 from physhandi.errors import UsageError
 from physhandi.simulation.model import SpringMassModel
@@ -72,7 +72,7 @@ def benchmark_substeps(
     ]
     chosen = next(row for row in table if row["substeps"] == automatic)
     rated = next(row for row in table if row["substeps"] == SUBSTEPS)
-    scene = Scene(
+    scene = BenchmarkScene(
         name=name,
         model=model,
         parameters=replace(parameters, substeps_per_frame=automatic),

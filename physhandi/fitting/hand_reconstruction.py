@@ -20,7 +20,7 @@ from physhandi.data.sequence import Sequence
 from physhandi.errors import FitError, MissingInputError
 from physhandi.fitting.config import HandFitConfig
 from physhandi.hand.loading import load_hand_model
-from physhandi.hand.model import HandModel, Side
+from physhandi.hand.model import HandModel, HandSide
 from physhandi.hand.motion import HandMotion
 from physhandi.hand.rotation import quaternion_matrix
 from physhandi.perception.keypoints import detect_sequence
@@ -326,7 +326,7 @@ def limit_loss(articulation: Float[Tensor, "frame 15 3"], model: HandModel) -> F
     return (beyond**2).sum() / articulation.shape[0]
 
 
-def acceleration_loss(point: Float[Tensor, "frame 21 3"]) -> Float[Tensor, ""]:
+def hand_acceleration_loss(point: Float[Tensor, "frame 21 3"]) -> Float[Tensor, ""]:
     """Sum the squared second differences of the keypoints over time, averaged over frames."""
     if point.shape[0] < 3:
         return point.sum() * 0
@@ -360,7 +360,7 @@ class DepthTarget:
     """Uses since it was renewed."""
 
 
-def depth_target(sequence: Sequence, side: Side, point_count: int) -> DepthTarget | None:
+def depth_target(sequence: Sequence, side: HandSide, point_count: int) -> DepthTarget | None:
     """Collect the measured points of one hand from all views with depth and masks.
 
     Args:
@@ -416,7 +416,7 @@ def depth_loss(
     Returns:
         Mean over points, then frames, in units of the noise, squared.
     """
-    normal = vertex_normals(vertex, faces)
+    normal = vertex_normals_torch(vertex, faces)
     if target.vertex is None or target.age >= _REFRESH:
         target.vertex, target.age = _correspond(vertex.detach(), normal.detach(), target), 0
     target.age += 1
@@ -429,7 +429,7 @@ def depth_loss(
     return (target.weight * robust).sum() / max(int((target.weight.sum(1) > 0).sum()), 1)
 
 
-def vertex_normals(
+def vertex_normals_torch(
     vertex: Float[Tensor, "frame vertex 3"], faces: Tensor
 ) -> Float[Tensor, "frame vertex 3"]:
     """Compute unit normals of vertices, the area-weighted mean of their triangles'."""
@@ -458,7 +458,7 @@ def _correspond(vertex: Tensor, normal: Tensor, target: DepthTarget) -> Tensor:
     return chosen
 
 
-STAGE = "hand_reconstruction"
+HAND_STAGE = "hand_reconstruction"
 
 
 @dataclass(frozen=True, eq=False)
@@ -520,7 +520,7 @@ class HandProblem:
             + config.limit_weight * limit_loss(articulation, self.model)
             + config.pose_weight * (articulation**2).sum() / len(articulation)
             + config.shape_weight * (self.parameters["shape"] ** 2).sum()
-            + acceleration_loss(metres) / reach**2
+            + hand_acceleration_loss(metres) / reach**2
             + velocity_loss(articulation) / turn**2
         )
 
@@ -551,7 +551,7 @@ class HandProblem:
                 value = float(loss.detach())
                 curve.append((iteration, value))
                 message = f"{self.model.side.capitalize()} hand"
-                progress.report(STAGE, iteration, total, value, message)
+                progress.report(HAND_STAGE, iteration, total, value, message)
                 self._show(value, progress)
 
         with _one_thread():
@@ -581,7 +581,7 @@ class HandProblem:
         if joints is not None and progress.wants_preview():
             progress.preview(
                 lambda: Preview(
-                    stage=STAGE,
+                    stage=HAND_STAGE,
                     sequence=self.name,
                     loss=loss,
                     frame_rate=self.frame_rate,

@@ -18,9 +18,9 @@ from physhandi.data.importers.phystwin_experiment import (
     Checkpoint,
     Contact,
     Optimum,
-    read_checkpoint,
     read_inference,
     read_optimum,
+    read_phystwin_checkpoint,
 )
 from physhandi.data.run import RunFolder
 from physhandi.data.sequence import Sequence
@@ -215,7 +215,7 @@ def _changed(field: str, stored: float, used: float, how: str) -> str:
     return f"{field} {stored:.6g} is {how} as {used:g}, as PhysTwin does."
 
 
-STAGE = "import"
+_STAGE = "import"
 REPORT = "import.json"
 """Output that tells what was imported, what was changed, and how far the simulators differ."""
 _SELF_COLLIDING = ("cloth", "package")
@@ -264,7 +264,7 @@ def import_phystwin_run(
     watched = progress or NullProgress()
     node, control, case = _parts(sequence)
     optimum = read_optimum(optimal_params)
-    stored = None if checkpoint is None else read_checkpoint(checkpoint)
+    stored = None if checkpoint is None else read_phystwin_checkpoint(checkpoint)
     truncates = stored is not None if truncates_damping is None else truncates_damping
     collides = _collides(case) if self_collision is None else self_collision
     profile = load_profile("phystwin")
@@ -395,7 +395,7 @@ def _finish(
     metrics, errors = measure_run(attempt.out, sequence)
     attempt.save_json("metrics.json", {sequence.name: metrics})
     attempt.save_json(f"{folder}/frame_errors.json", errors)
-    attempt.finish_stage(STAGE, {"curve": [], **comparison})
+    attempt.finish_stage(_STAGE, {"curve": [], **comparison})
 
 
 def compare_rollouts(

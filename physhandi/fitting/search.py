@@ -14,7 +14,7 @@ from physhandi.errors import FitError
 from physhandi.progress import Progress
 from physhandi.simulation.parameters import SimulationParameters
 
-STAGE = "zeroth_order"
+SEARCH_STAGE = "zeroth_order"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,7 +165,7 @@ def search_parameters(
         worst = max(finite, default=1.0)
         strategy.tell(units, [loss if math.isfinite(loss) else 10.0 * worst for loss in losses])
         curve.append([float(evaluations), best_loss])
-        progress.report(STAGE, generation + 1, config.generations, best_loss)
+        progress.report(SEARCH_STAGE, generation + 1, config.generations, best_loss)
     if not math.isfinite(best_loss):
         raise FitError(
             f"All {evaluations} candidates diverged. Lower the upper end of the stiffness interval "

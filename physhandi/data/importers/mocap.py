@@ -17,7 +17,7 @@ from physhandi.data.sequence_writer import write_sequence
 from physhandi.errors import ImportFailedError
 from physhandi.progress import NullProgress, Progress
 
-STAGE = "import"
+_STAGE = "import"
 _FEWEST_FRAMES = 8
 _SAMPLES_PER_SEGMENT = 64
 
@@ -89,7 +89,7 @@ def import_mocap(
             "rest_node.npy": straight_chain(marker, nodes_per_segment).astype(np.float32),
         }
         sequences.append(write_sequence(Path(out) / meta.name, meta, arrays, overwrite=overwrite))
-        watched.report(STAGE, number + 1, len(paths), message=meta.name)
+        watched.report(_STAGE, number + 1, len(paths), message=meta.name)
     return sequences
 
 

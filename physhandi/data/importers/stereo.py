@@ -21,7 +21,7 @@ from physhandi.data.sequence_writer import SequenceWriter
 from physhandi.errors import ImportFailedError
 from physhandi.progress import NullProgress, Progress
 
-STAGE = "import"
+_STAGE = "import"
 _CAMERAS = (0, 1)
 _FRAME_RATE_RANGE = (1.0, 1000.0)
 
@@ -98,9 +98,9 @@ def import_stereo(
         for step, (view, video) in enumerate(zip(views, videos, strict=True)):
             progress.check_cancelled()
             writer.copy(f"views/{view.name}/color.mp4", video.path)
-            progress.report(STAGE, step + 1, len(views) + 1, None, video.path.name)
+            progress.report(_STAGE, step + 1, len(views) + 1, None, video.path.name)
         sequence = writer.finish(meta)
-    progress.report(STAGE, len(views) + 1, len(views) + 1, None, "Checked every frame")
+    progress.report(_STAGE, len(views) + 1, len(views) + 1, None, "Checked every frame")
     return sequence
 
 

@@ -17,7 +17,7 @@ from physhandi.fitting.artefacts import load_motions
 from physhandi.fitting.config import HandFitConfig, config_from_dict, config_to_dict, load_profile
 from physhandi.fitting.hand_reconstruction import reconstruct_hands
 from physhandi.hand.loading import load_hand_model
-from physhandi.hand.model import Side
+from physhandi.hand.model import HandSide
 from physhandi.run import Run
 
 BUNDLED = Path(__file__).parents[3] / "sequences"
@@ -25,7 +25,7 @@ CAMERAS = [scene.looking_at_hand(angle) for angle in (0.0, 1.2, 2.6)]
 
 
 @pytest.mark.parametrize("side", ["right", "left"])
-def test_a_known_mano_hand_is_found_again(tmp_path: Path, mano: Path, side: Side) -> None:
+def test_a_known_mano_hand_is_found_again(tmp_path: Path, mano: Path, side: HandSide) -> None:
     truth = scene.grasping(side, model="mano")
     keypoint = scene.seen_keypoints([truth], CAMERAS)
     sequence = scene.write_scene(tmp_path / "a", [truth], CAMERAS, keypoint)
