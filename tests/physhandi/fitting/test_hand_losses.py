@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from physhandi.data.camera import PinholeCamera
+from physhandi.data.camera import PinholeCamera, triangulate
 from physhandi.fitting.hand_reconstruction import (
     JOINT_LIMIT,
     DepthTarget,
@@ -15,7 +15,6 @@ from physhandi.fitting.hand_reconstruction import (
     keypoint_target,
     limit_loss,
     reprojection_loss,
-    triangulate,
     velocity_loss,
     vertex_normals_torch,
 )
