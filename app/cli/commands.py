@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, cast
 
@@ -249,11 +250,15 @@ def import_foreign(source: Any, progress: Progress) -> dict[str, Any]:
         case ImportStereo():
             from physhandi.data.importers.stereo import import_stereo
 
-            return {"sequence": str(import_stereo(source.source, source.out, progress).folder)}
+            options = {f.name: getattr(source, f.name) for f in fields(source)}
+            folder, out = options.pop("source"), options.pop("out")
+            return {"sequence": str(import_stereo(folder, out, progress, **options).folder)}
         case ImportMocap():
             from physhandi.data.importers.mocap import import_mocap
 
-            sequences = import_mocap(source.source, source.out, progress)
+            options = {f.name: getattr(source, f.name) for f in fields(source)}
+            recordings, out = options.pop("source"), options.pop("out")
+            sequences = import_mocap(recordings, out, progress, **options)
             return {"sequences": [str(sequence.folder) for sequence in sequences]}
         case ImportMano():
             from physhandi.data.importers.mano import import_mano
