@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from physhandi.synthetic.hands.true_hand import Capsule, HandPose
+from physhandi.synthetic.hands.true_hand import Capsule, TrueHandPose
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class PinchAndLift:
     def at(self, time):
         closed = self.squeeze * smooth(time / 0.2)
         rise = self.height * smooth((time - 0.3) / (self.end - 0.3))
-        return HandPose(
+        return TrueHandPose(
             orientation=np.zeros(3),
             position=np.add(self.place, [0.0, 0.0, rise]),
             bend=np.array([[closed, 0.0, 0.0]]),

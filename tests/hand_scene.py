@@ -9,7 +9,7 @@ from physhandi.data.sequence import Sequence, ViewMeta
 from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import SequenceWriter
 from physhandi.hand.loading import load_hand_model
-from physhandi.hand.model import HandKind, Side
+from physhandi.hand.model import HandKind, HandSide
 from physhandi.hand.motion import HandMotion
 
 SIZE = 240
@@ -31,7 +31,7 @@ def looking_at_hand(azimuth: float, distance: float = 0.6) -> PinholeCamera:
 
 
 def grasping(
-    side: Side = "right", frames: int = 16, scale: float = 1.0, model: HandKind = "open"
+    side: HandSide = "right", frames: int = 16, scale: float = 1.0, model: HandKind = "open"
 ) -> HandMotion:
     """A hand with a shape of its own that closes while it turns and moves."""
     time = np.linspace(0, 1, frames)

@@ -6,7 +6,7 @@ from numpy import ndarray
 from physhandi.synthetic.bodies.bodies import Body
 from physhandi.synthetic.bodies.sheets import make_sheet
 from physhandi.synthetic.engines.truth import PhysicalTruth
-from physhandi.synthetic.hands.true_hand import BONE_COUNT, HandPose, load_true_hand
+from physhandi.synthetic.hands.true_hand import BONE_COUNT, TrueHandPose, load_true_hand
 
 SPEED = 0.30
 """Speed at which the hands and the sheet's far edge rise [m/s]."""
@@ -53,8 +53,8 @@ def lifted_sheet(frame_count: int, sides: tuple[str, ...] = ("right",)) -> Physi
     )
 
 
-def hand_pose(across: float, height: float) -> HandPose:
-    return HandPose(
+def hand_pose(across: float, height: float) -> TrueHandPose:
+    return TrueHandPose(
         orientation=np.array([0.0, 0.0, np.pi]),
         position=np.array([0.26, across, 0.06 + height]),
         bend=np.zeros((BONE_COUNT, 3)),

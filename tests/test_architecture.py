@@ -3,6 +3,7 @@
 import ast
 import re
 import subprocess
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
@@ -20,6 +21,19 @@ KERNEL_FILES = [
 ]
 READABLE = 20
 """Files of a folder that a person reads at a glance."""
+
+ANYWHERE = {"logger", "main"}
+"""Public names that mean the same in every module."""
+AMBIGUOUS = """
+AUTOMATIC Action CARRIERS COLUMNS CURVES Catalog Cell Change Curve FIELDS FINGERTIPS FLAT FOLDER
+FORMAT FORMATS FRAME_RATE HandPose HandSurface Id Kind Link METHODS MOST MOST_FRAMES Motion Move
+PARTS Part Path Picture Raster Row SAFETY SIDES SMALLEST SPRINGS_AT_NODE STAGE Scene Sequence
+Setting Side Theme Window acceleration_loss evaluate evaluate_hands evaluate_suite export
+frame_errors is_higher_better measure open_run paint place_controls plain rasterize
+read_checkpoint read_json read_split reconstruct serve settings_of simulate summarize tape_layout
+triangle_areas unit_of vertex_normals work write_csv write_gltf write_npz write_yaml
+"""
+"""Names that still have more than one meaning; the list only shrinks."""
 
 
 @cache
@@ -182,6 +196,29 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
     imports = {name: imported_modules(path) for name, path in MODULES.items()}
     assert sum(map(len, imports.values())) > 500
     assert circles(imports) == []
+
+
+def public_names(path: Path) -> set[str]:
+    """What a module defines at its top without an underscore."""
+    found: set[str] = set()
+    for node in tree(path).body:
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            found.add(node.name)
+        elif isinstance(node, ast.Assign):
+            found.update(target.id for target in node.targets if isinstance(target, ast.Name))
+        elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            found.add(node.target.id)
+    return {name for name in found if not name.startswith("_")}
+
+
+def test_a_public_name_has_one_meaning() -> None:
+    places = defaultdict(list)
+    for module, path in MODULES.items():
+        for name in public_names(path):
+            places[name].append(module)
+    assert len(places) > 1000
+    several = {name: found for name, found in places.items() if len(found) > 1}
+    assert {name: several[name] for name in several.keys() - ANYWHERE - {*AMBIGUOUS.split()}} == {}
 
 
 def test_vendored_and_bundled_data_stay_small() -> None:

@@ -3,7 +3,7 @@
 import queue
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import median
 from typing import Any
 
@@ -69,7 +69,7 @@ class _Slider:
             LiveRequest(
                 run=self._run.folder,
                 sequence=self._sequence,
-                parameters=take.parameters.replace(**changes),
+                parameters=replace(take.parameters, **changes),
                 automatic_substeps=automatic,
             ),
         )

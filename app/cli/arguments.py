@@ -47,6 +47,14 @@ class ImportStereo:
     """Folder of the recording."""
     out: Path
     """Sequence folder to write."""
+    hands: tuple[Literal["right", "left"], ...] = ("right",)
+    """Hands that the recording shows: right, left or both."""
+    origin: str = ""
+    """Who recorded it and where it was published; kept with the sequence."""
+    licence: str = ""
+    """Licence of the recording; kept with the sequence."""
+    overwrite: bool = False
+    """Replace a sequence that is there."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,9 +62,27 @@ class ImportMocap:
     """Motion capture of a rope held by two grippers (one .npy per trajectory)."""
 
     source: Positional[Path]
-    """A trajectory, or a folder of them."""
+    """A trajectory (frame, marker, 3), markers in order along the rope; or a folder of them."""
     out: Path
     """Folder to write one sequence per trajectory into."""
+    controlled_markers: tuple[int, ...] = (0, 1, 11, 12)
+    """Markers that sit on the grippers, counted from 0."""
+    recording_rate: float = 100.0
+    """Frames per second of the recording."""
+    frame_rate: float = 30.0
+    """Frames per second of the sequences."""
+    nodes_per_segment: int = 4
+    """Object nodes from one marker to the next."""
+    node_spacing: float | None = None
+    """Distance between nodes [m], in the place of --nodes-per-segment."""
+    rest_shape: Literal["straight", "first_frame"] = "straight"
+    """Shape without tension: straight with median segment lengths, or as in the first frame."""
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
+    """Axis of the recording that points up."""
+    unit: Literal["m", "cm", "mm", "in"] = "m"
+    """Length unit of the recording."""
+    overwrite: bool = False
+    """Replace sequences that are there."""
 
 
 @dataclass(frozen=True, kw_only=True)

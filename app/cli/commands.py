@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, cast
 
@@ -14,10 +15,10 @@ from physhandi.data.files import plain, without_non_finite
 from physhandi.data.run import RunKind
 from physhandi.data.sequence import Sequence
 from physhandi.errors import RunError, UsageError
-from physhandi.fitting.config import load_profile
+from physhandi.fitting.config import changed_parameters, config_to_dict, load_profile
 from physhandi.progress import Progress
 from physhandi.run import Run
-from physhandi.simulation.parameters import SimulationParameters, changed_parameters
+from physhandi.simulation.parameters import SimulationParameters
 
 OVERRIDES = (
     "connection_radius",
@@ -131,7 +132,7 @@ def reconstruct(command: Any, progress: Progress) -> dict[str, Any]:
     for sequence in sequences:
         sequence.validate(reads_color=False)  # Tells wrong data before a run is made.
     device = pick_device(command.device)
-    config = {"profile": load_profile(command.profile).to_dict()}
+    config = {"profile": config_to_dict(load_profile(command.profile))}
     paths = [str(sequence.folder) for sequence in sequences]
     return _execute(_run_at(command.out, "reconstruction", paths, config), device, progress)
 
@@ -249,11 +250,15 @@ def import_foreign(source: Any, progress: Progress) -> dict[str, Any]:
         case ImportStereo():
             from physhandi.data.importers.stereo import import_stereo
 
-            return {"sequence": str(import_stereo(source.source, source.out, progress).folder)}
+            options = {f.name: getattr(source, f.name) for f in fields(source)}
+            folder, out = options.pop("source"), options.pop("out")
+            return {"sequence": str(import_stereo(folder, out, progress, **options).folder)}
         case ImportMocap():
             from physhandi.data.importers.mocap import import_mocap
 
-            sequences = import_mocap(source.source, source.out, progress)
+            options = {f.name: getattr(source, f.name) for f in fields(source)}
+            recordings, out = options.pop("source"), options.pop("out")
+            sequences = import_mocap(recordings, out, progress, **options)
             return {"sequences": [str(sequence.folder) for sequence in sequences]}
         case ImportMano():
             from physhandi.data.importers.mano import import_mano

@@ -21,9 +21,9 @@ def evaluate_suite(command: Any, progress: Progress) -> dict[str, Any]:
         UsageError: If a method, seed or sequence makes no sense, or the folder holds other data.
     """
     from app.cli.suite_workers import MOST, SuiteWorkers
-    from physhandi.synthetic.suite.evaluation import Order, evaluate
+    from physhandi.synthetic.suite.evaluation import Order, evaluate_suite
     from physhandi.synthetic.suite.folder import check_folder
-    from physhandi.synthetic.suite.methods import parse_method, settings_of
+    from physhandi.synthetic.suite.methods import method_settings, parse_method
     from physhandi.synthetic.suite.suite import (
         NAMED_SETTINGS,
         check_seeds,
@@ -39,7 +39,7 @@ def evaluate_suite(command: Any, progress: Progress) -> dict[str, Any]:
     settings = suite.settings if command.suite or not command.sequences else NAMED_SETTINGS
     methods = command.methods or suite.methods
     for method in methods:  # Tells a wrong one before a sequence is made, which takes long.
-        settings_of(parse_method(method), settings)
+        method_settings(parse_method(method), settings)
     seeds = command.seeds or suite.seeds
     check_seeds(seeds)
     device = pick_device(command.device)
@@ -74,7 +74,7 @@ def evaluate_suite(command: Any, progress: Progress) -> dict[str, Any]:
         for recording in order.recordings:
             recording.validate(reads_color=False)
         fill = None if workers is None else workers.fill(order, out)
-        found = evaluate(order, out, progress, fill=fill)
+        found = evaluate_suite(order, out, progress, fill=fill)
     return found | {"seconds": round(time.monotonic() - start, 1)}
 
 
@@ -93,7 +93,7 @@ def _joined(seeds: Iterable[int]) -> str:
 
 def _suite_command(command: Any, device: str) -> str:
     """Write the command again, with all that decides the result."""
-    parts = ["physhandi", "evaluate", "suite"]
+    parts = ["physhandi", "evaluate_suite", "suite"]
     if command.suite or not command.sequences:
         parts += ["--suite", command.suite or "tiny"]
     for name in ("methods", "seeds", "protocols", "sequences"):

@@ -14,8 +14,8 @@ from app.viewer.content.content import Content
 from app.viewer.content.session_state import Pose, SessionState
 from app.viewer.scene.framing import frame_content
 from app.viewer.scene.scene import FRAME_BYTES, SceneDrawing
+from app.viewer.scene.scene_server import start_viser
 from app.viewer.ui.guard import plain
-from app.viewer.ui.scene_server import start_viser
 from physhandi.object_rollout import ObjectRollout
 
 GRID = 2.0**-14

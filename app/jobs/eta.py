@@ -26,6 +26,7 @@ from physhandi.fitting.config import (
     SPRINGS,
     STAGES,
     PipelineConfig,
+    config_from_dict,
 )
 from physhandi.run import Run
 
@@ -439,7 +440,7 @@ class Forecast:
 def _config_of(settings: Mapping[str, Any]) -> PipelineConfig | None:
     """Read settings; None if they are those of another version of the program."""
     try:
-        return PipelineConfig.from_dict(dict(settings))
+        return config_from_dict(dict(settings))
     except UsageError:
         return None
 

@@ -13,8 +13,10 @@ from physhandi.fitting.config import (
     Setting,
     all_settings,
     apply_overrides,
-    named_profile,
-    overrides_of,
+    changes,
+    config_from_dict,
+    config_to_dict,
+    load_profile,
     profile_names,
     values_of,
 )
@@ -38,10 +40,10 @@ def fit_config(
         UsageError: If there is no such profile.
         SettingsError: If settings are unknown or wrong; names all of them.
     """
-    base = named_profile(profile)
+    base = load_profile(profile)
     config = apply_overrides(base, overrides or {})
-    changed = overrides_of(config, base)
-    stored: dict[str, Any] = {"profile": config.to_dict()}
+    changed = changes(config, base)
+    stored: dict[str, Any] = {"profile": config_to_dict(config)}
     return (
         stored
         | ({"overrides": changed} if changed else {})
@@ -62,7 +64,7 @@ def settings_of_run(run: Run) -> PipelineConfig | None:
     if run.kind != "reconstruction" or not profile:
         return None
     try:
-        return PipelineConfig.from_dict(profile)
+        return config_from_dict(profile)
     except UsageError:
         return None
 
@@ -139,4 +141,4 @@ def _row(setting: Setting, base: Any, value: Any) -> dict[str, Any]:
 
 @lru_cache(maxsize=32)
 def _base_values(profile: str) -> dict[str, Any]:
-    return values_of(named_profile(profile)) if profile in profile_names() else {}
+    return values_of(load_profile(profile)) if profile in profile_names() else {}

@@ -13,7 +13,13 @@ from app.pages.metrics import about_quantity, figure, scaled, unit_of
 from app.pages.render import Pages
 from physhandi.data.run_folder import read_json
 from physhandi.errors import PhysHandiError, RunError
-from physhandi.metrics.suite_report import Row, is_higher_better, laid_out, read_rows, tables_of
+from physhandi.metrics.suite_report import (
+    SuiteRow,
+    is_higher_better,
+    laid_out,
+    read_rows,
+    tables_of,
+)
 
 _NAME = r"^[A-Za-z0-9_-]{1,64}$"
 Name = Annotated[str, Field(pattern=_NAME)]
@@ -180,7 +186,7 @@ def _read(path: Path) -> Cells:
         ) from None
 
 
-def _rows(path: Path) -> list[Row]:
+def _rows(path: Path) -> list[SuiteRow]:
     file = path / "table.csv"
     try:
         return read_rows(file.read_text(encoding="utf-8"))
@@ -188,7 +194,7 @@ def _rows(path: Path) -> list[Row]:
         raise RunError(f"{file} is not readable: {error}. Evaluate the suite again.") from error
 
 
-def _tables(rows: list[Row], oracles: list[str]) -> list[dict[str, Any]]:
+def _tables(rows: list[SuiteRow], oracles: list[str]) -> list[dict[str, Any]]:
     tables: list[dict[str, Any]] = []
     for title, columns in tables_of(rows).items():
         head, *lines = laid_out(rows, columns, _BEST + "{}", oracles)

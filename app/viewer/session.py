@@ -16,70 +16,14 @@ from app.viewer.export.export_panel import ExportPanel
 from app.viewer.export.snapshot import Snapshot
 from app.viewer.inspect.inspector import Inspection
 from app.viewer.live.client import SimulationClient
-from app.viewer.physics.frame_strip import FrameStrip
 from app.viewer.physics.keep_panel import UserStorage
-from app.viewer.physics.object_session import ObjectSession
-from app.viewer.restoring import complete_state
+from app.viewer.physics.object_session import FrameStrip, ObjectSession
+from app.viewer.restoring import complete_state, differences
 from app.viewer.scene.framing import frame_content
 from app.viewer.scene.layers_panel import LayersPanel, TimelinePanel, add_legend, set_theme
 from app.viewer.scene.scene import SceneDrawing
-from app.viewer.ui.scene_server import SceneServer
+from app.viewer.scene.scene_server import SceneServer
 from physhandi.object_rollout import ObjectRollout
-from physhandi.simulation.parameters import parameter_changes
-
-
-class ViewSwitch:
-    """Draws the scene, the figure or two rollouts, and hides the others; used by the clock."""
-
-    def __init__(self, scene: SceneDrawing, figure: FigureMode, pin: PinMode) -> None:
-        self.scene = scene
-        self._figure = figure
-        self._pin = pin
-        self._shown: SceneDrawing | FigureMode | PinMode = scene
-
-    def draw(
-        self, frame: int, take: ObjectRollout | None, take_frame: int, *, is_playing: bool
-    ) -> None:
-        """Bring what is seen to a frame.
-
-        Args:
-            frame: Frame of hands, observation and cameras.
-            take: The object's rollout; None without an object.
-            take_frame: Frame of the rollout, which may lag behind while it is being computed.
-            is_playing: Whether the clock is running.
-        """
-        mode = self._mode(take)
-        now = self.scene if mode is None else mode
-        if now is not self._shown:
-            self._shown.hide()
-            self._shown = now
-        if mode is None or take is None:
-            self.scene.draw(frame, take, take_frame, is_playing=is_playing)
-        else:
-            mode.draw(take, take_frame, frame, self.scene.layers, is_playing=is_playing)
-
-    def snapshot(
-        self, content: Content, frame: int, take: ObjectRollout | None, take_frame: int
-    ) -> Snapshot:
-        """Collect what is seen, for the export panel."""
-        snapshot = Snapshot(content=content, frame=frame, rollout=take, rollout_frame=take_frame)
-        mode = self._mode(take)
-        if mode is None or take is None:
-            return snapshot
-        sides = mode.sides(take, take_frame, frame)
-        return replace(snapshot, sides=sides, picture=mode.framed_picture)
-
-    def _mode(self, take: ObjectRollout | None) -> FigureMode | PinMode | None:
-        """Tell what is shown instead of the scene."""
-        if take is None:
-            return None
-        return next((mode for mode in (self._pin, self._figure) if mode.is_on), None)
-
-    def clear(self) -> None:
-        """Remove everything, to make room for another content."""
-        self._pin.stop()
-        self._figure.close()
-        self.scene.clear()
 
 
 class Session(SceneServer):
@@ -162,7 +106,7 @@ class Session(SceneServer):
                 automatic_substeps=history is not None and history.is_automatic,
                 is_figure=self._figure.is_on,
                 pose=self._figure.pose(),
-                parameter_changes=parameter_changes(history.start, history.current)
+                parameter_changes=differences(history.start, history.current)
                 if history is not None
                 else {},
             )
@@ -346,3 +290,57 @@ class Session(SceneServer):
             return self._object.at(frame)
         fitted = self._content.fitted
         return fitted, frame if fitted is None else min(frame, fitted.ready - 1)
+
+
+class ViewSwitch:
+    """Draws the scene, the figure or two rollouts, and hides the others; used by the clock."""
+
+    def __init__(self, scene: SceneDrawing, figure: FigureMode, pin: PinMode) -> None:
+        self.scene = scene
+        self._figure = figure
+        self._pin = pin
+        self._shown: SceneDrawing | FigureMode | PinMode = scene
+
+    def draw(
+        self, frame: int, take: ObjectRollout | None, take_frame: int, *, is_playing: bool
+    ) -> None:
+        """Bring what is seen to a frame.
+
+        Args:
+            frame: Frame of hands, observation and cameras.
+            take: The object's rollout; None without an object.
+            take_frame: Frame of the rollout, which may lag behind while it is being computed.
+            is_playing: Whether the clock is running.
+        """
+        mode = self._mode(take)
+        now = self.scene if mode is None else mode
+        if now is not self._shown:
+            self._shown.hide()
+            self._shown = now
+        if mode is None or take is None:
+            self.scene.draw(frame, take, take_frame, is_playing=is_playing)
+        else:
+            mode.draw(take, take_frame, frame, self.scene.layers, is_playing=is_playing)
+
+    def snapshot(
+        self, content: Content, frame: int, take: ObjectRollout | None, take_frame: int
+    ) -> Snapshot:
+        """Collect what is seen, for the export panel."""
+        snapshot = Snapshot(content=content, frame=frame, rollout=take, rollout_frame=take_frame)
+        mode = self._mode(take)
+        if mode is None or take is None:
+            return snapshot
+        sides = mode.sides(take, take_frame, frame)
+        return replace(snapshot, sides=sides, picture=mode.framed_picture)
+
+    def _mode(self, take: ObjectRollout | None) -> FigureMode | PinMode | None:
+        """Tell what is shown instead of the scene."""
+        if take is None:
+            return None
+        return next((mode for mode in (self._pin, self._figure) if mode.is_on), None)
+
+    def clear(self) -> None:
+        """Remove everything, to make room for another content."""
+        self._pin.stop()
+        self._figure.close()
+        self.scene.clear()

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from physhandi.benchmarks.phystwin_like import PhysTwinLike
-from physhandi.benchmarks.scenes import SUBSTEPS, Scene, check_positive, scene_of
+from physhandi.benchmarks.scenes import SUBSTEPS, BenchmarkScene, check_positive, scene_of
 from physhandi.benchmarks.timing import (
     describe_difference,
     describe_scene,
@@ -109,7 +109,7 @@ def benchmark_batch(
     }
 
 
-def _target(scene: Scene) -> MotionTarget:
+def _target(scene: BenchmarkScene) -> MotionTarget:
     """Make up observations of the usual number: points and tracks near where the nodes began."""
     node, frames = scene.model.object_node, len(scene.control)
     rng = np.random.default_rng(1)
@@ -133,7 +133,8 @@ def _candidates(reference: SimulationParameters, count: int) -> list[SimulationP
     return [
         reference,
         *(
-            reference.replace(
+            replace(
+                reference,
                 connection_radius=reference.connection_radius * rng.uniform(0.8, 1.0),
                 virtual_connection_radius=reference.virtual_connection_radius
                 * rng.uniform(0.8, 1.0),

@@ -8,7 +8,7 @@ import torch
 import warp as wp
 
 from physhandi.benchmarks.phystwin_like import PhysTwinLike
-from physhandi.benchmarks.scenes import SUBSTEPS, Scene, scene_of
+from physhandi.benchmarks.scenes import SUBSTEPS, BenchmarkScene, scene_of
 from physhandi.benchmarks.timing import (
     describe_difference,
     describe_scene,
@@ -87,7 +87,7 @@ def benchmark_gradient(
 
 
 def _gradient(
-    scene: Scene, device: str, memory: int, window: int | None
+    scene: BenchmarkScene, device: str, memory: int, window: int | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return where our rollout ends [m], and its gradient in the logarithm of stiffness."""
     log_stiffness = torch.from_numpy(np.log(scene.model.stiffness)).to(_torch_device(device))

@@ -15,7 +15,7 @@ from numpy import ndarray
 from physhandi.simulation.kernels.baseline import (
     add_spring_forces,
     integrate,
-    place_controls,
+    place_baseline_controls,
     sum_heights,
     update_velocity,
 )
@@ -146,7 +146,7 @@ class PhysTwinLike:
         force.zero_()
         launches = (
             (
-                place_controls,
+                place_baseline_controls,
                 self.model.control_count,
                 [fraction, *self.controls],
                 [control],

@@ -6,7 +6,7 @@ from typing import Any
 import warp as wp
 
 from physhandi.benchmarks.phystwin_like import PhysTwinLike
-from physhandi.benchmarks.scenes import SUBSTEPS, Scene, scene_of
+from physhandi.benchmarks.scenes import SUBSTEPS, BenchmarkScene, scene_of
 from physhandi.benchmarks.timing import (
     describe_difference,
     describe_scene,
@@ -62,7 +62,7 @@ def benchmark_rollout(
     }
 
 
-def measure_rollout(scene: Scene, device: str, *, rounds: int) -> dict[str, float]:
+def measure_rollout(scene: BenchmarkScene, device: str, *, rounds: int) -> dict[str, float]:
     """Time the rollout of a scene with both simulators, and compare where they end."""
     simulator = Simulator(scene.model, scene.parameters, device)
     baseline = PhysTwinLike(scene.model, scene.parameters, device)

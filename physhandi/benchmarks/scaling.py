@@ -8,12 +8,12 @@ import numpy as np
 import warp as wp
 
 from physhandi.benchmarks.rollout import measure_rollout
-from physhandi.benchmarks.scenes import SUBSTEPS, Scene, check_positive, synthetic_block
+from physhandi.benchmarks.scenes import SUBSTEPS, BenchmarkScene, check_positive, synthetic_block
 from physhandi.benchmarks.timing import describe_machine
 
 NODE_COUNTS = (500, 1000, 3000, 10_000, 50_000)
 """Object nodes of the table."""
-SPRINGS_AT_NODE = (9, 18, 57)
+SCALED_SPRINGS_AT_NODE = (9, 18, 57)
 """Springs that end at a node on average: a sparse net, our usual object and PhysTwin's t_block."""
 _SECONDS = ("ms_per_frame", "baseline_ms_per_frame")
 
@@ -22,7 +22,7 @@ def benchmark_scaling(
     *,
     device: str = "cpu",
     node_counts: Sequence[int] = NODE_COUNTS,
-    springs_at_node: Sequence[int] = SPRINGS_AT_NODE,
+    springs_at_node: Sequence[int] = SCALED_SPRINGS_AT_NODE,
     frame_count: int = 3,
     substeps_per_frame: int = SUBSTEPS,
     time_limit_s: float = 300.0,
@@ -82,7 +82,7 @@ def benchmark_scaling(
     }
 
 
-def _size(scene: Scene) -> int:
+def _size(scene: BenchmarkScene) -> int:
     return len(scene.model.spring_nodes)
 
 

@@ -1,7 +1,7 @@
 """What benchmarks simulate: made-up blocks of any size, and objects read from a file."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,7 @@ _ARRAYS = ("position", "spring_nodes", "rest_length", "stiffness")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scene:
+class BenchmarkScene:
     """An object, what holds it and how that moves."""
 
     name: str
@@ -49,7 +49,7 @@ def synthetic_block(
     frame_count: int,
     springs_at_node: int = SPRINGS_AT_NODE,
     substeps_per_frame: int = SUBSTEPS,
-) -> Scene:
+) -> BenchmarkScene:
     """Build a block of nodes on the ground whose top is pulled up by nine control nodes.
 
     The nodes lie on a cubic lattice of 10 mm, moved by up to 1 mm, and the connection radius is
@@ -79,7 +79,7 @@ def synthetic_block(
         connection_radius=radius_for(node, round(node_count * springs_at_node / 2)),
         max_neighbors=min(1000, 4 * springs_at_node),
     )
-    return Scene(
+    return BenchmarkScene(
         name=f"block of {node_count} nodes",
         model=build_model(node, control, parameters),
         parameters=parameters,
@@ -87,7 +87,9 @@ def synthetic_block(
     )
 
 
-def recorded_object(path: Path, *, frame_count: int, substeps_per_frame: int = SUBSTEPS) -> Scene:
+def recorded_object(
+    path: Path, *, frame_count: int, substeps_per_frame: int = SUBSTEPS
+) -> BenchmarkScene:
     """Read springs from a file, floor their rest length at 1 mm, and hold the 30 highest nodes.
 
     Args:
@@ -117,7 +119,7 @@ def recorded_object(path: Path, *, frame_count: int, substeps_per_frame: int = S
         virtual_connection_radius=0.04,
         virtual_max_neighbors=50,
     )
-    held = build_model(node, control, parameters.replace(max_neighbors=0))
+    held = build_model(node, control, replace(parameters, max_neighbors=0))
     count = held.virtual_spring_count
     floor = np.float32(parameters.rest_length_floor)
     soft = np.full(count, np.median(stiffness), dtype=np.float32)
@@ -132,7 +134,9 @@ def recorded_object(path: Path, *, frame_count: int, substeps_per_frame: int = S
         control_count=len(control),
     )
     path_of_control = lifted(control, frame_count)
-    return Scene(name=path.stem, model=model, parameters=parameters, control=path_of_control)
+    return BenchmarkScene(
+        name=path.stem, model=model, parameters=parameters, control=path_of_control
+    )
 
 
 def scene_of(
@@ -140,7 +144,7 @@ def scene_of(
     node_count: int,
     frame_count: int,
     substeps_per_frame: int = SUBSTEPS,
-) -> Scene:
+) -> BenchmarkScene:
     """Take the object of a file if there is one, else a made-up block."""
     if topology is None:
         return synthetic_block(

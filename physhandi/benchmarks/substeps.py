@@ -1,6 +1,7 @@
 """What fewer substeps cost: how far the motion is from that of the reference's 667."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,7 @@ import warp as wp
 from jaxtyping import Float
 from numpy import ndarray
 
-from physhandi.benchmarks.scenes import SUBSTEPS, Scene
+from physhandi.benchmarks.scenes import SUBSTEPS, BenchmarkScene
 from physhandi.benchmarks.timing import describe_scene, time_in_turns
 from physhandi.errors import UsageError
 from physhandi.simulation.model import SpringMassModel
@@ -57,7 +58,7 @@ def benchmark_substeps(
     counts = {automatic, parameters.substeps_per_frame, SUBSTEPS, *SCATTER, *substeps}
     works, motions = {}, {}
     for count in sorted(counts):
-        simulator = Simulator(model, parameters.replace(substeps_per_frame=count), device)
+        simulator = Simulator(model, replace(parameters, substeps_per_frame=count), device)
         works[str(count)] = _keep(simulator, control, motions, count)
     times = time_in_turns(works, device, _ROUNDS)
     reference = motions[SUBSTEPS]
@@ -71,10 +72,10 @@ def benchmark_substeps(
     ]
     chosen = next(row for row in table if row["substeps"] == automatic)
     rated = next(row for row in table if row["substeps"] == SUBSTEPS)
-    scene = Scene(
+    scene = BenchmarkScene(
         name=name,
         model=model,
-        parameters=parameters.replace(substeps_per_frame=automatic),
+        parameters=replace(parameters, substeps_per_frame=automatic),
         control=np.asarray(control, dtype=np.float32),
     )
     return {

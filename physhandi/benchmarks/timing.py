@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from physhandi.benchmarks.scenes import Scene
+from physhandi.benchmarks.scenes import BenchmarkScene
 from physhandi.data.environment import describe_environment
 from physhandi.simulation.stability import stable_substeps
 
@@ -73,7 +73,7 @@ def describe_machine(device: str) -> dict[str, Any]:
     }
 
 
-def describe_scene(scene: Scene, device: str) -> dict[str, Any]:
+def describe_scene(scene: BenchmarkScene, device: str) -> dict[str, Any]:
     """Say what is measured and on what."""
     model = scene.model
     return {
@@ -98,7 +98,9 @@ def describe_times(ours: float, baseline: float) -> dict[str, float]:
     }
 
 
-def describe_traffic(scene: Scene, cost: tuple[int, int, int], seconds: float, device: str) -> Any:
+def describe_traffic(
+    scene: BenchmarkScene, cost: tuple[int, int, int], seconds: float, device: str
+) -> Any:
     """Compare the memory that a frame must move with what the device can copy meanwhile.
 
     Args:

@@ -41,7 +41,7 @@ from physhandi.data.run_folder import (
     OUT,
     PROGRESS,
     RUN_FORMAT,
-    STAGES,
+    STAGES_FILE,
     artefacts,
     attempt_numbers,
     file_record,
@@ -66,14 +66,14 @@ def take_over(previous: Path, folder: Path) -> list[dict[str, Any]]:
     Returns:
         The leading finished stages whose files are all still what they were.
     """
-    stages = _whole_stages(previous) if (previous / STAGES).is_file() else []
+    stages = _whole_stages(previous) if (previous / STAGES_FILE).is_file() else []
     for stage in stages:
         for rel in stage["files"]:
             _link(inside(previous / OUT, rel), inside(folder / OUT, rel))
     for rel, path in artefacts(previous / CHECKPOINTS):
         _link(path, inside(folder / CHECKPOINTS, rel))
     if stages:
-        write_json(folder / STAGES, stages)
+        write_json(folder / STAGES_FILE, stages)
     return stages
 
 
@@ -88,7 +88,7 @@ def prune(run_folder: Path, keep: set[int]) -> None:
 
 def _whole_stages(previous: Path) -> list[dict[str, Any]]:
     """Give the leading finished stages whose files are all still what they were."""
-    stages = _listed_stages(previous / STAGES)
+    stages = _listed_stages(previous / STAGES_FILE)
     latest: dict[str, Any] = {}
     for stage in stages:
         latest |= stage["files"]
@@ -547,7 +547,7 @@ class Attempt:
             }
         )
         self._stage_clock = time.monotonic()
-        write_json(self.folder / STAGES, self._stages)
+        write_json(self.folder / STAGES_FILE, self._stages)
         self._save_losses()
 
     def heartbeat(self) -> None:

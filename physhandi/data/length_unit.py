@@ -4,15 +4,15 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-FARTHEST = 20.0
+FARTHEST_POSITION = 20.0
 """A point or camera farther from the origin than this was not given in metres [m]."""
 _FAR_OUTSIDE = 5.0  # From the centre, in image sizes; a hand may reach out of the image.
-SMALLEST = 2e-3
+SMALLEST_EXTENT = 2e-3
 """An object smaller than this was not given in metres [m]."""
 
 
 def doubt_position(
-    position: Float[ndarray, "*axis 3"], farthest: float = FARTHEST
+    position: Float[ndarray, "*axis 3"], farthest: float = FARTHEST_POSITION
 ) -> tuple[tuple[int, ...], str] | None:
     """Find the first position that is too far from the origin to be in metres.
 
@@ -33,7 +33,7 @@ def doubt_position(
     )
 
 
-def doubt_extent(point: Float[ndarray, "point 3"], smallest: float = SMALLEST) -> str | None:
+def doubt_extent(point: Float[ndarray, "point 3"], smallest: float = SMALLEST_EXTENT) -> str | None:
     """Tell what is wrong with an object that is too small to be in metres; None if all is well.
 
     Args:

@@ -35,7 +35,7 @@ from physhandi.data.run_folder import (
     RUN,
     RUN_FORMAT,
     SAFE_ID,
-    STAGES,
+    STAGES_FILE,
     artefacts,
     attempt_numbers,
     find_damage,
@@ -205,7 +205,7 @@ class RunFolder:
         Raises:
             RunError: If their list is damaged.
         """
-        path = self.folder / ATTEMPTS / str(self.attempt) / STAGES
+        path = self.folder / ATTEMPTS / str(self.attempt) / STAGES_FILE
         content: Any = read_json(path) if path.is_file() else []
         if not isinstance(content, list):
             raise RunError(f"{path} must list stages; it is damaged.")

@@ -21,7 +21,7 @@ RUN_FORMAT = "physhandi-run/1"
 SAFE_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
 JOB, RUN, LEASE, EVENTS = "job.yaml", "run.yaml", "lease.json", "events.jsonl"
 PROGRESS, LOG, ATTEMPTS, CURRENT = "progress.json", "log.txt", "attempts", "current"
-EXIT, CANCEL, MANIFEST, STAGES = "exit.json", "CANCEL", "MANIFEST.json", "stages.json"
+EXIT, CANCEL, MANIFEST, STAGES_FILE = "exit.json", "CANCEL", "MANIFEST.json", "stages.json"
 OUT, CHECKPOINTS = "out", "ckpt"
 
 _SAFE_PART = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*")

@@ -13,7 +13,7 @@ from numpy import ndarray
 
 from physhandi.data.files import read_array
 from physhandi.data.length_unit import (
-    FARTHEST,
+    FARTHEST_POSITION,
     doubt_depth,
     doubt_extent,
     doubt_keypoints,
@@ -21,7 +21,7 @@ from physhandi.data.length_unit import (
 )
 from physhandi.data.sequence_meta import FILE, SequenceMeta, Side, read_meta
 from physhandi.data.sequence_meta import ViewMeta as ViewMeta
-from physhandi.data.truth import FOLDER as TRUTH
+from physhandi.data.truth import TRUTH_FOLDER as TRUTH
 from physhandi.data.view import View
 from physhandi.errors import SequenceError
 
@@ -128,7 +128,7 @@ def _check_unit(folder: Path, meta: SequenceMeta) -> None:
         if kind != _F or not (folder / file).is_file():
             continue
         position = read_array(folder / file)
-        doubt = doubt_position(position, FARTHEST)
+        doubt = doubt_position(position, FARTHEST_POSITION)
         if doubt is not None:
             at = ", ".join(f"{axis} {index}" for axis, index in zip(axes, doubt[0], strict=False))
             _fail(meta.name, f"{file}: {at}", doubt[1])

@@ -14,7 +14,7 @@ from numpy import ndarray
 from physhandi.data.files import read_array
 from physhandi.data.sequence_meta import Side
 
-FOLDER = "truth"
+TRUTH_FOLDER = "truth"
 """Folder of a sequence that holds the truth."""
 _SIDES: tuple[Side, Side] = ("right", "left")
 
@@ -45,7 +45,7 @@ def read_truth(folder: Path) -> Truth:
     """
 
     def read(file: str) -> Any:
-        path = folder / FOLDER / file
+        path = folder / TRUTH_FOLDER / file
         return read_array(path) if path.is_file() else None
 
     def of_hands(part: str) -> dict[Side, Any]:

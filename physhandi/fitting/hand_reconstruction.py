@@ -15,80 +15,17 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
-from physhandi.data.camera import PinholeCamera
+from physhandi.data.camera import PinholeCamera, triangulate
 from physhandi.data.sequence import Sequence
 from physhandi.errors import FitError, MissingInputError
 from physhandi.fitting.config import HandFitConfig
 from physhandi.hand.loading import load_hand_model
-from physhandi.hand.model import HandModel, Side
+from physhandi.hand.model import HandModel, HandSide
 from physhandi.hand.motion import HandMotion
 from physhandi.hand.rotation import quaternion_matrix
 from physhandi.perception.keypoints import detect_sequence
 from physhandi.perception.lifting import HAND_LABEL, surface_points
 from physhandi.progress import NullProgress, Preview, Progress
-
-_MIN_ANGLE = np.deg2rad(3)
-
-
-def triangulate(
-    cameras: Many[PinholeCamera],
-    pixel: Float[ndarray, "view point 2"],
-    weight: Float[ndarray, "view point"],
-    tolerance: float,
-) -> Float[ndarray, "point 3"]:
-    """Triangulate points by the direct linear transform, keeping only those that all views confirm.
-
-    Args:
-        cameras: Camera of each view.
-        pixel: Where each view sees each point; NaN where it does not [px].
-        weight: Trust in each observation.
-        tolerance: Largest distance between an observation and the point's projection [px].
-
-    Returns:
-        World points; NaN where fewer than two views see the point, where they see it along nearly
-        the same ray, or where one of them disagrees.
-    """
-    point = np.full((pixel.shape[1], 3), np.nan)
-    if len(cameras) < 2:
-        return point
-    is_seen = np.isfinite(pixel).all(-1) & (weight > 0)
-    rows = np.zeros((pixel.shape[1], 2 * len(cameras), 4))
-    for view, camera in enumerate(cameras):
-        projection = camera.K @ camera.T_camera_world[:3]
-        straight = camera.undistort(np.where(is_seen[view][:, None], pixel[view], 0.0))
-        equation = straight[:, :, None] * projection[2] - projection[:2]
-        trust = np.where(is_seen[view], weight[view], 0.0)[:, None, None]
-        scale = np.linalg.norm(projection[0, :3])
-        rows[:, 2 * view : 2 * view + 2] = trust * equation / scale
-    enough = is_seen.sum(0) >= 2
-    if not enough.any():
-        return point
-    solution = np.linalg.svd(rows[enough])[2][:, -1]
-    homogeneous = np.where(abs(solution[:, 3:]) > 1e-12, solution[:, 3:], np.nan)
-    point[enough] = solution[:, :3] / homogeneous
-    is_confirmed = _widest_angle(cameras, point, is_seen) > _MIN_ANGLE
-    for view, camera in enumerate(cameras):
-        error = np.linalg.norm(camera.project(point) - pixel[view], axis=-1)
-        is_confirmed &= ~is_seen[view] | (error <= tolerance)
-    point[~is_confirmed] = np.nan
-    return point
-
-
-def _widest_angle(
-    cameras: Many[PinholeCamera],
-    point: Float[ndarray, "point 3"],
-    is_seen: ndarray,
-) -> Float[ndarray, " point"]:
-    """Compute the largest angle between the rays on which a point is seen [rad]."""
-    rays = np.stack([point - camera.T_world_camera[:3, 3] for camera in cameras])
-    rays /= np.maximum(np.linalg.norm(rays, axis=-1, keepdims=True), 1e-12)
-    widest = np.zeros(point.shape[0])
-    for first in range(len(cameras)):
-        for second in range(first):
-            angle = np.arccos(np.clip((rays[first] * rays[second]).sum(-1), -1, 1))
-            widest = np.where(is_seen[first] & is_seen[second], np.fmax(widest, angle), widest)
-    return widest
-
 
 PALM = (0, 1, 5, 9, 13, 17)
 """Keypoints that move with the palm."""
@@ -326,7 +263,7 @@ def limit_loss(articulation: Float[Tensor, "frame 15 3"], model: HandModel) -> F
     return (beyond**2).sum() / articulation.shape[0]
 
 
-def acceleration_loss(point: Float[Tensor, "frame 21 3"]) -> Float[Tensor, ""]:
+def hand_acceleration_loss(point: Float[Tensor, "frame 21 3"]) -> Float[Tensor, ""]:
     """Sum the squared second differences of the keypoints over time, averaged over frames."""
     if point.shape[0] < 3:
         return point.sum() * 0
@@ -360,7 +297,7 @@ class DepthTarget:
     """Uses since it was renewed."""
 
 
-def depth_target(sequence: Sequence, side: Side, point_count: int) -> DepthTarget | None:
+def depth_target(sequence: Sequence, side: HandSide, point_count: int) -> DepthTarget | None:
     """Collect the measured points of one hand from all views with depth and masks.
 
     Args:
@@ -416,7 +353,7 @@ def depth_loss(
     Returns:
         Mean over points, then frames, in units of the noise, squared.
     """
-    normal = vertex_normals(vertex, faces)
+    normal = vertex_normals_torch(vertex, faces)
     if target.vertex is None or target.age >= _REFRESH:
         target.vertex, target.age = _correspond(vertex.detach(), normal.detach(), target), 0
     target.age += 1
@@ -429,7 +366,7 @@ def depth_loss(
     return (target.weight * robust).sum() / max(int((target.weight.sum(1) > 0).sum()), 1)
 
 
-def vertex_normals(
+def vertex_normals_torch(
     vertex: Float[Tensor, "frame vertex 3"], faces: Tensor
 ) -> Float[Tensor, "frame vertex 3"]:
     """Compute unit normals of vertices, the area-weighted mean of their triangles'."""
@@ -458,7 +395,7 @@ def _correspond(vertex: Tensor, normal: Tensor, target: DepthTarget) -> Tensor:
     return chosen
 
 
-STAGE = "hand_reconstruction"
+HAND_STAGE = "hand_reconstruction"
 
 
 @dataclass(frozen=True, eq=False)
@@ -520,7 +457,7 @@ class HandProblem:
             + config.limit_weight * limit_loss(articulation, self.model)
             + config.pose_weight * (articulation**2).sum() / len(articulation)
             + config.shape_weight * (self.parameters["shape"] ** 2).sum()
-            + acceleration_loss(metres) / reach**2
+            + hand_acceleration_loss(metres) / reach**2
             + velocity_loss(articulation) / turn**2
         )
 
@@ -551,7 +488,7 @@ class HandProblem:
                 value = float(loss.detach())
                 curve.append((iteration, value))
                 message = f"{self.model.side.capitalize()} hand"
-                progress.report(STAGE, iteration, total, value, message)
+                progress.report(HAND_STAGE, iteration, total, value, message)
                 self._show(value, progress)
 
         with _one_thread():
@@ -581,7 +518,7 @@ class HandProblem:
         if joints is not None and progress.wants_preview():
             progress.preview(
                 lambda: Preview(
-                    stage=STAGE,
+                    stage=HAND_STAGE,
                     sequence=self.name,
                     loss=loss,
                     frame_rate=self.frame_rate,

@@ -34,7 +34,7 @@ vectors [rad]), of the wrist's ``rotation`` (in the hand's own frame [rad]) and 
 
 BETA_1 = 0.9
 """Decay of the first moment."""
-FLAT = 1e-12
+FLAT_GRADIENT = 1e-12
 """A step that changes the loss by less than a square micrometre is not worth taking [m²]."""
 
 
@@ -174,7 +174,7 @@ class OffsetDescent:
                 self.second[name].lerp_(squared[name], 1 - self.beta_2)
                 mean = self.first[name] / (1 - BETA_1**self.count)
                 size = (self.second[name] / (1 - self.beta_2**self.count)).sqrt()
-                offset.sub_(share * self.rates[name] * mean / (size + FLAT))
+                offset.sub_(share * self.rates[name] * mean / (size + FLAT_GRADIENT))
 
 
 def control_nodes(
@@ -214,7 +214,7 @@ def _tensor(array: ndarray) -> Tensor:
     return torch.from_numpy(np.array(array, dtype=np.float32))
 
 
-STAGE = "hand_refinement"
+REFINEMENT_STAGE = "hand_refinement"
 STEEPEST = 50.0
 """A gradient this many times as steep as that of an object tied rigidly to its hand is chaos."""
 HALVINGS = 4
@@ -292,7 +292,7 @@ def refine_hands(
         CancelledError: If the user asked to stop.
     """
     refinement = Refinement(problem, config, device)
-    preview = RolloutPreview(STAGE, progress)
+    preview = RolloutPreview(REFINEMENT_STAGE, progress)
     curve: list[list[float]] = []
     for iteration in range(config.iterations + 1):
         progress.check_cancelled()
@@ -305,7 +305,7 @@ def refine_hands(
             message = f"step halved: {error}"
             loss = refinement.go_back()
         curve.append([float(iteration), loss])
-        progress.report(STAGE, iteration, config.iterations, loss, message)
+        progress.report(REFINEMENT_STAGE, iteration, config.iterations, loss, message)
         if refinement.simulated is not None:
             preview.see(problem.object_, *refinement.simulated)
             preview.show(loss)
@@ -383,7 +383,7 @@ class Refinement:
                 loss = self._simulated_loss(self._control(refined))
             except SimulationDivergedError as error:
                 total = self.config.iterations
-                progress.report(STAGE, total, total, None, f"correction halved: {error}")
+                progress.report(REFINEMENT_STAGE, total, total, None, f"correction halved: {error}")
                 continue
             if loss < before:
                 motions, after = refined, loss

@@ -75,7 +75,7 @@ def track_loss(
     return squared.sum(dim=1) / divisor.clamp(min=1)
 
 
-def acceleration_loss(
+def node_acceleration_loss(
     velocity: Float[Tensor, "frame node 3"],
 ) -> Float[Tensor, " frame"]:
     """Measure how abruptly frame-to-frame changes of velocity differ, half-squared [m²/s²].
@@ -110,7 +110,7 @@ def _nearest(
     return nearest.to(node.device)
 
 
-CARRIERS = 4  # nodes that carry one observed surface point
+TRACK_CARRIERS = 4  # nodes that carry one observed surface point
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -224,7 +224,7 @@ def _carriers(
         return kept, carrier, weight, np.zeros((len(kept), 3), np.float32)
     kept = np.flatnonzero(observation.is_visible[0])
     start = np.asarray(observation.point[0, kept], np.float32)
-    count = min(CARRIERS, len(object_node))
+    count = min(TRACK_CARRIERS, len(object_node))
     distance, carrier = KDTree(object_node).query(start, k=count)
     distance, carrier = np.reshape(distance, (-1, count)), np.reshape(carrier, (-1, count))
     weight = 1.0 / (distance + 1e-4)
@@ -343,7 +343,7 @@ def initial_velocity(
     return (moved[near] * weight[..., None]).sum(axis=1).astype(np.float32)
 
 
-SAFETY = 1.25
+SUBSTEP_SAFETY = 1.25
 """Margin of the substeps over the stability limit."""
 
 
@@ -407,7 +407,7 @@ def mean_loss(
             node[1:], track_weight=config.track_weight, freeze_counts=config.freezes_counts
         )
         if acceleration_weight > 0.0:
-            frame_losses = frame_losses + acceleration_weight * acceleration_loss(velocity)[1:]
+            frame_losses = frame_losses + acceleration_weight * node_acceleration_loss(velocity)[1:]
         losses.append(float(frame_losses.mean()))
     return float(np.mean(losses))
 
@@ -417,7 +417,7 @@ def settle_substeps(
     parameters: SimulationParameters,
     config: ObjectFitConfig,
     *,
-    safety: float = SAFETY,
+    safety: float = SUBSTEP_SAFETY,
 ) -> SimulationParameters:
     """Choose the substeps that keep all models stable, if the configuration says so.
 
@@ -427,4 +427,4 @@ def settle_substeps(
     if not config.automatic_substeps:
         return parameters
     needed = max(stable_substeps(model, parameters, safety=safety) for model in models)
-    return parameters.replace(substeps_per_frame=10 * math.ceil(needed / 10))
+    return replace(parameters, substeps_per_frame=10 * math.ceil(needed / 10))

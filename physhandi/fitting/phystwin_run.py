@@ -18,15 +18,15 @@ from physhandi.data.importers.phystwin_experiment import (
     Checkpoint,
     Contact,
     Optimum,
-    read_checkpoint,
     read_inference,
     read_optimum,
+    read_phystwin_checkpoint,
 )
 from physhandi.data.run import RunFolder
 from physhandi.data.sequence import Sequence
 from physhandi.errors import ImportFailedError
 from physhandi.fitting import artefacts
-from physhandi.fitting.config import load_profile
+from physhandi.fitting.config import config_to_dict, load_profile
 from physhandi.fitting.rollouts import simulate_sequence
 from physhandi.metrics.report import measure_run
 from physhandi.perception.lifting import observe_object
@@ -85,7 +85,8 @@ def phystwin_parameters(
         ):
             if used != value:
                 notes.append(_changed(field, value, used, "loaded (as a whole number)"))
-    parameters = base.replace(
+    parameters = replace(
+        base,
         connection_radius=optimum.object_radius,
         # PhysTwin counts the node itself.
         max_neighbors=optimum.object_max_neighbours - 1,
@@ -214,7 +215,7 @@ def _changed(field: str, stored: float, used: float, how: str) -> str:
     return f"{field} {stored:.6g} is {how} as {used:g}, as PhysTwin does."
 
 
-STAGE = "import"
+_STAGE = "import"
 REPORT = "import.json"
 """Output that tells what was imported, what was changed, and how far the simulators differ."""
 _SELF_COLLIDING = ("cloth", "package")
@@ -263,7 +264,7 @@ def import_phystwin_run(
     watched = progress or NullProgress()
     node, control, case = _parts(sequence)
     optimum = read_optimum(optimal_params)
-    stored = None if checkpoint is None else read_checkpoint(checkpoint)
+    stored = None if checkpoint is None else read_phystwin_checkpoint(checkpoint)
     truncates = stored is not None if truncates_damping is None else truncates_damping
     collides = _collides(case) if self_collision is None else self_collision
     profile = load_profile("phystwin")
@@ -298,7 +299,7 @@ def import_phystwin_run(
         kind="reconstruction",
         sequences=[str(sequence.folder)],
         config={
-            "profile": profile.replace(simulation=parameters).to_dict(),
+            "profile": config_to_dict(replace(profile, simulation=parameters)),
             "imported": report,
         },
     )
@@ -394,7 +395,7 @@ def _finish(
     metrics, errors = measure_run(attempt.out, sequence)
     attempt.save_json("metrics.json", {sequence.name: metrics})
     attempt.save_json(f"{folder}/frame_errors.json", errors)
-    attempt.finish_stage(STAGE, {"curve": [], **comparison})
+    attempt.finish_stage(_STAGE, {"curve": [], **comparison})
 
 
 def compare_rollouts(

@@ -89,7 +89,7 @@ def lay_object(
     return best.astype(np.float32)
 
 
-STAGE = "rollout"
+ROLLOUT_STAGE = "rollout"
 LEAST_CLOUD = 10
 
 
@@ -250,7 +250,7 @@ def simulate_sequence(
     for frame, position, _ in Simulator(model, parameters, device=device).frames(control):
         progress.check_cancelled()
         positions.append(position)
-        progress.report(STAGE, frame + 1, len(control))
+        progress.report(ROLLOUT_STAGE, frame + 1, len(control))
     rollout = np.stack(positions).astype(np.float32)
     output.save_array(f"{folder}/rollout.npy", rollout)
     return rollout

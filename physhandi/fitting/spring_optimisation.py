@@ -15,7 +15,7 @@ from torch import Tensor
 from physhandi.errors import FitError, SimulationDivergedError
 from physhandi.fitting.config import FirstOrderConfig, ObjectFitConfig
 from physhandi.fitting.object_problem import (
-    SAFETY,
+    SUBSTEP_SAFETY,
     ObjectProblem,
     build_problem_model,
     mean_loss,
@@ -35,7 +35,7 @@ CONTACT = {
     "self_friction": (0.0, 2.0),
 }
 """Interval of each contact coefficient; outside it acts as at the nearer end (physics.md §3.2)."""
-SMALLEST = 1e-6
+SMALLEST_VALUE = 1e-6
 """Stands for a zero, which has no logarithm, in a spring's stiffness [N] or damping [N·s/m]."""
 
 
@@ -134,12 +134,12 @@ class Material:
             name: min(max(float(value.detach()), CONTACT[name][0]), CONTACT[name][1])
             for name, value in self._contact.items()
         }
-        return parameters.replace(**learned)
+        return replace(parameters, **learned)
 
 
 def _logarithms(model: SpringMassModel, part: slice) -> Tensor:
     both = np.stack([model.stiffness[part], model.damping[part]])
-    return torch.log(torch.from_numpy(both).clamp(min=SMALLEST)).requires_grad_()
+    return torch.log(torch.from_numpy(both).clamp(min=SMALLEST_VALUE)).requires_grad_()
 
 
 State = tuple[Float[Tensor, "node 3"], Float[Tensor, "node 3"]]
@@ -147,7 +147,7 @@ State = tuple[Float[Tensor, "node 3"], Float[Tensor, "node 3"]]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Window:
+class FitWindow:
     """A few simulated frames whose gradient lies in the material."""
 
     frame_losses: Float[Tensor, " frame"]
@@ -216,7 +216,7 @@ class Descent:
         model: SpringMassModel,
         frames: tuple[int, int],
         state: State,
-    ) -> Window | None:
+    ) -> FitWindow | None:
         """Simulate one window and leave the gradient of its mean loss in the material.
 
         Motion that is chaotic over the window has gradients that grow without bound and point
@@ -264,7 +264,7 @@ class Descent:
                 if reach < end - begin:
                     self._reach[problem.name] = reach
                 last = node[-1].detach(), velocity[-1].detach()
-                return Window(frame_losses=frame_losses.detach(), state=last)
+                return FitWindow(frame_losses=frame_losses.detach(), state=last)
             reach //= 2
         return None
 
@@ -273,7 +273,7 @@ class Descent:
         return max(float(gradient.double().norm()) for gradient in gradients)
 
 
-STAGE = "first_order"
+SPRING_STAGE = "first_order"
 logger = logging.getLogger(__name__)
 
 
@@ -334,7 +334,9 @@ def optimise_springs(
         parameters = _truncated(parameters)
     models = {p.name: build_problem_model(p, parameters) for p in problems}
     # Springs may stiffen while they are fitted, so the limit is kept farther away.
-    parameters = settle_substeps(list(models.values()), parameters, config, safety=SAFETY * SAFETY)
+    parameters = settle_substeps(
+        list(models.values()), parameters, config, safety=SUBSTEP_SAFETY * SUBSTEP_SAFETY
+    )
     material = Material(models, parameters, settings)
     loss_before = _finite(
         mean_loss(problems, models, parameters, config, device),
@@ -344,7 +346,7 @@ def optimise_springs(
     best_loss = math.inf if settings.judges_online else loss_before
     curve = [[0.0, loss_before]]
     descent = Descent(material, parameters, config, device)
-    preview = RolloutPreview(STAGE, progress)
+    preview = RolloutPreview(SPRING_STAGE, progress)
     stopped = ""
     for iteration in range(settings.iterations):
         progress.check_cancelled()
@@ -358,8 +360,8 @@ def optimise_springs(
             if isinstance(error, FitError) and iteration == 0:
                 raise
             stopped = f"Stopped after {iteration} of {settings.iterations} iterations. {error}"
-            logger.warning("%s: %s", STAGE, stopped)
-            progress.report(STAGE, iteration, settings.iterations, best_loss, stopped)
+            logger.warning("%s: %s", SPRING_STAGE, stopped)
+            progress.report(SPRING_STAGE, iteration, settings.iterations, best_loss, stopped)
             break
         now = {name: material.model(name, model) for name, model in models.items()}
         now_parameters = material.parameters(parameters)
@@ -371,7 +373,7 @@ def optimise_springs(
         if _is_judged(iteration, settings) and loss < best_loss:
             best, best_parameters, best_loss = now, now_parameters, loss
         curve.append([float(iteration + 1), loss])
-        progress.report(STAGE, iteration + 1, settings.iterations, loss, note)
+        progress.report(SPRING_STAGE, iteration + 1, settings.iterations, loss, note)
     if settings.judges_online:
         best_loss = _finite(
             mean_loss(problems, best, best_parameters, config, device),
@@ -396,7 +398,7 @@ def _finite(loss: float, otherwise: str) -> float:
 
 def _truncated(parameters: SimulationParameters) -> SimulationParameters:
     damping, drag = math.trunc(parameters.damping), math.trunc(parameters.drag)
-    return parameters.replace(damping=float(damping), drag=float(drag))
+    return replace(parameters, damping=float(damping), drag=float(drag))
 
 
 def _is_judged(iteration: int, config: FirstOrderConfig) -> bool:

@@ -1,11 +1,11 @@
 """Which hand model a hand is fitted with: the built-in open hand, or the user's MANO."""
 
 from physhandi.hand.mano import ManoHand
-from physhandi.hand.model import HandKind, HandModel, Side
+from physhandi.hand.model import HandKind, HandModel, HandSide
 from physhandi.hand.open_hand import OpenHand
 
 
-def load_hand_model(side: Side, kind: HandKind = "open") -> HandModel:
+def load_hand_model(side: HandSide, kind: HandKind = "open") -> HandModel:
     """Load a hand model; repeated calls return the same object.
 
     Args:

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from physhandi.errors import MissingInputError
-from physhandi.hand.model import JOINT_COUNT, HandModel, HandPose, Side
+from physhandi.hand.model import JOINT_COUNT, HandModel, HandPose, HandSide
 from physhandi.hand.open_hand import OpenHand
 from physhandi.hand.rotation import rotation_offset
 from physhandi.hand.skinning import blend, place, turn_bones
@@ -71,7 +71,7 @@ class ManoHand(HandModel):
 
     kind = "mano"
 
-    def __init__(self, arrays: dict[str, ndarray], side: Side) -> None:
+    def __init__(self, arrays: dict[str, ndarray], side: HandSide) -> None:
         """Arrange MANO's arrays in the order of `JOINT_NAMES`.
 
         Args:
@@ -83,7 +83,7 @@ class ManoHand(HandModel):
         posedirs = arrays["posedirs"].reshape(-1, 3, JOINT_COUNT, 9)
         posedirs = posedirs[:, :, [joint - 1 for joint in MANO_JOINT]].reshape(-1, 3, 135)
         wrist = regressor[0] @ arrays["v_template"]
-        self.side: Side = side
+        self.side: HandSide = side
         self.faces = arrays["f"].astype(np.int64)
         self.vertex_count = len(arrays["v_template"])
         self.weight = arrays["weights"][:, bone]
@@ -102,7 +102,7 @@ class ManoHand(HandModel):
         self._tensors: dict[torch.dtype, dict[str, Tensor]] = {}
 
     @staticmethod
-    def load(side: Side) -> "ManoHand":
+    def load(side: HandSide) -> "ManoHand":
         """Load the user's MANO of one side.
 
         Raises:
@@ -204,7 +204,7 @@ class ManoHand(HandModel):
 
 
 @cache
-def _read(path: Path, _changed: int, side: Side) -> ManoHand:
+def _read(path: Path, _changed: int, side: HandSide) -> ManoHand:
     """Read an imported file; `_changed` makes a file that was imported anew another one."""
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
@@ -216,7 +216,7 @@ def _read(path: Path, _changed: int, side: Side) -> ManoHand:
         ) from error
 
 
-def _axes(bone_origin: Float[ndarray, "16 3"], side: Side) -> Float[ndarray, "15 3 3"]:
+def _axes(bone_origin: Float[ndarray, "16 3"], side: HandSide) -> Float[ndarray, "15 3 3"]:
     """Lay the open hand's axes onto other bones: with the palm, then along each bone.
 
     A thumb's axes cannot be told from its bones alone, so they come from a hand that has them. A

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from torch import Tensor
 
-Side = Literal["right", "left"]
+HandSide = Literal["right", "left"]
 HandKind = Literal["open", "mano"]
 """The built-in open hand, or the user's MANO."""
 
@@ -57,7 +57,7 @@ class HandModel(ABC):
 
     kind: HandKind
     """Which model it is, as `load_hand_model` names it."""
-    side: Side
+    side: HandSide
     """Which hand it is."""
     faces: Int[ndarray, "face 3"]
     """Vertices of each triangle, counter-clockwise from outside."""

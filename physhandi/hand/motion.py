@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Float
 from numpy import ndarray
 
-from physhandi.hand.model import HandKind, HandModel, HandPose, Side
+from physhandi.hand.model import HandKind, HandModel, HandPose, HandSide
 
 _BATCH = 128
-_SIDES: tuple[Side, Side] = ("right", "left")
+_SIDES: tuple[HandSide, HandSide] = ("right", "left")
 _MODELS: tuple[HandKind, HandKind] = ("open", "mano")
 
 
@@ -20,7 +20,7 @@ _MODELS: tuple[HandKind, HandKind] = ("open", "mano")
 class HandMotion:
     """Shape, articulation and wrist pose of one hand over all frames of a sequence."""
 
-    side: Side
+    side: HandSide
     """Which hand it is."""
     shape: Float[ndarray, " 10"]
     """Shape coefficients, constant over the sequence."""
@@ -113,7 +113,7 @@ class HandMotion:
             raise ValueError(f"hand motion's 'model' must be 0 or 1, not {model}")
         return cls(
             model=_MODELS[int(model)],
-            side=cast("Side", _SIDES[int(tensors["side"])]),
+            side=cast("HandSide", _SIDES[int(tensors["side"])]),
             shape=tensors["shape"],
             articulation=tensors["articulation"],
             wrist_rotation=tensors["wrist_rotation"],

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from torch import Tensor
 
-from physhandi.hand.model import JOINT_COUNT, HandModel, HandPose, Side
+from physhandi.hand.model import JOINT_COUNT, HandModel, HandPose, HandSide
 from physhandi.hand.rotation import rotation_offset
 from physhandi.hand.skinning import blend, place, turn_bones
 
@@ -185,7 +185,7 @@ class OpenHand(HandModel):
 
     kind = "open"
 
-    def __init__(self, mesh: SkinnedMesh, side: Side) -> None:
+    def __init__(self, mesh: SkinnedMesh, side: HandSide) -> None:
         """Arrange the right hand's mesh by joints and, for a left hand, mirror it.
 
         Args:
@@ -198,7 +198,7 @@ class OpenHand(HandModel):
         mirror = np.array([-1.0 if side == "left" else 1.0, 1.0, 1.0])
 
         weight = mesh.weight[:, joint]
-        self.side: Side = side
+        self.side: HandSide = side
         self.faces = mesh.faces if side == "right" else np.ascontiguousarray(mesh.faces[:, ::-1])
         self.vertex_count = len(mesh.vertex)
         self.weight = np.concatenate([1.0 - weight.sum(1, keepdims=True), weight], axis=1)
@@ -215,7 +215,7 @@ class OpenHand(HandModel):
 
     @staticmethod
     @cache
-    def load(side: Side) -> "OpenHand":
+    def load(side: HandSide) -> "OpenHand":
         """Load the vendored hand of one side."""
         return OpenHand(read_skinned_mesh(ASSETS / "right.glb"), side)
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-COLUMNS = ("method", "split", "metric", "mean", "low", "high", "n")
+SUITE_COLUMNS = ("method", "split", "metric", "mean", "low", "high", "n")
 """Columns of ``table.csv``."""
 PAIRED_COLUMNS = (
     *("method", "against", "split", "metric"),
@@ -43,7 +43,7 @@ class Score:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Row:
+class SuiteRow:
     """A method's mean over cases."""
 
     method: str
@@ -117,14 +117,14 @@ def interval(value: Float[ndarray, " case"], resamples: int = RESAMPLES) -> tupl
     return float(low), float(high)
 
 
-def summarise(scores: Iterable[Score]) -> list[Row]:
+def summarise(scores: Iterable[Score]) -> list[SuiteRow]:
     """Average every metric of every method and split over its cases, in the order they come."""
-    rows: list[Row] = []
+    rows: list[SuiteRow] = []
     for (method, split, metric), cases in _grouped(scores).items():
         value = np.array([cases[case] for case in sorted(cases)])
         low, high = interval(value)
         rows.append(
-            Row(
+            SuiteRow(
                 method=method,
                 split=split,
                 metric=metric,
@@ -165,7 +165,9 @@ def compare(scores: Iterable[Score], against: str) -> list[Difference]:
     return found
 
 
-def to_csv(rows: Sequence[Row] | Sequence[Difference], columns: tuple[str, ...] = COLUMNS) -> str:
+def to_csv(
+    rows: Sequence[SuiteRow] | Sequence[Difference], columns: tuple[str, ...] = SUITE_COLUMNS
+) -> str:
     """Write rows as comma-separated values with a header; numbers keep 7 digits."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
@@ -176,22 +178,22 @@ def to_csv(rows: Sequence[Row] | Sequence[Difference], columns: tuple[str, ...] 
     return stream.getvalue()
 
 
-def read_rows(text: str) -> list[Row]:
+def read_rows(text: str) -> list[SuiteRow]:
     """Read back what `to_csv` wrote of rows.
 
     Raises:
         ValueError: If the columns are others, or a number is not one.
     """
     table = list(csv.reader(io.StringIO(text)))
-    if not table or tuple(table[0]) != COLUMNS:
-        raise ValueError(f"the columns must be {', '.join(COLUMNS)}")
-    rows: list[Row] = []
+    if not table or tuple(table[0]) != SUITE_COLUMNS:
+        raise ValueError(f"the columns must be {', '.join(SUITE_COLUMNS)}")
+    rows: list[SuiteRow] = []
     for line, cells in enumerate(table[1:], 2):
-        if len(cells) != len(COLUMNS):
-            raise ValueError(f"line {line} has {len(cells)} cells instead of {len(COLUMNS)}")
+        if len(cells) != len(SUITE_COLUMNS):
+            raise ValueError(f"line {line} has {len(cells)} cells instead of {len(SUITE_COLUMNS)}")
         method, split, metric, mean, low, high, n = cells
         rows.append(
-            Row(
+            SuiteRow(
                 method=method,
                 split=split,
                 metric=metric,
@@ -241,7 +243,7 @@ class Column:
 
 
 def markdown_table(
-    rows: Sequence[Row], columns: Sequence[Column], unranked: Collection[str] = ()
+    rows: Sequence[SuiteRow], columns: Sequence[Column], unranked: Collection[str] = ()
 ) -> str:
     """Lay methods out against columns, with intervals; the best of a column is bold."""
     head, *body = laid_out(rows, columns, "**{}**", unranked)
@@ -251,7 +253,7 @@ def markdown_table(
 
 
 def latex_table(
-    rows: Sequence[Row], columns: Sequence[Column], unranked: Collection[str] = ()
+    rows: Sequence[SuiteRow], columns: Sequence[Column], unranked: Collection[str] = ()
 ) -> str:
     """Lay methods out against columns as a ``tabular`` of booktabs; the best is bold."""
     # The command is put in after escaping, which would break it.
@@ -265,7 +267,7 @@ def latex_table(
 
 
 def laid_out(
-    rows: Sequence[Row],
+    rows: Sequence[SuiteRow],
     columns: Sequence[Column],
     best: str = "{}",
     unranked: Collection[str] = (),
@@ -296,7 +298,7 @@ def laid_out(
 
 
 def _column(
-    rows: Sequence[Row | None], column: Column, best: str, unranked: Collection[str]
+    rows: Sequence[SuiteRow | None], column: Column, best: str, unranked: Collection[str]
 ) -> list[str]:
     rivals = [row for row in rows if row is not None and row.method not in unranked]
     pick = max if is_higher_better(column.metric) else min
@@ -461,7 +463,7 @@ docs/evaluation.md explains the methods and protocols, docs/metrics.md every met
 
 def write_report(
     about: Mapping[str, Any],
-    rows: Sequence[Row],
+    rows: Sequence[SuiteRow],
     differences: Sequence[Difference],
     cells: Sequence[Mapping[str, Any]],
 ) -> dict[str, str]:
@@ -503,7 +505,7 @@ def write_report(
     }
 
 
-def tables_of(rows: Sequence[Row]) -> dict[str, list[Column]]:
+def tables_of(rows: Sequence[SuiteRow]) -> dict[str, list[Column]]:
     """Choose the tables for which there are figures, in the order of the paper."""
     splits = list(dict.fromkeys(row.split for row in rows))
     wanted: dict[str, list[Column]] = {
@@ -677,7 +679,7 @@ def _per_sequence(cells: Sequence[Mapping[str, Any]]) -> str:
     return stream.getvalue()
 
 
-def _charts(rows: Sequence[Row], cells: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+def _charts(rows: Sequence[SuiteRow], cells: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     charts: dict[str, str] = {}
     for split in _SPLITS:
         bars = [

@@ -14,7 +14,7 @@ import physhandi.hand
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
 from physhandi.errors import MissingInputError
-from physhandi.hand.model import Side
+from physhandi.hand.model import HandSide
 from physhandi.progress import NullProgress, Progress
 
 _ASSETS = Path(physhandi.hand.__file__).parent / "assets"
@@ -206,14 +206,14 @@ def _turn_to_up(wrist: Float[ndarray, " 2"], knuckle: Float[ndarray, " 2"]) -> f
 _PRESENCE = 0.5
 _SAME_HAND = 0.5
 _MAX_HANDS = 2
-STAGE = "keypoint_detection"
+KEYPOINT_STAGE = "keypoint_detection"
 
 
 @dataclass(frozen=True)
 class DetectedHand:
     """One hand in one image."""
 
-    side: Side
+    side: HandSide
     """Which hand it looks like, in an image that is not mirrored."""
     keypoint: Float[ndarray, "21 2"]
     """Keypoints in MediaPipe's order [px]."""
@@ -277,12 +277,12 @@ class KeypointDetector:
         hand = self._find_landmarks(image, region)
         is_new = all(overlap(hand.pixel, other.keypoint) < _SAME_HAND for other in found)
         if hand.presence > _PRESENCE and is_new:
-            side: Side = "right" if hand.right > 0.5 else "left"
+            side: HandSide = "right" if hand.right > 0.5 else "left"
             found.append(DetectedHand(side, hand.pixel, hand.presence, hand.right))
 
 
 def detect_view(
-    view: View, hands: tuple[Side, ...], progress: Progress, detector: KeypointDetector
+    view: View, hands: tuple[HandSide, ...], progress: Progress, detector: KeypointDetector
 ) -> Float[ndarray, "frame hand 21 3"]:
     """Follow the given hands through one view.
 
@@ -308,7 +308,7 @@ def detect_view(
             result[frame, index, :, :2] = hand.keypoint
             result[frame, index, :, 2] = hand.confidence
         previous = list(assigned.values())
-        progress.report(STAGE, frame + 1, view.frame_count, None, f"View {view.name}")
+        progress.report(KEYPOINT_STAGE, frame + 1, view.frame_count, None, f"View {view.name}")
     return result
 
 
@@ -346,7 +346,7 @@ def detect_sequence(
 
 
 def assign_hands(
-    found: SequenceOf[DetectedHand], hands: tuple[Side, ...]
+    found: SequenceOf[DetectedHand], hands: tuple[HandSide, ...]
 ) -> dict[int, DetectedHand]:
     """Say which of the wanted hands each found one is.
 

@@ -21,7 +21,7 @@ from physhandi.synthetic.bodies.bodies import BodyName, Resolution, make_body
 from physhandi.synthetic.code_version import generator_version
 from physhandi.synthetic.engines.mujoco_flex import simulate_truth
 from physhandi.synthetic.engines.truth import FRAME_RATE, CapsuleHand, Hold, PhysicalTruth
-from physhandi.synthetic.film.cameras import MOST, make_viewpoints
+from physhandi.synthetic.film.cameras import MOST_CAMERAS, make_viewpoints
 from physhandi.synthetic.film.degradations import changed, find_preset
 from physhandi.synthetic.film.filmed_scene import SIDES, make_filmed_scene
 from physhandi.synthetic.film.recording import Images, record
@@ -32,7 +32,7 @@ _LOG = logging.getLogger(__name__)
 
 FRAMES = 90
 """Frames of a sequence if nothing else is asked for: three seconds."""
-LEAST_FRAMES, MOST_FRAMES = 2, 1000
+LEAST_FRAMES, MOST_SYNTHETIC_FRAMES = 2, 1000
 """A sequence has at least and at most so many frames."""
 LABEL = "SynthHDI"
 """Label of the sequences."""
@@ -162,10 +162,10 @@ def _check(
         raise UsageError(f"There is no action {action!r}. Choose one of: {', '.join(ACTIONS)}.")
     if not 0 <= seed < 2**32:
         raise UsageError(f"seed is {seed}; expected a whole number from 0 to 4294967295.")
-    if not 1 <= cameras <= MOST:
-        raise UsageError(f"cameras is {cameras}; expected 1 to {MOST}.")
-    if not LEAST_FRAMES <= frames <= MOST_FRAMES:
-        raise UsageError(f"frames is {frames}; expected {LEAST_FRAMES} to {MOST_FRAMES}.")
+    if not 1 <= cameras <= MOST_CAMERAS:
+        raise UsageError(f"cameras is {cameras}; expected 1 to {MOST_CAMERAS}.")
+    if not LEAST_FRAMES <= frames <= MOST_SYNTHETIC_FRAMES:
+        raise UsageError(f"frames is {frames}; expected {LEAST_FRAMES} to {MOST_SYNTHETIC_FRAMES}.")
     for name, value, known in (
         ("hold", hold, get_args(Hold)),
         ("images", images, get_args(Images)),

@@ -71,3 +71,23 @@ def test_mano_is_imported_where_fits_look_for_it(tmp_path, capsys, monkeypatch):
     assert "mano_right.npz" in out
     assert load_hand_model("right", "mano").vertex_count == 778
     assert [path.name for path in (tmp_path / "hands").iterdir()] == ["mano_right.npz"]
+
+
+def test_every_option_of_a_motion_capture_import_can_be_given(tmp_path, capsys):
+    rope = np.zeros((40, 5, 3), np.float32)
+    rope[..., 1] = 1000 * (1 + np.arange(40)[:, None] / 100)
+    rope[..., 0] = 80 * np.arange(5)
+    np.save(tmp_path / "rope.npy", rope)
+    command = ("import", "mocap", tmp_path / "rope.npy", "--out", tmp_path / "out")
+    code, _, error = call(capsys, *command)
+    assert (code, "--controlled-markers" in error) == (1, True)
+    options = ("--controlled-markers", 0, 4, "--recording-rate", 60, "--frame-rate", 20)
+    options += ("--node-spacing", 0.02, "--rest-shape", "first_frame", "--up", "y", "--unit", "mm")
+    code, _, error = call(capsys, *command, *options)
+    assert code == 0, error
+    sequence = Sequence.load(tmp_path / "out" / "rope")
+    assert (sequence.frame_rate, sequence.frame_count) == (20.0, 14)
+    assert sequence.object_node is not None
+    np.testing.assert_allclose(sequence.object_node[[0, -1]], [[0, 0, 1], [0, 0.32, 1]], atol=1e-6)
+    assert call(capsys, *command, *options)[0] != 0
+    assert call(capsys, *command, *options, "--overwrite")[0] == 0

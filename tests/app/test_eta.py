@@ -31,6 +31,7 @@ from physhandi.fitting.config import (
     SPRINGS,
     PipelineConfig,
     apply_overrides,
+    config_to_dict,
     load_profile,
 )
 from physhandi.run import Run
@@ -45,7 +46,7 @@ BEGIN = 1_000_000.0
 def finished(
     seconds: dict[str, float], config: PipelineConfig = QUICK, machine: tuple[Any, ...] = MACHINE
 ) -> FinishedFit:
-    settings = config.to_dict()
+    settings = config_to_dict(config)
     values = {key: v for key, v in settings.items() if key not in {"profile", "description"}}
     text = json.dumps(values, sort_keys=True, default=str)
     return FinishedFit(text, config.profile, machine, work_of(config, TOWEL), seconds, 0.0)
@@ -58,7 +59,7 @@ def stages(**seconds: float) -> dict[str, float]:
 
 def expected(fits: list[FinishedFit], config: PipelineConfig = QUICK, frames: int = 60) -> Any:
     work = work_of(config, replace(TOWEL, frames=frames, hand_frames=frames))
-    return expect(fits, config.to_dict(), MACHINE, work)
+    return expect(fits, config_to_dict(config), MACHINE, work)
 
 
 def test_work_grows_with_frames_and_iterations_and_is_none_where_nothing_is_to_be_done() -> None:

@@ -19,7 +19,7 @@ from physhandi.data.sequence import Sequence
 from physhandi.errors import CancelledError, RunError, UsageError
 from physhandi.progress import NullProgress, Progress
 from physhandi.run import Run
-from physhandi.synthetic.suite.evaluation import Order, evaluate, filler, list_tasks
+from physhandi.synthetic.suite.evaluation import Order, evaluate_suite, filler, list_tasks
 from physhandi.synthetic.suite.methods import parse_method
 
 pytestmark = pytest.mark.timeout(900)
@@ -71,11 +71,11 @@ class Watched(Progress):
 def test_two_processes_give_the_table_of_one_and_fill_each_cell_once(
     tmp_path: Path, order: Order
 ) -> None:
-    evaluate(order, tmp_path / "one")
+    evaluate_suite(order, tmp_path / "one")
     progress = Watched()
     with SuiteWorkers(2, progress) as workers:
         out = tmp_path / "two"
-        found = evaluate(order, out, progress, fill=workers.fill(order, out))
+        found = evaluate_suite(order, out, progress, fill=workers.fill(order, out))
         shares = [process.cpu_affinity() for process in children()]
         assert sorted(shares) == suite_workers._shares(2)
     assert (found["cells"], found["failed"], found["skipped"]) == (14, 0, [])
@@ -137,10 +137,10 @@ def test_a_process_that_is_killed_is_told_and_the_command_goes_on(
     out = tmp_path / "suite"
     told = r"ended while it worked on .*exit code -9.*--jobs"
     with pytest.raises(RunError, match=told), SuiteWorkers(2, Killer()) as workers:
-        evaluate(order, out, fill=workers.fill(order, out))
+        evaluate_suite(order, out, fill=workers.fill(order, out))
     assert children() == []
     with SuiteWorkers(2, NullProgress()) as workers:
-        found = evaluate(order, out, fill=workers.fill(order, out))
+        found = evaluate_suite(order, out, fill=workers.fill(order, out))
     assert (found["cells"], found["failed"]) == (14, 0)
 
 
@@ -149,7 +149,7 @@ def test_a_wish_to_stop_ends_all_processes_and_keeps_what_is_finished(
 ) -> None:
     progress = Watched(stop_at="quick, low")
     with pytest.raises(CancelledError), SuiteWorkers(2, progress) as workers:
-        evaluate(order, tmp_path, progress, fill=workers.fill(order, tmp_path))
+        evaluate_suite(order, tmp_path, progress, fill=workers.fill(order, tmp_path))
     assert children() == []
     cells = json.loads((tmp_path / "cells.json").read_text())
     assert {cell["method"] for cell in cells["cells"]} >= {"static"}
@@ -160,7 +160,7 @@ def test_what_a_process_finds_wrong_is_told_in_its_words(tmp_path: Path, order: 
     wrong = replace(order, methods=("quick@object_.search.population=1",))
     told = r"population is 1; expected a whole number from 2"
     with pytest.raises(UsageError, match=told), SuiteWorkers(2, NullProgress()) as workers:
-        evaluate(wrong, tmp_path, fill=workers.fill(wrong, tmp_path))
+        evaluate_suite(wrong, tmp_path, fill=workers.fill(wrong, tmp_path))
     making = {"object": "brick", "action": "lift", "seed": 0}
     told = "no object named 'brick'"
     with pytest.raises(UsageError, match=told), SuiteWorkers(2, NullProgress()) as workers:

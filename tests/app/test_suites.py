@@ -9,7 +9,7 @@ import pytest
 from server_world import World
 
 from physhandi.data.sequence import Sequence
-from physhandi.synthetic.suite.evaluation import Order, evaluate
+from physhandi.synthetic.suite.evaluation import Order, evaluate_suite
 
 METHODS = ("static", "rigid_follow", "quick@simulation.connection_radius=0.01")
 
@@ -21,7 +21,7 @@ def suite_folder(tmp_path_factory: pytest.TempPathFactory, sheet_folder: Path) -
     folder = tmp_path_factory.mktemp("suites") / "small"
     recordings = (Sequence.load(sheet_folder),)
     order = Order(title="A <b>sheet</b>", recordings=recordings, methods=METHODS, settings=settings)
-    assert evaluate(order, folder)["failed"] == 1
+    assert evaluate_suite(order, folder)["failed"] == 1
     return folder
 
 

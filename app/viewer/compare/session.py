@@ -23,9 +23,9 @@ from app.viewer.export.export_panel import ExportPanel
 from app.viewer.export.snapshot import Snapshot
 from app.viewer.scene.framing import Framing, frame_content
 from app.viewer.scene.layers_panel import LayersPanel, TimelinePanel, set_theme
+from app.viewer.scene.scene_server import SceneServer
 from app.viewer.ui.guard import plain
 from app.viewer.ui.keyboard import bind
-from app.viewer.ui.scene_server import SceneServer
 
 
 class CompareSession(SceneServer):

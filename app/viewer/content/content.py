@@ -10,9 +10,15 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from app.viewer.content.markers import Markers
-from app.viewer.content.observed import CloudSet, DepthCloud, Observed, PointSet, Tracks
-from app.viewer.content.skeleton import lift_keypoints
+from app.viewer.content.observed import (
+    CloudSet,
+    DepthCloud,
+    Markers,
+    Observed,
+    PointSet,
+    Tracks,
+    lift_keypoints,
+)
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
 from physhandi.errors import MissingInputError, PhysHandiError, UsageError

@@ -1,46 +1,19 @@
-"""Observed points of a frame, from markers or from depth images."""
+"""What was seen: points and clouds of a frame, identified tracks and markers, hand keypoints."""
 
 from collections.abc import Sequence as Listing
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
+from app.previews.links import MOST_MARKERS, marker_links
+from physhandi.data.camera import triangulate
+from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
 
 _POINTS = 5_000
 _GREEN = np.array([46, 160, 67], dtype=np.uint8)
-
-
-class Observed(Protocol):
-    """Finds what was seen in a frame."""
-
-    def points(self, frame: int) -> Float[ndarray, "point 3"]:
-        """Find the points seen in a frame [m]."""
-        ...
-
-    def colors(self) -> UInt8[ndarray, "point 3"] | UInt8[ndarray, " 3"]:
-        """Tell the color of the points of the frame asked for last."""
-        ...
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Tracks:
-    """Points that keep their identity over the frames, so that errors can be told for each."""
-
-    point: Float[ndarray, "frame track 3"]
-    """Observed places [m]."""
-    is_visible: Bool[ndarray, "frame track"]
-    """Whether a track is seen."""
-    node: Int[ndarray, " track"] | None = None
-    """Node that each track observes; None if the nodes around it carry it."""
-
-    @property
-    def name(self) -> str:
-        """What they are called: whoever knows their nodes has markers."""
-        return "the tracks" if self.node is None else "the markers"
 
 
 class PointSet:
@@ -113,5 +86,93 @@ class DepthCloud:
         return np.concatenate(clouds).astype(np.float32)
 
     def colors(self) -> UInt8[ndarray, "point 3"]:
-        """Tell the pixels' colors."""
+        """Give the pixels' colors."""
         return self._colors
+
+
+Observed = PointSet | CloudSet | DepthCloud
+"""Finds the points that were seen in a frame, and the colors of those it found last."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Tracks:
+    """Points that keep their identity over the frames, so that errors can be told for each."""
+
+    point: Float[ndarray, "frame track 3"]
+    """Observed places [m]."""
+    is_visible: Bool[ndarray, "frame track"]
+    """Whether a track is seen."""
+    node: Int[ndarray, " track"] | None = None
+    """Node that each track observes; None if the nodes around it carry it."""
+
+    @property
+    def name(self) -> str:
+        """What they are called: whoever knows their nodes has markers."""
+        return "the tracks" if self.node is None else "the markers"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Markers:
+    """Markers that keep their number over the frames."""
+
+    point: Float[ndarray, "frame marker 3"]
+    """Where they are [m]; NaN where they are not seen."""
+    held: tuple[int, ...]
+    """Those that sit on what moves the object, and are control points therefore."""
+    links: Int[ndarray, "link 2"]
+    """Pairs of neighbors."""
+
+    @classmethod
+    def of(cls, sequence: Sequence) -> "Markers | None":
+        """Find the markers of a sequence; None if there are none, or too many to be told apart."""
+        marker = sequence.marker
+        if marker is None or marker.shape[1] > MOST_MARKERS:
+            return None
+        return cls(point=marker, held=sequence.controlled_markers, links=marker_links(marker[0]))
+
+    def segments(self, frame: int) -> Float[ndarray, "link 2 3"]:
+        """Give the lines between neighbors that are both seen in a frame."""
+        line = np.asarray(self.point[frame], dtype=np.float32)[self.links]
+        return line[np.isfinite(line).all(axis=(1, 2))]
+
+    def neighbors(self, marker: int) -> list[int]:
+        """Find the neighbors of a marker."""
+        pairs = self.links[(self.links == marker).any(axis=1)]
+        return sorted(int(other) for other in pairs[pairs != marker])
+
+
+BONES = np.array(
+    [
+        *([0, 1], [1, 2], [2, 3], [3, 4]),
+        *([0, 5], [5, 6], [6, 7], [7, 8]),
+        *([5, 9], [9, 10], [10, 11], [11, 12]),
+        *([9, 13], [13, 14], [14, 15], [15, 16]),
+        *([13, 17], [0, 17], [17, 18], [18, 19], [19, 20]),
+    ]
+)
+"""Pairs of keypoints, in MediaPipe's order, that a bone joins."""
+
+_MIN_CONFIDENCE = 0.3
+
+
+def lift_keypoints(views: Listing[View]) -> tuple[Float[ndarray, "frame keypoint 3"], ...]:
+    """Triangulate each hand's keypoints from all views that see them, for a first look.
+
+    Args:
+        views: Views; those without keypoints are left out.
+
+    Returns:
+        One array per hand [m], NaN where fewer than two views see a keypoint; empty if fewer than
+        two views have keypoints.
+    """
+    seen = [(view.camera, view.keypoint) for view in views if view.keypoint is not None]
+    if len(seen) < 2:
+        return ()
+    keypoint = np.stack([keypoint for _, keypoint in seen]).astype(np.float64)
+    views_count, frames, hands, joints, _ = keypoint.shape
+    flat = keypoint.reshape(views_count, -1, 3)
+    trust = np.where(flat[..., 2] >= _MIN_CONFIDENCE, 1.0, 0.0)
+    cameras = [camera for camera, _ in seen]
+    point = triangulate(cameras, flat[..., :2], trust, tolerance=np.inf).astype(np.float32)
+    point = point.reshape(frames, hands, joints, 3)
+    return tuple(point[:, hand] for hand in range(hands))

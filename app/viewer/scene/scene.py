@@ -13,7 +13,7 @@ from app.viewer.color.coloring import Painted, Painter
 from app.viewer.color.hand_coloring import HandPainter
 from app.viewer.content.content import Content
 from app.viewer.content.layers import GREEN, GREY, SKIN, default_layers
-from app.viewer.content.skeleton import BONES
+from app.viewer.content.observed import BONES
 from app.viewer.scene.cameras import CameraNodes
 from app.viewer.scene.framing import Framing
 from app.viewer.scene.nodes import SceneNodes

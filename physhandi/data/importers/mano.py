@@ -15,7 +15,7 @@ from physhandi.data.files import named_fields, write_atomically
 from physhandi.data.foreign import read_untrusted
 from physhandi.errors import ImportFailedError
 
-FORMAT = "physhandi-mano-1"
+MANO_FORMAT = "physhandi-mano-1"
 SHAPES: dict[str, tuple[int, ...]] = {
     "v_template": (778, 3),
     "shapedirs": (778, 3, 10),
@@ -57,7 +57,7 @@ def import_mano(source: Path | str, out: Path | str) -> Path:
     if mirrored:
         arrays["shapedirs"][:, 0] *= -1
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    notes = {"format": FORMAT, "side": side, "source_sha256": digest}
+    notes = {"format": MANO_FORMAT, "side": side, "source_sha256": digest}
     texts = {name: np.array(value) for name, value in notes.items()}
     target = Path(out) / f"mano_{side}.npz"
     target.parent.mkdir(parents=True, exist_ok=True)

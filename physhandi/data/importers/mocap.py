@@ -1,8 +1,9 @@
 """Motion capture of a rope that grippers swing: markers in, point controllers out."""
 
+import math
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -14,10 +15,23 @@ from physhandi.data.length_unit import doubt_extent, doubt_position
 from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import write_sequence
-from physhandi.errors import ImportFailedError
+from physhandi.errors import ImportFailedError, UsageError
 from physhandi.progress import NullProgress, Progress
 
-STAGE = "import"
+_STAGE = "import"
+Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
+LengthUnit = Literal["m", "cm", "mm", "in"]
+RestShape = Literal["straight", "first_frame"]
+UNITS: dict[LengthUnit, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
+"""Metres of a file's length unit."""
+LARGEST_STRETCH = 0.4
+"""Range of a segment's length (2 to 98 % of the frames) over its median; a rope's is below 0.25."""
+SMALLEST_STRETCH = 5e-3
+"""Segments whose length varies by less are never refused: that is the markers' noise [m]."""
+LARGEST_SEGMENT_RATIO = 10.0
+"""Longest over shortest segment; more is a jump between branches."""
+LONGEST_CHAIN = 10.0
+"""Chains longer than this were not given in the unit that they are read in [m]."""
 _FEWEST_FRAMES = 8
 _SAMPLES_PER_SEGMENT = 64
 
@@ -31,12 +45,16 @@ def import_mocap(
     recording_rate: float = 100.0,
     frame_rate: float = 30.0,
     nodes_per_segment: int = 4,
+    node_spacing: float | None = None,
+    rest_shape: RestShape = "straight",
+    up: Axis = "z",
+    unit: LengthUnit = "m",
     overwrite: bool = False,
 ) -> list[Sequence]:
     """Convert trajectories of a rope's markers, each to a sequence ``out/<name of the file>``.
 
-    A trajectory is a float array "frame marker 3" in metres with z up; the markers are given in
-    their order along the rope.
+    A trajectory is a float array "frame marker 3"; the markers are given in their order along the
+    rope.
 
     Args:
         source: One ``.npy`` file, or a folder of them.
@@ -46,24 +64,42 @@ def import_mocap(
         recording_rate: Frames per second of the recording [Hz].
         frame_rate: Frames per second of the sequence [Hz].
         nodes_per_segment: Object nodes from one marker to the next.
+        node_spacing: Distance between nodes [m]; replaces `nodes_per_segment` by what the median
+            segment needs.
+        rest_shape: ``straight``, each segment as long as its median, or as in the ``first_frame``.
+        up: Axis of the recording that points up.
+        unit: Length unit of the recording.
         overwrite: Whether to replace sequences that are there.
 
     Returns:
         The sequences, by name.
 
     Raises:
-        ImportFailedError: If a file is no such trajectory; names file, frame and marker. Nothing is
-            written then.
+        ImportFailedError: If a file is no such trajectory, or its markers are no chain; names file,
+            frame and marker. Nothing is written then.
+        UsageError: If a rate, a count or a spacing is not positive.
     """
+    for name, value in (
+        ("recording rate", recording_rate),
+        ("frame rate", frame_rate),
+        ("number of nodes per segment", nodes_per_segment),
+        ("node spacing", 1.0 if node_spacing is None else node_spacing),
+    ):
+        if not 0 < value < math.inf:
+            raise UsageError(f"The {name} must be positive, not {value:g}.")
     watched = progress or NullProgress()
     paths = _trajectories(Path(source))
     # All are read before the first is written: a bad one must not leave half of a folder.
-    recordings = {path: _read(path, controlled_markers) for path in paths}
+    recordings = {path: _read(path, controlled_markers, up, unit) for path in paths}
     sequences: list[Sequence] = []
     for number, (path, marker) in enumerate(recordings.items()):
         watched.check_cancelled()
         resampled = resample(marker, recording_rate, frame_rate).astype(np.float32)
-        node, marker_node = refine(resampled[0].astype(np.float64), nodes_per_segment)
+        per_segment = nodes_per_segment
+        if node_spacing is not None:
+            per_segment = max(1, round(float(np.median(_segment_length(marker))) / node_spacing))
+        node, marker_node = refine(resampled[0].astype(np.float64), per_segment)
+        rest = node if rest_shape == "first_frame" else straight_chain(marker, per_segment)
         meta = SequenceMeta(
             name=_name(path),
             description=f"Rope with {marker.shape[1]} motion-capture markers, moved by grippers.",
@@ -78,7 +114,10 @@ def import_mocap(
                 "file": path.name,
                 "recording_rate": float(recording_rate),
                 "recorded_frames": len(marker),
-                "nodes_per_segment": nodes_per_segment,
+                "nodes_per_segment": per_segment,
+                "rest_shape": rest_shape,
+                "up": up,
+                "unit": unit,
             },
         )
         arrays = {
@@ -86,10 +125,10 @@ def import_mocap(
             "marker.npy": resampled,
             "marker_node.npy": marker_node.astype(np.int32),
             "object_node.npy": node.astype(np.float32),
-            "rest_node.npy": straight_chain(marker, nodes_per_segment).astype(np.float32),
+            "rest_node.npy": rest.astype(np.float32),
         }
         sequences.append(write_sequence(Path(out) / meta.name, meta, arrays, overwrite=overwrite))
-        watched.report(STAGE, number + 1, len(paths), message=meta.name)
+        watched.report(_STAGE, number + 1, len(paths), message=meta.name)
     return sequences
 
 
@@ -136,7 +175,7 @@ def straight_chain(
     marker: Float[ndarray, "frame marker 3"], nodes_per_segment: int
 ) -> Float[ndarray, "node 3"]:
     """Give the rope without tension: straight along x, each segment as long as its median [m]."""
-    length = np.median(np.linalg.norm(np.diff(marker, axis=1), axis=2), axis=0)
+    length = np.median(_segment_length(marker), axis=0)
     step = np.repeat(length / nodes_per_segment, nodes_per_segment)
     node = np.zeros((len(step) + 1, 3))
     node[1:, 0] = np.cumsum(step)
@@ -154,7 +193,23 @@ def _trajectories(source: Path) -> list[Path]:
     return paths
 
 
-def _read(path: Path, controlled_markers: tuple[int, ...]) -> Float[ndarray, "sample marker 3"]:
+def turned_up(
+    marker: Float[ndarray, "frame marker 3"], up: Axis
+) -> Float[ndarray, "frame marker 3"]:
+    """Turn a recording so that its axis `up` becomes z; the axes keep their handedness."""
+    axis = "xyz".index(up[-1])
+    # The two axes after `up`, in cyclic order, become x and y.
+    turned = marker[..., [(axis + 1) % 3, (axis + 2) % 3, axis]]
+    return turned * np.array([1.0, -1.0, -1.0]) if up.startswith("-") else turned
+
+
+def _segment_length(marker: ndarray) -> Float[ndarray, "frame segment"]:
+    return np.linalg.norm(np.diff(marker, axis=1), axis=2)
+
+
+def _read(
+    path: Path, controlled_markers: tuple[int, ...], up: Axis, unit: LengthUnit
+) -> Float[ndarray, "sample marker 3"]:
     try:
         array = read_array(path)
     except (ValueError, OSError) as error:
@@ -172,10 +227,12 @@ def _read(path: Path, controlled_markers: tuple[int, ...]) -> Float[ndarray, "sa
     if wrong or not controlled_markers or array.shape[1] < 2:
         raise ImportFailedError(
             f"{path.name} has {array.shape[1]} markers, but markers {list(controlled_markers)} "
-            "shall be the controls. Name other controls, or give a recording that has them."
+            "shall be the controls. Name other controls (--controlled-markers), or give a "
+            "recording that has them."
         )
-    marker = array.astype(np.float64)
+    marker = turned_up(array.astype(np.float64) * UNITS[unit], up)
     _check_values(path, marker)
+    _check_chain(path, marker, unit)
     return marker
 
 
@@ -194,13 +251,40 @@ def _check_values(path: Path, marker: ndarray) -> None:
     reason = doubt_extent(marker[0])
     if reason is not None:
         raise ImportFailedError(f"{path.name}: frame 0 {reason}.")
-    length = np.linalg.norm(np.diff(marker, axis=1), axis=2)
-    short = np.argwhere(length < 1e-6)
+    short = np.argwhere(_segment_length(marker) < 1e-6)
     if short.size:
         frame, number = short[0]
         raise ImportFailedError(
             f"{path.name}: frame {frame}: markers {number} and {number + 1} are at one place. "
             "Give markers in their order along the rope, each once."
+        )
+
+
+def _check_chain(path: Path, marker: ndarray, unit: LengthUnit) -> None:
+    """Refuse markers that are no chain of nearly constant segments, or in a wrong unit."""
+    length = _segment_length(marker)
+    median = np.median(length, axis=0)
+    low, high = np.percentile(length, [2, 98], axis=0)
+    if median.sum() > LONGEST_CHAIN:
+        raise ImportFailedError(
+            f"{path.name}: the markers make a rope of {median.sum():.1f} m, read in {unit}. "
+            "Name the recording's unit (--unit)."
+        )
+    stretch = (high - low) / median
+    worst = int(stretch.argmax())
+    if stretch[worst] > LARGEST_STRETCH and (high - low)[worst] > SMALLEST_STRETCH:
+        raise ImportFailedError(
+            f"{path.name}: from marker {worst} to {worst + 1} it is {1e3 * low[worst]:.0f} to "
+            f"{1e3 * high[worst]:.0f} mm, but the segments of a rope keep their lengths. Give "
+            "markers in their order along one rope, without branches, all axes in one unit."
+        )
+    longest, shortest = int(median.argmax()), int(median.argmin())
+    if median[longest] > LARGEST_SEGMENT_RATIO * median[shortest]:
+        raise ImportFailedError(
+            f"{path.name}: from marker {longest} to {longest + 1} it is "
+            f"{1e3 * median[longest]:.0f} mm, but {1e3 * median[shortest]:.0f} mm from marker "
+            f"{shortest} to {shortest + 1}. Give markers in their order along one rope, without "
+            "branches."
         )
 
 

@@ -14,7 +14,7 @@ from numpy import ndarray
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.importers.phystwin_files import (
-    FRAME_RATE,
+    PHYSTWIN_FRAME_RATE,
     CaseImages,
     CaseMetadata,
     CaseMotion,
@@ -27,8 +27,8 @@ from physhandi.data.importers.phystwin_files import (
     read_cleaned_masks,
     read_metadata,
     read_motion,
+    read_phystwin_split,
     read_poses,
-    read_split,
     read_validation,
 )
 from physhandi.data.sequence_meta import SequenceMeta, ViewMeta
@@ -105,7 +105,7 @@ def read_case(folder: Path) -> Case:
         cameras=cameras,
         motion=motion,
         validation=read_validation(files["gt_track_3d.pkl"], count) if has_validation else None,
-        reconstruction=read_split(folder / "split.json", count),
+        reconstruction=read_phystwin_split(folder / "split.json", count),
     )
 
 
@@ -180,7 +180,7 @@ def _check_images(folder: Path, camera_count: int) -> None:
                 )
 
 
-STAGE = "import"
+_STAGE = "import"
 GRAVITY = 9.8
 """PhysTwin's gravitational acceleration [m/s²]."""
 
@@ -226,7 +226,7 @@ def import_phystwin(
         meta = SequenceMeta(
             name=Path(out).resolve().name,
             description=f"PhysTwin case '{found.folder.name}'.",
-            frame_rate=found.metadata.frame_rate if found.metadata else FRAME_RATE,
+            frame_rate=found.metadata.frame_rate if found.metadata else PHYSTWIN_FRAME_RATE,
             frame_count=found.frame_count,
             ground_height=0.0,
             gravity=GRAVITY,
@@ -246,7 +246,7 @@ def import_phystwin(
             sequence = writer.finish(meta)
         except SequenceError as error:
             raise ImportFailedError(f"{found.folder} makes no valid sequence: {error}") from error
-    watched.report(STAGE, 1, 1, None, "Checked every frame")
+    watched.report(_STAGE, 1, 1, None, "Checked every frame")
     return sequence.folder
 
 
@@ -295,6 +295,6 @@ def _save_images(
             copy_depth(images, frame, writer, view.name)
             if images.mask is not None or uses_cleaned:
                 writer.save_image(f"views/{view.name}/mask/{frame:05d}.png", masks.label(frame))
-            progress.report(STAGE, number * case.frame_count + frame + 1, total, None, view.name)
+            progress.report(_STAGE, number * case.frame_count + frame + 1, total, None, view.name)
         # A view is its folder, also if nothing of it was recorded.
         writer.make_folder(f"views/{view.name}")

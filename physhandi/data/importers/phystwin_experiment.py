@@ -87,7 +87,7 @@ def read_optimum(path: Path) -> Optimum:
     )
 
 
-def read_checkpoint(path: Path) -> Checkpoint:
+def read_phystwin_checkpoint(path: Path) -> Checkpoint:
     """Read ``best_*.pth`` or ``iter_*.pth``.
 
     Raises:

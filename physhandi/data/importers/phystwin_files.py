@@ -16,7 +16,7 @@ from numpy import ndarray
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.files import read_array
 from physhandi.data.foreign import read_untrusted
-from physhandi.data.length_unit import FARTHEST as FARTHEST
+from physhandi.data.length_unit import FARTHEST_POSITION as FARTHEST
 from physhandi.data.sequence_writer import SequenceWriter
 from physhandi.errors import ImportFailedError
 
@@ -29,7 +29,7 @@ def fail(path: Path, reason: str) -> NoReturn:
     raise ImportFailedError(f"{path}: {reason}.")
 
 
-def read_json(path: Path) -> dict[str, Any]:
+def read_foreign_json(path: Path) -> dict[str, Any]:
     """Read a JSON file that holds named fields.
 
     Raises:
@@ -138,7 +138,7 @@ def _array(
     return value
 
 
-FRAME_RATE = 30.0
+PHYSTWIN_FRAME_RATE = 30.0
 """PhysTwin's frame rate, for cases whose ``metadata.json`` does not say another one [Hz]."""
 _RECONSTRUCTED = 0.7
 
@@ -228,7 +228,7 @@ def read_metadata(path: Path) -> CaseMetadata:
     Raises:
         ImportFailedError: If it is no JSON, or a field is missing or wrong.
     """
-    table = read_json(path)
+    table = read_foreign_json(path)
     for field in ("intrinsics", "WH"):
         if field not in table:
             fail(path, f"field '{field}' is missing. It is needed to place images; add it")
@@ -236,7 +236,7 @@ def read_metadata(path: Path) -> CaseMetadata:
     size = numbers(path, table, "WH", (2,))
     if not (size > 0).all() or (size != np.floor(size)).any():
         fail(path, f"WH is {table['WH']!r}; expected image width and height in pixels")
-    rate, count = table.get("fps", FRAME_RATE), table.get("frame_num")
+    rate, count = table.get("fps", PHYSTWIN_FRAME_RATE), table.get("frame_num")
     if type(rate) not in (int, float) or not 1.0 <= rate <= 1000.0:
         fail(path, f"fps is {rate!r}; expected frames per second from 1 to 1000")
     if count is not None and (type(count) is not int or count < 1):
@@ -291,7 +291,7 @@ def join_cameras(
     return tuple(cameras)
 
 
-def read_split(path: Path, frame_count: int) -> int:
+def read_phystwin_split(path: Path, frame_count: int) -> int:
     """Read how many leading frames are fitted; without the file, PhysTwin's 70 per cent.
 
     Raises:
@@ -299,7 +299,7 @@ def read_split(path: Path, frame_count: int) -> int:
     """
     if not path.is_file():
         return max(1, math.floor(_RECONSTRUCTED * frame_count))
-    table = read_json(path)
+    table = read_foreign_json(path)
     if table.get("frame_len") != frame_count:
         fail(path, f"frame_len is {table.get('frame_len')!r}, but there are {frame_count} frames")
     train, test = _interval(table.get("train")), _interval(table.get("test", table.get("train")))
@@ -579,7 +579,7 @@ def read_cleaned_masks(case: Path) -> Any | None:
 def _read_labels(images: CaseImages) -> list[tuple[Path, int]]:
     """List the mask folders with their labels, the object's first, then the hands' by number."""
     path = images.case / f"mask/mask_info_{images.camera}.json"
-    names = read_json(path)
+    names = read_foreign_json(path)
     wrong = [
         key for key, label in names.items() if not (key.isdecimal() and isinstance(label, str))
     ]

@@ -1,4 +1,4 @@
-"""Imports a hand filmed by two calibrated cameras, as TemugeB/handpose3d publishes it.
+"""Imports hands filmed by two calibrated cameras, in the layout of TemugeB/handpose3d.
 
 The folder holds a video per camera (``cam0*.mp4``, ``cam1*.mp4``), intrinsics and lens distortion
 (``c0.dat``, ``c1.dat``) and the pose of the checkerboard in each camera (``rot_trans_c0.dat``,
@@ -18,10 +18,10 @@ from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence import Sequence, ViewMeta
 from physhandi.data.sequence_meta import SequenceMeta, Side
 from physhandi.data.sequence_writer import SequenceWriter
-from physhandi.errors import ImportFailedError
+from physhandi.errors import ImportFailedError, UsageError
 from physhandi.progress import NullProgress, Progress
 
-STAGE = "import"
+_STAGE = "import"
 _CAMERAS = (0, 1)
 _FRAME_RATE_RANGE = (1.0, 1000.0)
 
@@ -41,6 +41,8 @@ def import_stereo(
     progress: Progress | None = None,
     *,
     hands: tuple[Side, ...] = ("right",),
+    origin: str = "",
+    licence: str = "",
     overwrite: bool = False,
 ) -> Sequence:
     """Convert a two-camera recording of a hand into a sequence.
@@ -54,6 +56,8 @@ def import_stereo(
         out_folder: Where the sequence shall appear; its last part names the sequence.
         progress: Told after every step.
         hands: Hands that the recording shows.
+        origin: Who recorded it, and where it was published; kept with the sequence if given.
+        licence: Under which licence; kept with the sequence if given.
         overwrite: Whether to replace a sequence that is there.
 
     Returns:
@@ -61,7 +65,10 @@ def import_stereo(
 
     Raises:
         ImportFailedError: If a file is missing or malformed; names file and line.
+        UsageError: If no hand is named, or one twice.
     """
+    if not hands or len(set(hands)) != len(hands):
+        raise UsageError(f"Name each hand that the recording shows once, not {list(hands)}.")
     source, progress = Path(source_folder), progress or NullProgress()
     if not source.is_dir():
         raise ImportFailedError(f"{source} is not a folder. Give the folder with cam0*.mp4.")
@@ -85,22 +92,24 @@ def import_stereo(
     )
     meta = SequenceMeta(
         name=Path(out_folder).resolve().name,
-        description="One hand in front of two calibrated cameras, no depth, no object.",
+        description=f"{' and '.join(hands).capitalize()} hand before two calibrated cameras.",
         frame_rate=videos[0].frame_rate,
         frame_count=videos[0].frame_count,
         metric=False,
         length_unit="board square",
         hands=hands,
         views=views,
-        provenance={"importer": "stereo", "origin": "TemugeB/handpose3d", "licence": "MIT"},
+        provenance={"importer": "stereo", "folder": source.resolve().name}
+        | ({"origin": origin} if origin else {})
+        | ({"licence": licence} if licence else {}),
     )
     with SequenceWriter(out_folder, overwrite=overwrite) as writer:
         for step, (view, video) in enumerate(zip(views, videos, strict=True)):
             progress.check_cancelled()
             writer.copy(f"views/{view.name}/color.mp4", video.path)
-            progress.report(STAGE, step + 1, len(views) + 1, None, video.path.name)
+            progress.report(_STAGE, step + 1, len(views) + 1, None, video.path.name)
         sequence = writer.finish(meta)
-    progress.report(STAGE, len(views) + 1, len(views) + 1, None, "Checked every frame")
+    progress.report(_STAGE, len(views) + 1, len(views) + 1, None, "Checked every frame")
     return sequence
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from collections.abc import Sequence as Many
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -15,7 +15,7 @@ from physhandi.errors import SimulationDivergedError, UsageError
 from physhandi.simulation.engines.graph import LaunchGraph
 from physhandi.simulation.engines.partition import bisect_nodes
 from physhandi.simulation.kernels.batch import (
-    FIELDS,
+    CANDIDATE_FIELDS,
     block_threads,
     make_batch_kernel,
     note_divergence,
@@ -24,7 +24,7 @@ from physhandi.simulation.kernels.batch import (
 )
 from physhandi.simulation.kernels.batch_losses import (
     NODES,
-    POINTS,
+    POINTS_PER_THREAD,
     add_losses,
     sum_accelerations,
     sum_chamfer,
@@ -98,8 +98,8 @@ class LossSum:
         self._layout = [width, nodes]
         surface = node_number[: target.surface_count]
         points = 0 if len(surface) == 0 else target.cloud.shape[1]
-        chunks = -(-points // POINTS)
-        more = ((0, 0), (0, chunks * POINTS - points))
+        chunks = -(-points // POINTS_PER_THREAD)
+        more = ((0, 0), (0, chunks * POINTS_PER_THREAD - points))
         cloud = np.pad(target.cloud[:, :points], (*more, (0, 0)))
         weight = np.pad(target.cloud_weight[:, :points], more)
         self._cloud = [
@@ -218,8 +218,12 @@ class Population:
         self._order = np.lexsort(reach.T[::-1])
         lanes = np.full(self._groups * self._width, self._order[-1])
         lanes[: self._count] = self._order
-        numbers = [[_number(parameters[i], name, substeps) for i in lanes] for name in FIELDS]
-        table = np.array(numbers, dtype=np.float32).reshape(len(FIELDS), self._groups, self._width)
+        numbers = [
+            [_number(parameters[i], name, substeps) for i in lanes] for name in CANDIDATE_FIELDS
+        ]
+        table = np.array(numbers, dtype=np.float32).reshape(
+            len(CANDIDATE_FIELDS), self._groups, self._width
+        )
         group_reach = reach[lanes].reshape(self._groups, self._width, 2).max(axis=1)
         limit = np.array([(p.connection_radius, p.max_neighbors) for p in parameters])
         group_limit = limit[lanes].reshape(self._groups, self._width, 2).min(axis=1)
@@ -406,7 +410,7 @@ def _number(parameters: SimulationParameters, name: str, substeps: int) -> float
     scale = parameters.stiffness_scale
     derived = {
         "dt": duration / substeps,
-        "velocity_loss": parameters.replace(substeps_per_frame=substeps).velocity_loss(),
+        "velocity_loss": replace(parameters, substeps_per_frame=substeps).velocity_loss(),
         "has_ground": float(height is not None),
         "ground_height": 0.0 if height is None else height,
         "control_rate": parameters.simulated_frame_rate * parameters.use_control_velocity,

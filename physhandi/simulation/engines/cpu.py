@@ -278,7 +278,7 @@ class CpuEngine:
         )
 
 
-def tape_layout(places: int, nodes: int, substeps: int) -> TapeLayout:
+def cpu_tape_layout(places: int, nodes: int, substeps: int) -> TapeLayout:
     """Say what is kept of a frame: states in all places, and velocities before contact.
 
     Args:
@@ -303,7 +303,7 @@ class CpuAdjoint:
         model, parts = simulator.model, engine.partition
         nodes, held = model.node_count, len(parts.control)
         substeps = simulator.parameters.substeps_per_frame
-        self.layout = tape_layout(parts.place_count, nodes, substeps)
+        self.layout = cpu_tape_layout(parts.place_count, nodes, substeps)
         self._state = simulator.position, simulator.velocity
         self.position_bar = engine.zeros(nodes, wp.vec3)
         self.velocity_bar = engine.zeros(nodes, wp.vec3)

@@ -342,7 +342,7 @@ class CudaEngine:
         )
 
 
-def tape_layout(nodes: int, substeps: int) -> TapeLayout:
+def cuda_tape_layout(nodes: int, substeps: int) -> TapeLayout:
     """Say what is kept of a frame: position, velocity and velocity before contact, side by side."""
     return (((substeps, 3 * nodes), wp.vec4),)
 
@@ -365,7 +365,7 @@ class CudaAdjoint:
         def zeros(count: int, dtype: Any) -> wp.array:
             return wp.zeros(count, dtype=dtype, device=device)
 
-        self.layout = tape_layout(nodes, simulator.parameters.substeps_per_frame)
+        self.layout = cuda_tape_layout(nodes, simulator.parameters.substeps_per_frame)
         self._state = simulator.position, simulator.velocity
         self.position_bar, self.velocity_bar = zeros(nodes, wp.vec3), zeros(nodes, wp.vec3)
         self._held_bars = [zeros(held, wp.vec3) for _ in range(2)]

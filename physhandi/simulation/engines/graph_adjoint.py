@@ -13,7 +13,7 @@ from physhandi.simulation.self_collision import SelfCollision
 from physhandi.simulation.simulator import Simulator
 
 
-def tape_layout(nodes: int, substeps: int, *, collides: bool) -> TapeLayout:
+def graph_tape_layout(nodes: int, substeps: int, *, collides: bool) -> TapeLayout:
     """Say what is kept of a frame: positions, velocities, and velocities before each contact."""
     states, steps = ((substeps + 1, nodes), wp.vec3), ((substeps, nodes), wp.vec3)
     return (states, states, steps, steps) if collides else (states, states, steps)
@@ -41,7 +41,7 @@ class GraphAdjoint:
         def zeros(shape: int | tuple[int, ...], dtype: Any) -> Any:
             return wp.zeros(shape, dtype=dtype, device=device)
 
-        self.layout = tape_layout(nodes, substeps, collides=collides)
+        self.layout = graph_tape_layout(nodes, substeps, collides=collides)
         self._tape = tuple(zeros(shape, dtype) for shape, dtype in self.layout)
         rows = [[whole[row] for row in range(whole.shape[0])] for whole in self._tape]
         self._position, self._velocity, self._free_velocity, *contact = rows

@@ -7,7 +7,7 @@ import warp as wp
 
 
 @wp.kernel
-def place_controls(
+def place_baseline_controls(
     fraction: float,
     control_start: wp.array[wp.vec3],
     control_end: wp.array[wp.vec3],

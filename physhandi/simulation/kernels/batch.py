@@ -14,7 +14,7 @@ from physhandi.simulation.kernels.world import World
 
 wp.set_module_options({"enable_backward": False})
 
-FIELDS = (
+CANDIDATE_FIELDS = (
     "dt",
     "velocity_loss",
     "gravity",
@@ -213,7 +213,7 @@ def make_batch_kernel(count: int, parts: int) -> wp.Kernel:
         if group >= groups:
             return
         own = 192 * (group * nodes + node) + lane
-        numbers = wp.static(32 * len(FIELDS)) * group + lane
+        numbers = wp.static(32 * len(CANDIDATE_FIELDS)) * group + lane
         x = vectors()
         v = vectors()
         force = vectors()
@@ -222,7 +222,9 @@ def make_batch_kernel(count: int, parts: int) -> wp.Kernel:
             v[k] = load(state, own + 96 + 32 * k)
         material = materials()
         for k in range(4):
-            material[k] = load(number, numbers + 32 * (wp.static(FIELDS.index("stiffness")) + k))
+            material[k] = load(
+                number, numbers + 32 * (wp.static(CANDIDATE_FIELDS.index("stiffness")) + k)
+            )
         force = sum_springs(
             state,
             192 * group * nodes + lane,
@@ -237,15 +239,21 @@ def make_batch_kernel(count: int, parts: int) -> wp.Kernel:
             material,
             force,
         )
-        dt = load(number, numbers + wp.static(32 * FIELDS.index("dt")))
-        velocity_loss = load(number, numbers + wp.static(32 * FIELDS.index("velocity_loss")))
-        gravity = load(number, numbers + wp.static(32 * FIELDS.index("gravity")))
-        has_ground = load(number, numbers + wp.static(32 * FIELDS.index("has_ground")))
-        ground_height = load(number, numbers + wp.static(32 * FIELDS.index("ground_height")))
-        restitution = load(number, numbers + wp.static(32 * FIELDS.index("restitution")))
-        friction = load(number, numbers + wp.static(32 * FIELDS.index("friction")))
-        control_rate = load(number, numbers + wp.static(32 * FIELDS.index("control_rate")))
-        speed_limit = load(number, numbers + wp.static(32 * FIELDS.index("speed_limit")))
+        dt = load(number, numbers + wp.static(32 * CANDIDATE_FIELDS.index("dt")))
+        velocity_loss = load(
+            number, numbers + wp.static(32 * CANDIDATE_FIELDS.index("velocity_loss"))
+        )
+        gravity = load(number, numbers + wp.static(32 * CANDIDATE_FIELDS.index("gravity")))
+        has_ground = load(number, numbers + wp.static(32 * CANDIDATE_FIELDS.index("has_ground")))
+        ground_height = load(
+            number, numbers + wp.static(32 * CANDIDATE_FIELDS.index("ground_height"))
+        )
+        restitution = load(number, numbers + wp.static(32 * CANDIDATE_FIELDS.index("restitution")))
+        friction = load(number, numbers + wp.static(32 * CANDIDATE_FIELDS.index("friction")))
+        control_rate = load(
+            number, numbers + wp.static(32 * CANDIDATE_FIELDS.index("control_rate"))
+        )
+        speed_limit = load(number, numbers + wp.static(32 * CANDIDATE_FIELDS.index("speed_limit")))
         for e in range(held_start[node] + part, held_start[node + 1], wp.static(parts)):
             length = held_length[e]
             # The nearest control comes first, so no later one is in reach either.
@@ -257,7 +265,8 @@ def make_batch_kernel(count: int, parts: int) -> wp.Kernel:
             tie = materials()
             for k in range(4):
                 tie[k] = load(
-                    number, numbers + 32 * (wp.static(FIELDS.index("virtual_stiffness")) + k)
+                    number,
+                    numbers + 32 * (wp.static(CANDIDATE_FIELDS.index("virtual_stiffness")) + k),
                 )
             for i in range(wp.static(count)):
                 if length[0] < tie[2, i] and float(rank) < tie[3, i]:

@@ -10,13 +10,13 @@ from physhandi.simulation.kernels.batch import place_of
 
 wp.set_module_options({"enable_backward": False})
 
-POINTS = 8
+POINTS_PER_THREAD = 8
 """Observed points that one thread holds while it walks over the nodes."""
 NODES = 16
 """Nodes whose velocities one thread compares."""
 
-_Points = wp.types.matrix(shape=(POINTS, 3), dtype=wp.float32)
-_Nearest = wp.types.vector(length=POINTS, dtype=wp.float32)
+_Points = wp.types.matrix(shape=(POINTS_PER_THREAD, 3), dtype=wp.float32)
+_Nearest = wp.types.vector(length=POINTS_PER_THREAD, dtype=wp.float32)
 
 
 @wp.kernel
@@ -34,10 +34,10 @@ def sum_chamfer(
 ):
     """Add up the squared distances of some observed points to the nearest surface node."""
     chunk, candidate = wp.tid()
-    first = wp.static(POINTS) * chunk
+    first = wp.static(POINTS_PER_THREAD) * chunk
     points = _Points()
     nearest = _Nearest()
-    for k in range(wp.static(POINTS)):
+    for k in range(wp.static(POINTS_PER_THREAD)):
         point = cloud[frame, first + k]
         points[k, 0] = point[0]
         points[k, 1] = point[1]
@@ -48,13 +48,13 @@ def sum_chamfer(
         x = state[base]
         y = state[base + width]
         z = state[base + 2 * width]
-        for k in range(wp.static(POINTS)):
+        for k in range(wp.static(POINTS_PER_THREAD)):
             dx = points[k, 0] - x
             dy = points[k, 1] - y
             dz = points[k, 2] - z
             nearest[k] = wp.min(nearest[k], dx * dx + dy * dy + dz * dz)
     total = float(0.0)
-    for k in range(wp.static(POINTS)):
+    for k in range(wp.static(POINTS_PER_THREAD)):
         total += weight[frame, first + k] * nearest[k]
     part_out[chunk, candidate] = total
 

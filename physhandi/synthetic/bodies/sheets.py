@@ -19,7 +19,7 @@ from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.topology import build_model
 from physhandi.synthetic.hands.script import minimum_jerk
 
-FINGERTIPS = (4, 8, 12, 16, 20)
+FINGERTIP_KEYPOINTS = (4, 8, 12, 16, 20)
 """Keypoints at the ends of the fingers."""
 
 # Curl of the thumb's three joints, its base also spread and twisted [rad].
@@ -202,4 +202,4 @@ def _grasp_point(
             torch.from_numpy(rotation)[None],
             torch.tensor([_WRIST], dtype=torch.float64),
         )
-    return keypoint[0, list(FINGERTIPS)].mean(dim=0).numpy()
+    return keypoint[0, list(FINGERTIP_KEYPOINTS)].mean(dim=0).numpy()

@@ -9,7 +9,7 @@ from numpy import ndarray
 
 from physhandi.data.sequence_meta import Side
 from physhandi.synthetic.bodies.bodies import Body
-from physhandi.synthetic.hands.true_hand import Capsule, HandPose
+from physhandi.synthetic.hands.true_hand import Capsule, TrueHandPose
 
 FRAME_RATE = 30.0
 """Frames per second [Hz]."""
@@ -25,7 +25,7 @@ class CapsuleHand(Protocol):
         """Its shape for touching."""
         ...
 
-    def bone_transforms(self, pose: HandPose, /) -> Float[ndarray, "bone 4 4"]:
+    def bone_transforms(self, pose: TrueHandPose, /) -> Float[ndarray, "bone 4 4"]:
         """Compute where each bone takes the points of the resting hand."""
         ...
 
@@ -43,7 +43,7 @@ class MovingHand(Protocol):
         """When the hand starts to move [s]; 0 is frame 0, so this is not positive."""
         ...
 
-    def at(self, time: float, /) -> HandPose:
+    def at(self, time: float, /) -> TrueHandPose:
         """Give the pose at any time [s]."""
         ...
 

@@ -16,9 +16,9 @@ SIZE = (848, 480)
 """Width and height of a D455's depth image [px]."""
 FOCAL_LENGTH = 447.0
 """Its focal length [px]."""
-MOST = 4
+MOST_CAMERAS = 4
 """A recording has at most this many cameras."""
-NEAREST, FARTHEST = 0.6, 1.0
+NEAREST_CAMERA, FARTHEST_CAMERA = 0.6, 1.0
 """Distances of the cameras from what they look at [m]."""
 _ELEVATION = (30.0, 55.0)
 _MARGIN = 12
@@ -56,8 +56,8 @@ def make_viewpoints(
     Raises:
         UsageError: If there are no cameras, or more than four.
     """
-    if not 1 <= count <= MOST:
-        raise UsageError(f"cameras is {count}; expected 1 to {MOST}.")
+    if not 1 <= count <= MOST_CAMERAS:
+        raise UsageError(f"cameras is {count}; expected 1 to {MOST_CAMERAS}.")
     random = np.random.default_rng([seed, 10])
     center = (point.min(axis=0) + point.max(axis=0)) / 2
     first = random.uniform(0, 2 * np.pi)
@@ -85,7 +85,7 @@ def _place(
 ) -> PinholeCamera:
     azimuth += np.deg2rad(random.uniform(-15, 15))
     elevation = np.deg2rad(random.uniform(*_ELEVATION))
-    distance = random.uniform(NEAREST, FARTHEST)
+    distance = random.uniform(NEAREST_CAMERA, FARTHEST_CAMERA)
     level = np.cos(elevation)
     towards = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
     while True:
@@ -93,13 +93,13 @@ def _place(
         pixel = np.nan_to_num(camera.project(point), nan=-1e6)
         low, high = pixel.min(axis=0), pixel.max(axis=0)
         is_whole = (low >= _MARGIN).all() and (high <= np.array(SIZE) - 1 - _MARGIN).all()
-        if is_whole or distance + _STEP > FARTHEST:
+        if is_whole or distance + _STEP > FARTHEST_CAMERA:
             return camera
         distance += _STEP
 
 
 @dataclass(frozen=True)
-class Window:
+class CropWindow:
     """A part of a camera's picture."""
 
     rows: slice
@@ -110,7 +110,9 @@ class Window:
     """Sees exactly this part."""
 
 
-def window_around(camera: PinholeCamera, point: Float[ndarray, "point 3"], margin: int) -> Window:
+def window_around(
+    camera: PinholeCamera, point: Float[ndarray, "point 3"], margin: int
+) -> CropWindow:
     """Cut out the part of a picture that shows some points.
 
     Args:
@@ -127,7 +129,7 @@ def window_around(camera: PinholeCamera, point: Float[ndarray, "point 3"], margi
         low, high = np.zeros(2, dtype=int), size
     K = camera.K.copy()
     K[:2, 2] -= low
-    return Window(
+    return CropWindow(
         slice(int(low[1]), int(high[1])),
         slice(int(low[0]), int(high[0])),
         PinholeCamera(

@@ -14,8 +14,8 @@ from physhandi.synthetic.hands.handling import Graspable, Handler
 from physhandi.synthetic.hands.script import HandScript
 from physhandi.synthetic.hands.true_hand import TrueHand, load_true_hand
 
-Action = Literal["lift", "fold", "stretch", "squeeze", "wipe", "push"]
-ACTIONS: tuple[Action, ...] = ("lift", "fold", "stretch", "squeeze", "wipe", "push")
+ActionName = Literal["lift", "fold", "stretch", "squeeze", "wipe", "push"]
+ACTIONS: tuple[ActionName, ...] = ("lift", "fold", "stretch", "squeeze", "wipe", "push")
 """What hands can do."""
 _UP = np.array([0.0, 0.0, 1.0])
 # How far hands pull each body beyond its length: as far as friction holds it.

@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from physhandi.errors import SequenceError
-from physhandi.synthetic.hands.true_hand import BONE_COUNT, Capsule, HandPose, TrueHand
+from physhandi.synthetic.hands.true_hand import BONE_COUNT, Capsule, TrueHand, TrueHandPose
 
 FINGER_NAMES = ("thumb", "index", "middle", "ring", "little")
 """Fingers in the order in which they are numbered."""
@@ -38,7 +38,7 @@ RELAXED = np.array([0.0, 0.0, 0.0, 0.15, 0.2] + [0.45, 0.0, 0.5] * 4)
 """Joints of a hand about to grasp: the thumb's five freedoms, then three of each finger [rad]."""
 PINCHING = np.array([0.1, 0.3, 0.0, 0.1, 0.0] + [0.8, 0.0, 0.25] * 2 + [0.6, 0.0, 0.4] * 2)
 """Joints of a hand whose finger pads face the thumb's [rad]."""
-FLAT = np.array([-0.41, -0.33, -0.18, 0.33, 0.36] + [-0.06, 0.0, -0.05] * 4)
+FLAT_HAND = np.array([-0.41, -0.33, -0.18, 0.33, 0.36] + [-0.06, 0.0, -0.05] * 4)
 """Joints of an open hand with straight fingers [rad]."""
 POINTING = np.array([0.3, 0.0, 0.0, 0.3, 0.5, 0.5, 0.0, 0.25] + [1.2, 0.0, 1.5] * 3)
 """Joints of a hand whose index finger points while the others are curled [rad]."""
@@ -88,10 +88,10 @@ def reach(
     *,
     orientation: Float[ndarray, " 3"],
     joints: Float[ndarray, " 17"],
-    start: HandPose | None = None,
+    start: TrueHandPose | None = None,
     along: Float[ndarray, " 3"] | None = None,
     floor: float = -np.inf,
-) -> HandPose:
+) -> TrueHandPose:
     """Bend and place a hand so that the middles of its fingertips are in given places.
 
     The middle of a fingertip is the end of its capsule's line, one radius under the skin.
@@ -121,9 +121,9 @@ def reach(
     low = np.concatenate([np.full(3, -_TURN_RANGE), *reach_low])
     high = np.concatenate([np.full(3, _TURN_RANGE), *reach_high])
 
-    def pose_of(value: ndarray) -> HandPose:
+    def pose_of(value: ndarray) -> TrueHandPose:
         turn = Rotation.from_rotvec(value[:3]) * held
-        return HandPose(
+        return TrueHandPose(
             orientation=turn.as_rotvec(), position=value[3:6].copy(), bend=bend_of(value[6:])
         )
 
@@ -169,7 +169,7 @@ def _first_place(
     hand: TrueHand, targets: Mapping[int, ndarray], held: Rotation, joints: ndarray
 ) -> Float[ndarray, " 3"]:
     """Put the wrist so that the fingertips are where they should be on average."""
-    pose = HandPose(orientation=held.as_rotvec(), position=np.zeros(3), bend=bend_of(joints))
+    pose = TrueHandPose(orientation=held.as_rotvec(), position=np.zeros(3), bend=bend_of(joints))
     transform = hand.bone_transforms(pose)
     missing = []
     for finger, target in targets.items():

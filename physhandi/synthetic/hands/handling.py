@@ -11,7 +11,7 @@ from numpy.random import Generator
 
 from physhandi.errors import SequenceError
 from physhandi.synthetic.hands.grasp import (
-    FLAT,
+    FLAT_HAND,
     INDEX,
     POINTING,
     bend_of,
@@ -26,9 +26,9 @@ from physhandi.synthetic.hands.places import (
     narrow_places,
     rim_place,
 )
-from physhandi.synthetic.hands.script import HandScript, Move, Tremor
+from physhandi.synthetic.hands.script import HandMove, HandScript, Tremor
 from physhandi.synthetic.hands.shapes import claw, lowest_skin, moved, pinch, turned
-from physhandi.synthetic.hands.true_hand import HandPose, TrueHand
+from physhandi.synthetic.hands.true_hand import TrueHand, TrueHandPose
 
 Carry = Callable[[float], tuple[Float[ndarray, " 3"], Float[ndarray, " 3"]]]
 """Where a grasp has gone after a share of a move: shift [m] and rotation vector [rad]."""
@@ -70,11 +70,11 @@ class Graspable(Protocol):
 class Grasp:
     """A hand at an object: its way from open to closed."""
 
-    poses: Sequence[HandPose]
+    poses: Sequence[TrueHandPose]
     """Poses from the one that first touches the object to the one that holds it."""
     place: Place
     """Where the object is grasped, and which way the hand faces."""
-    approach: Sequence[Move]
+    approach: Sequence[HandMove]
     """How the hand gets there before the recording starts, from far away to the last pose."""
 
     @property
@@ -127,9 +127,9 @@ class Handler:
             place=held,
             poses=(moved(closed, raised),),
             approach=(
-                Move(_BEGIN, _TOUCH, (outside, lower[0])),
-                Move(_TOUCH, _CLOSED, lower),
-                Move(_CLOSED, _READY, (closed, moved(closed, raised))),
+                HandMove(_BEGIN, _TOUCH, (outside, lower[0])),
+                HandMove(_TOUCH, _CLOSED, lower),
+                HandMove(_CLOSED, _READY, (closed, moved(closed, raised))),
             ),
         )
 
@@ -167,10 +167,10 @@ class Handler:
         middle = self._body.node.mean(axis=0)
         _, top = height_range(self._body, middle, 0.06)
         place = Place(point=np.array([*middle[:2], top]), forward=forward, inwards=forward)
-        pose = HandPose(
+        pose = TrueHandPose(
             orientation=orientation_towards(forward, pitch=0.06),
             position=np.zeros(3),
-            bend=bend_of(FLAT),
+            bend=bend_of(FLAT_HAND),
         )
         low, center = lowest_skin(self._hand, pose)
         is_soft = height_range(self._body, middle, 0.06)[1] > 0.02
@@ -219,7 +219,7 @@ class Handler:
         for start, end, carry in moves:
             phases = np.linspace(0.0, 1.0, _POSES_PER_MOVE)
             poses = [turned(held, grasp.place.point, *carry(float(p))) for p in phases]
-            chain.append(Move(start, end, poses))
+            chain.append(HandMove(start, end, poses))
         return HandScript(self._hand.side, chain, Tremor(self._random))
 
     def squeeze_script(
@@ -246,24 +246,24 @@ class Handler:
         for number, (leg, first, last) in enumerate(legs):
             shares = np.linspace(first, last, len(leg))
             drifting = [moved(p, share * drift) for p, share in zip(leg, shares, strict=True)]
-            chain.append(Move(times[number], times[number + 1], drifting))
+            chain.append(HandMove(times[number], times[number + 1], drifting))
         return HandScript(self._hand.side, chain, Tremor(self._random))
 
     def distance_to_middle(self, grasp: Grasp) -> float:
         """How far the grasp is from the object's middle along the way the hand faces [m]."""
         return abs(float((self._body.node.mean(axis=0) - grasp.place.point) @ grasp.place.inwards))
 
-    def _close(self, place: Place, gaps: Float[ndarray, " step"]) -> list[HandPose]:
+    def _close(self, place: Place, gaps: Float[ndarray, " step"]) -> list[TrueHandPose]:
         """Close thumb and fingers in steps, the wrist almost at rest."""
-        poses: list[HandPose] = []
+        poses: list[TrueHandPose] = []
         for gap in gaps:
             poses.append(claw(self._hand, place, float(gap), poses[-1] if poses else None))
         return poses
 
 
-def _from_above(first: HandPose, closing: Sequence[HandPose]) -> list[Move]:
+def _from_above(first: TrueHandPose, closing: Sequence[TrueHandPose]) -> list[HandMove]:
     """Come down to where a hand touches first, then close it."""
     return [
-        Move(_BEGIN, _TOUCH, (moved(first, _HOVER * _UP), first)),
-        Move(_TOUCH, _READY, closing),
+        HandMove(_BEGIN, _TOUCH, (moved(first, _HOVER * _UP), first)),
+        HandMove(_TOUCH, _READY, closing),
     ]

@@ -12,7 +12,7 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from physhandi.data.sequence_meta import Side
-from physhandi.synthetic.hands.true_hand import BONE_COUNT, HandPose
+from physhandi.synthetic.hands.true_hand import BONE_COUNT, TrueHandPose
 
 TREMOR_FREQUENCY = 6.0
 """Middle of the band in which a hand trembles [Hz]."""
@@ -51,25 +51,27 @@ class Tremor:
         amplitude[6] = 0.0  # bone 0 is the wrist: it has no joint to shake in
         self._amplitude = level * amplitude
 
-    def shake(self, pose: HandPose, time: float) -> HandPose:
+    def shake(self, pose: TrueHandPose, time: float) -> TrueHandPose:
         """Add to a pose what the hand trembles by at one time [s]."""
         wave = np.cos(2 * np.pi * self._frequency * time + self._phase).sum(axis=0)
         shift = self._amplitude * np.sqrt(2 / _TREMOR_WAVES) * wave
         turn = Rotation.from_rotvec(shift[3:6]) * Rotation.from_rotvec(pose.orientation)
         bend = pose.bend.copy()
         bend[:, 0] += shift[6:]
-        return HandPose(orientation=turn.as_rotvec(), position=pose.position + shift[:3], bend=bend)
+        return TrueHandPose(
+            orientation=turn.as_rotvec(), position=pose.position + shift[:3], bend=bend
+        )
 
 
 @dataclass(frozen=True)
-class Move:
+class HandMove:
     """One smooth move, at rest at both ends."""
 
     start: float
     """When it begins [s]."""
     end: float
     """When it ends [s]."""
-    poses: Sequence[HandPose]
+    poses: Sequence[TrueHandPose]
     """Poses that are passed, the first and the last included, evenly along the way."""
 
 
@@ -81,7 +83,7 @@ class HandScript:
     `end` the hand stays where it is and only trembles.
     """
 
-    def __init__(self, side: Side, moves: Sequence[Move], tremor: Tremor) -> None:
+    def __init__(self, side: Side, moves: Sequence[HandMove], tremor: Tremor) -> None:
         """Chain moves.
 
         Args:
@@ -106,7 +108,7 @@ class HandScript:
         self._paths = tuple(_Path(move.poses) for move in moves)
         self._tremor = tremor
 
-    def at(self, time: float) -> HandPose:
+    def at(self, time: float) -> TrueHandPose:
         """Compute where the hand is at a time [s]."""
         number = max(sum(move.start <= time for move in self._moves) - 1, 0)
         move = self._moves[number]
@@ -117,7 +119,7 @@ class HandScript:
 class _Path:
     """A smooth curve through poses, the orientations relative to the first one."""
 
-    def __init__(self, poses: Sequence[HandPose]) -> None:
+    def __init__(self, poses: Sequence[TrueHandPose]) -> None:
         self._first = Rotation.from_rotvec(poses[0].orientation)
         relative = [
             (Rotation.from_rotvec(pose.orientation) * self._first.inv()).as_rotvec()
@@ -134,9 +136,9 @@ class _Path:
         degree = min(3, len(values) - 1)
         self._curve = make_interp_spline(knots, values, k=degree) if degree else None
 
-    def at(self, phase: float) -> HandPose:
+    def at(self, phase: float) -> TrueHandPose:
         value = self._fixed if self._curve is None else self._curve(phase)
-        return HandPose(
+        return TrueHandPose(
             orientation=(Rotation.from_rotvec(value[:3]) * self._first).as_rotvec(),
             position=value[3:6].copy(),
             bend=value[6:].reshape(BONE_COUNT, 3).copy(),

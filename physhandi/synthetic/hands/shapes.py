@@ -18,7 +18,7 @@ from physhandi.synthetic.hands.grasp import (
     reach,
 )
 from physhandi.synthetic.hands.places import Place
-from physhandi.synthetic.hands.true_hand import HandPose, TrueHand
+from physhandi.synthetic.hands.true_hand import TrueHand, TrueHandPose
 
 _UP = np.array([0.0, 0.0, 1.0])
 _CLEAR_OF = 0.02
@@ -28,7 +28,7 @@ _PITCH, _PINCH_PITCH = 0.75, 0.0
 _TILT, _PAD = 0.7, 0.006
 
 
-def pinch(hand: TrueHand, place: Place, gap: float, start: HandPose | None) -> HandPose:
+def pinch(hand: TrueHand, place: Place, gap: float, start: TrueHandPose | None) -> TrueHandPose:
     """Put the thumb below a place and two fingers above it; the others stay clear of it."""
     along = np.cos(_TILT) * place.forward - np.sin(_TILT) * _UP
     above = np.sin(_TILT) * place.forward + np.cos(_TILT) * _UP
@@ -49,7 +49,7 @@ def pinch(hand: TrueHand, place: Place, gap: float, start: HandPose | None) -> H
     )
 
 
-def claw(hand: TrueHand, place: Place, gap: float, start: HandPose | None) -> HandPose:
+def claw(hand: TrueHand, place: Place, gap: float, start: TrueHandPose | None) -> TrueHandPose:
     """Put the thumb and all fingers on opposite sides of a place, tips down."""
     targets: dict[int, ndarray] = {}
     for finger in (THUMB, INDEX, MIDDLE, RING, LITTLE):
@@ -69,7 +69,7 @@ def claw(hand: TrueHand, place: Place, gap: float, start: HandPose | None) -> Ha
     )
 
 
-def lowest_skin(hand: TrueHand, pose: HandPose) -> tuple[float, Float[ndarray, " 3"]]:
+def lowest_skin(hand: TrueHand, pose: TrueHandPose) -> tuple[float, Float[ndarray, " 3"]]:
     """Find the lowest skin of a pose, and the middle of its palm."""
     transform = hand.bone_transforms(pose)
     lowest = np.inf
@@ -81,20 +81,22 @@ def lowest_skin(hand: TrueHand, pose: HandPose) -> tuple[float, Float[ndarray, "
     return lowest, (keypoint[0] + keypoint[9]) / 2
 
 
-def moved(pose: HandPose, shift: Float[ndarray, " 3"]) -> HandPose:
+def moved(pose: TrueHandPose, shift: Float[ndarray, " 3"]) -> TrueHandPose:
     """Shift a pose."""
-    return HandPose(orientation=pose.orientation, position=pose.position + shift, bend=pose.bend)
+    return TrueHandPose(
+        orientation=pose.orientation, position=pose.position + shift, bend=pose.bend
+    )
 
 
 def turned(
-    pose: HandPose,
+    pose: TrueHandPose,
     point: Float[ndarray, " 3"],
     shift: Float[ndarray, " 3"],
     turn: Float[ndarray, " 3"],
-) -> HandPose:
+) -> TrueHandPose:
     """Turn a pose about a point, then shift it."""
     rotation = Rotation.from_rotvec(turn)
-    return HandPose(
+    return TrueHandPose(
         orientation=(rotation * Rotation.from_rotvec(pose.orientation)).as_rotvec(),
         position=point + rotation.apply(pose.position - point) + shift,
         bend=pose.bend,

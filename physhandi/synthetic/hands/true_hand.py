@@ -36,7 +36,7 @@ _SOFT_RANGE = (0.001, 0.002)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class HandPose:
+class TrueHandPose:
     """Where a hand is and how its fingers are bent."""
 
     orientation: Float[ndarray, " 3"]
@@ -137,7 +137,7 @@ class TrueHand:
         capsules.append(_fit_capsule(0, joints[0], joints[1], palm))
         return tuple(capsules)
 
-    def bone_transforms(self, pose: HandPose) -> Float[ndarray, "bone 4 4"]:
+    def bone_transforms(self, pose: TrueHandPose) -> Float[ndarray, "bone 4 4"]:
         """Compute where each bone takes the points of the resting hand."""
         turn = np.asarray(pose.bend, dtype=np.float64)
         if turn.shape != (BONE_COUNT, 3) or turn[0].any():
@@ -157,7 +157,7 @@ class TrueHand:
             transform[bones, :3, 3:] = place - rotation @ origin
         return transform
 
-    def pose(self, pose: HandPose) -> PosedHand:
+    def pose(self, pose: TrueHandPose) -> PosedHand:
         """Put surface and keypoints where a pose has them."""
         return self.carry(self.bone_transforms(pose))
 

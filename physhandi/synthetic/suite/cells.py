@@ -45,7 +45,7 @@ from physhandi.synthetic.suite.methods import (
     Method,
     correct,
     execute,
-    settings_of,
+    method_settings,
     shared_stages,
     simulate_in,
 )
@@ -418,7 +418,7 @@ class Bench:
     def _settings_of(self, method: Method) -> dict[str, Any]:
         key = json.dumps([method.profile, dict(method.overrides)], sort_keys=True)
         if key not in self._settings:
-            self._settings[key] = settings_of(method, self.common)
+            self._settings[key] = method_settings(method, self.common)
         return self._settings[key]
 
     def _folder(self, method: Method, recording: Sequence, variant: str) -> Path:

@@ -24,7 +24,7 @@ from physhandi.synthetic.code_version import (
 )
 from physhandi.synthetic.suite.cells import FAILURES, Bench, Outcome
 from physhandi.synthetic.suite.folder import SuiteFolder, contact_kind, figures_of
-from physhandi.synthetic.suite.methods import METHODS, Method, parse_method, settings_of
+from physhandi.synthetic.suite.methods import METHODS, Method, method_settings, parse_method
 from physhandi.synthetic.suite.suite import RESERVED_SEED, Protocol
 
 SENSITIVITY = ((0.001, 3), (0.002, 3), (0.02, 3), (0.04, 3), (0.002, 1), (0.002, 10), (0.002, 50))
@@ -151,7 +151,7 @@ WRITE_EVERY = 600.0
 _SCORES = "synthetic/suite/folder.py"
 
 
-def evaluate(
+def evaluate_suite(
     order: Order, out: Path, progress: Progress | None = None, *, fill: Fill | None = None
 ) -> dict[str, Any]:
     """Run what is missing of an order, and write its tables.
@@ -365,4 +365,4 @@ def _check(order: Order, methods: Many[Method]) -> None:
     if doubled:
         raise UsageError(f"Two sequences are named '{doubled[0]}'. Rename one of them.")
     for method in methods:
-        settings_of(method, order.settings)
+        method_settings(method, order.settings)

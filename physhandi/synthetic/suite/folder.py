@@ -175,11 +175,11 @@ def _times(seconds: Mapping[str, float], frame_count: int) -> dict[str, Any]:
 
 CELLS = "cells.json"
 """What was asked for, and every cell with its figures."""
-CURVES = "curves.json"
+CURVES_FILE = "curves.json"
 """Errors frame by frame of the same cells, in the same order."""
 _KEY = ("protocol", "split", "method", "case")
 
-Cell = dict[str, Any]
+CellScores = dict[str, Any]
 
 
 class SuiteFolder:
@@ -198,9 +198,9 @@ class SuiteFolder:
         """
         self.out = out
         self.about = dict(about)
-        self.done: list[Cell] = []
+        self.done: list[CellScores] = []
         before = check_folder(out, about["title"], about["cases"])
-        self._earlier: list[Cell] = []
+        self._earlier: list[CellScores] = []
         self._skipped: list[str] = []
         self.notes: list[str] = []
         if before is None:
@@ -252,7 +252,7 @@ class SuiteFolder:
         for file, content in files.items():
             (self.out / file).parent.mkdir(parents=True, exist_ok=True)
             write_bytes(self.out / file, content.encode())
-        write_json(self.out / CURVES, {"curves": [cell["curves"] for cell in cells]})
+        write_json(self.out / CURVES_FILE, {"curves": [cell["curves"] for cell in cells]})
         plain = [{name: v for name, v in cell.items() if name != "curves"} for cell in cells]
         write_json(self.out / CELLS, {"about": about, "cells": plain})
         return {
@@ -261,7 +261,7 @@ class SuiteFolder:
             "report": str(self.out / "report.md"),
         }
 
-    def _all_cells(self) -> list[Cell]:
+    def _all_cells(self) -> list[CellScores]:
         """Put what is finished beside what is kept of earlier orders, in the order of tables."""
         new = {_key(cell) for cell in self.done}
         kept = [
@@ -271,7 +271,7 @@ class SuiteFolder:
         ]
         places = [list(self.about[name]) for name in ("protocols", "cases", "methods")]
 
-        def place(cell: Cell) -> tuple[int, ...]:
+        def place(cell: CellScores) -> tuple[int, ...]:
             named = (cell["protocol"], cell["case"], cell["method"])
             return tuple(known.index(name) for known, name in zip(places, named, strict=True))
 
@@ -310,11 +310,11 @@ def check_folder(out: Path, title: str, cases: Iterable[str]) -> dict[str, Any] 
             f"{out} holds the table '{about['title']}' of {', '.join(about['cases'])}, which "
             f"'{title}' of {', '.join(wanted_cases)} would replace. Choose another --out."
         )
-    return {"about": about, "cells": cast("list[Cell]", cells)}
+    return {"about": about, "cells": cast("list[CellScores]", cells)}
 
 
-def _with_curves(out: Path, cells: Many[Cell]) -> list[Cell]:
-    path = out / CURVES
+def _with_curves(out: Path, cells: Many[CellScores]) -> list[CellScores]:
+    path = out / CURVES_FILE
     curves = (named_fields(read_json(path)) or {}).get("curves") if path.is_file() else None
     if not isinstance(curves, list) or len(cast("list[Any]", curves)) != len(cells):
         curves = [{} for _ in cells]
@@ -322,5 +322,5 @@ def _with_curves(out: Path, cells: Many[Cell]) -> list[Cell]:
     return [{**cell, "curves": curve} for cell, curve in both]
 
 
-def _key(cell: Cell) -> tuple[str, ...]:
+def _key(cell: CellScores) -> tuple[str, ...]:
     return tuple(cell[name] for name in _KEY)

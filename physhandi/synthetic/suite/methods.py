@@ -209,11 +209,11 @@ def parse_method(text: str) -> Method:
         )
     about = f"{start.about} The last residual is added." if is_corrected else start.about
     method = replace(start, name=text, about=about, overrides=overrides, is_corrected=is_corrected)
-    settings_of(method, {})
+    method_settings(method, {})
     return method
 
 
-def settings_of(method: Method, common: Mapping[str, Any]) -> dict[str, Any]:
+def method_settings(method: Method, common: Mapping[str, Any]) -> dict[str, Any]:
     """Give all settings of a method, in plain data.
 
     Args:
@@ -255,8 +255,8 @@ def execute(
     Raises:
         PhysHandiError: If the method has no result; the run folder then says why.
     """
-    settings = settings_of(method, common)
-    run = open_run(folder, title, recording, {"profile": settings, "method": method.name})
+    settings = method_settings(method, common)
+    run = open_suite_run(folder, title, recording, {"profile": settings, "method": method.name})
     if run.is_published:
         return run
     with run.begin_attempt() as attempt:
@@ -266,7 +266,7 @@ def execute(
             take_disturbed_hands(hands, attempt, recording.name, noise)
         elif hands is not None:
             take_stages(hands, attempt, shared_stages(hands.config["profile"], settings))
-        config = pipeline.PipelineConfig.from_dict(settings)
+        config = pipeline.config_from_dict(settings)
         if method.rule is None:
             pipeline.reconstruct([recording], config, attempt, watched, device=device)
         else:
@@ -285,7 +285,7 @@ def correct(
         MissingInputError: If no track is seen in the last frame that was fitted.
     """
     config = {**base.config, "method": method.name, "source": str(base.folder.resolve())}
-    run = open_run(folder, title, recording, config)
+    run = open_suite_run(folder, title, recording, config)
     if run.is_published:
         return run
     inside = f"sequences/{recording.name}"
@@ -341,7 +341,9 @@ def simulate_in(
     return RunFolder.open(folder)
 
 
-def open_run(folder: Path, title: str, recording: Sequence, config: Mapping[str, Any]) -> RunFolder:
+def open_suite_run(
+    folder: Path, title: str, recording: Sequence, config: Mapping[str, Any]
+) -> RunFolder:
     """Open the run in a folder, or make it."""
     if (folder / "run.yaml").is_file():
         return RunFolder.open(folder)

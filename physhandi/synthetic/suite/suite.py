@@ -29,7 +29,7 @@ ORACLES = ("oracle_hand", "oracle_parameters")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scene:
+class SuiteScene:
     """One scene of a suite; with a seed it becomes a sequence."""
 
     object_: str
@@ -55,7 +55,7 @@ class Suite:
     """What it is called."""
     about: str
     """What it is for, in one sentence."""
-    scenes: tuple[Scene, ...]
+    scenes: tuple[SuiteScene, ...]
     """Scenes, in order."""
     seeds: tuple[int, ...]
     """Seeds of each scene."""
@@ -69,9 +69,9 @@ class Suite:
     """What the generator is told of every sequence: preset, frames, images, resolution."""
 
 
-def _scenes(*pairs: str) -> tuple[Scene, ...]:
+def _scenes(*pairs: str) -> tuple[SuiteScene, ...]:
     split = [pair.split() for pair in pairs]
-    return tuple(Scene(object_=object_, action=action) for object_, action in split)
+    return tuple(SuiteScene(object_=object_, action=action) for object_, action in split)
 
 
 SUITES: dict[str, Suite] = {
@@ -222,7 +222,7 @@ def make_recording(making: Making, target: Path, progress: Progress) -> None:
     synthesize(making["object"], **others, out=target, progress=progress)
 
 
-def _making(suite: Suite, scene: Scene, seed: int) -> dict[str, Any]:
+def _making(suite: Suite, scene: SuiteScene, seed: int) -> dict[str, Any]:
     scripted = {"object": scene.object_, "action": scene.action, "seed": seed, "hold": scene.hold}
     return scripted | dict(suite.recording)
 

@@ -38,7 +38,7 @@ _MILLIMETRES = 1000.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Change:
+class VariantChange:
     """How a variant differs from its recording; everything else is copied."""
 
     meta: SequenceMeta
@@ -51,12 +51,12 @@ class Change:
     """Beginnings of the names of files that are left out."""
 
 
-def unchanged(recording: Sequence, _random: Generator) -> Change:
+def unchanged(recording: Sequence, _random: Generator) -> VariantChange:
     """Give everything that a method may have."""
-    return Change(meta=recording.meta)
+    return VariantChange(meta=recording.meta)
 
 
-def true_hand(recording: Sequence, _random: Generator) -> Change:
+def true_hand(recording: Sequence, _random: Generator) -> VariantChange:
     """Give the vertices of the true hands as point controllers, and no hand to fit.
 
     Raises:
@@ -71,19 +71,19 @@ def true_hand(recording: Sequence, _random: Generator) -> Change:
         )
     control = np.concatenate([vertices[side] for side in recording.hands], axis=1)
     keypoints = tuple(f"views/{view.name}/keypoint.npy" for view in recording.views)
-    return Change(
+    return VariantChange(
         meta=replace(recording.meta, hands=()),
         arrays={"control.npy": control.astype(np.float32)},
         without=keypoints,
     )
 
 
-def all_frames(recording: Sequence, _random: Generator) -> Change:
+def all_frames(recording: Sequence, _random: Generator) -> VariantChange:
     """Give every frame to the fit, the held-out ones too."""
-    return Change(meta=replace(recording.meta, reconstruction=recording.frame_count))
+    return VariantChange(meta=replace(recording.meta, reconstruction=recording.frame_count))
 
 
-def one_view(recording: Sequence, _random: Generator) -> Change:
+def one_view(recording: Sequence, _random: Generator) -> VariantChange:
     """Give the first camera alone.
 
     Raises:
@@ -97,13 +97,13 @@ def one_view(recording: Sequence, _random: Generator) -> Change:
             "several views with depth and masks, and no markers."
         )
     first, *others = recording.meta.views
-    return Change(
+    return VariantChange(
         meta=replace(recording.meta, views=(first,)),
         without=tuple(f"views/{view.name}/" for view in others),
     )
 
 
-def noisy_depth(recording: Sequence, random: Generator) -> Change:
+def noisy_depth(recording: Sequence, random: Generator) -> VariantChange:
     """Add the paper's noise to every depth, or along no special axis to markers."""
     images: dict[str, ndarray] = {}
     for view in recording.views:
@@ -118,10 +118,10 @@ def noisy_depth(recording: Sequence, random: Generator) -> Change:
     arrays: dict[str, ndarray] = {}
     if recording.marker is not None:
         arrays["marker.npy"] = _disturbed(recording.marker, DEPTH_NOISE, random)
-    return Change(meta=recording.meta, arrays=arrays, images=images)
+    return VariantChange(meta=recording.meta, arrays=arrays, images=images)
 
 
-def noisy_tracks(recording: Sequence, random: Generator) -> Change:
+def noisy_tracks(recording: Sequence, random: Generator) -> VariantChange:
     """Add the paper's noise to every track; markers move by as much as a pixel is wide there.
 
     Raises:
@@ -139,10 +139,10 @@ def noisy_tracks(recording: Sequence, random: Generator) -> Change:
         arrays["marker.npy"] = _disturbed(recording.marker, TRACK_NOISE * pixel, random)
     if not arrays:
         raise MissingInputError(f"Sequence '{recording.name}' has no tracks to disturb.")
-    return Change(meta=recording.meta, arrays=arrays)
+    return VariantChange(meta=recording.meta, arrays=arrays)
 
 
-def noisy_hand(recording: Sequence, random: Generator) -> Change:
+def noisy_hand(recording: Sequence, random: Generator) -> VariantChange:
     """Give everything; the hands are disturbed after they were fitted.
 
     Raises:
@@ -153,7 +153,7 @@ def noisy_hand(recording: Sequence, random: Generator) -> Change:
     return unchanged(recording, random)
 
 
-VARIANTS: dict[str, Callable[[Sequence, Generator], Change]] = {
+VARIANTS: dict[str, Callable[[Sequence, Generator], VariantChange]] = {
     "recording": unchanged,
     "true_hand": true_hand,
     "all_frames": all_frames,

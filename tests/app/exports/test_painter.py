@@ -8,7 +8,7 @@ import pytest
 from app.exports.painter import BACKGROUND, paint_scene, visible_from
 from app.exports.primitives import Part, parts_of
 from app.viewer.content.session_state import Pose
-from app.viewer.ui.scene_server import start_viser
+from app.viewer.scene.scene_server import start_viser
 
 RED, BLUE = np.array([[200.0, 10.0, 10.0]]), np.array([[10.0, 10.0, 200.0]])
 UP = np.array([0.0, 0.0, 1.0])

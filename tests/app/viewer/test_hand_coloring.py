@@ -13,8 +13,8 @@ from app.viewer.content.content import Content, HandSurface
 from app.viewer.content.layers import Layers
 from app.viewer.inspect.picking import Pick
 from app.viewer.inspect.readings import Readings
-from app.viewer.restoring import complete_state
 from app.viewer.scene.framing import frame_content
+from app.viewer.session import complete_state
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.view import View
 

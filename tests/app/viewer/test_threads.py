@@ -1,5 +1,6 @@
 """What users, clock and simulation do at the same moment ends right, whichever comes last."""
 
+import asyncio
 import socket
 import sys
 import threading
@@ -40,6 +41,12 @@ def beside(act: Callable[[], Any]) -> threading.Thread:
     thread = threading.Thread(target=act)
     thread.start()
     return thread
+
+
+def write_all(session: Session) -> None:
+    """Wait until viser's event loop has written what was handed to it."""
+    loop = session._server.get_event_loop()
+    asyncio.run_coroutine_threadsafe(asyncio.sleep(0), loop).result(PATIENCE)
 
 
 def test_a_scrub_that_met_a_frame_on_its_way_is_told_where_it_stands(sessions: Sessions) -> None:
@@ -162,6 +169,7 @@ def test_typed_ends_of_the_colors_are_not_replaced_before_they_are_heard(
         )
         monkeypatch.setattr(colors, "_painter", grown)
         colors.show(is_playing=False, is_hidden=False)
+        write_all(session)
         assert colors._range.handle.value == (0.25, 0.75)
         colors._type()
         factor = painter.quantity("speed").factor
@@ -169,6 +177,7 @@ def test_typed_ends_of_the_colors_are_not_replaced_before_they_are_heard(
         # What was heard follows the sequence again when it is let go.
         colors._layers.color_range = None
         colors.show(is_playing=False, is_hidden=False)
+        write_all(session)
         assert colors._range.handle.value == pytest.approx((0.0, 40.0 * factor))
 
 

@@ -6,18 +6,17 @@ import numpy as np
 import pytest
 import torch
 
-from physhandi.data.camera import PinholeCamera
+from physhandi.data.camera import PinholeCamera, triangulate
 from physhandi.fitting.hand_reconstruction import (
     JOINT_LIMIT,
     DepthTarget,
-    acceleration_loss,
     depth_loss,
+    hand_acceleration_loss,
     keypoint_target,
     limit_loss,
     reprojection_loss,
-    triangulate,
     velocity_loss,
-    vertex_normals,
+    vertex_normals_torch,
 )
 from physhandi.hand.loading import load_hand_model
 
@@ -66,8 +65,8 @@ def test_limits_cost_the_square_of_the_excess_on_both_sides() -> None:
 def test_smoothness_is_the_square_of_differences() -> None:
     time = torch.arange(5.0)[:, None, None]
     falling = (0.5 * 0.2 * time**2).expand(5, 21, 3)
-    assert float(acceleration_loss(falling)) == pytest.approx(3 * 21 * 3 * 0.04 / 5, rel=1e-4)
-    assert float(acceleration_loss(falling[:2])) == 0
+    assert float(hand_acceleration_loss(falling)) == pytest.approx(3 * 21 * 3 * 0.04 / 5, rel=1e-4)
+    assert float(hand_acceleration_loss(falling[:2])) == 0
     even = (0.1 * time).expand(5, 15, 3)
     assert float(velocity_loss(even)) == pytest.approx(4 * 15 * 3 * 0.01 / 5, rel=1e-4)
 
@@ -76,7 +75,7 @@ def test_normals_of_a_hand_have_length_one_and_point_outwards() -> None:
     hand = load_hand_model("left")
     zero = torch.zeros(1, 3, dtype=torch.float64)
     vertex = hand(zero.new_zeros(10), zero.new_zeros(1, 15, 3), zero, zero).vertex
-    normal = vertex_normals(vertex, torch.from_numpy(hand.faces))
+    normal = vertex_normals_torch(vertex, torch.from_numpy(hand.faces))
     np.testing.assert_allclose(normal.norm(dim=-1), 1, atol=1e-9)
     swollen = vertex + 1e-3 * normal
     assert (

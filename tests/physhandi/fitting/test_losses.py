@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from physhandi.fitting.object_problem import acceleration_loss, chamfer_loss, track_loss
+from physhandi.fitting.object_problem import chamfer_loss, node_acceleration_loss, track_loss
 
 
 def test_chamfer_is_one_way_and_squared() -> None:
@@ -50,11 +50,11 @@ def test_six_track_losses_are_one_of_phystwin() -> None:
 
 def test_acceleration_loss_sees_a_jerk_and_no_steady_push() -> None:
     steady = torch.arange(5.0)[:, None, None].expand(5, 2, 3)
-    assert acceleration_loss(steady).tolist() == [0.0] * 5
+    assert node_acceleration_loss(steady).tolist() == [0.0] * 5
     kick = steady.clone()
     kick[3:] += 1.0
     # The change of velocity grows by 1 and falls back by 1: smooth L1 of 1 is 0.5, twice.
-    assert acceleration_loss(kick).tolist() == pytest.approx([0.0, 0.0, 0.0, 0.5, 0.5])
+    assert node_acceleration_loss(kick).tolist() == pytest.approx([0.0, 0.0, 0.0, 0.5, 0.5])
 
 
 @pytest.mark.parametrize("seed", range(3))

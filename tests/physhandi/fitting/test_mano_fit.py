@@ -1,6 +1,7 @@
 """MANO through the stages: fitted, stored, simulated with, and opened again."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import hand_scene as scene
@@ -13,10 +14,10 @@ from physhandi.data.exporters import export_run
 from physhandi.data.sequence import Sequence
 from physhandi.errors import MissingInputError, UsageError
 from physhandi.fitting.artefacts import load_motions
-from physhandi.fitting.config import HandFitConfig, PipelineConfig, load_profile
+from physhandi.fitting.config import HandFitConfig, config_from_dict, config_to_dict, load_profile
 from physhandi.fitting.hand_reconstruction import reconstruct_hands
 from physhandi.hand.loading import load_hand_model
-from physhandi.hand.model import Side
+from physhandi.hand.model import HandSide
 from physhandi.run import Run
 
 BUNDLED = Path(__file__).parents[3] / "sequences"
@@ -24,7 +25,7 @@ CAMERAS = [scene.looking_at_hand(angle) for angle in (0.0, 1.2, 2.6)]
 
 
 @pytest.mark.parametrize("side", ["right", "left"])
-def test_a_known_mano_hand_is_found_again(tmp_path: Path, mano: Path, side: Side) -> None:
+def test_a_known_mano_hand_is_found_again(tmp_path: Path, mano: Path, side: HandSide) -> None:
     truth = scene.grasping(side, model="mano")
     keypoint = scene.seen_keypoints([truth], CAMERAS)
     sequence = scene.write_scene(tmp_path / "a", [truth], CAMERAS, keypoint)
@@ -48,7 +49,7 @@ def test_without_mano_the_fit_says_how_to_bring_it(
     with pytest.raises(MissingInputError, match="physhandi import mano"):
         reconstruct_hands(sequence, HandFitConfig(model="mano"))
     with pytest.raises(UsageError, match=r"hand: model is 'smpl'; expected one of 'open', 'mano'"):
-        PipelineConfig.from_dict({"hand": {"model": "smpl"}})
+        config_from_dict({"hand": {"model": "smpl"}})
 
 
 @pytest.mark.slow
@@ -62,18 +63,19 @@ def test_a_whole_run_uses_mano_and_outlives_it(
     for view, seen in zip(Sequence.load(folder).views, keypoint, strict=True):
         np.save(view.folder / "keypoint.npy", seen)
     config = load_profile("quick")
-    search = config.object_.search.replace(generations=1, population=4)
-    first_order = config.object_.first_order.replace(iterations=1)
-    config = config.replace(
-        hand=config.hand.replace(model="mano", iterations=60, depth_iterations=0),
-        object_=config.object_.replace(search=search, first_order=first_order),
+    search = replace(config.object_.search, generations=1, population=4)
+    first_order = replace(config.object_.first_order, iterations=1)
+    config = replace(
+        config,
+        hand=replace(config.hand, model="mano", iterations=60, depth_iterations=0),
+        object_=replace(config.object_, search=search, first_order=first_order),
     )
     run = Run.create(
         tmp_path / "run",
         name="with MANO",
         kind="reconstruction",
         sequences=[str(folder)],
-        config={"profile": config.to_dict()},
+        config={"profile": config_to_dict(config)},
     )
     pipeline.run_job(run)
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from physhandi.hand.loading import load_hand_model
-from physhandi.hand.model import Side
+from physhandi.hand.model import HandSide
 from physhandi.hand.motion import HandMotion, control_trajectory
 
 
-def _motion(side: Side = "right", frame_count: int = 200) -> HandMotion:
+def _motion(side: HandSide = "right", frame_count: int = 200) -> HandMotion:
     random = np.random.default_rng(0)
     return HandMotion(
         side=side,

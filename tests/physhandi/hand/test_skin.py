@@ -8,12 +8,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from physhandi.hand.loading import load_hand_model
-from physhandi.hand.model import JOINT_NAMES, HandKind, Side
+from physhandi.hand.model import JOINT_NAMES, HandKind, HandSide
 from physhandi.hand.motion import HandMotion
 from physhandi.hand.skin import HandSkin, hand_skin
 
 
-def _motion(side: Side, kind: HandKind) -> HandMotion:
+def _motion(side: HandSide, kind: HandKind) -> HandMotion:
     random = np.random.default_rng(5)
     time = np.linspace(0, 1, 7)[:, None, None]
     turn = np.linspace(0, 7, 7)[:, None] * np.array([0.2, 0.9, -0.4])
@@ -42,7 +42,7 @@ def _vertices(skin: HandSkin, frame: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("side", ["right", "left"])
-def test_the_open_hands_skin_is_exact(side: Side) -> None:
+def test_the_open_hands_skin_is_exact(side: HandSide) -> None:
     hand, motion = load_hand_model(side), _motion(side, "open")
     skin, expected = hand_skin(hand, motion), motion.vertices(hand)
     for frame in (0, 3, 6):

@@ -4,7 +4,7 @@ import re
 
 from physhandi.metrics.suite_report import (
     Column,
-    Row,
+    SuiteRow,
     bar_chart,
     laid_out,
     latex_table,
@@ -19,8 +19,8 @@ SHOWN = (
 )
 
 
-def row(method: str, metric: str, mean: float, n: int = 3) -> Row:
-    return Row(
+def row(method: str, metric: str, mean: float, n: int = 3) -> SuiteRow:
+    return SuiteRow(
         method=method, split="future", metric=metric, mean=mean, low=mean / 2, high=2 * mean, n=n
     )
 

@@ -9,8 +9,8 @@ import pytest
 from scipy.stats import bootstrap
 
 from physhandi.metrics.suite_report import (
-    COLUMNS,
     PAIRED_COLUMNS,
+    SUITE_COLUMNS,
     Score,
     compare,
     interval,
@@ -75,7 +75,7 @@ def test_shares_are_better_when_they_are_higher() -> None:
 def test_the_table_has_the_agreed_columns_and_is_read_back() -> None:
     rows = summarise([score("a@x=1,y=2", "x", 0.0123456789), score("a@x=1,y=2", "y", 0.5)])
     text = to_csv(rows)
-    assert text.splitlines()[0] == "method,split,metric,mean,low,high,n" == ",".join(COLUMNS)
+    assert text.splitlines()[0] == "method,split,metric,mean,low,high,n" == ",".join(SUITE_COLUMNS)
     (line,) = csv.DictReader(io.StringIO(text))
     assert line["method"] == "a@x=1,y=2"
     assert float(line["mean"]) == pytest.approx(0.25617284, rel=1e-6)
@@ -89,8 +89,8 @@ def test_the_table_has_the_agreed_columns_and_is_read_back() -> None:
     [
         ("", "columns"),
         ("method,mean\n", "columns"),
-        (",".join(COLUMNS) + "\na,b,c,1,2\n", "line 2 has 5"),
-        (",".join(COLUMNS) + "\na,b,c,one,2,3,4\n", "one"),
+        (",".join(SUITE_COLUMNS) + "\na,b,c,1,2\n", "line 2 has 5"),
+        (",".join(SUITE_COLUMNS) + "\na,b,c,one,2,3,4\n", "one"),
     ],
 )
 def test_a_damaged_table_is_refused(text: str, told: str) -> None:

@@ -46,10 +46,10 @@ class Counter:
 
 def test_bytes_of_two_hundred_frames_of_five_thousand_nodes():
     # Three vectors of four floats; states of eight floats and vectors of four; vectors of three.
-    fast = cuda.tape_layout(5000, 667)
-    on_cpu = cpu.tape_layout(5000, 5000, 667)
-    plain = graph_adjoint.tape_layout(5000, 667, collides=False)
-    colliding = graph_adjoint.tape_layout(5000, 667, collides=True)
+    fast = cuda.cuda_tape_layout(5000, 667)
+    on_cpu = cpu.cpu_tape_layout(5000, 5000, 667)
+    plain = graph_adjoint.graph_tape_layout(5000, 667, collides=False)
+    colliding = graph_adjoint.graph_tape_layout(5000, 667, collides=True)
     assert 200 * frame_bytes(fast) == 32_016_000_000
     assert 200 * frame_bytes(on_cpu) == 32_048_000_000
     assert 200 * frame_bytes(plain) == 24_036_000_000

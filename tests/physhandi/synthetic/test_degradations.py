@@ -7,9 +7,9 @@ import pytest
 
 from physhandi.errors import UsageError
 from physhandi.synthetic.film.cameras import (
-    FARTHEST,
+    FARTHEST_CAMERA,
     FOCAL_LENGTH,
-    NEAREST,
+    NEAREST_CAMERA,
     SIZE,
     make_viewpoints,
     window_around,
@@ -98,7 +98,7 @@ def test_cameras_stand_around_and_see_everything(count):
         assert (camera.width, camera.height) == SIZE == (848, 480)
         assert camera.K[0, 0] == camera.K[1, 1] == FOCAL_LENGTH == 447
         away = camera.T_world_camera[:3, 3] - center
-        assert NEAREST <= np.linalg.norm(away) <= FARTHEST
+        assert NEAREST_CAMERA <= np.linalg.norm(away) <= FARTHEST_CAMERA
         assert 30 <= np.rad2deg(np.arcsin(away[2] / np.linalg.norm(away))) <= 55
         pixel = camera.project(BOX)
         assert (pixel >= 0).all()

@@ -15,7 +15,7 @@ from physhandi.errors import MissingInputError, UsageError
 from physhandi.progress import Progress
 from physhandi.run import Run
 from physhandi.synthetic.suite.cells import Bench
-from physhandi.synthetic.suite.evaluation import evaluate, list_tasks
+from physhandi.synthetic.suite.evaluation import evaluate_suite, list_tasks
 from physhandi.synthetic.suite.folder import contact_kind
 from physhandi.synthetic.suite.methods import parse_method
 
@@ -29,7 +29,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> tuple[Sequence, ...]
 @pytest.fixture(scope="module")
 def out(tmp_path_factory: pytest.TempPathFactory, recordings: tuple[Sequence, ...]) -> Path:
     folder = tmp_path_factory.mktemp("suite")
-    found = evaluate(order_of(recordings), folder)
+    found = evaluate_suite(order_of(recordings), folder)
     assert (found["cells"], found["failed"], found["skipped"]) == (14, 0, [])
     return folder
 
@@ -102,7 +102,7 @@ def test_a_second_time_nothing_is_computed(out: Path, recordings: tuple[Sequence
             stages.append(stage)
 
     before = (out / "table.csv").read_bytes()
-    evaluate(order_of(recordings), out, Listener())
+    evaluate_suite(order_of(recordings), out, Listener())
     assert set(stages) == {"suite"}
     assert (out / "table.csv").read_bytes() == before
 
@@ -118,7 +118,7 @@ def test_a_method_without_output_scores_as_static_and_is_told(
         recordings[:1], methods=("static", lost), settings=settings, protocols=("main",)
     )
     for _ in range(2):
-        assert evaluate(order, tmp_path)["failed"] == 1
+        assert evaluate_suite(order, tmp_path)["failed"] == 1
     rows = table(tmp_path)
     assert (
         rows[lost, "future", "track_error"]["mean"]
@@ -145,7 +145,7 @@ def test_an_object_that_no_hand_reaches_elsewhere_stays_where_it_is(
     far = Sequence.load(far.folder)
     order = order_of((low, far), methods=("static", "quick"), protocols=("unseen",))
     for _ in range(2):  # What was fitted in `far` is lost as well.
-        assert evaluate(order, tmp_path / "out")["failed"] == 2
+        assert evaluate_suite(order, tmp_path / "out")["failed"] == 2
     cells = json.loads((tmp_path / "out" / "cells.json").read_text())["cells"]
     still, lost = [cell for cell in cells if cell["case"] == "far"]
     assert "No virtual spring forms in sequence 'far'" in lost["error"]
@@ -159,7 +159,7 @@ def test_what_a_recording_cannot_give_is_not_asked_for(
     order = order_of(
         recordings[:1], methods=("static", "oracle_hand"), protocols=("main", "single_view")
     )
-    found = evaluate(order, tmp_path)
+    found = evaluate_suite(order, tmp_path)
     assert found["cells"] == 1
     assert len(found["skipped"]) == 2
     assert "true hand" in found["skipped"][0]
@@ -171,7 +171,7 @@ def test_starts_and_disturbances_have_splits_of_their_own(
     order = order_of(
         recordings, methods=("static", "quick"), protocols=("sensitivity", "robustness")
     )
-    found = evaluate(order, tmp_path)
+    found = evaluate_suite(order, tmp_path)
     # Seven starts of the first sequence; depth noise of both; no view to tell pixels, no hand.
     assert (found["cells"], len(found["skipped"])) == (7 + 4, 8)
     splits = {split for _, split, _ in table(tmp_path)}
@@ -219,7 +219,7 @@ def test_an_order_that_makes_no_sense_is_refused(
         (order_of((low,), settings={"node_spacin": 1.0}), "node_spacin"),
     ):
         with pytest.raises(UsageError, match=told):
-            evaluate(wrong, tmp_path)
+            evaluate_suite(wrong, tmp_path)
     assert not list(tmp_path.iterdir())
 
 
@@ -240,7 +240,7 @@ def test_a_recording_that_shows_nothing_is_named_and_the_others_are_scored(
 ) -> None:
     blind("low", monkeypatch)
     order = order_of(recordings, methods=("static", "rigid_follow"), protocols=("main", "unseen"))
-    found = evaluate(order, tmp_path)
+    found = evaluate_suite(order, tmp_path)
     assert found["skipped"] == ["low: Sequence 'low' shows no object."]
     assert found["cells"] == 2
     assert table(tmp_path)["static", "future", "track_error"]["n"] == "1"
@@ -249,7 +249,7 @@ def test_a_recording_that_shows_nothing_is_named_and_the_others_are_scored(
         in (tmp_path / "report.md").read_text()
     )
     with pytest.raises(MissingInputError, match=r"No sequence can be evaluated.*shows no object"):
-        evaluate(replace(order, recordings=recordings[:1]), tmp_path / "blind")
+        evaluate_suite(replace(order, recordings=recordings[:1]), tmp_path / "blind")
 
 
 def test_an_unseen_interaction_needs_the_same_body_in_another_action(
@@ -258,7 +258,7 @@ def test_an_unseen_interaction_needs_the_same_body_in_another_action(
     low = recordings[0]
     again = write_told(tmp_path / "again", 0.2)
     order = order_of((low, again), methods=("static",), protocols=("unseen",))
-    found = evaluate(order, tmp_path / "same")
+    found = evaluate_suite(order, tmp_path / "same")
     assert found["cells"] == 0
     assert found["skipped"] == [
         f"{name}, unseen: no other sequence shows the same body in another action."
@@ -267,7 +267,7 @@ def test_an_unseen_interaction_needs_the_same_body_in_another_action(
     assert found["skipped"][0] in (tmp_path / "same/report.md").read_text()
     other = write_told(tmp_path / "other", 0.2, "wipe", seed=1)
     order = replace(order, recordings=(low, again, other))
-    assert len(evaluate(order, tmp_path / "seeds")["skipped"]) == 3
+    assert len(evaluate_suite(order, tmp_path / "seeds")["skipped"]) == 3
     # Another generator may make another body of the same seed.
     provenance = {**low.provenance, "generator": "older"}
     old = Sequence(low.folder, replace(low.meta, name="old", provenance=provenance))
@@ -276,4 +276,4 @@ def test_an_unseen_interaction_needs_the_same_body_in_another_action(
     assert [task.fitted for task in list_tasks(order, static)] == [None, None]
     order = replace(order, recordings=(low, again, recordings[1]))
     assert [task.fitted for task in list_tasks(order, static)] == [recordings[1]] * 2 + [low]
-    assert evaluate(order, tmp_path / "all")["cells"] == 3
+    assert evaluate_suite(order, tmp_path / "all")["cells"] == 3

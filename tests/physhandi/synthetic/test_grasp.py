@@ -16,12 +16,12 @@ from physhandi.synthetic.hands.grasp import (
     orientation_towards,
     reach,
 )
-from physhandi.synthetic.hands.true_hand import HandPose, TrueHand, load_true_hand
+from physhandi.synthetic.hands.true_hand import TrueHand, TrueHandPose, load_true_hand
 
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def tip(hand: TrueHand, pose: HandPose, finger: int) -> np.ndarray:
+def tip(hand: TrueHand, pose: TrueHandPose, finger: int) -> np.ndarray:
     solid = fingertip(hand, finger)
     return (hand.bone_transforms(pose)[solid.bone] @ [*solid.end, 1])[:3]
 

@@ -2,14 +2,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from physhandi.synthetic.hands.script import HandScript, Move, Tremor, minimum_jerk
-from physhandi.synthetic.hands.true_hand import BONE_COUNT, HandPose
+from physhandi.synthetic.hands.script import HandMove, HandScript, Tremor, minimum_jerk
+from physhandi.synthetic.hands.true_hand import BONE_COUNT, TrueHandPose
 
 
-def key(x: float, *, turn: float = 0.0, flexion: float = 0.0) -> HandPose:
+def key(x: float, *, turn: float = 0.0, flexion: float = 0.0) -> TrueHandPose:
     bend = np.zeros((BONE_COUNT, 3))
     bend[4, 0] = flexion
-    return HandPose(
+    return TrueHandPose(
         orientation=np.array([0.0, 0.0, turn]), position=np.array([x, 0.0, 0.1]), bend=bend
     )
 
@@ -30,8 +30,8 @@ def test_minimum_jerk_is_the_polynomial_without_speed_and_acceleration_at_its_en
 
 def test_it_goes_from_pose_to_pose_and_waits_in_between():
     moves = [
-        Move(-1.0, 0.0, (key(0.0), key(0.2, turn=0.6, flexion=1.0))),
-        Move(1.0, 2.0, (key(0.2, turn=0.6, flexion=1.0), key(-0.1))),
+        HandMove(-1.0, 0.0, (key(0.0), key(0.2, turn=0.6, flexion=1.0))),
+        HandMove(1.0, 2.0, (key(0.2, turn=0.6, flexion=1.0), key(-0.1))),
     ]
     script = HandScript("left", moves, still())
     assert (script.side, script.begin, script.end) == ("left", -1.0, 2.0)
@@ -51,14 +51,14 @@ def test_it_goes_from_pose_to_pose_and_waits_in_between():
 def test_a_move_passes_smoothly_through_all_its_poses():
     angles = np.linspace(0, 1.2, 9)
     poses = [
-        HandPose(
+        TrueHandPose(
             orientation=np.array([0.0, angle, 0.0]),
             position=0.1 * np.array([1 - np.cos(angle), 0.0, np.sin(angle)]),
             bend=np.zeros((BONE_COUNT, 3)),
         )
         for angle in angles
     ]
-    script = HandScript("right", [Move(0.0, 1.0, poses)], still())
+    script = HandScript("right", [HandMove(0.0, 1.0, poses)], still())
     times = np.linspace(0, 1, 50)
     phase = minimum_jerk(times, 0.0, 1.0)
     for time, angle in zip(times, 1.2 * phase, strict=True):
@@ -70,7 +70,7 @@ def test_a_move_passes_smoothly_through_all_its_poses():
 
 def test_tremor_is_a_third_of_a_millimetre_around_six_hertz():
     script = HandScript(
-        "right", [Move(-1.0, 0.0, (key(0.0), key(0.0)))], Tremor(np.random.default_rng(3))
+        "right", [HandMove(-1.0, 0.0, (key(0.0), key(0.0)))], Tremor(np.random.default_rng(3))
     )
     times = np.arange(0, 20, 1 / 50)
     place = np.array([script.at(float(time)).position for time in times])
@@ -89,7 +89,7 @@ def test_tremor_comes_from_the_seed_alone():
     def turn(seed: int) -> np.ndarray:
         tremor = Tremor(np.random.default_rng(seed))
         return (
-            HandScript("right", [Move(-1.0, 1.0, (key(0.0), key(0.3, turn=2.0)))], tremor)
+            HandScript("right", [HandMove(-1.0, 1.0, (key(0.0), key(0.3, turn=2.0)))], tremor)
             .at(0.4)
             .orientation
         )
@@ -103,10 +103,10 @@ def test_tremor_comes_from_the_seed_alone():
     ("moves", "message"),
     [
         ([], "needs moves"),
-        ([Move(1.0, 1.0, (key(0.0), key(1.0)))], "needs moves"),
-        ([Move(0.0, 1.0, (key(0.0),)), Move(0.5, 2.0, (key(0.0),))], "overlap"),
+        ([HandMove(1.0, 1.0, (key(0.0), key(1.0)))], "needs moves"),
+        ([HandMove(0.0, 1.0, (key(0.0),)), HandMove(0.5, 2.0, (key(0.0),))], "overlap"),
     ],
 )
-def test_scripts_without_a_timeline_are_refused(moves: list[Move], message: str):
+def test_scripts_without_a_timeline_are_refused(moves: list[HandMove], message: str):
     with pytest.raises(ValueError, match=message):
         HandScript("right", moves, still())

@@ -6,7 +6,7 @@ from physhandi.hand.loading import load_hand_model
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.topology import build_model
 from physhandi.synthetic.bodies.sheets import (
-    FINGERTIPS,
+    FINGERTIP_KEYPOINTS,
     fold_motion,
     make_sheet,
     minimum_jerk,
@@ -60,7 +60,7 @@ def test_stiffness_varies_in_patches_and_only_inside_the_object():
 def test_the_hand_touches_pinches_lifts_and_travels():
     hand = load_hand_model("right")
     motion = fold_motion(hand, 60, 30.0, rng())
-    vertex, tip = motion.vertices(hand), motion.keypoints(hand)[:, FINGERTIPS]
+    vertex, tip = motion.vertices(hand), motion.keypoints(hand)[:, FINGERTIP_KEYPOINTS]
     assert abs(vertex[0, :, 2].min()) < 0.0015
     middle = tip.mean(axis=1)
     rise = middle[:, 2] - middle[0, 2]

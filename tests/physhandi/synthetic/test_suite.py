@@ -17,13 +17,22 @@ from physhandi.synthetic import code_version as module
 from physhandi.synthetic import synthesize as generator
 from physhandi.synthetic.bodies.bodies import make_body
 from physhandi.synthetic.code_version import code_hash, generator_version, outdated
-from physhandi.synthetic.suite.methods import parse_method, settings_of
-from physhandi.synthetic.suite.suite import SUITES, Scene, Suite, make_one_by_one, make_recordings
+from physhandi.synthetic.suite.methods import method_settings, parse_method
+from physhandi.synthetic.suite.suite import (
+    SUITES,
+    Suite,
+    SuiteScene,
+    make_one_by_one,
+    make_recordings,
+)
 
 SUITE = Suite(
     name="tiny",
     about="Two scenes.",
-    scenes=(Scene(object_="cloth", action="lift"), Scene(object_="rope", action="stretch")),
+    scenes=(
+        SuiteScene(object_="cloth", action="lift"),
+        SuiteScene(object_="rope", action="stretch"),
+    ),
     seeds=(0,),
     methods=("static",),
     recording={"preset": "clean", "frames": 30},
@@ -138,5 +147,5 @@ def test_every_fit_of_dev_makes_the_same_number_of_steps() -> None:
     assert "paper" not in dev.methods
     assert "paper" in SUITES["full"].methods
     for name in dev.methods:
-        settings = settings_of(parse_method(name), dev.settings)
+        settings = method_settings(parse_method(name), dev.settings)
         assert settings["object_"]["first_order"]["iterations"] == 80

@@ -15,7 +15,7 @@ from physhandi.progress import Progress
 from physhandi.synthetic.code_version import generator_version
 from physhandi.synthetic.suite import evaluation
 from physhandi.synthetic.suite.cells import Bench
-from physhandi.synthetic.suite.evaluation import evaluate
+from physhandi.synthetic.suite.evaluation import evaluate_suite
 
 
 @pytest.fixture(scope="module")
@@ -32,12 +32,12 @@ def test_what_was_cancelled_goes_on(tmp_path: Path, recordings: tuple[Sequence, 
 
     order = order_of(recordings[:1], methods=("static", "quick"), protocols=("main",))
     with pytest.raises(CancelledError):
-        evaluate(order, tmp_path, Stopper())
+        evaluate_suite(order, tmp_path, Stopper())
     assert {method for method, *_ in table(tmp_path)} == {"static"}
     assert "**Not finished**: 1 cells are missing" in (tmp_path / "report.md").read_text()
     (static,) = (tmp_path / "cells").glob("low-static-*")
     published = (static / "current").stat().st_mtime_ns
-    assert evaluate(order, tmp_path)["cells"] == 2
+    assert evaluate_suite(order, tmp_path)["cells"] == 2
     assert "Not finished" not in (tmp_path / "report.md").read_text()
     assert (static / "current").stat().st_mtime_ns == published
     assert ("quick", "future", "track_error") in table(tmp_path)
@@ -55,7 +55,7 @@ def test_tables_are_written_after_each_protocol_and_survive_a_crash(
     monkeypatch.setattr(Bench, "unseen", crash)
     order = order_of(recordings, methods=("static", "rigid_follow"))
     with pytest.raises(RuntimeError, match="out of luck"):
-        evaluate(order, tmp_path)
+        evaluate_suite(order, tmp_path)
     assert seen == [True]
     assert table(tmp_path)["rigid_follow", "future", "track_error"]["n"] == "2"
     assert "**Not finished**: 4 cells" in (tmp_path / "report.md").read_text()
@@ -74,7 +74,7 @@ def test_tables_of_a_long_protocol_are_written_on_the_way(
 
     order = order_of(recordings, methods=("static", "rigid_follow"), protocols=("main",))
     monkeypatch.setattr(evaluation, "WRITE_EVERY", -1.0)
-    evaluate(order, tmp_path, Listener())
+    evaluate_suite(order, tmp_path, Listener())
     assert known == [0, 1, 2, 3, 3]  # Told before each cell; the last one is written at the end.
 
 
@@ -82,10 +82,10 @@ def test_an_order_of_fewer_methods_keeps_what_was_known(
     tmp_path: Path, recordings: tuple[Sequence, ...]
 ) -> None:
     whole = order_of(recordings, methods=("static", "rigid_follow"))
-    evaluate(whole, tmp_path)
+    evaluate_suite(whole, tmp_path)
     before = (tmp_path / "table.csv").read_bytes()
     report = (tmp_path / "report.md").read_text().partition("## Computed with")[0]
-    evaluate(replace(whole, methods=("rigid_follow",), protocols=("main",)), tmp_path)
+    evaluate_suite(replace(whole, methods=("rigid_follow",), protocols=("main",)), tmp_path)
     assert (tmp_path / "table.csv").read_bytes() == before
     assert (tmp_path / "report.md").read_text().partition("## Computed with")[0] == report
     curves = json.loads((tmp_path / "curves.json").read_text())["curves"]
@@ -96,7 +96,7 @@ def test_an_order_of_fewer_methods_keeps_what_was_known(
     # A run that was deleted has no place in the table.
     (gone,) = (tmp_path / "cells").glob("high-rigid_follow-*")
     shutil.rmtree(gone)
-    evaluate(replace(whole, methods=("static",)), tmp_path)
+    evaluate_suite(replace(whole, methods=("static",)), tmp_path)
     assert table(tmp_path)["rigid_follow", "future", "track_error"]["n"] == "1"
 
 
@@ -104,8 +104,10 @@ def test_methods_that_were_computed_otherwise_are_named_when_they_leave_the_tabl
     tmp_path: Path, recordings: tuple[Sequence, ...]
 ) -> None:
     order = order_of(recordings[:1], methods=("static", "rigid_follow"), protocols=("main",))
-    evaluate(order, tmp_path)
-    found = evaluate(replace(order, methods=("static",), settings={"node_spacing": 0.5}), tmp_path)
+    evaluate_suite(order, tmp_path)
+    found = evaluate_suite(
+        replace(order, methods=("static",), settings={"node_spacing": 0.5}), tmp_path
+    )
     assert "rigid_follow" in found["notes"][0]
     assert "rigid_follow. Evaluate them again" in (tmp_path / "report.md").read_text()
     assert {method for method, *_ in table(tmp_path)} == {"static"}
@@ -115,22 +117,22 @@ def test_a_folder_with_the_table_of_other_sequences_is_refused(
     tmp_path: Path, recordings: tuple[Sequence, ...]
 ) -> None:
     order = order_of(recordings[:1], methods=("static",), protocols=("main",))
-    evaluate(order, tmp_path)
+    evaluate_suite(order, tmp_path)
     before = (tmp_path / "cells.json").read_bytes()
     for other in (replace(order, recordings=recordings), replace(order, title="Suite dev")):
         with pytest.raises(UsageError, match=r"holds the table 'Two sheets' of low.*another --out"):
-            evaluate(other, tmp_path)
+            evaluate_suite(other, tmp_path)
     assert (tmp_path / "cells.json").read_bytes() == before
     (tmp_path / "cells.json").write_text('{"about": {}}')
     with pytest.raises(UsageError, match=r"cells\.json is damaged"):
-        evaluate(order, tmp_path)
+        evaluate_suite(order, tmp_path)
 
 
 def test_a_sequence_called_like_a_split_has_a_chart_of_its_own(tmp_path: Path) -> None:
     order = order_of(
         (write_told(tmp_path / "future", 0.1),), methods=("static",), protocols=("main",)
     )
-    evaluate(order, tmp_path / "out")
+    evaluate_suite(order, tmp_path / "out")
     charts = json.loads((tmp_path / "out/cells.json").read_text())["about"]["charts"]
     assert charts == ["reconstruction.svg", "future.svg", "sequence_future.svg"]
     bars, lines = ((tmp_path / "out/charts" / name).read_text() for name in charts[1:])
@@ -144,7 +146,7 @@ def test_the_report_tells_how_to_make_it_again_and_marks_reserved_seeds(tmp_path
         recording = write_told(folder / "sheet", 0.1, seed=seed)
         order = order_of((recording,), methods=("static",), protocols=("main", "main"))
         order = replace(order, command="physhandi evaluate suite --suite dev")
-        assert evaluate(order, folder / "out")["cells"] == 1
+        assert evaluate_suite(order, folder / "out")["cells"] == 1
         report = (folder / "out/report.md").read_text()
         for line in (
             "* command: `physhandi evaluate suite --suite dev`\n",
@@ -164,7 +166,7 @@ def test_recordings_of_another_generator_are_told_in_log_and_report(
     provenance = {**low.provenance, "generator": "0123456789ab-mujoco-1.0"}
     old = Sequence(low.folder, replace(low.meta, provenance=provenance))
     order = order_of((old,), methods=("static",), protocols=("main",))
-    (note,) = evaluate(order, tmp_path)["notes"]
+    (note,) = evaluate_suite(order, tmp_path)["notes"]
     assert "0123456789ab-mujoco-1.0" in note
     assert note in caplog.text
     assert f"**Note**: {note}" in (tmp_path / "report.md").read_text()

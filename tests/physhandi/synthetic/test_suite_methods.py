@@ -3,7 +3,7 @@
 import pytest
 
 from physhandi.errors import UsageError
-from physhandi.synthetic.suite.methods import METHODS, parse_method, settings_of, shared_stages
+from physhandi.synthetic.suite.methods import METHODS, method_settings, parse_method, shared_stages
 from physhandi.synthetic.suite.suite import SUITES, check_seeds, find_suite
 
 
@@ -11,7 +11,7 @@ def test_a_name_says_base_settings_and_correction() -> None:
     method = parse_method("quick@node_spacing=0.03,object_.search.generations=2+last_residual")
     assert (method.profile, method.rule, method.is_corrected) == ("quick", None, True)
     assert method.base.name == "quick@node_spacing=0.03,object_.search.generations=2"
-    settings = settings_of(method, {"node_spacing": 0.5, "refinement.iterations": 3})
+    settings = method_settings(method, {"node_spacing": 0.5, "refinement.iterations": 3})
     assert settings["node_spacing"] == 0.03
     assert settings["object_"]["search"]["generations"] == 2
     assert settings["refinement"]["iterations"] == 3
@@ -62,16 +62,16 @@ def test_hindsight_is_not_told_as_a_bound() -> None:
 def test_stages_are_shared_as_far_as_settings_agree() -> None:
     common = {"node_spacing": 0.02, "hand.iterations": 7}
     one, other, sparse = (
-        settings_of(METHODS[name], common) for name in ("static", "quick", "phystwin")
+        method_settings(METHODS[name], common) for name in ("static", "quick", "phystwin")
     )
     assert len(shared_stages(one, other)) == 2
     assert shared_stages(one, sparse) == shared_stages(one, other)[:1]
-    assert shared_stages(one, settings_of(METHODS["quick"], {"hand.iterations": 8})) == ()
+    assert shared_stages(one, method_settings(METHODS["quick"], {"hand.iterations": 8})) == ()
 
 
 @pytest.mark.parametrize("suite", SUITES.values(), ids=list(SUITES))
 def test_every_suite_holds_methods_that_exist_and_reserved_seeds_are_not_in_it(suite) -> None:
-    assert all(settings_of(parse_method(name), suite.settings) for name in suite.methods)
+    assert all(method_settings(parse_method(name), suite.settings) for name in suite.methods)
     assert {"static", "phystwin"} <= set(suite.methods)
     assert len(set(suite.scenes)) == len(suite.scenes)
     assert max(suite.seeds) < 1000

@@ -12,16 +12,16 @@ from physhandi.synthetic.hands.true_hand import (
     ASSET,
     BONE_COUNT,
     FINGERTIPS,
-    HandPose,
     TrueHand,
+    TrueHandPose,
     load_true_hand,
     soft_tissue_offset,
 )
 
 
-def pose(**changed: np.ndarray) -> HandPose:
+def pose(**changed: np.ndarray) -> TrueHandPose:
     rest = {"orientation": np.zeros(3), "position": np.zeros(3), "bend": np.zeros((BONE_COUNT, 3))}
-    return HandPose(**(rest | changed))
+    return TrueHandPose(**(rest | changed))
 
 
 def bend(**bones: tuple[float, float, float]) -> np.ndarray:
@@ -33,7 +33,7 @@ def bend(**bones: tuple[float, float, float]) -> np.ndarray:
     return turned
 
 
-def random_pose(seed: int) -> HandPose:
+def random_pose(seed: int) -> TrueHandPose:
     random = np.random.default_rng(seed)
     turned = random.uniform(-0.6, 0.6, (BONE_COUNT, 3))
     turned[0] = 0

@@ -5,8 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from physhandi.data.importers.mocap import import_mocap, refine, resample, straight_chain
-from physhandi.errors import CancelledError, ImportFailedError
+from physhandi.data.importers.mocap import (
+    import_mocap,
+    refine,
+    resample,
+    straight_chain,
+    turned_up,
+)
+from physhandi.errors import CancelledError, ImportFailedError, UsageError
 from physhandi.progress import Progress
 
 SEGMENT = 0.08
@@ -87,6 +93,70 @@ def test_a_folder_of_trajectories_becomes_sequences(tmp_path: Path) -> None:
     assert len(import_mocap(tmp_path, tmp_path / "out", overwrite=True)) == 3
 
 
+def test_rate_spacing_rest_shape_unit_and_up_axis_are_options(tmp_path: Path) -> None:
+    rope = make_rope(120)
+    # In centimetres, y up: what was z is y, and the axes keep their handedness.
+    np.save(tmp_path / "swing.npy", 100 * rope[..., [1, 2, 0]])
+    (sequence,) = import_mocap(
+        tmp_path / "swing.npy",
+        tmp_path / "out",
+        controlled_markers=(0, 12),
+        recording_rate=50.0,
+        frame_rate=25.0,
+        node_spacing=SEGMENT / 2,
+        rest_shape="first_frame",
+        up="y",
+        unit="cm",
+    )
+    assert (sequence.frame_rate, sequence.frame_count) == (25.0, 60)
+    assert sequence.marker is not None
+    np.testing.assert_allclose(sequence.marker, rope[::2], atol=1e-5)
+    assert sequence.controlled_markers == (0, 12)
+    assert sequence.object_node is not None
+    assert sequence.object_node.shape == (25, 3)
+    np.testing.assert_array_equal(sequence.rest_node, sequence.object_node)
+    assert sequence.provenance["nodes_per_segment"] == 2
+
+
+@pytest.mark.parametrize("up", ["x", "y", "z", "-x", "-y", "-z"])
+def test_turning_a_recording_up_is_a_rotation(up: str) -> None:
+    axes = turned_up(np.eye(3)[None], up)[0]  # type: ignore[arg-type]
+    assert np.linalg.det(axes) == pytest.approx(1.0)
+    direction = np.eye(3)["xyz".index(up[-1])] * (-1 if up.startswith("-") else 1)
+    np.testing.assert_array_equal(turned_up(direction[None, None], up)[0, 0], [0, 0, 1])  # type: ignore[arg-type]
+
+
+def test_options_out_of_range_are_refused(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", make_rope(20))
+    zero = {"recording_rate": 0.0, "frame_rate": 0.0, "nodes_per_segment": 0, "node_spacing": 0.0}
+    for option, value in zero.items():
+        with pytest.raises(UsageError, match=f"{option.split('_')[0]}.* must be positive, not 0"):
+            import_mocap(tmp_path / "a.npy", tmp_path / "out", **{option: value})
+    assert not (tmp_path / "out").exists()
+
+
+def branched() -> np.ndarray:
+    """Two arms of one tree, listed one after the other, that swing against each other."""
+    rope = make_rope(100)
+    rope[:, 7:, 0] += 0.3 * np.sin(np.arange(100) / 9)[:, None]
+    return rope
+
+
+def far_branch() -> np.ndarray:
+    """A second arm that keeps its distance, a long way off."""
+    rope = make_rope(100)
+    rope[:, 7:, 0] += 2.0
+    return rope
+
+
+def one_axis_in_another_unit() -> np.ndarray:
+    """A rope that turns about the vertical, one of whose axes is twice as long as it should be."""
+    rope, angle = make_rope(100), np.arange(100) / 20
+    turn = np.stack([np.cos(angle), np.sin(angle)], axis=1)[:, None]
+    rope[..., :2] = rope[..., :1] * turn
+    return rope * [2.0, 1.0, 1.0]
+
+
 def with_value(value: object, *place: int) -> np.ndarray:
     rope = make_rope(20)
     rope[place] = value
@@ -104,6 +174,10 @@ def with_value(value: object, *place: int) -> np.ndarray:
         (with_value(np.inf, 19, 0, 2), "bad.npy: frame 19, marker 0 is"),
         (make_rope(20) * 1000, r"bad.npy: frame 0, marker 0 is \d+ m from the origin"),
         (with_value(make_rope(20)[3, 5], 3, 6), "frame 3: markers 5 and 6 are at one place"),
+        (branched(), r"bad.npy: from marker 6 to 7 it is \d+ to \d+ mm, but .* without branches"),
+        (far_branch(), r"bad.npy: from marker 6 to 7 it is \d+ mm, but 80 mm from marker"),
+        (one_axis_in_another_unit(), "bad.npy: from marker .* all axes in one unit"),
+        (make_rope(20) * 12, r"bad.npy: the markers make a rope of 11\.5 m, read in m. .*--unit"),
         (np.array([None, 3], dtype=object), "bad.npy is not a readable .npy file"),
     ],
 )

@@ -8,7 +8,7 @@ import pytest
 from recordings import recording as published
 
 from physhandi.data.importers.stereo import import_stereo
-from physhandi.errors import ImportFailedError
+from physhandi.errors import ImportFailedError, UsageError
 
 INTRINSICS = """intrinsic:
 60.0 0.0 32.0
@@ -75,6 +75,19 @@ def test_cameras_stand_above_the_board(recording: Path, tmp_path: Path) -> None:
     copied = sequence.folder / "views/view1/color.mp4"
     assert copied.read_bytes() == (recording / "cam1_test.mp4").read_bytes()
     assert sequence.views[0].color(2).mean() == pytest.approx(80, abs=4)
+
+
+def test_who_recorded_it_is_kept_only_if_told(recording: Path, tmp_path: Path) -> None:
+    plain = import_stereo(recording, tmp_path / "plain").provenance
+    assert plain == {"importer": "stereo", "folder": "recording"}
+    both = import_stereo(
+        recording, tmp_path / "both", hands=("left", "right"), origin="our lab", licence="CC0-1.0"
+    )
+    assert both.hands == ("left", "right")
+    assert both.provenance == plain | {"origin": "our lab", "licence": "CC0-1.0"}
+    for hands in ((), ("left", "left")):
+        with pytest.raises(UsageError, match="Name each hand"):
+            import_stereo(recording, tmp_path / "none", hands=hands)
 
 
 def test_a_board_seen_from_its_z_side_is_not_turned(recording: Path, tmp_path: Path) -> None:
