@@ -30,7 +30,7 @@ from app.jobs.views import (
     select_runs,
 )
 from app.jobs.watch import Watch
-from physhandi.fitting.config import load_profile, profile_names
+from physhandi.fitting.config import named_profile, profile_names
 
 Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
 Path = Annotated[str, Field(max_length=200)]
@@ -174,7 +174,7 @@ def _add_listings(router: APIRouter, catalog: Catalog, scheduler: Scheduler) -> 
         names = profile_names()
         return {
             "profiles": [
-                {"name": name, "description": load_profile(name).description} for name in names
+                {"name": name, "description": named_profile(name).description} for name in names
             ]
         }
 

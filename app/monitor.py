@@ -26,9 +26,8 @@ from physhandi.fitting.config import (
     GROUPS,
     all_settings,
     apply_overrides,
-    changes,
-    config_to_dict,
-    load_profile,
+    named_profile,
+    overrides_of,
     profile_names,
     values_of,
 )
@@ -118,9 +117,11 @@ def describe_settings(catalog: Catalog, profile: str | None, run_id: str | None)
                 f"Run '{run_id}' cannot be fitted again with changes: it is a simulation, or "
                 "another version of the program made it. Launch a new fit of its sequence."
             )
-        if profile in {None, config.profile}:
-            profile, own = config.profile, values_of(config)
-    base = load_profile(profile or "quick")
+        # A profile of the user's own is not among those offered; the run holds all its settings.
+        of_run = config.profile if config.profile in profile_names() else "default"
+        if profile in {None, of_run}:
+            profile, own = of_run, values_of(config)
+    base = named_profile(profile or "quick")
     before = values_of(base)
     return {
         "profile": base.profile,
@@ -156,15 +157,15 @@ def check_order(
         UsageError: If there is no such profile.
         SequenceError: If a sequence is unknown or damaged.
     """
-    base = load_profile(profile)
+    base = named_profile(profile)
     sequences = [catalog.sequence(sequence_id) for sequence_id in sequence_ids]
     try:
         config = apply_overrides(base, overrides)
     except SettingsError as error:
         problems = [{"field": path, "message": told} for path, told in error.fields.items()]
         return {"problems": problems, "overrides": {}, "expected": None}
-    expected = forecast.of_order(config_to_dict(config), sequences)
-    return {"problems": [], "overrides": changes(config, base), "expected": expected}
+    expected = forecast.of_order(config.to_dict(), sequences)
+    return {"problems": [], "overrides": overrides_of(config, base), "expected": expected}
 
 
 Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
@@ -284,7 +285,7 @@ def _launch_page(
         parent=item and {"id": item.id, "name": item.run.name if item.run else item.id},
         profile=found["profile"],
         description=found["description"],
-        profiles=[(name, load_profile(name).description) for name in profile_names()],
+        profiles=[(name, named_profile(name).description) for name in profile_names()],
         groups=groups,
         sequences=sequences,
         chosen=chosen,

@@ -12,23 +12,17 @@ from numpy import ndarray
 from physhandi.data.run import RunFolder
 from physhandi.errors import MissingInputError
 from physhandi.object_rollout import ObjectRollout, load_fitted
+from physhandi.settings import changes
 from physhandi.simulation.model import SpringMassModel
-from physhandi.simulation.parameters import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters, parameter_names
 from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.stability import largest_stable_step
 from physhandi.simulation.topology import MINIMUM_VIRTUAL_REST_LENGTH, retopologize, virtual_springs
 
-# Parameters that are built into the model; the others are read by the simulator.
-_MATERIAL = ("stiffness", "virtual_stiffness", "damping")
-_TOPOLOGY = (
-    *_MATERIAL,
-    "connection_radius",
-    "max_neighbors",
-    "virtual_connection_radius",
-    "virtual_max_neighbors",
-    "rest_length_floor",
-    "virtual_rest_length_floor",
-)
+_MATERIAL = parameter_names("material")
+_BUILT_IN = parameter_names("material", "topology")
+"""Parameters that are built into the model; the others are read by the simulator."""
+_STEP = parameter_names("step")
 
 
 class FittedObject:
@@ -78,7 +72,7 @@ class FittedObject:
 
     def model(self, parameters: SimulationParameters) -> SpringMassModel:
         """Build the springs for other parameters, keeping what was fitted."""
-        key = tuple(getattr(parameters, name) for name in _TOPOLOGY)
+        key = tuple(getattr(parameters, name) for name in _BUILT_IN)
         if self._latest is None or self._latest[0] != key:
             self._latest = (key, self._build(parameters))
         return self._latest[1]
@@ -96,11 +90,10 @@ class FittedObject:
     ) -> Simulator:
         """Place a model on the device, or use it again if it is there already."""
         known = self._simulator
-        lengths = ("frame_rate", "substeps_per_frame")
         if (
             known is not None
             and known.model is model
-            and all(getattr(known.parameters, n) == getattr(parameters, n) for n in lengths)
+            and not set(_STEP) & set(changes(known.parameters, parameters))
         ):
             known.set_parameters(parameters)
             return known
@@ -111,7 +104,7 @@ class FittedObject:
         fitted, model = self.take.parameters, self.take.model
         if self._chosen is not None:
             return _hold_anew(model, parameters, self._attached)
-        is_changed = {n for n in _TOPOLOGY if getattr(parameters, n) != getattr(fitted, n)}
+        is_changed = set(_BUILT_IN) & set(changes(fitted, parameters))
         if is_changed <= set(_MATERIAL):
             return _scale_material(model, fitted, parameters) if is_changed else model
         return retopologize(

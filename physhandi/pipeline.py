@@ -30,8 +30,6 @@ from physhandi.fitting.config import (
     SPRINGS,
     PipelineConfig,
     apply_overrides,
-    config_from_dict,
-    config_to_dict,
     load_profile,
 )
 from physhandi.fitting.config import STAGES as STAGES
@@ -63,7 +61,7 @@ def settings_of(profile: str, overrides: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         UsageError: If there is no such profile, or a setting is unknown or out of bounds.
     """
-    return config_to_dict(apply_overrides(load_profile(profile), overrides))
+    return apply_overrides(load_profile(profile), overrides).to_dict()
 
 
 def reconstruct(
@@ -397,6 +395,6 @@ def run_job(run: RunFolder, progress: Progress | None = None, *, device: str = "
                 source, sequences[0], run.config["parameters"], attempt, watched, device=device
             )
         else:
-            config = config_from_dict(run.config["profile"])
+            config = PipelineConfig.from_dict(run.config["profile"])
             reconstruct(sequences, config, attempt, watched, device=device)
         attempt.publish()

@@ -15,7 +15,7 @@ from app.server import create_app
 from app.settings import BUNDLED, Settings
 from app.viewer.sessions import Sessions
 from physhandi import pipeline
-from physhandi.fitting.config import PipelineConfig, config_to_dict
+from physhandi.fitting.config import PipelineConfig
 from physhandi.run import Run
 
 TOKEN = "a-token-that-only-the-tests-know"  # noqa: S105
@@ -75,7 +75,7 @@ def fit_sheet(folder: Path, sequence: Path) -> Run:
         name="a sheet",
         kind="reconstruction",
         sequences=[str(sequence)],
-        config={"profile": config_to_dict(tiny_config())},
+        config={"profile": tiny_config().to_dict()},
     )
     pipeline.run_job(run)
     return Run.open(folder)

@@ -8,8 +8,7 @@ import numpy as np
 from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import write_sequence
-from physhandi.fitting.config import PipelineConfig, load_profile
-from physhandi.fitting.search import SearchVariable
+from physhandi.fitting.config import PipelineConfig, SearchVariable, load_profile
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.topology import build_model
@@ -70,13 +69,12 @@ def sheet_config(*, generations: int, population: int, iterations: int) -> Pipel
         "stiffness": soft,
         "virtual_stiffness": soft,
     }
-    search = replace(
-        config.object_.search,
+    search = config.object_.search.replace(
         generations=generations,
         population=population,
         variables=variables,
     )
-    first_order = replace(config.object_.first_order, iterations=iterations)
-    simulation = replace(config.simulation, connection_radius=0.08, virtual_connection_radius=0.02)
-    object_ = replace(config.object_, search=search, first_order=first_order)
-    return replace(config, object_=object_, simulation=simulation)
+    first_order = config.object_.first_order.replace(iterations=iterations)
+    simulation = config.simulation.replace(connection_radius=0.08, virtual_connection_radius=0.02)
+    object_ = config.object_.replace(search=search, first_order=first_order)
+    return config.replace(object_=object_, simulation=simulation)

@@ -3,7 +3,7 @@
 import queue
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
@@ -69,7 +69,7 @@ class _Slider:
             LiveRequest(
                 run=self._run.folder,
                 sequence=self._sequence,
-                parameters=replace(take.parameters, **changes),
+                parameters=take.parameters.replace(**changes),
                 automatic_substeps=automatic,
             ),
         )

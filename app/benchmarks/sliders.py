@@ -1,7 +1,7 @@
 """How long it takes from a slider of a live scene to the first new frame, without a browser."""
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -81,7 +81,7 @@ class Slider:
     def _move(self, value: float) -> Move:
         value = min(max(round(value, 6), self.knob.low), self.knob.high)
         chosen = {self.knob.field: self.knob.from_slider(value)}
-        parameters = replace(self._start, **chosen)
+        parameters = self._start.replace(**chosen)
         model = self._fitted.model(parameters)
         control = self._fitted.choose_controls(None)
         simulator = self._fitted.simulator(model, parameters, "cpu")

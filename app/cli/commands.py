@@ -15,10 +15,10 @@ from physhandi.data.files import plain, without_non_finite
 from physhandi.data.run import RunKind
 from physhandi.data.sequence import Sequence
 from physhandi.errors import RunError, UsageError
-from physhandi.fitting.config import changed_parameters, config_to_dict, load_profile
+from physhandi.fitting.config import load_profile
 from physhandi.progress import Progress
 from physhandi.run import Run
-from physhandi.simulation.parameters import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters, changed_parameters
 
 OVERRIDES = (
     "connection_radius",
@@ -132,7 +132,7 @@ def reconstruct(command: Any, progress: Progress) -> dict[str, Any]:
     for sequence in sequences:
         sequence.validate(reads_color=False)  # Tells wrong data before a run is made.
     device = pick_device(command.device)
-    config = {"profile": config_to_dict(load_profile(command.profile))}
+    config = {"profile": load_profile(command.profile).to_dict()}
     paths = [str(sequence.folder) for sequence in sequences]
     return _execute(_run_at(command.out, "reconstruction", paths, config), device, progress)
 

@@ -29,10 +29,8 @@ import numpy as np
 from app.viewer.content.layers import THEMES, Layers
 from app.viewer.content.session_state import Pose, SessionState
 from physhandi.errors import UsageError
-from physhandi.simulation.parameters import SimulationParameters
+from physhandi.simulation.parameters import AUTOMATIC, PARAMETERS, SimulationParameters
 
-AUTOMATIC = "auto"
-"""Instead of a number of substeps: as few as are stable."""
 _FARTHEST = 1e5
 _LARGEST_VALUE = 1e12
 _LAST_FRAME = 10_000_000
@@ -49,9 +47,7 @@ _SWITCHES = tuple(name for name, kind in _LAYER_TYPES.items() if kind is bool an
 _CHOICES: dict[str, tuple[str, ...]] = {
     name: get_args(kind) for name, kind in _LAYER_TYPES.items() if get_origin(kind) is Literal
 }
-# These belong to the recording or to how the simulator rounds; no slider moves them.
-_FIXED = {"frame_rate", "frame_duration", "uses_sequence_gravity", "rounds_decay"}
-_PARAMETERS = tuple(name for name in SimulationParameters().to_dict() if name not in _FIXED)
+_PARAMETERS = tuple(name for name, parameter in PARAMETERS.items() if parameter.is_in_links)
 
 
 def state_to_query(state: SessionState) -> dict[str, str]:
@@ -249,11 +245,11 @@ def _switch(query: Mapping[str, str], name: str, *, usual: bool) -> bool:
 
 def _parameter(name: str, text: str) -> Any:
     """Read a parameter in the type of its field, within the bounds of the simulator."""
-    usual = getattr(SimulationParameters(), name)
+    kind = PARAMETERS[name].kind
     value: Any
-    if isinstance(usual, bool):
-        value = _switch({name: text}, name, usual=usual)
-    elif isinstance(usual, int):
+    if kind == "switch":
+        value = _switch({name: text}, name, usual=False)
+    elif kind == "whole":
         value = _integer({name: text}, name, _MOST_SUBSTEPS)
     elif text == "none":
         value = None

@@ -26,7 +26,6 @@ from physhandi.fitting.config import (
     SPRINGS,
     STAGES,
     PipelineConfig,
-    config_from_dict,
 )
 from physhandi.run import Run
 
@@ -440,7 +439,7 @@ class Forecast:
 def _config_of(settings: Mapping[str, Any]) -> PipelineConfig | None:
     """Read settings; None if they are those of another version of the program."""
     try:
-        return config_from_dict(dict(settings))
+        return PipelineConfig.from_dict(dict(settings))
     except UsageError:
         return None
 

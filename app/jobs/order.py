@@ -13,10 +13,8 @@ from physhandi.fitting.config import (
     Setting,
     all_settings,
     apply_overrides,
-    changes,
-    config_from_dict,
-    config_to_dict,
-    load_profile,
+    named_profile,
+    overrides_of,
     profile_names,
     values_of,
 )
@@ -40,10 +38,10 @@ def fit_config(
         UsageError: If there is no such profile.
         SettingsError: If settings are unknown or wrong; names all of them.
     """
-    base = load_profile(profile)
+    base = named_profile(profile)
     config = apply_overrides(base, overrides or {})
-    changed = changes(config, base)
-    stored: dict[str, Any] = {"profile": config_to_dict(config)}
+    changed = overrides_of(config, base)
+    stored: dict[str, Any] = {"profile": config.to_dict()}
     return (
         stored
         | ({"overrides": changed} if changed else {})
@@ -64,7 +62,7 @@ def settings_of_run(run: Run) -> PipelineConfig | None:
     if run.kind != "reconstruction" or not profile:
         return None
     try:
-        return config_from_dict(profile)
+        return PipelineConfig.from_dict(profile)
     except UsageError:
         return None
 
@@ -141,4 +139,4 @@ def _row(setting: Setting, base: Any, value: Any) -> dict[str, Any]:
 
 @lru_cache(maxsize=32)
 def _base_values(profile: str) -> dict[str, Any]:
-    return values_of(load_profile(profile)) if profile in profile_names() else {}
+    return values_of(named_profile(profile)) if profile in profile_names() else {}

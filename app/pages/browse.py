@@ -14,7 +14,7 @@ from app.jobs.views import STATES, RunQuery, describe_sequence, page_of, select_
 from app.pages.render import Pages
 from app.previews.store import Kind, Previews
 from physhandi.errors import UsageError
-from physhandi.fitting.config import load_profile, profile_names
+from physhandi.fitting.config import named_profile, profile_names
 
 _RECENT_RUNS = 8
 _HOME_SEQUENCES = 6
@@ -94,7 +94,7 @@ def add_lists(
         return found[::-1]
 
     def launch_values(sequences: list[dict[str, Any]]) -> dict[str, Any]:
-        profiles = [(name, load_profile(name).description) for name in ordered_profiles()]
+        profiles = [(name, named_profile(name).description) for name in ordered_profiles()]
         return {"profiles": profiles, "usable": [s for s in sequences if not s["error"]]}
 
     @router.get("/")

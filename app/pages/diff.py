@@ -6,9 +6,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
 from app.pages.metrics import about_quantity, figure, is_count, is_higher_better, scaled, unit_of
-from app.pages.parameters import field_notes
+from app.pages.parameters import meaning_of
 from app.pages.render import duration, short, words
 from physhandi.data.files import named_fields
+from physhandi.settings import flatten, is_same
 
 LEAST, MOST = 2, 5
 """How many runs can be compared."""
@@ -86,17 +87,6 @@ def compare_runs(
     return [section for section in sections if section.rows]
 
 
-def flatten(value: Any, name: str = "") -> dict[str, Any]:
-    """Name every value inside nested fields by its path, with dots between."""
-    fields = named_fields(value)
-    if fields is None:
-        return {name: value}
-    flat: dict[str, Any] = {}
-    for key, inner in fields.items():
-        flat |= flatten(inner, f"{name}.{key}" if name else key)
-    return flat
-
-
 def _facts_of(run: Mapping[str, Any]) -> dict[str, Any]:
     facts = {
         "state": run["state"],
@@ -134,7 +124,7 @@ def _plain_rows(columns: Sequence[Mapping[str, Any]]) -> list[Row]:
 def _parameter_rows(columns: Sequence[Mapping[str, Any]]) -> list[Row]:
     rows: list[Row] = []
     for name in _names(columns):
-        about, unit = field_notes().get(name, ("", ""))
+        about, unit = meaning_of(name)
         values = [column.get(name) for column in columns]
         scaled_columns = [
             {name: scaled(column[name], unit)[0]} if name in column else {} for column in columns
@@ -264,9 +254,7 @@ def _differ(values: Sequence[Any]) -> bool:
 
 
 def _same(first: Any, second: Any) -> bool:
-    if _is_number(first) and _is_number(second):
-        return math.isclose(first, second, rel_tol=1e-9)
-    return type(first) is type(second) and first == second
+    return is_same(first, second, tolerance=1e-9)
 
 
 def _is_number(value: Any) -> bool:

@@ -1,8 +1,6 @@
 """The simulation's parameters as a table: what was found beside what it began with."""
 
-import math
 from collections.abc import Mapping
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +8,13 @@ from app.pages.metrics import scaled
 from app.pages.render import short
 from physhandi.data.files import named_fields
 from physhandi.errors import PhysHandiError
-from physhandi.fitting.config import notes_of
 from physhandi.run import Run
-from physhandi.simulation.parameters import SimulationParameters
+from physhandi.settings import changes
+from physhandi.simulation.parameters import PARAMETERS
 
 _FOUND = "object/parameters.yaml"
+_TOLERANCE = 1e-9
+"""Numbers that differ by a smaller share were only rounded on the way."""
 
 
 def parameter_rows(run: Run, found: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -26,8 +26,9 @@ def parameter_rows(run: Run, found: Mapping[str, Any]) -> list[dict[str, Any]]:
     """
     start = _start_of(run)
     rows: list[dict[str, Any]] = []
+    changed = changes(start, found, tolerance=_TOLERANCE)
     for name, value in found.items():
-        about, unit = field_notes().get(name, ("", ""))
+        about, unit = meaning_of(name)
         before = start.get(name)
         rows.append(
             {
@@ -36,16 +37,16 @@ def parameter_rows(run: Run, found: Mapping[str, Any]) -> list[dict[str, Any]]:
                 "unit": scaled(None, unit)[1],
                 "start": _text(before, unit) if name in start else "",
                 "value": _text(value, unit),
-                "is_changed": name in start and not _is_same(before, value),
+                "is_changed": name in start and name in changed,
             }
         )
     return rows
 
 
-@cache
-def field_notes() -> dict[str, tuple[str, str]]:
-    """Read what each simulation parameter means, and its unit, from where it is declared."""
-    return notes_of(SimulationParameters)
+def meaning_of(name: str) -> tuple[str, str]:
+    """Give what a simulation parameter means, and its unit; empty for one of another version."""
+    parameter = PARAMETERS.get(name)
+    return (parameter.about, parameter.unit) if parameter else ("", "")
 
 
 def _start_of(run: Run) -> dict[str, Any]:
@@ -63,8 +64,3 @@ def _text(value: Any, unit: str) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     return short(scaled(value, unit)[0])
-
-
-def _is_same(first: Any, second: Any) -> bool:
-    numbers = [v for v in (first, second) if isinstance(v, int | float)]
-    return math.isclose(*numbers, rel_tol=1e-9) if len(numbers) == 2 else first == second

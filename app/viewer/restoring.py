@@ -1,7 +1,6 @@
 """Making a state that somebody asked for, as by a link, fit what is there."""
 
-from dataclasses import fields, replace
-from typing import Any
+from dataclasses import replace
 
 from app.viewer.content.content import Content
 from app.viewer.content.layers import default_layers
@@ -9,7 +8,6 @@ from app.viewer.content.session_state import SessionState
 from app.viewer.scene.cameras import pose_of_view
 from app.viewer.scene.framing import frame_content
 from physhandi.errors import UsageError
-from physhandi.simulation.parameters import SimulationParameters
 
 
 def complete_state(state: SessionState, content: Content) -> SessionState:
@@ -46,18 +44,9 @@ def complete_state(state: SessionState, content: Content) -> SessionState:
         raise UsageError(f"{name}: nothing is simulated here, since no object was fitted.")
     parameters = state.parameters
     if parameters is None and content.fitted is not None:
-        parameters = replace(content.fitted.parameters, **state.parameter_changes)
+        parameters = content.fitted.parameters.replace(**state.parameter_changes)
     pose = state.pose
     if pose is None and layers.looks_from is not None:
         view = content.views[views.index(layers.looks_from)]
         pose = pose_of_view(view, frame_content(content))
     return replace(state, layers=layers, parameters=parameters, pose=pose)
-
-
-def differences(start: SimulationParameters, now: SimulationParameters) -> dict[str, Any]:
-    """Find the parameters that differ, with their new values."""
-    return {
-        item.name: getattr(now, item.name)
-        for item in fields(start)
-        if getattr(now, item.name) != getattr(start, item.name)
-    }

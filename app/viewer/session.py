@@ -18,12 +18,13 @@ from app.viewer.inspect.inspector import Inspection
 from app.viewer.live.client import SimulationClient
 from app.viewer.physics.keep_panel import UserStorage
 from app.viewer.physics.object_session import FrameStrip, ObjectSession
-from app.viewer.restoring import complete_state, differences
+from app.viewer.restoring import complete_state
 from app.viewer.scene.framing import frame_content
 from app.viewer.scene.layers_panel import LayersPanel, TimelinePanel, add_legend, set_theme
 from app.viewer.scene.scene import SceneDrawing
 from app.viewer.scene.scene_server import SceneServer
 from physhandi.object_rollout import ObjectRollout
+from physhandi.simulation.parameters import parameter_changes
 
 
 class Session(SceneServer):
@@ -106,7 +107,7 @@ class Session(SceneServer):
                 automatic_substeps=history is not None and history.is_automatic,
                 is_figure=self._figure.is_on,
                 pose=self._figure.pose(),
-                parameter_changes=differences(history.start, history.current)
+                parameter_changes=parameter_changes(history.start, history.current)
                 if history is not None
                 else {},
             )

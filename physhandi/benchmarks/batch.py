@@ -133,8 +133,7 @@ def _candidates(reference: SimulationParameters, count: int) -> list[SimulationP
     return [
         reference,
         *(
-            replace(
-                reference,
+            reference.replace(
                 connection_radius=reference.connection_radius * rng.uniform(0.8, 1.0),
                 virtual_connection_radius=reference.virtual_connection_radius
                 * rng.uniform(0.8, 1.0),

@@ -1,7 +1,7 @@
 """What benchmarks simulate: made-up blocks of any size, and objects read from a file."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -119,7 +119,7 @@ def recorded_object(
         virtual_connection_radius=0.04,
         virtual_max_neighbors=50,
     )
-    held = build_model(node, control, replace(parameters, max_neighbors=0))
+    held = build_model(node, control, parameters.replace(max_neighbors=0))
     count = held.virtual_spring_count
     floor = np.float32(parameters.rest_length_floor)
     soft = np.full(count, np.median(stiffness), dtype=np.float32)

@@ -427,4 +427,4 @@ def settle_substeps(
     if not config.automatic_substeps:
         return parameters
     needed = max(stable_substeps(model, parameters, safety=safety) for model in models)
-    return replace(parameters, substeps_per_frame=10 * math.ceil(needed / 10))
+    return parameters.replace(substeps_per_frame=10 * math.ceil(needed / 10))

@@ -10,7 +10,7 @@ from numpy import ndarray
 from scipy.spatial import KDTree
 
 from physhandi.errors import FitError, UsageError
-from physhandi.fitting.config import ObjectFitConfig
+from physhandi.fitting.config import ObjectFitConfig, SearchConfig
 from physhandi.fitting.object_problem import (
     ObjectProblem,
     mean_loss,
@@ -19,7 +19,7 @@ from physhandi.fitting.object_problem import (
     simulate_problem,
 )
 from physhandi.fitting.preview import RolloutPreview
-from physhandi.fitting.search import SEARCH_STAGE, SearchConfig, SearchResult, search_parameters
+from physhandi.fitting.search import SEARCH_STAGE, SearchResult, search_parameters
 from physhandi.progress import Progress
 from physhandi.simulation.engines.batch import BatchSimulator, MotionTarget
 from physhandi.simulation.master_topology import MasterTopology

@@ -26,7 +26,7 @@ from physhandi.data.run import RunFolder
 from physhandi.data.sequence import Sequence
 from physhandi.errors import ImportFailedError
 from physhandi.fitting import artefacts
-from physhandi.fitting.config import config_to_dict, load_profile
+from physhandi.fitting.config import load_profile
 from physhandi.fitting.rollouts import simulate_sequence
 from physhandi.metrics.report import measure_run
 from physhandi.perception.lifting import observe_object
@@ -85,8 +85,7 @@ def phystwin_parameters(
         ):
             if used != value:
                 notes.append(_changed(field, value, used, "loaded (as a whole number)"))
-    parameters = replace(
-        base,
+    parameters = base.replace(
         connection_radius=optimum.object_radius,
         # PhysTwin counts the node itself.
         max_neighbors=optimum.object_max_neighbours - 1,
@@ -299,7 +298,7 @@ def import_phystwin_run(
         kind="reconstruction",
         sequences=[str(sequence.folder)],
         config={
-            "profile": config_to_dict(replace(profile, simulation=parameters)),
+            "profile": profile.replace(simulation=parameters).to_dict(),
             "imported": report,
         },
     )

@@ -4,75 +4,18 @@ import math
 import warnings
 from collections.abc import Callable
 from collections.abc import Sequence as Many
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
 from physhandi.errors import FitError
+from physhandi.fitting.config import SearchConfig
 from physhandi.progress import Progress
 from physhandi.simulation.parameters import SimulationParameters
 
 SEARCH_STAGE = "zeroth_order"
-
-
-@dataclass(frozen=True, kw_only=True)
-class SearchVariable:
-    """One searched parameter and the interval in which it is looked for."""
-
-    low: float
-    """Lower end of the interval, in the parameter's unit."""
-    high: float
-    """Upper end of the interval, in the parameter's unit."""
-    scale: str = "linear"
-    """How the interval is walked: ``linear``, ``log`` or ``integer``."""
-
-    def __post_init__(self) -> None:
-        if self.scale not in {"linear", "log", "integer"}:
-            raise ValueError(f"scale is {self.scale!r}; expected linear, log or integer")
-        if not self.low < self.high or (self.scale == "log" and self.low <= 0):
-            raise ValueError(
-                f"interval [{self.low}, {self.high}] is empty or not positive for a log scale"
-            )
-
-    def to_unit(self, value: float) -> float:
-        """Map a value to [0, 1]; values outside the interval land on its ends."""
-        if self.scale == "log":
-            unit = math.log(value / self.low) / math.log(self.high / self.low)
-        else:
-            unit = (value - self.low) / (self.high - self.low)
-        return min(max(unit, 0.0), 1.0)
-
-    def from_unit(self, unit: float) -> float | int:
-        """Map a number in [0, 1] to a value of the parameter."""
-        if self.scale == "log":
-            return float(self.low * (self.high / self.low) ** unit)
-        value = self.low + unit * (self.high - self.low)
-        return math.floor(value) if self.scale == "integer" else value
-
-
-@dataclass(frozen=True, kw_only=True)
-class SearchConfig:
-    """How the global parameters are searched (CMA-ES)."""
-
-    generations: int = 20
-    """Generations of the evolution strategy; 0 keeps the start values."""
-    population: int | None = None
-    """Candidates a generation; none leaves it to the number of variables."""
-    sigma: float = 1.0 / 6.0
-    """First step, as a part of each interval."""
-    longest_step: float | None = None
-    """Most that the step may grow to, as a part of each interval; none for no limit."""
-    keeps_start: bool = True
-    """Whether the start values are returned if nothing better was found; PhysTwin returns the best
-    of the evolution alone."""
-    seed: int = 42
-    """Seed of the random numbers."""
-    variables: dict[str, SearchVariable] = field(default_factory=dict)
-    """Interval of each searched parameter, by its name in the simulation parameters."""
-    tied: dict[str, str] = field(default_factory=dict)
-    """Parameters that take the value of another one, such as virtual_stiffness: stiffness."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,7 +73,7 @@ def search_parameters(
             n: config.variables[n].from_unit(float(u)) for n, u in zip(names, unit, strict=True)
         }
         values |= {name: values[other] for name, other in config.tied.items() if other in values}
-        return replace(start, **values)
+        return start.replace(**values)
 
     if not config.keeps_start:
         best_loss = math.inf

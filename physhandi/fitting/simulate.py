@@ -12,13 +12,14 @@ from physhandi.data.run import RunFolder
 from physhandi.data.sequence import Sequence
 from physhandi.errors import RunError
 from physhandi.fitting import artefacts
-from physhandi.fitting.config import changed_parameters, config_from_dict
+from physhandi.fitting.config import PipelineConfig
 from physhandi.fitting.hand_reconstruction import reconstruct_hands
 from physhandi.fitting.object_problem import initial_velocity
 from physhandi.fitting.object_reconstruction import check_springs
 from physhandi.fitting.rollouts import control_trajectory_of, object_nodes_of, simulate_sequence
 from physhandi.perception.lifting import observe_object
 from physhandi.progress import Progress
+from physhandi.simulation.parameters import changed_parameters
 from physhandi.simulation.stability import with_stable_substeps
 from physhandi.simulation.topology import retopologize
 
@@ -82,7 +83,7 @@ def simulate_again(
             gravity=sequence.gravity,
         )
         substeps = with_stable_substeps(in_world, model, control[0]).substeps_per_frame
-        parameters = replace(parameters, substeps_per_frame=substeps)
+        parameters = parameters.replace(substeps_per_frame=substeps)
     check_springs(sequence.name, model, parameters, attachment, rest_node)
     folder = artefacts.sequence_folder(sequence.name)
     output.save_array(f"{folder}/control.npy", control)
@@ -111,7 +112,7 @@ def _prepare(
     """Reconstruct the hands of another sequence and lay the known object into it."""
     while source.kind == "simulation":
         source = RunFolder.open(Path(source.config["source"]))
-    config = config_from_dict(source.config["profile"])
+    config = PipelineConfig.from_dict(source.config["profile"])
     motions = ()
     if sequence.hands:
         fit = reconstruct_hands(sequence, config.hand, progress)

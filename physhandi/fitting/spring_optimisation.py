@@ -134,7 +134,7 @@ class Material:
             name: min(max(float(value.detach()), CONTACT[name][0]), CONTACT[name][1])
             for name, value in self._contact.items()
         }
-        return replace(parameters, **learned)
+        return parameters.replace(**learned)
 
 
 def _logarithms(model: SpringMassModel, part: slice) -> Tensor:
@@ -398,7 +398,7 @@ def _finite(loss: float, otherwise: str) -> float:
 
 def _truncated(parameters: SimulationParameters) -> SimulationParameters:
     damping, drag = math.trunc(parameters.damping), math.trunc(parameters.drag)
-    return replace(parameters, damping=float(damping), drag=float(drag))
+    return parameters.replace(damping=float(damping), drag=float(drag))
 
 
 def _is_judged(iteration: int, config: FirstOrderConfig) -> bool:

@@ -1,127 +1,355 @@
-"""The parameters of a simulation: what each means, its unit and its bounds."""
+"""The parameters of a simulation in one table: meaning, unit, bounds, and how people change them.
+
+`SimulationParameters` declares each once; `PARAMETERS` is the table that follows from it. Bounds,
+errors, sliders, links, presets, pages and docs/parameters.md are read there.
+"""
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from msgspec import Meta
 
-from physhandi.errors import UsageError
+from physhandi.errors import SettingsError
+from physhandi.settings import Field, Finite, NonNegative, Settings, changes, fields_of, no_such
 
-BOUNDS: dict[str, tuple[float | None, float | None]] = {
-    "connection_radius": (0.0, None),
-    "max_neighbors": (0, 1000),
-    "virtual_connection_radius": (0.0, None),
-    "virtual_max_neighbors": (0, 1000),
-    "stiffness": (0.0, None),
-    "stiffness_scale": (0.0, None),
-    "virtual_stiffness": (0.0, None),
-    "damping": (0.0, None),
-    "drag": (0.0, None),
-    "restitution": (0.0, 1.0),
-    "friction": (0.0, 2.0),
-    "collision_distance": (0.0, None),
-    "self_restitution": (0.0, 1.0),
-    "self_friction": (0.0, 2.0),
-    "ground_height": (None, None),
-    "gravity": (None, None),
-    "frame_rate": (1e-3, None),
-    "frame_duration": (1e-6, None),
-    "substeps_per_frame": (1, 1_000_000),
-    "rest_length_floor": (0.0, None),
-    "virtual_rest_length_floor": (0.0, None),
-}
-"""Lowest and highest value of each parameter that is a number; None leaves that side open."""
-_INTEGERS = ("max_neighbors", "virtual_max_neighbors", "substeps_per_frame")
-_SWITCHES = (
-    "use_control_velocity",
-    "self_collision",
-    "collides_rest_neighbors",
-    "uses_sequence_gravity",
-    "uses_sequence_ground",
-    "rounds_decay",
-)
-_LARGEST = 1e30  # Larger numbers, squared or multiplied, leave the simulator's float32.
-_OPTIONAL = ("ground_height", "frame_duration")
+AUTOMATIC = "auto"
+"""Instead of a number of substeps: as few as are stable and fine enough."""
+
 # float32 exp(-5e-5 drag) on an H200 for drag 0, 1, …, 20, less the nearest float32, in units of
 # 2^-24 (measured). PhysTwin truncates its drag to a whole number.
 _DECAY_UNITS = (0, 1, 1, -1, 0, 0, 0, 0, 1, 1, 1, 1, -1, 0, 0, 0, 0, 1, 1, 1, 1)
 
+Effect = Literal["live", "material", "topology", "step", "world"]
+"""What has to be done for a new value: ``live`` is assigned to the device at once; ``material``
+scales the fitted springs; ``topology`` lays the springs anew; ``step`` needs another simulator;
+``world`` only decides what `SimulationParameters.in_world` takes from a recording."""
+
+SliderGroup = Literal["springs", "more", "ground", "self-collision"]
+SliderScale = Literal["linear", "power", "relative power"]
+
 
 @dataclass(frozen=True, kw_only=True)
-class SimulationParameters:
+class Slider:
+    """How people move a parameter; a switch gets a tick box instead."""
+
+    group: SliderGroup
+    """Folder in which it is."""
+    hint: str
+    """What it does, in a sentence for the panel."""
+    widest: float | None = None
+    """End of the slider, in the parameter's unit; a larger fitted value moves it. None takes the
+    parameter's own upper bound."""
+    step: float = 1.0
+    """Distance of two slider values, in the parameter's unit; of the exponent on a power scale."""
+    scale: SliderScale = "linear"
+    """``power`` moves the decimal logarithm, ``relative power`` that of the ratio to the fit."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Role:
+    """What a parameter does in the simulation, and how people meet it."""
+
+    effect: Effect = "live"
+    """What has to be done for a new value."""
+    label: str = ""
+    """What people call it; empty for its own name."""
+    slider: Slider | None = None
+    """How people move it live; None where they do not."""
+    is_length: bool = False
+    """Whether it is measured in the recording's unit of length, which need not be the metre."""
+    is_of_recording: bool = False
+    """Whether it belongs to the recording, so that no preset changes it."""
+    is_in_links: bool = True
+    """Whether a link may say it."""
+    is_searched: bool = True
+    """Whether the zeroth-order stage may search it, if it is a number."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parameter(Field, Role):
+    """One row of the table of parameters."""
+
+    @property
+    def title(self) -> str:
+        """What people call it."""
+        return self.label or self.name
+
+
+class SimulationParameters(Settings, frozen=True, kw_only=True):
     """The few numbers that describe an object as a whole; sliders and searches move these."""
 
-    connection_radius: float = 0.02
+    connection_radius: Annotated[
+        NonNegative,
+        Role(
+            effect="topology",
+            label="δ object",
+            is_length=True,
+            slider=Slider(
+                group="springs",
+                hint="Object nodes nearer than this get a spring.",
+                widest=0.08,
+                step=0.0005,
+            ),
+        ),
+    ] = 0.02
     """δ: object nodes nearer than this get a spring [m]."""
-    max_neighbors: int = 29
+    max_neighbors: Annotated[
+        int,
+        Meta(ge=0, le=1000),
+        Role(
+            effect="topology",
+            label="d_max object",
+            slider=Slider(
+                group="springs", hint="Most object springs that one node starts.", widest=80
+            ),
+        ),
+    ] = 29
     """d_max: most object springs that one node may start, the node itself not counted."""
-    virtual_connection_radius: float = 0.01
+    virtual_connection_radius: Annotated[
+        NonNegative,
+        Role(
+            effect="topology",
+            label="δ virtual",
+            is_length=True,
+            slider=Slider(
+                group="springs",
+                hint="A control node holds the object nodes nearer than this.",
+                widest=0.08,
+                step=0.0005,
+            ),
+        ),
+    ] = 0.01
     """Object nodes nearer to a control node than this are held by it [m]."""
-    virtual_max_neighbors: int = 6
+    virtual_max_neighbors: Annotated[
+        int,
+        Meta(ge=0, le=1000),
+        Role(
+            effect="topology",
+            label="d_max virtual",
+            slider=Slider(
+                group="springs", hint="Most virtual springs of one control node.", widest=80
+            ),
+        ),
+    ] = 6
     """Most virtual springs that one control node may start."""
-    stiffness: float = 3e4
+    stiffness: Annotated[
+        NonNegative,
+        Role(
+            effect="material",
+            label="k object",
+            slider=Slider(
+                group="more",
+                hint="Multiplies the stiffness of object springs alone.",
+                step=0.05,
+                scale="relative power",
+            ),
+        ),
+    ] = 3e4
     """Force per unit strain that a new object spring gets [N]."""
-    stiffness_scale: float = 1.0
+    stiffness_scale: Annotated[
+        NonNegative,
+        Role(
+            label="stiffness",
+            slider=Slider(
+                group="springs",
+                hint="Multiplies the stiffness of every spring: 0 is as fitted, -1 a tenth.",
+                step=0.05,
+                scale="power",
+            ),
+        ),
+    ] = 1.0
     """Multiplies the stiffness of every spring."""
-    virtual_stiffness: float = 3e4
+    virtual_stiffness: Annotated[
+        NonNegative,
+        Role(
+            effect="material",
+            label="k virtual",
+            slider=Slider(
+                group="more",
+                hint="Multiplies the stiffness of virtual springs alone.",
+                step=0.05,
+                scale="relative power",
+            ),
+        ),
+    ] = 3e4
     """Force per unit strain that a new virtual spring gets [N]."""
-    damping: float = 100.0
+    damping: Annotated[
+        NonNegative,
+        Role(
+            effect="material",
+            label="damping",
+            slider=Slider(group="more", hint="Dashpot along each spring.", widest=300.0),
+        ),
+    ] = 100.0
     """Dashpot along each spring [N·s/m]."""
-    drag: float = 3.0
+    drag: Annotated[
+        NonNegative,
+        Role(
+            label="drag",
+            slider=Slider(
+                group="more", hint="How fast every motion dies out.", widest=20.0, step=0.1
+            ),
+        ),
+    ] = 3.0
     """Decay rate of every node's velocity [1/s]."""
-    restitution: float = 0.5
+    restitution: Annotated[
+        float,
+        Meta(ge=0.0, le=1.0),
+        Role(
+            label="restitution",
+            slider=Slider(
+                group="ground",
+                hint="Part of its speed that a node that hits the ground bounces back with.",
+                step=0.05,
+            ),
+        ),
+    ] = 0.5
     """Part of the normal speed that a bounce on the ground gives back."""
-    friction: float = 0.3
+    friction: Annotated[
+        float,
+        Meta(ge=0.0, le=2.0),
+        Role(
+            label="friction",
+            slider=Slider(
+                group="ground",
+                hint="How much nodes on the ground resist sliding; 0 is ice.",
+                step=0.05,
+            ),
+        ),
+    ] = 0.3
     """Coulomb friction coefficient of the ground."""
-    ground_height: float | None = 0.0
+    ground_height: Annotated[
+        Finite | None,
+        Role(
+            label="ground height",
+            is_length=True,
+            is_searched=False,
+            slider=Slider(
+                group="ground",
+                hint="Height of the ground, at most that of the object's lowest node at frame 0.",
+                step=0.001,
+            ),
+        ),
+    ] = 0.0
     """Height of the ground plane [m]; none for no ground."""
-    gravity: float = 9.81
+    gravity: Annotated[
+        Finite,
+        Role(
+            label="gravity",
+            is_length=True,
+            is_searched=False,
+            slider=Slider(group="more", hint="Acceleration downwards.", widest=20.0, step=0.1),
+        ),
+    ] = 9.81
     """Acceleration along -z [m/s²]."""
-    uses_sequence_gravity: bool = True
+    uses_sequence_gravity: Annotated[
+        bool, Role(effect="world", is_of_recording=True, is_in_links=False)
+    ] = True
     """Whether `in_world` takes the sequence's gravity; PhysTwin's own is 9.8 everywhere."""
-    uses_sequence_ground: bool = True
+    uses_sequence_ground: Annotated[bool, Role(effect="world", is_of_recording=True)] = True
     """Whether `in_world` takes the sequence's ground."""
-    frame_rate: float = 30.0
+    frame_rate: Annotated[
+        float,
+        Meta(ge=1e-3, le=1e30),
+        Role(effect="step", is_of_recording=True, is_in_links=False, is_searched=False),
+    ] = 30.0
     """Frames in a second [Hz]."""
-    frame_duration: float | None = None
+    frame_duration: Annotated[
+        Annotated[float, Meta(ge=1e-6, le=1e30)] | None,
+        Role(effect="step", is_of_recording=True, is_in_links=False, is_searched=False),
+    ] = None
     """Time that the simulation takes a frame to last [s]; none for 1 / frame_rate. PhysTwin's 667
     substeps of 5e-5 s make 33.35 ms, whatever the rate of the recording."""
-    substeps_per_frame: int = 667
+    substeps_per_frame: Annotated[
+        int,
+        Meta(ge=1, le=1_000_000),
+        Role(effect="step", label="substeps", is_searched=False),
+    ] = 667
     """Integration steps in one frame; stiffer springs need more."""
-    rest_length_floor: float = 1e-3
+    rest_length_floor: Annotated[
+        NonNegative, Role(effect="topology", label="shortest object spring", is_length=True)
+    ] = 1e-3
     """Shortest rest length of an object spring [m]; 0 for none."""
-    virtual_rest_length_floor: float = 1e-3
+    virtual_rest_length_floor: Annotated[
+        NonNegative, Role(effect="topology", label="shortest virtual spring", is_length=True)
+    ] = 1e-3
     """Shortest rest length of a virtual spring [m]; 0 for none."""
-    use_control_velocity: bool = True
+    use_control_velocity: Annotated[bool, Role(label="dashpots see the hand move")] = True
     """Whether the dashpots of virtual springs see the control nodes move."""
-    rounds_decay: bool = False
+    rounds_decay: Annotated[bool, Role(is_in_links=False)] = False
     """Whether a substep's drag is rounded as in PhysTwin's float32 factor; see `velocity_loss`."""
-    self_collision: bool = False
+    self_collision: Annotated[
+        bool,
+        Role(
+            label="nodes collide",
+            slider=Slider(
+                group="self-collision",
+                hint="Object nodes bounce off each other, so that layers of cloth stay apart.",
+            ),
+        ),
+    ] = False
     """Whether object nodes bounce off each other."""
-    collision_distance: float = 0.005
+    collision_distance: Annotated[
+        NonNegative,
+        Role(
+            label="distance",
+            is_length=True,
+            slider=Slider(
+                group="self-collision",
+                hint="Nodes that approach each other nearer than this collide.",
+                widest=0.02,
+                step=0.0001,
+            ),
+        ),
+    ] = 0.005
     """Object nodes that approach each other nearer than this collide [m]."""
-    self_restitution: float = 0.7
+    self_restitution: Annotated[
+        float,
+        Meta(ge=0.0, le=1.0),
+        Role(
+            label="restitution of nodes",
+            slider=Slider(
+                group="self-collision",
+                hint="Part of the approach speed that a collision gives back.",
+                step=0.05,
+            ),
+        ),
+    ] = 0.7
     """Part of the approach speed that a collision of two nodes gives back."""
-    self_friction: float = 0.3
+    self_friction: Annotated[
+        float,
+        Meta(ge=0.0, le=2.0),
+        Role(
+            label="friction of nodes",
+            slider=Slider(
+                group="self-collision",
+                hint="How much nodes that touch resist sliding past each other.",
+                step=0.05,
+            ),
+        ),
+    ] = 0.3
     """Coulomb friction coefficient between two nodes."""
-    collides_rest_neighbors: bool = False
+    collides_rest_neighbors: Annotated[
+        bool,
+        Role(
+            label="also rest neighbors",
+            slider=Slider(
+                group="self-collision",
+                hint="Also collide nodes nearer than the distance at frame 0, as PhysTwin does.",
+            ),
+        ),
+    ] = False
     """Whether nodes collide that are nearer than `collision_distance` at frame 0 (PhysTwin)."""
 
     def __post_init__(self) -> None:
-        for name, (low, high) in BOUNDS.items():
-            value = getattr(self, name)
-            if value is None and name in _OPTIONAL:
-                continue
-            if isinstance(value, bool) or not isinstance(value, int | float | np.number):
-                raise UsageError(f"Simulation parameter {name} is {value!r}; expected a number.")
-            is_inside = (low is None or value >= low) and (high is None or value <= high)
-            if not (math.isfinite(value) and is_inside and abs(value) <= _LARGEST):
-                raise UsageError(
-                    f"Simulation parameter {name} is {value}; expected a finite value in "
-                    f"[{-_LARGEST if low is None else low}, {_LARGEST if high is None else high}]."
-                )
+        """Check the values; see `Settings.__post_init__`."""
+        try:
+            super().__post_init__()
+        except SettingsError as error:
+            raise _of_parameters(error) from None
 
     @property
     def simulated_frame_rate(self) -> float:
@@ -164,54 +392,85 @@ class SimulationParameters:
                 `uses_sequence_ground`.
             gravity: Acceleration along -z [m/s²]; ignored without `uses_sequence_gravity`.
         """
-        return replace(
-            self,
+        return self.replace(
             frame_rate=frame_rate,
             ground_height=ground_height if self.uses_sequence_ground else self.ground_height,
             gravity=gravity if self.uses_sequence_gravity else self.gravity,
         )
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the fields as plain values, ready for YAML or JSON."""
-        return asdict(self)
-
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "SimulationParameters":
         """Read parameters from plain values; fields that are left out keep their default.
 
-        Args:
-            values: Field names and values, as `to_dict` returns them.
+        Numbers may be written as text or as NumPy's, and whole ones with a point, as people and
+        other programs store them.
 
         Raises:
-            UsageError: If a key is unknown or a value is of the wrong kind or out of bounds.
+            SettingsError: If a name is unknown or a value is of the wrong kind or out of bounds.
         """
-        unknown = sorted(set(values) - {field.name for field in fields(cls)})
+        unknown = {
+            name: no_such("simulation parameter", name, PARAMETERS)
+            for name in values
+            if name not in PARAMETERS
+        }
         if unknown:
-            raise UsageError(
-                f"Unknown simulation parameter {', '.join(map(repr, unknown))}. "
-                f"Known are {', '.join(field.name for field in fields(cls))}."
-            )
-        return cls(**{name: _converted(name, value) for name, value in values.items()})
+            raise SettingsError(unknown)
+        return cls(**{name: PARAMETERS[name].converted(v) for name, v in values.items()})
 
 
-def _converted(name: str, value: Any) -> Any:
-    """Return a value in the type of its field."""
-    if value is None:
-        if name in _OPTIONAL:
-            return None
-        raise UsageError(f"Simulation parameter {name} is empty; expected a value.")
-    if name in _SWITCHES:
-        if not isinstance(value, bool | np.bool_):
-            raise UsageError(f"Simulation parameter {name} is {value!r}; expected true or false.")
-        return bool(value)
-    try:
-        number = float(value)
-    except (TypeError, ValueError, OverflowError):
-        raise UsageError(f"Simulation parameter {name} is {value!r}; expected a number.") from None
-    if isinstance(value, bool):
-        raise UsageError(f"Simulation parameter {name} is {value!r}; expected a number.")
-    if name not in _INTEGERS:
-        return number
-    if not number.is_integer():
-        raise UsageError(f"Simulation parameter {name} is {value!r}; expected a whole number.")
-    return int(number)
+def _parameter(field: Field) -> Parameter:
+    (role,) = (note for note in field.notes if isinstance(note, Role))
+    return Parameter(**vars(field), **vars(role))
+
+
+PARAMETERS: dict[str, Parameter] = {
+    field.name: _parameter(field) for field in fields_of(SimulationParameters)
+}
+"""The table of all parameters by their names, in the order of their declaration."""
+
+
+def parameter_names(*effects: Effect) -> tuple[str, ...]:
+    """Name the parameters whose new values have one of some effects."""
+    return tuple(name for name, parameter in PARAMETERS.items() if parameter.effect in effects)
+
+
+def changed_parameters(
+    fitted: SimulationParameters, changed: Mapping[str, Any]
+) -> tuple[SimulationParameters, bool]:
+    """Apply changes to fitted parameters.
+
+    Args:
+        fitted: What is changed.
+        changed: New values by name; `substeps_per_frame` may be `AUTOMATIC`.
+
+    Returns:
+        The new parameters, and whether their substeps are yet to be chosen automatically.
+
+    Raises:
+        SettingsError: If a parameter is unknown or out of bounds.
+    """
+    given = dict(changed)
+    is_automatic = given.get("substeps_per_frame") == AUTOMATIC
+    if is_automatic:
+        del given["substeps_per_frame"]
+    return SimulationParameters.from_dict(fitted.to_dict() | given), is_automatic
+
+
+def parameter_changes(
+    fitted: SimulationParameters, now: SimulationParameters, *, is_automatic: bool = False
+) -> dict[str, Any]:
+    """Give what makes parameters out of the fitted ones: the reverse of `changed_parameters`.
+
+    Args:
+        fitted: What was changed.
+        now: What became of it.
+        is_automatic: Whether the substeps are chosen automatically.
+    """
+    automatic = {"substeps_per_frame": AUTOMATIC} if is_automatic else {}
+    return changes(fitted, now) | automatic
+
+
+def _of_parameters(error: SettingsError) -> SettingsError:
+    return SettingsError(
+        {name: f"Simulation parameter {problem}" for name, problem in error.fields.items()}
+    )

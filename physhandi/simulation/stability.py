@@ -1,7 +1,7 @@
 """How long a substep may be before the springs explode."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -103,7 +103,7 @@ def with_stable_substeps(
     stable = stable_substeps(model, parameters, control, safety=safety)
     # A frame that is a whole number of longest steps must not get one more by rounding.
     fine = math.ceil(1.0 / (parameters.simulated_frame_rate * longest_step) - 1e-6)
-    return replace(parameters, substeps_per_frame=max(stable, fine))
+    return parameters.replace(substeps_per_frame=max(stable, fine))
 
 
 def explain_divergence(model: SpringMassModel, parameters: SimulationParameters, node: int) -> str:

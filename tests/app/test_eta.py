@@ -31,7 +31,6 @@ from physhandi.fitting.config import (
     SPRINGS,
     PipelineConfig,
     apply_overrides,
-    config_to_dict,
     load_profile,
 )
 from physhandi.run import Run
@@ -46,7 +45,7 @@ BEGIN = 1_000_000.0
 def finished(
     seconds: dict[str, float], config: PipelineConfig = QUICK, machine: tuple[Any, ...] = MACHINE
 ) -> FinishedFit:
-    settings = config_to_dict(config)
+    settings = config.to_dict()
     values = {key: v for key, v in settings.items() if key not in {"profile", "description"}}
     text = json.dumps(values, sort_keys=True, default=str)
     return FinishedFit(text, config.profile, machine, work_of(config, TOWEL), seconds, 0.0)
@@ -59,7 +58,7 @@ def stages(**seconds: float) -> dict[str, float]:
 
 def expected(fits: list[FinishedFit], config: PipelineConfig = QUICK, frames: int = 60) -> Any:
     work = work_of(config, replace(TOWEL, frames=frames, hand_frames=frames))
-    return expect(fits, config_to_dict(config), MACHINE, work)
+    return expect(fits, config.to_dict(), MACHINE, work)
 
 
 def test_work_grows_with_frames_and_iterations_and_is_none_where_nothing_is_to_be_done() -> None:

@@ -7,7 +7,7 @@ import pytest
 from run_world import make_run
 
 from app.pages.metrics import tabulate
-from app.pages.parameters import field_notes, parameter_rows
+from app.pages.parameters import meaning_of, parameter_rows
 from physhandi.run import Run
 from physhandi.simulation.parameters import SimulationParameters
 
@@ -103,8 +103,7 @@ def test_damaged_scores_make_no_table(scores: object) -> None:
 
 
 def test_every_parameter_is_explained_where_it_is_declared() -> None:
-    notes = field_notes()
-    assert set(notes) == set(SimulationParameters().to_dict())
+    notes = {name: meaning_of(name) for name in SimulationParameters().to_dict()}
     assert all(about for about, _ in notes.values())
     assert notes["connection_radius"][1] == "m"
     assert notes["drag"][1] == "1/s"

@@ -1,6 +1,5 @@
 """Broken recordings, each given to ``physhandi reconstruct``."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -280,7 +279,7 @@ def test_a_fit_with_mano_needs_a_whole_one(
     terminal: Terminal, filmed: Path, monkeypatch: pytest.MonkeyPatch, case: Bad
 ) -> None:
     config = tiny_config()
-    config = replace(config, hand=replace(config.hand, model="mano"))
+    config = config.replace(hand=config.hand.replace(model="mano"))
     monkeypatch.setattr(commands, "load_profile", lambda _: config)
     monkeypatch.setenv("PHYSHANDI_HANDS", str(terminal.folder))
     case.damage(terminal.folder)

@@ -1,4 +1,3 @@
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -36,14 +35,14 @@ def test_material_is_scaled_for_its_own_springs_alone(
     was = fitted.model(PARAMETERS)
     count = was.object_spring_count
     assert 0 < count < len(was.stiffness)
-    now = fitted.model(replace(PARAMETERS, **{field: factor * getattr(PARAMETERS, field)}))
+    now = fitted.model(PARAMETERS.replace(**{field: factor * getattr(PARAMETERS, field)}))
     np.testing.assert_allclose(now.stiffness[:count], own * was.stiffness[:count], rtol=1e-6)
     np.testing.assert_allclose(now.stiffness[count:], virtual * was.stiffness[count:], rtol=1e-6)
     np.testing.assert_allclose(now.damping, damping * was.damping, rtol=1e-6)
 
 
 def test_material_is_what_a_run_of_its_own_would_get(fitted, run) -> None:
-    changed = replace(PARAMETERS, stiffness=90.0, virtual_stiffness=7000.0, damping=11.0)
+    changed = PARAMETERS.replace(stiffness=90.0, virtual_stiffness=7000.0, damping=11.0)
     now = fitted.model(changed)
     model, control = fitted.take.model, run.array("sequences/lift/control.npy")
     rest = run.tensors("object/material.safetensors")["rest_node"]

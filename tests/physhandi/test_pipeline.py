@@ -14,7 +14,7 @@ from physhandi.data.run_folder import read_events
 from physhandi.data.sequence import Sequence
 from physhandi.errors import CancelledError, MissingInputError, RunError, UsageError
 from physhandi.fitting.artefacts import load_model, load_parameters
-from physhandi.fitting.config import PipelineConfig, config_to_dict
+from physhandi.fitting.config import PipelineConfig
 from physhandi.progress import Progress
 from physhandi.run import Run
 
@@ -29,7 +29,7 @@ def new_run(folder: Path, sequences: list[Path], config: PipelineConfig | None =
         name="test",
         kind="reconstruction",
         sequences=[str(path) for path in sequences],
-        config={"profile": config_to_dict(config or small_config())},
+        config={"profile": config or small_config().to_dict()},
     )
 
 

@@ -1,6 +1,5 @@
 """A real rope: fitted on two trajectories, it predicts two that it never saw."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +8,7 @@ from recordings import recording
 
 from physhandi import pipeline
 from physhandi.data.importers.mocap import import_mocap
-from physhandi.fitting.config import config_to_dict, load_profile
+from physhandi.fitting.config import load_profile
 from physhandi.run import Run
 
 
@@ -19,17 +18,15 @@ def test_a_rope_predicts_trajectories_it_was_not_fitted_on(tmp_path: Path) -> No
     for number in (48, 49, 52, 53):
         import_mocap(folder / f"trajectory_{number:03d}.npy", tmp_path / "sequences")
     config = load_profile("default")
-    search = replace(config.object_.search, generations=5, population=8)
-    first_order = replace(config.object_.first_order, iterations=0)
-    config = replace(
-        config, object_=replace(config.object_, search=search, first_order=first_order)
-    )
+    search = config.object_.search.replace(generations=5, population=8)
+    first_order = config.object_.first_order.replace(iterations=0)
+    config = config.replace(object_=config.object_.replace(search=search, first_order=first_order))
     run = Run.create(
         tmp_path / "fit",
         name="rope",
         kind="reconstruction",
         sequences=[str(tmp_path / "sequences" / f"trajectory_{n:03d}") for n in (48, 49)],
-        config={"profile": config_to_dict(config)},
+        config={"profile": config.to_dict()},
     )
     pipeline.run_job(run)
     errors = []

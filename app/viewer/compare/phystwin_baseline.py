@@ -1,7 +1,7 @@
 """PhysTwin's way of holding the object of a run: few visible points, long virtual springs."""
 
 from collections.abc import Sequence as Listing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import permutations
 
 import numpy as np
@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from app.viewer.content.content import Content, HandSurface
-from physhandi.fitting.config import load_profile
+from physhandi.fitting.config import named_profile
 from physhandi.fitting.rollouts import farthest_points, visible_vertices
 from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.parameters import SimulationParameters
@@ -36,7 +36,7 @@ class PhysTwinBaseline:
         """Tell whether there is something to compare: fewer points than PhysTwin's are no rival."""
         if content.fitted is None:
             return False
-        count = load_profile(PROFILE).control_count
+        count = named_profile(PROFILE).control_count
         return bool(content.hands) or content.fitted.model.control_count >= count
 
     @classmethod
@@ -53,10 +53,9 @@ class PhysTwinBaseline:
             content: Hands and cameras.
             fitted: The run's rollout.
         """
-        profile = load_profile(PROFILE)
+        profile = named_profile(PROFILE)
         values = profile.simulation
-        parameters = replace(
-            fitted.parameters,
+        parameters = fitted.parameters.replace(
             virtual_connection_radius=values.virtual_connection_radius,
             virtual_max_neighbors=values.virtual_max_neighbors,
             virtual_rest_length_floor=values.virtual_rest_length_floor,

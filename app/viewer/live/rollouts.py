@@ -217,8 +217,8 @@ class LiveRollouts:
     def _update(self, message: Message) -> None:
         if message.kind == "started":
             model = SpringMassModel.from_tensors(message.arrays)
-            parameters = replace(
-                self._wanted.parameters, substeps_per_frame=message["substeps_per_frame"]
+            parameters = self._wanted.parameters.replace(
+                substeps_per_frame=message["substeps_per_frame"]
             )
             self._incoming = ObjectRollout.empty(model, parameters, self.fitted.control)
             self._durations = []

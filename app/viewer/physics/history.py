@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 from physhandi.simulation.parameters import SimulationParameters
@@ -58,7 +57,7 @@ class History:
     def set(self, field: str, value: Any) -> Setting:
         """Change one parameter, as a slider does that is being moved."""
         now = self._clock()
-        setting = self.setting._replace(parameters=replace(self.current, **{field: value}))
+        setting = self.setting._replace(parameters=self.current.replace(**{field: value}))
         is_same_gesture = field == self._moved and now - self._moved_at < _REST
         if is_same_gesture and self._index > 0:
             self._steps[self._index :] = [setting]
@@ -76,14 +75,14 @@ class History:
 
     def set_substeps(self, number: int, *, is_automatic: bool = False) -> Setting:
         """Change the number of substeps, and whether it is chosen automatically."""
-        changed = replace(self.current, substeps_per_frame=number)
+        changed = self.current.replace(substeps_per_frame=number)
         return self.replace(changed, is_automatic=is_automatic)
 
     def put_back(self, *fields: str) -> Setting:
         """Give some parameters their fitted values again."""
         fitted = {field: getattr(self.start, field) for field in fields}
         is_automatic = self.is_automatic and "substeps_per_frame" not in fields
-        return self.replace(replace(self.current, **fitted), is_automatic=is_automatic)
+        return self.replace(self.current.replace(**fitted), is_automatic=is_automatic)
 
     def undo(self) -> Setting:
         """Take the last change back."""

@@ -19,7 +19,6 @@ from app.viewer.physics.presets import (
     Preset,
     PresetStore,
     builtin_presets,
-    changes_of,
 )
 from app.viewer.ui.followed import FollowedChoice
 from app.viewer.ui.guard import Guard, notify
@@ -27,7 +26,7 @@ from physhandi.data.run_folder import new_run_id
 from physhandi.data.sequence import Sequence
 from physhandi.errors import UsageError
 from physhandi.run import Run
-from physhandi.simulation.parameters import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters, parameter_changes
 
 _POLL_S = 0.3
 _MOST_LETTERS = 80
@@ -149,7 +148,7 @@ def run_changes(
         now: What is on the screen.
         is_automatic: Whether its substeps are chosen automatically.
     """
-    changes = changes_of(fitted, now, is_automatic=is_automatic)
+    changes = parameter_changes(fitted, now, is_automatic=is_automatic)
     stored = SimulationParameters.from_dict(source.yaml("object/parameters.yaml"))
     # A ground or gravity other than the recording's must not be taken from it again.
     for field, switch in (
@@ -366,7 +365,9 @@ class KeepPanel:
 
     def _save_preset(self, event: Any) -> None:
         history = self._history
-        changes = changes_of(history.start, history.current, is_automatic=history.is_automatic)
+        changes = parameter_changes(
+            history.start, history.current, is_automatic=history.is_automatic
+        )
         preset = self._store.save(self._name.value, changes, self._unit)
         self._choice.want(preset.label)
         self.show()

@@ -12,29 +12,22 @@ from typing import Any
 from app.viewer.ui.guard import plain
 from physhandi.data.files import named_fields, parse_yaml, write_json, write_yaml
 from physhandi.errors import PhysHandiError, UsageError, describe
-from physhandi.fitting.config import AUTOMATIC, changed_parameters, load_profile
-from physhandi.simulation.parameters import SimulationParameters
+from physhandi.fitting.config import named_profile
+from physhandi.simulation.parameters import (
+    AUTOMATIC,
+    PARAMETERS,
+    SimulationParameters,
+    changed_parameters,
+)
 
 AS_FITTED = "as fitted"
 BY_HAND = "by hand"
 """What the list shows while the parameters are those of no preset."""
 OWN = "★ "
 """Before the name of a user's preset in the list."""
-RECORDED = frozenset(
-    {"frame_rate", "frame_duration", "uses_sequence_gravity", "uses_sequence_ground"}
-)
+_OF_RECORDING = frozenset(name for name, p in PARAMETERS.items() if p.is_of_recording)
 """Parameters that belong to the recording, which no preset changes."""
-IN_LENGTHS = frozenset(
-    {
-        "connection_radius",
-        "virtual_connection_radius",
-        "collision_distance",
-        "rest_length_floor",
-        "virtual_rest_length_floor",
-        "ground_height",
-        "gravity",
-    }
-)
+_LENGTHS = frozenset(name for name, p in PARAMETERS.items() if p.is_length)
 """Parameters that are measured in the recording's unit of length."""
 _HOLD = (
     "virtual_connection_radius",
@@ -70,7 +63,7 @@ class Preset:
 
     def suits(self, fitted: SimulationParameters, length_unit: str) -> bool:
         """Tell whether it makes sense for an object: in its unit, and with its ground."""
-        is_in_unit = length_unit == self.length_unit or not IN_LENGTHS & set(self.changes)
+        is_in_unit = length_unit == self.length_unit or not _LENGTHS & set(self.changes)
         needs_ground = {"friction", "restitution"} & set(self.changes)
         has_ground = self.changes.get("ground_height", fitted.ground_height) is not None
         return is_in_unit and (has_ground or self.is_own or not needs_ground)
@@ -82,7 +75,7 @@ def builtin_presets() -> tuple[Preset, ...]:
 
     def hold(profile: str) -> dict[str, Any]:
         """Take how a profile lets the hand hold the object; its stiffness is for other springs."""
-        simulation = load_profile(profile).simulation
+        simulation = named_profile(profile).simulation
         return {name: getattr(simulation, name) for name in _HOLD}
 
     stiff = {"stiffness_scale": 5.0, "substeps_per_frame": AUTOMATIC}
@@ -101,17 +94,6 @@ def builtin_presets() -> tuple[Preset, ...]:
         "layers collide": {"self_collision": True},
     }
     return tuple(Preset(name=name, changes=change) for name, change in changes.items())
-
-
-def changes_of(
-    fitted: SimulationParameters, now: SimulationParameters, *, is_automatic: bool
-) -> dict[str, Any]:
-    """Find what makes parameters out of the fitted ones, as a preset keeps it."""
-    was = fitted.to_dict()
-    changes = {name: value for name, value in now.to_dict().items() if value != was[name]}
-    if is_automatic:
-        changes["substeps_per_frame"] = AUTOMATIC
-    return changes
 
 
 logger = logging.getLogger(__name__)
@@ -165,11 +147,11 @@ class PresetStore:
             UsageError: If the name cannot be used, nothing is changed, or there are too many.
         """
         name = checked_name(name)
-        changes = {field: value for field, value in changes.items() if field not in RECORDED}
+        changes = {field: value for field, value in changes.items() if field not in _OF_RECORDING}
         if not changes:
             raise UsageError("Nothing is changed yet, so nothing can be kept. Move a slider first.")
         content: dict[str, Any] = {"format": PRESET_FORMAT, "name": name}
-        if IN_LENGTHS & set(changes):
+        if _LENGTHS & set(changes):
             content["length_unit"] = length_unit
         content["parameters"] = dict(changes)
         with self._lock:
@@ -266,7 +248,7 @@ def read_preset(path: Path) -> Preset:
     nested = [field for field, value in changes.items() if isinstance(value, dict | list)]
     if nested:
         raise UsageError(f"parameters.{nested[0]} is a list; expected one value.")
-    recorded = sorted(RECORDED & set(changes))
+    recorded = sorted(_OF_RECORDING & set(changes))
     if recorded:
         raise UsageError(f"parameters.{recorded[0]} belongs to the recording. Take it out.")
     changed_parameters(SimulationParameters(), changes)  # Names a wrong field and what it may be.

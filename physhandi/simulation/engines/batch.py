@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from collections.abc import Sequence as Many
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -410,7 +410,7 @@ def _number(parameters: SimulationParameters, name: str, substeps: int) -> float
     scale = parameters.stiffness_scale
     derived = {
         "dt": duration / substeps,
-        "velocity_loss": replace(parameters, substeps_per_frame=substeps).velocity_loss(),
+        "velocity_loss": parameters.replace(substeps_per_frame=substeps).velocity_loss(),
         "has_ground": float(height is not None),
         "ground_height": 0.0 if height is None else height,
         "control_rate": parameters.simulated_frame_rate * parameters.use_control_velocity,

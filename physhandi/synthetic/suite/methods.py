@@ -266,7 +266,7 @@ def execute(
             take_disturbed_hands(hands, attempt, recording.name, noise)
         elif hands is not None:
             take_stages(hands, attempt, shared_stages(hands.config["profile"], settings))
-        config = pipeline.config_from_dict(settings)
+        config = pipeline.PipelineConfig.from_dict(settings)
         if method.rule is None:
             pipeline.reconstruct([recording], config, attempt, watched, device=device)
         else:

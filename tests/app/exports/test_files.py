@@ -3,7 +3,6 @@
 import io
 import json
 import zipfile
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -65,7 +64,7 @@ def test_a_changed_parameter_is_simulated_before_it_is_written(
     world: World, run: Run, made: list[FileRequest], tmp_path: Path
 ) -> None:
     fitted = FittedObject(str(run.folder), "sheet")
-    parameters = replace(fitted.take.parameters, drag=9.0)
+    parameters = fitted.take.parameters.replace(drag=9.0)
     control = fitted.choose_controls(None)
     expected = Simulator(fitted.model(parameters), parameters).rollout(control).position
     assert np.abs(expected - rollout(run)).max() > 1e-3

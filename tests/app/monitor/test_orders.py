@@ -9,7 +9,7 @@ import pytest
 import yaml
 from queue_world import HOSTILE, QueueWorld
 
-from physhandi.fitting.config import config_from_dict, load_profile
+from physhandi.fitting.config import PipelineConfig, load_profile
 from physhandi.run import Run
 
 OVERRIDES = {
@@ -40,7 +40,7 @@ def test_only_what_differs_is_kept_as_changes_and_all_settings_are_stored(
     changed = {path: value for path, value in OVERRIDES.items() if "refinement" not in path}
     assert config["overrides"] == changed
     assert config["parent"] == "fitted"
-    settings = config_from_dict(config["profile"])
+    settings = PipelineConfig.from_dict(config["profile"])
     assert settings.object_.search.generations == 12
     assert settings.simulation.stiffness == 2000.0
     assert "drag" not in settings.object_.search.variables

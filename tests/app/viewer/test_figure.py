@@ -69,8 +69,7 @@ def lengths_of(client: ViewerClient, name: str) -> ndarray:
 def rolled_out(run: Run) -> ObjectRollout:
     """Simulate PhysTwin's way without the live process."""
     control = run.array("sequences/lift/control.npy")
-    values = replace(
-        PARAMETERS,
+    values = PARAMETERS.replace(
         virtual_connection_radius=0.04,
         virtual_max_neighbors=50,
         virtual_stiffness=PARAMETERS.stiffness,

@@ -55,7 +55,7 @@ def mailbox(live: SimulationClient) -> Iterator[Mailbox]:
 
 
 def ask(run: Run, **changes: float) -> LiveRequest:
-    return LiveRequest(run=run.folder, sequence="lift", parameters=replace(PARAMETERS, **changes))
+    return LiveRequest(run=run.folder, sequence="lift", parameters=PARAMETERS.replace(**changes))
 
 
 def frames(messages: list[Message]) -> np.ndarray:

@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import pytest
 
 from app.viewer.physics.parameters import changes_in, ground_knobs, knobs, self_collision_knobs
@@ -50,7 +48,7 @@ def test_what_changed_is_said_in_the_sliders_units() -> None:
     text = what_changed(knobs(START, length_unit="m"), START, now)
     assert text == "δ object [mm] 23.7 → 35, stiffness x1 → x0.5"
     assert what_changed(knobs(START, length_unit="m"), START, START) == ""
-    other = replace(START, use_control_velocity=False, rest_length_floor=0.0)
+    other = START.replace(use_control_velocity=False, rest_length_floor=0.0)
     changes = changes_in(knobs(START, length_unit="m"), START, other, is_automatic=True)
     assert [change.text for change in changes] == [
         "substeps 667 → automatic",
@@ -74,10 +72,10 @@ def test_self_collision_is_a_box_and_its_sliders() -> None:
 
 def test_the_ground_is_a_box_and_its_height() -> None:
     box, height, *_ = ground_knobs(START, length_unit="m", low=0.01, high=0.2)
-    none = replace(START, ground_height=None)
+    none = START.replace(ground_height=None)
     assert (box.to_slider(START), box.to_slider(none), box.to_slider(START)) == (True, False, True)
     assert (box.from_slider(False), box.from_slider(True)) == (None, 0.0)
-    lower = replace(START, ground_height=height.from_slider(-120.0))
+    lower = START.replace(ground_height=height.from_slider(-120.0))
     assert lower.ground_height == pytest.approx(-0.12)
     assert height.to_slider(lower) == -120.0
     # No higher than the lowest node, which would be thrown out of the ground.
@@ -94,7 +92,7 @@ def test_stiffness_of_both_kinds_of_springs_is_moved_apart() -> None:
     for field in ("stiffness", "virtual_stiffness"):
         assert by_field[field].to_slider(START) == 0.0
         assert by_field[field].from_slider(-1.0) == pytest.approx(0.1 * getattr(START, field))
-    off = replace(START, stiffness=0.0)
+    off = START.replace(stiffness=0.0)
     assert "stiffness" not in {knob.field for knob in knobs(off, length_unit="m")}
 
 

@@ -15,12 +15,11 @@ from app.viewer.physics.presets import (
     PRESET_FORMAT,
     PresetStore,
     builtin_presets,
-    changes_of,
     checked_name,
 )
 from app.viewer.ui.guard import Guard
 from physhandi.errors import UsageError
-from physhandi.simulation.parameters import SimulationParameters
+from physhandi.simulation.parameters import SimulationParameters, parameter_changes
 
 FITTED = SimulationParameters(connection_radius=0.035, drag=2.0, substeps_per_frame=230)
 
@@ -70,7 +69,7 @@ def test_a_preset_is_kept_read_by_another_server_and_deleted(store) -> None:
     heard: list[int] = []
     stop = store.subscribe(lambda: heard.append(1))
     now = SimulationParameters.from_dict(FITTED.to_dict() | {"drag": 7.5, "ground_height": None})
-    changes = changes_of(FITTED, now, is_automatic=True)
+    changes = parameter_changes(FITTED, now, is_automatic=True)
     store.save("  Wet   towel ", changes, "m")
     (path,) = store.folder.iterdir()
     assert path.name == "wet-towel.yaml"
@@ -136,7 +135,7 @@ def test_json_is_read_and_stays_json(store) -> None:
         (good(name="soft"), "is a preset of the program"),
         (good(parameters={}), "parameters is empty"),
         (good(parameters={"drag": [1, 2]}), "parameters.drag is a list"),
-        (good(parameters={"dragg": 1}), "Unknown simulation parameter 'dragg'"),
+        (good(parameters={"dragg": 1}), "no simulation parameter 'dragg'. Do you mean 'drag'"),
         (good(parameters={"friction": 3}), r"friction is 3.0; expected"),
         (good(parameters={"drag": "fast"}), "drag is 'fast'; expected a number"),
         (good(parameters={"frame_rate": 60}), "frame_rate belongs to the recording"),

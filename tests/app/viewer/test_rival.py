@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import trimesh
@@ -54,8 +52,7 @@ def test_only_the_way_of_holding_differs_from_the_fit() -> None:
     assert (values.virtual_connection_radius, values.virtual_max_neighbors) == (0.04, 50)
     assert (values.use_control_velocity, values.virtual_stiffness) == (False, 500.0)
     assert PARAMETERS.virtual_stiffness == 800.0
-    back = replace(
-        values,
+    back = values.replace(
         virtual_connection_radius=PARAMETERS.virtual_connection_radius,
         virtual_max_neighbors=PARAMETERS.virtual_max_neighbors,
         virtual_stiffness=PARAMETERS.virtual_stiffness,

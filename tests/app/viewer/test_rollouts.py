@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from viewer_world import FRAMES, PARAMETERS
@@ -72,7 +70,7 @@ def rollouts(live, run, changes) -> LiveRollouts:
 
 
 def start(rollouts: LiveRollouts, live: FakeLive, count: int) -> int:
-    rollouts.request(replace(PARAMETERS, drag=7.0), automatic_substeps=False)
+    rollouts.request(PARAMETERS.replace(drag=7.0), automatic_substeps=False)
     number = len(live.requests)
     tensors = rollouts.fitted.model.to_tensors()
     live.say("started", number, tensors, substeps_per_frame=30)
@@ -117,7 +115,7 @@ def test_divergence_keeps_the_last_good_state(rollouts, live, changes) -> None:
 
 
 def test_divergence_before_the_first_frame_keeps_the_rollout_before(rollouts, live) -> None:
-    rollouts.request(replace(PARAMETERS, drag=7.0), automatic_substeps=False)
+    rollouts.request(PARAMETERS.replace(drag=7.0), automatic_substeps=False)
     live.say("failed", 1, error="no")
     take, frame = rollouts.at(6)
     assert (take, frame) == (rollouts.fitted, 6)

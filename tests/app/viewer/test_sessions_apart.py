@@ -5,7 +5,6 @@ import threading
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -58,7 +57,7 @@ def positions(client: ViewerClient) -> np.ndarray:
 def simulated(scale: float) -> np.ndarray:
     """The rollout of another stiffness, simulated here."""
     control = controls((0.0, 0.0, 1.0))
-    parameters = replace(PARAMETERS, stiffness_scale=scale)
+    parameters = PARAMETERS.replace(stiffness_scale=scale)
     return (
         Simulator(build_model(sheet(), control[0], parameters), parameters)
         .rollout(control)

@@ -3,7 +3,6 @@
 import re
 import threading
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -233,12 +232,12 @@ def test_what_a_run_is_told_gives_the_parameters_of_the_scene(run) -> None:
     stored = SimulationParameters.from_dict(run.yaml("object/parameters.yaml"))
     world = {"frame_rate": 60.0, "ground_height": 0.1, "gravity": 9.7}
     fitted = stored.in_world(**world)
-    now = replace(fitted, ground_height=None, gravity=3.0, friction=1.5)
+    now = fitted.replace(ground_height=None, gravity=3.0, friction=1.5)
     changes = run_changes(run, fitted, now, is_automatic=False)
     assert "frame_rate" not in changes
     again = SimulationParameters.from_dict(stored.to_dict() | changes).in_world(**world)
     shown = {"uses_sequence_ground": False, "uses_sequence_gravity": False}
-    assert again == replace(now, **shown)
+    assert again == now.replace(**shown)
     assert run_changes(run, fitted, fitted, is_automatic=True) == {"substeps_per_frame": "auto"}
 
 

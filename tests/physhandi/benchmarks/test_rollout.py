@@ -69,7 +69,7 @@ def test_a_gradient_is_timed_and_compared(device):
 
 def test_another_physics_is_not_called_the_same(device, monkeypatch):
     def floating(model, parameters, device):
-        return PhysTwinLike(model, replace(parameters, gravity=0.0), device)
+        return PhysTwinLike(model, parameters.replace(gravity=0.0), device)
 
     monkeypatch.setattr(rollout, "PhysTwinLike", floating)
     monkeypatch.setattr(gradient, "PhysTwinLike", floating)

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -69,8 +68,7 @@ def sheet(name: str, lift: float, gravity: float = 9.81, **more: object) -> Obje
 def drawn(count: int) -> list[SimulationParameters]:
     rng = np.random.default_rng(7)
     return [
-        replace(
-            PARAMETERS,
+        PARAMETERS.replace(
             connection_radius=rng.uniform(0.11, 0.2),
             max_neighbors=int(rng.integers(2, 8)),
             stiffness=rng.uniform(100, 600),
@@ -98,7 +96,7 @@ def test_a_judgement_is_the_mean_loss_of_all_sequences(
     assert [p.stiffness for p, _ in judged] == [p.stiffness for p in candidates]
     if device != "cpu":  # There all take the substeps of the one that needs most.
         most = max(p.substeps_per_frame for p, _ in judged)
-        judged = [(replace(p, substeps_per_frame=most), loss) for p, loss in judged]
+        judged = [(p.replace(substeps_per_frame=most), loss) for p, loss in judged]
     for parameters, loss in judged:
         assert (parameters.substeps_per_frame == 40) != config.automatic_substeps
         models = {p.name: build_problem_model(p, parameters) for p in problems}
@@ -118,15 +116,15 @@ def test_a_judgement_is_the_mean_loss_of_all_sequences(
 def test_what_cannot_be_simulated_is_infinitely_bad_and_harms_nobody(device: str) -> None:
     problems = [sheet("slow", 0.05)]
     good = drawn(2)
-    bare = replace(good[0], connection_radius=1e-3, virtual_connection_radius=1e-3)
-    wild = replace(good[0], stiffness=1e9)
+    bare = good[0].replace(connection_radius=1e-3, virtual_connection_radius=1e-3)
+    wild = good[0].replace(stiffness=1e9)
     config = ObjectFitConfig()
     alone = [loss for _, loss in Judge(problems, config, NullProgress(), device=device)(good)]
     mixed = Judge(problems, config, NullProgress(), device=device)([good[0], bare, wild, good[1]])
     losses = [loss for _, loss in mixed]
     assert losses[1:3] == [math.inf, math.inf]
     assert [losses[0], losses[3]] == pytest.approx(alone, rel=1e-6)
-    frugal = replace(config, automatic_substeps=True, most_substeps=300)
+    frugal = config.replace(automatic_substeps=True, most_substeps=300)
     ((greedy, loss),) = Judge(problems, frugal, NullProgress(), device=device)([wild])
     assert greedy.substeps_per_frame > 300
     assert loss == math.inf
@@ -135,8 +133,8 @@ def test_what_cannot_be_simulated_is_infinitely_bad_and_harms_nobody(device: str
 def test_colliding_candidates_are_judged_with_their_collisions(device: str) -> None:
     problem = sheet("slow", 0.05, gravity=0.0)
     free = drawn(1)[0]
-    crowded = replace(
-        free, self_collision=True, collision_distance=0.12, collides_rest_neighbors=True
+    crowded = free.replace(
+        self_collision=True, collision_distance=0.12, collides_rest_neighbors=True
     )
     config = ObjectFitConfig()
     (_, apart), (_, loss) = Judge([problem], config, NullProgress(), device=device)([free, crowded])

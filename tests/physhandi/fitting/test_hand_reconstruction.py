@@ -10,7 +10,7 @@ import torch
 from recordings import recording
 
 from physhandi.data.importers.stereo import import_stereo
-from physhandi.errors import CancelledError, FitError, MissingInputError
+from physhandi.errors import CancelledError, FitError, MissingInputError, SettingsError
 from physhandi.fitting.hand_reconstruction import HandFit, HandFitConfig, reconstruct_hands
 from physhandi.hand.loading import load_hand_model
 from physhandi.hand.motion import HandMotion
@@ -123,7 +123,7 @@ def test_what_is_missing_is_said(tmp_path: Path) -> None:
         reconstruct_hands(scene.write_scene(tmp_path / "b", [truth], [], None))
     with pytest.raises(MissingInputError, match=r"'c': view 'view0' has no color"):
         reconstruct_hands(scene.write_scene(tmp_path / "c", [truth], CAMERAS, None, depth=True))
-    with pytest.raises(ValueError, match="at least 1"):
+    with pytest.raises(SettingsError, match="iterations is 0; expected a whole number from 1"):
         HandFitConfig(iterations=0)
 
 

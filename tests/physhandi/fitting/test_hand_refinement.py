@@ -11,7 +11,7 @@ from reference.spring_mass import Scene, simulate
 from refinement_world import SOFT, held_patch, moved, mpjpe
 from scipy.spatial.transform import Rotation
 
-from physhandi.errors import CancelledError, SimulationDivergedError
+from physhandi.errors import CancelledError, SettingsError, SimulationDivergedError
 from physhandi.fitting import hand_refinement
 from physhandi.fitting.hand_reconstruction import keypoint_target
 from physhandi.fitting.hand_refinement import (
@@ -150,7 +150,7 @@ def test_the_gradient_agrees_with_central_differences_in_float64(every: int) -> 
     truth = two_hands(frames=5)
     seen = tuple(disturbed(motion, seed) for seed, motion in enumerate(truth))
     problem = with_targets(held_patch(truth, seen, fitted=4, every=every), 4)
-    config = replace(FREE, prior_weight=0.3, smoothness_weight=0.7, keypoint_weight=1e-7)
+    config = FREE.replace(prior_weight=0.3, smoothness_weight=0.7, keypoint_weight=1e-7)
     random = np.random.default_rng(3)
     refinement = Refinement(problem, config, "cpu")
     offset = []
@@ -186,7 +186,7 @@ def test_a_shift_of_the_whole_hand_is_found_with_its_sign_and_size() -> None:
     # Nothing else acts on the nodes, so in rest they are displaced as the hand is.
     truth, shift = standing(12), (0.006, -0.004, 0.003)
     problem = held_patch((truth,), (moved(truth, shift),), fitted=12)
-    config = replace(FREE, rotation_rate=0.0, articulation_rate=0.0, iterations=60)
+    config = FREE.replace(rotation_rate=0.0, articulation_rate=0.0, iterations=60)
     result = refine_hands(problem, config, NullProgress())
     found = result.motions[0].wrist_translation - problem.motions[0].wrist_translation
     np.testing.assert_allclose(found[2:].mean(axis=0), -np.array(shift), atol=3e-4)
@@ -223,7 +223,7 @@ def test_the_result_is_simulated_from_what_is_returned() -> None:
 def test_frames_that_are_not_fitted_fade_to_stage_1() -> None:
     truth = (grasping(frames=10),)
     problem = held_patch(truth, (moved(truth[0], (0.005, 0.0, 0.0)),), fitted=6)
-    config = replace(FREE, carry_time=0.1)
+    config = FREE.replace(carry_time=0.1)
     after = refine_hands(problem, config, NullProgress()).motions[0]
     found = after.wrist_translation - problem.motions[0].wrist_translation
     assert np.linalg.norm(found[5]) > 1e-3
@@ -240,7 +240,7 @@ def test_later_frames_of_the_hands_do_not_change_earlier_corrections() -> None:
     results = [
         refine_hands(
             held_patch(truth, (replace(seen, wrist_translation=place),), fitted=6),
-            replace(FREE, iterations=4),
+            FREE.replace(iterations=4),
             NullProgress(),
         )
         for place in (seen.wrist_translation, later)
@@ -256,7 +256,7 @@ def test_keypoints_keep_a_hand_in_the_images() -> None:
     wrong_object = (moved(truth[0], (0.0, 0.006, 0.0)),)
     problem = with_targets(held_patch(wrong_object, truth, fitted=6), 6)
     free = refine_hands(problem, FREE, NullProgress())
-    held = refine_hands(problem, replace(FREE, keypoint_weight=1e-5), NullProgress())
+    held = refine_hands(problem, FREE.replace(keypoint_weight=1e-5), NullProgress())
     assert mpjpe(free.motions[0], truth[0]) > 2 * mpjpe(held.motions[0], truth[0])
     assert mpjpe(free.motions[0], truth[0]) > 0.003
 
@@ -309,7 +309,7 @@ def test_a_step_into_divergence_is_taken_back_and_halved(monkeypatch: pytest.Mon
     broken = diverges(at={1}, real=watched)
     monkeypatch.setattr(hand_refinement.differentiable, "rollout", broken)
     listener = Listener()
-    result = refine_hands(problem, replace(FREE, iterations=5), listener)
+    result = refine_hands(problem, FREE.replace(iterations=5), listener)
     assert [iteration for iteration, _ in listener.told] == list(range(6))
     assert [n for n, (_, message) in enumerate(listener.told) if "ran away" in message] == [1]
     # The second evaluation that came to an end is that of the unrefined hands again.
@@ -317,7 +317,7 @@ def test_a_step_into_divergence_is_taken_back_and_halved(monkeypatch: pytest.Mon
     halved = np.abs(seen[2] - seen[0]).max()
     monkeypatch.setattr(hand_refinement.differentiable, "rollout", watched)
     seen.clear()
-    refine_hands(problem, replace(FREE, iterations=1), NullProgress())
+    refine_hands(problem, FREE.replace(iterations=1), NullProgress())
     whole = np.abs(seen[1] - seen[0]).max()
     assert halved == pytest.approx(0.5 * FREE.decay * whole, rel=0.02)
     assert result.loss_after < result.loss_before
@@ -372,7 +372,7 @@ def test_a_gradient_that_grows_with_its_reach_reaches_less_far(
         return node + (1e6 if window > 2 else 0.0) * (control - control.detach()).sum(), velocity
 
     monkeypatch.setattr(hand_refinement.differentiable, "rollout", steep)
-    result = refine_hands(problem, replace(FREE, iterations=2), NullProgress())
+    result = refine_hands(problem, FREE.replace(iterations=2), NullProgress())
     assert reaches == [8, 4, 2, 2, 2]
     assert result.loss_after < result.loss_before
 
@@ -381,7 +381,7 @@ def test_a_gradient_that_grows_with_its_reach_reaches_less_far(
     "wrong", [{"iterations": -1}, {"window": 0}, {"decay": 0.0}, {"translation_rate": -1.0}]
 )
 def test_settings_that_make_no_sense_are_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match="must"):
+    with pytest.raises(SettingsError, match=r" is .*; expected "):
         RefinementConfig(**wrong)
 
 

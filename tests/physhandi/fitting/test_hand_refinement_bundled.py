@@ -17,7 +17,7 @@ from refinement_world import mpjpe, mpvpe, with_error
 from physhandi import pipeline
 from physhandi.errors import CancelledError
 from physhandi.fitting import artefacts, hand_refinement
-from physhandi.fitting.config import config_from_dict, config_to_dict
+from physhandi.fitting.config import PipelineConfig
 from physhandi.fitting.hand_refinement import (
     RefinedHands,
     RefinementConfig,
@@ -161,7 +161,7 @@ def control_of(motion: HandMotion) -> np.ndarray:
 
 def fitted_until_refinement(run: Run, folder: Path) -> Run:
     """A run like the bundled one was before stage 3, with the hands of stage 1."""
-    config = config_to_dict(config_from_dict(run.config["profile"]))
+    config = PipelineConfig.from_dict(run.config["profile"]).to_dict()
     later = Run.create(
         folder,
         name="later",

@@ -1,7 +1,6 @@
 """MANO through the stages: fitted, stored, simulated with, and opened again."""
 
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import hand_scene as scene
@@ -14,7 +13,7 @@ from physhandi.data.exporters import export_run
 from physhandi.data.sequence import Sequence
 from physhandi.errors import MissingInputError, UsageError
 from physhandi.fitting.artefacts import load_motions
-from physhandi.fitting.config import HandFitConfig, config_from_dict, config_to_dict, load_profile
+from physhandi.fitting.config import HandFitConfig, PipelineConfig, load_profile
 from physhandi.fitting.hand_reconstruction import reconstruct_hands
 from physhandi.hand.loading import load_hand_model
 from physhandi.hand.model import HandSide
@@ -49,7 +48,7 @@ def test_without_mano_the_fit_says_how_to_bring_it(
     with pytest.raises(MissingInputError, match="physhandi import mano"):
         reconstruct_hands(sequence, HandFitConfig(model="mano"))
     with pytest.raises(UsageError, match=r"hand: model is 'smpl'; expected one of 'open', 'mano'"):
-        config_from_dict({"hand": {"model": "smpl"}})
+        PipelineConfig.from_dict({"hand": {"model": "smpl"}})
 
 
 @pytest.mark.slow
@@ -63,19 +62,18 @@ def test_a_whole_run_uses_mano_and_outlives_it(
     for view, seen in zip(Sequence.load(folder).views, keypoint, strict=True):
         np.save(view.folder / "keypoint.npy", seen)
     config = load_profile("quick")
-    search = replace(config.object_.search, generations=1, population=4)
-    first_order = replace(config.object_.first_order, iterations=1)
-    config = replace(
-        config,
-        hand=replace(config.hand, model="mano", iterations=60, depth_iterations=0),
-        object_=replace(config.object_, search=search, first_order=first_order),
+    search = config.object_.search.replace(generations=1, population=4)
+    first_order = config.object_.first_order.replace(iterations=1)
+    config = config.replace(
+        hand=config.hand.replace(model="mano", iterations=60, depth_iterations=0),
+        object_=config.object_.replace(search=search, first_order=first_order),
     )
     run = Run.create(
         tmp_path / "run",
         name="with MANO",
         kind="reconstruction",
         sequences=[str(folder)],
-        config={"profile": config_to_dict(config)},
+        config={"profile": config.to_dict()},
     )
     pipeline.run_job(run)
 

@@ -1,7 +1,6 @@
 """What the first-order stage learns, and where it stops learning."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -90,7 +89,7 @@ def test_contact_is_learned_only_if_asked_for_and_stays_in_its_interval() -> Non
         contact["restitution"] -= 0.4047
         contact["friction"] += 1.1026
         contact["self_friction"] += 0.1
-    expected = replace(PARAMETERS, restitution=0.0, friction=2.0, self_friction=1.2)
+    expected = PARAMETERS.replace(restitution=0.0, friction=2.0, self_friction=1.2)
     learned = made.parameters(PARAMETERS)
     assert (learned.restitution, learned.friction) == (0.0, 2.0)
     assert learned.self_friction == pytest.approx(expected.self_friction)

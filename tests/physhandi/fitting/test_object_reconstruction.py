@@ -7,10 +7,9 @@ import pytest
 
 from physhandi.data.observation import ObjectObservation
 from physhandi.errors import CancelledError, FitError
-from physhandi.fitting.config import FirstOrderConfig, ObjectFitConfig
+from physhandi.fitting.config import FirstOrderConfig, ObjectFitConfig, SearchConfig, SearchVariable
 from physhandi.fitting.object_problem import ObjectProblem, build_problem, mean_loss
 from physhandi.fitting.object_reconstruction import search_object
-from physhandi.fitting.search import SearchConfig, SearchVariable
 from physhandi.fitting.spring_optimisation import optimise_springs
 from physhandi.progress import NullProgress, Progress
 from physhandi.simulation.parameters import SimulationParameters
@@ -114,7 +113,7 @@ def test_annealing_ends_on_the_whole_sequence() -> None:
 
 def test_search_improves_a_wrong_start() -> None:
     problems = [held_sheet("slow", 0.2)]
-    start = replace(PARAMETERS, stiffness=2000.0)
+    start = PARAMETERS.replace(stiffness=2000.0)
     result = search_object(problems, start, config(), NullProgress())
     assert 100.0 < result.parameters.stiffness < 900.0
     assert result.loss_after < 0.3 * result.loss_before
@@ -128,7 +127,7 @@ def test_objects_that_differ_are_refused() -> None:
 
 
 def test_a_start_that_diverges_is_an_error() -> None:
-    stiff = replace(PARAMETERS, stiffness=1e6)
+    stiff = PARAMETERS.replace(stiffness=1e6)
     with pytest.raises(FitError, match="diverge"):
         optimise_springs([held_sheet("slow", 0.2)], stiff, config(), NullProgress())
 

@@ -1,6 +1,5 @@
 """Settings that a fit may be given: what there is, what is refused, and what comes of them."""
 
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -9,12 +8,11 @@ from physhandi.errors import SettingsError
 from physhandi.fitting.config import (
     GROUPS,
     INTERVALS,
+    PipelineConfig,
     all_settings,
     apply_overrides,
-    changes,
-    config_from_dict,
-    config_to_dict,
     load_profile,
+    overrides_of,
     values_of,
 )
 
@@ -36,7 +34,7 @@ def test_every_field_of_every_profile_is_a_setting_or_left_out_on_purpose() -> N
     left_out = {"profile", "description", "simulation.frame_rate", "simulation.ground_height"}
     for name in ("quick", "default", "paper", "phystwin"):
         config = load_profile(name)
-        found = {p for p in leaves(config_to_dict(config)) if "search.tied" not in p}
+        found = {p for p in leaves(config.to_dict()) if "search.tied" not in p}
         assert found - known == left_out
     assert {path for path in known if not path.startswith(INTERVALS)} == found - left_out - {
         path for path in found if path.startswith(INTERVALS)
@@ -64,15 +62,13 @@ def test_every_setting_has_a_meaning_a_group_and_bounds() -> None:
 @pytest.mark.parametrize("name", ["quick", "default", "paper", "phystwin"])
 def test_the_settings_of_any_profile_lie_within_the_bounds(name: str) -> None:
     config = load_profile(name)
-    assert apply_overrides(QUICK, values_of(config)) == replace(
-        config,
+    assert apply_overrides(QUICK, values_of(config)) == config.replace(
         profile="quick",
         description=QUICK.description,
-        object_=replace(
-            config.object_, search=replace(config.object_.search, tied=QUICK.object_.search.tied)
+        object_=config.object_.replace(
+            search=config.object_.search.replace(tied=QUICK.object_.search.tied)
         ),
-        simulation=replace(
-            config.simulation,
+        simulation=config.simulation.replace(
             frame_rate=QUICK.simulation.frame_rate,
             ground_height=QUICK.simulation.ground_height,
         ),
@@ -97,13 +93,13 @@ def test_what_is_changed_changes_and_nothing_else() -> None:
         "friction",
     ]
     assert changed.object_.search.variables["friction"].high == 1.5
-    assert changes(changed, QUICK) == overrides
-    assert changes(QUICK, QUICK) == {}
-    back = apply_overrides(changed, changes(QUICK, changed))
-    assert changes(back, QUICK) == {}
+    assert overrides_of(changed, QUICK) == overrides
+    assert overrides_of(QUICK, QUICK) == {}
+    back = apply_overrides(changed, overrides_of(QUICK, changed))
+    assert overrides_of(back, QUICK) == {}
     assert load_profile("quick") == QUICK
-    stored = config_from_dict(config_to_dict(changed))
-    assert changes(stored, QUICK) == overrides
+    stored = PipelineConfig.from_dict(changed.to_dict())
+    assert overrides_of(stored, QUICK) == overrides
     assert stored.profile == "quick"
 
 

@@ -11,7 +11,7 @@ from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import write_sequence
 from physhandi.fitting.artefacts import load_model, load_parameters
-from physhandi.fitting.config import PipelineConfig, config_to_dict, load_profile
+from physhandi.fitting.config import PipelineConfig, load_profile
 from physhandi.run import Run
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
@@ -23,7 +23,7 @@ NODE = np.stack([*np.meshgrid(SIDE, SIDE[:3], indexing="ij"), np.full((7, 3), 0.
 NODE = NODE.reshape(-1, 3)
 MIDDLE = 0.045
 PROFILE = load_profile("phystwin")
-TRUTH: SimulationParameters = replace(PROFILE.simulation, stiffness=500.0, virtual_stiffness=500.0)
+TRUTH: SimulationParameters = PROFILE.simulation.replace(stiffness=500.0, virtual_stiffness=500.0)
 
 
 def write_strip(folder: Path) -> Sequence:
@@ -60,11 +60,11 @@ def write_strip(folder: Path) -> Sequence:
 def tiny() -> PipelineConfig:
     """The profile with little effort; every other switch is as it ships."""
     object_ = PROFILE.object_
-    search = replace(object_.search, generations=3)
-    first_order = replace(object_.first_order, iterations=12, judged_every=5, learning_rate=0.02)
-    object_ = replace(object_, search=search, first_order=first_order)
-    simulation = replace(PROFILE.simulation, stiffness=2000.0, virtual_stiffness=2000.0)
-    return replace(PROFILE, object_=object_, simulation=simulation)
+    search = object_.search.replace(generations=3)
+    first_order = object_.first_order.replace(iterations=12, judged_every=5, learning_rate=0.02)
+    object_ = object_.replace(search=search, first_order=first_order)
+    simulation = PROFILE.simulation.replace(stiffness=2000.0, virtual_stiffness=2000.0)
+    return PROFILE.replace(object_=object_, simulation=simulation)
 
 
 @pytest.mark.slow
@@ -75,7 +75,7 @@ def test_a_fit_as_phystwin_tells_soft_from_stiff(tmp_path: Path) -> None:
         name="strip",
         kind="reconstruction",
         sequences=[str(sequence.folder)],
-        config={"profile": config_to_dict(tiny())},
+        config={"profile": tiny().to_dict()},
     )
     pipeline.run_job(run)
     fitted = Run.open(run.folder)

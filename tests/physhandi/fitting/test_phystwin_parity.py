@@ -135,7 +135,7 @@ def test_counts_are_those_of_frame_1(made: Any) -> None:
     assert int(problem.is_observed[1].sum()) == 561 == int(case["is_visible"][1].sum())
     assert int(problem.is_valid[1].sum()) == 475 == int(case["is_motion_valid"][0].sum())
     node = torch.from_numpy(case["position"] * UP)
-    own = replace(config.object_, freezes_counts=False)
+    own = config.object_.replace(freezes_counts=False)
     off = np.abs(frame_losses(problem, node, own) / case["loss"][:, :2].sum(axis=1) - 1.0)
     # Without the switch only the first frame would agree.
     assert off[0] < 1e-3

@@ -1,7 +1,6 @@
 """What a fit shows of itself is what it simulated: its loss can be computed from it again."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +10,11 @@ from hand_scene import grasping, looking_at_hand, seen_keypoints, write_scene
 from refinement_world import held_patch, moved
 
 from physhandi.data.observation import ObjectObservation
-from physhandi.fitting.config import FirstOrderConfig, ObjectFitConfig
+from physhandi.fitting.config import FirstOrderConfig, ObjectFitConfig, SearchConfig, SearchVariable
 from physhandi.fitting.hand_reconstruction import HandFitConfig, reconstruct_hands
 from physhandi.fitting.hand_refinement import RefinementConfig, refine_hands
 from physhandi.fitting.object_problem import ObjectProblem, build_problem
 from physhandi.fitting.object_reconstruction import search_object
-from physhandi.fitting.search import SearchConfig, SearchVariable
 from physhandi.fitting.spring_optimisation import optimise_springs
 from physhandi.hand.loading import load_hand_model
 from physhandi.progress import Preview, Progress
@@ -106,7 +104,7 @@ def test_the_search_shows_its_best_candidates_as_they_moved() -> None:
 
 def test_every_iteration_can_be_shown_and_none_is_made_for_nobody() -> None:
     problem, progress = lifted_sheet(), Watching()
-    soft = replace(PARAMETERS, stiffness=300.0)
+    soft = PARAMETERS.replace(stiffness=300.0)
     result = optimise_springs([problem], soft, settings(), progress)
     curve = [loss for _, loss in result.curve[1:]]
     assert [shown.loss for shown in progress.shown] == curve

@@ -1,15 +1,13 @@
 """Which distances let springs form at frame 0, judged beside the springs that are built."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from physhandi.data.observation import ObjectObservation
 from physhandi.errors import FitError, UsageError
+from physhandi.fitting.config import SearchConfig, SearchVariable
 from physhandi.fitting.object_problem import ObjectProblem, build_problem
 from physhandi.fitting.object_reconstruction import check_problem, check_springs
-from physhandi.fitting.search import SearchConfig, SearchVariable
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.topology import build_model
 
@@ -48,7 +46,7 @@ def searched(**highs: float) -> SearchConfig:
 def test_controls_must_be_within_the_widest_radius(radius: float, is_searched: bool) -> None:
     start = SimulationParameters(virtual_connection_radius=1e-3 if is_searched else radius)
     config = searched(virtual_connection_radius=radius) if is_searched else SearchConfig()
-    widest = replace(start, virtual_connection_radius=radius)
+    widest = start.replace(virtual_connection_radius=radius)
     holds = build_model(NODE, CONTROL, widest).virtual_spring_count > 0
     assert holds == (radius > 0.004)
     if holds:
@@ -62,7 +60,7 @@ def test_controls_must_be_within_the_widest_radius(radius: float, is_searched: b
 def test_nodes_must_be_within_the_widest_radius(radius: float) -> None:
     start = SimulationParameters(connection_radius=1e-3, virtual_connection_radius=0.01)
     config = searched(connection_radius=radius)
-    widest = replace(start, connection_radius=radius)
+    widest = start.replace(connection_radius=radius)
     joins = build_model(NODE, CONTROL, widest).object_spring_count > 0
     assert joins == (radius > 0.01)
     if joins:

@@ -10,7 +10,7 @@ import torch
 from physhandi.data.observation import ObjectObservation
 from physhandi.errors import FitError
 from physhandi.fitting import spring_optimisation
-from physhandi.fitting.config import FirstOrderConfig, ObjectFitConfig
+from physhandi.fitting.config import FirstOrderConfig, ObjectFitConfig, SearchConfig, SearchVariable
 from physhandi.fitting.object_problem import (
     ObjectProblem,
     build_problem,
@@ -18,7 +18,6 @@ from physhandi.fitting.object_problem import (
     mean_loss,
 )
 from physhandi.fitting.object_reconstruction import search_object
-from physhandi.fitting.search import SearchConfig, SearchVariable
 from physhandi.fitting.spring_optimisation import (
     Descent,
     FirstOrderResult,
@@ -80,7 +79,7 @@ def test_friction_is_learned_by_a_step_a_frame(observed: float, change: float) -
     # The error grows as t², and so do the one-frame gradients: 1, 4, 9. With Adam's decays of 0.9
     # and 0.99 three steps of 1e-3 then go 1, 2.579 / √8.538 and 4.948 / √32.94 of it: 2.745.
     settings = config(learns_contact=True, judges_online=True)
-    still = replace(PARAMETERS, drag=0.0)
+    still = PARAMETERS.replace(drag=0.0)
     result = optimise_springs([sliding_pair(observed)], still, settings, NullProgress())
     assert result.parameters.friction == pytest.approx(0.3 + change, abs=1e-5)
     assert result.parameters.self_friction == pytest.approx(PARAMETERS.self_friction)
@@ -93,7 +92,7 @@ def test_damping_and_drag_lose_their_fraction_only_if_asked_for() -> None:
     problem = sliding_pair(0.3)
     result = optimise_springs([problem], PARAMETERS, config(truncates_damping=True), NullProgress())
     assert (result.parameters.damping, result.parameters.drag) == (83.0, 2.0)
-    whole = replace(PARAMETERS, damping=83.0, drag=2.0)
+    whole = PARAMETERS.replace(damping=83.0, drag=2.0)
     models = {"pair": build_problem_model(problem, whole)}
     expected = mean_loss([problem], models, whole, config(), "cpu")
     assert result.loss_before == expected
@@ -194,7 +193,7 @@ def test_the_limit_on_gradients_can_be_lifted() -> None:
 
 def test_a_walk_tells_the_mean_loss_it_met() -> None:
     problem = sliding_pair(0.8)
-    still = replace(PARAMETERS, drag=0.0)
+    still = PARAMETERS.replace(drag=0.0)
     model = build_problem_model(problem, still)
     settings = config(learning_rate=0.0)
     material = Material({"pair": model}, still, settings.first_order)
@@ -217,15 +216,14 @@ def test_acceleration_counts_in_the_search_alone() -> None:
     # Fall with drag: v' = q (v - g dt) each substep, so frame t changes v by G Q^(t-1) (1 - Q) and
     # the change itself changes by G (1 - Q)² Q^(t-2), from frame 2 on; smooth L1 halves its square.
     problem = falling_node()
-    parameters = replace(PARAMETERS, drag=8.0, gravity=9.81)
+    parameters = PARAMETERS.replace(drag=8.0, gravity=9.81)
     step = parameters.dt
     q = math.exp(-8.0 * step)
     limit, frame = 9.81 * step * q / (1.0 - q), q**parameters.substeps_per_frame
     jerk = [0.0] + [limit * (1 - frame) ** 2 * frame ** (t - 2) for t in range(2, FRAMES)]
     expected = 0.01 * np.mean([0.5 * value**2 / 3.0 for value in jerk])
     assert expected > 1e-6
-    settings = replace(
-        config(),
+    settings = config().replace(
         acceleration_weight=0.01,
         search=SearchConfig(generations=0, variables={"drag": SearchVariable(low=0.0, high=20.0)}),
     )

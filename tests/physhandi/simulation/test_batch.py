@@ -19,8 +19,7 @@ def candidates(count, seed=0):
     """Draw parameters that differ in every scalar and in topology."""
     rng = np.random.default_rng(seed)
     return [
-        replace(
-            BASE,
+        BASE.replace(
             connection_radius=rng.uniform(0.011, 0.02),
             max_neighbors=int(rng.integers(2, 20)),
             virtual_connection_radius=rng.uniform(0.002, 0.02),
@@ -92,7 +91,7 @@ def test_each_candidate_moves_as_if_it_were_alone(device, count):
 def test_sizes_that_fit_shared_memory_in_different_ways(side):
     _needs_cuda()
     node, control, velocity = scene(side)
-    drawn = [replace(p, connection_radius=0.03, max_neighbors=60) for p in candidates(3)]
+    drawn = [p.replace(connection_radius=0.03, max_neighbors=60) for p in candidates(3)]
     master = MasterTopology.of(node, control[0], drawn, initial_velocity=velocity)
     batch = BatchSimulator(master, drawn, device="cuda:0").rollout(control)
     for candidate, parameters in enumerate(drawn):
@@ -107,7 +106,7 @@ def test_a_node_with_more_neighbors_than_fit_is_simulated_too():
     node = rng.uniform(0, 0.05, (500, 3)).astype(np.float32)
     still = np.zeros((3, 0, 3), np.float32)
     drawn = [
-        replace(BASE, connection_radius=0.2, max_neighbors=499, stiffness=s, damping=0.05)
+        BASE.replace(connection_radius=0.2, max_neighbors=499, stiffness=s, damping=0.05)
         for s in (0.05, 0.2)
     ]
     master = MasterTopology.of(node, still[0], drawn)
@@ -135,7 +134,7 @@ def test_a_thousand_candidates_at_once():
 def test_a_candidate_that_diverges_does_not_harm_the_others(device):
     node, control, velocity = scene()
     drawn = candidates(5)
-    drawn[2] = replace(drawn[2], stiffness=1e7, connection_radius=0.02, max_neighbors=19)
+    drawn[2] = drawn[2].replace(stiffness=1e7, connection_radius=0.02, max_neighbors=19)
     master = MasterTopology.of(node, control[0], drawn, initial_velocity=velocity)
     batch = BatchSimulator(master, drawn, device=device).rollout(control)
     assert batch.diverged_frame[2] >= 1
@@ -151,9 +150,9 @@ def test_what_must_be_common_and_what_a_batch_cannot_do_are_refused():
     with pytest.raises(UsageError, match="at least one"):
         BatchSimulator(master, [])
     with pytest.raises(UsageError, match="rest_length_floor"):
-        BatchSimulator(master, [BASE, replace(BASE, rest_length_floor=2e-3)])
+        BatchSimulator(master, [BASE, BASE.replace(rest_length_floor=2e-3)])
     with pytest.raises(UsageError, match=r"[Ss]elf-collision"):
-        BatchSimulator(master, [replace(BASE, self_collision=True)])
+        BatchSimulator(master, [BASE.replace(self_collision=True)])
     with pytest.raises(ValueError, match="control"):
         BatchSimulator(master, [BASE]).rollout(control[:, :1])
 

@@ -64,8 +64,7 @@ def oracle(seen, position, velocity):
 def candidates(count):
     rng = np.random.default_rng(4)
     return [
-        replace(
-            BASE,
+        BASE.replace(
             connection_radius=rng.uniform(0.011, 0.02),
             virtual_connection_radius=rng.uniform(0.006, 0.02),
             stiffness=rng.uniform(50, 250),
@@ -118,7 +117,7 @@ def test_the_acceleration_term_is_not_lost_among_the_others(device):
 def test_a_candidate_that_diverges_has_an_infinite_loss_and_the_others_theirs(device):
     node, control = scene()
     drawn = candidates(3)
-    wild = [drawn[0], replace(drawn[1], stiffness=1e8), drawn[2]]
+    wild = [drawn[0], drawn[1].replace(stiffness=1e8), drawn[2]]
     seen = target(node)
     tame = BatchSimulator(MasterTopology.of(node, control[0], drawn), drawn, device)
     found = BatchSimulator(MasterTopology.of(node, control[0], wild), wild, device)

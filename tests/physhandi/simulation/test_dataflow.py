@@ -44,7 +44,7 @@ def test_gradients_are_those_of_the_recorded_adjoint(side, monkeypatch):
     fast = block_gradients(model, control, PARAMETERS, "cuda:0")
     monkeypatch.setattr(CudaAdjoint, "of", lambda *_: None)
     # Other parameters, so that another simulator is made; the difference is far below rounding.
-    slow = block_gradients(model, control, replace(PARAMETERS, frame_rate=30.0 + 1e-9), "cuda:0")
+    slow = block_gradients(model, control, PARAMETERS.replace(frame_rate=30.0 + 1e-9), "cuda:0")
     for name, theirs in slow.items():
         assert np.abs(theirs).max() > 0
         error = np.linalg.norm(fast[name] - theirs) / np.linalg.norm(theirs)

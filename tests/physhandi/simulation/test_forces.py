@@ -21,7 +21,7 @@ def test_one_virtual_spring_pulls_with_strain_and_closing_speed():
     model, parameters = as_model(replace(scene, control=np.array([[[0.0, 0.0, 0.6]]] * 2)))
     force = virtual_forces(
         model,
-        replace(parameters, stiffness_scale=2.0),
+        parameters.replace(stiffness_scale=2.0),
         model.object_node,
         np.array([[0.0, 0.0, 0.1], [0, 0, 0]]),
         np.array([[0.0, 0.0, 0.6]]),
@@ -46,7 +46,7 @@ def test_forces_are_the_oracle_s_without_object_springs():
     force = virtual_forces(model, parameters, scene.node, scene.velocity, held, rate)
     np.testing.assert_allclose(force, expected, atol=1e-5)
     at_rest = virtual_forces(model, parameters, scene.node, scene.velocity, held)
-    still = replace(parameters, use_control_velocity=False)
+    still = parameters.replace(use_control_velocity=False)
     np.testing.assert_array_equal(
         at_rest, virtual_forces(model, still, scene.node, scene.velocity, held, rate)
     )

@@ -144,7 +144,7 @@ def test_a_batch_moves_hard_objects_as_each_would_alone(device, case):
     base = SimulationParameters(
         **BATCHES[case], max_neighbors=18, rest_length_floor=1e-5, substeps_per_frame=300
     )
-    drawn = [base, replace(base, gravity=5.0, restitution=0.9, stiffness_scale=0.5)]
+    drawn = [base, base.replace(gravity=5.0, restitution=0.9, stiffness_scale=0.5)]
     still = np.zeros((4, 0, 3), np.float32)
     master = MasterTopology.of(node, still[0], drawn, initial_velocity=velocity)
     batch = BatchSimulator(master, drawn, device=device).rollout(still)

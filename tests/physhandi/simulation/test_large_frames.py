@@ -165,7 +165,7 @@ def test_material_and_world_may_change_between_frames(kept, large):
                 simulator.set_material(stiffness=2 * model.stiffness, damping=0.3 * model.damping)
             simulator.step_frame(2, control[1], control[2])
             if changes:
-                simulator.set_parameters(replace(PARAMETERS, stiffness_scale=0.2, gravity=30.0))
+                simulator.set_parameters(PARAMETERS.replace(stiffness_scale=0.2, gravity=30.0))
             simulator.step_frame(3, control[2], control[3])
             ends.append(simulator.position.numpy())
     np.testing.assert_allclose(ends[0], ends[1], atol=2e-6)
@@ -191,7 +191,7 @@ def test_gradients_go_the_recorded_way(large, monkeypatch):
     monkeypatch.setattr(cuda, "ADJOINT_LOCALS", 0)
     theirs = block_gradients(model, control, PARAMETERS, "cuda:0")
     monkeypatch.undo()
-    ours = block_gradients(model, control, replace(PARAMETERS, frame_rate=30.0 + 1e-9), "cuda:0")
+    ours = block_gradients(model, control, PARAMETERS.replace(frame_rate=30.0 + 1e-9), "cuda:0")
     for name, value in theirs.items():
         assert np.abs(value).max() > 0
         error = np.linalg.norm(ours[name] - value) / np.linalg.norm(value)

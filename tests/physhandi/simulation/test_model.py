@@ -65,14 +65,14 @@ def test_whole_drags_decay_as_a_gpu_rounds_them(drag, decay):
     # What float32 expf(-5e-5 drag) was on an H200; next to 1 a unit of float32 is 6e-8.
     rounded = SimulationParameters(drag=drag, frame_duration=0.03335, rounds_decay=True)
     assert 1.0 - rounded.velocity_loss() == np.float64(np.float32(decay))
-    exact = replace(rounded, rounds_decay=False)
+    exact = rounded.replace(rounds_decay=False)
     assert exact.velocity_loss() == pytest.approx(1.0 - np.exp(-5e-5 * drag), rel=1e-9)
     assert exact.velocity_loss() == pytest.approx(rounded.velocity_loss(), abs=9e-8)
 
 
 def test_other_drags_decay_by_the_nearest_float32():
     own = SimulationParameters(drag=3.0, frame_duration=0.03335, rounds_decay=True)
-    for drag, of in ((2.5, own), (21.0, own), (3.0, replace(own, substeps_per_frame=500))):
+    for drag, of in ((2.5, own), (21.0, own), (3.0, own.replace(substeps_per_frame=500))):
         decay = 1.0 - of.velocity_loss(drag)
         assert decay == np.float64(np.float32(np.exp(-of.dt * drag)))
 
@@ -88,8 +88,8 @@ def test_whole_numbers_and_numpy_values_are_converted():
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"stifness": 1.0}, "Unknown simulation parameter 'stifness'. Known are connection_radius"),
-        ({"stiffness": -1.0}, r"stiffness is -1.0; expected a finite value in \[0.0, 1e\+30\]"),
+        ({"stifness": 1.0}, "no simulation parameter 'stifness'. Do you mean 'stiffness'"),
+        ({"stiffness": -1.0}, "stiffness is -1.0; expected a number from 0 on"),
         ({"friction": 2.1}, "friction is 2.1"),
         ({"drag": float("nan")}, "drag is nan"),
         ({"substeps_per_frame": 0}, "substeps_per_frame is 0"),
@@ -98,7 +98,7 @@ def test_whole_numbers_and_numpy_values_are_converted():
         ({"gravity": None}, "gravity is empty"),
         ({"use_control_velocity": "no"}, "use_control_velocity is 'no'; expected true or false"),
         ({"self_collision": 1.0}, "self_collision is 1.0; expected true or false"),
-        ({"self_restitution": 1.1}, r"self_restitution is 1.1; expected .* in \[0.0, 1.0\]"),
+        ({"self_restitution": 1.1}, "self_restitution is 1.1; expected a number from 0 to 1"),
         ({"collision_distance": -0.1}, "collision_distance is -0.1"),
         ({"frame_duration": 0.0}, "frame_duration is 0.0"),
         ({"rounds_decay": 1}, "rounds_decay is 1; expected true or false"),

@@ -1,7 +1,6 @@
 """Trajectories that PhysTwin's own simulator produced, with its switches set."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -34,8 +33,8 @@ def test_trajectories_agree_with_phystwin(device, shared_array, name):
 
 def test_a_sheet_folds_as_in_phystwin_with_self_collision(device, shared_array):
     case = shared_array("phystwin_parity/sheet_fold_self_collision.npz")
-    parameters = replace(
-        PARAMETERS, self_collision=True, collision_distance=0.008, collides_rest_neighbors=True
+    parameters = PARAMETERS.replace(
+        self_collision=True, collision_distance=0.008, collides_rest_neighbors=True
     )
     simulator = Simulator(model_of(case), parameters, device=device)
     rollout = simulator.rollout(case["control"] * UP)
@@ -44,7 +43,7 @@ def test_a_sheet_folds_as_in_phystwin_with_self_collision(device, shared_array):
     np.testing.assert_allclose(rollout.position[:10], position[:10], atol=1e-4)
     # The recorded nodes never come nearer than 8.8 mm, so this fold meets no collision; from
     # 12 mm on, spring neighbours would block each other.
-    simulator.set_parameters(replace(parameters, collision_distance=0.012))
+    simulator.set_parameters(parameters.replace(collision_distance=0.012))
     blocked = simulator.rollout(case["control"][:10] * UP)
     assert np.abs(blocked.position - position[:10]).max() > 1e-3
 

@@ -196,7 +196,7 @@ def test_tunables_act_without_another_capture(device):
     simulator = Simulator(model, parameters, device=device)
     simulator.rollout(before.control)
     graph = simulator._recordings[False].graph
-    simulator.set_parameters(replace(as_model(after)[1], stiffness_scale=2.0))
+    simulator.set_parameters(as_model(after)[1].replace(stiffness_scale=2.0))
     simulator.set_material(stiffness=model.stiffness / 3.0, damping=model.damping * 2.0)
     changed = simulator.rollout(after.control)
     oracle = replace(after, stiffness=after.stiffness * 2.0 / 3.0, damping=after.damping * 2.0)
@@ -208,7 +208,7 @@ def test_only_what_moves_the_nodes_is_laid_out(device):
     scene = cube_scene()
     model, parameters = as_model(scene)
     plain = Simulator(model, parameters, device=device)
-    colliding = Simulator(model, replace(parameters, self_collision=True), device=device)
+    colliding = Simulator(model, parameters.replace(self_collision=True), device=device)
     for simulator in (plain, colliding):
         assert not {"engine", "sums"} & set(vars(simulator))
         simulator.rollout(scene.control)
@@ -224,7 +224,7 @@ def test_a_substep_of_another_length_needs_another_simulator(device):
     model, parameters = as_model(cube_scene())
     simulator = Simulator(model, parameters, device=device)
     with pytest.raises(ValueError, match="substeps_per_frame are fixed"):
-        simulator.set_parameters(replace(parameters, substeps_per_frame=41))
+        simulator.set_parameters(parameters.replace(substeps_per_frame=41))
 
 
 @pytest.mark.parametrize(

@@ -100,12 +100,12 @@ def test_one_node_between_two_controls():
 def test_automatic_substeps_are_stable_and_never_coarse():
     scene = cube_scene()
     model, parameters = as_model(scene)
-    parameters = replace(parameters, drag=5.0, frame_duration=1.0 / 25.0)
-    stiff = replace(parameters, stiffness_scale=1e6)
+    parameters = parameters.replace(drag=5.0, frame_duration=1.0 / 25.0)
+    stiff = parameters.replace(stiffness_scale=1e6)
     control = scene.control[0]
     needed = stable_substeps(model, stiff, control)
     assert needed > 1000
-    assert with_stable_substeps(stiff, model, control) == replace(stiff, substeps_per_frame=needed)
+    assert with_stable_substeps(stiff, model, control) == stiff.replace(substeps_per_frame=needed)
     twice = with_stable_substeps(stiff, model, control, safety=2.0 * SAFETY).substeps_per_frame
     assert twice == pytest.approx(2 * needed, abs=1)
     # What is soft is held by the longest step: 25 frames a second are 144 of 1/3600 s each.
@@ -121,11 +121,11 @@ def test_one_spring_is_stable_up_to_the_textbook_step():
     )
     model, parameters = as_model(scene)
     assert largest_stable_step(model, parameters) == pytest.approx(0.1, rel=1e-4)
-    assert largest_stable_step(model, replace(parameters, stiffness_scale=4.0)) == pytest.approx(
+    assert largest_stable_step(model, parameters.replace(stiffness_scale=4.0)) == pytest.approx(
         0.05, rel=1e-4
     )
     # One frame of 1 s needs ten of those, 25 % more for safety.
-    assert stable_substeps(model, replace(parameters, frame_rate=1.0)) == 13
+    assert stable_substeps(model, parameters.replace(frame_rate=1.0)) == 13
 
 
 def test_nothing_stiff_needs_one_substep():
@@ -154,11 +154,11 @@ def test_the_simulator_diverges_beyond_the_step_and_not_before(device):
     )
     model, parameters = as_model(scene)
     step = largest_stable_step(model, parameters)
-    fine = replace(parameters, frame_rate=1.0 / (0.97 * step), substeps_per_frame=1)
+    fine = parameters.replace(frame_rate=1.0 / (0.97 * step), substeps_per_frame=1)
     rollout = Simulator(model, fine, device=device).rollout(scene.control)
     assert np.abs(rollout.velocity).max() < 1.0
     with pytest.raises(SimulationDivergedError):
-        Simulator(model, replace(fine, frame_rate=1.0 / (1.03 * step)), device=device).rollout(
+        Simulator(model, fine.replace(frame_rate=1.0 / (1.03 * step)), device=device).rollout(
             scene.control
         )
 

@@ -31,7 +31,7 @@ def simulator_of(model, parameters=PARAMETERS, threads=None):
 @pytest.mark.parametrize("side", [2, 5])
 def test_parts_move_as_the_oracle_says(side, ground, threads):
     model, control = thrown_block(side, frames=3)
-    parameters = replace(PARAMETERS, ground_height=ground)
+    parameters = PARAMETERS.replace(ground_height=ground)
     position, velocity = simulate(as_scene(model, control, parameters))
     rollout = simulator_of(model, parameters, threads).rollout(control)
     assert np.abs(position[-1] - position[0]).max() > 0.005
@@ -57,7 +57,7 @@ def test_gradients_are_those_of_the_recorded_adjoint(side, monkeypatch):
     fast = block_gradients(model, control, PARAMETERS, "cpu")
     monkeypatch.setattr(CpuAdjoint, "of", lambda *_: None)
     # Other parameters, so that another simulator is made; the difference is far below rounding.
-    slow = block_gradients(model, control, replace(PARAMETERS, frame_rate=30.0 + 1e-9), "cpu")
+    slow = block_gradients(model, control, PARAMETERS.replace(frame_rate=30.0 + 1e-9), "cpu")
     for name, theirs in slow.items():
         assert np.abs(theirs).max() > 0
         error = np.linalg.norm(fast[name] - theirs) / np.linalg.norm(theirs)
@@ -154,7 +154,7 @@ def test_divergence_in_any_part_is_told_and_forgotten():
 
 def test_what_sliders_move_acts_on_the_next_frame():
     model, control = thrown_block(4)
-    changed = replace(PARAMETERS, stiffness_scale=2.0, drag=20.0, ground_height=0.001)
+    changed = PARAMETERS.replace(stiffness_scale=2.0, drag=20.0, ground_height=0.001)
     stiffness, damping = 1.5 * model.stiffness, 0.5 * model.damping
     simulator, slow = simulator_of(model), recorded(model, "cpu")
     before = simulator.rollout(control).position
@@ -168,7 +168,7 @@ def test_what_sliders_move_acts_on_the_next_frame():
 
 def test_self_collision_goes_the_recorded_way():
     model, control = thrown_block(3, frames=2)
-    collides = replace(PARAMETERS, self_collision=True, collision_distance=0.009)
+    collides = PARAMETERS.replace(self_collision=True, collision_distance=0.009)
     simulator = simulator_of(model)
     plain = simulator.rollout(control).position
     simulator.set_parameters(collides)

@@ -92,8 +92,8 @@ def test_nodes_on_top_of_each_other_are_not_joined():
 def test_a_model_has_floors_and_global_values():
     node = np.array([[0.0, 0, 0], [0, 0, 5e-4], [0, 0, 0.1]])
     control = np.array([[0.0, 0, 0], [0, 0, 0.099], [9, 9, 9]])
-    parameters = replace(
-        PARAMETERS, stiffness=10.0, virtual_stiffness=20.0, damping=3.0, virtual_max_neighbors=1,
+    parameters = PARAMETERS.replace(
+        stiffness=10.0, virtual_stiffness=20.0, damping=3.0, virtual_max_neighbors=1,
         rest_length_floor=1e-3, virtual_rest_length_floor=2e-3,
     )  # fmt: skip
     model = build_model(node, control, parameters)
@@ -103,7 +103,7 @@ def test_a_model_has_floors_and_global_values():
     assert model.damping.tolist() == [3] * 5
     assert (model.object_spring_count, model.virtual_spring_count, model.control_count) == (3, 2, 3)
     bare = build_model(
-        node, control, replace(parameters, rest_length_floor=0.0, virtual_rest_length_floor=0.0)
+        node, control, parameters.replace(rest_length_floor=0.0, virtual_rest_length_floor=0.0)
     )
     np.testing.assert_allclose(bare.rest_length, [5e-4, 0.1, 0.0995, 1e-6, 1e-3], rtol=1e-4)
 
@@ -111,8 +111,8 @@ def test_a_model_has_floors_and_global_values():
 def test_a_spring_without_stiffness_is_off_with_its_dashpot():
     node = np.array([[0.0, 0, 0], [0, 0, 0.05]])
     control = np.array([[0.0, 0, 0.01]])
-    parameters = replace(PARAMETERS, stiffness=0.0, virtual_stiffness=20.0, damping=3.0)
-    model = build_model(node, control, replace(parameters, virtual_max_neighbors=1))
+    parameters = PARAMETERS.replace(stiffness=0.0, virtual_stiffness=20.0, damping=3.0)
+    model = build_model(node, control, parameters.replace(virtual_max_neighbors=1))
     assert model.stiffness.tolist() == [0, 20]
     assert model.damping.tolist() == [0, 3]
 
@@ -128,22 +128,22 @@ def test_the_rest_shape_decides_object_springs_but_not_virtual_ones():
 
 def test_the_same_nodes_give_the_same_springs_each_time():
     grid = np.stack(np.meshgrid(*[np.arange(6) * 0.01] * 3), axis=-1).reshape(-1, 3)
-    first = build_model(grid, grid[:3], replace(PARAMETERS, connection_radius=0.02))
-    second = build_model(grid.copy(), grid[:3].copy(), replace(PARAMETERS, connection_radius=0.02))
+    first = build_model(grid, grid[:3], PARAMETERS.replace(connection_radius=0.02))
+    second = build_model(grid.copy(), grid[:3].copy(), PARAMETERS.replace(connection_radius=0.02))
     assert len(first.spring_nodes) > 500
     assert first.spring_nodes.tobytes() == second.spring_nodes.tobytes()
 
 
 def test_a_new_topology_keeps_what_was_fitted_as_a_ratio():
     node, control = cloud(3, 30), cloud(4, 4)
-    fitted = replace(PARAMETERS, stiffness=100.0, virtual_stiffness=50.0, damping=2.0)
+    fitted = PARAMETERS.replace(stiffness=100.0, virtual_stiffness=50.0, damping=2.0)
     built = build_model(node, control, fitted)
     factor = np.random.default_rng(5).uniform(0.5, 2.0, len(built.spring_nodes)).astype(np.float32)
     model = replace(
         built, stiffness=built.stiffness * factor, damping=built.damping / factor,
         initial_velocity=np.full((30, 3), 0.1, dtype=np.float32),
     )  # fmt: skip
-    changed = replace(fitted, connection_radius=0.12, max_neighbors=7, stiffness=300.0, damping=5.0)
+    changed = fitted.replace(connection_radius=0.12, max_neighbors=7, stiffness=300.0, damping=5.0)
     new = retopologize(model, changed, control, fitted=fitted)
     known = {
         frozenset(pair): value

@@ -1,4 +1,3 @@
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from physhandi.errors import CancelledError, SequenceError
 from physhandi.perception.lifting import hand_points, observe_object
 from physhandi.perception.shape import object_nodes_from_observation
 from physhandi.progress import Progress
-from physhandi.simulation.parameters import SimulationParameters
+from physhandi.simulation.parameters import PARAMETERS
 from physhandi.simulation.topology import virtual_springs
 
 SMALL = Recipe(
@@ -74,7 +73,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_one_does_not(small, tmp_
 @pytest.mark.parametrize("which", ["small", "bundled"])
 def test_the_folder_keeps_the_makers_numbers_to_itself(which, request):
     sequence: Sequence = request.getfixturevalue(which)
-    names = {field.name for field in fields(SimulationParameters)} - {
+    names = set(PARAMETERS) - {
         "ground_height",
         "gravity",
         "frame_rate",
