@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import warp as wp
 from jaxtyping import Float
 from numpy import ndarray
 
@@ -18,6 +17,7 @@ from physhandi.data.attempt import Attempt
 from physhandi.data.environment import ENVIRONMENT, describe_environment
 from physhandi.data.run import RunFolder
 from physhandi.data.sequence import Sequence
+from physhandi.devices import describe_device
 from physhandi.errors import MissingInputError
 from physhandi.fitting import artefacts
 from physhandi.fitting.config import (
@@ -384,7 +384,7 @@ def run_job(run: RunFolder, progress: Progress | None = None, *, device: str = "
     """
     with run.begin_attempt() as attempt:
         watched = attempt.progress(progress)
-        environment = describe_environment(device, wp.get_device(device).name)
+        environment = describe_environment(device, describe_device(device))
         attempt.save_json(ENVIRONMENT, environment)
         sequences = [Sequence.load(Path(path)) for path in run.sequences]
         for sequence in sequences:

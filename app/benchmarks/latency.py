@@ -8,11 +8,11 @@ from statistics import median
 from typing import Any
 
 import numpy as np
-import warp as wp
 
 from app.viewer.live.client import LiveRequest, SimulationClient
 from app.viewer.live.wire import Message
 from physhandi.benchmarks.timing import describe_machine
+from physhandi.devices import start_warp
 from physhandi.errors import MissingInputError, SimulationError
 from physhandi.object_rollout import ObjectRollout, load_fitted
 from physhandi.run import Run
@@ -123,7 +123,7 @@ def measure_latency(
         MissingInputError: If the run has no object in this sequence.
         SimulationError: If the process cannot simulate it, dies, or says nothing.
     """
-    wp.init()
+    start_warp()
     take = load_fitted(run, sequence)
     if take is None:
         raise MissingInputError(f"Run '{run.name}' has no object in '{sequence}' to simulate.")

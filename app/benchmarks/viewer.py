@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import warp as wp
-
 from app.benchmarks.browser import (
     measure_first_paint,
     measure_slider_in_browser,
@@ -29,6 +27,7 @@ from app.benchmarks.sliders import FIELDS, Slider, measure_first_move, measure_s
 from app.benchmarks.streams import measure_scrub, measure_sessions, percentiles
 from app.settings import BUNDLED
 from physhandi.benchmarks.timing import describe_machine
+from physhandi.devices import start_warp
 from physhandi.errors import MissingInputError
 from physhandi.run import Run
 
@@ -99,7 +98,7 @@ def measure_viewer(
         MissingInputError: If the run has no object there, or a browser is asked for and missing.
         ServerFailedError: If the server does not start or does not do what it is asked.
     """
-    wp.init()
+    start_warp()
     about = describe_machine("cpu")
     effort = _QUICK if is_quick else _FULL
     position = f"sequences/{sequence}/rollout.npy"

@@ -14,6 +14,7 @@ from app.settings import Settings
 from physhandi.data.files import plain, without_non_finite
 from physhandi.data.run import RunKind
 from physhandi.data.sequence import Sequence
+from physhandi.devices import pick_device
 from physhandi.errors import RunError, UsageError
 from physhandi.fitting.config import load_profile
 from physhandi.progress import Progress
@@ -55,25 +56,6 @@ def read_settings(**given: Any) -> Settings:
 def open_catalog(data_dir: Path | None) -> Catalog:
     """Find sequences and runs in a data folder and among the bundled ones."""
     return Catalog(read_settings(data_dir=data_dir))
-
-
-def pick_device(name: str) -> str:
-    """Turn ``auto`` into the fastest Warp device of this machine, and ``cuda`` into its first GPU.
-
-    Raises:
-        UsageError: If the named device does not exist here.
-    """
-    import warp as wp
-
-    wp.config.log_level = wp.LOG_WARNING  # Its greeting would come before what is printed here.
-    if name == "auto":
-        return "cuda:0" if wp.is_cuda_available() else "cpu"
-    if name == "cuda":
-        name = "cuda:0"
-    known = [str(device) for device in wp.get_devices()]
-    if name not in known:
-        raise UsageError(f"There is no device '{name}' here. There is: {', '.join(known)}.")
-    return name
 
 
 def find_sequence(name: str, data_dir: Path | None) -> Sequence:

@@ -5,7 +5,8 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from app.cli.commands import open_catalog, pick_device, read_settings
+from app.cli.commands import open_catalog, read_settings
+from physhandi.devices import pick_device
 
 
 def examine(data_dir: Path | None) -> tuple[bool, list[str]]:

@@ -10,7 +10,8 @@ from app.cli.arguments import (
     BenchmarkSubsteps,
     BenchmarkViewer,
 )
-from app.cli.commands import find_result, pick_device
+from app.cli.commands import find_result
+from physhandi.devices import pick_device
 from physhandi.errors import UsageError
 
 

@@ -8,8 +8,9 @@ from contextlib import ExitStack
 from functools import partial
 from typing import Any
 
-from app.cli.commands import find_sequence, pick_device, read_settings
+from app.cli.commands import find_sequence, read_settings
 from physhandi.data.sequence import Sequence
+from physhandi.devices import pick_device
 from physhandi.errors import UsageError
 from physhandi.progress import Progress
 
@@ -93,7 +94,7 @@ def _joined(seeds: Iterable[int]) -> str:
 
 def _suite_command(command: Any, device: str) -> str:
     """Write the command again, with all that decides the result."""
-    parts = ["physhandi", "evaluate_suite", "suite"]
+    parts = ["physhandi", "evaluate", "suite"]
     if command.suite or not command.sequences:
         parts += ["--suite", command.suite or "tiny"]
     for name in ("methods", "seeds", "protocols", "sequences"):

@@ -6,7 +6,6 @@ from statistics import median
 from typing import Any
 
 import numpy as np
-import warp as wp
 
 from physhandi.benchmarks.phystwin_like import PhysTwinLike
 from physhandi.benchmarks.scenes import SUBSTEPS, BenchmarkScene, check_positive, scene_of
@@ -17,6 +16,7 @@ from physhandi.benchmarks.timing import (
     describe_traffic,
     time_in_turns,
 )
+from physhandi.devices import start_warp
 from physhandi.simulation.engines.batch import BatchSimulator, MotionTarget
 from physhandi.simulation.master_topology import MasterTopology
 from physhandi.simulation.parameters import SimulationParameters
@@ -62,7 +62,7 @@ def benchmark_batch(
         UsageError: If a number is not positive or the file is missing or incomplete.
     """
     check_positive(candidates=candidate_count)
-    wp.init()
+    start_warp()
     scene = scene_of(topology, node_count, frame_count, substeps_per_frame)
     candidates = _candidates(scene.parameters, candidate_count)
     master = MasterTopology.of(scene.model.object_node, scene.control[0], candidates)

@@ -16,6 +16,7 @@ from physhandi.benchmarks.timing import (
     describe_traffic,
     time_in_turns,
 )
+from physhandi.devices import start_warp
 from physhandi.simulation import differentiable
 from physhandi.simulation.engines.tape import frame_bytes, memory_budget, stored_frames
 
@@ -56,7 +57,7 @@ def benchmark_gradient(
     Raises:
         UsageError: If a number is not positive or the file is missing or incomplete.
     """
-    wp.init()
+    start_warp()
     scene = scene_of(topology, node_count, frame_count, substeps_per_frame)
     about = describe_scene(scene, device)
     baseline = PhysTwinLike(scene.model, scene.parameters, device)

@@ -3,8 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-import warp as wp
-
 from physhandi.benchmarks.phystwin_like import PhysTwinLike
 from physhandi.benchmarks.scenes import SUBSTEPS, BenchmarkScene, scene_of
 from physhandi.benchmarks.timing import (
@@ -14,6 +12,7 @@ from physhandi.benchmarks.timing import (
     describe_traffic,
     time_in_turns,
 )
+from physhandi.devices import start_warp
 from physhandi.simulation.simulator import Simulator
 
 FORWARD_COST = (20, 48, 24)
@@ -49,7 +48,7 @@ def benchmark_rollout(
     Raises:
         UsageError: If a number is not positive or the file is missing or incomplete.
     """
-    wp.init()
+    start_warp()
     scene = scene_of(topology, node_count, frame_count, substeps_per_frame)
     about = describe_scene(scene, device)
     measured = measure_rollout(scene, device, rounds=_ROUNDS)

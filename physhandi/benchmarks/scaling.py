@@ -5,11 +5,11 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
-import warp as wp
 
 from physhandi.benchmarks.rollout import measure_rollout
 from physhandi.benchmarks.scenes import SUBSTEPS, BenchmarkScene, check_positive, synthetic_block
 from physhandi.benchmarks.timing import describe_machine
+from physhandi.devices import start_warp
 
 NODE_COUNTS = (500, 1000, 3000, 10_000, 50_000)
 """Object nodes of the table."""
@@ -47,7 +47,7 @@ def benchmark_scaling(
         UsageError: If a number is not positive.
     """
     check_positive(frames=frame_count, time_limit_s=time_limit_s)
-    wp.init()
+    start_warp()
     begin = time.monotonic()
     rows: list[dict[str, Any]] = []
     skipped: list[dict[str, int]] = []

@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import warp as wp
 from jaxtyping import Float
 from numpy import ndarray
 
 from physhandi.benchmarks.scenes import SUBSTEPS, BenchmarkScene
 from physhandi.benchmarks.timing import describe_scene, time_in_turns
+from physhandi.devices import start_warp
 from physhandi.errors import UsageError
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
@@ -50,7 +50,7 @@ def benchmark_substeps(
         UsageError: If there is no frame to simulate.
         SimulationDivergedError: If a motion runs away.
     """
-    wp.init()
+    start_warp()
     if len(control) < 2:
         raise UsageError(f"{name} has {len(control)} frames; substeps need at least two.")
     automatic = with_stable_substeps(parameters, model, control[0]).substeps_per_frame

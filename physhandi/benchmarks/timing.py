@@ -11,6 +11,7 @@ import warp as wp
 
 from physhandi.benchmarks.scenes import BenchmarkScene
 from physhandi.data.environment import describe_environment
+from physhandi.devices import describe_device
 from physhandi.simulation.stability import stable_substeps
 
 _COPY_SIZE = {"cpu": 1 << 27, "cuda": 1 << 29}
@@ -63,7 +64,7 @@ def copy_bandwidth(device: str) -> float:
 
 def describe_machine(device: str) -> dict[str, Any]:
     """Say on what is measured, and how busy the machine was in the minute before."""
-    told = describe_environment(device, wp.get_device(device).name)
+    told = describe_environment(device, describe_device(device))
     return {
         "device": device,
         "device_name": told["device_name"],

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import warp as wp
 from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.spatial import KDTree
@@ -24,6 +23,7 @@ from physhandi.data.importers.phystwin_experiment import (
 )
 from physhandi.data.run import RunFolder
 from physhandi.data.sequence import Sequence
+from physhandi.devices import describe_device
 from physhandi.errors import ImportFailedError
 from physhandi.fitting import artefacts
 from physhandi.fitting.config import load_profile
@@ -366,7 +366,7 @@ def _fill(
 ) -> None:
     """Store what a fit would have stored, and simulate all frames."""
     folder = artefacts.sequence_folder(sequence.name)
-    environment = describe_environment(device, wp.get_device(device).name)
+    environment = describe_environment(device, describe_device(device))
     attempt.save_json(ENVIRONMENT, environment)
     artefacts.save_sequence_meta(attempt, sequence)
     artefacts.save_observation(attempt, sequence.name, observe_object(sequence, progress))

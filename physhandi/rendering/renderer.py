@@ -11,6 +11,7 @@ from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from physhandi.data.camera import PinholeCamera
+from physhandi.devices import start_warp
 from physhandi.rendering.kernels import (
     NOTHING,
     Grid,
@@ -21,8 +22,6 @@ from physhandi.rendering.kernels import (
 )
 from physhandi.rendering.projection import Projection, project
 from physhandi.rendering.shapes import Shape
-
-wp.config.log_level = wp.LOG_WARNING
 
 NEAR = 1e-3
 """What is nearer to the camera is not seen, unless a caller says otherwise."""
@@ -158,7 +157,7 @@ class _DeviceScene:
     """A projection on a device."""
 
     def __init__(self, projection: Projection, near: float, width: int, device: str) -> None:
-        wp.init()
+        start_warp()
         self.device: Any = wp.get_device(device)
         self.width = width
         self._K, self._near = projection.K, near

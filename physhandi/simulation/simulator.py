@@ -10,6 +10,7 @@ import warp as wp
 from jaxtyping import Float, Float32
 from numpy import ndarray
 
+from physhandi.devices import start_warp
 from physhandi.errors import SimulationDivergedError
 from physhandi.simulation.engines.cpu import CpuEngine
 from physhandi.simulation.engines.cuda import CudaEngine
@@ -21,8 +22,6 @@ from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.self_collision import SelfCollision
 from physhandi.simulation.stability import explain_divergence
-
-wp.config.log_level = wp.LOG_WARNING
 
 SPEED_LIMIT = 50.0
 """A node faster than this has diverged [m/s]."""
@@ -58,7 +57,7 @@ class Simulator:
             parameters: Global parameters; radii and floors have done their work in the model.
             device: Warp device to run on, for example ``"cuda:0"``.
         """
-        wp.init()
+        start_warp()
         self.model = model
         self.parameters = parameters
         self.device = wp.get_device(device)

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import warp as wp
 from jaxtyping import Float
 from numpy import ndarray
 
@@ -26,6 +25,7 @@ from physhandi.data.run import RunFolder
 from physhandi.data.run_folder import EXIT, artefacts, read_json, read_mapping
 from physhandi.data.sequence import Sequence
 from physhandi.data.truth import read_truth
+from physhandi.devices import describe_device
 from physhandi.errors import (
     FitError,
     MissingInputError,
@@ -182,7 +182,7 @@ class Bench:
         self.out = out
         self.common = dict(common)
         self.device = device
-        name = processor_name() if device == "cpu" else wp.get_device(device).name
+        name = processor_name() if device == "cpu" else describe_device(device)
         self.device_name = f"{device} {name}"
         self.progress = progress
         self._settings: dict[str, dict[str, Any]] = {}

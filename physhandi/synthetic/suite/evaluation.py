@@ -8,11 +8,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import warp as wp
-
 from physhandi.data.environment import describe_environment
 from physhandi.data.files import named_fields
 from physhandi.data.sequence import Sequence
+from physhandi.devices import describe_device
 from physhandi.errors import MissingInputError, SequenceError, UsageError
 from physhandi.progress import NullProgress, Progress
 from physhandi.synthetic.code_version import (
@@ -317,7 +316,7 @@ class _Work:
 
 
 def _environment(order: Order) -> dict[str, Any]:
-    return describe_environment(order.device, wp.get_device(order.device).name)
+    return describe_environment(order.device, describe_device(order.device))
 
 
 def _about(order: Order, methods: Many[Method]) -> dict[str, Any]:

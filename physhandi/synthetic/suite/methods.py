@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import warp as wp
 import yaml
 from safetensors.numpy import load_file
 from scipy.spatial.transform import Rotation
@@ -24,6 +23,7 @@ from physhandi.data.environment import ENVIRONMENT, describe_environment
 from physhandi.data.run import RunFolder
 from physhandi.data.run_folder import artefacts
 from physhandi.data.sequence import Sequence
+from physhandi.devices import describe_device
 from physhandi.errors import MissingInputError, UsageError
 from physhandi.hand.loading import load_hand_model
 from physhandi.hand.motion import HandMotion
@@ -358,7 +358,7 @@ def open_suite_run(
 
 def save_environment(attempt: Attempt, device: str) -> None:
     """Note what a run was computed with."""
-    about = describe_environment(device, wp.get_device(device).name)
+    about = describe_environment(device, describe_device(device))
     attempt.save_json(ENVIRONMENT, about)
 
 

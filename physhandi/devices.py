@@ -1,0 +1,85 @@
+"""Devices that simulate: starting Warp without a word, and choosing one by name."""
+
+import ctypes
+import os
+import sys
+import tempfile
+from collections.abc import Generator
+from contextlib import contextmanager
+
+from physhandi.errors import UsageError
+
+
+def start_warp() -> None:
+    """Start Warp, once a process, without its greeting.
+
+    Where there is no CUDA driver, its native library writes a warning to standard error that no
+    setting switches off; nobody asked for a GPU, so it is not shown.
+    """
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_WARNING
+    if has_cuda_driver():
+        wp.init()
+        return
+    with _native_errors_held():
+        wp.init()
+
+
+def has_cuda_driver() -> bool:
+    """Tell whether NVIDIA's driver is installed."""
+    try:
+        ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+    except OSError:
+        return False
+    return True
+
+
+def pick_device(name: str) -> str:
+    """Turn ``auto`` into the fastest Warp device of this machine, and ``cuda`` into its first GPU.
+
+    Raises:
+        UsageError: If the named device does not exist here.
+    """
+    import warp as wp
+
+    start_warp()
+    if name == "auto":
+        return "cuda:0" if wp.is_cuda_available() else "cpu"
+    if name == "cuda":
+        name = "cuda:0"
+    names = [str(device) for device in wp.get_devices()]
+    if name not in names:
+        raise UsageError(f"There is no device '{name}' here. There is: {', '.join(names)}.")
+    return name
+
+
+def describe_device(name: str) -> str:
+    """Give the model of a Warp device, as its driver names it."""
+    import warp as wp
+
+    start_warp()
+    return str(wp.get_device(name).name)
+
+
+@contextmanager
+def _native_errors_held() -> Generator[None]:
+    """Keep what native code writes to standard error, and pass it on if this fails."""
+    try:
+        kept = os.dup(2)
+    except OSError:  # Standard error is closed, so nothing would be seen of it anyway.
+        yield
+        return
+    with tempfile.TemporaryFile() as held:
+        sys.stderr.flush()
+        os.dup2(held.fileno(), 2)
+        try:
+            yield
+        except BaseException:
+            os.dup2(kept, 2)
+            held.seek(0)
+            os.write(2, held.read())
+            raise
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)

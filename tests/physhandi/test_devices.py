@@ -1,0 +1,54 @@
+"""Choosing a device, and starting Warp without a word."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import warp as wp
+
+from physhandi.devices import describe_device, has_cuda_driver, pick_device
+from physhandi.errors import UsageError
+
+
+def run(code: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=Path(__file__).parents[2],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_warp_starts_without_a_word() -> None:
+    code = "from physhandi.devices import start_warp; start_warp(); start_warp()\n"
+    done = run(code + "import sys; sys.stderr.write('still heard')")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "still heard")
+
+
+def test_what_was_written_before_a_failed_start_is_shown() -> None:
+    done = run(
+        "import os, warp\n"
+        "from physhandi import devices\n"
+        "devices.has_cuda_driver = lambda: False\n"
+        "def fail():\n"
+        "    os.write(2, b'native words; ')\n"
+        "    raise RuntimeError('no start')\n"
+        "warp.init = fail\n"
+        "devices.start_warp()\n"
+    )
+    assert done.returncode == 1
+    assert "native words; " in done.stderr
+    assert "RuntimeError: no start" in done.stderr
+
+
+def test_a_device_is_picked_by_name() -> None:
+    assert pick_device("auto") == ("cuda:0" if wp.is_cuda_available() else "cpu")
+    assert pick_device("cpu") == "cpu"
+    assert describe_device("cpu")
+    with pytest.raises(UsageError, match="There is no device 'tpu' here"):
+        pick_device("tpu")
+    if not has_cuda_driver():
+        with pytest.raises(UsageError, match="no device 'cuda:0'"):
+            pick_device("cuda")
