@@ -55,7 +55,7 @@ class Scenes:
     def find(self, session_id: str, owner: str) -> Scene | None:
         return self.opened.get(session_id)
 
-    def farewell(self, session_id: str, owner: str) -> None:
+    def closed_session(self, session_id: str, owner: str) -> None:
         return None
 
     def close(self, session_id: str) -> bool:

@@ -84,7 +84,7 @@ class Scenes(Protocol):
         """Find a live scene of an owner."""
         ...
 
-    def farewell(self, session_id: str, owner: str) -> ClosedScene | None:
+    def closed_session(self, session_id: str, owner: str) -> ClosedScene | None:
         """Remember a live scene of an owner that was closed."""
         ...
 
@@ -160,7 +160,7 @@ def create_pages(
         scene = scenes.find(session_id, request.state.owner)
         if scene is not None:
             return pages.render("live.html", session=session_id, scene=scene.info)
-        closed = scenes.farewell(session_id, request.state.owner)
+        closed = scenes.closed_session(session_id, request.state.owner)
         if closed is not None:
             query = request.url.query
             return pages.render("closed.html", status=404, scene=closed, query=query)

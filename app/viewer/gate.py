@@ -33,8 +33,8 @@ _LEAVING_S = 1.2
 def create_gate(sessions: Sessions) -> APIRouter:
     """Make the routes of the live sessions.
 
-    ``GET /viewer/{session}/`` answers with viser's one page and nothing else; no path is passed
-    on. ``/viewer/{session}`` with or without the slash is the websocket, passed on unchanged.
+    ``GET /viewer/{session_id}/`` answers with viser's one page and nothing else; no path is passed
+    on. ``/viewer/{session_id}`` with or without the slash is the websocket, passed on unchanged.
     Who may come in is decided before the gate; that a session is one's own, here. Each tab has a
     session of its own: a page that is opened while another tab watches the session is sent on to a
     copy, which begins with the same state. A tab that is reloaded has hung up before.
@@ -47,13 +47,13 @@ def create_gate(sessions: Sessions) -> APIRouter:
     page = _PAGE.read_bytes()
     packed = gzip.compress(page, mtime=0)
 
-    @router.get("/viewer/{session}/")
-    async def show_page(session: str, request: Request) -> Response:
-        found = sessions.find(session, request.state.owner)
-        if found is None:
+    @router.get("/viewer/{session_id}/")
+    async def show_page(session_id: str, request: Request) -> Response:
+        session = sessions.find(session_id, request.state.owner)
+        if session is None:
             raise HTTPException(404, _GONE)
-        if await _is_taken(watching, session):
-            copied = await asyncio.to_thread(sessions.copy, found)
+        if await _is_taken(watching, session_id):
+            copied = await asyncio.to_thread(sessions.copy, session)
             headers = {"Cache-Control": "no-store"}
             return RedirectResponse(f"/viewer/{copied}/", 303, headers=headers)
         is_packed = "gzip" in request.headers.get("accept-encoding", "")
@@ -62,24 +62,24 @@ def create_gate(sessions: Sessions) -> APIRouter:
             headers["Content-Encoding"] = "gzip"
         return Response(packed if is_packed else page, media_type="text/html", headers=headers)
 
-    @router.websocket("/viewer/{session}")
-    @router.websocket("/viewer/{session}/")
-    async def pass_on(websocket: WebSocket, session: str) -> None:
-        found = sessions.find(session, websocket.state.owner)
-        if found is None:
+    @router.websocket("/viewer/{session_id}")
+    @router.websocket("/viewer/{session_id}/")
+    async def pass_on(websocket: WebSocket, session_id: str) -> None:
+        session = sessions.find(session_id, websocket.state.owner)
+        if session is None:
             await _refuse(websocket, 404, _GONE)
             return
-        watching[session] += 1
+        watching[session_id] += 1
         upstream: ClientConnection | None = None
         try:
-            upstream = await _connect(websocket, found.port)
+            upstream = await _connect(websocket, session.port)
             if upstream is not None:
                 await _exchange(websocket, upstream)
         finally:
             # Before the scene has hung up, which may take long: the tab may be coming back.
-            watching[session] -= 1
-            if watching[session] <= 0:
-                del watching[session]
+            watching[session_id] -= 1
+            if watching[session_id] <= 0:
+                del watching[session_id]
             if upstream is not None:
                 await upstream.close()
 
@@ -113,10 +113,10 @@ async def _connect(websocket: WebSocket, port: int) -> ClientConnection | None:
     return upstream
 
 
-async def _is_taken(watching: Counter[str], session: str) -> bool:
+async def _is_taken(watching: Counter[str], session_id: str) -> bool:
     """Tell whether another tab watches a session, and goes on watching it."""
     end = asyncio.get_running_loop().time() + _LEAVING_S
-    while watching[session] > 0:
+    while watching[session_id] > 0:
         if asyncio.get_running_loop().time() > end:
             return True
         await asyncio.sleep(0.03)

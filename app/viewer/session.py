@@ -100,7 +100,7 @@ class Session(SceneServer):
                 is_playing=self._playback.is_playing,
                 speed=self._playback.speed,
                 does_loop=self._playback.does_loop,
-                layers=replace(self._stage.scene.layers),
+                layers=replace(self._view.scene.layers),
                 theme=theme,
                 prefers_dark=prefers_dark,
                 parameters=history.current if history is not None else None,
@@ -127,9 +127,9 @@ class Session(SceneServer):
         run = self._catalog.run(self._target) if self.kind == "run" else None
         with self._lock:
             frame = self._playback.frame
-            take, take_frame = self._take(frame)
-            snapshot = self._stage.snapshot(self._content, frame, take, take_frame)
-            layers = replace(self._stage.scene.layers)
+            rollout, rollout_frame = self._rollout_at(frame)
+            snapshot = self._view.snapshot(self._content, frame, rollout, rollout_frame)
+            layers = replace(self._view.scene.layers)
         return replace(snapshot, run=run, layers=layers, link=self.link_of(self))
 
     def go(self, frame: int) -> None:
@@ -187,7 +187,7 @@ class Session(SceneServer):
         content = self._content
         framing = frame_content(content)
         scene = SceneDrawing(self._server, content, framing)
-        self._stage = ViewSwitch(scene, self._figure, self._pin)
+        self._view = ViewSwitch(scene, self._figure, self._pin)
         self._layers.replace(content, scene.layers, framing, has_surface=scene.may_have_surface)
         self._inspection.replace(content, scene, framing)
         run = self._catalog.run(self._target) if self.kind == "run" else None
@@ -238,7 +238,7 @@ class Session(SceneServer):
             if self._object is not None:
                 self._object.remove()
                 self._object = None
-            self._stage.clear()
+            self._view.clear()
             self._content.close()
             self._content = content
             self._playback.replace(content.frame_count, content.frame_rate)
@@ -267,15 +267,15 @@ class Session(SceneServer):
 
     def _draw(self, frame: int, is_playing: bool) -> None:
         with self._lock, TURN:
-            take, take_frame = self._take(frame)
-            self._stage.draw(frame, take, take_frame, is_playing=is_playing)
+            rollout, rollout_frame = self._rollout_at(frame)
+            self._view.draw(frame, rollout, rollout_frame, is_playing=is_playing)
             self._timeline.show(is_playing=is_playing)
             self._inspection.show(
-                take,
+                rollout,
                 frame,
-                take_frame,
+                rollout_frame,
                 is_playing=is_playing,
-                is_hidden=(self._figure.is_on or self._pin.is_on) and take is not None,
+                is_hidden=(self._figure.is_on or self._pin.is_on) and rollout is not None,
             )
             if self._object is not None:
                 self._object.show(frame, is_playing=is_playing)
@@ -285,7 +285,7 @@ class Session(SceneServer):
         """Find the rollout that was asked for last, as far as it is there."""
         return self._object.newest if self._object is not None else self._content.fitted
 
-    def _take(self, frame: int) -> tuple[ObjectRollout | None, int]:
+    def _rollout_at(self, frame: int) -> tuple[ObjectRollout | None, int]:
         """Find the rollout to show in a frame, and which of its frames."""
         if self._object is not None:
             return self._object.at(frame)
@@ -303,40 +303,42 @@ class ViewSwitch:
         self._shown: SceneDrawing | FigureMode | PinMode = scene
 
     def draw(
-        self, frame: int, take: ObjectRollout | None, take_frame: int, *, is_playing: bool
+        self, frame: int, rollout: ObjectRollout | None, rollout_frame: int, *, is_playing: bool
     ) -> None:
         """Bring what is seen to a frame.
 
         Args:
             frame: Frame of hands, observation and cameras.
-            take: The object's rollout; None without an object.
-            take_frame: Frame of the rollout, which may lag behind while it is being computed.
+            rollout: The object's rollout; None without an object.
+            rollout_frame: Frame of the rollout, which may lag behind while it is being computed.
             is_playing: Whether the clock is running.
         """
-        mode = self._mode(take)
+        mode = self._mode(rollout)
         now = self.scene if mode is None else mode
         if now is not self._shown:
             self._shown.hide()
             self._shown = now
-        if mode is None or take is None:
-            self.scene.draw(frame, take, take_frame, is_playing=is_playing)
+        if mode is None or rollout is None:
+            self.scene.draw(frame, rollout, rollout_frame, is_playing=is_playing)
         else:
-            mode.draw(take, take_frame, frame, self.scene.layers, is_playing=is_playing)
+            mode.draw(rollout, rollout_frame, frame, self.scene.layers, is_playing=is_playing)
 
     def snapshot(
-        self, content: Content, frame: int, take: ObjectRollout | None, take_frame: int
+        self, content: Content, frame: int, rollout: ObjectRollout | None, rollout_frame: int
     ) -> Snapshot:
         """Collect what is seen, for the export panel."""
-        snapshot = Snapshot(content=content, frame=frame, rollout=take, rollout_frame=take_frame)
-        mode = self._mode(take)
-        if mode is None or take is None:
+        snapshot = Snapshot(
+            content=content, frame=frame, rollout=rollout, rollout_frame=rollout_frame
+        )
+        mode = self._mode(rollout)
+        if mode is None or rollout is None:
             return snapshot
-        sides = mode.sides(take, take_frame, frame)
+        sides = mode.sides(rollout, rollout_frame, frame)
         return replace(snapshot, sides=sides, picture=mode.framed_picture)
 
-    def _mode(self, take: ObjectRollout | None) -> FigureMode | PinMode | None:
+    def _mode(self, rollout: ObjectRollout | None) -> FigureMode | PinMode | None:
         """Tell what is shown instead of the scene."""
-        if take is None:
+        if rollout is None:
             return None
         return next((mode for mode in (self._pin, self._figure) if mode.is_on), None)
 

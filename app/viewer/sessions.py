@@ -6,8 +6,9 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, get_args
+from typing import get_args
 
+from app.settings import Settings
 from app.viewer.compare.session import CompareSession
 from app.viewer.content.content import Catalog
 from app.viewer.content.session_state import Kind, SessionInfo, SessionState
@@ -28,25 +29,6 @@ AnySession = Session | CompareSession
 
 class TooManySessionsError(PhysHandiError):
     """No further live session can be opened now."""
-
-
-class ViewerSettings(Protocol):
-    """What the sessions need to know of the server's settings."""
-
-    @property
-    def live_sessions(self) -> int:
-        """Most live sessions at a time."""
-        ...
-
-    @property
-    def live_idle_s(self) -> float:
-        """Seconds after which a session that nobody looks at is closed."""
-        ...
-
-    @property
-    def device(self) -> str:
-        """Warp device of the live simulation."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +55,7 @@ class Sessions:
 
     def __init__(
         self,
-        settings: ViewerSettings,
+        settings: Settings,
         catalog: Catalog,
         storage: UserStorage | None = None,
     ) -> None:
@@ -89,7 +71,7 @@ class Sessions:
         self._catalog = catalog
         self._lock = threading.Lock()
         self._sessions: dict[str, AnySession] = {}
-        self._farewells: OrderedDict[str, ClosedSession] = OrderedDict()
+        self._closed_sessions: OrderedDict[str, ClosedSession] = OrderedDict()
         self._opening = 0
         self.link_of: Callable[[Session], str] = lambda _: ""
         self.live = SimulationClient(settings.device)
@@ -148,11 +130,11 @@ class Sessions:
         session = self.get(session_id)
         return session if session is not None and session.owner == owner else None
 
-    def farewell(self, session_id: str, owner: str) -> ClosedSession | None:
+    def closed_session(self, session_id: str, owner: str) -> ClosedSession | None:
         """Remember a session of an owner that was closed; None if there was none."""
         with self._lock:
-            farewell = self._farewells.get(session_id)
-        return farewell if farewell is not None and farewell.owner == owner else None
+            closed = self._closed_sessions.get(session_id)
+        return closed if closed is not None and closed.owner == owner else None
 
     def list(self) -> list[SessionInfo]:
         """Describe all sessions, the oldest first."""
@@ -170,15 +152,15 @@ class Sessions:
         with self._lock:
             session = self._sessions.pop(session_id, None)
             if session is not None:
-                self._farewells[session_id] = ClosedSession(
+                self._closed_sessions[session_id] = ClosedSession(
                     kind=session.kind,
                     target=session.target,
                     title=session.info.title,
                     owner=session.owner,
                     reason=reason,
                 )
-                while len(self._farewells) > _REMEMBERED:
-                    self._farewells.popitem(last=False)
+                while len(self._closed_sessions) > _REMEMBERED:
+                    self._closed_sessions.popitem(last=False)
         if session is not None:
             session.close()
         return session is not None

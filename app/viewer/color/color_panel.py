@@ -153,7 +153,7 @@ class ColorPanel:
     def _type(self) -> None:
         """Take over the ends that a user typed, and hold them."""
         painter = self._painter
-        low, high = (float(end) for end in self._range.take())
+        low, high = (float(end) for end in self._range.read())
         if painter is None or self._layers.color == "plain":
             return
         factor = painter.quantity(self._layers.color).factor

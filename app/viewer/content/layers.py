@@ -75,6 +75,6 @@ def default_layers(content: Content) -> Layers:
     )
 
 
-def _has_few_springs(take: ObjectRollout) -> bool:
+def _has_few_springs(rollout: ObjectRollout) -> bool:
     """Tell whether all springs fit into a playing frame; they make nodes read as cloth or rope."""
-    return take.model.object_spring_count <= PLAYING_SPRINGS
+    return rollout.model.object_spring_count <= PLAYING_SPRINGS

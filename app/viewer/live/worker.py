@@ -241,11 +241,11 @@ class SimulationWorker:
 
     def _object(self, request: Message) -> FittedObject:
         key = (str(request["run"]), str(request["sequence"]))
-        known = self._objects.get(request["session"])
-        if known is None or known[0] != key:
-            known = (key, FittedObject(*key))
-            self._objects[request["session"]] = known
-        return known[1]
+        loaded = self._objects.get(request["session"])
+        if loaded is None or loaded[0] != key:
+            loaded = (key, FittedObject(*key))
+            self._objects[request["session"]] = loaded
+        return loaded[1]
 
 
 _CUBE = SimulationParameters(

@@ -81,7 +81,7 @@ class ErrorPanel:
         self._source = "the tracks" if content.tracks is None else content.tracks.name
         self._track = np.full(count, np.nan) if track_error is None else track_error[:count]
         self._again = np.zeros(count)
-        self._take: ObjectRollout = fitted
+        self._rollout: ObjectRollout = fitted
         self._measured = 0
         self._frame = 0
         self._refreshed = 0.0
@@ -110,20 +110,20 @@ class ErrorPanel:
                 self._frame = frame
                 self._write(at_once=not is_playing)
 
-    def follow(self, take: ObjectRollout, *, at_once: bool) -> None:
+    def follow(self, rollout: ObjectRollout, *, at_once: bool) -> None:
         """Measure the frames of a rollout that have become ready.
 
         Args:
-            take: The newest rollout.
+            rollout: The newest rollout.
             at_once: Whether to show it even if the plot is fresh.
         """
         with self._lock:
-            if take is not self._take:
-                self._take, self._measured = take, 0
+            if rollout is not self._rollout:
+                self._rollout, self._measured = rollout, 0
                 self._again = np.zeros(len(self._track))
-            is_fit = take is self._fitted
-            for frame in range(self._measured, 0 if is_fit else take.ready):
-                self._again[frame] = take.frame_distance(self._fitted, frame)
+            is_fit = rollout is self._fitted
+            for frame in range(self._measured, 0 if is_fit else rollout.ready):
+                self._again[frame] = rollout.frame_distance(self._fitted, frame)
                 self._measured = frame + 1
             self._write(at_once=at_once)
 
@@ -131,7 +131,7 @@ class ErrorPanel:
     def errors(self) -> tuple[float, float]:
         """Errors of the current frame [m]: fit against tracks, re-simulation against fit."""
         frame = min(self._frame, len(self._track) - 1)
-        is_there = self._take is self._fitted or frame < self._measured
+        is_there = self._rollout is self._fitted or frame < self._measured
         return float(self._track[frame]), float(self._again[frame]) if is_there else float("nan")
 
     def _write(self, *, at_once: bool) -> None:
@@ -143,7 +143,7 @@ class ErrorPanel:
         track, again = self.errors
         fit = self._words(_FIT, "fit", track, f"from {self._source}")
         new = ""
-        if self._take is not self._fitted:
+        if self._rollout is not self._fitted:
             new = self._words(_AGAIN, "re-simulated", again, "from the fit")
         said = "<br/>".join(text for text in (fit, new) if text) or "Move a slider to compare."
         self._text.content = f'<div style="{_STYLE}">{said}</div>'
@@ -158,7 +158,7 @@ class ErrorPanel:
     def _curves(self) -> list[Float[ndarray, " frame"]]:
         """Collect the curves, as far as the rollout is simulated."""
         again = self._again.copy()
-        if self._take is not self._fitted:
+        if self._rollout is not self._fitted:
             again[self._measured :] = np.nan
         tracks = [self._track] if np.isfinite(self._track).any() else []
         return [curve * self._per_unit for curve in (*tracks, again)]

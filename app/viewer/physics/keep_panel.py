@@ -2,14 +2,14 @@
 
 import html
 import threading
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import viser
 
+from app.jobs.catalog import Catalog
 from app.viewer.content.content import Content
 from app.viewer.live.rollouts import LiveRollouts
 from app.viewer.physics.history import History
@@ -23,25 +23,12 @@ from app.viewer.physics.presets import (
 from app.viewer.ui.followed import FollowedChoice
 from app.viewer.ui.guard import Guard, notify
 from physhandi.data.run_folder import new_run_id
-from physhandi.data.sequence import Sequence
 from physhandi.errors import UsageError
 from physhandi.run import Run
 from physhandi.simulation.parameters import SimulationParameters, parameter_changes
 
 _POLL_S = 0.3
 _MOST_LETTERS = 80
-
-
-class RunCatalog(Protocol):
-    """Finds runs, and the recordings behind them."""
-
-    def run(self, run_id: str, /) -> Run:
-        """Open a run."""
-        ...
-
-    def sequences_of(self, run: Run) -> list[Sequence]:
-        """Open the sequences of a run; raises `SequenceError` if one is gone."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +57,7 @@ class RunSaver:
     parameters give the same motion.
     """
 
-    def __init__(self, catalog: RunCatalog, folder: Path, start: Callable[[Run], None]) -> None:
+    def __init__(self, catalog: Catalog, folder: Path, start: Callable[[Run], None]) -> None:
         """Prepare.
 
         Args:
@@ -113,24 +100,26 @@ class RunSaver:
         return run
 
     def follow(
-        self, run: Run, tell: Callable[[SavedRun], None], is_over: threading.Event
+        self, run: Run, report: Callable[[SavedRun], None], is_closed: threading.Event
     ) -> threading.Thread:
-        """Tell how far a run is whenever that changes, until it ends or nobody listens.
+        """Report how far a run is whenever that changes, until it ends or nobody listens.
 
         Args:
             run: A run that `save` made.
-            tell: Is told, in a thread of its own.
-            is_over: Set when nobody listens any more.
+            report: Called in a thread of its own.
+            is_closed: Set when nobody listens any more.
         """
 
         def watch() -> None:
-            told: SavedRun | None = None
-            while not is_over.is_set() and not (told is not None and told.is_over):
+            reported: SavedRun | None = None
+            while not is_closed.is_set():
                 now = SavedRun(id=run.id, name=run.name, state=run.state, error=run.error)
-                if now != told:
-                    tell(now)
-                    told = now
-                time.sleep(_POLL_S)
+                if now != reported:
+                    report(now)
+                    reported = now
+                if now.is_over:
+                    return
+                is_closed.wait(_POLL_S)
 
         thread = threading.Thread(target=watch, name=f"saving-{run.id}", daemon=True)
         thread.start()
@@ -244,7 +233,7 @@ class PresetChoice:
         self.show()
 
     def _hear(self) -> None:
-        preset = self._presets.get(self._choice.take())
+        preset = self._presets.get(self._choice.read())
         if preset is None:
             self.show()  # "By hand" is what the list says, nothing to choose.
             return

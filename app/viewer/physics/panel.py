@@ -166,7 +166,7 @@ class SubstepsChoice:
         self._in_use = readout.substeps_per_frame
 
     def _hear_choice(self) -> None:
-        history, choice = self._history, self._followed.take()
+        history, choice = self._history, self._followed.read()
         if choice == SUBSTEPS_BY_HAND:
             # Nothing is simulated anew before another number is typed.
             self._number.value, self._number.visible = self._in_use, True
@@ -381,7 +381,7 @@ class PhysicsPanel:
         self._change(lambda: self.history.set_substeps(number, is_automatic=is_automatic))
 
     def _put_one_back(self) -> None:
-        fields = self._changed.get(self._put_back.take())
+        fields = self._changed.get(self._put_back.read())
         if fields:
             self._change(lambda: self.history.put_back(*fields))
 

@@ -10,7 +10,7 @@ class FollowedChoice:
     """A list or a field that both the program and a user set.
 
     Viser stores a user's choice on its event loop before it calls anybody, so a value that was not
-    the last one written or taken here is a user's that is about to be heard. The program writes on
+    the last one written or read here is a user's that is about to be heard. The program writes on
     the same loop: no user's choice can come between looking and writing.
 
     Attributes:
@@ -27,15 +27,15 @@ class FollowedChoice:
         self.handle = handle
         self._guard = guard
         self._lock = threading.Lock()
-        self._known: Any = handle.value
+        self._last: Any = handle.value
 
     def show(self, value: Any) -> None:
         """Name what is in force, unless a user's choice is about to be heard."""
 
         def write() -> None:
             with self._lock:
-                if self.handle.value == self._known != value:
-                    self._known = value
+                if self.handle.value == self._last != value:
+                    self._last = value
                     self.handle.value = value
 
         self._guard.on_event_loop(write)
@@ -46,15 +46,15 @@ class FollowedChoice:
         def write() -> None:
             with self._lock:
                 if tuple(self.handle.options) != options:
-                    is_heard = self.handle.value == self._known
+                    is_heard = self.handle.value == self._last
                     self.handle.options = options
                     if is_heard:
-                        self._known = self.handle.value
+                        self._last = self.handle.value
 
         self._guard.on_event_loop(write)
 
-    def take(self) -> Any:
+    def read(self) -> Any:
         """Read the control, whoever has set it."""
         with self._lock:
-            self._known = self.handle.value
-            return self._known
+            self._last = self.handle.value
+            return self._last

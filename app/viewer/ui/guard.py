@@ -64,10 +64,10 @@ class Guard:
                 callback(event)
             except PhysHandiError as error:
                 logger.warning("%s was refused: %s", callback.__qualname__, error)
-                self._tell(event, "Not possible", error)
+                self._notify(event, "Not possible", error)
             except Exception as error:
                 logger.exception("%s failed", callback.__qualname__)
-                self._tell(event, "Something went wrong", error)
+                self._notify(event, "Something went wrong", error)
 
         return guarded
 
@@ -88,7 +88,7 @@ class Guard:
         """
         self._server.get_event_loop().call_soon_threadsafe(action)
 
-    def _tell(self, event: Any, title: str, error: Exception) -> None:
+    def _notify(self, event: Any, title: str, error: Exception) -> None:
         lines = str(error).splitlines() or [type(error).__name__]
         target = event if isinstance(event, viser.ClientHandle) else event.client
         notify(target or self._server, title, lines[0])

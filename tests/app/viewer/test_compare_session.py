@@ -261,7 +261,7 @@ def test_an_ask_survives_its_query() -> None:
     assert CompareAsk(a="x", b="y").query == "a=x&b=y"
 
 
-def test_a_copy_and_a_farewell_know_the_pair(sessions: Sessions) -> None:
+def test_a_copy_and_a_closed_session_know_the_pair(sessions: Sessions) -> None:
     first = sessions.open("comparison", "a=sheet&b=moved&mode=overlay&f=7", "me")
     session = sessions.get(first)
     assert session is not None
@@ -270,9 +270,9 @@ def test_a_copy_and_a_farewell_know_the_pair(sessions: Sessions) -> None:
     assert copied.target == session.target == "a=sheet&b=moved&mode=overlay&f=7"
     assert sessions.find(first, "somebody else") is None
     sessions.close(first, "Enough.")
-    farewell = sessions.farewell(first, "me")
-    assert farewell is not None
-    assert (farewell.kind, farewell.target) == ("comparison", session.target)
+    closed = sessions.closed_session(first, "me")
+    assert closed is not None
+    assert (closed.kind, closed.target) == ("comparison", session.target)
 
 
 def test_the_numbers_of_both_sides_can_be_saved(sessions: Sessions) -> None:

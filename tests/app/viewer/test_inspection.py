@@ -62,7 +62,7 @@ def commands(client) -> dict[tuple[str, str | None], str]:
 
 def show_only_nodes(session, client) -> None:
     """Hide what holds the sheet, so that only nodes can be hit from above."""
-    layers = session._stage.scene.layers
+    layers = session._view.scene.layers
     press(client, "6"), press(client, "5")
     client.until(lambda: not (layers.controls or layers.virtual_springs))
     client.until(lambda: client.visible.get("/springs/virtual") is False)
@@ -213,7 +213,7 @@ def test_keys_move_the_clock_switch_layers_and_turn_colors_over(paused) -> None:
     client.until(lambda: client.value("Speed") == pytest.approx(1.0))
     # Again and again: the clock is started last of all that the key before does.
     client.until(lambda: press(client, "K") or not session._playback.is_playing)
-    layers = session._stage.scene.layers
+    layers = session._view.scene.layers
     press(client, "2")
     client.until(lambda: not layers.nodes and client.visible.get("/object/nodes") is False)
     # The run has no hand: its key does nothing.

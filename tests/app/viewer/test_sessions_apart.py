@@ -131,10 +131,10 @@ def test_what_was_closed_says_why_to_its_owner(catalog) -> None:
         sessions.get(session_id)._seen -= 1.0
         settings.live_idle_s = 0.2  # Not earlier: the sessions look after themselves, too.
         assert sessions.reap() == 1 or sessions.get(session_id) is None
-        farewell = sessions.farewell(session_id, "me")
-        assert (farewell.kind, farewell.target) == ("run", "sheet")
-        assert farewell.reason == "Nobody looked at it for 0.2 seconds."
-        assert sessions.farewell(session_id, "somebody") is None
+        closed = sessions.closed_session(session_id, "me")
+        assert (closed.kind, closed.target) == ("run", "sheet")
+        assert closed.reason == "Nobody looked at it for 0.2 seconds."
+        assert sessions.closed_session(session_id, "somebody") is None
         assert sessions.find(session_id, "me") is None
     finally:
         sessions.shutdown()
@@ -148,7 +148,7 @@ def test_one_s_own_forgotten_tab_makes_room(catalog) -> None:
         sessions.get(theirs)._seen -= 90.0
         new = sessions.open("run", "sheet", "me")
         assert {info.id for info in sessions.list()} == {theirs, new}
-        assert sessions.farewell(mine, "me").reason.startswith("It made room")
+        assert sessions.closed_session(mine, "me").reason.startswith("It made room")
     finally:
         sessions.shutdown()
 
