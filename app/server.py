@@ -40,6 +40,7 @@ from physhandi.errors import (
     PhysHandiError,
     SequenceError,
     SettingsError,
+    SimulationError,
     UsageError,
     describe,
 )
@@ -59,6 +60,7 @@ _STATUS: tuple[tuple[type[PhysHandiError], int, str], ...] = (
     (UsageError, 422, "invalid"),
     (SequenceError, 422, "unusable_sequence"),
     (MissingInputError, 422, "missing_input"),
+    (SimulationError, 422, "invalid"),
 )
 
 

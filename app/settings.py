@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
-from app.child import PACKAGE_ROOT
+from physhandi.child import PACKAGE_ROOT
 
 BUNDLED = PACKAGE_ROOT / "sequences"
 WEB_ASSETS = PACKAGE_ROOT / "web_assets"

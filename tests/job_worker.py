@@ -1,14 +1,13 @@
 """A worker for tests of the queue: the run's name tells what it does."""
 
-import argparse
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
+from physhandi.child import Channel, run_child
 from physhandi.data.attempt import Attempt
 from physhandi.errors import MissingInputError
 from physhandi.run import Run
@@ -106,12 +105,8 @@ def crash(run: Run, attempt: Attempt) -> None:
 BEHAVIOURS = {f.__name__: f for f in (publish, wait, stubborn, killed, fail, crash, defect, script)}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--run-dir", type=Path, required=True)
-    parser.add_argument("--device", required=True)
-    options, _ = parser.parse_known_args()
-    run = Run.open(options.run_dir)
+def work(channel: Channel) -> None:
+    run = Run.open(channel.arguments[0])
     if run.name == "silent":
         raise SystemExit(5)
     with run.begin_attempt() as attempt:
@@ -119,4 +114,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_child(work)

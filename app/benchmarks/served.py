@@ -17,7 +17,7 @@ from urllib.parse import parse_qs, urlsplit
 import psutil
 
 from app.benchmarks.viewer_client import ViewerClient
-from app.child import PACKAGE_ROOT
+from physhandi.child import PACKAGE_ROOT
 from physhandi.errors import PhysHandiError
 
 _START = "from app.cli import main; main()"

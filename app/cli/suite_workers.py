@@ -1,26 +1,21 @@
 """Processes that make the sequences of a suite and fill its cells, a few side by side."""
 
 import itertools
-import json
 import os
 import queue
-import subprocess
-import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from collections.abc import Sequence as Many
-from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any, TextIO
+from typing import Any
 
-from app.child import die_with_parent, start_module
-from physhandi import errors
+from physhandi.child import Channel, Child, ChildEndedError, run_child
 from physhandi.data.sequence import Sequence
-from physhandi.errors import PhysHandiError, UsageError, describe
+from physhandi.errors import PhysHandiError, RunError, UsageError
 from physhandi.progress import Progress
 from physhandi.synthetic.suite.evaluation import Fill, Order, Task
 from physhandi.synthetic.suite.suite import Making
@@ -47,11 +42,11 @@ def order_from_json(about: dict[str, Any]) -> Order:
     return Order(**read)
 
 
-class _Told(Progress):
+class _ToldProgress(Progress):
     """Tells the parent how far the work is, a few times a second."""
 
-    def __init__(self, tell: Callable[..., None]) -> None:
-        self._tell = tell
+    def __init__(self, channel: Channel) -> None:
+        self._channel = channel
         self._last = 0.0
 
     def report(
@@ -64,52 +59,33 @@ class _Told(Progress):
     ) -> None:
         if time.monotonic() - self._last >= _TELL_EVERY:
             self._last = time.monotonic()
-            self._tell(stage=stage, iteration=iteration, total=total)
+            self._channel.tell(stage=stage, iteration=iteration, total=total)
 
 
-def work(requests: TextIO, answers: TextIO) -> None:
-    """Do what is asked for until nothing more is."""
+def work(channel: Channel) -> None:
+    """Do what is asked for until nothing more is, on processors that no sibling uses."""
     from physhandi.synthetic.suite.evaluation import filler
     from physhandi.synthetic.suite.suite import make_recording
 
-    def tell(**about: object) -> None:
-        answers.write(json.dumps(about) + "\n")
-        answers.flush()
-
-    progress = _Told(tell)
-    fill: Callable[[int], None] | None = None
-    for line in requests:
-        asked = json.loads(line)
-        try:
-            if "make" in asked:
-                make_recording(asked["make"], Path(asked["target"]), progress)
-            elif "order" in asked:
-                fill = filler(order_from_json(asked["order"]), Path(asked["out"]), progress)
-            elif fill is None:
-                raise UsageError("A cell was asked for before an order.")
-            else:
-                fill(asked["cell"])
-        except (PhysHandiError, OSError, MemoryError) as error:
-            tell(error=describe(error), kind=type(error).__name__)
-        else:
-            tell(done=True)
-
-
-def main(arguments: list[str]) -> None:
-    """Work for a parent, on processors that no other of its children uses."""
-    die_with_parent(int(arguments[0]))
     if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {int(number) for number in arguments[1].split(",")})
-    # Libraries print to standard output; answers have that place to themselves.
-    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)
-    work(sys.stdin, answers)
+        os.sched_setaffinity(0, {int(number) for number in channel.arguments[0].split(",")})
+    progress = _ToldProgress(channel)
+    fill: Callable[[int], None] | None = None
+    for asked in channel.requests():
+        if "make" in asked:
+            make_recording(asked["make"], Path(asked["target"]), progress)
+        elif "order" in asked:
+            fill = filler(order_from_json(asked["order"]), Path(asked["out"]), progress)
+        elif fill is None:
+            raise UsageError("A cell was asked for before an order.")
+        else:
+            fill(asked["cell"])
+        channel.tell(done=True)
 
 
 MOST = 64
 """Processes at most."""
 _LISTEN = 0.2
-_ENDED = object()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,10 +101,9 @@ class _Job:
 class _Worker:
     """One process, and what it is doing."""
 
-    process: "subprocess.Popen[str]"
-    requests: IO[str]
+    child: Child
     listener: threading.Thread
-    order: str = ""
+    order: Mapping[str, Any] | None = None
     """The order that it was told last."""
     jobs: "deque[_Job | None]" = field(default_factory=deque["_Job | None"])
     """What it owes an answer for, the oldest first; None stands for an order."""
@@ -155,7 +130,7 @@ class SuiteWorkers:
             UsageError: If the number makes no sense.
         """
         if not 2 <= count <= MOST:
-            raise errors.UsageError(f"{count} processes make no sense; choose 2 to {MOST}.")
+            raise UsageError(f"{count} processes make no sense; choose 2 to {MOST}.")
         self._progress = progress
         self._heard: queue.Queue[tuple[int, Any]] = queue.Queue()
         self._workers = [self._start(number, share) for number, share in enumerate(_shares(count))]
@@ -170,12 +145,10 @@ class SuiteWorkers:
         _trace: TracebackType | None,
     ) -> None:
         for worker in self._workers:
-            worker.process.kill()
+            worker.child.kill()
         for worker in self._workers:
-            worker.process.wait()
             worker.listener.join()
-            with suppress(BrokenPipeError):  # A request that was never read.
-                worker.requests.close()
+            worker.child.close()
 
     def make(self, makings: Mapping[Path, Making]) -> None:
         """Make sequences of a suite.
@@ -201,7 +174,7 @@ class SuiteWorkers:
             order: What is evaluated.
             out: Folder of the suite.
         """
-        told = json.dumps({"order": order_to_json(order), "out": str(out.resolve())})
+        asked = {"order": order_to_json(order), "out": str(out.resolve())}
 
         def fill(tasks: Many[Task]) -> Iterator[int]:
             jobs = [
@@ -212,11 +185,13 @@ class SuiteWorkers:
                 )
                 for number in _in_order(tasks)
             ]
-            return self._done("suite", jobs, told)
+            return self._done("suite", jobs, asked)
 
         return fill
 
-    def _done(self, stage: str, jobs: Many[_Job], order: str = "") -> Iterator[int]:
+    def _done(
+        self, stage: str, jobs: Many[_Job], order: Mapping[str, Any] | None = None
+    ) -> Iterator[int]:
         """Have jobs done; yields their numbers as they are finished."""
         waiting = deque(jobs)
         finished = 0
@@ -230,10 +205,10 @@ class SuiteWorkers:
                 continue
             worker = self._workers[number]
             job = worker.jobs[0] if worker.jobs else None
-            if answer is _ENDED:
-                raise _lost(worker)
-            if "error" in answer:
-                raise _as_error(answer)
+            if isinstance(answer, ChildEndedError):
+                raise _lost(worker, answer)
+            if isinstance(answer, PhysHandiError):
+                raise answer
             if "done" in answer:
                 worker.jobs.popleft()
                 if job is not None:
@@ -247,55 +222,41 @@ class SuiteWorkers:
             told = " · ".join(w.state for w in self._workers if w.state)
             self._progress.report(stage, finished, len(jobs), message=told)
 
-    def _give(self, worker: _Worker, waiting: deque[_Job], order: str) -> None:
+    def _give(self, worker: _Worker, waiting: deque[_Job], order: Mapping[str, Any] | None) -> None:
         if not waiting:
             return
         job = waiting.popleft()
-        lines = [json.dumps(job.request)]
-        if order and worker.order != order:
+        if order is not None and worker.order is not order:
             worker.order = order
             worker.jobs.append(None)
-            lines.insert(0, order)
+            worker.child.send(order)
         worker.jobs.append(job)
         worker.state = job.label
-        with suppress(BrokenPipeError):  # It has ended, which its listener tells.
-            worker.requests.write("".join(line + "\n" for line in lines))
-            worker.requests.flush()
+        worker.child.send(job.request)
 
     def _start(self, number: int, share: Many[int]) -> _Worker:
         processors = ",".join(str(processor) for processor in share)
-        process = start_module(
-            "app.cli.suite_workers",
-            str(os.getpid()),
-            processors,
-            threads=len(share),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            # An interrupt from the keyboard is for the parent, which ends them.
-            start_new_session=True,
-        )
-        if process.stdin is None or process.stdout is None:
-            raise AssertionError("both were asked for")
-        listener = threading.Thread(target=self._listen, args=(number, process.stdout), daemon=True)
+        child = Child("app.cli.suite_workers", processors, threads=len(share))
+        listener = threading.Thread(target=self._listen, args=(number, child), daemon=True)
         listener.start()
-        return _Worker(process=process, requests=process.stdin, listener=listener)
+        return _Worker(child=child, listener=listener)
 
-    def _listen(self, number: int, answers: IO[str]) -> None:
-        with answers:
-            for line in answers:
-                self._heard.put((number, json.loads(line)))
-        self._heard.put((number, _ENDED))
+    def _listen(self, number: int, child: Child) -> None:
+        try:
+            for message in child.messages():
+                self._heard.put((number, message))
+        except PhysHandiError as error:
+            self._heard.put((number, error))
 
 
-def _lost(worker: _Worker) -> errors.PhysHandiError:
+def _lost(worker: _Worker, end: ChildEndedError) -> RunError:
     """Say what the end of a process means."""
-    code = worker.process.wait()
     labels = [job.label for job in worker.jobs if job is not None]
     doing = f"while it worked on {labels[0]}" if labels else "while it had nothing to do"
-    return errors.RunError(
-        f"A process of the suite ended {doing} (exit code {code}; its last words stand above). "
+    return RunError(
+        f"A process of the suite ended {doing} (exit code {end.code}). "
         "If memory ran out, take fewer of them (--jobs). What is finished stays; the same command "
-        "goes on."
+        f"goes on. {end.last_words}".rstrip()
     )
 
 
@@ -324,15 +285,5 @@ def _shares(count: int) -> list[list[int]]:
     ]
 
 
-def _as_error(answer: Mapping[str, Any]) -> errors.PhysHandiError:
-    """Say an error of a process as this one's."""
-    kind = getattr(errors, str(answer["kind"]), errors.RunError)
-    if issubclass(kind, errors.UsageError):  # Some of these are made of more than a sentence.
-        kind = errors.UsageError
-    elif kind not in {errors.MissingInputError, errors.SequenceError, errors.CancelledError}:
-        kind = errors.RunError
-    return kind(str(answer["error"]))
-
-
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    run_child(work)

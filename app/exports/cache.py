@@ -1,25 +1,23 @@
 """Makes heavy files in child processes, a few at a time, and keeps them in a bounded cache."""
 
 import hashlib
-import json
 import logging
 import os
 import shutil
-import subprocess
 import threading
 import time
 from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import IO, Any, Literal
+from typing import Literal
 
 import viser
 
-from app.child import start_module
 from app.exports.request import SUFFIXES, FileRequest
 from physhandi import __version__, errors
+from physhandi.child import Child, ChildEndedError
 from physhandi.data.files import sweep_temporary, temporary_name
 from physhandi.data.run_folder import CURRENT
 from physhandi.data.sequence_meta import FILE
@@ -35,15 +33,6 @@ MOST_BYTES = 2**30
 MOST_SECONDS = 300.0
 """How long making one file may take."""
 _VERSION = 1
-_WORDS_KEPT = 4_000
-_ERRORS: dict[str, type[errors.PhysHandiError]] = {
-    "UsageError": errors.UsageError,
-    "MissingInputError": errors.MissingInputError,
-    "SequenceError": errors.SequenceError,
-    "SimulationError": errors.UsageError,
-    "SimulationDivergedError": errors.UsageError,
-}
-"""What a process tells about an error comes back as this one, else as a `RunError`."""
 
 
 class TooManyFilesError(errors.PhysHandiError):
@@ -98,7 +87,7 @@ class FileCache:
         self._threads = ThreadPoolExecutor(at_once, thread_name_prefix="export")
         self._lock = threading.Lock()
         self._works: dict[str, FileJob] = {}
-        self._processes: set[subprocess.Popen[str]] = set()
+        self._children: set[Child] = set()
         self._is_closed = False
 
     def begin(self, order: FileRequest) -> FileJob:
@@ -162,9 +151,9 @@ class FileCache:
         """End what is being made."""
         with self._lock:
             self._is_closed = True
-            processes = list(self._processes)
-        for process in processes:
-            process.kill()
+            children = list(self._children)
+        for child in children:
+            child.kill()
         self._threads.shutdown(wait=True, cancel_futures=True)
 
     def _start(self, order: FileRequest, path: Path) -> FileJob:
@@ -206,44 +195,28 @@ class FileCache:
             work.future.set_exception(error)
 
     def _run(self, order: FileRequest, work: FileJob) -> None:
-        process = start_module(
-            "app.exports.making",
-            str(os.getpid()),
-            str(work.path),
-            threads=1,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-        )
         with self._lock:
-            self._processes.add(process)
-        late = threading.Event()
-
-        def end() -> None:
-            late.set()
-            process.kill()
-
-        timer = threading.Timer(self._seconds, end)
-        timer.daemon = True
-        timer.start()
+            if self._is_closed:
+                raise errors.RunError("The server is being stopped.")
+            child = Child(
+                "app.exports.making", str(work.path), threads=1, time_limit_s=self._seconds
+            )
+            self._children.add(child)
         try:
-            answer = _converse(process, order.to_text(), work)
-        finally:
-            timer.cancel()
-            process.kill()
-            process.wait()
-            for stream in (process.stdout, process.stderr):
-                if stream is not None:
-                    stream.close()
-            with self._lock:
-                self._processes.discard(process)
-            sweep_temporary(work.path.parent.glob(".*.tmp"))
-        if "error" in answer:
-            raise _ERRORS.get(str(answer["kind"]), errors.RunError)(str(answer["error"]))
-        if not work.path.is_file():
+            with child:
+                child.send(asdict(order))
+                child.end_requests()
+                for message in child.messages():
+                    work.done, work.of = message["done"], message["of"]
+        except ChildEndedError as error:
+            logger.error("the file of %s was not made: %s", order.folder, error)  # noqa: TRY400
             limit = f"took longer than {self._seconds:g} s"
-            why = limit if late.is_set() else "was ended by the system"
-            raise errors.RunError(f"The file could not be made: it {why}.")
+            why = limit if error.is_late else "was ended by the system"
+            raise errors.RunError(f"The file could not be made: it {why}.") from None
+        finally:
+            with self._lock:
+                self._children.discard(child)
+            sweep_temporary(work.path.parent.glob(".*.tmp"))
 
     def _make_room(self, newest: Path) -> None:
         """Remove the files that were not used for longest."""
@@ -262,38 +235,6 @@ class FileCache:
             if path != newest:
                 path.unlink(missing_ok=True)
                 total -= size
-
-
-def _converse(process: "subprocess.Popen[str]", order: str, work: FileJob) -> dict[str, Any]:
-    """Give the order and hear how far it is; returns the last answer if it is an error."""
-    words: list[str] = []
-    listener = threading.Thread(target=_hear, args=(process.stderr, words), daemon=True)
-    listener.start()
-    last: dict[str, Any] = {}
-    try:
-        if process.stdin is not None:
-            process.stdin.write(order)
-            process.stdin.close()
-    except BrokenPipeError:
-        logger.info("the process did not read its order")
-    for line in process.stdout or ():
-        try:
-            last = json.loads(line)
-        except ValueError:
-            words.append(line)
-            continue
-        work.done, work.of = last.get("done", work.done), last.get("of", work.of)
-    code = process.wait()
-    listener.join(timeout=2)
-    if code != 0 and "error" not in last:
-        logger.error("the process ended with code %d: %s", code, "".join(words)[-_WORDS_KEPT:])
-    return last if "error" in last else {}
-
-
-def _hear(stream: IO[str] | None, words: list[str]) -> None:
-    for line in stream or ():
-        words.append(line)
-        del words[:-200]
 
 
 def _key(order: FileRequest) -> str:

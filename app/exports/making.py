@@ -3,16 +3,14 @@
 import json
 import os
 import shutil
-import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import cv2
 import numpy as np
 
-from app.child import die_with_parent
 from app.exports.offscreen import Offscreen
 from app.exports.painter import paint_scene, visible_from
 from app.exports.primitives import parts_of
@@ -24,10 +22,11 @@ from app.viewer.content.session_state import Pose, SessionState
 from app.viewer.export.bundle import Screenshot, bundle
 from app.viewer.export.snapshot import Snapshot, scene_data
 from app.viewer.restoring import complete_state
+from physhandi.child import Channel, run_child
 from physhandi.data.exporters import export_scene
 from physhandi.data.files import write_atomically, write_bytes, write_json
 from physhandi.data.sequence import Sequence
-from physhandi.errors import PhysHandiError, UsageError, describe
+from physhandi.errors import UsageError
 from physhandi.object_rollout import ObjectRollout
 from physhandi.run import Run
 from physhandi.simulation.model import SpringMassModel
@@ -207,25 +206,13 @@ def _write_motion(order: FileRequest, snapshot: Snapshot, out: Path) -> None:
 _NICENESS = 5
 
 
-def main(arguments: list[str], orders: TextIO, answers: TextIO) -> int:
-    """Make the file; returns the exit code."""
-    parent, out = int(arguments[0]), Path(arguments[1])
-    die_with_parent(parent)
+def _work(channel: Channel) -> None:
+    """Make the file that the only request describes, at the path that is the only argument."""
     os.nice(_NICENESS)  # Live scenes go first.
-    from app.exports.request import FileRequest
-
-    def tell(**about: object) -> None:
-        answers.write(json.dumps(about) + "\n")
-        answers.flush()
-
-    try:
-        order = FileRequest.from_text(orders.read())
-        make(order, out, lambda done, of: tell(done=done, of=of))
-    except (PhysHandiError, OSError, MemoryError) as error:
-        tell(error=describe(error), kind=type(error).__name__)
-        return 1
-    return 0
+    (order,) = channel.requests()
+    out = Path(channel.arguments[0])
+    make(FileRequest(**order), out, lambda done, of: channel.tell(done=done, of=of))
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:], sys.stdin, sys.stdout))
+    run_child(_work)

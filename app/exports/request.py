@@ -65,8 +65,3 @@ class FileRequest:
     def to_text(self) -> str:
         """Write the order on one line."""
         return json.dumps(asdict(self), sort_keys=True)
-
-    @classmethod
-    def from_text(cls, text: str) -> "FileRequest":
-        """Read an order."""
-        return cls(**json.loads(text))

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import psutil
 
-from app.child import set_process_option, start_module
+from physhandi.child import set_process_option, start_module
 
 COOKIE = "PHYSHANDI_RUN"
 """Environment variable that marks a run's processes; children inherit it, wherever they move."""
@@ -161,13 +161,10 @@ def start_supervisor(
     """
     return start_module(
         "app.jobs.supervise",
-        *("--run-dir", str(run_folder), "--device", device, "--worker", worker),
+        *(str(run_folder), device, worker),
         threads=threads,
-        environment={
-            COOKIE: cookie_of(run_folder, secrets.token_hex(8)),
-            "PYTHONUNBUFFERED": "1",
-        },
-        stdout=subprocess.DEVNULL,
+        environment={COOKIE: cookie_of(run_folder, secrets.token_hex(8))},
+        outlives_parent=True,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
     )

@@ -1,15 +1,16 @@
-"""The process that fills one run: `python -m app.jobs.worker --run-dir DIR`."""
+"""The process that fills one run: ``python -m app.jobs.worker RUN_FOLDER DEVICE``.
 
-import argparse
+The run folder tells how far it is and how it ended; its log has the details.
+"""
+
 import logging
 import signal
-import sys
 import time
 from pathlib import Path
 from types import FrameType
 
-from app.child import die_with_parent
-from physhandi.errors import CancelledError, PhysHandiError, describe
+from physhandi.child import Channel, run_child
+from physhandi.errors import CancelledError
 from physhandi.progress import Progress
 from physhandi.run import Run
 
@@ -36,54 +37,35 @@ class LoggedProgress(Progress):
         if stage == self._stage and time.monotonic() - self._time < _LOG_INTERVAL_S:
             return
         self._stage, self._time = stage, time.monotonic()
-        told = f"{stage}: {iteration} of {total}"
-        told += "" if loss is None else f", loss {loss:.4g}"
-        logger.info("%s", f"{told} ({message})" if message else told)
+        line = f"{stage}: {iteration} of {total}"
+        line += "" if loss is None else f", loss {loss:.4g}"
+        logger.info("%s", f"{line} ({message})" if message else line)
 
 
-def work(run_folder: Path, device: str) -> int:
-    """Run the pipeline for a run folder; returns the exit code.
+def fill_run(run_folder: Path, device: str) -> None:
+    """Run the pipeline for a run folder.
 
-    The run folder tells how it ended; the log has the details.
+    Raises:
+        PhysHandiError: If it failed or was cancelled, as the run folder says too.
     """
     run = Run.open(run_folder)
     logger.info("run %s begins on %s", run.id, device)
-    try:
-        from physhandi import pipeline
+    from physhandi import pipeline
 
-        pipeline.run_job(run, LoggedProgress(), device=device)
-    except CancelledError as error:
-        logger.info("%s", error)
-        return 0
-    except (PhysHandiError, OSError) as error:
-        # The message is for the user; no traceback.
-        logger.error("%s", describe(error))  # noqa: TRY400
-        return 1
-    except Exception as error:
-        defect = f"{type(error).__name__}: {error}"
-        logger.exception("run %s stopped by a defect of the program (%s)", run.id, defect)
-        return 1
+    pipeline.run_job(run, LoggedProgress(), device=device)
     logger.info("run %s is finished", run.id)
-    return 0
 
 
 def _stop(_number: int, _frame: FrameType | None) -> None:
     raise CancelledError("The process was asked to end.")
 
 
-def main(argv: list[str] | None = None) -> None:
-    """Read the arguments, work, exit."""
-    parser = argparse.ArgumentParser(prog="physhandi-worker", description=__doc__)
-    parser.add_argument("--run-dir", type=Path, required=True)
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--parent", type=int, help="process id of the supervisor")
-    options = parser.parse_args(argv)
-    if options.parent is not None:
-        die_with_parent(options.parent)
+def _work(channel: Channel) -> None:
+    run_folder, device = channel.arguments
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
     signal.signal(signal.SIGTERM, _stop)
-    sys.exit(work(options.run_dir, options.device))
+    fill_run(Path(run_folder), device)
 
 
 if __name__ == "__main__":
-    main()
+    run_child(_work)

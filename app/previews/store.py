@@ -1,11 +1,9 @@
 """Which previews there are, and the thread that has the missing ones drawn."""
 
 import hashlib
-import json
 import logging
 import os
 import signal
-import subprocess
 import threading
 from collections import OrderedDict
 from collections.abc import Iterable
@@ -13,13 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from app.child import start_module
 from app.jobs.catalog import Catalog, NotFoundError, RunItem
 from app.previews.worker import MOVING, NONE, SECONDS_EACH, STILL
 from app.settings import Settings
+from physhandi.child import Child, ChildEndedError
 from physhandi.data.files import write_bytes
 from physhandi.data.run_folder import CURRENT
 from physhandi.data.sequence_meta import FILE
+from physhandi.errors import PhysHandiError
 
 logger = logging.getLogger(__name__)
 
@@ -82,7 +81,7 @@ class Previews:
         self._folder = settings.preview_dir
         self._lock = threading.Condition()
         self._waiting: OrderedDict[str, _Source] = OrderedDict()
-        self._child: subprocess.Popen[str] | None = None
+        self._child: Child | None = None
         self._is_closed = False
         self._thread = threading.Thread(target=self._work, name="previews", daemon=True)
 
@@ -183,22 +182,23 @@ class Previews:
         with self._lock:
             if self._is_closed or not orders:
                 return
-            self._child = start_module(
+            self._child = child = Child(
                 "app.previews.worker",
-                str(os.getpid()),
                 threads=1,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
+                time_limit_s=_PATIENCE * SECONDS_EACH * len(orders),
             )
-        try:
-            self._child.communicate(
-                json.dumps(orders), timeout=_PATIENCE * SECONDS_EACH * len(orders)
-            )
-        except subprocess.TimeoutExpired:
-            self._child.kill()
-            self._child.wait()
-        code, self._child = self._child.returncode, None
+        code = 0
+        with child:
+            for order in orders:
+                child.send(order)
+            child.end_requests()
+            try:
+                for _ in child.messages():
+                    pass
+            except PhysHandiError as error:
+                code = error.code if isinstance(error, ChildEndedError) else 1
+                logger.info("%s", error)
+        self._child = None
         undone = [s for s in missing if not self._is_settled(s)]
         if undone and code not in _ENDED_FROM_OUTSIDE and not self._is_closed:
             # The first one ended the process or kept it too long; the others are tried again.

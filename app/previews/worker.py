@@ -1,19 +1,17 @@
 """The process that draws previews: reads what to draw from its input, writes files, ends."""
 
-import json
 import logging
 import math
 import os
 import resource
-import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
 
-from app.child import die_with_parent
 from app.previews.clip import clip_of_run, clip_of_sequence
+from physhandi.child import Channel, run_child
 from physhandi.data.files import write_bytes
 from physhandi.errors import describe
 
@@ -52,13 +50,12 @@ def draw(order: Mapping[str, str], *, is_still: bool) -> None:
     write_bytes(Path(f"{target}{NONE}"), reason.encode())
 
 
-def main() -> None:
+def draw_all(channel: Channel) -> None:
     """Draw what the server asks for, out of its way."""
-    die_with_parent(int(sys.argv[1]))
     os.nice(_POLITENESS)
     cv2.setNumThreads(1)
     logging.getLogger("physhandi").setLevel(logging.ERROR)
-    orders: list[dict[str, str]] = json.loads(sys.stdin.read())
+    orders: list[dict[str, str]] = list(channel.requests())
     most = math.ceil(time.process_time() + SECONDS_EACH * len(orders))
     resource.setrlimit(resource.RLIMIT_CPU, (most, most))
     # A list is told apart by its still pictures, so all of those come first.
@@ -68,4 +65,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_child(draw_all)

@@ -9,11 +9,9 @@ import io
 import json
 import logging
 import math
-import os
 import pickle
 import resource
 import signal
-import subprocess
 import sys
 import tempfile
 import zipfile
@@ -26,7 +24,8 @@ import numpy as np
 from numpy import ndarray
 from numpy.lib.stride_tricks import as_strided
 
-from physhandi.errors import ImportFailedError
+from physhandi.child import Channel, Child, ChildEndedError, run_child
+from physhandi.errors import ImportFailedError, PhysHandiError
 
 _PLAIN_KINDS = "biufcSU"
 _BYTE_ORDERS = {"<", ">", "|", "="}
@@ -406,8 +405,6 @@ TORCH_STAND_INS: dict[str, dict[str, Any]] = {
 """What else a torch checkpoint may name."""
 
 
-REFUSED = 3
-"""Exit code when the file was refused and ``refusal.txt`` says why."""
 TEXT_OF_ARCHIVES = zip_text.getregentry()
 """Loaded here, since names in an archive need it when nothing may be loaded any more."""
 ZIP_MAGIC = b"PK\x03\x04"
@@ -621,23 +618,16 @@ def limit(seconds: int, most_bytes: int) -> None:
         resource.setrlimit(kind, (least, least))
 
 
-def main(arguments: list[str]) -> int:
+def _work(channel: Channel) -> None:
     """Read the file that the arguments name."""
-    source, out = Path(arguments[0]), Path(arguments[1])
-    most_bytes = int(arguments[3])
-    limit(int(arguments[2]), most_bytes)
-    try:
-        read(source, out, most_bytes)
-    except ImportFailedError as error:
-        (out / "refusal.txt").write_text(str(error), encoding="utf-8")
-        return REFUSED
-    return 0
+    source, out, seconds, most_bytes = channel.arguments
+    limit(int(seconds), int(most_bytes))
+    read(Path(source), Path(out), int(most_bytes))
 
 
 logger = logging.getLogger(__name__)
 
 _WORKER = "physhandi.data.foreign"
-_PACKAGE_ROOT = Path(__file__).parents[2]
 _ADVICE = (
     "Only numbers, text, containers, NumPy arrays, sparse matrices, chumpy arrays and tensors of "
     "a torch checkpoint are read. Nothing of the file was executed; use the file as its publisher "
@@ -674,33 +664,21 @@ def read_untrusted(path: Path, *, time_limit_s: float = 120.0, memory_limit: int
 
 
 def _read_in_child(path: Path, out: Path, time_limit_s: float, memory_limit: int) -> None:
-    seconds = max(1, round(time_limit_s))
-    limits = [str(seconds), str(memory_limit)]
-    kept = {name: value for name, value in os.environ.items() if name[:10] != "PHYSHANDI_"}
+    limits = [str(max(1, round(time_limit_s))), str(memory_limit)]
+    reader = Child(_WORKER, str(path), str(out), *limits, threads=1, time_limit_s=time_limit_s)
     try:
-        child = subprocess.run(
-            [sys.executable, "-m", _WORKER, str(path), str(out), *limits],
-            # `-m` searches the working directory first, so it must be the one of our packages.
-            cwd=_PACKAGE_ROOT,
-            env={**kept, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            timeout=time_limit_s,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        raise ImportFailedError(
-            f"{path}: refused, because reading it took more than {time_limit_s:g} s. {_ADVICE}"
-        ) from None
-    if child.returncode == REFUSED:
-        reason = (out / "refusal.txt").read_text(encoding="utf-8")
-        raise ImportFailedError(f"{path}: refused, because {reason}. {_ADVICE}")
-    if child.returncode:
-        logger.debug("the reader of %s said: %s", path, child.stderr.decode(errors="replace"))
-        raise ImportFailedError(
-            f"{path}: refused, because its reader ended {_ending(child.returncode)}. {_ADVICE}"
-        )
+        with reader:
+            for _ in reader.messages():
+                pass
+    except ChildEndedError as error:
+        logger.debug("the reader of %s said: %s", path, error.last_words)
+        if error.is_late:
+            reason = f"reading it took more than {time_limit_s:g} s"
+        else:
+            reason = f"its reader ended {_ending(error.code)}"
+        raise ImportFailedError(f"{path}: refused, because {reason}. {_ADVICE}") from None
+    except PhysHandiError as error:
+        raise ImportFailedError(f"{path}: refused, because {error}. {_ADVICE}") from None
 
 
 def _ending(code: int) -> str:
@@ -729,4 +707,4 @@ def _decode(value: Any, arrays: list[Any]) -> Any:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    run_child(_work)

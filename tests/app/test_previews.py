@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +18,13 @@ from PIL import Image, ImageSequence
 from server_world import World
 from waiting import until
 
-from app.child import PACKAGE_ROOT
 from app.previews import store, worker
 from app.previews.camera import fitting_camera
 from app.previews.clip import clip_of_run, clip_of_sequence
 from app.previews.draw import HEIGHT, WIDTH, Motion, draw_motion
 from app.previews.store import Previews
 from app.settings import BUNDLED
+from physhandi.child import PACKAGE_ROOT, ChildEndedError
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence import Sequence
 
@@ -189,18 +189,19 @@ def test_what_ends_its_process_is_noted_and_the_others_are_drawn(
 def test_what_computes_for_too_long_is_ended_and_what_waits_is_not() -> None:
     code = (
         "import app.previews.worker as worker, os, signal\n"
+        "from physhandi.child import run_child\n"
         "worker.SECONDS_EACH = 1\n"
         "def draw(order, *, is_still):\n"
         "    while order['kind'] == 'endless': pass\n"
         "    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)\n"
         "worker.draw = draw\n"
-        "worker.main()\n"
+        "run_child(worker.draw_all)\n"
     )
 
     def end(kind: str) -> int:
         return subprocess.run(
-            [sys.executable, "-c", code, str(os.getpid())],
-            input=json.dumps([{"kind": kind}]).encode(),
+            [sys.executable, "-c", code],
+            input=json.dumps({"kind": kind}).encode(),
             cwd=PACKAGE_ROOT,
             timeout=150,
             check=False,
@@ -216,21 +217,33 @@ def test_a_folder_that_is_deleted_while_pictures_are_drawn_ends_nothing(
     # The note that it crashed cannot be written; there is nothing to tidy; at last it is drawn.
     codes = iter((1, -signal.SIGTERM, 0))
 
-    class Child:
+    class FakeChild:
         def __init__(self, *_: object, **__: object) -> None:
-            self.returncode = next(codes)
+            self.code = next(codes)
+            self.orders: list[Any] = []
+            self.send = self.orders.append
 
-        def communicate(self, orders: str, **_: object) -> None:
-            if self.returncode:
+        def __enter__(self) -> "FakeChild":
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            pass
+
+        def end_requests(self) -> None:
+            pass
+
+        def messages(self) -> Iterator[dict[str, Any]]:
+            if self.code:
                 shutil.rmtree(world.settings.preview_dir)
-                return
-            for order in json.loads(orders):
+                raise ChildEndedError("worker", self.code, "")
+            for order in self.orders:
                 Path(f"{order['target']}{worker.MOVING}").write_bytes(b"RIFF")
+            yield from ()
 
         def kill(self) -> None:
             pass
 
-    monkeypatch.setattr(store, "start_module", Child)
+    monkeypatch.setattr(store, "Child", FakeChild)
     monkeypatch.setattr(store, "_PAUSE_S", 0.0)
     previews = Previews(world.settings, world.catalog)
     previews.start()

@@ -1,7 +1,6 @@
 """The server's side of the live simulation process: starts it, feeds it and hears its answers."""
 
 import logging
-import os
 import socket
 import subprocess
 import threading
@@ -13,8 +12,8 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from app.child import start_module
 from app.viewer.live.wire import PAUSE, RESUME, STEP, Message, WireError, receive, send
+from physhandi.child import start_module
 from physhandi.simulation.parameters import SimulationParameters
 
 logger = logging.getLogger(__name__)
@@ -211,7 +210,6 @@ class SimulationClient:
             self._process = start_module(
                 "app.viewer.live.worker",
                 str(theirs.fileno()),
-                str(os.getpid()),
                 self._device,
                 pass_fds=[theirs.fileno()],
             )

@@ -8,7 +8,6 @@ thread simulates one frame of each active session in turn. The process ends when
 import logging
 import signal
 import socket
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -16,8 +15,8 @@ from collections.abc import Iterator
 import numpy as np
 import warp as wp
 
-from app.child import die_with_parent
 from app.viewer.live.wire import PAUSE, RESUME, STEP, Message, receive, send
+from physhandi.child import Channel, run_child
 from physhandi.errors import PhysHandiError, SimulationDivergedError
 from physhandi.fitted_object import FittedObject
 from physhandi.simulation.parameters import SimulationParameters
@@ -277,18 +276,17 @@ def warm_up(device: str) -> None:
         logger.exception("the live simulation could not be prepared")
 
 
-def main(arguments: list[str]) -> None:
+def _work(channel: Channel) -> None:
     """Serve requests from the socket whose descriptor is the first argument."""
-    descriptor, parent, device = int(arguments[0]), int(arguments[1]), arguments[2]
-    die_with_parent(parent)
+    descriptor, device = channel.arguments
     if device == "auto":
         device = "cuda:0" if wp.get_cuda_device_count() > 0 else "cpu"
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # The server is told too, and closes the socket.
     logging.basicConfig(level=logging.INFO, format="live simulation: %(levelname)s %(message)s")
-    with socket.socket(fileno=descriptor) as connection:
+    with socket.socket(fileno=int(descriptor)) as connection:
         SimulationWorker(connection, device).run()
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    run_child(_work)

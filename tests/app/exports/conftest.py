@@ -1,5 +1,6 @@
 """A finished run to export, and a workshop that works in this process."""
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,7 +19,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[FileRequest]:
     orders: list[FileRequest] = []
 
     def run(_: FileCache, order: FileRequest, work: FileJob) -> None:
-        again = FileRequest.from_text(order.to_text())
+        again = FileRequest(**json.loads(order.to_text()))
         orders.append(again)
         make(again, work.path)
 

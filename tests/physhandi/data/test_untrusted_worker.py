@@ -102,7 +102,7 @@ def test_arrays_may_take_a_quarter_of_the_memory() -> None:
 FORBIDDEN = """
 import os, sys
 from pathlib import Path
-from physhandi.data.untrusted_worker import forbid_calls
+from physhandi.data.foreign import forbid_calls
 from physhandi.errors import ImportFailedError
 
 canary = Path(sys.argv[1])
