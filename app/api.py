@@ -1,6 +1,7 @@
 """The REST interface below /api/v1: nothing but translation."""
 
 import asyncio
+import time
 from collections.abc import Iterable
 from typing import Annotated, Any, Literal, Protocol
 
@@ -11,29 +12,29 @@ from starlette.background import BackgroundTask
 from starlette.exceptions import HTTPException
 
 from app.comparison import NewComparison
+from app.ids import ItemId
 from app.jobs.about import RunChanges, change_about
 from app.jobs.catalog import Catalog, NotFoundError
+from app.jobs.listing import RunQuery, page_of, select_runs
 from app.jobs.log import open_log
 from app.jobs.machine import Machine
-from app.jobs.order import describe_order
+from app.jobs.order import check_order, describe_order, describe_settings
+from app.jobs.overview import Overview
 from app.jobs.scheduler import Scheduler
 from app.jobs.streams import Feed, News, Streams
 from app.jobs.views import (
-    RunQuery,
     describe_results,
     describe_run,
     describe_sequence,
     follow_run,
     frame_errors,
     loss_curves,
-    page_of,
-    select_runs,
 )
-from app.jobs.watch import Watch
+from app.jobs.watch import Watch, preview_bytes
 from physhandi.fitting.config import named_profile, profile_names
 
-Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
-Path = Annotated[str, Field(max_length=200)]
+SettingPath = Annotated[str, Field(max_length=200)]
+_INTERVAL_S = 1.0
 
 
 class OpenScene(Protocol):
@@ -69,13 +70,23 @@ class NewRun(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    sequences: Annotated[list[Id], Field(min_length=1, max_length=64)]
-    profile: Id = "quick"
+    sequences: Annotated[list[ItemId], Field(min_length=1, max_length=64)]
+    profile: ItemId = "quick"
     name: Annotated[str, Field(max_length=120)] = ""
-    overrides: Annotated[dict[Path, JsonValue], Field(max_length=200)] = {}
+    overrides: Annotated[dict[SettingPath, JsonValue], Field(max_length=200)] = {}
     """New values of settings by their paths; `GET /api/v1/settings` lists them."""
-    parent: Id | None = None
+    parent: ItemId | None = None
     """The run that it was made from."""
+
+
+class Draft(BaseModel):
+    """A fit that is not launched yet."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    sequences: Annotated[list[ItemId], Field(max_length=64)] = []
+    profile: ItemId = "quick"
+    overrides: Annotated[dict[SettingPath, JsonValue], Field(max_length=200)] = {}
 
 
 class NewSession(BaseModel):
@@ -84,7 +95,7 @@ class NewSession(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     kind: Literal["run", "sequence"]
-    id: Id
+    id: ItemId
 
 
 NewScene = Annotated[NewSession | NewComparison, Field(discriminator="kind")]
@@ -106,7 +117,9 @@ def create_api(
     scheduler: Scheduler,
     feed: Feed,
     sessions: SessionOpener,
+    *,
     machine: Machine,
+    overview: Overview,
 ) -> APIRouter:
     """Make the routes.
 
@@ -116,12 +129,15 @@ def create_api(
         feed: Tells what changed.
         sessions: Opens live scenes.
         machine: Tells how busy the machine is.
+        overview: Describes machine, queue and program.
     """
     router = APIRouter(prefix="/api/v1")
     _add_listings(router, catalog, scheduler)
+    _add_results(router, catalog)
     _add_jobs(router, catalog, scheduler)
     _add_sessions(router, sessions)
     _add_streams(router, catalog, scheduler, feed, machine)
+    _add_system(router, overview)
     return router
 
 
@@ -131,7 +147,7 @@ def _add_listings(router: APIRouter, catalog: Catalog, scheduler: Scheduler) -> 
         return {"sequences": [describe_sequence(item) for item in catalog.sequences()]}
 
     @router.get("/sequences/{sequence_id}")
-    def show_sequence(sequence_id: Id) -> dict[str, Any]:
+    def show_sequence(sequence_id: ItemId) -> dict[str, Any]:
         return describe_sequence(catalog.sequence_item(sequence_id))
 
     @router.get("/runs")
@@ -140,34 +156,13 @@ def _add_listings(router: APIRouter, catalog: Catalog, scheduler: Scheduler) -> 
         return {"runs": page_of(runs, query), "total": len(runs)}
 
     @router.get("/runs/{run_id}")
-    def show_run(run_id: Id) -> dict[str, Any]:
+    def show_run(run_id: ItemId) -> dict[str, Any]:
         item = catalog.run_item(run_id)
         # The state first: of a run that is called finished, all results are there.
         followed = follow_run(item, scheduler)
         results = describe_results(item.run) if item.run else {}
         order = describe_order(item.run) if item.run else {}
         return followed | order | {"results": results}
-
-    @router.get("/runs/{run_id}/losses")
-    def show_losses(run_id: Id) -> dict[str, Any]:
-        losses, number = loss_curves(catalog.run(run_id))
-        return {"losses": losses, "seq": number}
-
-    @router.get("/runs/{run_id}/frame_errors")
-    def show_frame_errors(run_id: Id) -> dict[str, Any]:
-        return {"sequences": frame_errors(catalog.run(run_id))}
-
-    @router.get("/runs/{run_id}/log")
-    def show_log(run_id: Id) -> Response:
-        log = open_log(catalog.run_item(run_id).folder)
-        headers = {"Content-Disposition": f'attachment; filename="{run_id}_log.txt"'}
-        if log is None:
-            raise NotFoundError(f"Run '{run_id}' has no log yet.")
-        content = iter(lambda: log.read(2**16), b"")
-        clean_up = BackgroundTask(log.close)
-        return StreamingResponse(
-            content, media_type="text/plain; charset=utf-8", headers=headers, background=clean_up
-        )
 
     @router.get("/profiles")
     def list_profiles() -> dict[str, Any]:
@@ -179,7 +174,51 @@ def _add_listings(router: APIRouter, catalog: Catalog, scheduler: Scheduler) -> 
         }
 
 
+def _add_results(router: APIRouter, catalog: Catalog) -> None:
+    @router.get("/runs/{run_id}/losses")
+    def show_losses(run_id: ItemId) -> dict[str, Any]:
+        losses, number = loss_curves(catalog.run(run_id))
+        return {"losses": losses, "seq": number}
+
+    @router.get("/runs/{run_id}/frame_errors")
+    def show_frame_errors(run_id: ItemId) -> dict[str, Any]:
+        return {"sequences": frame_errors(catalog.run(run_id))}
+
+    @router.get("/runs/{run_id}/log")
+    def show_log(run_id: ItemId) -> Response:
+        log = open_log(catalog.run_item(run_id).folder)
+        headers = {"Content-Disposition": f'attachment; filename="{run_id}_log.txt"'}
+        if log is None:
+            raise NotFoundError(f"Run '{run_id}' has no log yet.")
+        content = iter(lambda: log.read(2**16), b"")
+        clean_up = BackgroundTask(log.close)
+        return StreamingResponse(
+            content, media_type="text/plain; charset=utf-8", headers=headers, background=clean_up
+        )
+
+    @router.get("/runs/{run_id}/preview")
+    def show_preview(run_id: ItemId) -> Response:
+        """Give what a running fit shows of itself: few frames, few points (safetensors)."""
+        content = preview_bytes(catalog.run_item(run_id).folder)
+        if content is None:
+            raise NotFoundError(f"Run '{run_id}' has shown nothing yet.")
+        headers = {"Cache-Control": "no-store"}
+        return Response(content, media_type="application/octet-stream", headers=headers)
+
+
 def _add_jobs(router: APIRouter, catalog: Catalog, scheduler: Scheduler) -> None:
+    @router.get("/settings")
+    def show_settings(profile: ItemId | None = None, run: ItemId | None = None) -> dict[str, Any]:
+        """List all settings of a profile, or of a run beside its profile."""
+        return describe_settings(catalog, profile, run)
+
+    @router.post("/runs/check")
+    def check(draft: Draft) -> dict[str, Any]:
+        """Tell what differs from the profile and how long the fit would take."""
+        return check_order(
+            catalog, scheduler.forecast, draft.sequences, draft.profile, draft.overrides
+        )
+
     @router.post("/runs", status_code=201)
     def launch(new: NewRun) -> dict[str, Any]:
         run = scheduler.launch(
@@ -188,23 +227,23 @@ def _add_jobs(router: APIRouter, catalog: Catalog, scheduler: Scheduler) -> None
         return describe_run(catalog.run_item(run.id), scheduler)
 
     @router.patch("/runs/{run_id}")
-    def change(run_id: Id, changes: RunChanges) -> dict[str, Any]:
+    def change(run_id: ItemId, changes: RunChanges) -> dict[str, Any]:
         """Change what a run is called, its tags or its note; what is left out stays."""
         change_about(catalog, run_id, changes)
         return describe_run(catalog.run_item(run_id), scheduler)
 
     @router.post("/runs/{run_id}/cancel")
-    def cancel(run_id: Id) -> dict[str, Any]:
+    def cancel(run_id: ItemId) -> dict[str, Any]:
         scheduler.cancel(run_id)
         return describe_run(catalog.run_item(run_id), scheduler)
 
     @router.post("/runs/{run_id}/resume")
-    def resume(run_id: Id) -> dict[str, Any]:
+    def resume(run_id: ItemId) -> dict[str, Any]:
         scheduler.resume(run_id)
         return describe_run(catalog.run_item(run_id), scheduler)
 
     @router.delete("/runs/{run_id}", status_code=204)
-    def delete(run_id: Id) -> Response:
+    def delete(run_id: ItemId) -> Response:
         scheduler.delete(run_id)
         return Response(status_code=204)
 
@@ -223,12 +262,12 @@ def _add_sessions(router: APIRouter, sessions: SessionOpener) -> None:
         return scene
 
     @router.get("/sessions/{session_id}")
-    def show_session(session_id: Id, request: Request) -> dict[str, str]:
+    def show_session(session_id: ItemId, request: Request) -> dict[str, str]:
         find(session_id, request)
         return {"id": session_id, "url": f"/live/{session_id}"}
 
     @router.patch("/sessions/{session_id}", status_code=204)
-    def change_session(session_id: Id, wishes: SessionWishes, request: Request) -> Response:
+    def change_session(session_id: ItemId, wishes: SessionWishes, request: Request) -> Response:
         scene = find(session_id, request)
         if wishes.dark is not None:
             scene.prefer_dark(on=wishes.dark)
@@ -237,7 +276,7 @@ def _add_sessions(router: APIRouter, sessions: SessionOpener) -> None:
         return Response(status_code=204)
 
     @router.delete("/sessions/{session_id}", status_code=204)
-    def close_session(session_id: Id, request: Request) -> Response:
+    def close_session(session_id: ItemId, request: Request) -> Response:
         if sessions.find(session_id, request.state.owner) is not None:
             sessions.close(session_id)
         return Response(status_code=204)
@@ -271,7 +310,7 @@ def _add_streams(
     @router.get("/runs/{run_id}/events")
     async def watch_run(
         request: Request,
-        run_id: Id,
+        run_id: ItemId,
         since: Annotated[str | None, Query(max_length=64)] = None,
         last_event_id: Annotated[str | None, Header(max_length=64)] = None,
     ) -> StreamingResponse:
@@ -283,3 +322,28 @@ def _add_streams(
             lambda: {"machine": machine.load(), "run": machine.of_run(item.folder)},
         )
         return streams.answer(request, watch.news)
+
+
+def _add_system(router: APIRouter, overview: Overview) -> None:
+    streams = Streams()
+
+    @router.get("/system")
+    def show_system() -> dict[str, Any]:
+        return overview.whole()
+
+    @router.get("/system/events")
+    async def watch_system(request: Request) -> StreamingResponse:
+        known: dict[str, Any] = {}
+        looked = 0.0
+
+        def news() -> Iterable[News]:
+            nonlocal known, looked
+            if time.monotonic() - looked < _INTERVAL_S:
+                return
+            looked = time.monotonic()
+            found = overview.moving()
+            if found != known:
+                known = found
+                yield "0", "system", found
+
+        return streams.answer(request, news)

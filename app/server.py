@@ -22,10 +22,10 @@ from app.exports.cache import FileCache, TooManyFilesError
 from app.exports.routes import create_exports
 from app.jobs.catalog import Catalog, NotFoundError
 from app.jobs.machine import Machine
+from app.jobs.overview import Overview
 from app.jobs.scheduler import QueueFullError, Scheduler
 from app.jobs.streams import Feed
 from app.jobs.views import describe_run
-from app.monitor import Overview, create_monitor
 from app.pages import Pages, create_pages
 from app.previews.store import Previews
 from app.security import Gatekeeper, Security
@@ -93,7 +93,7 @@ def create_app(
     feed = Feed(lambda: [describe_run(item, scheduler) for item in catalog.runs()])
     pages = Pages()
     previews = Previews(settings, catalog)
-    workshop = FileCache(settings.data_dir / "cache" / "exports")
+    file_cache = FileCache(settings.data_dir / "cache" / "exports")
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncGenerator[None]:
@@ -103,7 +103,7 @@ def create_app(
         previews.shutdown()
         scheduler.shutdown()
         sessions.shutdown()
-        workshop.close()
+        file_cache.close()
 
     app = FastAPI(
         title="PhysHanDI",
@@ -118,9 +118,10 @@ def create_app(
     app.state.scheduler = scheduler
     app.state.sessions = sessions
     app.state.security = security
-    app.include_router(create_api(catalog, scheduler, feed, sessions, machine))
     overview = Overview(settings, catalog, scheduler, machine)
-    app.include_router(create_monitor(catalog, scheduler, overview, pages))
+    app.include_router(
+        create_api(catalog, scheduler, feed, sessions, machine=machine, overview=overview)
+    )
     app.include_router(
         create_pages(
             catalog,
@@ -128,11 +129,12 @@ def create_app(
             feed,
             sessions,
             pages,
+            overview=overview,
             previews=previews,
             suites=settings.suite_dir,
         )
     )
-    app.include_router(create_exports(catalog, sessions, pages, workshop))
+    app.include_router(create_exports(catalog, sessions, pages, file_cache))
     app.include_router(create_comparing(catalog, scheduler, pages))
     app.include_router(create_gate(sessions))
     app.mount("/assets", StaticFiles(directory=WEB_ASSETS), name="assets")

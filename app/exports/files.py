@@ -14,12 +14,13 @@ from starlette.background import BackgroundTask
 from starlette.exceptions import HTTPException
 
 from app.exports.cache import FileCache
-from app.exports.links import CLOSED, Id, address, read_query
+from app.exports.links import CLOSED, address, read_query
 from app.exports.making import store_take
 from app.exports.painter import LARGEST
 from app.exports.permalink import state_from_query, state_to_query
 from app.exports.request import SMALLEST, SUFFIXES, FileRequest
 from app.exports.schema import MEDIA_TYPES, RunFormat, errors, files
+from app.ids import ItemId
 from app.jobs.catalog import Catalog
 from app.viewer.export.snapshot import write_yaml
 from app.viewer.session import Session
@@ -55,7 +56,7 @@ def create_files(catalog: Catalog, sessions: Sessions, workshop: FileCache) -> A
     def export(
         *,
         request: Request,
-        run_id: Id,
+        run_id: ItemId,
         kind: Annotated[RunFormat, Query(alias="format")],
         sequence: Annotated[str | None, Query(max_length=200)] = None,
         f: Annotated[int | None, Query(ge=0, description="Frame of PNG, ZIP and PLY.")] = None,
@@ -94,7 +95,7 @@ def create_files(catalog: Catalog, sessions: Sessions, workshop: FileCache) -> A
     )
     def export_scene(
         request: Request,
-        session_id: Id,
+        session_id: ItemId,
         kind: Annotated[RunFormat, Query(alias="format")],
         width: Annotated[Side, Query(description="Of PNG and ZIP [px].")] = 1280,
         height: Annotated[Side, Query(description="Of PNG and ZIP [px].")] = 720,

@@ -1,21 +1,21 @@
 """Permalinks: an address that opens a live scene as somebody left it, and the way back."""
 
 from collections.abc import Mapping
-from typing import Annotated, Literal
+from typing import Literal
 from urllib.parse import urlencode
 
 from fastapi import APIRouter, Request
 from fastapi.responses import RedirectResponse
-from pydantic import BaseModel, Field
+from pydantic import BaseModel
 from starlette.exceptions import HTTPException
 
 from app.exports.permalink import state_from_query, state_to_query
 from app.exports.schema import errors
+from app.ids import ItemId
 from app.viewer.session import Session
 from app.viewer.sessions import Sessions
 from physhandi.errors import UsageError
 
-Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
 _LONGEST = 4_000
 CLOSED = "This live scene was closed, or it is not yours."
 """What is said to who asks for a scene that is not there."""
@@ -50,15 +50,15 @@ def create_links(sessions: Sessions) -> APIRouter:
         return f"/live/{session}" + (f"?{rest}" if rest else "")
 
     @router.get("/runs/{run_id}/view", include_in_schema=False)
-    def view_run(run_id: Id, request: Request) -> RedirectResponse:
+    def view_run(run_id: ItemId, request: Request) -> RedirectResponse:
         return RedirectResponse(open_scene("run", run_id, request), 303)
 
     @router.get("/sequences/{sequence_id}/view", include_in_schema=False)
-    def view_sequence(sequence_id: Id, request: Request) -> RedirectResponse:
+    def view_sequence(sequence_id: ItemId, request: Request) -> RedirectResponse:
         return RedirectResponse(open_scene("sequence", sequence_id, request), 303)
 
     @router.get("/api/v1/sessions/{session_id}/link", responses=errors(404))
-    def show_link(session_id: Id, request: Request) -> Link:
+    def show_link(session_id: ItemId, request: Request) -> Link:
         """Tell the address that opens another scene in the state of this one."""
         session = sessions.find(session_id, request.state.owner)
         if session is None:

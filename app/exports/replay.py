@@ -13,10 +13,11 @@ from pydantic import BaseModel
 
 from app.exports.cache import FileCache, FileJob
 from app.exports.files import request_of
-from app.exports.links import Id, read_query
+from app.exports.links import read_query
 from app.exports.permalink import state_from_query
 from app.exports.request import FileRequest
 from app.exports.schema import errors, files
+from app.ids import ItemId
 from app.jobs.catalog import Catalog
 from app.pages.render import Pages
 from physhandi.errors import UsageError, describe
@@ -65,7 +66,7 @@ def create_replays(catalog: Catalog, workshop: FileCache, pages: Pages) -> APIRo
         return request_of(catalog, catalog.run(run_id), "viser", query | {"theme": theme})
 
     @router.get("/runs/{run_id}/replay", include_in_schema=False)
-    def show_page(run_id: Id, request: Request) -> HTMLResponse:
+    def show_page(run_id: ItemId, request: Request) -> HTMLResponse:
         query = read_query(request)
         unknown = [name for name in query if name not in _KNOWN]
         if unknown:
@@ -89,7 +90,7 @@ def create_replays(catalog: Catalog, workshop: FileCache, pages: Pages) -> APIRo
         )
 
     @router.post("/api/v1/runs/{run_id}/replay", responses=errors(404, 409, 422, 429))
-    def prepare(run_id: Id, sequence: Sequence = None, theme: Theme = "light") -> Replay:
+    def prepare(run_id: ItemId, sequence: Sequence = None, theme: Theme = "light") -> Replay:
         """Have the replay of a run made, unless it is there, and tell how far it is."""
         work = workshop.begin(order(run_id, sequence, theme))
         query = {"theme": theme} | ({"sequence": sequence} if sequence else {})
@@ -100,7 +101,7 @@ def create_replays(catalog: Catalog, workshop: FileCache, pages: Pages) -> APIRo
         response_class=FileResponse,
         responses=files("viser") | errors(404, 409, 422, 429),
     )
-    def fetch(run_id: Id, sequence: Sequence = None, theme: Theme = "light") -> FileResponse:
+    def fetch(run_id: ItemId, sequence: Sequence = None, theme: Theme = "light") -> FileResponse:
         """Give the replay of a run as viser's recording; made when it is missing."""
         path = workshop.make(order(run_id, sequence, theme))
         headers = {"Cache-Control": "private, no-cache"}

@@ -1,12 +1,14 @@
-"""What a fit was asked to do: a profile, what differs from it, and the run it was made from."""
+"""What a fit is asked to do: a profile, what differs from it, and the run it is made from."""
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from functools import lru_cache
 from typing import Any
 
 from app.jobs.catalog import Catalog, RunItem, UnknownRunError
+from app.jobs.eta import Forecast
 from physhandi.data.files import named_fields
-from physhandi.errors import UsageError
+from physhandi.errors import SettingsError, UsageError
 from physhandi.fitting.config import (
     GROUPS,
     PipelineConfig,
@@ -140,3 +142,78 @@ def _row(setting: Setting, base: Any, value: Any) -> dict[str, Any]:
 @lru_cache(maxsize=32)
 def _base_values(profile: str) -> dict[str, Any]:
     return values_of(named_profile(profile)) if profile in profile_names() else {}
+
+
+def describe_settings(catalog: Catalog, profile: str | None, run_id: str | None) -> dict[str, Any]:
+    """List all settings with their values, to be changed one by one.
+
+    Args:
+        catalog: Finds the run.
+        profile: Values of this profile; none takes the run's, else the quick one.
+        run_id: A run whose own values are given beside those of its profile.
+
+    Returns:
+        ``profile``, ``parent`` (the run's id, else none), ``description`` and ``settings``: rows
+        of all that a `Setting` has, with ``base`` (the profile's value) and ``value``.
+
+    Raises:
+        UsageError: If there is no such profile, or the run has no settings that can be changed.
+    """
+    own: dict[str, Any] = {}
+    if run_id is not None:
+        run = catalog.run(run_id)
+        config = settings_of_run(run)
+        if config is None:
+            raise UsageError(
+                f"Run '{run_id}' cannot be fitted again with changes: it is a simulation, or "
+                "another version of the program made it. Launch a new fit of its sequence."
+            )
+        # A profile of the user's own is not among those offered; the run holds all its settings.
+        of_run = config.profile if config.profile in profile_names() else "default"
+        if profile in {None, of_run}:
+            profile, own = of_run, values_of(config)
+    base = named_profile(profile or "quick")
+    before = values_of(base)
+    return {
+        "profile": base.profile,
+        "parent": run_id,
+        "description": base.description,
+        "settings": [
+            asdict(setting)
+            | {
+                "group_name": GROUPS[setting.group],
+                "base": before[setting.path],
+                "base_text": shown_value(before[setting.path]),
+                "value": own.get(setting.path, before[setting.path]),
+            }
+            for setting in all_settings()
+        ],
+    }
+
+
+def check_order(
+    catalog: Catalog,
+    forecast: Forecast,
+    sequence_ids: list[str],
+    profile: str,
+    overrides: dict[str, Any],
+) -> dict[str, Any]:
+    """Tell what a fit would be, without launching it.
+
+    Returns:
+        ``problems`` (``field message`` of each setting that is wrong), ``overrides`` that differ
+        from the profile, and ``expected``: ``seconds basis``, none if no earlier fit is known.
+
+    Raises:
+        UsageError: If there is no such profile.
+        SequenceError: If a sequence is unknown or damaged.
+    """
+    base = named_profile(profile)
+    sequences = [catalog.sequence(sequence_id) for sequence_id in sequence_ids]
+    try:
+        config = apply_overrides(base, overrides)
+    except SettingsError as error:
+        problems = [{"field": path, "message": told} for path, told in error.fields.items()]
+        return {"problems": problems, "overrides": {}, "expected": None}
+    expected = forecast.of_order(config.to_dict(), sequences)
+    return {"problems": [], "overrides": overrides_of(config, base), "expected": expected}

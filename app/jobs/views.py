@@ -3,15 +3,12 @@
 import builtins
 import hashlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast, get_args
-from urllib.parse import urlencode
+from typing import Any, cast
 from weakref import WeakKeyDictionary
-
-from pydantic import BaseModel, ConfigDict, Field
 
 from app.jobs.catalog import RunItem, SequenceItem
 from app.jobs.scheduler import AT_WORK, JobView, Scheduler
@@ -19,108 +16,151 @@ from physhandi import errors
 from physhandi.data.environment import ENVIRONMENT
 from physhandi.data.files import named_fields
 from physhandi.data.run_folder import EXIT, read_events, read_mapping
-from physhandi.errors import PhysHandiError, UsageError
+from physhandi.errors import PhysHandiError
 from physhandi.fitting.config import SIMULATION, STAGES
 from physhandi.run import Run
 
 _METRICS = "metrics.json"
+PARTS = ("color", "depth", "mask", "keypoint", "track", "control", "marker", "object_node")
+_RESULTS = ("losses.json", "metrics.json", "object/parameters.yaml", ENVIRONMENT)
+CURVE_LIMIT = 2000
+"""Most points of a curve that are sent to a browser."""
+# Runs and the views of ended runs stay the same objects while nothing changes on disk, so a long
+# list is described once; a run at work has a new view, and is described anew, each time.
+_described: WeakKeyDictionary[Run, tuple[JobView, dict[str, Any]]] = WeakKeyDictionary()
 
 
-@dataclass(frozen=True)
-class RunSummary:
-    """What a run took and how well it did."""
+def describe_sequence(item: SequenceItem) -> dict[str, Any]:
+    """Describe one sequence of a listing."""
+    described: dict[str, Any] = {
+        "id": item.id,
+        "name": item.id,
+        "is_bundled": item.is_bundled,
+        "error": item.error,
+    }
+    sequence = item.sequence
+    if sequence is None:
+        return described
+    missing = sequence.missing(*PARTS)
+    return described | {
+        "name": sequence.name,
+        "description": sequence.description,
+        "label": sequence.label,
+        "frame_count": sequence.frame_count,
+        "frame_rate": sequence.frame_rate,
+        "duration_s": sequence.frame_count / sequence.frame_rate,
+        "view_count": len(sequence.views),
+        "hands": list(sequence.hands),
+        "marker_count": 0 if sequence.marker is None else sequence.marker.shape[1],
+        "parts": [part for part in PARTS if part not in missing],
+        "metric": sequence.metric,
+        "length_unit": sequence.length_unit,
+        "reconstruction_frames": len(sequence.reconstruction_frames),
+    }
 
-    duration_s: float | None = None
-    """Time that its finished stages took [s]."""
-    track_error_fitted: float | None = None
-    """Track error of the rollout in the frames that were fitted [m]."""
-    track_error_predicted: float | None = None
-    """Track error of the rollout in the frames that were not fitted [m]."""
-    reprojection: float | None = None
-    """Median distance of the hands' joints from their keypoints in the images [px]."""
+
+def describe_run(item: RunItem, scheduler: Scheduler) -> dict[str, Any]:
+    """Describe one run of a listing, with how far it is and how long it still takes."""
+    view = scheduler.view(item)
+    known = _described.get(item.run) if item.run else None
+    if known is None or known[0] is not view:
+        known = (view, _describe(item, view))
+        if item.run is not None:
+            _described[item.run] = known
+    return _with_time_left(known[1], item.run, view, scheduler)
 
 
-def summarize(run: Run) -> RunSummary:
-    """Read the figures of a run; what is missing or damaged is None, as a list must not fail.
+def _with_time_left(
+    described: dict[str, Any], run: Run | None, view: JobView, scheduler: Scheduler
+) -> dict[str, Any]:
+    """Add ``estimate``: `Forecast.of_running` or `Forecast.of_waiting`, else none.
 
-    Of several sequences the mean over the frames of all of them is given. A simulation of a
-    sequence that its source was not fitted to is a prediction from its first frame on.
+    Of a run at work, ``eta_s`` of its ``progress`` becomes the time that its stage still takes.
     """
+    estimate = None
+    if run is not None and view.state in {"starting", "running"}:
+        estimate = scheduler.forecast.of_running(run)
+    elif run is not None and view.state == "queued":
+        line = scheduler.in_line()
+        place = next((number for number, other in enumerate(line) if other.id == run.id), None)
+        if place is not None:
+            estimate = scheduler.forecast.of_waiting(
+                run, line[:place], scheduler.at_work(), scheduler.slots
+            )
+    progress = dict(described["progress"])
+    if progress and estimate and "stage_left_s" in estimate:
+        progress["eta_s"] = estimate["stage_left_s"]
+    return described | {"estimate": estimate, "progress": progress}
+
+
+def _describe(item: RunItem, view: JobView) -> dict[str, Any]:
+    described: dict[str, Any] = {
+        "id": item.id,
+        "name": item.id,
+        "is_bundled": item.is_bundled,
+        "state": view.state,
+        "place": view.place,
+        "reason": view.reason,
+        "progress": dict(view.progress),
+        "is_published": view.is_published,
+        "error": item.error,
+        "kind": "",
+        "created": "",
+        "sequences": [],
+        "profile": "",
+        "tags": [],
+        "note": "",
+    }
+    run = item.run
+    if run is None:
+        return described | asdict(RunSummary())
+    profile = named_fields(run.config.get("profile")) or {}
+    return (
+        described
+        | {
+            "name": run.name,
+            "kind": run.kind,
+            "created": run.created,
+            "sequences": run.sequence_names,
+            "profile": str(profile.get("profile", "")),
+            "tags": tags_of(run.label),
+            "note": run.note,
+            "error": view.reason if view.state == "failed" else None,
+        }
+        | asdict(summarize(run) if view.is_published else RunSummary())
+    )
+
+
+def follow_run(item: RunItem, scheduler: Scheduler) -> dict[str, Any]:
+    """Describe one run as its own page shows it.
+
+    Returns:
+        `describe_run`, with ``stages`` (see `StageView`), ``failure`` (``message advice`` of a
+        failed run, else none) and ``revision``, which differs whenever anything but the progress
+        within a stage does.
+    """
+    described = describe_run(item, scheduler)
+    run, state = item.run, described["state"]
+    results: list[tuple[str, int]] = []
+    stages: list[dict[str, Any]] = []
     try:
-        fitted, predicted = _track_errors(run)
-        reprojection = _reprojection(run)
-    except (PhysHandiError, OSError):
-        fitted = predicted = reprojection = None
-    return RunSummary(_duration(run), fitted, predicted, reprojection)
+        if run is not None:
+            stages = stages_of(run, state)
+            results = [
+                (rel, (run.out / rel).stat().st_mtime_ns) for rel in _RESULTS if run.has(rel)
+            ]
+    except (PhysHandiError, OSError) as error:
+        described |= {"state": "failed", "reason": str(error)}
+    failure = asdict(explain(run, described["reason"])) if state == "failed" else None
+    shown = [described | {"progress": None, "estimate": None}, results, failure]
+    shown += [stage | {"seconds": None} for stage in stages]
+    revision = hashlib.sha256(json.dumps(shown, default=str).encode()).hexdigest()[:16]
+    return described | {"stages": stages, "failure": failure, "revision": revision}
 
 
-def _duration(run: Run) -> float | None:
-    try:
-        seconds = [stage.get("seconds") for stage in run.stages()]
-    except (PhysHandiError, OSError):
-        return None
-    known = [float(value) for value in seconds if isinstance(value, int | float)]
-    return sum(known) if known and len(known) == len(seconds) else None
-
-
-def _track_errors(run: Run) -> tuple[float | None, float | None]:
-    if not run.has(_METRICS):
-        return None, None
-    metrics = named_fields(run.json(_METRICS)) or {}
-    unseen = _unseen_sequences(run)
-    fitted: list[tuple[float, float]] = []
-    predicted: list[tuple[float, float]] = []
-    for name, scores in metrics.items():
-        of_sequence = named_fields(scores) or {}
-        if of_sequence.get("unit", "m") != "m":
-            continue
-        fitted_frames = predicted if name in unseen else fitted
-        fitted_frames += _error_and_weight(of_sequence.get("reconstruction"))
-        predicted += _error_and_weight(of_sequence.get("future"))
-    return _mean(fitted), _mean(predicted)
-
-
-def _reprojection(run: Run) -> float | None:
-    """Give the median reprojection error, weighted by the keypoints of each hand."""
-    metrics = (named_fields(run.json(_METRICS)) if run.has(_METRICS) else None) or {}
-    found: list[tuple[float, float]] = []
-    for scores in metrics.values():
-        hands = named_fields((named_fields(scores) or {}).get("hands")) or {}
-        for score in hands.values():
-            fields = named_fields(score) or {}
-            error, count = fields.get("reprojection_median"), fields.get("scored_keypoints")
-            if isinstance(error, int | float) and isinstance(count, int | float) and count > 0:
-                found.append((float(error), float(count)))
-    return _mean(found)
-
-
-def _unseen_sequences(run: Run) -> set[str]:
-    if run.kind != "simulation":
-        return set()
-    try:
-        source = Run.open(Path(str(run.config.get("source", ""))))
-    except (PhysHandiError, OSError):
-        return set()  # The run that it began from was deleted since.
-    return set(run.sequence_names) - set(source.sequence_names)
-
-
-def _error_and_weight(part: Any) -> list[tuple[float, float]]:
-    """Give the track error of a part of a sequence and its number of frames, if it is known."""
-    fields = named_fields(part) or {}
-    error = (named_fields(fields.get("rollout")) or {}).get("track_error")
-    frames = fields.get("frames")
-    if not isinstance(error, int | float) or isinstance(error, bool):
-        return []
-    match frames:
-        case [int(first), int(end)] if end > first:
-            return [(float(error), float(end - first))]
-        case _:
-            return [(float(error), 1.0)]
-
-
-def _mean(weighted: list[tuple[float, float]]) -> float | None:
-    total = sum(weight for _, weight in weighted)
-    return sum(error * weight for error, weight in weighted) / total if total else None
+def tags_of(label: str) -> list[str]:
+    """Split a run's label into its tags."""
+    return list(dict.fromkeys(tag.strip() for tag in label.split(",") if tag.strip()))
 
 
 @dataclass(frozen=True)
@@ -289,304 +329,101 @@ def explain(run: Run | None, reason: str) -> Failure:
     return Failure(f"The program stopped at a mistake of its own ({kind}: {reason}).", _DEFECT)
 
 
-Sort = Literal[
-    "name",
-    "-name",
-    "sequence",
-    "-sequence",
-    "profile",
-    "-profile",
-    "state",
-    "-state",
-    "created",
-    "-created",
-    "duration",
-    "-duration",
-    "fitted",
-    "-fitted",
-    "predicted",
-    "-predicted",
-]
-"""A column to sort by; with a minus, from high to low."""
-SORTS = tuple(name for name in get_args(Sort) if name[0] != "-")
-STATES = ("queued", "starting", "running", "stopping", "succeeded", "failed", "cancelled")
-"""States in the order in which they come."""
-_FIELDS = {
-    "name": "name",
-    "profile": "profile",
-    "created": "created",
-    "duration": "duration_s",
-    "fitted": "track_error_fitted",
-    "predicted": "track_error_predicted",
-}
-_KEYS = ("is", "state", "profile", "sequence", "kind", "tag")
-_FLAGS = ("bundled", "mine", "published", *STATES)
+@dataclass(frozen=True)
+class RunSummary:
+    """What a run took and how well it did."""
 
-Word = Annotated[str, Field(max_length=120)]
+    duration_s: float | None = None
+    """Time that its finished stages took [s]."""
+    track_error_fitted: float | None = None
+    """Track error of the rollout in the frames that were fitted [m]."""
+    track_error_predicted: float | None = None
+    """Track error of the rollout in the frames that were not fitted [m]."""
+    reprojection: float | None = None
+    """Median distance of the hands' joints from their keypoints in the images [px]."""
 
 
-class RunQuery(BaseModel):
-    """Which runs, in which order; its fields are the parameters of an address."""
+def summarize(run: Run) -> RunSummary:
+    """Read the figures of a run; what is missing or damaged is None, as a list must not fail.
 
-    model_config = ConfigDict(extra="forbid")
-
-    q: Annotated[str, Field(max_length=200)] = ""
-    """Words that name, id, tags, sequences or profile contain, and conditions such as
-    ``state:failed``, ``profile:quick``, ``sequence:towel_fold``, ``kind:simulation``, ``tag:best``
-    or ``is:bundled``; a minus in front turns one around."""
-    state: Word = ""
-    """Only runs in this state."""
-    profile: Word = ""
-    """Only runs of this profile."""
-    sequence: Word = ""
-    """Only runs of this sequence."""
-    kind: Word = ""
-    """Only ``reconstruction`` or ``simulation``."""
-    sort: Sort | Literal[""] = ""
-    """Column to sort by; nothing puts the newest first and the bundled ones last."""
-    limit: Annotated[int, Field(ge=1, le=10_000)] | None = None
-    """Most runs to give; none gives all."""
-    offset: Annotated[int, Field(ge=0)] = 0
-    """Runs to leave out at the beginning."""
-
-    @property
-    def is_filtered(self) -> bool:
-        """Whether it leaves any run out."""
-        return bool(self.q.strip() or self.state or self.profile or self.sequence or self.kind)
-
-    def address(self, path: str = "/runs", **changes: Any) -> str:
-        """Write it as an address, with some fields changed; what is not set is left out."""
-        fields = self.model_dump() | {"offset": 0} | changes
-        defaults = RunQuery()
-        told = {k: v for k, v in fields.items() if v != getattr(defaults, k)}
-        return f"{path}?{urlencode(told)}" if told else path
-
-
-def select_runs(runs: Iterable[Mapping[str, Any]], query: RunQuery) -> list[Mapping[str, Any]]:
-    """Give the runs that a query asks for in its order, whatever its limit and offset.
-
-    Args:
-        runs: Descriptions of `describe_run`, the newest first.
-        query: What is asked for.
-
-    Raises:
-        UsageError: If a condition has an unknown name or value; names it.
+    Of several sequences the mean over the frames of all of them is given. A simulation of a
+    sequence that its source was not fitted to is a prediction from its first frame on.
     """
-    conditions = _conditions(query)
-    chosen = [run for run in runs if all(_fits(run, *condition) for condition in conditions)]
-    if not query.sort:
-        return chosen
-    name = query.sort.removeprefix("-")
-    # A run that lacks the figure comes last in either direction.
-    known = [(key, run) for run in chosen if (key := _key(run, name)) is not None]
-    known.sort(key=lambda pair: pair[0], reverse=query.sort.startswith("-"))
-    return [run for _, run in known] + [run for run in chosen if _key(run, name) is None]
-
-
-def page_of(runs: Sequence[Mapping[str, Any]], query: RunQuery) -> Sequence[Mapping[str, Any]]:
-    """Cut out the part that limit and offset ask for."""
-    end = None if query.limit is None else query.offset + query.limit
-    return runs[query.offset : end]
-
-
-def tags_of(label: str) -> list[str]:
-    """Split a run's label into its tags."""
-    return list(dict.fromkeys(tag.strip() for tag in label.split(",") if tag.strip()))
-
-
-def _conditions(query: RunQuery) -> list[tuple[str, str, bool]]:
-    """List what must hold: a key (empty for free text), its value, and whether it must not."""
-    chosen = [
-        (key, str(getattr(query, key)).lower(), False)
-        for key in ("state", "profile", "sequence", "kind")
-        if getattr(query, key)
-    ]
-    for word in query.q.lower().split():
-        is_not = len(word) > 1 and word.startswith("-")
-        key, colon, value = word.removeprefix("-" if is_not else "").partition(":")
-        if not colon:
-            chosen.append(("", key, is_not))
-        elif key not in _KEYS:
-            known = ", ".join(f"{name}:" for name in _KEYS)
-            raise UsageError(f"The filter knows no '{key}:'. It knows {known} and plain words.")
-        elif key == "is" and value not in _FLAGS:
-            known = ", ".join(_FLAGS)
-            raise UsageError(f"The filter knows no 'is:{value}'. After 'is:' write one of {known}.")
-        elif value:
-            chosen.append((key, value, is_not))
-    return chosen
-
-
-def _fits(run: Mapping[str, Any], key: str, value: str, is_not: bool) -> bool:
-    if key == "is":
-        flags = {
-            "bundled": run["is_bundled"],
-            "mine": not run["is_bundled"],
-            "published": run["is_published"],
-        }
-        found = flags.get(value, run["state"] == value)
-    elif key == "sequence":
-        found = value in (name.lower() for name in run["sequences"])
-    elif key == "tag":
-        found = value in (tag.lower() for tag in run["tags"])
-    elif key:
-        found = str(run[key]).lower() == value
-    else:
-        found = value in _text_of(run)
-    return found is not is_not
-
-
-def _text_of(run: Mapping[str, Any]) -> str:
-    told = (run["name"], run["id"], run["profile"], run.get("note", ""))
-    parts = (*told, *run["sequences"], *run["tags"])
-    return "\n".join(parts).lower()
-
-
-def _key(run: Mapping[str, Any], name: str) -> Any:
-    """Give what a run is sorted by; None if it has no such thing."""
-    if name == "state":
-        return STATES.index(run["state"]) if run["state"] in STATES else None
-    value = ", ".join(run["sequences"]) if name == "sequence" else run[_FIELDS[name]]
-    if isinstance(value, str):
-        return value.casefold() or None
-    return value
-
-
-PARTS = ("color", "depth", "mask", "keypoint", "track", "control", "marker", "object_node")
-_RESULTS = ("losses.json", "metrics.json", "object/parameters.yaml", ENVIRONMENT)
-CURVE_LIMIT = 2000
-"""Most points of a curve that are sent to a browser."""
-# Runs and the views of ended runs stay the same objects while nothing changes on disk, so a long
-# list is described once; a run at work has a new view, and is described anew, each time.
-_described: WeakKeyDictionary[Run, tuple[JobView, dict[str, Any]]] = WeakKeyDictionary()
-
-
-def describe_sequence(item: SequenceItem) -> dict[str, Any]:
-    """Describe one sequence of a listing."""
-    described: dict[str, Any] = {
-        "id": item.id,
-        "name": item.id,
-        "is_bundled": item.is_bundled,
-        "error": item.error,
-    }
-    sequence = item.sequence
-    if sequence is None:
-        return described
-    missing = sequence.missing(*PARTS)
-    return described | {
-        "name": sequence.name,
-        "description": sequence.description,
-        "label": sequence.label,
-        "frame_count": sequence.frame_count,
-        "frame_rate": sequence.frame_rate,
-        "duration_s": sequence.frame_count / sequence.frame_rate,
-        "view_count": len(sequence.views),
-        "hands": list(sequence.hands),
-        "marker_count": 0 if sequence.marker is None else sequence.marker.shape[1],
-        "parts": [part for part in PARTS if part not in missing],
-        "metric": sequence.metric,
-        "length_unit": sequence.length_unit,
-        "reconstruction_frames": len(sequence.reconstruction_frames),
-    }
-
-
-def describe_run(item: RunItem, scheduler: Scheduler) -> dict[str, Any]:
-    """Describe one run of a listing, with how far it is and how long it still takes."""
-    view = scheduler.view(item)
-    known = _described.get(item.run) if item.run else None
-    if known is None or known[0] is not view:
-        known = (view, _describe(item, view))
-        if item.run is not None:
-            _described[item.run] = known
-    return _with_time_left(known[1], item.run, view, scheduler)
-
-
-def _with_time_left(
-    described: dict[str, Any], run: Run | None, view: JobView, scheduler: Scheduler
-) -> dict[str, Any]:
-    """Add ``estimate``: `Forecast.of_running` or `Forecast.of_waiting`, else none.
-
-    Of a run at work, ``eta_s`` of its ``progress`` becomes the time that its stage still takes.
-    """
-    estimate = None
-    if run is not None and view.state in {"starting", "running"}:
-        estimate = scheduler.forecast.of_running(run)
-    elif run is not None and view.state == "queued":
-        line = scheduler.in_line()
-        place = next((number for number, other in enumerate(line) if other.id == run.id), None)
-        if place is not None:
-            estimate = scheduler.forecast.of_waiting(
-                run, line[:place], scheduler.at_work(), scheduler.slots
-            )
-    progress = dict(described["progress"])
-    if progress and estimate and "stage_left_s" in estimate:
-        progress["eta_s"] = estimate["stage_left_s"]
-    return described | {"estimate": estimate, "progress": progress}
-
-
-def _describe(item: RunItem, view: JobView) -> dict[str, Any]:
-    described: dict[str, Any] = {
-        "id": item.id,
-        "name": item.id,
-        "is_bundled": item.is_bundled,
-        "state": view.state,
-        "place": view.place,
-        "reason": view.reason,
-        "progress": dict(view.progress),
-        "is_published": view.is_published,
-        "error": item.error,
-        "kind": "",
-        "created": "",
-        "sequences": [],
-        "profile": "",
-        "tags": [],
-        "note": "",
-    }
-    run = item.run
-    if run is None:
-        return described | asdict(RunSummary())
-    profile = named_fields(run.config.get("profile")) or {}
-    return (
-        described
-        | {
-            "name": run.name,
-            "kind": run.kind,
-            "created": run.created,
-            "sequences": run.sequence_names,
-            "profile": str(profile.get("profile", "")),
-            "tags": tags_of(run.label),
-            "note": run.note,
-            "error": view.reason if view.state == "failed" else None,
-        }
-        | asdict(summarize(run) if view.is_published else RunSummary())
-    )
-
-
-def follow_run(item: RunItem, scheduler: Scheduler) -> dict[str, Any]:
-    """Describe one run as its own page shows it.
-
-    Returns:
-        `describe_run`, with ``stages`` (see `StageView`), ``failure`` (``message advice`` of a
-        failed run, else none) and ``revision``, which differs whenever anything but the progress
-        within a stage does.
-    """
-    described = describe_run(item, scheduler)
-    run, state = item.run, described["state"]
-    results: list[tuple[str, int]] = []
-    stages: list[dict[str, Any]] = []
     try:
-        if run is not None:
-            stages = stages_of(run, state)
-            results = [
-                (rel, (run.out / rel).stat().st_mtime_ns) for rel in _RESULTS if run.has(rel)
-            ]
-    except (PhysHandiError, OSError) as error:
-        described |= {"state": "failed", "reason": str(error)}
-    failure = asdict(explain(run, described["reason"])) if state == "failed" else None
-    shown = [described | {"progress": None, "estimate": None}, results, failure]
-    shown += [stage | {"seconds": None} for stage in stages]
-    revision = hashlib.sha256(json.dumps(shown, default=str).encode()).hexdigest()[:16]
-    return described | {"stages": stages, "failure": failure, "revision": revision}
+        fitted, predicted = _track_errors(run)
+        reprojection = _reprojection(run)
+    except (PhysHandiError, OSError):
+        fitted = predicted = reprojection = None
+    return RunSummary(_duration(run), fitted, predicted, reprojection)
+
+
+def _duration(run: Run) -> float | None:
+    try:
+        seconds = [stage.get("seconds") for stage in run.stages()]
+    except (PhysHandiError, OSError):
+        return None
+    known = [float(value) for value in seconds if isinstance(value, int | float)]
+    return sum(known) if known and len(known) == len(seconds) else None
+
+
+def _track_errors(run: Run) -> tuple[float | None, float | None]:
+    if not run.has(_METRICS):
+        return None, None
+    metrics = named_fields(run.json(_METRICS)) or {}
+    unseen = _unseen_sequences(run)
+    fitted: list[tuple[float, float]] = []
+    predicted: list[tuple[float, float]] = []
+    for name, scores in metrics.items():
+        of_sequence = named_fields(scores) or {}
+        if of_sequence.get("unit", "m") != "m":
+            continue
+        fitted_frames = predicted if name in unseen else fitted
+        fitted_frames += _error_and_weight(of_sequence.get("reconstruction"))
+        predicted += _error_and_weight(of_sequence.get("future"))
+    return _mean(fitted), _mean(predicted)
+
+
+def _reprojection(run: Run) -> float | None:
+    """Give the median reprojection error, weighted by the keypoints of each hand."""
+    metrics = (named_fields(run.json(_METRICS)) if run.has(_METRICS) else None) or {}
+    found: list[tuple[float, float]] = []
+    for scores in metrics.values():
+        hands = named_fields((named_fields(scores) or {}).get("hands")) or {}
+        for score in hands.values():
+            fields = named_fields(score) or {}
+            error, count = fields.get("reprojection_median"), fields.get("scored_keypoints")
+            if isinstance(error, int | float) and isinstance(count, int | float) and count > 0:
+                found.append((float(error), float(count)))
+    return _mean(found)
+
+
+def _unseen_sequences(run: Run) -> set[str]:
+    if run.kind != "simulation":
+        return set()
+    try:
+        source = Run.open(Path(str(run.config.get("source", ""))))
+    except (PhysHandiError, OSError):
+        return set()  # The run that it began from was deleted since.
+    return set(run.sequence_names) - set(source.sequence_names)
+
+
+def _error_and_weight(part: Any) -> list[tuple[float, float]]:
+    """Give the track error of a part of a sequence and its number of frames, if it is known."""
+    fields = named_fields(part) or {}
+    error = (named_fields(fields.get("rollout")) or {}).get("track_error")
+    frames = fields.get("frames")
+    if not isinstance(error, int | float) or isinstance(error, bool):
+        return []
+    match frames:
+        case [int(first), int(end)] if end > first:
+            return [(float(error), float(end - first))]
+        case _:
+            return [(float(error), 1.0)]
+
+
+def _mean(weighted: list[tuple[float, float]]) -> float | None:
+    total = sum(weight for _, weight in weighted)
+    return sum(error * weight for error, weight in weighted) / total if total else None
 
 
 def describe_results(run: Run) -> dict[str, dict[str, Any]]:

@@ -8,9 +8,10 @@ from fastapi import APIRouter, Header, Query, Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from app.jobs.catalog import Catalog
+from app.jobs.listing import STATES, RunQuery, page_of, select_runs
 from app.jobs.scheduler import ENDED
 from app.jobs.streams import Feed
-from app.jobs.views import STATES, RunQuery, describe_sequence, page_of, select_runs
+from app.jobs.views import describe_sequence
 from app.pages.render import Pages
 from app.previews.store import Kind, Previews
 from physhandi.errors import UsageError

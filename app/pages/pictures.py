@@ -1,13 +1,13 @@
 """The small pictures of runs and sequences, as files of addresses that change with them."""
 
-from typing import Annotated, Any
+from typing import Any
 
-from fastapi import APIRouter, Path, Response
+from fastapi import APIRouter, Response
 from fastapi.responses import FileResponse
 
+from app.ids import ItemId
 from app.previews.store import Kind, Previews
 
-Id = Annotated[str, Path(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
 _KEPT = {"Cache-Control": "private, max-age=604800, immutable"}
 _AGAIN = {"Cache-Control": "no-store"}
 
@@ -30,27 +30,27 @@ def add_pictures(router: APIRouter, previews: Previews) -> None:
         return Response(status_code=202 if picture.state == "pending" else 204, headers=_AGAIN)
 
     @router.get("/runs/{run_id}/still")
-    def run_still(run_id: Id, v: str = "") -> Response:
+    def run_still(run_id: ItemId, v: str = "") -> Response:
         return answer("run", run_id, v, is_moving=False)
 
     @router.get("/runs/{run_id}/preview")
-    def run_preview(run_id: Id, v: str = "") -> Response:
+    def run_preview(run_id: ItemId, v: str = "") -> Response:
         return answer("run", run_id, v, is_moving=True)
 
     @router.get("/runs/{run_id}/picture")
-    def run_picture(run_id: Id) -> dict[str, Any]:
+    def run_picture(run_id: ItemId) -> dict[str, Any]:
         return _told(previews, "run", run_id)
 
     @router.get("/sequences/{sequence_id}/still")
-    def sequence_still(sequence_id: Id, v: str = "") -> Response:
+    def sequence_still(sequence_id: ItemId, v: str = "") -> Response:
         return answer("sequence", sequence_id, v, is_moving=False)
 
     @router.get("/sequences/{sequence_id}/preview")
-    def sequence_preview(sequence_id: Id, v: str = "") -> Response:
+    def sequence_preview(sequence_id: ItemId, v: str = "") -> Response:
         return answer("sequence", sequence_id, v, is_moving=True)
 
     @router.get("/sequences/{sequence_id}/picture")
-    def sequence_picture(sequence_id: Id) -> dict[str, Any]:
+    def sequence_picture(sequence_id: ItemId) -> dict[str, Any]:
         return _told(previews, "sequence", sequence_id)
 
 

@@ -7,15 +7,16 @@ from typing import Annotated, Any, Literal, Protocol
 import cv2
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse
-from pydantic import Field
 from starlette.exceptions import HTTPException
 
+from app.ids import ItemId
 from app.jobs.catalog import Catalog, RunItem
 from app.jobs.log import read_log
-from app.jobs.order import order_of
+from app.jobs.order import describe_settings, order_of
+from app.jobs.overview import Overview
 from app.jobs.scheduler import ENDED, Scheduler
 from app.jobs.streams import Feed
-from app.jobs.views import describe_results, describe_run, follow_run
+from app.jobs.views import describe_results, describe_run, describe_sequence, follow_run
 from app.pages.browse import add_lists
 from app.pages.diff import LEAST, MOST, compare_runs
 from app.pages.metrics import METHODS, tabulate
@@ -26,8 +27,8 @@ from app.pages.suites import add_suites
 from app.previews.store import Previews
 from physhandi.data.sequence import Sequence
 from physhandi.errors import UsageError
+from physhandi.fitting.config import named_profile, profile_names
 
-Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
 _THUMBNAIL_WIDTH = 640
 
 
@@ -41,7 +42,7 @@ class ShownScene(Protocol):
 
     @property
     def target(self) -> str:
-        """Id of the run or the sequence."""
+        """ItemId of the run or the sequence."""
         ...
 
     @property
@@ -96,6 +97,7 @@ def create_pages(
     scenes: Scenes,
     pages: Pages,
     *,
+    overview: Overview,
     previews: Previews,
     suites: Path,
 ) -> APIRouter:
@@ -107,6 +109,7 @@ def create_pages(
         feed: Names the state that a page shows.
         scenes: Finds live scenes.
         pages: Renders.
+        overview: Describes machine, queue and program.
         previews: Keeps small pictures.
         suites: Folder of suites.
     """
@@ -114,9 +117,10 @@ def create_pages(
     add_lists(router, catalog, feed, pages, previews=previews)
     add_pictures(router, previews)
     add_suites(router, suites, pages)
+    _add_launch(router, catalog, overview, pages)
 
     @router.get("/runs/{run_id}")
-    def run(run_id: Id) -> HTMLResponse:
+    def run(run_id: ItemId) -> HTMLResponse:
         item = catalog.run_item(run_id)
         described = follow_run(item, scheduler)
         log = read_log(item.folder, is_ended=described["state"] in ENDED)
@@ -124,14 +128,14 @@ def create_pages(
         return pages.render("run.html", log=log, is_listed=item.run is not None, **values)
 
     @router.get("/runs/{run_id}/parts")
-    def parts(run_id: Id) -> HTMLResponse:
+    def parts(run_id: ItemId) -> HTMLResponse:
         """Give the parts of a run's page that change when a stage or the run ends."""
         item = catalog.run_item(run_id)
         return pages.render("parts.html", **run_values(item, follow_run(item, scheduler), catalog))
 
     @router.get("/diff")
     def diff(
-        run: Annotated[list[Id], Query(max_length=20)] = [],  # noqa: B006  # FastAPI copies it
+        run: Annotated[list[ItemId], Query(max_length=20)] = [],  # noqa: B006  # FastAPI copies it
         show: Literal["differences", "all"] = "differences",
     ) -> HTMLResponse:
         ids = list(dict.fromkeys(run))
@@ -156,7 +160,7 @@ def create_pages(
         )
 
     @router.get("/live/{session_id}")
-    def live(session_id: Id, request: Request) -> HTMLResponse:
+    def live(session_id: ItemId, request: Request) -> HTMLResponse:
         scene = scenes.find(session_id, request.state.owner)
         if scene is not None:
             return pages.render("live.html", session=session_id, scene=scene.info)
@@ -171,7 +175,7 @@ def create_pages(
         )
 
     @router.get("/sequences/{sequence_id}/thumbnail")
-    def thumbnail(sequence_id: Id) -> Response:
+    def thumbnail(sequence_id: ItemId) -> Response:
         item = catalog.sequence_item(sequence_id)
         image = _thumbnail(item.folder, (item.folder / "sequence.yaml").stat().st_mtime_ns)
         if image is None:
@@ -180,6 +184,20 @@ def create_pages(
         return Response(image, media_type="image/jpeg", headers=headers)
 
     return router
+
+
+def _add_launch(router: APIRouter, catalog: Catalog, overview: Overview, pages: Pages) -> None:
+    @router.get("/system")
+    def system() -> HTMLResponse:
+        return pages.render("system.html", system=overview.whole())
+
+    @router.get("/launch")
+    def launch(
+        run: Annotated[ItemId | None, Query()] = None,
+        profile: Annotated[ItemId | None, Query()] = None,
+        sequence: Annotated[ItemId | None, Query()] = None,
+    ) -> HTMLResponse:
+        return _launch_page(catalog, pages, run, profile, sequence)
 
 
 def run_values(item: RunItem, described: dict[str, Any], catalog: Catalog) -> dict[str, Any]:
@@ -201,6 +219,38 @@ def run_values(item: RunItem, described: dict[str, Any], catalog: Catalog) -> di
         "problem": results.get("problem", {}).get("message"),
         "methods": METHODS,
     }
+
+
+def _launch_page(
+    catalog: Catalog, pages: Pages, run_id: str | None, profile: str | None, sequence: str | None
+) -> HTMLResponse:
+    found = describe_settings(catalog, profile, run_id)
+    sequences = [entry for s in catalog.sequences() if not (entry := describe_sequence(s))["error"]]
+    item = catalog.run_item(run_id) if run_id else None
+    chosen: set[str | None] = {sequence}
+    missing: list[str] = []
+    if item is not None and item.run is not None:
+        folders = {str(s.folder): s.id for s in catalog.sequences()}
+        names = {entry["name"]: entry["id"] for entry in sequences}
+        for folder, name in zip(item.run.sequences, item.run.sequence_names, strict=True):
+            known = folders.get(folder, names.get(name))
+            if known is None:
+                missing.append(name)
+            chosen.add(known)
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for setting in found["settings"]:
+        groups.setdefault(setting["group_name"], []).append(setting)
+    return pages.render(
+        "launch.html",
+        parent=item and {"id": item.id, "name": item.run.name if item.run else item.id},
+        profile=found["profile"],
+        description=found["description"],
+        profiles=[(name, named_profile(name).description) for name in profile_names()],
+        groups=groups,
+        sequences=sequences,
+        chosen=chosen,
+        missing=missing,
+    )
 
 
 @lru_cache(maxsize=256)

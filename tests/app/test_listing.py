@@ -11,7 +11,8 @@ from server_world import World
 
 from app.jobs import catalog
 from app.jobs.catalog import Catalog, UnknownRunError
-from app.jobs.views import SORTS, RunQuery, page_of, select_runs, summarize, tags_of
+from app.jobs.listing import SORTS, RunQuery, page_of, select_runs
+from app.jobs.views import summarize, tags_of
 from app.settings import Settings
 from physhandi.errors import UsageError
 from physhandi.run import Run
