@@ -33,7 +33,6 @@ _MOST_FITS = 5
 """Most finished fits that a median is taken of, the newest ones."""
 _REFRESH_S = 10.0
 """Time after which the run folders are looked at again [s]."""
-_MOST_FOLLOWED = 256
 _TRUST = {True: 0.1, False: 0.02}
 """Weight of "as fast as the finished fits" beside what a fit itself shows, as a share of its
 expected time; the first if those had the same settings and machine."""

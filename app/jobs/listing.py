@@ -1,7 +1,7 @@
 """Which runs a list shows, in which order, and which page of it."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -27,7 +27,6 @@ Sort = Literal[
     "-predicted",
 ]
 """A column to sort by; with a minus, from high to low."""
-SORTS = tuple(name for name in get_args(Sort) if name[0] != "-")
 STATES = ("queued", "starting", "running", "stopping", "succeeded", "failed", "cancelled")
 """States in the order in which they come."""
 _FIELDS = {

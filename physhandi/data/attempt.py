@@ -254,31 +254,6 @@ def encode(preview: Preview, number: int) -> bytes:
     return save(packed(arrays), metadata={"about": json.dumps(about)})
 
 
-def read_preview(run_folder: Path) -> tuple[dict[str, Any], dict[str, Float[ndarray, "f p 3"]]]:
-    """Read a run's preview.
-
-    Returns:
-        What is shown (``stage sequence loss frame_rate frames low side number``), and the points
-        of each kind, NaN where they are not known [m].
-
-    Raises:
-        RunError: If there is none, or it is damaged.
-    """
-    path = run_folder / PREVIEW
-    try:
-        opened: Any = safe_open(path, framework="numpy")
-        with opened as stream:
-            about = named_fields(json.loads(dict(stream.metadata() or {})["about"])) or {}
-            arrays = {str(kind): np.asarray(stream.get_tensor(kind)) for kind in stream.keys()}  # noqa: SIM118
-        points: dict[str, ndarray] = {}
-        for kind, whole in arrays.items():
-            metres = np.asarray(about["low"]) + whole / _STEPS * float(about["side"])
-            points[kind] = np.where(whole == _UNKNOWN, np.nan, metres)
-    except (SafetensorError, OSError, KeyError, ValueError) as error:
-        raise RunError(f"{path} cannot be read: {error}.") from error
-    return about, points
-
-
 def _spread(count: int, most: int) -> Int[ndarray, " kept"]:
     """Choose so many of the numbers from 0 to `count` - 1, evenly and with both ends."""
     return np.rint(np.linspace(0, count - 1, most)).astype(np.int64)
@@ -508,17 +483,6 @@ class Attempt:
     def stage_done(self, name: str) -> bool:
         """Tell whether a stage is finished, here or in the attempt before."""
         return any(stage["name"] == name for stage in self._stages)
-
-    def stage_summary(self, name: str) -> dict[str, Any]:
-        """Give what `finish_stage` was told about a finished stage.
-
-        Raises:
-            KeyError: If the stage is not finished.
-        """
-        for stage in self._stages:
-            if stage["name"] == name:
-                return stage["summary"]
-        raise KeyError(name)
 
     def finish_stage(self, name: str, summary: Mapping[str, Any] | None = None) -> None:
         """Declare a stage finished with all files that were written until now.

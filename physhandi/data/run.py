@@ -28,7 +28,6 @@ from physhandi.data.run_folder import (
     CURRENT,
     EXIT,
     JOB,
-    LOG,
     MANIFEST,
     OUT,
     PROGRESS,
@@ -301,11 +300,6 @@ class RunFolder:
     def progress(self) -> dict[str, Any]:
         """The latest report: ``stage iteration total loss message eta_s time``; empty at first."""
         return read_mapping(self.folder / PROGRESS)
-
-    @property
-    def log_path(self) -> Path:
-        """Text log of the worker."""
-        return self.folder / LOG
 
     def begin_attempt(self, *, take_over: bool = False) -> Attempt:
         """Start working on the run; stages that an earlier attempt finished are taken over.

@@ -2,7 +2,6 @@
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NoReturn
@@ -260,15 +259,6 @@ def _fail(name: str, file: str, reason: str) -> NoReturn:
 _VIEW_PARTS = ("color", "depth", "mask", "keypoint", "track")
 
 
-@dataclass(frozen=True)
-class SequenceEntry:
-    """One folder of a listing: its sequence, or why it cannot be used."""
-
-    folder: Path
-    sequence: "Sequence | None"
-    error: str | None
-
-
 class Sequence:
     """One recorded interaction; every part but ``sequence.yaml`` may be absent.
 
@@ -474,22 +464,3 @@ class Sequence:
     def _array(self, file: str, kind: Any) -> Any:
         path = self.folder / file
         return read_array(path).astype(kind, copy=False) if path.is_file() else None
-
-
-def find_sequences(folder: Path | str) -> list[SequenceEntry]:
-    """List the sequences directly below a folder, by name.
-
-    A damaged sequence is listed with its error; nothing is raised because of one.
-    """
-    root = Path(folder)
-    entries: list[SequenceEntry] = []
-    if not root.is_dir():
-        return entries
-    for path in sorted(root.iterdir()):
-        if path.name.startswith(".") or not (path / FILE).is_file():
-            continue
-        try:
-            entries.append(SequenceEntry(path, Sequence.load(path), None))
-        except (SequenceError, OSError) as error:
-            entries.append(SequenceEntry(path, None, str(error)))
-    return entries

@@ -45,20 +45,6 @@ class HandScore:
         return asdict(self)
 
 
-def hide_keypoints(
-    keypoint: Float[ndarray, "view frame hand 21 3"], share: float = 0.1, seed: int = 0
-) -> Bool[ndarray, "view frame hand 21"]:
-    """Choose keypoints at random to keep from a fit, so that they can score it.
-
-    Args:
-        keypoint: Keypoints; NaN where not seen [px].
-        share: Share of the seen keypoints to hide.
-        seed: Seed of the choice.
-    """
-    chosen = np.random.default_rng(seed).random(keypoint.shape[:4]) < share
-    return chosen & np.isfinite(keypoint).all(-1)
-
-
 def evaluate_hands(
     cameras: Sequence[PinholeCamera],
     joint: Sequence[Float[ndarray, "frame 21 3"]],

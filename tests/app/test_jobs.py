@@ -260,7 +260,7 @@ def test_every_way_to_fail_tells_why(desk: Desk, behaviour: str, reason: str) ->
     assert reason in view.reason
     assert desk.run(run_id).state == "failed"
     if behaviour == "crash":
-        until(lambda: "the last words" in desk.run(run_id).log_path.read_text())
+        until(lambda: "the last words" in (desk.run(run_id).folder / "log.txt").read_text())
 
 
 def test_the_worker_dies_with_its_supervisor_and_the_run_can_go_on(desk: Desk) -> None:

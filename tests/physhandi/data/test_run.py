@@ -131,7 +131,6 @@ def test_finished_stages_are_taken_over(tmp_path: Path) -> None:
     with run.begin_attempt() as attempt:
         assert attempt.stage_done("hands")
         assert not attempt.stage_done("search")
-        assert attempt.stage_summary("hands")["after"] == 1.0
         assert sorted(p.name for p in attempt.out.iterdir()) == ["hands.npy", "losses.json"]
         checkpoint = attempt.load_checkpoint("search")
         assert checkpoint is not None

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from physhandi.data.camera import PinholeCamera
-from physhandi.data.sequence import Sequence, find_sequences
+from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import SequenceMeta, ViewMeta
 from physhandi.data.sequence_writer import SequenceWriter, write_sequence
 from physhandi.errors import SequenceError
@@ -320,18 +320,6 @@ def test_files_cannot_leave_the_sequence(tmp_path: Path, rel: str) -> None:
         pytest.raises(SequenceError, match="not a file name inside"),
     ):
         writer.save_array(rel, np.zeros(3))
-
-
-def test_a_damaged_sequence_does_not_hide_the_others(folder: Path, tmp_path: Path) -> None:
-    (tmp_path / "bad").mkdir()
-    (tmp_path / "bad" / "sequence.yaml").write_text("name: [")
-    (tmp_path / "notes").mkdir()
-    bad, good = find_sequences(tmp_path)
-    assert bad.sequence is None
-    assert "Sequence 'bad': sequence.yaml cannot be read" in (bad.error or "")
-    assert good.sequence is not None
-    assert good.sequence.name == "lift"
-    assert find_sequences(tmp_path / "nowhere") == []
 
 
 def test_wrong_images_are_named(folder: Path) -> None:

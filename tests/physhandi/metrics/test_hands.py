@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from physhandi.data.camera import PinholeCamera
-from physhandi.metrics.hands import evaluate_hands, hide_keypoints
+from physhandi.metrics.hands import evaluate_hands
 
 CAMERA = PinholeCamera(
     K=np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]),
@@ -63,13 +63,3 @@ def test_frames_seen_by_too_few_views_can_be_left_out() -> None:
     scores = [evaluate_hands([CAMERA, CAMERA], [joint], keypoint, least_views=n)[0] for n in (1, 2)]
     assert [score.frame_count for score in scores] == [4, 3]
     assert [score.fitted.keypoint_count for score in scores] == [147, 126]
-
-
-def test_the_share_of_hidden_keypoints_and_its_seed() -> None:
-    _, keypoint = _scene(400)
-    keypoint[0, :50] = np.nan
-    hidden = hide_keypoints(keypoint, 0.1, seed=3)
-    assert hidden[np.isfinite(keypoint).all(-1)].mean() == pytest.approx(0.1, abs=0.015)
-    assert not hidden[0, :50].any()
-    assert np.array_equal(hidden, hide_keypoints(keypoint, 0.1, seed=3))
-    assert not np.array_equal(hidden, hide_keypoints(keypoint, 0.1, seed=4))
