@@ -3,7 +3,7 @@
 import asyncio
 import time
 from collections.abc import Iterable
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Header, Query, Request, Response
 from fastapi.responses import StreamingResponse
@@ -27,42 +27,15 @@ from app.jobs.views import (
     describe_run,
     describe_sequence,
     follow_run,
-    frame_errors,
     loss_curves,
+    read_frame_errors,
 )
 from app.jobs.watch import Watch, preview_bytes
+from app.viewer.sessions import AnySession, Sessions
 from physhandi.fitting.config import named_profile, profile_names
 
 SettingPath = Annotated[str, Field(max_length=200)]
 _INTERVAL_S = 1.0
-
-
-class OpenScene(Protocol):
-    """A live scene that is open."""
-
-    def prefer_dark(self, *, on: bool) -> None:
-        """Follow the browser's color scheme."""
-        ...
-
-    def go(self, frame: int) -> None:
-        """Stop at a frame."""
-        ...
-
-
-class SessionOpener(Protocol):
-    """The part of the live viewer that the API needs."""
-
-    def open(self, kind: Literal["run", "sequence", "comparison"], target: str, owner: str) -> str:
-        """Open a live scene and return its id."""
-        ...
-
-    def close(self, session_id: str) -> bool:
-        """Close a live scene."""
-        ...
-
-    def find(self, session_id: str, owner: str) -> OpenScene | None:
-        """Find a live scene of an owner."""
-        ...
 
 
 class NewRun(BaseModel):
@@ -116,7 +89,7 @@ def create_api(
     catalog: Catalog,
     scheduler: Scheduler,
     feed: Feed,
-    sessions: SessionOpener,
+    sessions: Sessions,
     *,
     machine: Machine,
     overview: Overview,
@@ -182,7 +155,7 @@ def _add_results(router: APIRouter, catalog: Catalog) -> None:
 
     @router.get("/runs/{run_id}/frame_errors")
     def show_frame_errors(run_id: ItemId) -> dict[str, Any]:
-        return {"sequences": frame_errors(catalog.run(run_id))}
+        return {"sequences": read_frame_errors(catalog.run(run_id))}
 
     @router.get("/runs/{run_id}/log")
     def show_log(run_id: ItemId) -> Response:
@@ -248,14 +221,14 @@ def _add_jobs(router: APIRouter, catalog: Catalog, scheduler: Scheduler) -> None
         return Response(status_code=204)
 
 
-def _add_sessions(router: APIRouter, sessions: SessionOpener) -> None:
+def _add_sessions(router: APIRouter, sessions: Sessions) -> None:
     @router.post("/sessions", status_code=201)
     def open_session(new: NewScene, request: Request) -> dict[str, str]:
         target = new.query if isinstance(new, NewComparison) else new.id
         session_id = sessions.open(new.kind, target, request.state.owner)
         return {"id": session_id, "url": f"/live/{session_id}"}
 
-    def find(session_id: str, request: Request) -> OpenScene:
+    def find(session_id: str, request: Request) -> AnySession:
         scene = sessions.find(session_id, request.state.owner)
         if scene is None:
             raise HTTPException(404, "This live scene was closed, or it is not yours.")

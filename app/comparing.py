@@ -8,7 +8,7 @@ from fastapi.responses import HTMLResponse
 from app.comparison import CompareAsk, Id
 from app.jobs.catalog import Catalog, RunItem
 from app.jobs.scheduler import Scheduler
-from app.jobs.views import describe_results, describe_run, frame_errors
+from app.jobs.views import describe_results, describe_run, read_frame_errors
 from app.pages import Pages
 from app.pages.diff import compare_runs
 from app.viewer.color.difference import compare_frames, way_of
@@ -78,7 +78,7 @@ def create_comparing(catalog: Catalog, scheduler: Scheduler, pages: Pages) -> AP
         runs = (catalog.run(ask.a), catalog.run(ask.b))
         frames = [pair.clock.frames(tick) for tick in range(pair.clock.tick_count)]
         names = [content.sequence_name for content in pair.contents]
-        errors = [frame_errors(run).get(n, {}) for run, n in zip(runs, names, strict=True)]
+        errors = [read_frame_errors(run).get(n, {}) for run, n in zip(runs, names, strict=True)]
         return {
             "sequences": names,
             "notes": list(pair.notes),

@@ -21,7 +21,7 @@ def evaluate_suite(command: Any, progress: Progress) -> dict[str, Any]:
     Raises:
         UsageError: If a method, seed or sequence makes no sense, or the folder holds other data.
     """
-    from app.cli.suite_workers import MOST, SuiteWorkers
+    from app.cli.suite_workers import MOST_PROCESSES, SuiteWorkers
     from physhandi.synthetic.suite.evaluation import Order, evaluate_suite
     from physhandi.synthetic.suite.folder import check_folder
     from physhandi.synthetic.suite.methods import method_settings, parse_method
@@ -54,8 +54,8 @@ def evaluate_suite(command: Any, progress: Progress) -> dict[str, Any]:
         of_seeds = "" if set(seeds) == set(suite.seeds) else f"-seeds-{_joined(seeds)}"
         out = command.out or folders / f"{suite.name}{of_seeds}"
     check_folder(out, title, cases)
-    if not 1 <= command.jobs <= MOST:
-        raise UsageError(f"--jobs {command.jobs} makes no sense; choose 1 to {MOST}.")
+    if not 1 <= command.jobs <= MOST_PROCESSES:
+        raise UsageError(f"--jobs {command.jobs} makes no sense; choose 1 to {MOST_PROCESSES}.")
     with ExitStack() as stack:
         # Everything that a user may have got wrong is told before they are started.
         make, workers = partial(make_one_by_one, progress=progress), None

@@ -83,7 +83,7 @@ def work(channel: Channel) -> None:
         channel.tell(done=True)
 
 
-MOST = 64
+MOST_PROCESSES = 64
 """Processes at most."""
 _LISTEN = 0.2
 
@@ -129,8 +129,8 @@ class SuiteWorkers:
         Raises:
             UsageError: If the number makes no sense.
         """
-        if not 2 <= count <= MOST:
-            raise UsageError(f"{count} processes make no sense; choose 2 to {MOST}.")
+        if not 2 <= count <= MOST_PROCESSES:
+            raise UsageError(f"{count} processes make no sense; choose 2 to {MOST_PROCESSES}.")
         self._progress = progress
         self._heard: queue.Queue[tuple[int, Any]] = queue.Queue()
         self._workers = [self._start(number, share) for number, share in enumerate(_shares(count))]

@@ -31,8 +31,8 @@ from physhandi.run import Run
 
 _OWN_FIELDS = ("format", "width", "height", "download")
 _SIMPLE = ("ply", "gltf", "npz", "csv", "yaml")
-Side = Annotated[int, Field(ge=SMALLEST, le=LARGEST)]
-Link = Annotated[
+PictureSide = Annotated[int, Field(ge=SMALLEST, le=LARGEST)]
+LinkField = Annotated[
     str | None,
     Query(max_length=600, description="As in a link of the viewer; see the page's “Copy link”."),
 ]
@@ -60,14 +60,14 @@ def create_files(catalog: Catalog, sessions: Sessions, workshop: FileCache) -> A
         kind: Annotated[RunFormat, Query(alias="format")],
         sequence: Annotated[str | None, Query(max_length=200)] = None,
         f: Annotated[int | None, Query(ge=0, description="Frame of PNG, ZIP and PLY.")] = None,
-        width: Annotated[Side, Query(description="Of PNG and ZIP [px].")] = 1280,
-        height: Annotated[Side, Query(description="Of PNG and ZIP [px].")] = 720,
-        cam: Link = None,
-        fov: Link = None,
-        show: Link = None,
-        color: Link = None,
-        scale: Link = None,
-        theme: Link = None,
+        width: Annotated[PictureSide, Query(description="Of PNG and ZIP [px].")] = 1280,
+        height: Annotated[PictureSide, Query(description="Of PNG and ZIP [px].")] = 720,
+        cam: LinkField = None,
+        fov: LinkField = None,
+        show: LinkField = None,
+        color: LinkField = None,
+        scale: LinkField = None,
+        theme: LinkField = None,
     ) -> FileResponse:
         """Write a run as a file that other programs read.
 
@@ -97,8 +97,8 @@ def create_files(catalog: Catalog, sessions: Sessions, workshop: FileCache) -> A
         request: Request,
         session_id: ItemId,
         kind: Annotated[RunFormat, Query(alias="format")],
-        width: Annotated[Side, Query(description="Of PNG and ZIP [px].")] = 1280,
-        height: Annotated[Side, Query(description="Of PNG and ZIP [px].")] = 720,
+        width: Annotated[PictureSide, Query(description="Of PNG and ZIP [px].")] = 1280,
+        height: Annotated[PictureSide, Query(description="Of PNG and ZIP [px].")] = 720,
     ) -> Response:
         """Write what a live scene shows: the rollout that its sliders asked for, as it looks."""
         session = sessions.find(session_id, request.state.owner)

@@ -9,7 +9,7 @@ from app.viewer.content.session_state import SessionState
 from physhandi.errors import UsageError
 from physhandi.object_rollout import ObjectRollout
 
-MOST_FRAMES = 3_000
+LONGEST_RECORDING = 3_000
 """Longer sequences are not recorded."""
 BYTES_FOR_300_FRAMES = 20_000_000
 """What a recording of 300 frames may weigh, springs and arrows giving way."""
@@ -41,9 +41,10 @@ def record_scene(
         UsageError: If the sequence is too long.
     """
     count = content.frame_count
-    if count > MOST_FRAMES:
+    if count > LONGEST_RECORDING:
         raise UsageError(
-            f"'{content.sequence_name}' has {count} frames; at most {MOST_FRAMES} are recorded."
+            f"'{content.sequence_name}' has {count} frames; at most "
+            f"{LONGEST_RECORDING} are recorded."
         )
     frame_bytes = int(_PACKING * BYTES_FOR_300_FRAMES / 300)
     pause = 1.0 / (content.frame_rate * state.speed)

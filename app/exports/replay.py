@@ -25,8 +25,8 @@ from physhandi.errors import UsageError, describe
 _CLIENT = Path(viser.__file__).parent / "client" / "build" / "index.html"
 _CAMERA = ("cam", "up", "fov")
 _KNOWN = ("sequence", "theme", *_CAMERA)
-Sequence = Annotated[str | None, Query(max_length=200)]
-Theme = Annotated[Literal["light", "dark"], Query()]
+SequenceField = Annotated[str | None, Query(max_length=200)]
+ThemeField = Annotated[Literal["light", "dark"], Query()]
 
 
 class Replay(BaseModel):
@@ -90,7 +90,9 @@ def create_replays(catalog: Catalog, workshop: FileCache, pages: Pages) -> APIRo
         )
 
     @router.post("/api/v1/runs/{run_id}/replay", responses=errors(404, 409, 422, 429))
-    def prepare(run_id: ItemId, sequence: Sequence = None, theme: Theme = "light") -> Replay:
+    def prepare(
+        run_id: ItemId, sequence: SequenceField = None, theme: ThemeField = "light"
+    ) -> Replay:
         """Have the replay of a run made, unless it is there, and tell how far it is."""
         work = workshop.begin(order(run_id, sequence, theme))
         query = {"theme": theme} | ({"sequence": sequence} if sequence else {})
@@ -101,7 +103,9 @@ def create_replays(catalog: Catalog, workshop: FileCache, pages: Pages) -> APIRo
         response_class=FileResponse,
         responses=files("viser") | errors(404, 409, 422, 429),
     )
-    def fetch(run_id: ItemId, sequence: Sequence = None, theme: Theme = "light") -> FileResponse:
+    def fetch(
+        run_id: ItemId, sequence: SequenceField = None, theme: ThemeField = "light"
+    ) -> FileResponse:
         """Give the replay of a run as viser's recording; made when it is missing."""
         path = workshop.make(order(run_id, sequence, theme))
         headers = {"Cache-Control": "private, no-cache"}

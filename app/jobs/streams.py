@@ -86,7 +86,7 @@ _SHARE = 0.1
 
 
 @dataclass(frozen=True)
-class Change:
+class RunEvent:
     """One thing that changed."""
 
     id: str
@@ -127,15 +127,15 @@ class Feed:
             self._refresh()
             return self._id(self._number), list((self._known or {}).values())
 
-    def since(self, last: str | None) -> list[Change]:
+    def since(self, last: str | None) -> list[RunEvent]:
         """Give all changes after the one named; one ``reset`` if they are not known any more."""
         with self._lock:
             self._refresh()
             number = self._number_of(last)
             if number is None:
-                return [Change(self._id(self._number), "reset", {})]
+                return [RunEvent(self._id(self._number), "reset", {})]
             return [
-                Change(self._id(n), event, data) for n, event, data in self._changes if n > number
+                RunEvent(self._id(n), event, data) for n, event, data in self._changes if n > number
             ]
 
     def _id(self, number: int) -> str:

@@ -127,7 +127,7 @@ def _describe(item: RunItem, view: JobView) -> dict[str, Any]:
             "note": run.note,
             "error": view.reason if view.state == "failed" else None,
         }
-        | asdict(summarize(run) if view.is_published else RunSummary())
+        | asdict(summarize_run(run) if view.is_published else RunSummary())
     )
 
 
@@ -343,7 +343,7 @@ class RunSummary:
     """Median distance of the hands' joints from their keypoints in the images [px]."""
 
 
-def summarize(run: Run) -> RunSummary:
+def summarize_run(run: Run) -> RunSummary:
     """Read the figures of a run; what is missing or damaged is None, as a list must not fail.
 
     Of several sequences the mean over the frames of all of them is given. A simulation of a
@@ -442,7 +442,7 @@ def describe_results(run: Run) -> dict[str, dict[str, Any]]:
     return results
 
 
-def frame_errors(run: Run) -> dict[str, dict[str, Any]]:
+def read_frame_errors(run: Run) -> dict[str, dict[str, Any]]:
     """Give the errors of every frame, for each sequence that they were measured in.
 
     Returns:

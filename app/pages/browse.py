@@ -13,7 +13,7 @@ from app.jobs.scheduler import ENDED
 from app.jobs.streams import Feed
 from app.jobs.views import describe_sequence
 from app.pages.render import Pages
-from app.previews.store import Kind, Previews
+from app.previews.store import PreviewKind, Previews
 from physhandi.errors import UsageError
 from physhandi.fitting.config import named_profile, profile_names
 
@@ -89,7 +89,7 @@ def add_lists(
         described = [describe_sequence(item) for item in catalog.sequences()]
         return [sequence | {"run_count": counts[sequence["name"]]} for sequence in described]
 
-    def pictured(kind: Kind, shown: Sequence[Any]) -> list[dict[str, Any]]:
+    def pictured(kind: PreviewKind, shown: Sequence[Any]) -> list[dict[str, Any]]:
         # From the last to the first: what was asked for last is drawn first.
         found = [entry | {"picture": previews.look(kind, entry["id"])} for entry in shown[::-1]]
         return found[::-1]

@@ -5,13 +5,20 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
-from app.pages.metrics import about_quantity, figure, is_count, is_higher_better, scaled, unit_of
+from app.pages.metrics import (
+    about_quantity,
+    figure,
+    is_better_when_higher,
+    is_count,
+    scaled,
+    unit_of_metric,
+)
 from app.pages.parameters import meaning_of
 from app.pages.render import duration, short, words
 from physhandi.data.files import named_fields
 from physhandi.settings import flatten, is_same
 
-LEAST, MOST = 2, 5
+LEAST_RUNS, MOST_RUNS = 2, 5
 """How many runs can be compared."""
 _COMMIT_DIGITS = 12
 _SPLITS = {"reconstruction": "fitted frames", "future": "predicted frames"}
@@ -21,7 +28,7 @@ _Scores = dict[tuple[str, str, str], tuple[float, str]]
 
 
 @dataclass(frozen=True)
-class Cell:
+class ComparedCell:
     """What one run has of a quantity."""
 
     text: str
@@ -38,7 +45,7 @@ class Row:
     """One quantity of all runs."""
 
     name: str
-    cells: list[Cell]
+    cells: list[ComparedCell]
     differs: bool
     """Whether the runs do not all have the same."""
     about: str = ""
@@ -115,7 +122,7 @@ def _plain_rows(columns: Sequence[Mapping[str, Any]]) -> list[Row]:
     for name in _names(columns):
         values = [column.get(name) for column in columns]
         if any(value is not None for value in values):
-            cells = [Cell(text) for text in _texts(columns, name)]
+            cells = [ComparedCell(text) for text in _texts(columns, name)]
             shown = " / ".join(words(part.rstrip("_")) for part in name.split("."))
             rows.append(Row(shown, cells, _differ(values)))
     return rows
@@ -129,7 +136,7 @@ def _parameter_rows(columns: Sequence[Mapping[str, Any]]) -> list[Row]:
         scaled_columns = [
             {name: scaled(column[name], unit)[0]} if name in column else {} for column in columns
         ]
-        cells = [Cell(text) for text in _texts(scaled_columns, name)]
+        cells = [ComparedCell(text) for text in _texts(scaled_columns, name)]
         rows.append(Row(words(name), cells, _differ(values), about, scaled(None, unit)[1]))
     return rows
 
@@ -155,12 +162,14 @@ def _score_row(columns: Sequence[_Scores], key: tuple[str, str, str]) -> Row:
     words_of_name = set(name.rsplit(".", 1)[-1].split("_"))
     values = [column[key][0] if key in column else None for column in columns]
     numbers = [value for value in values if value is not None]
-    unit = unit_of(words_of_name, next(column[key][1] for column in columns if key in column))
-    best = (max if is_higher_better(words_of_name) else min)(numbers)
+    unit = unit_of_metric(
+        words_of_name, next(column[key][1] for column in columns if key in column)
+    )
+    best = (max if is_better_when_higher(words_of_name) else min)(numbers)
     is_score = key[1] != "topology" and not is_count(words_of_name)
     is_contest = is_score and any(not _same(value, best) for value in numbers)
     cells = [
-        Cell(
+        ComparedCell(
             figure(scaled(value, unit)[0]),
             is_contest and value is not None and _same(value, best),
             _change(values[0], value) if number else "",

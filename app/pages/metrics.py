@@ -5,7 +5,7 @@ from typing import Any, cast
 from app.pages.render import short, words
 from physhandi.data.files import named_fields
 
-METHODS = {
+METHOD_TEXTS = {
     "rollout": "The fitted object, simulated from frame 0 on with the motion of the hand.",
     "static": "Baseline: the object stays as it is in frame 0.",
     "rigid_follow": "Baseline: the object of frame 0 moves rigidly with the control nodes.",
@@ -78,7 +78,7 @@ def tabulate(scores: Any) -> dict[str, Any]:
             if key != "unit" and not isinstance(value, int | float | None)
         }
         note = ", ".join(f"{words(key)} {_fact(key, v)}" for key, v in facts.items())
-        heads = [{"name": key, "about": METHODS.get(key, "")} for key in columns]
+        heads = [{"name": key, "about": METHOD_TEXTS.get(key, "")} for key in columns]
         tables.append({"name": name, "note": note, "columns": heads, "rows": rows})
     return {"tables": tables, "notes": notes}
 
@@ -99,8 +99,8 @@ def _rows(columns: dict[str, dict[str, Any]], unit: str) -> list[dict[str, Any]]
             continue
         parts = set(quantity.split("_"))
         local = next((str(c["unit"]) for c in columns.values() if "unit" in c), unit)
-        kind = unit_of(parts, local)
-        is_higher = is_higher_better(parts)
+        kind = unit_of_metric(parts, local)
+        is_higher = is_better_when_higher(parts)
         is_contest = "rollout" in columns and len(known) > 1 and not parts & _COUNTS
         best = (max if is_higher else min)(known) if is_contest else None
         rows.append(
@@ -108,7 +108,7 @@ def _rows(columns: dict[str, dict[str, Any]], unit: str) -> list[dict[str, Any]]
                 "name": quantity,
                 "about": about_quantity(quantity),
                 "unit": scaled(None, kind)[1],
-                "is_higher_better": is_higher,
+                "is_better_when_higher": is_higher,
                 "cells": [
                     {
                         "text": figure(scaled(value, kind)[0]),
@@ -126,7 +126,7 @@ def about_quantity(name: str) -> str:
     return next((text for start, text in _ABOUT if start in name), "")
 
 
-def is_higher_better(parts: set[str]) -> bool:
+def is_better_when_higher(parts: set[str]) -> bool:
     """Tell by the words of its name whether more of a quantity is better."""
     return bool(parts & _HIGHER)
 
@@ -144,7 +144,7 @@ def figure(value: Any) -> str:
     return f"{value:#.4g}" if is_plain else short(value)
 
 
-def unit_of(parts: set[str], unit: str) -> str:
+def unit_of_metric(parts: set[str], unit: str) -> str:
     """Tell what a quantity is measured in by the words of its name; empty for a mere number."""
     if parts & _COUNTS:
         return ""
@@ -162,6 +162,6 @@ def _fact(name: str, value: Any) -> str:
     fields = named_fields(value)
     if fields is not None:
         return ", ".join(f"{words(key)} {_fact(key, inner)}" for key, inner in fields.items())
-    kind = unit_of(set(name.split("_")), "m")
+    kind = unit_of_metric(set(name.split("_")), "m")
     shown, unit = scaled(value, kind)
     return f"{short(shown)} {unit}".strip()

@@ -6,7 +6,7 @@ from fastapi import APIRouter, Response
 from fastapi.responses import FileResponse
 
 from app.ids import ItemId
-from app.previews.store import Kind, Previews
+from app.previews.store import PreviewKind, Previews
 
 _KEPT = {"Cache-Control": "private, max-age=604800, immutable"}
 _AGAIN = {"Cache-Control": "no-store"}
@@ -20,7 +20,7 @@ def add_pictures(router: APIRouter, previews: Previews) -> None:
         previews: Keeps them.
     """
 
-    def answer(kind: Kind, item_id: str, version: str, *, is_moving: bool) -> Response:
+    def answer(kind: PreviewKind, item_id: str, version: str, *, is_moving: bool) -> Response:
         path = previews.file(kind, item_id, is_moving=is_moving)
         if path is not None:
             headers = _KEPT if version and f"-{version}." in path.name else _AGAIN
@@ -54,7 +54,7 @@ def add_pictures(router: APIRouter, previews: Previews) -> None:
         return _told(previews, "sequence", sequence_id)
 
 
-def _told(previews: Previews, kind: Kind, item_id: str) -> dict[str, Any]:
+def _told(previews: Previews, kind: PreviewKind, item_id: str) -> dict[str, Any]:
     """Tell a page that waits for a picture whether it is there by now, and where."""
     picture = previews.look(kind, item_id)
     return {"state": picture.state, "still": picture.still, "moving": picture.moving}

@@ -2,7 +2,7 @@
 
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal
 
 import cv2
 from fastapi import APIRouter, Query, Request, Response
@@ -18,13 +18,14 @@ from app.jobs.scheduler import ENDED, Scheduler
 from app.jobs.streams import Feed
 from app.jobs.views import describe_results, describe_run, describe_sequence, follow_run
 from app.pages.browse import add_lists
-from app.pages.diff import LEAST, MOST, compare_runs
-from app.pages.metrics import METHODS, tabulate
+from app.pages.diff import LEAST_RUNS, MOST_RUNS, compare_runs
+from app.pages.metrics import METHOD_TEXTS, tabulate
 from app.pages.parameters import parameter_rows
 from app.pages.pictures import add_pictures
 from app.pages.render import Pages
 from app.pages.suites import add_suites
 from app.previews.store import Previews
+from app.viewer.sessions import Sessions
 from physhandi.data.sequence import Sequence
 from physhandi.errors import UsageError
 from physhandi.fitting.config import named_profile, profile_names
@@ -32,69 +33,11 @@ from physhandi.fitting.config import named_profile, profile_names
 _THUMBNAIL_WIDTH = 640
 
 
-class ShownScene(Protocol):
-    """What a page says about a live scene."""
-
-    @property
-    def kind(self) -> str:
-        """``run`` or ``sequence``."""
-        ...
-
-    @property
-    def target(self) -> str:
-        """ItemId of the run or the sequence."""
-        ...
-
-    @property
-    def title(self) -> str:
-        """Its name."""
-        ...
-
-
-class LiveScene(ShownScene, Protocol):
-    """What a page says about a live scene that is open."""
-
-    @property
-    def offers(self) -> tuple[str, ...]:
-        """What it has: ``object``, ``colors``, ``figure``."""
-        ...
-
-
-class Scene(Protocol):
-    """A live scene of the viewer."""
-
-    @property
-    def info(self) -> LiveScene:
-        """What is to be said about it."""
-        ...
-
-
-class ClosedScene(ShownScene, Protocol):
-    """What is remembered of a live scene that was closed."""
-
-    @property
-    def reason(self) -> str:
-        """Why it was closed, as a sentence."""
-        ...
-
-
-class Scenes(Protocol):
-    """The part of the live viewer that the pages need."""
-
-    def find(self, session_id: str, owner: str) -> Scene | None:
-        """Find a live scene of an owner."""
-        ...
-
-    def closed_session(self, session_id: str, owner: str) -> ClosedScene | None:
-        """Remember a live scene of an owner that was closed."""
-        ...
-
-
 def create_pages(
     catalog: Catalog,
     scheduler: Scheduler,
     feed: Feed,
-    scenes: Scenes,
+    sessions: Sessions,
     pages: Pages,
     *,
     overview: Overview,
@@ -107,7 +50,7 @@ def create_pages(
         catalog: Finds sequences and runs.
         scheduler: Tells how far runs are.
         feed: Names the state that a page shows.
-        scenes: Finds live scenes.
+        sessions: Finds live scenes.
         pages: Renders.
         overview: Describes machine, queue and program.
         previews: Keeps small pictures.
@@ -139,9 +82,9 @@ def create_pages(
         show: Literal["differences", "all"] = "differences",
     ) -> HTMLResponse:
         ids = list(dict.fromkeys(run))
-        if not LEAST <= len(ids) <= MOST:
+        if not LEAST_RUNS <= len(ids) <= MOST_RUNS:
             raise UsageError(
-                f"Choose {LEAST} to {MOST} runs in the list of runs to compare them; "
+                f"Choose {LEAST_RUNS} to {MOST_RUNS} runs in the list of runs to compare them; "
                 f"this address names {len(ids)}."
             )
         items = [catalog.run_item(run_id) for run_id in ids]
@@ -156,15 +99,15 @@ def create_pages(
             runs=[entry | {"picture": previews.look("run", entry["id"])} for entry in described],
             sections=sections,
             shows_all=show == "all",
-            least=LEAST,
+            least=LEAST_RUNS,
         )
 
     @router.get("/live/{session_id}")
     def live(session_id: ItemId, request: Request) -> HTMLResponse:
-        scene = scenes.find(session_id, request.state.owner)
+        scene = sessions.find(session_id, request.state.owner)
         if scene is not None:
             return pages.render("live.html", session=session_id, scene=scene.info)
-        closed = scenes.closed_session(session_id, request.state.owner)
+        closed = sessions.closed_session(session_id, request.state.owner)
         if closed is not None:
             query = request.url.query
             return pages.render("closed.html", status=404, scene=closed, query=query)
@@ -217,7 +160,7 @@ def run_values(item: RunItem, described: dict[str, Any], catalog: Catalog) -> di
         "parameters": parameter_rows(item.run, found) if item.run else [],
         "environment": results.get("environment", {}),
         "problem": results.get("problem", {}).get("message"),
-        "methods": METHODS,
+        "methods": METHOD_TEXTS,
     }
 
 

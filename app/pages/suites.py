@@ -9,7 +9,7 @@ from fastapi.responses import HTMLResponse
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from app.jobs.catalog import NotFoundError
-from app.pages.metrics import about_quantity, figure, scaled, unit_of
+from app.pages.metrics import about_quantity, figure, scaled, unit_of_metric
 from app.pages.render import Pages
 from physhandi.data.run_folder import read_json
 from physhandi.errors import PhysHandiError, RunError
@@ -66,7 +66,7 @@ class About(BaseModel):
     environment: Environment
 
 
-class Cell(BaseModel):
+class StoredCell(BaseModel):
     """One cell in ``cells.json``, as far as the page shows it."""
 
     method: str
@@ -77,11 +77,11 @@ class Cell(BaseModel):
     figures: dict[str, dict[str, float | None]]
 
 
-class Cells(BaseModel):
+class StoredCells(BaseModel):
     """Content of ``cells.json``."""
 
     about: About
-    cells: list[Cell]
+    cells: list[StoredCell]
 
 
 def add_suites(router: APIRouter, folder: Path, pages: Pages) -> None:
@@ -168,7 +168,7 @@ def _described(path: Path) -> dict[str, Any]:
     }
 
 
-def _read(path: Path) -> Cells:
+def _read(path: Path) -> StoredCells:
     """Read what a suite says of itself.
 
     Raises:
@@ -176,7 +176,7 @@ def _read(path: Path) -> Cells:
     """
     file = path / "cells.json"
     try:
-        return Cells.model_validate(read_json(file))
+        return StoredCells.model_validate(read_json(file))
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
@@ -212,11 +212,11 @@ def _tables(rows: list[SuiteRow], oracles: list[str]) -> list[dict[str, Any]]:
     return tables
 
 
-def _matrix(cells: list[Cell], oracles: list[str], query: CellQuery) -> dict[str, Any]:
+def _matrix(cells: list[StoredCell], oracles: list[str], query: CellQuery) -> dict[str, Any]:
     """Arrange one figure by sequence and method; every cell leads to its run."""
     shown = [cell for cell in cells if query.split in cell.figures]
     methods = list(dict.fromkeys(cell.method for cell in shown))
-    unit = unit_of(set(query.metric.split("_")), "m")
+    unit = unit_of_metric(set(query.metric.split("_")), "m")
     rows: list[dict[str, Any]] = []
     for case in dict.fromkeys(cell.case for cell in shown):
         of_case = {cell.method: cell for cell in shown if cell.case == case}
@@ -251,7 +251,9 @@ def _matrix(cells: list[Cell], oracles: list[str], query: CellQuery) -> dict[str
     }
 
 
-def _shown(cell: Cell | None, value: float | None, unit: str, best: float | None) -> dict[str, Any]:
+def _shown(
+    cell: StoredCell | None, value: float | None, unit: str, best: float | None
+) -> dict[str, Any]:
     return {
         "text": figure(scaled(value, unit)[0]),
         "is_best": value is not None and value == best and cell is not None and not cell.error,
@@ -260,7 +262,7 @@ def _shown(cell: Cell | None, value: float | None, unit: str, best: float | None
     }
 
 
-def _choices(cells: list[Cell]) -> dict[str, list[str]]:
+def _choices(cells: list[StoredCell]) -> dict[str, list[str]]:
     splits = dict.fromkeys(split for cell in cells for split in cell.figures)
     metrics = dict.fromkeys(
         metric for cell in cells for part in cell.figures.values() for metric in part

@@ -22,7 +22,7 @@ from physhandi.errors import PhysHandiError
 
 logger = logging.getLogger(__name__)
 
-Kind = Literal["run", "sequence"]
+PreviewKind = Literal["run", "sequence"]
 _VERSION = 1
 _BATCH = 8
 _ENDED_FROM_OUTSIDE = (-signal.SIGTERM, -signal.SIGINT)
@@ -34,7 +34,7 @@ _PAUSE_S = 1.0
 
 
 @dataclass(frozen=True)
-class Picture:
+class PreviewPictures:
     """The preview of a run or a sequence."""
 
     state: Literal["ready", "pending", "none"]
@@ -49,7 +49,7 @@ class Picture:
 class _Source:
     """What a preview shows, and the name of its files, which changes whenever its source does."""
 
-    kind: Kind
+    kind: PreviewKind
     id: str
     folder: Path
     stamp: int
@@ -99,7 +99,7 @@ class Previews:
         if self._thread.is_alive():
             self._thread.join(timeout=5)
 
-    def look(self, kind: Kind, item_id: str) -> Picture:
+    def look(self, kind: PreviewKind, item_id: str) -> PreviewPictures:
         """Tell whether there is a preview, and have it drawn if there is none.
 
         A run without results shows its first sequence.
@@ -109,22 +109,22 @@ class Previews:
         """
         source = self._source(kind, item_id)
         if source is None:
-            return Picture("none")
+            return PreviewPictures("none")
         address, version = f"/{source.kind}s/{source.id}", source.key[-16:]
         still = f"{address}/still?v={version}" if self._path(source, STILL).is_file() else ""
         if self._path(source, MOVING).is_file():
-            return Picture("ready", still, f"{address}/preview?v={version}")
+            return PreviewPictures("ready", still, f"{address}/preview?v={version}")
         if self._path(source, NONE).is_file():
-            return Picture("none")
+            return PreviewPictures("none")
         with self._lock:
             # What was asked for last is on a screen now, so it is drawn first.
             self._waiting.setdefault(source.key, source)
             while len(self._waiting) > _MOST_WAITING:
                 self._waiting.popitem(last=False)
             self._lock.notify_all()
-        return Picture("pending", still)
+        return PreviewPictures("pending", still)
 
-    def file(self, kind: Kind, item_id: str, *, is_moving: bool) -> Path | None:
+    def file(self, kind: PreviewKind, item_id: str, *, is_moving: bool) -> Path | None:
         """Give the file of a preview; None if it is not there.
 
         Raises:
@@ -134,7 +134,7 @@ class Previews:
         path = source and self._path(source, MOVING if is_moving else STILL)
         return path if path is not None and path.is_file() else None
 
-    def _source(self, kind: Kind, item_id: str) -> _Source | None:
+    def _source(self, kind: PreviewKind, item_id: str) -> _Source | None:
         if kind == "sequence":
             item = self._catalog.sequence_item(item_id)
             return _source("sequence", item_id, item.folder, FILE) if item.sequence else None
@@ -224,7 +224,7 @@ class Previews:
         _remove(path for _, _, path in files[: max(0, len(files) - _MOST_FILES)])
 
 
-def _source(kind: Kind, item_id: str, folder: Path, watched: str) -> _Source | None:
+def _source(kind: PreviewKind, item_id: str, folder: Path, watched: str) -> _Source | None:
     try:
         return _Source(kind, item_id, folder, (folder / watched).stat().st_mtime_ns)
     except OSError:

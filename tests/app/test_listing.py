@@ -12,7 +12,7 @@ from server_world import World
 from app.jobs import catalog
 from app.jobs.catalog import Catalog, UnknownRunError
 from app.jobs.listing import RunQuery, page_of, select_runs
-from app.jobs.views import summarize, tags_of
+from app.jobs.views import summarize_run, tags_of
 from app.settings import Settings
 from physhandi.errors import UsageError
 from physhandi.run import Run
@@ -156,15 +156,15 @@ def test_a_summary_is_the_mean_over_frames_and_the_sum_over_stages(world: World)
             "other": {"hands": {"left": {"reprojection_median": 2.0, "scored_keypoints": 10}}},
         },
     )
-    summary = summarize(run)
+    summary = summarize_run(run)
     assert summary.track_error_fitted == pytest.approx((10 * 0.002 + 20 * 0.005) / 30)
     assert summary.track_error_predicted == 0.5
     assert summary.reprojection == pytest.approx(3.5)
     assert len(seconds) > 2
     assert summary.duration_s == pytest.approx(sum(seconds))
     (run.out / "metrics.json").write_text("{")
-    assert summarize(run).track_error_fitted is None
-    assert summarize(run).duration_s == summary.duration_s
+    assert summarize_run(run).track_error_fitted is None
+    assert summarize_run(run).duration_s == summary.duration_s
 
 
 def test_a_simulation_of_an_unseen_sequence_is_a_prediction(world: World, tmp_path: Path) -> None:
@@ -178,7 +178,7 @@ def test_a_simulation_of_an_unseen_sequence_is_a_prediction(world: World, tmp_pa
         run.sequence_names = [name]
         (folder / "attempts/1/out").mkdir(parents=True)
         write_metrics(run, {name: {"reconstruction": scores(0.25, 1, 9)}})
-        summary = summarize(run)
+        summary = summarize_run(run)
         found = (summary.track_error_fitted, summary.track_error_predicted)
         assert found == ((None, 0.25) if unseen else (0.25, None))
 
