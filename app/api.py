@@ -306,17 +306,17 @@ def _add_system(router: APIRouter, overview: Overview) -> None:
 
     @router.get("/system/events")
     async def watch_system(request: Request) -> StreamingResponse:
-        known: dict[str, Any] = {}
+        latest: dict[str, Any] = {}
         looked = 0.0
 
         def news() -> Iterable[News]:
-            nonlocal known, looked
+            nonlocal latest, looked
             if time.monotonic() - looked < _INTERVAL_S:
                 return
             looked = time.monotonic()
-            found = overview.moving()
-            if found != known:
-                known = found
-                yield "0", "system", found
+            state = overview.moving()
+            if state != latest:
+                latest = state
+                yield "0", "system", state
 
         return streams.answer(request, news)

@@ -167,7 +167,7 @@ def _answer_errors(app: FastAPI, pages: Pages) -> None:
         if status >= 500:
             logger.error("a request failed: %s: %s", request.url.path, describe(error))
         fields = (
-            [{"field": path, "message": told} for path, told in error.fields.items()]
+            [{"field": path, "message": problem} for path, problem in error.fields.items()]
             if isinstance(error, SettingsError)
             else None
         )
@@ -175,9 +175,9 @@ def _answer_errors(app: FastAPI, pages: Pages) -> None:
 
     @app.exception_handler(HTTPException)
     def on_http(request: Request, error: HTTPException) -> Response:
-        known = {404: _NOWHERE, 413: "The request is too large."}
+        texts = {404: _NOWHERE, 413: "The request is too large."}
         is_plain = error.detail in {"Not Found", "Content Too Large", "Request Entity Too Large"}
-        message = known.get(error.status_code, error.detail) if is_plain else error.detail
+        message = texts.get(error.status_code, error.detail) if is_plain else error.detail
         code = {404: "not_found", 405: "wrong_method", 413: "too_large"}.get(error.status_code)
         return answer(request, error.status_code, code or "http", str(message))
 
@@ -202,8 +202,8 @@ def _status_of(error: PhysHandiError | OSError) -> tuple[int, str]:
     if isinstance(error, OSError):
         is_full = error.errno in {errno.ENOSPC, errno.EDQUOT}
         return (507 if is_full else 500), "storage"
-    found = [(status, code) for kind, status, code in _STATUS if isinstance(error, kind)]
-    return found[0] if found else (409, "conflict")
+    matches = [(status, code) for kind, status, code in _STATUS if isinstance(error, kind)]
+    return matches[0] if matches else (409, "conflict")
 
 
 def serve(settings: Settings, on_ready: Callable[[str], None], *, queue_demo: bool = False) -> None:

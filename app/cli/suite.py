@@ -75,8 +75,8 @@ def evaluate_suite(command: Any, progress: Progress) -> dict[str, Any]:
         for recording in order.recordings:
             recording.validate(reads_color=False)
         fill = None if workers is None else workers.fill(order, out)
-        found = evaluate_suite(order, out, progress, fill=fill)
-    return found | {"seconds": round(time.monotonic() - start, 1)}
+        summary = evaluate_suite(order, out, progress, fill=fill)
+    return summary | {"seconds": round(time.monotonic() - start, 1)}
 
 
 def _name_for(sequences: list[Sequence]) -> str:

@@ -219,8 +219,8 @@ class SuiteWorkers:
             elif job is not None:
                 share = 100 * answer["iteration"] // max(1, answer["total"])
                 worker.state = f"{job.label} {answer['stage']} {share} %"
-            told = " · ".join(w.state for w in self._workers if w.state)
-            self._progress.report(stage, finished, len(jobs), message=told)
+            states = " · ".join(w.state for w in self._workers if w.state)
+            self._progress.report(stage, finished, len(jobs), message=states)
 
     def _give(self, worker: _Worker, waiting: deque[_Job], order: Mapping[str, Any] | None) -> None:
         if not waiting:
@@ -276,12 +276,13 @@ def _in_order(tasks: Many[Task]) -> list[int]:
 def _shares(count: int) -> list[list[int]]:
     """Divide this machine's processors; with fewer of them than processes some share one."""
     if hasattr(os, "sched_getaffinity"):
-        known = sorted(os.sched_getaffinity(0))
+        numbers = sorted(os.sched_getaffinity(0))
     else:
-        known = list(range(os.cpu_count() or 1))
-    bounds = [number * len(known) // count for number in range(count + 1)]
+        numbers = list(range(os.cpu_count() or 1))
+    bounds = [number * len(numbers) // count for number in range(count + 1)]
     return [
-        known[low:high] or [known[low % len(known)]] for low, high in itertools.pairwise(bounds)
+        numbers[low:high] or [numbers[low % len(numbers)]]
+        for low, high in itertools.pairwise(bounds)
     ]
 
 

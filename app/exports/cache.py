@@ -103,15 +103,15 @@ class FileCache:
         order.check()
         path = self._folder / f"{_key(order)}.{SUFFIXES.get(order.format, order.format)}"
         with self._lock:
-            known = self._works.get(path.name)
-            if known is not None and known.state == "failed":
-                known = None
-            if known is not None and known.state == "ready" and not path.is_file():
-                known = None
-            if known is None:
-                known = self._start(order, path)
-            known.last_used = time.monotonic()
-            return known
+            work = self._works.get(path.name)
+            if work is not None and work.state == "failed":
+                work = None
+            if work is not None and work.state == "ready" and not path.is_file():
+                work = None
+            if work is None:
+                work = self._start(order, path)
+            work.last_used = time.monotonic()
+            return work
 
     def make(self, order: FileRequest) -> Path:
         """Have a file made and wait for it; see `begin`.
@@ -166,7 +166,7 @@ class FileCache:
         return self._put_in_line(order, work, path.name)
 
     def _put_in_line(self, order: FileRequest, work: FileJob, name: str) -> FileJob:
-        busy = sum(known.state == "making" for known in self._works.values())
+        busy = sum(other.state == "making" for other in self._works.values())
         if busy >= MOST_WAITING or self._is_closed:
             raise TooManyFilesError(
                 f"{busy} files are being made already, the most this server allows. "

@@ -174,8 +174,8 @@ def _check_frame(run: Run, query: Mapping[str, str]) -> None:
     """Say at once, not after a process was started, that there is no such frame."""
     name = query.get("sequence") or run.sequence_names[0]
     if name not in run.sequence_names:
-        known = ", ".join(run.sequence_names)
-        raise UsageError(f"sequence: run '{run.id}' has no sequence '{name[:80]}', but {known}.")
+        names = ", ".join(run.sequence_names)
+        raise UsageError(f"sequence: run '{run.id}' has no sequence '{name[:80]}', but {names}.")
     meta = f"sequences/{name}/meta.yaml"
     count = int(run.yaml(meta).get("frame_count", 0)) if run.has(meta) else 0
     frame = state_from_query(query).frame

@@ -95,9 +95,9 @@ class RunIndex:
             self._entries = {k: v for k, v in self._entries.items() if k in folders}
             used = {entry["config"] for entry in self._entries.values()}
             self._configs = {k: v for k, v in self._configs.items() if k in used}
-            known = {"format": _FORMAT, "configs": self._configs, "runs": self._entries}
+            stored = {"format": _FORMAT, "configs": self._configs, "runs": self._entries}
             try:
-                content = json.dumps(known).encode()
+                content = json.dumps(stored).encode()
                 self._path.parent.mkdir(parents=True, exist_ok=True)
                 write_atomically(self._path, lambda file: file.write(content), is_durable=False)
             except (OSError, TypeError, ValueError) as error:
@@ -115,12 +115,12 @@ class RunIndex:
             return {}
         runs = named_fields(content.get("runs"))
         self._configs = named_fields(content.get("configs")) or {}
-        found: dict[str, dict[str, Any]] = {}
+        entries: dict[str, dict[str, Any]] = {}
         for folder, content_of_run in (runs or {}).items():
             entry = named_fields(content_of_run)
             if entry is not None and isinstance(entry.get("config"), str):
-                found[folder] = entry
-        return found
+                entries[folder] = entry
+        return entries
 
 
 T = TypeVar("T")
@@ -204,12 +204,12 @@ class Catalog:
         """List the runs, the newest of the data folder first and the bundled ones last."""
         items: dict[str, RunItem] = {}
         for root, is_bundled in self._run_dirs:
-            found = [
+            listed = [
                 RunItem(folder.name, folder, is_bundled, run, error)
                 for folder, (run, error) in self._runs.list(root)
             ]
-            found.sort(key=lambda item: item.run.created if item.run else "", reverse=True)
-            for item in found:
+            listed.sort(key=lambda item: item.run.created if item.run else "", reverse=True)
+            for item in listed:
                 items.setdefault(item.id, item)
         self._index.save(lambda: self._runs.paths)
         return list(items.values())
@@ -221,9 +221,9 @@ class Catalog:
             UnknownSequenceError: If there is no such sequence.
         """
         for root, is_bundled in self._sequence_dirs:
-            found = self._sequences.find(root, sequence_id)
-            if found is not None:
-                return SequenceItem(sequence_id, root / sequence_id, is_bundled, *found)
+            opened = self._sequences.find(root, sequence_id)
+            if opened is not None:
+                return SequenceItem(sequence_id, root / sequence_id, is_bundled, *opened)
         raise UnknownSequenceError(f"There is no sequence '{sequence_id}'.")
 
     def sequence(self, sequence_id: str, /) -> Sequence:
@@ -246,9 +246,9 @@ class Catalog:
         """
         cells = ((folder, False) for folder in sorted(self._suite_dir.glob("*/cells")))
         for root, is_bundled in (*self._run_dirs, *cells):
-            found = self._runs.find(root, run_id)
-            if found is not None:
-                return RunItem(run_id, root / run_id, is_bundled, *found)
+            opened = self._runs.find(root, run_id)
+            if opened is not None:
+                return RunItem(run_id, root / run_id, is_bundled, *opened)
         raise UnknownRunError(f"There is no run '{run_id}'.")
 
     def run(self, run_id: str, /) -> Run:
@@ -312,20 +312,20 @@ class _Folders(Generic[T]):
         """Open the folder of that name directly below a root; None if there is none."""
         if not name or name.startswith(".") or {"/", "\\", "\0"} & set(name):
             return None
-        found = self._look(f"{root}/{name}")
-        return None if found is None else found[1]
+        opened = self._look(f"{root}/{name}")
+        return None if opened is None else opened[1]
 
     def _look(self, path: str) -> tuple[Path, tuple[T | None, str | None]] | None:
         stamp = self._stamp(path)
         if stamp is None:
             return None
-        known = self._known.get(path)
-        if known is None or known[0] != stamp:
+        entry = self._known.get(path)
+        if entry is None or entry[0] != stamp:
             folder = Path(path)
-            known = (stamp, folder, self._open(folder, stamp))
+            entry = (stamp, folder, self._open(folder, stamp))
             with self._lock:
-                self._known[path] = known
-        return known[1], known[2]
+                self._known[path] = entry
+        return entry[1], entry[2]
 
     def _stamp(self, path: str) -> Stamp | None:
         """Summarise what would change with the folder; None if it is not one of the kind."""

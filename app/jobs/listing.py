@@ -76,8 +76,8 @@ class RunQuery(BaseModel):
         """Write it as an address, with some fields changed; what is not set is left out."""
         fields = self.model_dump() | {"offset": 0} | changes
         defaults = RunQuery()
-        told = {k: v for k, v in fields.items() if v != getattr(defaults, k)}
-        return f"{path}?{urlencode(told)}" if told else path
+        fields_set = {k: v for k, v in fields.items() if v != getattr(defaults, k)}
+        return f"{path}?{urlencode(fields_set)}" if fields_set else path
 
 
 def select_runs(runs: Iterable[Mapping[str, Any]], query: RunQuery) -> list[Mapping[str, Any]]:
@@ -96,9 +96,9 @@ def select_runs(runs: Iterable[Mapping[str, Any]], query: RunQuery) -> list[Mapp
         return chosen
     name = query.sort.removeprefix("-")
     # A run that lacks the figure comes last in either direction.
-    known = [(key, run) for run in chosen if (key := _key(run, name)) is not None]
-    known.sort(key=lambda pair: pair[0], reverse=query.sort.startswith("-"))
-    return [run for _, run in known] + [run for run in chosen if _key(run, name) is None]
+    sortable = [(key, run) for run in chosen if (key := _key(run, name)) is not None]
+    sortable.sort(key=lambda pair: pair[0], reverse=query.sort.startswith("-"))
+    return [run for _, run in sortable] + [run for run in chosen if _key(run, name) is None]
 
 
 def page_of(runs: Sequence[Mapping[str, Any]], query: RunQuery) -> Sequence[Mapping[str, Any]]:
@@ -120,11 +120,11 @@ def _conditions(query: RunQuery) -> list[tuple[str, str, bool]]:
         if not colon:
             chosen.append(("", key, is_not))
         elif key not in _KEYS:
-            known = ", ".join(f"{name}:" for name in _KEYS)
-            raise UsageError(f"The filter knows no '{key}:'. It knows {known} and plain words.")
+            names = ", ".join(f"{name}:" for name in _KEYS)
+            raise UsageError(f"The filter knows no '{key}:'. It knows {names} and plain words.")
         elif key == "is" and value not in _FLAGS:
-            known = ", ".join(_FLAGS)
-            raise UsageError(f"The filter knows no 'is:{value}'. After 'is:' write one of {known}.")
+            names = ", ".join(_FLAGS)
+            raise UsageError(f"The filter knows no 'is:{value}'. After 'is:' write one of {names}.")
         elif value:
             chosen.append((key, value, is_not))
     return chosen
@@ -137,21 +137,21 @@ def _fits(run: Mapping[str, Any], key: str, value: str, is_not: bool) -> bool:
             "mine": not run["is_bundled"],
             "published": run["is_published"],
         }
-        found = flags.get(value, run["state"] == value)
+        is_match = flags.get(value, run["state"] == value)
     elif key == "sequence":
-        found = value in (name.lower() for name in run["sequences"])
+        is_match = value in (name.lower() for name in run["sequences"])
     elif key == "tag":
-        found = value in (tag.lower() for tag in run["tags"])
+        is_match = value in (tag.lower() for tag in run["tags"])
     elif key:
-        found = str(run[key]).lower() == value
+        is_match = str(run[key]).lower() == value
     else:
-        found = value in _text_of(run)
-    return found is not is_not
+        is_match = value in _text_of(run)
+    return is_match is not is_not
 
 
 def _text_of(run: Mapping[str, Any]) -> str:
-    told = (run["name"], run["id"], run["profile"], run.get("note", ""))
-    parts = (*told, *run["sequences"], *run["tags"])
+    fields = (run["name"], run["id"], run["profile"], run.get("note", ""))
+    parts = (*fields, *run["sequences"], *run["tags"])
     return "\n".join(parts).lower()
 
 

@@ -70,9 +70,9 @@ def open_log(run_folder: Path) -> BinaryIO | None:
 
 def level_of(line: str) -> str:
     """Tell how bad a line is: ``error``, ``warning`` or nothing."""
-    found = re.match(r"\S+ \S+ (ERROR|CRITICAL|WARNING) ", line)
-    if found:
-        return "warning" if found[1] == "WARNING" else "error"
+    level = re.match(r"\S+ \S+ (ERROR|CRITICAL|WARNING) ", line)
+    if level:
+        return "warning" if level[1] == "WARNING" else "error"
     return "error" if re.match(r"[A-Za-z_.]*(Error|Exception)\b", line) else ""
 
 

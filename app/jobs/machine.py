@@ -169,15 +169,15 @@ class Machine:
         if not supervisor:
             return None
         with self._lock:
-            found = self._family(supervisor)
+            family = self._family(supervisor)
             memory, busy = 0, 0.0
-            for process in found:
+            for process in family:
                 try:
                     memory += process.memory_info().rss
                     busy += process.cpu_percent() / 100.0
                 except psutil.Error:
                     continue
-            alive = {process.pid for process in found}
+            alive = {process.pid for process in family}
             gone = [pid for pid in self._known if not psutil.pid_exists(pid)]
             for pid in gone:
                 del self._known[pid]

@@ -97,11 +97,11 @@ def describe_order(run: Run) -> dict[str, Any]:
     overrides = named_fields(run.config.get("overrides")) or {}
     profile = named_fields(run.config.get("profile")) or {}
     base = _base_values(str(profile.get("profile", "")))
-    known = {setting.path: setting for setting in all_settings()}
+    settings = {setting.path: setting for setting in all_settings()}
     rows = [
-        _row(known[path], base.get(path), value)
+        _row(settings[path], base.get(path), value)
         for path, value in overrides.items()
-        if path in known
+        if path in settings
     ]
     return {
         "parent": parent if isinstance(parent, str) else None,
@@ -213,7 +213,7 @@ def check_order(
     try:
         config = apply_overrides(base, overrides)
     except SettingsError as error:
-        problems = [{"field": path, "message": told} for path, told in error.fields.items()]
+        problems = [{"field": path, "message": problem} for path, problem in error.fields.items()]
         return {"problems": problems, "overrides": {}, "expected": None}
     expected = forecast.of_order(config.to_dict(), sequences)
     return {"problems": [], "overrides": overrides_of(config, base), "expected": expected}

@@ -258,9 +258,9 @@ class Scheduler:
             return JobView("failed", reason=str(item.error))
         try:
             stamp = item.folder.stat().st_mtime_ns
-            known = self._ended.get(item.id)
-            if known is not None and known[0] == stamp:
-                return known[1]
+            entry = self._ended.get(item.id)
+            if entry is not None and entry[0] == stamp:
+                return entry[1]
             view = self._look(item.run)
         except (PhysHandiError, OSError) as error:
             return JobView("failed", reason=str(error))

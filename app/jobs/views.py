@@ -62,12 +62,12 @@ def describe_sequence(item: SequenceItem) -> dict[str, Any]:
 def describe_run(item: RunItem, scheduler: Scheduler) -> dict[str, Any]:
     """Describe one run of a listing, with how far it is and how long it still takes."""
     view = scheduler.view(item)
-    known = _described.get(item.run) if item.run else None
-    if known is None or known[0] is not view:
-        known = (view, _describe(item, view))
+    entry = _described.get(item.run) if item.run else None
+    if entry is None or entry[0] is not view:
+        entry = (view, _describe(item, view))
         if item.run is not None:
-            _described[item.run] = known
-    return _with_time_left(known[1], item.run, view, scheduler)
+            _described[item.run] = entry
+    return _with_time_left(entry[1], item.run, view, scheduler)
 
 
 def _with_time_left(
@@ -221,8 +221,8 @@ def stage_views(
         latest: Stage of the latest report of this attempt.
     """
     done: dict[str, Mapping[str, Any]] = {str(stage["name"]): stage for stage in finished}
-    known: list[str] = [*names, *done, *([latest] if latest else [])]
-    order = list(dict.fromkeys(known))
+    mentioned: list[str] = [*names, *done, *([latest] if latest else [])]
+    order = list(dict.fromkeys(mentioned))
     last_done = max((order.index(name) for name in done), default=-1)
     # A stage may fail before it reports anything: then it is the one after the last finished.
     current = latest if latest and latest not in done else next(iter(order[last_done + 1 :]), None)
@@ -268,8 +268,8 @@ def _running_since(run: Run, finished: Sequence[Mapping[str, Any]]) -> float | N
     """When the stage that is at work began: at the end of the one before, or of this attempt."""
     environment = named_fields(run.json(ENVIRONMENT)) if run.has(ENVIRONMENT) else None
     times = [(environment or {}).get("started"), *(stage.get("time") for stage in finished[-1:])]
-    known = [datetime.fromisoformat(time).timestamp() for time in times if isinstance(time, str)]
-    return max(known, default=None)
+    begins = [datetime.fromisoformat(time).timestamp() for time in times if isinstance(time, str)]
+    return max(begins, default=None)
 
 
 _ADVICE = {
@@ -323,8 +323,8 @@ def explain(run: Run | None, reason: str) -> Failure:
             "There was not enough memory.",
             "End other programs or use a profile with fewer nodes, then resume.",
         )
-    known = getattr(builtins, kind, None)
-    if isinstance(known, type) and issubclass(known, OSError):
+    builtin = getattr(builtins, kind, None)
+    if isinstance(builtin, type) and issubclass(builtin, OSError):
         return Failure(reason, "Check the disk and the data folder, then resume.")
     return Failure(f"The program stopped at a mistake of its own ({kind}: {reason}).", _DEFECT)
 
@@ -362,8 +362,8 @@ def _duration(run: Run) -> float | None:
         seconds = [stage.get("seconds") for stage in run.stages()]
     except (PhysHandiError, OSError):
         return None
-    known = [float(value) for value in seconds if isinstance(value, int | float)]
-    return sum(known) if known and len(known) == len(seconds) else None
+    measured = [float(value) for value in seconds if isinstance(value, int | float)]
+    return sum(measured) if measured and len(measured) == len(seconds) else None
 
 
 def _track_errors(run: Run) -> tuple[float | None, float | None]:
@@ -386,15 +386,15 @@ def _track_errors(run: Run) -> tuple[float | None, float | None]:
 def _reprojection(run: Run) -> float | None:
     """Give the median reprojection error, weighted by the keypoints of each hand."""
     metrics = (named_fields(run.json(_METRICS)) if run.has(_METRICS) else None) or {}
-    found: list[tuple[float, float]] = []
+    errors_of_hands: list[tuple[float, float]] = []
     for scores in metrics.values():
         hands = named_fields((named_fields(scores) or {}).get("hands")) or {}
         for score in hands.values():
             fields = named_fields(score) or {}
             error, count = fields.get("reprojection_median"), fields.get("scored_keypoints")
             if isinstance(error, int | float) and isinstance(count, int | float) and count > 0:
-                found.append((float(error), float(count)))
-    return _mean(found)
+                errors_of_hands.append((float(error), float(count)))
+    return _mean(errors_of_hands)
 
 
 def _unseen_sequences(run: Run) -> set[str]:
@@ -450,7 +450,7 @@ def read_frame_errors(run: Run) -> dict[str, dict[str, Any]]:
         ``track_error chamfer_l2``) and ``future_start``, the first frame that was not fitted.
     """
     metrics = describe_results(run).get("metrics", {})
-    found: dict[str, dict[str, Any]] = {}
+    errors_of: dict[str, dict[str, Any]] = {}
     for name in run.sequence_names:
         rel = f"sequences/{name}/frame_errors.json"
         if not run.has(rel):
@@ -458,8 +458,10 @@ def read_frame_errors(run: Run) -> dict[str, dict[str, Any]]:
         content = named_fields(run.json(rel)) or {}
         scores = named_fields(metrics.get(name)) or {}
         future = (named_fields(scores.get("future")) or {}).get("frames")
-        found[name] = content | {"future_start": future[0] if isinstance(future, list) else None}
-    return found
+        errors_of[name] = content | {
+            "future_start": future[0] if isinstance(future, list) else None
+        }
+    return errors_of
 
 
 def loss_curves(run: Run) -> tuple[dict[str, dict[str, Any]], int]:
@@ -500,13 +502,13 @@ def thin(curve: list[list[float]], limit: int) -> list[list[float]]:
     if len(curve) <= limit:
         return curve
     parts = limit // 2
-    kept: list[list[float]] = []
+    thinned: list[list[float]] = []
     for part in range(parts):
         points = curve[part * len(curve) // parts : (part + 1) * len(curve) // parts]
         low = min(points, key=lambda point: point[1])
         high = max(points, key=lambda point: point[1])
-        kept.extend([low] if low == high else sorted([low, high], key=lambda point: point[0]))
-    return kept
+        thinned.extend([low] if low == high else sorted([low, high], key=lambda point: point[0]))
+    return thinned
 
 
 def _points(curve: object) -> list[list[float]]:

@@ -65,11 +65,11 @@ class Watch:
                 none, reports come from the first on, and the log from `TAIL_BYTES` before its end.
             load: Tells what the machine and the run's processes do.
         """
-        found = _CURSOR.fullmatch(cursor or "")
+        position = _CURSOR.fullmatch(cursor or "")
         self._folder = folder
         self._look = look
-        self._seen = int(found[1]) if found else -1
-        self._log = int(found[2]) if found and found[2] else None
+        self._seen = int(position[1]) if position else -1
+        self._log = int(position[2]) if position and position[2] else None
         self._offset = 0
         self._known: dict[str, Any] | None = None
         self._is_gone = False

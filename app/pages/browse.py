@@ -91,8 +91,8 @@ def add_lists(
 
     def pictured(kind: PreviewKind, shown: Sequence[Any]) -> list[dict[str, Any]]:
         # From the last to the first: what was asked for last is drawn first.
-        found = [entry | {"picture": previews.look(kind, entry["id"])} for entry in shown[::-1]]
-        return found[::-1]
+        entries = [entry | {"picture": previews.look(kind, entry["id"])} for entry in shown[::-1]]
+        return entries[::-1]
 
     def launch_values(sequences: list[dict[str, Any]]) -> dict[str, Any]:
         profiles = [(name, named_profile(name).description) for name in ordered_profiles()]
@@ -187,7 +187,7 @@ def _chosen(
 
 def _facets(runs: list[dict[str, Any]]) -> dict[str, list[tuple[str, int]]]:
     """Count what runs can be filtered by, so that only what exists is offered."""
-    found = {
+    counts_of = {
         "state": Counter(run["state"] for run in runs),
         "profile": Counter(run["profile"] for run in runs if run["profile"]),
         "sequence": Counter(name for run in runs for name in run["sequences"]),
@@ -196,7 +196,7 @@ def _facets(runs: list[dict[str, Any]]) -> dict[str, list[tuple[str, int]]]:
     order = {state: number for number, state in enumerate(STATES)}
     return {
         name: sorted(counts.items(), key=lambda pair: (order.get(pair[0], 0), pair[0]))
-        for name, counts in found.items()
+        for name, counts in counts_of.items()
     }
 
 

@@ -182,7 +182,7 @@ def _score_row(columns: Sequence[_Scores], key: tuple[str, str, str]) -> Row:
 
 def _scores_of(metrics: Mapping[str, Any]) -> _Scores:
     """Find every score of the rollout by sequence, part and name, with its unit of length."""
-    found: _Scores = {}
+    score_of: _Scores = {}
     for sequence, scores in metrics.items():
         fields = named_fields(scores) or {}
         unit = str(fields.get("unit", "m"))
@@ -192,8 +192,8 @@ def _scores_of(metrics: Mapping[str, Any]) -> _Scores:
             local = str(inside.get("unit", unit))
             for name, value in flatten(inside if of_object is None else of_object).items():
                 if _is_number(value) and name.rsplit(".", 1)[-1] not in _UNCOMPARED:
-                    found[sequence, _SPLITS.get(part, part), name] = (float(value), local)
-    return found
+                    score_of[sequence, _SPLITS.get(part, part), name] = (float(value), local)
+    return score_of
 
 
 def _losses_of(result: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

@@ -94,15 +94,15 @@ def _rows(columns: dict[str, dict[str, Any]], unit: str) -> list[dict[str, Any]]
     rows: list[dict[str, Any]] = []
     for quantity in dict.fromkeys(key for column in columns.values() for key in column):
         values = [column.get(quantity) for column in columns.values()]
-        known = [value for value in values if isinstance(value, int | float)]
-        if not known:
+        numbers = [value for value in values if isinstance(value, int | float)]
+        if not numbers:
             continue
         parts = set(quantity.split("_"))
         local = next((str(c["unit"]) for c in columns.values() if "unit" in c), unit)
         kind = unit_of_metric(parts, local)
         is_higher = is_better_when_higher(parts)
-        is_contest = "rollout" in columns and len(known) > 1 and not parts & _COUNTS
-        best = (max if is_higher else min)(known) if is_contest else None
+        is_contest = "rollout" in columns and len(numbers) > 1 and not parts & _COUNTS
+        best = (max if is_higher else min)(numbers) if is_contest else None
         rows.append(
             {
                 "name": quantity,

@@ -17,17 +17,17 @@ _TOLERANCE = 1e-9
 """Numbers that differ by a smaller share were only rounded on the way."""
 
 
-def parameter_rows(run: Run, found: Mapping[str, Any]) -> list[dict[str, Any]]:
+def parameter_rows(run: Run, final: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Lay the parameters out as rows of ``name about unit start value is_changed``.
 
     Args:
         run: The run; its configuration, or the run that it simulates again, tells the start.
-        found: The parameters that it ended with.
+        final: The parameters that it ended with.
     """
     start = _start_of(run)
     rows: list[dict[str, Any]] = []
-    changed = changes(start, found, tolerance=_TOLERANCE)
-    for name, value in found.items():
+    changed = changes(start, final, tolerance=_TOLERANCE)
+    for name, value in final.items():
         about, unit = meaning_of(name)
         before = start.get(name)
         rows.append(

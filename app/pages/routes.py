@@ -152,12 +152,12 @@ def run_values(item: RunItem, described: dict[str, Any], catalog: Catalog) -> di
         catalog: Knows the run that it was made from.
     """
     results = describe_results(item.run) if item.run else {}
-    found = results.get("parameters", {})
+    final = results.get("parameters", {})
     return {
         "run": described,
         "order": order_of(item, catalog),
         "metrics": {name: tabulate(v) for name, v in results.get("metrics", {}).items()},
-        "parameters": parameter_rows(item.run, found) if item.run else [],
+        "parameters": parameter_rows(item.run, final) if item.run else [],
         "environment": results.get("environment", {}),
         "problem": results.get("problem", {}).get("message"),
         "methods": METHOD_TEXTS,
@@ -167,7 +167,7 @@ def run_values(item: RunItem, described: dict[str, Any], catalog: Catalog) -> di
 def _launch_page(
     catalog: Catalog, pages: Pages, run_id: str | None, profile: str | None, sequence: str | None
 ) -> HTMLResponse:
-    found = describe_settings(catalog, profile, run_id)
+    offered = describe_settings(catalog, profile, run_id)
     sequences = [entry for s in catalog.sequences() if not (entry := describe_sequence(s))["error"]]
     item = catalog.run_item(run_id) if run_id else None
     chosen: set[str | None] = {sequence}
@@ -176,18 +176,18 @@ def _launch_page(
         folders = {str(s.folder): s.id for s in catalog.sequences()}
         names = {entry["name"]: entry["id"] for entry in sequences}
         for folder, name in zip(item.run.sequences, item.run.sequence_names, strict=True):
-            known = folders.get(folder, names.get(name))
-            if known is None:
+            sequence_id = folders.get(folder, names.get(name))
+            if sequence_id is None:
                 missing.append(name)
-            chosen.add(known)
+            chosen.add(sequence_id)
     groups: dict[str, list[dict[str, Any]]] = {}
-    for setting in found["settings"]:
+    for setting in offered["settings"]:
         groups.setdefault(setting["group_name"], []).append(setting)
     return pages.render(
         "launch.html",
         parent=item and {"id": item.id, "name": item.run.name if item.run else item.id},
-        profile=found["profile"],
-        description=found["description"],
+        profile=offered["profile"],
+        description=offered["description"],
         profiles=[(name, named_profile(name).description) for name in profile_names()],
         groups=groups,
         sequences=sequences,

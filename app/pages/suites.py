@@ -125,8 +125,8 @@ def add_suites(router: APIRouter, folder: Path, pages: Pages) -> None:
 
 
 def _folders(folder: Path) -> list[Path]:
-    found = [path.parent for path in folder.glob("*/cells.json") if _has_page(path.parent)]
-    return sorted(found, key=lambda path: (path / "cells.json").stat().st_mtime_ns, reverse=True)
+    suites = [path.parent for path in folder.glob("*/cells.json") if _has_page(path.parent)]
+    return sorted(suites, key=lambda path: (path / "cells.json").stat().st_mtime_ns, reverse=True)
 
 
 def _has_page(path: Path) -> bool:
