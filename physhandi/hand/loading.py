@@ -1,8 +1,6 @@
 """Which hand model a hand is fitted with: the built-in open hand, or the user's MANO."""
 
-from physhandi.hand.mano import ManoHand
 from physhandi.hand.model import HandKind, HandModel, HandSide
-from physhandi.hand.open_hand import OpenHand
 
 
 def load_hand_model(side: HandSide, kind: HandKind = "open") -> HandModel:
@@ -15,4 +13,8 @@ def load_hand_model(side: HandSide, kind: HandKind = "open") -> HandModel:
     Raises:
         MissingInputError: If MANO was not imported; says how to.
     """
+    # These load torch, without which the server starts and the library is imported.
+    from physhandi.hand.mano import ManoHand
+    from physhandi.hand.open_hand import OpenHand
+
     return ManoHand.load(side) if kind == "mano" else OpenHand.load(side)
