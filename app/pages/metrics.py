@@ -108,7 +108,7 @@ def _rows(columns: dict[str, dict[str, Any]], unit: str) -> list[dict[str, Any]]
                 "name": quantity,
                 "about": about_quantity(quantity),
                 "unit": scaled(None, kind)[1],
-                "is_better_when_higher": is_higher,
+                "is_higher_better": is_higher,
                 "cells": [
                     {
                         "text": figure(scaled(value, kind)[0]),
