@@ -1,23 +1,42 @@
-"""The fitted object of a run, rebuilt for other parameters."""
+"""The object that a run fitted: simulated again with other parameters, or in another recording."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 from jaxtyping import Float
 from numpy import ndarray
 
+from physhandi.data.exporters.scene_data import HandSurface, SceneData, read_scene
 from physhandi.data.run import RunFolder
-from physhandi.errors import MissingInputError
+from physhandi.data.sequence import Sequence as Recording
+from physhandi.errors import MissingInputError, RunError, UsageError
 from physhandi.object_rollout import ObjectRollout, load_fitted
-from physhandi.settings import changes
+from physhandi.progress import Progress, Watcher, watched
+from physhandi.settings import changes as changed_settings
 from physhandi.simulation.model import SpringMassModel
-from physhandi.simulation.parameters import SimulationParameters, parameter_names
+from physhandi.simulation.parameters import (
+    SimulationParameters,
+    changed_parameters,
+    parameter_names,
+)
 from physhandi.simulation.simulator import Simulator
-from physhandi.simulation.stability import largest_stable_step
+from physhandi.simulation.stability import (
+    largest_stable_step,
+    stable_substeps,
+    with_stable_substeps,
+)
 from physhandi.simulation.topology import MINIMUM_VIRTUAL_REST_LENGTH, retopologize, virtual_springs
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from physhandi.fitting.placement import PlacedObject
 
 _MATERIAL = parameter_names("material")
 _BUILT_IN = parameter_names("material", "topology")
@@ -25,42 +44,322 @@ _BUILT_IN = parameter_names("material", "topology")
 _STEP = parameter_names("step")
 
 
-class FittedObject:
-    """The fitted object of one sequence of a run, from which sliders start."""
+ROLLOUT = "rollout"
+"""What the simulation of an object is called where its progress is told."""
 
-    def __init__(self, folder: str, sequence: str) -> None:
-        run = RunFolder.open(Path(folder))
-        take = load_fitted(run, sequence)
-        if take is None:
-            raise MissingInputError(
-                f"Run '{run.name}' has no fitted object for sequence '{sequence}' to simulate."
-            )
-        self.take: ObjectRollout = take
-        self._all_controls = np.ascontiguousarray(take.control, dtype=np.float32)
+Frame = tuple[int, Float[ndarray, "node 3"], Float[ndarray, "node 3"]]
+
+
+class FittedObject:
+    """A fitted object in one of its sequences; everything that simulates a stored run does it here.
+
+    `simulate` is for scripts. What shows frames as they come calls `begin` and then `fill`.
+    """
+
+    def __init__(
+        self,
+        fitted: ObjectRollout,
+        *,
+        attachment: Float[ndarray, "control 3"] | None = None,
+        rest_node: Float[ndarray, "node 3"] | None = None,
+        run: RunFolder | None = None,
+        sequence: str = "",
+    ) -> None:
+        """Hold an object.
+
+        Args:
+            fitted: Its springs, parameters and control nodes; the motion may be missing.
+            attachment: Where the control nodes were when the virtual springs were laid [m];
+                frame 0 of the control nodes, unless refinement has moved the hands since.
+            rest_node: Its rest shape [m]; frame 0 if left out.
+            run: Run that it was fitted in.
+            sequence: Name of the sequence.
+        """
+        self.fitted = fitted
+        """The rollout that was fitted: springs, parameters, controls and motion."""
+        self.run = run
+        self.sequence = sequence
+        self.rest_node = rest_node
+        self.placement: PlacedObject | None = None
+        """What was found out to lay the object into a recording that it was not fitted in."""
+        self._all_controls = np.ascontiguousarray(fitted.control, dtype=np.float32)
         self._control = self._all_controls
-        # Springs begin where the hands were when they were laid; refinement may have moved these.
-        moved = f"sequences/{sequence}/attachment.npy"
-        self._all_attached = run.array(moved) if run.has(moved) else self._all_controls[0]
+        self._all_attached = self._all_controls[0] if attachment is None else attachment
         self._attached = self._all_attached
         self._chosen: tuple[int, ...] | None = None
         self._latest: tuple[tuple[float, ...], SpringMassModel] | None = None
         self._simulator: Simulator | None = None
         self._limit: tuple[SpringMassModel, float, float] | None = None
-        self._rest_node = None
-        if run.has("object/material.safetensors"):
-            self._rest_node = run.tensors("object/material.safetensors").get("rest_node")
 
-    def choose_controls(self, chosen: Sequence[int] | None) -> Float[ndarray, "frame control 3"]:
-        """Let only some of the control nodes hold the object from now on.
-
-        The object's own springs then stay as fitted, whatever the parameters say of them.
+    @classmethod
+    def of(cls, run: RunFolder | Path | str, sequence: str | None = None) -> "FittedObject":
+        """Load the object of a run.
 
         Args:
-            chosen: Numbers of control nodes; None for all.
+            run: The run, or its folder.
+            sequence: One of the run's sequences; the first one if left out.
+
+        Raises:
+            MissingInputError: If the run has no fitted object for that sequence.
+            RunError: If it is no run, or a file is missing or damaged.
+        """
+        folder = run if isinstance(run, RunFolder) else RunFolder.open(run)
+        name = folder.sequence_names[0] if sequence is None else sequence
+        fitted = load_fitted(folder, name)
+        if fitted is None:
+            raise MissingInputError(
+                f"Run '{folder.name}' has no fitted object for sequence '{name}' to simulate."
+            )
+        wrong = np.argwhere(~np.isfinite(fitted.control))
+        if len(wrong):
+            raise RunError(
+                f"{folder.out}/sequences/{name}/control.npy is not finite at frame {wrong[0][0]}, "
+                f"control {wrong[0][1]}. Run it again."
+            )
+        attachment, rest_node = f"sequences/{name}/attachment.npy", "object/material.safetensors"
+        loaded = cls(
+            fitted,
+            attachment=folder.array(attachment) if folder.has(attachment) else None,
+            rest_node=folder.tensors(rest_node).get("rest_node") if folder.has(rest_node) else None,
+            run=folder,
+            sequence=name,
+        )
+        fitted.scene = loaded.scene
+        return loaded
+
+    def __repr__(self) -> str:
+        count = self.fitted.model.node_count, len(self.fitted.model.spring_nodes)
+        return f"FittedObject({self.sequence!r}, {count[0]} nodes, {count[1]} springs)"
+
+    @property
+    def parameters(self) -> SimulationParameters:
+        """The fitted parameters, in the world of the sequence."""
+        return self.fitted.parameters
+
+    @property
+    def model(self) -> SpringMassModel:
+        """The fitted nodes and springs; each spring has a stiffness and a damping of its own."""
+        return self.fitted.model
+
+    def begin(
+        self,
+        parameters: SimulationParameters,
+        *,
+        controls: Sequence[int] | None = None,
+        automatic_substeps: bool = False,
+    ) -> ObjectRollout:
+        """Prepare a rollout with other parameters: springs are built anew, scaled, or kept.
+
+        Args:
+            parameters: What to simulate with.
+            controls: Numbers of the control nodes that hold the object; none for all. With some
+                of them the object's own springs stay as fitted, whatever the parameters say.
+            automatic_substeps: Whether to choose as few substeps as are stable and fine enough.
 
         Returns:
-            Their positions [m].
+            A rollout of which no frame is ready; see `fill`.
         """
+        self._choose_controls(controls)
+        model = self._model(parameters)
+        if automatic_substeps:
+            parameters = with_stable_substeps(parameters, model, self._control[0])
+        rollout = ObjectRollout.empty(model, parameters, self._control)
+        rollout.scene = self.fitted.scene
+        return rollout
+
+    def fill(self, rollout: ObjectRollout, device: str = "cpu") -> Iterator[Frame]:
+        """Simulate a rollout that `begin` prepared.
+
+        Args:
+            rollout: Its frames are filled one after the other.
+            device: Warp device.
+
+        Returns:
+            Gives each frame when it is ready: its number, positions [m] and velocities [m/s];
+            frame 0 is the initial state.
+
+        Raises:
+            SimulationDivergedError: If the motion runs away.
+        """
+        return _filled(rollout, self._placed(rollout.model, rollout.parameters, device))
+
+    def needed_substeps(self, rollout: ObjectRollout) -> int:
+        """Estimate the fewest substeps a frame that a rollout survives, without any margin."""
+        model, parameters = rollout.model, rollout.parameters
+        latest, scale = self._limit, parameters.stiffness_scale
+        if latest is None or latest[0] is not model or latest[1] != scale:
+            step = largest_stable_step(model, parameters, rollout.control[0])
+            latest = self._limit = (model, scale, step)
+        return max(1, math.ceil(1.0 / (parameters.simulated_frame_rate * latest[2])))
+
+    def simulate(
+        self,
+        *,
+        sequence: Recording | None = None,
+        device: str = "cpu",
+        progress: Watcher = None,
+        **changes: Any,
+    ) -> ObjectRollout:
+        """Simulate all frames, with some parameters changed or in another recording.
+
+        Args:
+            sequence: A recording of the same object; its hands are reconstructed and the object is
+                laid into its first frame. Left out, it is the one that the object was fitted in.
+            device: Warp device, such as ``"cuda:0"``.
+            progress: True shows a bar, a callable is given stage, iteration, total, loss and
+                message.
+            changes: New values of simulation parameters (`SimulationParameters`), such as
+                ``stiffness_scale=0.3``; ``substeps_per_frame="auto"`` chooses as few as are stable.
+
+        Returns:
+            The motion: ``position`` [m], ``velocity`` [m/s], ``forces(frame)`` [N], ``export``.
+
+        Raises:
+            UsageError: If a parameter is unknown or out of bounds, or leaves no spring.
+            MissingInputError: If the recording lacks what moves or shows the object.
+            SimulationDivergedError: If the motion runs away.
+        """
+        with watched(progress) as watch:
+            target = self if sequence is None else self.placed_in(sequence, watch)
+            rollout = target.changed(changes)
+            for frame, _, _ in target.fill(rollout, device):
+                watch.check_cancelled()
+                watch.report(ROLLOUT, frame + 1, rollout.frame_count)
+        return rollout
+
+    def changed(self, changes: Mapping[str, Any]) -> ObjectRollout:
+        """Prepare a rollout with some parameters changed; see `simulate`.
+
+        Raises:
+            UsageError: If a parameter is unknown or out of bounds, or leaves no spring.
+        """
+        from physhandi.fitting.object_reconstruction import check_springs
+
+        parameters, is_automatic = changed_parameters(self.parameters, changes)
+        rollout = self.begin(parameters, automatic_substeps=is_automatic)
+        rest = self.model.object_node if self.rest_node is None else self.rest_node
+        check_springs(self.sequence, rollout.model, parameters, self._attached, rest)
+        if self.placement is not None and "substeps_per_frame" not in changes:
+            needed = stable_substeps(rollout.model, parameters, rollout.control[0])
+            count = max(needed, parameters.substeps_per_frame)
+            rollout.parameters = parameters.replace(substeps_per_frame=count)
+        return rollout
+
+    def placed_in(self, sequence: Recording, progress: Progress) -> "FittedObject":
+        """Lay the object into another recording; see `simulate`.
+
+        The fit's substeps are kept there if they are stable, and raised to what is if not.
+        """
+        from physhandi.fitting.placement import place_object
+
+        if self.run is None:
+            raise RunError("The object belongs to no run, so its settings are not known.")
+        if self.run.holds(sequence):
+            return self if sequence.name == self.sequence else self.of(self.run, sequence.name)
+        rest = self.model.object_node if self.rest_node is None else self.rest_node
+        placed = place_object(self.run, sequence, (self.model.object_node, rest), progress)
+        parameters = self.parameters.in_world(
+            frame_rate=sequence.frame_rate,
+            ground_height=sequence.ground_height,
+            gravity=sequence.gravity,
+        )
+        model = retopologize(
+            replace(self.model, object_node=placed.node, initial_velocity=placed.velocity),
+            parameters,
+            placed.control[0],
+            fitted=self.parameters,
+            rest_node=rest,
+        )
+        empty = ObjectRollout.empty(model, parameters, placed.control)
+        empty.scene = partial(_scene_of, sequence, placed, empty)
+        other = FittedObject(empty, rest_node=rest, run=self.run, sequence=sequence.name)
+        other.placement = placed
+        return other
+
+    def rollout(
+        self,
+        *,
+        log_stiffness: "Tensor | None" = None,
+        log_virtual_stiffness: "Tensor | None" = None,
+        log_damping: "Tensor | None" = None,
+        control: "Tensor | None" = None,
+        device: str = "cpu",
+        **values: Any,
+    ) -> "Tensor":
+        """Simulate the fitted springs so that PyTorch can differentiate the motion.
+
+        What is left out has its fitted value, so that ``rollout(log_stiffness=log(x))`` moves as
+        ``simulate(stiffness=x)`` does.
+
+        Args:
+            log_stiffness: Natural logarithm of the stiffness [log N]. One number is that of
+                ``parameters.stiffness``: each object spring keeps its ratio to it. One number a
+                spring, in the order of ``model.spring_nodes``, is the stiffness of each.
+            log_virtual_stiffness: The same for ``parameters.virtual_stiffness`` and the virtual
+                springs; one number.
+            log_damping: Natural logarithm of the damping [log N·s/m], of ``parameters.damping`` or
+                of each spring.
+            control: Control nodes in every frame [m]; fewer frames make a shorter rollout.
+            device: Warp device; the result is where `control` is, else on the CPU.
+            values: ``drag``, ``restitution``, ``friction``, ``self_restitution``,
+                ``self_friction``, ``initial_position``, ``initial_velocity``, ``window`` and
+                ``memory`` of `physhandi.simulation.differentiable.rollout`.
+
+        Returns:
+            Object node positions in every frame [m].
+
+        Raises:
+            SimulationDivergedError: If the motion runs away.
+            UsageError: If a value does not fit the object.
+        """
+        import torch
+
+        from physhandi.simulation import differentiable
+
+        model, parameters = self.model, self.parameters
+        own, total = model.object_spring_count, len(model.stiffness)
+        stiffness = _logarithms(
+            "log_stiffness", log_stiffness, model.stiffness, slice(0, own), parameters.stiffness
+        )
+        virtual = _logarithms(
+            "log_virtual_stiffness",
+            log_virtual_stiffness,
+            model.stiffness,
+            slice(own, total),
+            parameters.virtual_stiffness,
+        )
+        if stiffness is not None and virtual is not None:
+            stiffness = torch.cat([stiffness[:own], virtual[own:]])
+        elif virtual is not None:
+            stiffness = virtual
+        damping = _logarithms(
+            "log_damping", log_damping, model.damping, slice(0, total), parameters.damping
+        )
+        try:
+            position, _ = differentiable.rollout(
+                model,
+                parameters,
+                torch.tensor(self._all_controls) if control is None else control,
+                log_stiffness=stiffness,
+                damping=None if damping is None else damping.exp(),
+                device=device,
+                **values,
+            )
+        except (TypeError, ValueError) as error:
+            raise UsageError(f"The rollout cannot be simulated: {error}.") from error
+        return position
+
+    def scene(self) -> SceneData:
+        """Read the hands and names of the sequence, which are exported with a motion.
+
+        Raises:
+            RunError: If the object belongs to no run, or a file is damaged.
+        """
+        if self.run is None:
+            raise RunError("The object belongs to no run, so nothing is known of its hands.")
+        return read_scene(self.run, self.sequence)
+
+    def _choose_controls(self, chosen: Sequence[int] | None) -> None:
         wanted = None if chosen is None else tuple(chosen)
         if wanted != self._chosen:
             self._chosen, self._latest = wanted, None
@@ -68,48 +367,106 @@ class FittedObject:
             self._control = everything if wanted is None else everything[:, list(wanted)].copy()
             attached = self._all_attached
             self._attached = attached if wanted is None else attached[list(wanted)].copy()
-        return self._control
 
-    def model(self, parameters: SimulationParameters) -> SpringMassModel:
+    def _model(self, parameters: SimulationParameters) -> SpringMassModel:
         """Build the springs for other parameters, keeping what was fitted."""
         key = tuple(getattr(parameters, name) for name in _BUILT_IN)
         if self._latest is None or self._latest[0] != key:
             self._latest = (key, self._build(parameters))
         return self._latest[1]
 
-    def needed_substeps(self, model: SpringMassModel, parameters: SimulationParameters) -> int:
-        """Estimate the fewest substeps a frame that a model survives, without any margin."""
-        known, scale = self._limit, parameters.stiffness_scale
-        if known is None or known[0] is not model or known[1] != scale:
-            step = largest_stable_step(model, parameters, self._control[0])
-            known = self._limit = (model, scale, step)
-        return max(1, math.ceil(1.0 / (parameters.simulated_frame_rate * known[2])))
-
-    def simulator(
-        self, model: SpringMassModel, parameters: SimulationParameters, device: str
-    ) -> Simulator:
-        """Place a model on the device, or use it again if it is there already."""
-        known = self._simulator
-        if (
-            known is not None
-            and known.model is model
-            and not set(_STEP) & set(changes(known.parameters, parameters))
-        ):
-            known.set_parameters(parameters)
-            return known
-        self._simulator = Simulator(model, parameters, device=device)
-        return self._simulator
-
     def _build(self, parameters: SimulationParameters) -> SpringMassModel:
-        fitted, model = self.take.parameters, self.take.model
+        fitted, model = self.parameters, self.model
         if self._chosen is not None:
             return _hold_anew(model, parameters, self._attached)
-        is_changed = set(_BUILT_IN) & set(changes(fitted, parameters))
+        is_changed = set(_BUILT_IN) & set(changed_settings(fitted, parameters))
         if is_changed <= set(_MATERIAL):
             return _scale_material(model, fitted, parameters) if is_changed else model
         return retopologize(
-            model, parameters, self._attached, fitted=fitted, rest_node=self._rest_node
+            model, parameters, self._attached, fitted=fitted, rest_node=self.rest_node
         )
+
+    def _placed(
+        self, model: SpringMassModel, parameters: SimulationParameters, device: str
+    ) -> Simulator:
+        """Place a model on the device, or use it again if it is there already."""
+        latest = self._simulator
+        if (
+            latest is not None
+            and latest.model is model
+            and latest.device == wp.get_device(device)
+            and not set(_STEP) & set(changed_settings(latest.parameters, parameters))
+        ):
+            latest.set_parameters(parameters)
+            return latest
+        self._simulator = Simulator(model, parameters, device=device)
+        return self._simulator
+
+
+def _filled(rollout: ObjectRollout, simulator: Simulator) -> Iterator[Frame]:
+    for frame, position, velocity in simulator.frames(rollout.control):
+        rollout.position[frame] = position
+        if rollout.velocity is not None:
+            rollout.velocity[frame] = velocity
+        rollout.ready = frame + 1
+        yield frame, position, velocity
+
+
+def _logarithms(
+    name: str, given: "Tensor | None", fitted: ndarray, part: slice, reference: float
+) -> "Tensor | None":
+    """Give the logarithm for each spring of a value for all of them, or for each.
+
+    Args:
+        name: What the user calls it.
+        given: What the user gave.
+        fitted: Value of each spring.
+        part: Springs that one value is about.
+        reference: Value for all of them that the fitted ones belong to.
+    """
+    import torch
+
+    if given is None:
+        return None
+    if given.ndim == 0:
+        least = np.finfo(np.float32).tiny
+        log = torch.tensor(np.log(np.maximum(fitted, least)), device=given.device)
+        offset = torch.zeros_like(log)
+        offset[part] = 1.0
+        if reference > 0.0:
+            return log + offset * (given - math.log(reference))
+        return torch.where(offset > 0.0, given, log)
+    if name == "log_virtual_stiffness" or given.shape != fitted.shape:
+        each = "" if name == "log_virtual_stiffness" else f", or one for each of {len(fitted)}"
+        raise UsageError(f"{name} has shape {tuple(given.shape)}; expected one number{each}.")
+    return given
+
+
+def _scene_of(sequence: Recording, placed: "PlacedObject", rollout: ObjectRollout) -> SceneData:
+    """Describe a recording, with its hands, for the export of a motion in it."""
+    from physhandi.hand.loading import load_hand_model
+    from physhandi.hand.skin import hand_skin
+
+    motions = () if placed.hands is None else placed.hands.motions
+    models = {motion.side: load_hand_model(motion.side, motion.model) for motion in motions}
+    return SceneData(
+        sequence=sequence.name,
+        frame_rate=sequence.frame_rate,
+        length_unit=sequence.length_unit,
+        rollout=rollout.position,
+        control=rollout.control,
+        spring_nodes=rollout.model.spring_nodes,
+        object_spring_count=rollout.model.object_spring_count,
+        hands={
+            m.side: HandSurface(
+                vertex=m.vertices(models[m.side]).astype(np.float32),
+                face=np.asarray(models[m.side].faces, np.int32),
+            )
+            for m in motions
+        },
+        joints={m.side: m.keypoints(models[m.side]).astype(np.float32) for m in motions},
+        skins={m.side: hand_skin(models[m.side], m).to_tensors() for m in motions},
+    )
 
 
 def _scale_material(

@@ -1,12 +1,17 @@
 """One rollout of the object: the fitted one, or one that is being simulated now."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from physhandi.data.exporters.export import export_scene
+from physhandi.data.exporters.scene_data import SceneData
 from physhandi.data.run import RunFolder
+from physhandi.errors import UsageError
 from physhandi.simulation.forces import (
     spring_strains,
     spring_tensions,
@@ -15,6 +20,8 @@ from physhandi.simulation.forces import (
 )
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
+
+_FORMATS = {".glb": "gltf", ".npz": "npz", ".csv": "csv", ".ply": "ply", "": "ply"}
 
 
 @dataclass(eq=False, kw_only=True)
@@ -35,6 +42,8 @@ class ObjectRollout:
     """Number of frames that have been simulated."""
     error: str | None = None
     """Why the simulation ended early, if it did."""
+    scene: Callable[[], SceneData] | None = None
+    """Reads the hands and names that `export` writes beside the motion, if they are known."""
 
     @classmethod
     def empty(
@@ -92,6 +101,58 @@ class ObjectRollout:
             np.asarray(velocity),
             np.asarray(self.control[frame]),
             _difference(self.control, frame, rate),
+        )
+
+    def export(
+        self, path: Path | str, *, frame: int | None = None, overwrite: bool = False
+    ) -> Path:
+        """Write the frames that are ready, with the control nodes, the springs and the hands.
+
+        Args:
+            path: File to write; its suffix says how: ``.glb`` (skinned hands, nodes and springs,
+                moving), ``.npz``, ``.csv`` or, for one frame, ``.ply``. A name without suffix is a
+                folder of PLY files, one a frame.
+            frame: The frame (PLY).
+            overwrite: Whether to replace what is there.
+
+        Returns:
+            What was written.
+
+        Raises:
+            UsageError: If the suffix or frame does not exist, or the path is in use.
+        """
+        out = Path(path)
+        if out.suffix not in _FORMATS:
+            raise UsageError(
+                f"{out.name} names no format; expected one of {', '.join(filter(None, _FORMATS))}, "
+                "or no suffix for a folder of PLY files."
+            )
+        return export_scene(
+            self.scene_data(), _FORMATS[out.suffix], out, frame=frame, overwrite=overwrite
+        )
+
+    def scene_data(self) -> SceneData:
+        """Collect the frames that are ready with what `scene` knows of their surroundings."""
+        count = self.ready
+        motion = {
+            "rollout": np.asarray(self.position[:count]),
+            "control": np.asarray(self.control[:count]),
+            "spring_nodes": self.model.spring_nodes,
+            "object_spring_count": self.model.object_spring_count,
+            "model": self.model.to_tensors(),
+        }
+        if self.scene is None:
+            rate = self.parameters.frame_rate
+            return SceneData(sequence="", frame_rate=rate, length_unit="m", hands={}, **motion)
+        scene = self.scene()
+        return replace(
+            scene,
+            hands={
+                side: replace(hand, vertex=hand.vertex[:count])
+                for side, hand in scene.hands.items()
+            },
+            joints={side: joint[:count] for side, joint in scene.joints.items()},
+            **motion,
         )
 
     def frame_distance(self, other: "ObjectRollout", frame: int) -> float:

@@ -6,6 +6,7 @@ goes on after its last finished stage.
 
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Many
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,11 @@ from numpy import ndarray
 from physhandi.data.attempt import Attempt
 from physhandi.data.environment import ENVIRONMENT, describe_environment
 from physhandi.data.run import RunFolder
+from physhandi.data.run_folder import read_mapping
 from physhandi.data.sequence import Sequence
 from physhandi.devices import describe_device
-from physhandi.errors import MissingInputError
+from physhandi.errors import MissingInputError, RunError
+from physhandi.fitted_object import ROLLOUT, FittedObject
 from physhandi.fitting import artefacts
 from physhandi.fitting.config import (
     EVALUATION,
@@ -36,23 +39,27 @@ from physhandi.fitting.config import STAGES as STAGES
 from physhandi.fitting.hand_reconstruction import reconstruct_hands
 from physhandi.fitting.object_problem import ObjectProblem, build_problem
 from physhandi.fitting.object_reconstruction import search_object
-from physhandi.fitting.rollouts import (
+from physhandi.fitting.placement import (
     control_trajectory_of,
     object_nodes_of,
     refine_sequence,
-    simulate_sequence,
     store_refined,
 )
-from physhandi.fitting.simulate import simulate_again
 from physhandi.fitting.spring_optimisation import optimise_springs
 from physhandi.metrics.report import measure_run, score_run
+from physhandi.object_rollout import ObjectRollout
 from physhandi.perception.lifting import observe_object
 from physhandi.progress import Progress
+from physhandi.simulation.parameters import changed_parameters
 
 Rule = Callable[
     [Float[ndarray, "node 3"], Float[ndarray, "frame control 3"]], Float[ndarray, "frame node 3"]
 ]
 """Moves the object's nodes of frame 0 with the control nodes of all frames [m]."""
+
+Problems = Callable[[], list[ObjectProblem]]
+"""Gives what the object is fitted to, one for each sequence."""
+METRICS = "metrics.json"
 
 
 def settings_of(profile: str, overrides: Mapping[str, Any]) -> dict[str, Any]:
@@ -71,7 +78,7 @@ def reconstruct(
     progress: Progress,
     *,
     device: str = "cpu",
-) -> None:
+) -> dict[str, Any]:
     """Reconstruct hands and one object from one or several sequences (paper, sections 3.2-3.4).
 
     Args:
@@ -81,6 +88,9 @@ def reconstruct(
         progress: Told about every iteration.
         device: Warp device.
 
+    Returns:
+        The measures of each sequence by its name, as ``metrics.json`` holds them.
+
     Raises:
         MissingInputError: If the sequences have neither hands nor an object to fit.
         FitError: If an optimisation has no usable result.
@@ -88,10 +98,12 @@ def reconstruct(
     """
     has_object = _prepare(sequences, config, attempt, progress)
     if has_object:
-        _stage_search(sequences, config, attempt, progress, device)
-        _stage_springs(sequences, config, attempt, progress, device)
-        _stage_refinement(sequences, config, attempt, progress, device)
-    _stage_evaluation(sequences, attempt, progress, device, has_object=has_object)
+        # Built once, by the first stage that is not finished yet.
+        problems = cache(lambda: _problems(sequences, config, attempt))
+        _stage_search(problems, config, attempt, progress, device)
+        _stage_springs(problems, config, attempt, progress, device)
+        _stage_refinement(sequences, problems, config, attempt, progress, device=device)
+    return _stage_evaluation(sequences, attempt, progress, device, has_object=has_object)
 
 
 def predict(
@@ -119,33 +131,138 @@ def predict(
     node = artefacts.load_array(attempt.out / folder / "object_node.npy")
     rollout = rule(node, artefacts.load_control(attempt.out, sequence.name))
     attempt.save_array(f"{folder}/rollout.npy", np.asarray(rollout, np.float32))
-    attempt.save_json("metrics.json", {sequence.name: _measure(sequence, attempt)})
+    attempt.save_json(METRICS, {sequence.name: _measure(sequence, attempt)})
     _finish(attempt, EVALUATION, [], [], [])
 
 
 def simulate(
     source: RunFolder,
-    sequence: Sequence,
-    changes: dict[str, float],
+    sequences: Many[Sequence],
+    changes: Mapping[str, Any],
     attempt: Attempt,
     progress: Progress,
     *,
     device: str = "cpu",
-) -> None:
-    """Simulate a fitted object with changed parameters, or in another sequence, and measure it.
+) -> dict[str, Any]:
+    """Simulate a fitted object with changed parameters, or in other recordings, and measure it.
+
+    A recording is one of the run's if its content is the same, whatever it is called; in others the
+    hands are reconstructed and the object is laid into frame 0. All are simulated with as many
+    substeps as the one that needs most.
 
     Args:
-        source: Run that the object was fitted in.
-        sequence: Where to simulate it.
-        changes: New values of simulation parameters.
-        attempt: Where results go.
+        source: Finished run that the object was fitted in.
+        sequences: Where to simulate it.
+        changes: New values of simulation parameters; ``substeps_per_frame`` may be ``auto``.
+        attempt: Where results go; what is chosen is stored with the other parameters.
         progress: Told about every frame.
         device: Warp device.
+
+    Returns:
+        The measures of each sequence by its name, as ``metrics.json`` holds them.
+
+    Raises:
+        RunError: If the run is not finished or damaged.
+        MissingInputError: If it holds no fitted object, or a recording lacks what moves it.
+        UsageError: If a parameter is unknown or out of bounds, or leaves no spring.
+        SimulationDivergedError: If the motion runs away.
     """
     if not attempt.stage_done(SIMULATION):
-        simulate_again(source, sequence, changes, attempt, progress, device=device)
-        _finish(attempt, SIMULATION, [], [], [])
-    attempt.save_json("metrics.json", {sequence.name: _measure(sequence, attempt)})
+        _stage_simulation(source, sequences, changes, attempt, progress, device=device)
+    metrics = {sequence.name: _measure(sequence, attempt) for sequence in sequences}
+    attempt.save_json(METRICS, metrics)
+    return metrics
+
+
+def _stage_simulation(
+    source: RunFolder,
+    sequences: Many[Sequence],
+    changes: Mapping[str, Any],
+    attempt: Attempt,
+    progress: Progress,
+    *,
+    device: str,
+) -> None:
+    source.verify(allows_more=True)
+    if not source.has("object/material.safetensors"):
+        raise RunError(
+            f"Run '{source.id}' holds no fitted object, so there is nothing to simulate."
+        )
+    fitted = artefacts.load_parameters(source.out)
+    parameters, _ = changed_parameters(fitted, changes)
+    objects = [_object_in(source, sequence, attempt, progress) for sequence in sequences]
+    rollouts = [object_.changed(changes) for object_ in objects]
+    substeps = max(rollout.parameters.substeps_per_frame for rollout in rollouts)
+    parameters = parameters.replace(substeps_per_frame=substeps)
+    if substeps != fitted.substeps_per_frame:
+        count = len(rollouts[0].control)
+        progress.report(SIMULATION, 0, count, message=f"{substeps} substeps a frame")
+    rest_node = artefacts.load_rest_node(source.out)
+    artefacts.save_object(attempt, parameters, rollouts[0].model, rest_node)
+    for object_, rollout in zip(objects, rollouts, strict=True):
+        rollout.parameters = rollout.parameters.replace(substeps_per_frame=substeps)
+        artefacts.save_model(attempt, object_.sequence, rollout.model)
+        _store_rollout(attempt, object_, rollout, device, progress)
+    _finish(attempt, SIMULATION, [], [], [])
+
+
+def _object_in(
+    source: RunFolder, sequence: Sequence, attempt: Attempt, progress: Progress
+) -> FittedObject:
+    """Lay a stored object into a recording, and store what the recording shows."""
+    name = sequence.name
+    artefacts.save_sequence_meta(attempt, sequence)
+    folder = artefacts.sequence_folder(name)
+    if source.holds(sequence):
+        artefacts.save_observation(attempt, name, artefacts.load_observation(source.out, name))
+        artefacts.save_motions(attempt, name, artefacts.load_motions(source.out, name))
+        artefacts.copy_hand_vertices(source, name, attempt)
+        artefacts.copy_hand_observation(source, name, attempt)
+        object_ = FittedObject.of(source, name)
+        if source.has(f"{folder}/attachment.npy"):
+            attempt.save_array(
+                f"{folder}/attachment.npy", artefacts.load_attachment(source.out, name)
+            )
+    else:
+        object_ = FittedObject.of(source).placed_in(sequence, progress)
+        placed = object_.placement
+        if placed is None:
+            raise RunError(f"Run '{source.id}' holds '{name}', but did so differently just now.")
+        artefacts.save_observation(attempt, name, placed.observation)
+        if placed.hands is not None:
+            artefacts.save_motions(attempt, name, placed.hands.motions)
+            artefacts.save_hand_vertices(attempt, name)
+            artefacts.save_hand_observation(attempt, name, placed.hands.keypoint)
+            artefacts.save_hand_points(attempt, sequence, progress)
+    attempt.save_array(f"{folder}/control.npy", np.asarray(object_.fitted.control))
+    return object_
+
+
+def _stored_object(attempt: Attempt, sequence: Sequence) -> FittedObject:
+    """Read the object that earlier stages stored, in the world of a sequence."""
+    parameters = artefacts.load_parameters(attempt.out).in_world(
+        frame_rate=sequence.frame_rate,
+        ground_height=sequence.ground_height,
+        gravity=sequence.gravity,
+    )
+    model = artefacts.load_model(attempt.out, sequence.name)
+    control = artefacts.load_control(attempt.out, sequence.name)
+    empty = ObjectRollout.empty(model, parameters, control)
+    return FittedObject(empty, sequence=sequence.name)
+
+
+def _store_rollout(
+    attempt: Attempt,
+    object_: FittedObject,
+    rollout: ObjectRollout,
+    device: str,
+    progress: Progress,
+) -> None:
+    for frame, _, _ in object_.fill(rollout, device):
+        progress.check_cancelled()
+        progress.report(ROLLOUT, frame + 1, rollout.frame_count)
+    folder = artefacts.sequence_folder(object_.sequence)
+    attempt.save_array(f"{folder}/rollout.npy", np.asarray(rollout.position))
 
 
 def evaluate(run: RunFolder, sequences: Many[Sequence]) -> dict[str, Any]:
@@ -246,7 +363,7 @@ def _problems(
 
 
 def _stage_search(
-    sequences: Many[Sequence],
+    problems: Problems,
     config: PipelineConfig,
     attempt: Attempt,
     progress: Progress,
@@ -255,14 +372,13 @@ def _stage_search(
     """Stage 2, zeroth-order: topology and the other global parameters."""
     if attempt.stage_done(SEARCH):
         return
-    problems = _problems(sequences, config, attempt)
-    result = search_object(problems, config.simulation, config.object_, progress, device=device)
+    result = search_object(problems(), config.simulation, config.object_, progress, device=device)
     attempt.save_yaml("object/parameters.yaml", result.parameters.to_dict())
     _finish(attempt, SEARCH, [result.loss_before], [result.loss_after], result.curve)
 
 
 def _stage_springs(
-    sequences: Many[Sequence],
+    problems: Problems,
     config: PipelineConfig,
     attempt: Attempt,
     progress: Progress,
@@ -271,12 +387,11 @@ def _stage_springs(
     """Stage 2, first-order: a stiffness and a damping for each spring."""
     if attempt.stage_done(SPRINGS):
         return
-    problems = _problems(sequences, config, attempt)
     parameters = artefacts.load_parameters(attempt.out)
-    result = optimise_springs(problems, parameters, config.object_, progress, device=device)
-    for problem in problems:
+    result = optimise_springs(problems(), parameters, config.object_, progress, device=device)
+    for problem in problems():
         artefacts.save_model(attempt, problem.name, result.models[problem.name])
-    first = problems[0]
+    first = problems()[0]
     artefacts.save_object(attempt, result.parameters, result.models[first.name], first.rest_node)
     losses = [result.loss_before], [result.loss_after]
     _finish(attempt, SPRINGS, *losses, result.curve, note=result.stopped)
@@ -284,9 +399,11 @@ def _stage_springs(
 
 def _stage_refinement(
     sequences: Many[Sequence],
+    problems: Problems,
     config: PipelineConfig,
     attempt: Attempt,
     progress: Progress,
+    *,
     device: str,
 ) -> None:
     """Stage 3: hands whose object moves as it was seen to; point controllers are as they are."""
@@ -295,13 +412,14 @@ def _stage_refinement(
     held = [sequence for sequence in sequences if sequence.hands and sequence.control is None]
     before, after, curve = [], [], []
     if config.refinement.iterations and held:
-        problems = _problems(held, config, attempt)
+        by_name = {problem.name: problem for problem in problems()}
+        shown = [by_name[sequence.name] for sequence in held]
         results = [
             refine_sequence(attempt, sequence, problem, config, progress, device=device)
-            for sequence, problem in zip(held, problems, strict=True)
+            for sequence, problem in zip(held, shown, strict=True)
         ]
         # Earlier stages' files are replaced, so an interruption before this must leave them all.
-        for sequence, problem, result in zip(held, problems, results, strict=True):
+        for sequence, problem, result in zip(held, shown, results, strict=True):
             store_refined(attempt, sequence, problem, result)
         before = [result.loss_before for result in results]
         after = [result.loss_after for result in results]
@@ -316,19 +434,21 @@ def _stage_evaluation(
     device: str,
     *,
     has_object: bool,
-) -> None:
+) -> dict[str, Any]:
     """Roll out all frames, the held-out ones included, and measure."""
     if attempt.stage_done(EVALUATION):
-        return
+        return read_mapping(attempt.out / METRICS)
     metrics = {}
     for number, sequence in enumerate(sequences):
         artefacts.save_hand_vertices(attempt, sequence.name)
         if has_object:
-            simulate_sequence(attempt, sequence, device=device, progress=progress)
+            fitted = _stored_object(attempt, sequence)
+            _store_rollout(attempt, fitted, fitted.begin(fitted.parameters), device, progress)
         metrics[sequence.name] = _measure(sequence, attempt)
         progress.report(EVALUATION, number + 1, len(sequences))
-    attempt.save_json("metrics.json", metrics)
+    attempt.save_json(METRICS, metrics)
     _finish(attempt, EVALUATION, [], [], [])
+    return metrics
 
 
 def _measure(sequence: Sequence, attempt: Attempt) -> dict[str, Any]:
@@ -391,9 +511,8 @@ def run_job(run: RunFolder, progress: Progress | None = None, *, device: str = "
             sequence.validate(reads_color=False)
         if run.kind == "simulation":
             source = RunFolder.open(Path(run.config["source"]))
-            simulate(
-                source, sequences[0], run.config["parameters"], attempt, watched, device=device
-            )
+            changes = run.config["parameters"]
+            simulate(source, sequences, changes, attempt, watched, device=device)
         else:
             config = PipelineConfig.from_dict(run.config["profile"])
             reconstruct(sequences, config, attempt, watched, device=device)

@@ -1,10 +1,19 @@
 """How long work tells what it is doing, and learns that it should stop."""
 
-from collections.abc import Callable, Mapping
+import sys
+from collections.abc import Callable, Generator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, TextIO
 
 from jaxtyping import Float
 from numpy import ndarray
+
+from physhandi.errors import UsageError
+
+if TYPE_CHECKING:
+    from rich.progress import Progress as RichProgress
+    from rich.progress import TaskID
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -66,3 +75,115 @@ class Progress:
 
 class NullProgress(Progress):
     """Progress of work that nobody watches."""
+
+
+_QUARTERS = 4
+
+
+class PrintedProgress(Progress):
+    """Shows the running stage on standard error: a bar on a terminal, else a line a quarter."""
+
+    def __init__(self, stream: TextIO | None = None) -> None:
+        """Show nothing until the first report.
+
+        Args:
+            stream: Where to; standard error if left out.
+        """
+        self._stream = sys.stderr if stream is None else stream
+        self._stage = ""
+        self._quarter = -1
+        self._bar: RichProgress | None = None
+        self._task: TaskID | None = None
+
+    def report(
+        self,
+        stage: str,
+        iteration: int,
+        total: int,
+        loss: float | None = None,
+        message: str = "",
+    ) -> None:
+        """Show a report; see `Progress.report`."""
+        words = [] if loss is None else [f"loss {loss:.6g}"]
+        text = "  ".join([*words, message] if message else words)
+        if self._stream.isatty():
+            self._draw(stage, iteration, total, text)
+        else:
+            self._write(stage, iteration, total, text)
+
+    def finish(self) -> None:
+        """End the bar, if there is one, so that what follows stands on a line of its own."""
+        if self._bar is not None:
+            self._bar.stop()
+        self._bar, self._task, self._stage, self._quarter = None, None, "", -1
+
+    def _draw(self, stage: str, iteration: int, total: int, text: str) -> None:
+        if self._bar is None:
+            from rich.console import Console
+            from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
+            from rich.progress import Progress as RichProgress
+
+            columns = (
+                TextColumn("{task.description:<20}", markup=False),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TextColumn("{task.fields[text]}", markup=False),
+            )
+            self._bar = RichProgress(*columns, console=Console(file=self._stream))
+            self._bar.start()
+        if self._task is None or stage != self._stage:
+            self._stage = stage
+            self._task = self._bar.add_task(stage, total=total, text=text)
+        self._bar.update(self._task, completed=iteration, total=total, text=text)
+
+    def _write(self, stage: str, iteration: int, total: int, text: str) -> None:
+        quarter = _QUARTERS * iteration // max(1, total)
+        if (stage, quarter) == (self._stage, self._quarter):
+            return
+        self._stage, self._quarter = stage, quarter
+        self._stream.write(f"{stage} {iteration}/{total}  {text}".rstrip() + "\n")
+        self._stream.flush()
+
+
+Report = Callable[[str, int, int, float | None, str], object]
+"""Is given stage, iteration, total, loss and message, as `Progress.report` is."""
+Watcher = Progress | Report | bool | None
+"""Who is told how far work is: True prints, a function is called, None and False are nobody."""
+
+
+class _CalledProgress(Progress):
+    def __init__(self, call: Report) -> None:
+        self._call = call
+
+    def report(
+        self,
+        stage: str,
+        iteration: int,
+        total: int,
+        loss: float | None = None,
+        message: str = "",
+    ) -> None:
+        self._call(stage, iteration, total, loss, message)
+
+
+@contextmanager
+def watched(watcher: Watcher) -> Generator[Progress]:
+    """Turn what a user asks for as ``progress=`` into a `Progress` for as long as work goes on.
+
+    Raises:
+        UsageError: If it is none of what `Watcher` may be.
+    """
+    if isinstance(watcher, Progress):
+        yield watcher
+    elif watcher is True:
+        printed = PrintedProgress()
+        try:
+            yield printed
+        finally:
+            printed.finish()
+    elif watcher is None or watcher is False:
+        yield NullProgress()
+    elif callable(watcher):
+        yield _CalledProgress(watcher)
+    else:
+        raise UsageError(f"progress is {watcher!r}; expected True, False or a function.")

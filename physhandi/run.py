@@ -1,7 +1,60 @@
-"""A run and the object in it, as scripts, the command line and the viewer hold them."""
+"""A run as scripts, the command line and the viewer hold it: its measures and its object."""
+
+from typing import TYPE_CHECKING, Any
 
 from physhandi.data.run import RunFolder
+
+if TYPE_CHECKING:
+    from physhandi.fitted_object import FittedObject
+    from physhandi.viewer_process import ViewerProcess
 
 
 class Run(RunFolder):
     """One execution of the pipeline: its folder, its measures and the object that it fitted."""
+
+    @property
+    def metrics(self) -> dict[str, Any]:
+        """The measures of each sequence by its name (docs/metrics.md).
+
+        Raises:
+            RunError: If the run has not been measured yet.
+        """
+        return self.json("metrics.json")
+
+    @property
+    def object(self) -> "FittedObject":
+        """The fitted object in the run's first sequence, which can be simulated again.
+
+        Raises:
+            MissingInputError: If the run has no fitted object.
+        """
+        return self.object_in(self.sequence_names[0])
+
+    def object_in(self, sequence: str) -> "FittedObject":
+        """Load the fitted object in one of the run's sequences.
+
+        Args:
+            sequence: Name of the sequence.
+
+        Raises:
+            MissingInputError: If the run has no fitted object for that sequence.
+        """
+        from physhandi.fitted_object import FittedObject
+
+        return FittedObject.of(self, sequence)
+
+    def show(self, *, opens_browser: bool = True) -> "ViewerProcess":
+        """Show the run in the viewer, which a child process serves on this machine alone.
+
+        Args:
+            opens_browser: Whether to open the page in the user's browser too.
+
+        Returns:
+            The process: ``url`` to open, ``stop()`` to end it. It ends with this program.
+
+        Raises:
+            RunError: If the viewer cannot be started; says why.
+        """
+        from physhandi.viewer_process import show_run
+
+        return show_run(self, opens_browser=opens_browser)

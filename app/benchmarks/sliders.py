@@ -44,10 +44,10 @@ class Slider:
             sequence: One of its sequences.
             field: Parameter that the slider moves.
         """
-        self._fitted = FittedObject(str(run.folder), sequence)
+        self._fitted = FittedObject.of(run, sequence)
         meta = run.yaml(f"sequences/{sequence}/meta.yaml")
         unit = "m" if meta.get("metric", True) else str(meta.get("length_unit", "units"))
-        start = self._fitted.take.parameters
+        start = self._fitted.parameters
         known = {knob.field: knob for knob in knobs(start, length_unit=unit)}
         self.knob: Knob = known[field]
         self._start = start
@@ -55,7 +55,7 @@ class Slider:
     @property
     def fitted(self) -> Float[ndarray, "frame node 3"]:
         """The fitted rollout [m]."""
-        return np.asarray(self._fitted.take.position)
+        return np.asarray(self._fitted.fitted.position)
 
     def moves(self, count: int) -> list[Move]:
         """Choose positions, each further than the one before, and simulate them.
@@ -82,10 +82,10 @@ class Slider:
         value = min(max(round(value, 6), self.knob.low), self.knob.high)
         chosen = {self.knob.field: self.knob.from_slider(value)}
         parameters = self._start.replace(**chosen)
-        model = self._fitted.model(parameters)
-        control = self._fitted.choose_controls(None)
-        simulator = self._fitted.simulator(model, parameters, "cpu")
-        return Move(value, np.stack([position for _, position, _ in simulator.frames(control)]))
+        rollout = self._fitted.begin(parameters)
+        for _ in self._fitted.fill(rollout):
+            pass
+        return Move(value, np.asarray(rollout.position))
 
 
 def is_new_frame(

@@ -2,10 +2,8 @@
 
 import json
 import logging
-import shutil
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import tyro
@@ -26,50 +24,14 @@ from app.cli.arguments import (
 )
 from app.cli.suite import evaluate_suite
 from physhandi.errors import PhysHandiError, UsageError, describe
-from physhandi.progress import Progress
+from physhandi.progress import Progress, watched
 
 Result = TypeVar("Result")
 
 
-@dataclass
-class PrintedProgress(Progress):
-    """Shows the running stage on one line of standard error."""
-
-    stage: str = field(default="", init=False)
-
-    def report(
-        self,
-        stage: str,
-        iteration: int,
-        total: int,
-        loss: float | None = None,
-        message: str = "",
-    ) -> None:
-        """Redraw the line; a new stage begins a new one."""
-        if self.stage not in {"", stage}:
-            print(file=sys.stderr)
-        self.stage = stage
-        done = round(24 * iteration / max(1, total))
-        shown = "" if loss is None else f"  loss {loss:.6g}"
-        bar = "█" * done + "░" * (24 - done)
-        line = f"{stage:<20} {bar} {iteration}/{total}{shown}  {message}"
-        # A line that is broken by the terminal could not be drawn over.
-        width = shutil.get_terminal_size((100, 24)).columns - 1
-        print(f"\r{line[:width]:<{width}}", end="", file=sys.stderr, flush=True)
-
-    def finish(self) -> None:
-        """End the line, if there is one, so that what follows stands on its own."""
-        if self.stage:
-            print(file=sys.stderr)
-            self.stage = ""
-
-
 def _watched(work: Callable[[Progress], Result]) -> Result:
-    progress = PrintedProgress()
-    try:
+    with watched(True) as progress:
         return work(progress)
-    finally:
-        progress.finish()
 
 
 def _show(result: Any, *, as_json: bool = False) -> None:

@@ -157,24 +157,14 @@ def _simulate(
     *,
     is_automatic: bool,
 ) -> ObjectRollout:
-    # These load the simulator, which takes longer than most files that need none.
+    # This loads the simulator, which takes longer than most files that need none.
     from physhandi.fitted_object import FittedObject
-    from physhandi.simulation.stability import with_stable_substeps
 
-    fitted = FittedObject(order.folder, content.sequence_name)
-    control = fitted.choose_controls(None)
-    model = fitted.model(parameters)
-    if is_automatic:
-        parameters = with_stable_substeps(parameters, model, control[0])
-    take = ObjectRollout.empty(model, parameters, control)
-    simulator = fitted.simulator(model, parameters, order.device)
-    for frame, position, velocity in simulator.frames(control):
-        take.position[frame] = position
-        if take.velocity is not None:
-            take.velocity[frame] = velocity
-        take.ready = frame + 1
-        report(take.ready, take.frame_count)
-    return take
+    fitted = FittedObject.of(order.folder, content.sequence_name)
+    rollout = fitted.begin(parameters, automatic_substeps=is_automatic)
+    for _ in fitted.fill(rollout, order.device):
+        report(rollout.ready, rollout.frame_count)
+    return rollout
 
 
 def _picture(order: FileRequest, snapshot: Snapshot, state: SessionState) -> Screenshot:

@@ -44,6 +44,7 @@ from physhandi.data.run_folder import (
     read_mapping,
     read_yaml,
 )
+from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import FILE, read_meta
 from physhandi.errors import RunError
 
@@ -262,6 +263,21 @@ class RunFolder:
     def json(self, rel: str) -> Any:
         """Read plain data from JSON."""
         return read_json(self._existing(rel))
+
+    def holds(self, sequence: Sequence) -> bool:
+        """Whether a recording is one that the run's results are about, by what was recorded.
+
+        Another recording may have the same name. Runs of version 0.1 kept no fingerprint; there the
+        recording must lie where the run found it.
+        """
+        if sequence.name not in self.sequence_names:
+            return False
+        meta = f"sequences/{sequence.name}/meta.yaml"
+        fingerprint = self.yaml(meta).get("fingerprint") if self.has(meta) else None
+        if fingerprint is not None:
+            return fingerprint == sequence.content_fingerprint()
+        folder = Path(self.sequences[self.sequence_names.index(sequence.name)])
+        return folder.resolve() == sequence.folder
 
     def verify(self, *, allows_more: bool = False) -> None:
         """Compare all published files with the hashes of their manifest.

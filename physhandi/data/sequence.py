@@ -1,6 +1,7 @@
 """A recorded interaction on disk: synchronised views, controls, markers and geometry."""
 
 import hashlib
+import json
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
@@ -429,22 +430,43 @@ class Sequence:
         """
         check_values(self.folder, self.meta, self.views, reads_color=reads_color)
 
+    def fingerprint(self) -> str:
+        """Compute a SHA-256 over all names and sizes, and the content of YAML and arrays."""
+        return self._fingerprint
+
+    def content_fingerprint(self) -> str:
+        """Compute a SHA-256 over what was recorded, whatever the sequence is called.
+
+        It covers what `fingerprint` covers, but of ``sequence.yaml`` only what describes the
+        recording: not name, description, label, provenance and split.
+        """
+        return self._content_fingerprint
+
     @cached_property
     def _fingerprint(self) -> str:
+        return self._digest(leaves_out=frozenset())
+
+    @cached_property
+    def _content_fingerprint(self) -> str:
+        fields = self.meta.to_dict()
+        for name in ("name", "description", "label", "provenance", "split"):
+            del fields[name]
+        text = json.dumps(fields, sort_keys=True) + self._digest(leaves_out=frozenset({FILE}))
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def _digest(self, *, leaves_out: frozenset[str]) -> str:
         digest = hashlib.sha256()
         for path in sorted(self.folder.rglob("*")):
             name = path.relative_to(self.folder).as_posix()
             if not path.is_file() or any(part.startswith(".") for part in name.split("/")):
+                continue
+            if name in leaves_out:
                 continue
             digest.update(f"{name}\0{path.stat().st_size}\0".encode())
             if path.suffix in {".npy", ".yaml"}:
                 with path.open("rb") as stream:
                     digest.update(hashlib.file_digest(stream, "sha256").digest())
         return digest.hexdigest()
-
-    def fingerprint(self) -> str:
-        """Compute a SHA-256 over all names and sizes, and the content of YAML and arrays."""
-        return self._fingerprint
 
     def _object_parts(self) -> list[str]:
         seen = ["marker"] if self._has("marker") else ["depth", "mask"]

@@ -51,6 +51,7 @@ def save_sequence_meta(output: Attempt, sequence: Sequence) -> None:
             "gravity": sequence.gravity,
             "hands": list(sequence.hands),
             "reconstruction_frames": len(sequence.reconstruction_frames),
+            "fingerprint": sequence.content_fingerprint(),
         },
     )
 

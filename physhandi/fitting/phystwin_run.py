@@ -27,12 +27,12 @@ from physhandi.devices import describe_device
 from physhandi.errors import ImportFailedError
 from physhandi.fitting import artefacts
 from physhandi.fitting.config import load_profile
-from physhandi.fitting.rollouts import simulate_sequence
 from physhandi.metrics.report import measure_run
 from physhandi.perception.lifting import observe_object
 from physhandi.progress import NullProgress, Progress
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
+from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.topology import MINIMUM_LENGTH, build_model
 
 STIFFEST = 1e5
@@ -375,7 +375,13 @@ def _fill(
     attempt.save_array("object/rest_node.npy", model.object_node)
     artefacts.save_model(attempt, sequence.name, model)
     artefacts.save_object(attempt, parameters, model, model.object_node)
-    simulate_sequence(attempt, sequence, device=device, progress=progress)
+    frames = []
+    control = np.asarray(sequence.control, np.float32)
+    for frame, position, _ in Simulator(model, parameters, device=device).frames(control):
+        progress.check_cancelled()
+        frames.append(position)
+        progress.report(_STAGE, frame + 1, len(control))
+    attempt.save_array(f"{folder}/rollout.npy", np.stack(frames))
 
 
 def _finish(

@@ -18,7 +18,7 @@ def run(tmp_path_factory) -> Run:
 
 @pytest.fixture
 def fitted(run) -> FittedObject:
-    return FittedObject(str(run.folder), "lift")
+    return FittedObject.of(run, "lift")
 
 
 @pytest.mark.parametrize(
@@ -32,10 +32,10 @@ def fitted(run) -> FittedObject:
 def test_material_is_scaled_for_its_own_springs_alone(
     fitted, field, factor, own, virtual, damping
 ) -> None:
-    was = fitted.model(PARAMETERS)
+    was = fitted.begin(PARAMETERS).model
     count = was.object_spring_count
     assert 0 < count < len(was.stiffness)
-    now = fitted.model(PARAMETERS.replace(**{field: factor * getattr(PARAMETERS, field)}))
+    now = fitted.begin(PARAMETERS.replace(**{field: factor * getattr(PARAMETERS, field)})).model
     np.testing.assert_allclose(now.stiffness[:count], own * was.stiffness[:count], rtol=1e-6)
     np.testing.assert_allclose(now.stiffness[count:], virtual * was.stiffness[count:], rtol=1e-6)
     np.testing.assert_allclose(now.damping, damping * was.damping, rtol=1e-6)
@@ -43,8 +43,8 @@ def test_material_is_scaled_for_its_own_springs_alone(
 
 def test_material_is_what_a_run_of_its_own_would_get(fitted, run) -> None:
     changed = PARAMETERS.replace(stiffness=90.0, virtual_stiffness=7000.0, damping=11.0)
-    now = fitted.model(changed)
-    model, control = fitted.take.model, run.array("sequences/lift/control.npy")
+    now = fitted.begin(changed).model
+    model, control = fitted.model, run.array("sequences/lift/control.npy")
     rest = run.tensors("object/material.safetensors")["rest_node"]
     anew = retopologize(model, changed, control[0], fitted=PARAMETERS, rest_node=rest)
     np.testing.assert_array_equal(now.spring_nodes, anew.spring_nodes)

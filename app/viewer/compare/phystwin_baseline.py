@@ -10,7 +10,7 @@ from numpy import ndarray
 
 from app.viewer.content.content import Content, HandSurface
 from physhandi.fitting.config import named_profile
-from physhandi.fitting.rollouts import farthest_points, visible_vertices
+from physhandi.fitting.placement import farthest_points, visible_vertices
 from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.parameters import SimulationParameters
 

@@ -21,7 +21,7 @@ from physhandi.errors import PhysHandiError, SimulationDivergedError
 from physhandi.fitted_object import FittedObject
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
-from physhandi.simulation.stability import stable_substeps, with_stable_substeps
+from physhandi.simulation.stability import stable_substeps
 from physhandi.simulation.topology import build_model
 
 logger = logging.getLogger(__name__)
@@ -179,10 +179,10 @@ class SimulationWorker:
         try:
             fitted = self._object(request)
             parameters = SimulationParameters.from_dict(request["parameters"])
-            model, control = fitted.model(parameters), fitted.choose_controls(None)
+            rollout = fitted.begin(parameters)
             yield 0
-            for frame, _, _ in fitted.simulator(model, parameters, self._device).frames(control):
-                yield int(frame) + 1
+            for frame, _, _ in fitted.fill(rollout, self._device):
+                yield frame + 1
                 if frame > 0:
                     return
         except (PhysHandiError, ValueError, OSError, RuntimeError, MemoryError):
@@ -191,23 +191,24 @@ class SimulationWorker:
     def _simulate(self, request: Message, about: dict[str, object]) -> Iterator[int]:
         fitted = self._object(request)
         parameters = SimulationParameters.from_dict(request["parameters"])
-        control = fitted.choose_controls(request["controls"])
-        model = fitted.model(parameters)
-        if request["automatic_substeps"]:
-            parameters = with_stable_substeps(parameters, model, control[0])
+        rollout = fitted.begin(
+            parameters,
+            controls=request["controls"],
+            automatic_substeps=bool(request["automatic_substeps"]),
+        )
         send(
             self._connection,
             Message(
                 "started",
-                {**about, "substeps_per_frame": parameters.substeps_per_frame},
-                model.to_tensors(),
+                {**about, "substeps_per_frame": rollout.parameters.substeps_per_frame},
+                rollout.model.to_tensors(),
             ),
         )
         yield 0
-        simulator = fitted.simulator(model, parameters, self._device)
+        frames = fitted.fill(rollout, self._device)
         clock, frame = time.perf_counter(), 0
         try:
-            for frame, position, velocity in simulator.frames(control):
+            for frame, position, velocity in frames:
                 now = time.perf_counter()
                 send(
                     self._connection,
@@ -215,23 +216,23 @@ class SimulationWorker:
                         "frame",
                         {
                             **about,
-                            "frame": int(frame),
+                            "frame": frame,
                             "duration": now - clock,
                             "elapsed": now - request["arrived"],
                         },
                         {
-                            "position": np.asarray(position, dtype=np.float32),
-                            "velocity": np.asarray(velocity, dtype=np.float32),
+                            "position": position,
+                            "velocity": velocity,
                         },
                     ),
                 )
                 if frame == 1:  # Not before the user sees the first frame that moves.
-                    self._send_stability(about, fitted.needed_substeps(model, parameters))
-                yield int(frame) + 1
+                    self._send_stability(about, fitted.needed_substeps(rollout))
+                yield frame + 1
                 clock = time.perf_counter()
         except SimulationDivergedError:
             if frame == 0:
-                self._send_stability(about, fitted.needed_substeps(model, parameters))
+                self._send_stability(about, fitted.needed_substeps(rollout))
             raise
         send(self._connection, Message("finished", about))
 
@@ -242,7 +243,7 @@ class SimulationWorker:
         key = (str(request["run"]), str(request["sequence"]))
         loaded = self._objects.get(request["session"])
         if loaded is None or loaded[0] != key:
-            loaded = (key, FittedObject(*key))
+            loaded = (key, FittedObject.of(*key))
             self._objects[request["session"]] = loaded
         return loaded[1]
 

@@ -76,6 +76,7 @@ def export_scene(
     out_path: Path | str,
     *,
     frame: int | None = None,
+    overwrite: bool = False,
 ) -> Path:
     """Write motion that need not be in any run, such as one that was simulated just now.
 
@@ -84,6 +85,7 @@ def export_scene(
         format: ``ply``, ``npz``, ``csv`` (trajectories) or ``gltf``; see `export_run`.
         out_path: File to write, or a folder for all frames as PLY.
         frame: Only this frame (PLY).
+        overwrite: Whether to replace an export that is there.
 
     Returns:
         What was written.
@@ -96,7 +98,7 @@ def export_scene(
         known = ", ".join(SCENE_FORMATS)
         raise UsageError(f"'{format}' is not a format of motion; choose one of {known}.")
     is_folder = format == "ply" and out.suffix != ".ply"
-    _check_target(out, format, is_folder=is_folder, overwrite=False)
+    _check_target(out, format, is_folder=is_folder, overwrite=overwrite)
     return _write_scene(scene, format, out, frame, is_folder=is_folder)
 
 

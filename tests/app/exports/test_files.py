@@ -63,10 +63,9 @@ def read_ply(content: bytes, folder: Path) -> np.ndarray:
 def test_a_changed_parameter_is_simulated_before_it_is_written(
     world: World, run: Run, made: list[FileRequest], tmp_path: Path
 ) -> None:
-    fitted = FittedObject(str(run.folder), "sheet")
-    parameters = fitted.take.parameters.replace(drag=9.0)
-    control = fitted.choose_controls(None)
-    expected = Simulator(fitted.model(parameters), parameters).rollout(control).position
+    fitted = FittedObject.of(run, "sheet")
+    parameters = fitted.parameters.replace(drag=9.0)
+    expected = Simulator(fitted.model, parameters).rollout(fitted.fitted.control).position
     assert np.abs(expected - rollout(run)).max() > 1e-3
     with np.load(io.BytesIO(fetch(world, "npz&drag=9"))) as arrays:
         np.testing.assert_allclose(arrays["rollout"], expected, atol=1e-6)

@@ -167,21 +167,22 @@ def test_the_halves_stay_left_and_right_as_the_camera_turns(sessions) -> None:
 
 def test_the_live_process_holds_the_object_in_phystwins_way(run) -> None:
     expected = rolled_out(run)
-    fitted = FittedObject(str(run.folder), "lift")
-    control = fitted.choose_controls(range(30))
-    model = fitted.model(expected.parameters)
-    assert model.object_spring_count == fitted.take.model.object_spring_count
+    fitted = FittedObject.of(run, "lift")
+    rollout = fitted.begin(expected.parameters, controls=range(30))
+    model, control = rollout.model, rollout.control
+    assert model.object_spring_count == fitted.model.object_spring_count
     np.testing.assert_array_equal(model.spring_nodes, expected.model.spring_nodes)
     np.testing.assert_allclose(model.rest_length, expected.model.rest_length, rtol=1e-6)
     np.testing.assert_array_equal(model.stiffness, expected.model.stiffness)
     motion = Simulator(model, expected.parameters).rollout(control)
     np.testing.assert_allclose(motion.position, expected.position, atol=1e-5)
-    some = fitted.choose_controls([3, 17])
-    np.testing.assert_array_equal(some, fitted.take.control[:, [3, 17]])
-    held = fitted.model(expected.parameters).spring_nodes[model.object_spring_count :, 1]
+    some = fitted.begin(expected.parameters, controls=[3, 17])
+    np.testing.assert_array_equal(some.control, fitted.fitted.control[:, [3, 17]])
+    held = some.model.spring_nodes[model.object_spring_count :, 1]
     assert set(held.tolist()) == {81, 82}
-    assert fitted.choose_controls(None).shape[1] == 30
-    assert fitted.model(PARAMETERS) is fitted.take.model
+    everything = fitted.begin(PARAMETERS)
+    assert everything.control.shape[1] == 30
+    assert everything.model is fitted.model
 
 
 def test_the_downloads_hold_positions_springs_and_forces_of_both_sides(run) -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from physhandi.fitting.rollouts import farthest_points, lay_object
+from physhandi.fitting.placement import farthest_points, lay_object
 
 
 def test_farthest_points_spread() -> None:

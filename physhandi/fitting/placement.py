@@ -1,6 +1,8 @@
-"""From a sequence and a fitted object to simulated motion."""
+"""Object nodes and control nodes of a sequence, where its recording shows them."""
 
 from collections.abc import Sequence as Listing
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -10,20 +12,21 @@ from scipy.spatial.transform import Rotation
 
 from physhandi.data.attempt import Attempt
 from physhandi.data.observation import ObjectObservation
+from physhandi.data.run import RunFolder
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
 from physhandi.errors import FitError, MissingInputError
 from physhandi.fitting import artefacts
 from physhandi.fitting.config import PipelineConfig
-from physhandi.fitting.hand_reconstruction import keypoint_target
+from physhandi.fitting.hand_reconstruction import HandFit, keypoint_target, reconstruct_hands
 from physhandi.fitting.hand_refinement import RefinedHands, RefinementProblem, refine_hands
-from physhandi.fitting.object_problem import ObjectProblem
+from physhandi.fitting.object_problem import ObjectProblem, initial_velocity
 from physhandi.hand.loading import load_hand_model
 from physhandi.hand.model import HandModel
 from physhandi.hand.motion import HandMotion, control_trajectory
+from physhandi.perception.lifting import observe_object
 from physhandi.perception.shape import object_nodes_from_observation
 from physhandi.progress import Progress
-from physhandi.simulation.simulator import Simulator
 
 
 def farthest_points(point: Float[ndarray, "point 3"], count: int) -> Int[ndarray, " chosen"]:
@@ -89,7 +92,6 @@ def lay_object(
     return best.astype(np.float32)
 
 
-ROLLOUT_STAGE = "rollout"
 LEAST_CLOUD = 10
 
 
@@ -230,27 +232,55 @@ def object_nodes_of(
     return lay_object(template[0], cloud), template[1]
 
 
-def simulate_sequence(
-    output: Attempt, sequence: Sequence, *, device: str, progress: Progress
-) -> Float[ndarray, "frame node 3"]:
-    """Simulate all frames of a sequence with the stored model, and store the motion [m].
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlacedObject:
+    """A known object in a recording that it was not fitted in."""
+
+    hands: HandFit | None
+    """The hands of the recording; None if it shows none."""
+    observation: ObjectObservation
+    """What the recording shows of the object."""
+    node: Float[ndarray, "node 3"]
+    """Object nodes at frame 0 [m]."""
+    velocity: Float[ndarray, "node 3"]
+    """Their velocities at frame 0 [m/s]."""
+    control: Float[ndarray, "frame control 3"]
+    """Control nodes [m]."""
+
+
+def place_object(
+    run: RunFolder,
+    sequence: Sequence,
+    template: tuple[Float[ndarray, "node 3"], Float[ndarray, "node 3"]],
+    progress: Progress,
+) -> PlacedObject:
+    """Reconstruct the hands of another recording and lay a known object into its frame 0.
+
+    Args:
+        run: Run that fitted the object; its settings are used.
+        sequence: The other recording.
+        template: Nodes in a sequence of the run, and at rest [m].
+        progress: Told about every iteration.
 
     Raises:
-        SimulationDivergedError: If the motion runs away.
+        MissingInputError: If the recording lacks what moves or shows the object.
+        FitError: If it shows another object, or its hands are not seen well enough.
+        RunError: If the run's settings cannot be read.
     """
-    model = artefacts.load_model(output.out, sequence.name)
-    parameters = artefacts.load_parameters(output.out).in_world(
-        frame_rate=sequence.frame_rate,
-        ground_height=sequence.ground_height,
-        gravity=sequence.gravity,
+    while run.kind == "simulation":
+        run = RunFolder.open(Path(run.config["source"]))
+    config = PipelineConfig.from_dict(run.config["profile"])
+    hands = reconstruct_hands(sequence, config.hand, progress) if sequence.hands else None
+    observation = observe_object(sequence, progress)
+    node, _ = object_nodes_of(sequence, observation, config.node_spacing, template)
+    velocity = np.zeros_like(node)
+    if not config.object_.starts_at_rest:
+        velocity = initial_velocity(observation, node, sequence.frame_rate)
+    motions = () if hands is None else hands.motions
+    return PlacedObject(
+        hands=hands,
+        observation=observation,
+        node=node,
+        velocity=velocity,
+        control=control_trajectory_of(sequence, motions, config),
     )
-    folder = artefacts.sequence_folder(sequence.name)
-    control = artefacts.load_control(output.out, sequence.name)
-    positions = []
-    for frame, position, _ in Simulator(model, parameters, device=device).frames(control):
-        progress.check_cancelled()
-        positions.append(position)
-        progress.report(ROLLOUT_STAGE, frame + 1, len(control))
-    rollout = np.stack(positions).astype(np.float32)
-    output.save_array(f"{folder}/rollout.npy", rollout)
-    return rollout

@@ -1,0 +1,115 @@
+"""The viewer of a run, served by a child process; the library itself knows no web framework."""
+
+import atexit
+import os
+import subprocess
+import sys
+import tempfile
+import webbrowser
+from pathlib import Path
+from types import TracebackType
+from urllib.parse import urlsplit, urlunsplit
+
+from physhandi.data.run import RunFolder
+from physhandi.errors import RunError
+
+_PACKAGES = Path(__file__).resolve().parent.parent
+_TAIL = 2000
+
+
+class ViewerProcess:
+    """A running ``physhandi serve`` that only this machine can reach; ends with this program.
+
+    What is saved in the viewer goes to a temporary folder, which is deleted with it: download what
+    shall stay, or serve the data folder with ``physhandi serve`` instead.
+    """
+
+    def __init__(self, run: RunFolder) -> None:
+        """Start it and wait until it answers.
+
+        Args:
+            run: The run to show.
+
+        Raises:
+            RunError: If it does not start; says what it wrote.
+        """
+        self._folder = tempfile.TemporaryDirectory(prefix="physhandi-show-")
+        data_dir = Path(self._folder.name)
+        for kind, name, target in (
+            ("runs", run.id, run.folder),
+            *(
+                ("sequences", name, Path(folder))
+                for name, folder in zip(run.sequence_names, run.sequences, strict=True)
+            ),
+        ):
+            (data_dir / kind).mkdir(exist_ok=True)
+            if target.is_dir():
+                (data_dir / kind / name).symlink_to(target.resolve())
+        self._errors = (data_dir / "errors.txt").open("w+", encoding="utf-8")
+        ours = {key: v for key, v in os.environ.items() if not key.startswith("PHYSHANDI_")}
+        options = ["--host", "127.0.0.1", "--port", "0", "--data-dir", str(data_dir)]
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "app.cli", "serve", *options],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            encoding="utf-8",
+            # `-m` searches the working directory first, so it must be the one of our packages.
+            cwd=_PACKAGES,
+            env=ours | {"PYTHONIOENCODING": "utf-8"},
+        )
+        atexit.register(self.stop)
+        try:
+            address = urlsplit(self._printed_address())
+        except BaseException:
+            self.stop()
+            raise
+        self.url = urlunsplit(address._replace(path=f"/runs/{run.id}/view"))
+        """Address of the run's scene; whoever knows it may open it on this machine."""
+
+    def __repr__(self) -> str:
+        return f"ViewerProcess({self.url!r})" if self.is_running else "ViewerProcess(stopped)"
+
+    def __enter__(self) -> "ViewerProcess":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.stop()
+
+    @property
+    def is_running(self) -> bool:
+        """Whether the viewer can be opened."""
+        return self._process.poll() is None
+
+    def stop(self) -> None:
+        """End the viewer and delete its temporary folder; nothing happens if it has ended."""
+        atexit.unregister(self.stop)
+        if self.is_running:
+            self._process.terminate()
+        self._process.wait()
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+        self._errors.close()
+        self._folder.cleanup()
+
+    def _printed_address(self) -> str:
+        for line in self._process.stdout or ():
+            if line.startswith("http://"):
+                return line.strip()
+        self._process.wait()
+        self._errors.seek(0)
+        reason = self._errors.read()[-_TAIL:].strip() or "it said nothing"
+        raise RunError(f"The viewer could not be started: {reason}")
+
+
+def show_run(run: RunFolder, *, opens_browser: bool) -> ViewerProcess:
+    """Start the viewer of a run; see `physhandi.run.Run.show`."""
+    viewer = ViewerProcess(run)
+    if opens_browser:
+        webbrowser.open(viewer.url)
+    return viewer
