@@ -59,7 +59,7 @@ Rule = Callable[
 
 Problems = Callable[[], list[ObjectProblem]]
 """Gives what the object is fitted to, one for each sequence."""
-METRICS = "metrics.json"
+METRICS_FILE = "metrics.json"
 
 
 def settings_of(profile: str, overrides: Mapping[str, Any]) -> dict[str, Any]:
@@ -131,7 +131,7 @@ def predict(
     node = artefacts.load_array(attempt.out / folder / "object_node.npy")
     rollout = rule(node, artefacts.load_control(attempt.out, sequence.name))
     attempt.save_array(f"{folder}/rollout.npy", np.asarray(rollout, np.float32))
-    attempt.save_json(METRICS, {sequence.name: _measure(sequence, attempt)})
+    attempt.save_json(METRICS_FILE, {sequence.name: _measure(sequence, attempt)})
     _finish(attempt, EVALUATION, [], [], [])
 
 
@@ -170,7 +170,7 @@ def simulate(
     if not attempt.stage_done(SIMULATION):
         _stage_simulation(source, sequences, changes, attempt, progress, device=device)
     metrics = {sequence.name: _measure(sequence, attempt) for sequence in sequences}
-    attempt.save_json(METRICS, metrics)
+    attempt.save_json(METRICS_FILE, metrics)
     return metrics
 
 
@@ -437,7 +437,7 @@ def _stage_evaluation(
 ) -> dict[str, Any]:
     """Roll out all frames, the held-out ones included, and measure."""
     if attempt.stage_done(EVALUATION):
-        return read_mapping(attempt.out / METRICS)
+        return read_mapping(attempt.out / METRICS_FILE)
     metrics = {}
     for number, sequence in enumerate(sequences):
         artefacts.save_hand_vertices(attempt, sequence.name)
@@ -446,7 +446,7 @@ def _stage_evaluation(
             _store_rollout(attempt, fitted, fitted.begin(fitted.parameters), device, progress)
         metrics[sequence.name] = _measure(sequence, attempt)
         progress.report(EVALUATION, number + 1, len(sequences))
-    attempt.save_json(METRICS, metrics)
+    attempt.save_json(METRICS_FILE, metrics)
     _finish(attempt, EVALUATION, [], [], [])
     return metrics
 

@@ -145,14 +145,14 @@ class PrintedProgress(Progress):
         self._stream.flush()
 
 
-Report = Callable[[str, int, int, float | None, str], object]
+ReportFunction = Callable[[str, int, int, float | None, str], object]
 """Is given stage, iteration, total, loss and message, as `Progress.report` is."""
-Watcher = Progress | Report | bool | None
+Watcher = Progress | ReportFunction | bool | None
 """Who is told how far work is: True prints, a function is called, None and False are nobody."""
 
 
 class _CalledProgress(Progress):
-    def __init__(self, call: Report) -> None:
+    def __init__(self, call: ReportFunction) -> None:
         self._call = call
 
     def report(

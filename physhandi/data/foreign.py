@@ -535,7 +535,7 @@ class Tree:
         return self._index[id(value)]
 
 
-def load(stream: io.BufferedIOBase) -> Any:
+def build_tree(stream: io.BufferedIOBase) -> Any:
     """Build the tree of a pickle or a torch checkpoint from stand-ins.
 
     Raises:
@@ -561,7 +561,7 @@ def convert(stream: io.BufferedIOBase, most_bytes: int) -> tuple[Any, list[ndarr
     """
     tree = Tree(most_bytes // 4)
     try:
-        return tree.encode(load(stream)), tree.arrays
+        return tree.encode(build_tree(stream)), tree.arrays
     except ImportFailedError:
         raise
     except (MemoryError, OverflowError):

@@ -380,7 +380,7 @@ def _fill(
     for frame, position, _ in Simulator(model, parameters, device=device).frames(control):
         progress.check_cancelled()
         frames.append(position)
-        progress.report(_STAGE, frame + 1, len(control))
+        progress.report("rollout", frame + 1, len(control))
     attempt.save_array(f"{folder}/rollout.npy", np.stack(frames))
 
 

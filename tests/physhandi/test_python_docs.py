@@ -1,0 +1,83 @@
+"""The code that users are shown: docs/python.md, README.md and the notebooks, executed."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from sheet_sequence import sheet_config, write_sheet
+
+import physhandi as ph
+from physhandi import pipeline
+from physhandi.fitting.config import config_to_dict, load_profile
+
+ROOT = Path(__file__).parents[2]
+SMALL = sheet_config(generations=2, population=6, iterations=2)
+
+
+def blocks(page: str) -> list[str]:
+    return re.findall(r"^```python\n(.*?)^```$", (ROOT / page).read_text(), re.M | re.S)
+
+
+def cells(notebook: Path) -> list[str]:
+    content = json.loads(notebook.read_text())
+    return ["".join(c["source"]) for c in content["cells"] if c["cell_type"] == "code"]
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with two recordings, and with the run that the pages ask for, fitted cheaply."""
+    folder = tmp_path_factory.mktemp("desk")
+    for name, lift in (("towel_fold", 0.12), ("towel_pull", 0.2)):
+        write_sheet(folder / "sequences" / name, lift=lift)
+    sequence = ph.load(folder / "sequences" / "towel_fold")
+    run = ph.Run.create(
+        folder / "runs" / "towel",
+        name="towel",
+        kind="reconstruction",
+        sequences=[str(sequence.folder)],
+        config={"profile": config_to_dict(load_profile("quick"))},
+    )
+    with run.begin_attempt() as attempt:
+        pipeline.reconstruct([sequence], SMALL, attempt, attempt.progress())
+        attempt.publish()
+    return folder
+
+
+def execute(texts: list[str]) -> None:
+    names: dict[str, object] = {}
+    for text in texts:
+        exec(compile(text, "documentation", "exec"), names)  # noqa: S102  # our own pages
+
+
+@pytest.mark.parametrize("page", ["docs/python.md", "README.md"])
+def test_the_code_of_a_page_runs(desk: Path, page: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = []
+    monkeypatch.chdir(desk)
+    monkeypatch.setattr(ph.Run, "show", lambda run: shown.append(run.id))
+    # The sheet's nodes are farther apart than a towel's, and it has ten frames.
+    texts = [
+        text.replace("radius=0.035", "radius=0.085").replace("forces(10)", "forces(6)")
+        for text in blocks(page)
+    ]
+    assert texts
+    execute(texts)
+    assert shown == (["towel"] if page == "README.md" else [])
+    assert list(desk.glob("*.glb"))
+
+
+@pytest.mark.parametrize("notebook", sorted((ROOT / "docs/notebooks").glob("*.ipynb")), ids=str)
+def test_a_notebook_runs(
+    notebook: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    texts = cells(notebook)
+    assert texts
+    execute(texts)
+    assert "mm at most from the fit" in capsys.readouterr().out
+
+
+def test_every_public_name_is_documented() -> None:
+    page = (ROOT / "docs/python.md").read_text()
+    for name in set(dir(ph)) - {"__version__"}:
+        assert f"ph.{name}" in page or f"`{name}`" in page, name
