@@ -9,7 +9,7 @@ from sheet_sequence import sheet_config, write_sheet
 
 import physhandi as ph
 from physhandi import pipeline
-from physhandi.fitting.config import config_to_dict, load_profile
+from physhandi.fitting.config import load_profile
 
 ROOT = Path(__file__).parents[2]
 SMALL = sheet_config(generations=2, population=6, iterations=2)
@@ -36,7 +36,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
         name="towel",
         kind="reconstruction",
         sequences=[str(sequence.folder)],
-        config={"profile": config_to_dict(load_profile("quick"))},
+        config={"profile": load_profile("quick").to_dict()},
     )
     with run.begin_attempt() as attempt:
         pipeline.reconstruct([sequence], SMALL, attempt, attempt.progress())
