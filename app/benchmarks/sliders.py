@@ -10,7 +10,7 @@ from numpy import ndarray
 
 from app.benchmarks.served import Served
 from app.benchmarks.streams import Screen, percentiles
-from app.viewer.live.rollouts import STARTING
+from app.viewer.live.client import STARTING
 from app.viewer.physics.parameters import Knob, knobs
 from physhandi.fitted_object import FittedObject
 from physhandi.run import Run

@@ -8,6 +8,7 @@ from typing import Any
 import viser
 
 from app.viewer.clock.playback import TURN, Playback
+from app.viewer.clock.timeline_panel import TimelinePanel
 from app.viewer.compare.figure_mode import FigureMode
 from app.viewer.compare.pin_mode import PinMode
 from app.viewer.content.content import Catalog, Content, open_run, open_sequence
@@ -20,7 +21,7 @@ from app.viewer.physics.keep_panel import UserStorage
 from app.viewer.physics.object_session import FrameStrip, ObjectSession
 from app.viewer.restoring import complete_state
 from app.viewer.scene.framing import frame_content
-from app.viewer.scene.layers_panel import LayersPanel, TimelinePanel, add_legend, set_theme
+from app.viewer.scene.layers_panel import LayersPanel, add_legend, set_theme
 from app.viewer.scene.scene import SceneDrawing
 from app.viewer.scene.scene_server import SceneServer
 from physhandi.object_rollout import ObjectRollout

@@ -14,8 +14,7 @@ from app.viewer.compare.phystwin_baseline import PhysTwinBaseline
 from app.viewer.content.content import Content
 from app.viewer.content.layers import Layers
 from app.viewer.content.session_state import Pose
-from app.viewer.live.client import SimulationClient
-from app.viewer.live.rollouts import LiveRollouts
+from app.viewer.live.client import LiveRollouts, SimulationClient
 from app.viewer.scene.framing import Framing
 from app.viewer.ui.guard import Guard, notify
 from app.viewer.ui.keyboard import bind

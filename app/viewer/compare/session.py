@@ -9,6 +9,7 @@ import viser
 
 from app.comparison import CompareAsk
 from app.viewer.clock.playback import TURN, Playback
+from app.viewer.clock.timeline_panel import TimelinePanel
 from app.viewer.compare.drawing import CompareDrawing
 from app.viewer.compare.figure import Side
 from app.viewer.compare.figure_camera import FigureCameras
@@ -22,7 +23,7 @@ from app.viewer.content.session_state import Kind, Pose, SessionState
 from app.viewer.export.export_panel import ExportPanel
 from app.viewer.export.snapshot import Snapshot
 from app.viewer.scene.framing import Framing, frame_content
-from app.viewer.scene.layers_panel import LayersPanel, TimelinePanel, set_theme
+from app.viewer.scene.layers_panel import LayersPanel, set_theme
 from app.viewer.scene.scene_server import SceneServer
 from app.viewer.ui.guard import plain
 from app.viewer.ui.keyboard import bind

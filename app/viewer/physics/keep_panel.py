@@ -11,7 +11,7 @@ import viser
 
 from app.jobs.catalog import Catalog
 from app.viewer.content.content import Content
-from app.viewer.live.rollouts import LiveRollouts
+from app.viewer.live.client import LiveRollouts
 from app.viewer.physics.history import History
 from app.viewer.physics.presets import (
     AS_FITTED,

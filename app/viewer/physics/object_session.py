@@ -9,8 +9,7 @@ import viser
 
 from app.viewer.clock.playback import Playback
 from app.viewer.content.content import Content
-from app.viewer.live.client import SimulationClient
-from app.viewer.live.rollouts import LiveRollouts, Readout
+from app.viewer.live.client import LiveRollouts, Readout, SimulationClient
 from app.viewer.physics.error_panel import ErrorPanel, load_track_error
 from app.viewer.physics.keep_panel import UserStorage
 from app.viewer.physics.panel import PhysicsPanel

@@ -11,7 +11,7 @@ import viser
 
 from app.keys import Action
 from app.viewer.content.content import Content
-from app.viewer.live.rollouts import STARTING, LiveRollouts, Readout
+from app.viewer.live.client import STARTING, LiveRollouts, Readout
 from app.viewer.physics.history import History, Setting
 from app.viewer.physics.keep_panel import KeepPanel, PresetChoice, UserStorage
 from app.viewer.physics.parameters import (

@@ -8,7 +8,6 @@ from typing import Any
 import viser
 
 from app.keys import LAYER_KEYS
-from app.viewer.clock.timeline_panel import TimelinePanel as TimelinePanel
 from app.viewer.color.legend import swatches_html
 from app.viewer.content.content import Content
 from app.viewer.content.layers import BLUE, GREEN, GREY, RED, SKIN, THEMES, YELLOW, Layers, Theme

@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 from viewer_world import FRAMES, PARAMETERS
 
-from app.viewer.live.client import LiveRequest
-from app.viewer.live.rollouts import LiveRollouts
+from app.viewer.live.client import LiveRequest, LiveRollouts
 from app.viewer.live.wire import Message
 from physhandi.object_rollout import load_fitted
 

@@ -13,7 +13,7 @@ from viewer_world import FRAMES, PARAMETERS, FakeSettings, controls, hear_all, r
 from waiting import WatchedLock, until
 
 from app.viewer import session
-from app.viewer.live.rollouts import STARTING
+from app.viewer.live.client import STARTING
 from app.viewer.session import ViewSwitch
 from app.viewer.sessions import Session, Sessions
 from physhandi.simulation.simulator import Simulator
