@@ -21,19 +21,45 @@ OUT = "attempts/1/out"
 SHEET = f"{OUT}/sequences/sheet"
 
 
+@pytest.fixture(scope="module")
+def shared(
+    tmp_path_factory: pytest.TempPathFactory,
+    sheet_folder: Path,
+    filmed_folder: Path,
+    fitted_folder: Path,
+) -> Iterator[World]:
+    """A server with a whole run and one for each damage, for tests that change nothing."""
+    data = tmp_path_factory.mktemp("shared")
+    for folder in (sheet_folder, filmed_folder):
+        shutil.copytree(folder, data / "sequences" / folder.name)
+    shutil.copytree(fitted_folder, data / "runs" / "whole")
+    for name, (damage, _) in RUNS.items():
+        damage(shutil.copytree(fitted_folder, data / "runs" / id_of(name)))
+    world = make_world(data, bundled=data / "nothing")
+    yield world
+    world.sessions.shutdown()
+
+
+@pytest.fixture(scope="module")
+def client(shared: World) -> TestClient:
+    return shared.script()
+
+
 @pytest.fixture
-def world(tmp_path: Path, sheet_folder: Path, filmed_folder: Path, fitted_folder: Path) -> World:
+def world(tmp_path: Path, sheet_folder: Path, filmed_folder: Path) -> Iterator[World]:
+    """A server with two recordings, to damage."""
     data = tmp_path / "data"
     for folder in (sheet_folder, filmed_folder):
         shutil.copytree(folder, data / "sequences" / folder.name)
-    shutil.copytree(fitted_folder, data / "runs" / "fitted")
-    return make_world(data, bundled=tmp_path / "nothing")
-
-
-@pytest.fixture
-def client(world: World) -> Iterator[TestClient]:
-    yield world.script()
+    (data / "runs").mkdir()
+    world = make_world(data, bundled=tmp_path / "nothing")
+    yield world
     world.sessions.shutdown()
+
+
+def id_of(name: str) -> str:
+    """The folder of the run with this damage."""
+    return name.replace(" ", "-").replace(".", "-")
 
 
 def refusal(response: Any) -> str:
@@ -67,15 +93,16 @@ LAUNCHES: dict[str, tuple[Any, int, str]] = {
 
 @table(LAUNCHES)
 def test_a_senseless_launch_is_refused(
-    world: World, client: TestClient, case: tuple[Any, int, str]
+    shared: World, client: TestClient, case: tuple[Any, int, str]
 ) -> None:
     body, status, word = case
+    before = sorted(shared.settings.run_dir.iterdir())
     content = body if isinstance(body, str) else json.dumps(body)
     headers = {"Content-Type": "application/json"}
     response = client.post("/api/v1/runs", content=content, headers=headers)
     assert response.status_code == status, response.text
     assert word in refusal(response)
-    assert [path.name for path in world.settings.run_dir.iterdir()] == ["fitted"]
+    assert sorted(shared.settings.run_dir.iterdir()) == before
 
 
 def test_an_endless_body_is_not_read(client: TestClient) -> None:
@@ -87,8 +114,8 @@ def test_an_endless_body_is_not_read(client: TestClient) -> None:
 SESSIONS: dict[str, tuple[Any, int, str]] = {
     "unknown run": ({"kind": "run", "id": "mine"}, 404, "'mine'"),
     "unknown sequence": ({"kind": "sequence", "id": "towel"}, 404, "'towel'"),
-    "unknown kind": ({"kind": "file", "id": "fitted"}, 422, "kind"),
-    "path for an id": ({"kind": "run", "id": "../fitted"}, 422, "id"),
+    "unknown kind": ({"kind": "file", "id": "whole"}, 422, "kind"),
+    "path for an id": ({"kind": "run", "id": "../whole"}, 422, "id"),
     "number for an id": ({"kind": "run", "id": 7}, 422, "id"),
 }
 
@@ -122,8 +149,8 @@ def test_an_id_is_never_a_path(client: TestClient, path: str) -> None:
 
 
 @pytest.mark.parametrize("path", ["runs/{}", "live/{}", "sequences/{}/thumbnail"])
-def test_a_page_of_nothing_is_a_page(world: World, path: str) -> None:
-    browser = world.browser()
+def test_a_page_of_nothing_is_a_page(shared: World, path: str) -> None:
+    browser = shared.browser()
     for id_ in (*IDS, "mine"):
         response = browser.get(f"/{path.format(id_)}")
         assert 400 <= response.status_code < 500
@@ -171,33 +198,39 @@ RUNS: dict[str, tuple[Callable[[Path], Any], str]] = {
 PATHS = ("", "/losses", "/frame_errors", "/log", "/export?format=npz", "/export?format=yaml")
 
 
-@table(RUNS)
-def test_a_damaged_run_is_told_and_hides_no_other(
-    world: World, client: TestClient, case: tuple[Callable[[Path], Any], str]
-) -> None:
-    damage, word = case
-    shutil.copytree(world.settings.run_dir / "fitted", world.settings.run_dir / "whole")
-    damage(world.settings.run_dir / "fitted")
+@pytest.mark.parametrize("name", RUNS)
+def test_a_damaged_run_is_told(shared: World, client: TestClient, name: str) -> None:
+    run_id, word = id_of(name), RUNS[name][1]
     told = ""
     for path in PATHS:
-        response = client.get(f"/api/v1/runs/fitted{path}")
+        response = client.get(f"/api/v1/runs/{run_id}{path}")
         assert response.status_code < 500, response.text
         assert "Traceback" not in response.text
         told += response.text if path != "/log" else ""
-    body = {"kind": "run", "id": "fitted"}
-    told += client.post("/api/v1/sessions", json=body).text
-    browser = world.browser()
-    for path in ("/", "/runs/fitted", "/runs/fitted/parts"):
+    response = client.post("/api/v1/sessions", json={"kind": "run", "id": run_id})
+    told += response.text
+    if response.status_code == 201:
+        client.delete(f"/api/v1/sessions/{response.json()['id']}")
+    browser = shared.browser()
+    for path in (f"/runs/{run_id}", f"/runs/{run_id}/parts"):
         page = browser.get(path)
         assert page.status_code < 500
         assert page.headers["content-type"].startswith("text/html")
         assert "Traceback" not in page.text
         told += page.text
     assert word in told
+
+
+def test_damaged_runs_hide_no_other(shared: World, client: TestClient) -> None:
     listed = {run["id"]: run for run in client.get("/api/v1/runs").json()["runs"]}
-    assert set(listed) == {"fitted", "whole"}
+    assert set(listed) == {"whole", *map(id_of, RUNS)}
     assert listed["whole"]["state"] == "succeeded"
-    assert client.post("/api/v1/sessions", json=body | {"id": "whole"}).status_code == 201
+    page = shared.browser().get("/runs")
+    assert page.status_code == 200
+    assert all(f"/runs/{run_id}" in page.text for run_id in listed)
+    assert "Traceback" not in page.text
+    response = client.post("/api/v1/sessions", json={"kind": "run", "id": "whole"})
+    assert response.status_code == 201
 
 
 SEQUENCES = {
@@ -214,9 +247,8 @@ SEQUENCES = {
 
 
 @table(SEQUENCES)
-def test_a_damaged_recording_is_told_and_hides_no_other(
-    world: World, client: TestClient, case: Any
-) -> None:
+def test_a_damaged_recording_is_told_and_hides_no_other(world: World, case: Any) -> None:
+    client = world.script()
     case.damage(world.settings.sequence_dir / "filmed")
     listed = {item["id"]: item for item in client.get("/api/v1/sequences").json()["sequences"]}
     assert listed["sheet"]["error"] is None
@@ -253,9 +285,9 @@ VALUES = {
 @table(VALUES)
 def test_a_fit_of_wrong_values_fails_with_its_reason_and_advice(
     world: World,
-    client: TestClient,
     case: tuple[str, Callable[[Path], Any], tuple[str, ...]],
 ) -> None:
+    client = world.script()
     name, damage, words = case
     response = client.post("/api/v1/runs", json={"sequences": [name]})
     damage(world.settings.sequence_dir / name)
@@ -282,4 +314,4 @@ def test_a_full_disk_is_told(world: World, monkeypatch: pytest.MonkeyPatch) -> N
     response = world.script().post("/api/v1/runs", json=RUN)
     assert response.status_code == 507
     assert "Free some space" in response.json()["error"]["message"]
-    assert [path.name for path in world.settings.run_dir.iterdir()] == ["fitted"]
+    assert list(world.settings.run_dir.iterdir()) == []
