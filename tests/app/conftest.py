@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from server_world import World, fit_sheet, make_world
+from shared_live import live_process as live_process
 from sheet_sequence import write_sheet
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from bad_input_world import Terminal, write_filmed
 from server_world import fit_sheet, tiny_config
+from shared_live import live_process as live_process
 from sheet_sequence import write_sheet
 
 from app.cli import commands

@@ -210,6 +210,7 @@ def test_there_are_only_so_many_sessions(catalog) -> None:
     finally:
         sessions.shutdown()
     assert sessions.list() == []
+    assert sessions.live.is_closed
 
 
 @pytest.mark.usefixtures("nobody_makes_room")
