@@ -157,7 +157,7 @@ def test_any_value_of_any_parameter(gate: Terminal, fitted: Path, option: str, v
 @QUICK
 @given(
     values=st.dictionaries(
-        st.sampled_from([*SimulationParameters.__dataclass_fields__, "colour"]), LEAF, max_size=3
+        st.sampled_from([*SimulationParameters.__struct_fields__, "colour"]), LEAF, max_size=3
     )
 )
 def test_parameters_are_either_refused_or_usable(values: dict[str, Any]) -> None:

@@ -8,8 +8,8 @@ from bad_input_world import Terminal, table, tree
 SIMULATE = {
     # option, value, what the message names
     "δ negative": ("--connection-radius", -0.02, ("connection_radius is -0.02",)),
-    "δ NaN": ("--connection-radius", "nan", ("connection_radius is nan", "finite")),
-    "δ infinite": ("--connection-radius", "inf", ("connection_radius is inf", "finite")),
+    "δ NaN": ("--connection-radius", "nan", ("connection_radius is nan", "number from 0")),
+    "δ infinite": ("--connection-radius", "inf", ("connection_radius is inf", "number from 0")),
     "δ of no spring": (
         "--connection-radius",
         1e-6,
@@ -20,8 +20,8 @@ SIMULATE = {
         0,
         ("No object spring", "max_neighbors is 0", "at least 1"),
     ),
-    "d_max negative": ("--max-neighbors", -1, ("max_neighbors is -1", "[0, 1000]")),
-    "d_max huge": ("--max-neighbors", 10**9, ("max_neighbors is 1000000000", "[0, 1000]")),
+    "d_max negative": ("--max-neighbors", -1, ("max_neighbors is -1", "0 to 1000")),
+    "d_max huge": ("--max-neighbors", 10**9, ("max_neighbors is 1000000000", "0 to 1000")),
     "virtual δ of no spring": (
         "--virtual-connection-radius",
         0.004,
@@ -31,9 +31,9 @@ SIMULATE = {
     "stiffness scale NaN": ("--stiffness-scale", "nan", ("stiffness_scale is nan",)),
     "damping negative": ("--damping", -1, ("damping is -1",)),
     "drag infinite": ("--drag", "1e999", ("drag is inf",)),
-    "restitution above 1": ("--restitution", 1.5, ("restitution is 1.5", "[0.0, 1.0]")),
-    "friction negative": ("--friction", -0.1, ("friction is -0.1", "[0.0, 2.0]")),
-    "no substeps": ("--substeps-per-frame", 0, ("substeps_per_frame is 0", "[1, 1000000]")),
+    "restitution above 1": ("--restitution", 1.5, ("restitution is 1.5", "0 to 1")),
+    "friction negative": ("--friction", -0.1, ("friction is -0.1", "0 to 2")),
+    "no substeps": ("--substeps-per-frame", 0, ("substeps_per_frame is 0", "from 1 to")),
 }
 
 
