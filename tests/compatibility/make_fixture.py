@@ -1,12 +1,13 @@
 # ruff: noqa: I001  # its imports are sorted as the modules of that commit are
-"""Makes the data folder of these tests, by the program as it was at commit 57a38d7.
+"""Makes the data folder of these tests, and lists what people can reach, at commit 57a38d7.
 
-Run it in a checkout of exactly that commit, not in this one::
+Run it in a checkout of exactly that commit, not in this one; HERE is this folder::
 
-    cd CHECKOUT && PYTHONPATH=CHECKOUT python .../tests/compatibility/make_fixture.py /srv/physhandi
+    cd CHECKOUT && PYTHONPATH=CHECKOUT:HERE/.. python HERE/make_fixture.py /srv/physhandi
 
-It writes ``data.tar.xz`` (the data folder), ``expected.json`` (what that program said of it) and
-``permalinks.json`` to the folder named on the command line; README.md says what is in them.
+It writes ``data.tar.xz`` (the data folder), ``expected.json`` (what that program said of it),
+``permalinks.json`` and ``surface.json`` to the folder named on the command line; README.md says
+what is in them.
 """
 
 import json
@@ -23,25 +24,30 @@ from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
+import surface
+from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from pydantic import SecretStr
 
-from app import cli, commands
+from app import cli, commands, permalink
 from app.arguments import Reconstruct
+from app.benchmarks.viewer_client import ViewerClient
 from app.comparison import CompareAsk
 from app.exports.links import address
-from app.jobs import run_index
+from app.jobs import listing, run_index
 from app.jobs.catalog import Catalog
 from app.jobs.listing import RunQuery
 from app.jobs.scheduler import Scheduler
+from app.keys import KEYS
 from app.permalink import state_from_query, state_to_query
 from app.server import create_app
 from app.settings import Settings
-from app.viewer.layers import Layers
+from app.viewer.layers import THEMES, Layers
 from app.viewer.preset_store import PresetStore
+from app.viewer.presets import builtin_presets
 from app.viewer.save_run import RunSaver
 from app.viewer.session_state import Pose, SessionState
 from physhandi.data.camera import PinholeCamera
@@ -57,6 +63,7 @@ from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.topology import build_model
 
 COMMIT = "57a38d7"
+POSE = {"cam": "0.5,0,0.5,0,0,0"}
 TOKEN = "made-for-this-fixture-and-nothing-else"  # noqa: S105
 IMAGE = 64
 GRASP_FRAMES, GRASP_FITTED = 3, 2
@@ -507,6 +514,69 @@ def record_answers(client: TestClient, ids: dict[str, str], data: Path) -> dict[
     }
 
 
+def link_fields() -> list[dict[str, str]]:
+    """Give a query for each field of a scene's link, and for each value that it names."""
+    known = [
+        *({key: value} for key in permalink._CHOICES for value in permalink._CHOICES[key]),
+        *({"show": layer} for layer in permalink._SWITCHES),
+        *({"theme": theme} for theme in THEMES),
+        *({key: "1"} for key in ("f", "fig", "play", "loop")),
+        {"sequence": "sheet"},
+        {"range": "0,1"},
+        {"scale": "2"},
+        {"from": "front"},
+        {"speed": "0.5"},
+        POSE,
+        POSE | {"fov": "50"},
+        POSE | {"up": "0,1,0"},
+        {"substeps_per_frame": "auto"},
+        {"ground_height": "none"},
+    ]
+    usual = SimulationParameters().to_dict()
+    for name in permalink._PARAMETERS:
+        value = 0.0 if usual[name] is None else usual[name]
+        known.append({name: permalink._parameter_text(value)})
+    return known
+
+
+def comparison_fields() -> list[dict[str, str]]:
+    """Give a query for each field of a comparison's address, and for each value that it names."""
+    both = {"a": "quick", "b": "softer"}
+    named = {name: get_args(field.annotation) for name, field in CompareAsk.model_fields.items()}
+    choices = [both | {key: value} for key in ("mode", "color") for value in named[key]]
+    return [both, both | {"sequence": "sheet"}, both | {"f": "3"}, *choices]
+
+
+def list_fields() -> list[str]:
+    """Give an address for each field of a list of runs, and for each value that it names."""
+    words = [f"is:{flag}" for flag in listing._FLAGS] + ["-tag:best", "quick"]
+    words += [f"{key}:sheet" for key in listing._KEYS if key != "is"]
+    fields = [{"q": word} for word in words]
+    fields += [{"sort": f"{sign}{name}"} for name in listing.SORTS for sign in ("", "-")]
+    fields += [{name: "x"} for name in ("state", "profile", "sequence", "kind")]
+    fields += [{"limit": "5"}, {"offset": "1"}]
+    return [listing.RunQuery.model_validate(field).address() for field in fields]
+
+
+def record_surface(server: FastAPI, client: TestClient, grasp: str) -> dict[str, Any]:
+    """List what people can reach."""
+    return {
+        "commands": surface.commands(cli.main),
+        "addresses": surface.addresses(server),
+        "answers": surface.answers(client, grasp),
+        "settings": surface.settings(client),
+        "server settings": sorted(f"PHYSHANDI_{name.upper()}" for name in Settings.model_fields),
+        "keys": surface.keys(KEYS),
+        "presets": [preset.name for preset in builtin_presets()],
+        "links": link_fields(),
+        "links of comparisons": comparison_fields(),
+        "lists": list_fields(),
+        "controls": surface.scenes(
+            server.state.sessions, grasp, ViewerClient, lambda _, told: told.listen(5.0)
+        ),
+    }
+
+
 def smallest_picture(client: TestClient, data: Path) -> tuple[str, bytes]:
     """Have the pictures of the list drawn; give name and content of the smallest one of a run."""
     folder = data / "cache" / "previews"
@@ -571,6 +641,7 @@ def main() -> None:
         links = record_links(client, ids)
         name, picture = smallest_picture(client, data)
         answers = record_answers(client, ids, data)
+        reached = record_surface(server, client, ids["grasp"])
     # Nothing starts it any more, so it waits in the folder as it does when a server has stopped.
     ids["waiting"] = scheduler.launch(["sheet"], "quick", "Waits for the next server").id
     answers["ids"] = answers["ids"] | ids
@@ -580,9 +651,10 @@ def main() -> None:
     shutil.rmtree(data / "cache" / "exports", ignore_errors=True)
     export_files(root, links)
     pack((data, root / "exports"), root / "data.tar.xz")
-    for file, content in {"expected.json": answers, "permalinks.json": links}.items():
+    records = {"expected": answers, "permalinks": links, "surface": reached}
+    for name, content in records.items():
         text = json.dumps(content, indent=1, sort_keys=True, ensure_ascii=False)
-        (root / file).write_text(text + "\n")
+        (root / f"{name}.json").write_text(text + "\n")
 
 
 if __name__ == "__main__":
