@@ -68,7 +68,8 @@ def start_module(
         pass_fds: Descriptors that it inherits.
         start_new_session: Whether it is spared what the keyboard sends to this process.
     """
-    inherited = {name: value for name, value in os.environ.items() if name not in _SECRETS}
+    kept_back = {*_SECRETS, _PARENT}
+    inherited = {name: value for name, value in os.environ.items() if name not in kept_back}
     limits = {} if threads is None else dict.fromkeys(_THREADS, str(threads))
     bond = {} if outlives_parent else {_PARENT: str(os.getpid())}
     return subprocess.Popen(

@@ -284,14 +284,14 @@ def _import_phystwin(source: ImportPhystwin, progress: Progress) -> dict[str, An
 
 def export(command: Any) -> Path:
     """Write a run as files of another format; returns what was written."""
-    from app.exports.shell import Wish
+    from app.exports.shell import ExportOptions
     from app.exports.shell import export as export_file
 
     run = find_result(command.run, command.data_dir)
     own = ("format", "out", "link", "sequence", "frame", "width", "height", "overwrite")
     device = pick_device(command.device) if command.link else "cpu"
-    wish = Wish(**{name: getattr(command, name) for name in own}, device=device)
-    return export_file(run, wish, open_catalog(command.data_dir))
+    options = ExportOptions(**{name: getattr(command, name) for name in own}, device=device)
+    return export_file(run, options, open_catalog(command.data_dir))
 
 
 def serve(command: Any, on_ready: Callable[[str], None]) -> None:

@@ -86,7 +86,7 @@ class FileCache:
         # Processes end with the thread that started them, so these threads stay.
         self._threads = ThreadPoolExecutor(at_once, thread_name_prefix="export")
         self._lock = threading.Lock()
-        self._works: dict[str, FileJob] = {}
+        self._jobs: dict[str, FileJob] = {}
         self._children: set[Child] = set()
         self._is_closed = False
 
@@ -103,15 +103,15 @@ class FileCache:
         order.check()
         path = self._folder / f"{_key(order)}.{SUFFIXES.get(order.format, order.format)}"
         with self._lock:
-            work = self._works.get(path.name)
-            if work is not None and work.state == "failed":
-                work = None
-            if work is not None and work.state == "ready" and not path.is_file():
-                work = None
-            if work is None:
-                work = self._start(order, path)
-            work.last_used = time.monotonic()
-            return work
+            job = self._jobs.get(path.name)
+            if job is not None and job.state == "failed":
+                job = None
+            if job is not None and job.state == "ready" and not path.is_file():
+                job = None
+            if job is None:
+                job = self._start(order, path)
+            job.last_used = time.monotonic()
+            return job
 
     def make(self, order: FileRequest) -> Path:
         """Have a file made and wait for it; see `begin`.
@@ -140,11 +140,11 @@ class FileCache:
             whole.check()
             out = folder / f"file.{SUFFIXES.get(order.format, order.format)}"
             with self._lock:
-                work = self._put_in_line(whole, FileJob(out), out.parent.name)
-            yield work.future.result()
+                job = self._put_in_line(whole, FileJob(out), out.parent.name)
+            yield job.future.result()
         finally:
             with self._lock:
-                self._works.pop(folder.name, None)
+                self._jobs.pop(folder.name, None)
             shutil.rmtree(folder, ignore_errors=True)
 
     def close(self) -> None:
@@ -157,49 +157,49 @@ class FileCache:
         self._threads.shutdown(wait=True, cancel_futures=True)
 
     def _start(self, order: FileRequest, path: Path) -> FileJob:
-        work = FileJob(path)
+        job = FileJob(path)
         if path.is_file():
             os.utime(path)
-            work.future.set_result(path)
-            self._works[path.name] = work
-            return work
-        return self._put_in_line(order, work, path.name)
+            job.future.set_result(path)
+            self._jobs[path.name] = job
+            return job
+        return self._put_in_line(order, job, path.name)
 
-    def _put_in_line(self, order: FileRequest, work: FileJob, name: str) -> FileJob:
-        busy = sum(other.state == "making" for other in self._works.values())
+    def _put_in_line(self, order: FileRequest, job: FileJob, name: str) -> FileJob:
+        busy = sum(other.state == "making" for other in self._jobs.values())
         if busy >= MOST_WAITING or self._is_closed:
             raise TooManyFilesError(
                 f"{busy} files are being made already, the most this server allows. "
                 "Try again in a moment."
             )
         self._forget()
-        self._works[name] = work
-        self._threads.submit(self._work, order, work)
-        return work
+        self._jobs[name] = job
+        self._threads.submit(self._make_in_thread, order, job)
+        return job
 
     def _forget(self) -> None:
-        """Keep the list of works short; their files stay."""
-        ended = [(w.last_used, name) for name, w in self._works.items() if w.state != "making"]
+        """Keep the list of jobs short; their files stay."""
+        ended = [(w.last_used, name) for name, w in self._jobs.items() if w.state != "making"]
         for _, name in sorted(ended)[: max(0, len(ended) - 500)]:
-            del self._works[name]
+            del self._jobs[name]
 
-    def _work(self, order: FileRequest, work: FileJob) -> None:
+    def _make_in_thread(self, order: FileRequest, job: FileJob) -> None:
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            self._run(order, work)
-            self._make_room(work.path)
-            work.future.set_result(work.path)
+            self._run(order, job)
+            self._make_room(job.path)
+            job.future.set_result(job.path)
         except Exception as error:
             if not isinstance(error, errors.PhysHandiError):
-                logger.exception("making %s failed", work.path.name)
-            work.future.set_exception(error)
+                logger.exception("making %s failed", job.path.name)
+            job.future.set_exception(error)
 
-    def _run(self, order: FileRequest, work: FileJob) -> None:
+    def _run(self, order: FileRequest, job: FileJob) -> None:
         with self._lock:
             if self._is_closed:
                 raise errors.RunError("The server is being stopped.")
             child = Child(
-                "app.exports.making", str(work.path), threads=1, time_limit_s=self._seconds
+                "app.exports.making", str(job.path), threads=1, time_limit_s=self._seconds
             )
             self._children.add(child)
         try:
@@ -207,7 +207,7 @@ class FileCache:
                 child.send(asdict(order))
                 child.end_requests()
                 for message in child.messages():
-                    work.done, work.of = message["done"], message["of"]
+                    job.done, job.of = message["done"], message["of"]
         except ChildEndedError as error:
             logger.error("the file of %s was not made: %s", order.folder, error)  # noqa: TRY400
             limit = f"took longer than {self._seconds:g} s"
@@ -216,7 +216,7 @@ class FileCache:
         finally:
             with self._lock:
                 self._children.discard(child)
-            sweep_temporary(work.path.parent.glob(".*.tmp"))
+            sweep_temporary(job.path.parent.glob(".*.tmp"))
 
     def _make_room(self, newest: Path) -> None:
         """Remove the files that were not used for longest."""

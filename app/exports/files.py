@@ -38,13 +38,13 @@ LinkField = Annotated[
 ]
 
 
-def create_files(catalog: Catalog, sessions: Sessions, workshop: FileCache) -> APIRouter:
+def create_files(catalog: Catalog, sessions: Sessions, file_cache: FileCache) -> APIRouter:
     """Make the routes.
 
     Args:
         catalog: Finds runs and sequences.
         sessions: The live scenes.
-        workshop: Makes files.
+        file_cache: Makes files.
     """
     router = APIRouter(prefix="/api/v1")
 
@@ -85,7 +85,7 @@ def create_files(catalog: Catalog, sessions: Sessions, workshop: FileCache) -> A
         if kind == "yaml":
             raise UsageError("format: yaml describes the run itself; leave changed parameters out.")
         order = request_of(catalog, catalog.run(run_id), kind, query)
-        path = workshop.make(replace(order, width=width, height=height))
+        path = file_cache.make(replace(order, width=width, height=height))
         return _answer(path, run_id, kind, query)
 
     @router.get(
@@ -114,8 +114,8 @@ def create_files(catalog: Catalog, sessions: Sessions, workshop: FileCache) -> A
         order = replace(order, width=width, height=height, link=snapshot.link)
         take = snapshot.rollout
         if take is None:
-            return _answer(workshop.make(order), session.target, kind, query)
-        with workshop.once(order, lambda folder: store_take(folder, take)) as path:
+            return _answer(file_cache.make(order), session.target, kind, query)
+        with file_cache.once(order, lambda folder: store_take(folder, take)) as path:
             return _attached(path.read_bytes(), _name(session.target, kind, query), kind)
 
     return router

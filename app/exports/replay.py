@@ -46,7 +46,7 @@ class Replay(BaseModel):
     """Why it could not be made."""
 
 
-def create_replays(catalog: Catalog, workshop: FileCache, pages: Pages) -> APIRouter:
+def create_replays(catalog: Catalog, file_cache: FileCache, pages: Pages) -> APIRouter:
     """Make the routes.
 
     ``/viewer/replay/`` is viser's page, which plays the file that its query names. It holds no data
@@ -54,7 +54,7 @@ def create_replays(catalog: Catalog, workshop: FileCache, pages: Pages) -> APIRo
 
     Args:
         catalog: Finds runs.
-        workshop: Makes the files.
+        file_cache: Makes the files.
         pages: Renders.
     """
     router = APIRouter()
@@ -94,7 +94,7 @@ def create_replays(catalog: Catalog, workshop: FileCache, pages: Pages) -> APIRo
         run_id: ItemId, sequence: SequenceField = None, theme: ThemeField = "light"
     ) -> Replay:
         """Have the replay of a run made, unless it is there, and tell how far it is."""
-        work = workshop.begin(order(run_id, sequence, theme))
+        work = file_cache.begin(order(run_id, sequence, theme))
         query = {"theme": theme} | ({"sequence": sequence} if sequence else {})
         return _describe(work, f"/api/v1/runs/{run_id}/replay.viser?{urlencode(query)}")
 
@@ -107,7 +107,7 @@ def create_replays(catalog: Catalog, workshop: FileCache, pages: Pages) -> APIRo
         run_id: ItemId, sequence: SequenceField = None, theme: ThemeField = "light"
     ) -> FileResponse:
         """Give the replay of a run as viser's recording; made when it is missing."""
-        path = workshop.make(order(run_id, sequence, theme))
+        path = file_cache.make(order(run_id, sequence, theme))
         headers = {"Cache-Control": "private, no-cache"}
         return FileResponse(path, media_type="application/octet-stream", headers=headers)
 

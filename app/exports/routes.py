@@ -12,7 +12,7 @@ from app.viewer.sessions import Sessions
 
 
 def create_exports(
-    catalog: Catalog, sessions: Sessions, pages: Pages, workshop: FileCache
+    catalog: Catalog, sessions: Sessions, pages: Pages, file_cache: FileCache
 ) -> APIRouter:
     """Make the routes of links, replays and files, and let scenes know their links.
 
@@ -20,11 +20,11 @@ def create_exports(
         catalog: Finds runs and sequences.
         sessions: The live scenes.
         pages: Renders.
-        workshop: Makes files.
+        file_cache: Makes files.
     """
     sessions.link_of = link_of
     router = APIRouter()
     router.include_router(create_links(sessions))
-    router.include_router(create_files(catalog, sessions, workshop))
-    router.include_router(create_replays(catalog, workshop, pages))
+    router.include_router(create_files(catalog, sessions, file_cache))
+    router.include_router(create_replays(catalog, file_cache, pages))
     return router

@@ -17,7 +17,7 @@ from physhandi.run import Run
 
 
 @dataclass(frozen=True, kw_only=True)
-class Wish:
+class ExportOptions:
     """What the command line asks for."""
 
     format: Any
@@ -40,12 +40,12 @@ class Wish:
     """Whether to replace what is there."""
 
 
-def export(run: Run, wish: Wish, catalog: Catalog) -> Path:
+def export(run: Run, options: ExportOptions, catalog: Catalog) -> Path:
     """Write a run as a file.
 
     Args:
         run: A finished run.
-        wish: What is asked for.
+        options: What is asked for.
         catalog: Finds recordings that have moved.
 
     Returns:
@@ -55,35 +55,35 @@ def export(run: Run, wish: Wish, catalog: Catalog) -> Path:
         UsageError: If a field of the link makes no sense, or the path is in use.
         PhysHandiError: If the file cannot be made.
     """
-    query = dict(read_link(wish.link))
-    if wish.sequence is not None:
-        query["sequence"] = wish.sequence
+    query = dict(read_link(options.link))
+    if options.sequence is not None:
+        query["sequence"] = options.sequence
     state = state_from_query(query)
     is_changed = bool(state.parameter_changes) or state.automatic_substeps
-    if wish.format in FORMATS and not is_changed:
+    if options.format in FORMATS and not is_changed:
         return export_run(
             run,
-            wish.format,
-            wish.out,
+            options.format,
+            options.out,
             sequence=state.sequence_name,
-            frame=wish.frame,
-            overwrite=wish.overwrite,
+            frame=options.frame,
+            overwrite=options.overwrite,
         )
-    if wish.format == "yaml":
+    if options.format == "yaml":
         raise UsageError("yaml describes the run itself; leave changed parameters out of the link.")
-    if wish.frame is not None and wish.format not in {"png", "zip"}:
+    if options.frame is not None and options.format not in {"png", "zip"}:
         raise UsageError(
-            f"A single frame can be exported as ply, png or zip, not as {wish.format}."
+            f"A single frame can be exported as ply, png or zip, not as {options.format}."
         )
-    if wish.frame is not None:
-        query["f"] = str(wish.frame)
-    order = _order(run, wish, query, catalog)
+    if options.frame is not None:
+        query["f"] = str(options.frame)
+    order = _order(run, options, query, catalog)
     order.check()
-    out = wish.out
-    suffix = f".{SUFFIXES.get(wish.format, wish.format)}"
+    out = options.out
+    suffix = f".{SUFFIXES.get(options.format, options.format)}"
     if out.suffix != suffix:
-        raise UsageError(f"{out} does not end in '{suffix}', as a file of {wish.format} does.")
-    if out.is_dir() or (out.exists() and not wish.overwrite):
+        raise UsageError(f"{out} does not end in '{suffix}', as a file of {options.format} does.")
+    if out.is_dir() or (out.exists() and not options.overwrite):
         raise UsageError(f"{out} exists already. Choose another path, or allow overwriting.")
     out.parent.mkdir(parents=True, exist_ok=True)
     make(order, out)
@@ -106,16 +106,18 @@ def read_link(text: str) -> Mapping[str, str]:
     return fields
 
 
-def _order(run: Run, wish: Wish, query: Mapping[str, str], catalog: Catalog) -> FileRequest:
-    whole = request_of(catalog, run, wish.format, query)
+def _order(
+    run: Run, options: ExportOptions, query: Mapping[str, str], catalog: Catalog
+) -> FileRequest:
+    whole = request_of(catalog, run, options.format, query)
     return FileRequest(
         kind="run",
         folder=str(run.folder.resolve()),
-        format=wish.format,
+        format=options.format,
         query=query,
         recordings=whole.recordings,
-        width=wish.width,
-        height=wish.height,
-        device=wish.device,
+        width=options.width,
+        height=options.height,
+        device=options.device,
         link=whole.link,
     )

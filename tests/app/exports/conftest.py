@@ -1,4 +1,4 @@
-"""A finished run to export, and a workshop that works in this process."""
+"""A finished run to export, and a cache of files that works in this process."""
 
 import json
 from collections.abc import Iterator
@@ -33,7 +33,7 @@ def run(world: World) -> Run:
 
 
 @pytest.fixture
-def workshop(tmp_path: Path) -> Iterator[FileCache]:
-    workshop = FileCache(tmp_path / "cache")
-    yield workshop
-    workshop.close()
+def file_cache(tmp_path: Path) -> Iterator[FileCache]:
+    file_cache = FileCache(tmp_path / "cache")
+    yield file_cache
+    file_cache.close()

@@ -10,7 +10,7 @@ from server_world import World
 from viser_file import Recording
 
 from app.cli import main
-from app.exports.shell import Wish, export, read_link
+from app.exports.shell import ExportOptions, export, read_link
 from physhandi.errors import UsageError
 from physhandi.run import Run
 
@@ -33,15 +33,15 @@ def test_the_command_paints_what_a_link_shows(world: World, tmp_path: Path) -> N
 def test_a_link_that_changes_parameters_is_simulated(
     world: World, run: Run, tmp_path: Path
 ) -> None:
-    wish = Wish(format="npz", out=tmp_path / "a.npz", link="drag=9&f=3")
-    with np.load(export(run, wish, world.catalog)) as arrays:
+    options = ExportOptions(format="npz", out=tmp_path / "a.npz", link="drag=9&f=3")
+    with np.load(export(run, options, world.catalog)) as arrays:
         changed = arrays["rollout"]
-    plain = replace(wish, link="f=3", out=tmp_path / "b.npz")
+    plain = replace(options, link="f=3", out=tmp_path / "b.npz")
     with np.load(export(run, plain, world.catalog)) as arrays:
         fitted = arrays["rollout"]
     np.testing.assert_array_equal(fitted, run.array("sequences/sheet/rollout.npy"))
     assert np.abs(changed - fitted).max() > 1e-3
-    replay = replace(wish, format="viser", out=tmp_path / "a.viser")
+    replay = replace(options, format="viser", out=tmp_path / "a.viser")
     recording = Recording.read(export(run, replay, world.catalog).read_bytes())
     shown = recording.at(9)["/object/nodes"]["points"].reshape(-1, 3)
     np.testing.assert_allclose(shown, changed[-1], atol=2e-4)
@@ -66,18 +66,18 @@ def test_what_cannot_be_made_is_refused_and_writes_nothing(
     named = {"format": "png", "out": tmp_path / "x.png"} | changes
     named["out"] = tmp_path / str(named["out"])
     with pytest.raises(UsageError, match=word):
-        export(run, Wish(**named), world.catalog)
+        export(run, ExportOptions(**named), world.catalog)
     assert [path.name for path in tmp_path.iterdir()] == ["data"]
 
 
 def test_nothing_is_overwritten_unasked(world: World, run: Run, tmp_path: Path) -> None:
-    wish = Wish(format="png", out=tmp_path / "x.png", width=32, height=32)
-    wish.out.write_text("precious")
+    options = ExportOptions(format="png", out=tmp_path / "x.png", width=32, height=32)
+    options.out.write_text("precious")
     with pytest.raises(UsageError, match="exists already"):
-        export(run, wish, world.catalog)
-    assert wish.out.read_text() == "precious"
-    export(run, replace(wish, overwrite=True), world.catalog)
-    assert wish.out.read_bytes().startswith(b"\x89PNG")
+        export(run, options, world.catalog)
+    assert options.out.read_text() == "precious"
+    export(run, replace(options, overwrite=True), world.catalog)
+    assert options.out.read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_token_in_a_link_is_dropped() -> None:

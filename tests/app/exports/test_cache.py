@@ -1,4 +1,4 @@
-"""The workshop: processes, cache, limits and errors."""
+"""The cache of files: processes, cache, limits and errors."""
 
 import os
 import threading
@@ -12,7 +12,7 @@ import psutil
 import pytest
 from server_world import World
 
-from app.exports import cache as workshop_module
+from app.exports import cache as cache_module
 from app.exports.cache import FileCache, FileJob, TooManyFilesError
 from app.exports.files import request_of
 from app.exports.request import FileRequest
@@ -42,18 +42,18 @@ def pretend(
 
 
 def test_a_process_makes_the_file_and_tells_how_far_it_is(
-    workshop: FileCache, order: FileRequest, monkeypatch: pytest.MonkeyPatch
+    file_cache: FileCache, order: FileRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     go, run = threading.Event(), FileCache._run
 
-    def run_when_told(workshop: FileCache, order: FileRequest, work: FileJob) -> None:
+    def run_when_told(file_cache: FileCache, order: FileRequest, work: FileJob) -> None:
         assert go.wait(60)
-        run(workshop, order, work)
+        run(file_cache, order, work)
 
     monkeypatch.setattr(FileCache, "_run", run_when_told)
-    picture = workshop.begin(replace(order, width=64, height=48))
-    recording = workshop.begin(replace(order, format="viser"))
-    wrong = workshop.begin(replace(order, query={"f": "77"}))
+    picture = file_cache.begin(replace(order, width=64, height=48))
+    recording = file_cache.begin(replace(order, format="viser"))
+    wrong = file_cache.begin(replace(order, query={"f": "77"}))
     assert recording.state == "making"
     go.set()
     image = cv2.imread(str(picture.future.result()))
@@ -71,22 +71,22 @@ def test_a_process_makes_the_file_and_tells_how_far_it_is(
 
 
 def test_the_same_order_is_made_once_and_again_when_the_run_changed(
-    workshop: FileCache, order: FileRequest, run: Run, monkeypatch: pytest.MonkeyPatch
+    file_cache: FileCache, order: FileRequest, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = pretend(monkeypatch)
-    first = workshop.make(order)
-    assert workshop.make(replace(order)) == first
+    first = file_cache.make(order)
+    assert file_cache.make(replace(order)) == first
     assert len(made) == 1
-    other = workshop.make(replace(order, query={"f": "3"}))
+    other = file_cache.make(replace(order, query={"f": "3"}))
     assert other != first
     first.unlink()
-    assert workshop.make(order).is_file()
+    assert file_cache.make(order).is_file()
     assert len(made) == 3
     current = run.folder / "current"
     current.write_text(current.read_text() + "\n")
-    assert workshop.make(order) != first
+    assert file_cache.make(order) != first
     again = FileCache(first.parent)
-    assert again.make(order) == workshop.make(order)
+    assert again.make(order) == file_cache.make(order)
     assert len(made) == 4
     again.close()
 
@@ -95,14 +95,14 @@ def test_the_cache_forgets_what_was_not_used_for_longest(
     tmp_path: Path, order: FileRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pretend(monkeypatch)
-    workshop = FileCache(tmp_path / "cache", most_bytes=350)
-    paths = [workshop.make(replace(order, query={"f": str(frame)})) for frame in range(3)]
+    file_cache = FileCache(tmp_path / "cache", most_bytes=350)
+    paths = [file_cache.make(replace(order, query={"f": str(frame)})) for frame in range(3)]
     for moment, path in enumerate(paths):
         os.utime(path, (moment, moment))
     FileCache(tmp_path / "cache").make(replace(order, query={"f": "0"}))  # Used again.
-    paths.append(workshop.make(replace(order, query={"f": "3"})))
+    paths.append(file_cache.make(replace(order, query={"f": "3"})))
     assert [path.exists() for path in paths] == [True, False, True, True]
-    workshop.close()
+    file_cache.close()
 
 
 def test_there_is_an_end_to_files_that_wait(
@@ -110,29 +110,29 @@ def test_there_is_an_end_to_files_that_wait(
 ) -> None:
     go = threading.Event()
     made = pretend(monkeypatch, lambda _order, _work: go.wait(120) and None)
-    monkeypatch.setattr(workshop_module, "MOST_WAITING", 3)
-    workshop = FileCache(tmp_path / "cache", at_once=1)
-    works = [workshop.begin(replace(order, query={"f": str(frame)})) for frame in range(3)]
-    assert workshop.begin(replace(order, query={"f": "0"})) is works[0]
+    monkeypatch.setattr(cache_module, "MOST_WAITING", 3)
+    file_cache = FileCache(tmp_path / "cache", at_once=1)
+    works = [file_cache.begin(replace(order, query={"f": str(frame)})) for frame in range(3)]
+    assert file_cache.begin(replace(order, query={"f": "0"})) is works[0]
     with pytest.raises(TooManyFilesError, match="3 files are being made already"):
-        workshop.begin(replace(order, query={"f": "9"}))
+        file_cache.begin(replace(order, query={"f": "9"}))
     assert len(made) <= 1
     go.set()
     assert [work.future.result(60).name for work in works] == [work.path.name for work in works]
-    workshop.begin(replace(order, query={"f": "9"})).future.result(60)
-    workshop.close()
+    file_cache.begin(replace(order, query={"f": "9"})).future.result(60)
+    file_cache.close()
 
 
 def test_a_process_that_takes_too_long_is_ended(tmp_path: Path, order: FileRequest) -> None:
-    workshop = FileCache(tmp_path / "cache", seconds=0.05)
+    file_cache = FileCache(tmp_path / "cache", seconds=0.05)
     with pytest.raises(RunError, match=r"took longer than 0.05 s"):
-        workshop.make(order)
+        file_cache.make(order)
     assert list((tmp_path / "cache").iterdir()) == []
-    workshop.close()
+    file_cache.close()
 
 
 def test_a_failure_is_told_and_the_next_order_tries_again(
-    workshop: FileCache, order: FileRequest, monkeypatch: pytest.MonkeyPatch
+    file_cache: FileCache, order: FileRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     troubles = [RunError("a file is damaged")]
 
@@ -141,25 +141,25 @@ def test_a_failure_is_told_and_the_next_order_tries_again(
             raise troubles.pop()
 
     pretend(monkeypatch, fail)
-    work = workshop.begin(order)
+    work = file_cache.begin(order)
     with pytest.raises(RunError, match="a file is damaged"):
         work.future.result(60)
     assert work.state == "failed"
-    assert workshop.make(order).read_bytes() == b"x" * 100
+    assert file_cache.make(order).read_bytes() == b"x" * 100
 
 
 def test_what_is_made_once_leaves_nothing_behind(
-    workshop: FileCache, order: FileRequest, monkeypatch: pytest.MonkeyPatch
+    file_cache: FileCache, order: FileRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = pretend(monkeypatch)
-    with workshop.once(order, lambda folder: (folder / "take.npz").touch()) as path:
+    with file_cache.once(order, lambda folder: (folder / "take.npz").touch()) as path:
         assert path.is_file()
         assert (Path(made[0].take) / "take.npz").is_file()
         folder = path.parent
     assert not folder.exists()
     with (
         pytest.raises(UsageError, match="width"),
-        workshop.once(replace(order, width=9_999), lambda _folder: None),
+        file_cache.once(replace(order, width=9_999), lambda _folder: None),
     ):
         pass
     assert list(folder.parent.iterdir()) == []
