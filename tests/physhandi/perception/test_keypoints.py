@@ -9,7 +9,6 @@ import pytest
 from recordings import recording
 
 from physhandi.data.camera import PinholeCamera
-from physhandi.data.exporters.overlay import hand_overlay
 from physhandi.data.sequence import Sequence, ViewMeta
 from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import SequenceWriter
@@ -26,6 +25,8 @@ from physhandi.perception.keypoints import (
     overlap,
 )
 from physhandi.progress import Progress
+from physhandi.rendering.renderer import render
+from physhandi.rendering.shapes import Surface
 
 
 @pytest.fixture(scope="module")
@@ -213,9 +214,11 @@ def test_the_open_hands_keypoints_are_where_the_networks_see_them(
             width=480,
             height=480,
         )
-        grey = np.full((480, 480, 3), 120, np.uint8)
-        skin = (225, 172, 140)
-        image = hand_overlay(grey, camera, vertex, hand.faces, color=skin, opacity=1.0)
+        skin = np.array([[225.0, 172.0, 140.0]])
+        surface = Surface(vertex=vertex, faces=hand.faces, color=skin, shading=0.65)
+        grey = (120, 120, 120)
+        picture = render(camera, [surface], background=grey, light=toward, samples=1)
+        image = np.ascontiguousarray(picture[..., :3])
         (found,) = detector.detect(cv2.GaussianBlur(image, (5, 5), 1.2))
         assert found.side == "right"
         for point, errors in ((keypoint, ours), (keypoint - KEYPOINT_OFFSET, joints)):
