@@ -75,7 +75,7 @@ NewScene = Annotated[NewSession | NewComparison, Field(discriminator="kind")]
 
 
 class SessionWishes(BaseModel):
-    """What a browser asks of a live scene."""
+    """Changes that a browser asks for in a live scene."""
 
     model_config = ConfigDict(extra="forbid")
 

@@ -75,7 +75,7 @@ def create_app(
     """Build the application.
 
     Args:
-        settings: What the server was told.
+        settings: Settings of the server.
         security: Holds the token; none draws one from the settings.
         catalog: Finds sequences and runs; none looks where the settings say.
         scheduler: Works through the queue; none makes one for the catalog.
@@ -210,7 +210,7 @@ def serve(settings: Settings, on_ready: Callable[[str], None], *, queue_demo: bo
     """Serve until interrupted; running fits go on and are found again by the next server.
 
     Args:
-        settings: What the server was told.
+        settings: Settings of the server.
         on_ready: Called with the address to open once it answers.
         queue_demo: Also launch a quick fit of the bundled sequence.
 

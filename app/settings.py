@@ -24,7 +24,7 @@ def is_loopback(host: str) -> bool:
 
 
 class Settings(BaseSettings):
-    """What a server may be told; everything has a default that is safe on one machine."""
+    """Settings of a server; every default is safe on one machine."""
 
     model_config = SettingsConfigDict(env_prefix="PHYSHANDI_", extra="forbid", frozen=True)
 
@@ -37,7 +37,7 @@ class Settings(BaseSettings):
     device: str = "cpu"
     """Warp device of fits and of the live simulation."""
     auth: bool = True
-    """Whether the token is asked for; only a loopback server may go without."""
+    """Whether requests need the token; only a loopback server may go without."""
     token: SecretStr | None = Field(default=None, min_length=16)
     """Token to use instead of a new random one at each start."""
     allowed_hosts: Annotated[tuple[str, ...], NoDecode] = ()
@@ -47,7 +47,7 @@ class Settings(BaseSettings):
     waiting_fits: int = Field(default=100, ge=1, le=10_000)
     """Fits that may wait in line."""
     cancel_grace_s: float = Field(default=8.0, gt=0, le=600)
-    """How long a cancelled fit may take to stop by itself before it is ended [s]."""
+    """Time that a cancelled fit has to stop by itself before it is killed [s]."""
     live_sessions: int = Field(default=10, ge=1, le=100)
     """Most live scenes at a time."""
     live_idle_s: float = Field(default=900.0, gt=0)
@@ -79,25 +79,25 @@ class Settings(BaseSettings):
 
     @property
     def run_dir(self) -> Path:
-        """Where runs are written."""
+        """Folder of runs."""
         return self.data_dir / "runs"
 
     @property
     def sequence_dir(self) -> Path:
-        """Where imported sequences are."""
+        """Folder of imported sequences."""
         return self.data_dir / "sequences"
 
     @property
     def suite_dir(self) -> Path:
-        """Where suites are; the runs of their cells are found by id, but not listed."""
+        """Folder of suites; the runs of their cells are found by id, but not listed."""
         return self.data_dir / "suites"
 
     @property
     def index_path(self) -> Path:
-        """Where it is kept what was read of runs; it is made again when it is deleted."""
+        """File of the index of runs; made again when it is deleted."""
         return self.data_dir / "cache" / "runs.json"
 
     @property
     def preview_dir(self) -> Path:
-        """Where small pictures are kept; they are made again when they are deleted."""
+        """Folder of previews; made again when they are deleted."""
         return self.data_dir / "cache" / "previews"

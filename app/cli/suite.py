@@ -1,4 +1,4 @@
-"""What `physhandi evaluate suite` does: finds or makes sequences, and has methods compared."""
+"""`physhandi evaluate suite`: find or make sequences, and compare methods on them."""
 
 import hashlib
 import shlex
@@ -57,7 +57,7 @@ def evaluate_suite(command: Any, progress: Progress) -> dict[str, Any]:
     if not 1 <= command.jobs <= MOST_PROCESSES:
         raise UsageError(f"--jobs {command.jobs} makes no sense; choose 1 to {MOST_PROCESSES}.")
     with ExitStack() as stack:
-        # Everything that a user may have got wrong is told before they are started.
+        # Every mistake of the user is reported before they are started.
         make, workers = partial(make_one_by_one, progress=progress), None
         if command.jobs > 1:
             workers = stack.enter_context(SuiteWorkers(command.jobs, progress))

@@ -24,7 +24,7 @@ _TELL_EVERY = 0.5
 
 
 def order_to_json(order: Order) -> dict[str, Any]:
-    """Write an order down for another process; recordings are told by their folders."""
+    """Write an order down for another process; recordings are named by their folders."""
     about = {field.name: getattr(order, field.name) for field in fields(order)}
     about["settings"] = dict(order.settings)
     return about | {"recordings": [str(r.folder.resolve()) for r in order.recordings]}
@@ -104,11 +104,11 @@ class _Worker:
     child: Child
     listener: threading.Thread
     order: Mapping[str, Any] | None = None
-    """The order that it was told last."""
+    """The order that it was sent last."""
     jobs: "deque[_Job | None]" = field(default_factory=deque["_Job | None"])
-    """What it owes an answer for, the oldest first; None stands for an order."""
+    """Requests without an answer yet, the oldest first; None stands for an order."""
     state: str = ""
-    """Where it is, in words."""
+    """Progress of its job, in words."""
 
 
 class SuiteWorkers:

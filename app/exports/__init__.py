@@ -1,1 +1,1 @@
-"""What leaves the application: permalinks, replays and files."""
+"""Permalinks, replays and files."""

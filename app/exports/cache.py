@@ -29,9 +29,9 @@ AT_ONCE = 2
 MOST_WAITING = 16
 """Files that may be made or wait."""
 MOST_BYTES = 2**30
-"""What the cache may hold."""
+"""Bytes that the cache may hold."""
 MOST_SECONDS = 300.0
-"""How long making one file may take."""
+"""Time that making one file may take [s]."""
 _VERSION = 1
 
 
@@ -44,19 +44,19 @@ class FileJob:
     """A file that is being made, or was."""
 
     path: Path
-    """Where it will be."""
+    """Path of the file."""
     future: "Future[Path]" = field(default_factory=Future[Path])
     """Ends with its path, or with what went wrong."""
     done: int = 0
-    """How much is done."""
+    """Finished steps."""
     of: int = 0
-    """Of how much; 0 before that is known."""
+    """All steps; 0 before that is known."""
     last_used: float = field(default_factory=time.monotonic)
     """When somebody asked for it."""
 
     @property
     def state(self) -> Literal["making", "ready", "failed"]:
-        """How far it is."""
+        """Whether the file is being made, is there or could not be made."""
         if not self.future.done():
             return "making"
         return "ready" if self.future.exception() is None else "failed"

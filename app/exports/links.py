@@ -18,11 +18,11 @@ from physhandi.errors import UsageError
 
 _LONGEST = 4_000
 CLOSED = "This live scene was closed, or it is not yours."
-"""What is said to who asks for a scene that is not there."""
+"""Message to who asks for a scene that is not there."""
 
 
 class Link(BaseModel):
-    """Where a live scene can be found again."""
+    """Address at which a live scene can be found again."""
 
     url: str
     """Address on this server that opens a scene in the same state."""

@@ -1,4 +1,4 @@
-"""What the routes of files say about themselves in the OpenAPI description."""
+"""Answers of the routes of files, for the OpenAPI description."""
 
 from typing import Any, Literal
 

@@ -18,18 +18,18 @@ from physhandi.run import Run
 
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions:
-    """What the command line asks for."""
+    """Options of an export from the command line."""
 
     format: Any
-    """Which kind of file."""
+    """Format of the file."""
     out: Path
     """File or folder to write."""
     link: str = ""
     """Link of the viewer, or its part after the question mark."""
     sequence: str | None = None
-    """Which sequence of the run; None for what the link says, else the first one."""
+    """Sequence of the run; None for that of the link, else the first one."""
     frame: int | None = None
-    """Which frame; None for what the link says."""
+    """Frame; None for that of the link."""
     width: int = 1280
     """Width of a picture [px]."""
     height: int = 720

@@ -1,4 +1,4 @@
-"""What a user says of a run: its name, its tags and a note."""
+"""Name, tags and note that a user gives a run."""
 
 import threading
 from typing import Annotated
@@ -43,7 +43,7 @@ Tag = Annotated[str, Field(max_length=40), AfterValidator(_word)]
 
 
 class RunChanges(BaseModel):
-    """What shall be said of a run from now on; what is left out stays as it is."""
+    """New name, tags or note of a run; a field that is left out stays as it is."""
 
     model_config = ConfigDict(extra="forbid")
 

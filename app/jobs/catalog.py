@@ -1,4 +1,4 @@
-"""Which sequences and runs there are: the bundled ones and those of the data folder."""
+"""Catalog of sequences and runs: the bundled ones and those of the data folder."""
 
 import hashlib
 import json
@@ -145,7 +145,7 @@ class SequenceItem:
     id: str
     """Name of its folder."""
     folder: Path
-    """Where it lies."""
+    """Its folder."""
     is_bundled: bool
     """Whether it came with the program."""
     sequence: Sequence | None
@@ -161,7 +161,7 @@ class RunItem:
     id: str
     """Name of its folder."""
     folder: Path
-    """Where it lies."""
+    """Its folder."""
     is_bundled: bool
     """Whether it came with the program."""
     run: Run | None

@@ -1,4 +1,4 @@
-"""How long fits still take: medians of what the stages of finished fits took for their work."""
+"""Time left of fits, from medians of the time that stages of finished fits took for their work."""
 
 import json
 import math
@@ -37,11 +37,11 @@ _TRUST = {True: 0.1, False: 0.02}
 """Weight of "as fast as the finished fits" beside what a fit itself shows, as a share of its
 expected time; the first if those had the same settings and machine."""
 _DEPTH_COST = 15.0
-"""What an update of the hand with depth costs, in updates without (measured: 14 to 18)."""
+"""Cost of an update of the hand with depth, in updates without (measured: 14 to 18)."""
 _GRADIENT_COST = 3.0
-"""What a simulation with its gradient costs, in simulations without."""
+"""Cost of a gradient, in simulations."""
 _NODE_COST = 6.0
-"""What a node costs in a substep, in springs."""
+"""Cost of a node in a substep, in springs."""
 _LEAST_SUBSTEPS = 120.0
 """Substeps of a soft object: none is longer than 1/3600 s."""
 _MACHINE = ("device", "device_name", "cpu_count")
@@ -49,7 +49,7 @@ _MACHINE = ("device", "device_name", "cpu_count")
 
 @dataclass(frozen=True)
 class Extent:
-    """How much was recorded: what the work of a fit grows with, beside its settings."""
+    """Size of the recordings, with which the work of a fit grows."""
 
     frames: int
     """Frames of all sequences together."""
@@ -110,7 +110,7 @@ def _frame_cost(config: PipelineConfig) -> float:
 
 @dataclass(frozen=True, eq=False)
 class FinishedFit:
-    """What the stages of a finished fit took."""
+    """Work and time of the stages of a finished fit."""
 
     settings: str
     """All of its settings but their name and description, as JSON."""
@@ -128,12 +128,12 @@ class FinishedFit:
 
 @dataclass(frozen=True)
 class Expectation:
-    """What a fit is expected to take."""
+    """Expected time of a fit, stage by stage."""
 
     seconds: Mapping[str, float]
     """Time of each stage, in their order [s]."""
     fit_count: int
-    """How many fits with the same settings on the same machine it is taken from; 0 if others."""
+    """Fits with the same settings on the same machine that it is taken from; 0 if others."""
 
     @property
     def total_s(self) -> float:
@@ -142,7 +142,7 @@ class Expectation:
 
     @property
     def basis(self) -> str:
-        """What it is taken from, in words."""
+        """Source of the estimate, in words."""
         if self.fit_count == 0:
             return "roughly, from fits with other settings or on another machine"
         if self.fit_count == 1:
@@ -204,7 +204,7 @@ def _values_of(settings: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Position:
-    """How far a fit at work is."""
+    """Progress of a fit at work."""
 
     finished: Mapping[str, float]
     """Time that its finished stages took [s]; 0 of those that an earlier attempt had finished."""

@@ -1,4 +1,4 @@
-"""Which runs a list shows, in which order, and which page of it."""
+"""Filters, order and pages of the list of runs."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, Any, Literal
@@ -44,7 +44,7 @@ Word = Annotated[str, Field(max_length=120)]
 
 
 class RunQuery(BaseModel):
-    """Which runs, in which order; its fields are the parameters of an address."""
+    """Filter, order and page; the fields are the parameters of an address."""
 
     model_config = ConfigDict(extra="forbid")
 

@@ -10,7 +10,7 @@ from typing import BinaryIO
 from physhandi.data.run_folder import LOG
 
 TAIL_BYTES = 20_000
-"""How much of the end of a log a page begins with."""
+"""Bytes of the end of a log that a page begins with."""
 _PART_BYTES = 200_000
 _TRACE = "Traceback (most recent call last):"
 _BETWEEN = re.compile(

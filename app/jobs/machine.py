@@ -1,4 +1,4 @@
-"""How busy this machine is: processors, memory, disk, graphics cards, and what each run takes."""
+"""Load of this machine: processors, memory, disk, graphics cards, and the share of each run."""
 
 import os
 import shutil
@@ -15,7 +15,7 @@ from app.jobs.processes import supervisor_of
 from physhandi.data.environment import processor_name
 
 _CARDS_KEPT_S = 2.0
-"""How old an answer may be before the tool is asked again [s]."""
+"""Age at which an answer of the tool is renewed [s]."""
 _PATIENCE_S = 10.0
 """The tool takes seconds where the driver sleeps between its calls [s]."""
 _MEBIBYTE = 2**20

@@ -19,7 +19,7 @@ class Overview:
         """Prepare.
 
         Args:
-            settings: What the server was told.
+            settings: Settings of the server.
             catalog: Finds runs and sequences.
             scheduler: Knows what is at work and in line.
             machine: Measures the load.

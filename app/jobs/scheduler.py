@@ -73,7 +73,7 @@ class QueueFullError(PhysHandiError):
 
 @dataclass(frozen=True)
 class JobView:
-    """How far a run is, for people."""
+    """State and progress of a run, for people."""
 
     state: str
     """queued, starting, running, stopping, succeeded, failed or cancelled."""
@@ -241,7 +241,7 @@ class Scheduler:
 
     @property
     def slots(self) -> int:
-        """How many fits run side by side."""
+        """Number of fits that run side by side."""
         return self._settings.parallel_fits
 
     def at_work(self) -> list[Run]:

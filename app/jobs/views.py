@@ -1,4 +1,4 @@
-"""What the API and the pages say about sequences and runs, as plain data."""
+"""Sequences and runs as plain data, for the API and the pages."""
 
 import builtins
 import hashlib
@@ -172,13 +172,13 @@ class StageView:
     state: str
     """``done``, ``passed`` (nothing to do), ``at-work``, ``failed``, ``stopped`` or ``to-come``."""
     seconds: float | None = None
-    """How long it took, or has taken so far."""
+    """Time that it took, or has taken so far [s]."""
     before: float | None = None
     """Loss at its start."""
     after: float | None = None
     """Loss at its end."""
     note: str = ""
-    """What there is to know about how it ended."""
+    """A remark on how it ended."""
 
 
 def stages_of(run: Run, state: str) -> list[dict[str, Any]]:
@@ -331,7 +331,7 @@ def explain(run: Run | None, reason: str) -> Failure:
 
 @dataclass(frozen=True)
 class RunSummary:
-    """What a run took and how well it did."""
+    """Duration and main errors of a run."""
 
     duration_s: float | None = None
     """Time that its finished stages took [s]."""

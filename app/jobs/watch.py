@@ -1,4 +1,4 @@
-"""What one browser is told about one run: its state, its progress and its log."""
+"""Events of one run for one browser: its state, its progress and its log."""
 
 import os
 import re

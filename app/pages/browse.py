@@ -58,7 +58,7 @@ SEQUENCE_ORDERS = (
 
 
 class SequenceQuery(BaseModel):
-    """Which sequences, in which order; its fields are the parameters of an address."""
+    """Filter and order of sequences; the fields are the parameters of an address."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -178,7 +178,7 @@ def _featured(runs: list[dict[str, Any]]) -> dict[str, Any] | None:
 def _chosen(
     runs: list[dict[str, Any]], query: RunQuery
 ) -> tuple[list[Mapping[str, Any]], str | None]:
-    """Choose runs; a condition that is wrong, perhaps half typed, is told beside an empty list."""
+    """Choose runs; a wrong condition, perhaps half typed, is shown beside an empty list."""
     try:
         return select_runs(runs, query), None
     except UsageError as error:

@@ -1,4 +1,4 @@
-"""What several runs have in common and where they differ, as one table."""
+"""Table of what several runs have in common and where they differ."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -19,7 +19,7 @@ from physhandi.data.files import named_fields
 from physhandi.settings import flatten, is_same
 
 LEAST_RUNS, MOST_RUNS = 2, 5
-"""How many runs can be compared."""
+"""Fewest and most runs that can be compared."""
 _COMMIT_DIGITS = 12
 _SPLITS = {"reconstruction": "fitted frames", "future": "predicted frames"}
 _UNCOMPARED = {"description", "aggregation", "unit", "frames"}
@@ -29,7 +29,7 @@ _Scores = dict[tuple[str, str, str], tuple[float, str]]
 
 @dataclass(frozen=True)
 class ComparedCell:
-    """What one run has of a quantity."""
+    """Value of a quantity in one run."""
 
     text: str
     is_best: bool = False
@@ -73,9 +73,9 @@ def compare_runs(
     """Lay runs side by side.
 
     Args:
-        described: What `describe_run` says of each.
+        described: `describe_run` of each.
         configs: Configuration of each.
-        results: What `describe_results` says of each.
+        results: `describe_results` of each.
 
     Returns:
         Sections of facts, scores, found parameters, settings and surroundings; one without rows is

@@ -10,7 +10,7 @@ METHOD_TEXTS = {
     "static": "Baseline: the object stays as it is in frame 0.",
     "rigid_follow": "Baseline: the object of frame 0 moves rigidly with the control nodes.",
 }
-"""What the columns of a comparison are."""
+"""Explanations of the columns of a comparison."""
 _HIGHER = {"accuracy", "iou", "precision", "recall", "f1", "psnr", "ssim"}
 _SHARES = {"accuracy", "iou", "precision", "recall", "f1", "share"}
 _LENGTHS = {"chamfer", "error", "mpjpe", "mpvpe", "distance", "spacing", "resolution", "radius"}
@@ -35,11 +35,14 @@ _ABOUT = (
     ("mpjpe", "Mean distance of the hand's joints to the true ones."),
     ("accuracy_proximity", "As accuracy, against what is this near on true hand and surface."),
     ("f1_proximity", "As F1, against what is this near on true hand and true surface."),
-    ("accuracy", "Share of nodes whose contact is told rightly, at this distance to the hand."),
-    ("precision", "Of the nodes told to be in contact, the share that is."),
-    ("recall", "Of the nodes in contact, the share that is told to be."),
+    (
+        "accuracy",
+        "Share of nodes with rightly predicted contact, at this distance to the hand.",
+    ),
+    ("precision", "Of the nodes predicted to be in contact, the share that is."),
+    ("recall", "Of the nodes in contact, the share that is predicted to be."),
     ("f1", "Harmonic mean of precision and recall of contact."),
-    ("predicted_share", "Share of nodes that are told to be in contact."),
+    ("predicted_share", "Share of nodes that are predicted to be in contact."),
     ("label_share", "Share of nodes that are in contact by the labels."),
     ("known_share", "Share of nodes whose contact could be labelled."),
     ("iou", "Nodes in contact in both over nodes in contact in either."),

@@ -148,7 +148,7 @@ def run_values(item: RunItem, described: dict[str, Any], catalog: Catalog) -> di
 
     Args:
         item: The run.
-        described: What `follow_run` says of it.
+        described: `follow_run` of it.
         catalog: Knows the run that it was made from.
     """
     results = describe_results(item.run) if item.run else {}

@@ -35,7 +35,7 @@ class UnknownSuiteError(NotFoundError):
 
 
 class CellQuery(BaseModel):
-    """Which figure the table of sequences shows; its fields are the parameters of an address."""
+    """Figure that the table of sequences shows; the fields are the parameters of an address."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -44,7 +44,7 @@ class CellQuery(BaseModel):
 
 
 class Environment(BaseModel):
-    """What a suite was computed with, as far as the page shows it."""
+    """Environment that a suite was computed in, as far as the page shows it."""
 
     started: str
     device: str
@@ -52,7 +52,7 @@ class Environment(BaseModel):
 
 
 class About(BaseModel):
-    """What a suite's ``cells.json`` says of itself, as far as the page shows it."""
+    """Description of a suite in its ``cells.json``, as far as the page shows it."""
 
     title: str
     cases: list[str]
@@ -169,7 +169,7 @@ def _described(path: Path) -> dict[str, Any]:
 
 
 def _read(path: Path) -> StoredCells:
-    """Read what a suite says of itself.
+    """Read the description and cells of a suite.
 
     Raises:
         RunError: If it is damaged.

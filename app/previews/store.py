@@ -1,4 +1,4 @@
-"""Which previews there are, and the thread that has the missing ones drawn."""
+"""Folder of previews, and the thread that has missing ones drawn."""
 
 import hashlib
 import logging
@@ -27,7 +27,7 @@ _VERSION = 1
 _BATCH = 8
 _ENDED_FROM_OUTSIDE = (-signal.SIGTERM, -signal.SIGINT)
 _PATIENCE = 10.0
-"""How many times as long as its processor time a preview may take by the clock."""
+"""Time that a preview may take by the clock, in its processor time."""
 _MOST_WAITING = 400
 _MOST_FILES = 4_000
 _PAUSE_S = 1.0
@@ -47,7 +47,7 @@ class PreviewPictures:
 
 @dataclass(frozen=True)
 class _Source:
-    """What a preview shows, and the name of its files, which changes whenever its source does."""
+    """Source of a preview, and the name of its files, which changes whenever the source does."""
 
     kind: PreviewKind
     id: str
