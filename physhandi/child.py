@@ -34,6 +34,7 @@ LOG_END = 2**20
 _LAST_WORDS = 4_000
 _LONGEST_MESSAGE = 2**20
 _PATIENCE_S = 5.0
+_SETTINGS_PREFIX = "PHYSHANDI_"
 _SECRETS = ("PHYSHANDI_TOKEN",)
 _PARENT = "PHYSHANDI_PARENT"
 """Environment variable that tells a child the process with which it has to end."""
@@ -47,9 +48,10 @@ def start_module(
     threads: int | None = None,
     environment: Mapping[str, str] | None = None,
     outlives_parent: bool = False,
+    without_settings: bool = False,
     stdin: int = subprocess.DEVNULL,
     stdout: int = subprocess.DEVNULL,
-    stderr: int | None = None,
+    stderr: int | IO[Any] | None = None,
     pass_fds: Collection[int] = (),
     start_new_session: bool = False,
 ) -> "subprocess.Popen[str]":
@@ -62,14 +64,19 @@ def start_module(
             which hinder each other badly where several such processes work side by side.
         environment: More variables.
         outlives_parent: Whether it goes on when the thread that started it has ended.
+        without_settings: Whether variables of the user that set up a server are kept from it.
         stdin: See `subprocess.Popen`; text in UTF-8, as are the others.
         stdout: See `subprocess.Popen`.
         stderr: See `subprocess.Popen`; None for this process's.
         pass_fds: Descriptors that it inherits.
         start_new_session: Whether it is spared what the keyboard sends to this process.
     """
-    kept_back = {*_SECRETS, _PARENT}
-    inherited = {name: value for name, value in os.environ.items() if name not in kept_back}
+    inherited = {
+        name: value
+        for name, value in os.environ.items()
+        if name not in {*_SECRETS, _PARENT}
+        and not (without_settings and name.startswith(_SETTINGS_PREFIX))
+    }
     limits = {} if threads is None else dict.fromkeys(_THREADS, str(threads))
     bond = {} if outlives_parent else {_PARENT: str(os.getpid())}
     return subprocess.Popen(

@@ -1,19 +1,17 @@
 """The viewer of a run, served by a child process; the library itself knows no web framework."""
 
 import atexit
-import os
 import subprocess
-import sys
 import tempfile
 import webbrowser
 from pathlib import Path
 from types import TracebackType
 from urllib.parse import urlsplit, urlunsplit
 
+from physhandi.child import start_module
 from physhandi.data.run import RunFolder
 from physhandi.errors import RunError
 
-_PACKAGES = Path(__file__).resolve().parent.parent
 _TAIL = 2000
 
 
@@ -46,17 +44,15 @@ class ViewerProcess:
             if target.is_dir():
                 (data_dir / kind / name).symlink_to(target.resolve())
         self._errors = (data_dir / "errors.txt").open("w+", encoding="utf-8")
-        ours = {key: v for key, v in os.environ.items() if not key.startswith("PHYSHANDI_")}
         options = ["--host", "127.0.0.1", "--port", "0", "--data-dir", str(data_dir)]
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "app.cli", "serve", *options],
-            stdin=subprocess.DEVNULL,
+        self._process = start_module(
+            "app.cli",
+            "serve",
+            *options,
+            without_settings=True,
+            outlives_parent=True,
             stdout=subprocess.PIPE,
             stderr=self._errors,
-            encoding="utf-8",
-            # `-m` searches the working directory first, so it must be the one of our packages.
-            cwd=_PACKAGES,
-            env=ours | {"PYTHONIOENCODING": "utf-8"},
         )
         atexit.register(self.stop)
         try:

@@ -2,9 +2,7 @@
 
 import http.client
 import json
-import os
 import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -17,10 +15,9 @@ from urllib.parse import parse_qs, urlsplit
 import psutil
 
 from app.benchmarks.viewer_client import ViewerClient
-from physhandi.child import PACKAGE_ROOT
+from physhandi.child import start_module
 from physhandi.errors import PhysHandiError
 
-_START = "from app.cli import main; main()"
 _PATIENCE = 120.0
 
 
@@ -49,19 +46,18 @@ class Served:
         Raises:
             ServerFailedError: If it does not start; says what it wrote.
         """
-        command = [sys.executable, "-c", _START, "serve", "--port", "0"]
-        command += ["--data-dir", str(data_dir.resolve()), "--device", device]
-        ours = {k: v for k, v in os.environ.items() if not k.startswith("PHYSHANDI_")}
+        options = ["--port", "0", "--data-dir", str(data_dir.resolve()), "--device", device]
         self._said = tempfile.TemporaryFile("w+")  # noqa: SIM115  # closed with the server
         start = time.perf_counter()
-        self._process = subprocess.Popen(
-            command,
+        self._process = start_module(
+            "app.cli",
+            "serve",
+            *options,
+            environment=environment,
+            without_settings=True,
+            outlives_parent=True,
             stdout=subprocess.PIPE,
             stderr=self._said,
-            text=True,
-            # `-c` searches the working directory first, so it must be the one of our packages.
-            cwd=PACKAGE_ROOT,
-            env=ours | dict(environment or {}),
         )
         self.url = self._printed()
         self.start_seconds = time.perf_counter() - start

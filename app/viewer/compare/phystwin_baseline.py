@@ -10,7 +10,6 @@ from numpy import ndarray
 
 from app.viewer.content.content import Content, HandSurface
 from physhandi.fitting.config import named_profile
-from physhandi.fitting.placement import farthest_points, visible_vertices
 from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.parameters import SimulationParameters
 
@@ -53,6 +52,8 @@ class PhysTwinBaseline:
             content: Hands and cameras.
             fitted: The run's rollout.
         """
+        from physhandi.fitting.placement import farthest_points  # It loads torch.
+
         profile = named_profile(PROFILE)
         values = profile.simulation
         parameters = fitted.parameters.replace(
@@ -74,6 +75,8 @@ def _candidates(
     content: Content, control: Float[ndarray, "control 3"], count: int
 ) -> tuple[Int[ndarray, " candidate"], str, str]:
     """Find the control nodes that PhysTwin could see, what they are, and what is to be said."""
+    from physhandi.fitting.placement import visible_vertices  # It loads torch.
+
     everything = np.arange(len(control))
     hands = _hands_in_order(content.hands, control)
     if hands is None:
