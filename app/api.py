@@ -21,7 +21,7 @@ from app.jobs.machine import Machine
 from app.jobs.order import check_order, describe_order, describe_settings
 from app.jobs.overview import Overview
 from app.jobs.scheduler import Scheduler
-from app.jobs.streams import Feed, News, Streams
+from app.jobs.streams import News, Streams
 from app.jobs.views import (
     describe_results,
     describe_run,
@@ -30,7 +30,7 @@ from app.jobs.views import (
     loss_curves,
     read_frame_errors,
 )
-from app.jobs.watch import Watch, preview_bytes
+from app.jobs.watch import Feed, Watch, preview_bytes
 from app.viewer.sessions import AnySession, Sessions
 from physhandi.fitting.config import named_profile, profile_names
 

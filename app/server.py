@@ -24,8 +24,8 @@ from app.jobs.catalog import Catalog, NotFoundError
 from app.jobs.machine import Machine
 from app.jobs.overview import Overview
 from app.jobs.scheduler import QueueFullError, Scheduler
-from app.jobs.streams import Feed
 from app.jobs.views import describe_run
+from app.jobs.watch import Feed
 from app.pages import Pages, create_pages
 from app.previews.store import Previews
 from app.security import Gatekeeper, Security

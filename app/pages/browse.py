@@ -10,8 +10,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from app.jobs.catalog import Catalog
 from app.jobs.listing import STATES, RunQuery, page_of, select_runs
 from app.jobs.scheduler import ENDED
-from app.jobs.streams import Feed
 from app.jobs.views import describe_sequence
+from app.jobs.watch import Feed
 from app.pages.render import Pages
 from app.previews.store import PreviewKind, Previews
 from physhandi.errors import UsageError

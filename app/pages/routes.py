@@ -15,8 +15,8 @@ from app.jobs.log import read_log
 from app.jobs.order import describe_settings, order_of
 from app.jobs.overview import Overview
 from app.jobs.scheduler import ENDED, Scheduler
-from app.jobs.streams import Feed
 from app.jobs.views import describe_results, describe_run, describe_sequence, follow_run
+from app.jobs.watch import Feed
 from app.pages.browse import add_lists
 from app.pages.diff import LEAST_RUNS, MOST_RUNS, compare_runs
 from app.pages.metrics import METHOD_TEXTS, tabulate

@@ -3,14 +3,14 @@ from typing import Any
 
 import pytest
 
-from app.jobs import streams as feed_module
-from app.jobs.streams import Feed
+from app.jobs import watch as feed_module
+from app.jobs.watch import Feed
 
 
 @pytest.fixture
 def runs(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
-    monkeypatch.setattr(feed_module, "_INTERVAL_S", 0.0)
-    monkeypatch.setattr(feed_module, "_SHARE", float("inf"))
+    monkeypatch.setattr(feed_module, "_LOOK_INTERVAL_S", 0.0)
+    monkeypatch.setattr(feed_module, "_LOOK_SHARE", float("inf"))
     return [{"id": "a", "state": "queued"}]
 
 
@@ -45,7 +45,7 @@ def test_a_reader_from_before_a_restart_is_told_to_reload(
 def test_a_reader_that_was_away_too_long_is_told_to_reload(
     runs: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(feed_module, "_KEPT", 3)
+    monkeypatch.setattr(feed_module, "_KEPT_EVENTS", 3)
     feed = Feed(lambda: [dict(run) for run in runs])
     start = feed.cursor()
     for number in range(3):
@@ -57,7 +57,7 @@ def test_a_reader_that_was_away_too_long_is_told_to_reload(
 
 
 def test_many_readers_cost_one_look(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(feed_module, "_INTERVAL_S", 60.0)
+    monkeypatch.setattr(feed_module, "_LOOK_INTERVAL_S", 60.0)
     looks: list[int] = []
 
     def look() -> list[dict[str, Any]]:
@@ -74,8 +74,8 @@ def test_many_readers_cost_one_look(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_slow_look_is_not_repeated_at_once_but_a_page_sees_what_is_there(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(feed_module, "_INTERVAL_S", 0.0)
-    monkeypatch.setattr(feed_module, "_SHARE", 1e-4)
+    monkeypatch.setattr(feed_module, "_LOOK_INTERVAL_S", 0.0)
+    monkeypatch.setattr(feed_module, "_LOOK_SHARE", 1e-4)
     clock = SimpleNamespace(now=1.0)
     clock.monotonic = lambda: clock.now
     monkeypatch.setattr(feed_module, "time", clock)
