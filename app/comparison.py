@@ -10,8 +10,8 @@ from physhandi.errors import UsageError
 Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
 Mode = Literal["side", "overlay", "wipe"]
 """Beside each other, one over the other, or A on one side of a line and B on the other."""
-Tint = Literal["side", "difference"]
-"""Whether nodes have the color of their side, or that of their difference."""
+Tint = Literal["side", "difference", "parts"]
+"""Nodes in the color of their side or of their difference, or parts as in the paper's figure."""
 
 
 class CompareAsk(BaseModel):

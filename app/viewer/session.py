@@ -9,8 +9,7 @@ import viser
 
 from app.viewer.clock.playback import TURN, Playback
 from app.viewer.clock.timeline_panel import TimelinePanel
-from app.viewer.compare.figure_mode import FigureMode
-from app.viewer.compare.pin_mode import PinMode
+from app.viewer.compare.live import LiveComparison
 from app.viewer.content.content import Catalog, Content, open_run, open_sequence
 from app.viewer.content.session_state import Kind, Pose, SessionState
 from app.viewer.export.export_panel import ExportPanel
@@ -106,8 +105,8 @@ class Session(SceneServer):
                 prefers_dark=prefers_dark,
                 parameters=history.current if history is not None else None,
                 automatic_substeps=history is not None and history.is_automatic,
-                is_figure=self._figure.is_on,
-                pose=self._figure.pose(),
+                is_figure=self._comparison.is_figure,
+                pose=self._comparison.pose(),
                 parameter_changes=parameter_changes(history.start, history.current)
                 if history is not None
                 else {},
@@ -119,7 +118,7 @@ class Session(SceneServer):
         there = {
             "object": self._content.fitted is not None,
             "colors": self._inspection.colors.is_there,
-            "figure": self._figure.is_offered,
+            "figure": self._comparison.offers_figure,
         }
         return tuple(name for name, is_there in there.items() if is_there)
 
@@ -129,9 +128,20 @@ class Session(SceneServer):
         with self._lock:
             frame = self._playback.frame
             rollout, rollout_frame = self._rollout_at(frame)
-            snapshot = self._view.snapshot(self._content, frame, rollout, rollout_frame)
-            layers = replace(self._view.scene.layers)
-        return replace(snapshot, run=run, layers=layers, link=self.link_of(self))
+            compared = None
+            if rollout is not None:
+                compared = self._comparison.rollouts(rollout, rollout_frame, frame)
+            return Snapshot(
+                content=self._content,
+                frame=frame,
+                rollout=rollout,
+                rollout_frame=rollout_frame,
+                compared=compared,
+                picture=self._comparison.framed_picture,
+                run=run,
+                layers=replace(self._view.scene.layers),
+                link=self.link_of(self),
+            )
 
     def go(self, frame: int) -> None:
         """Stop at a frame."""
@@ -147,8 +157,7 @@ class Session(SceneServer):
         self._playback.close()
         if self._object is not None:
             self._object.close()
-        self._figure.close()
-        self._pin.close()
+        self._comparison.close()
         self._server.stop()
         self._content.close()
 
@@ -167,8 +176,14 @@ class Session(SceneServer):
             choice.on_update(guard.by_user(lambda _: self._switch(choice)))
         self._timeline = TimelinePanel(server, self._playback, guard)
         self._strip = FrameStrip(server, self._timeline.behind_slider)
-        self._figure = FigureMode(server, guard, self._live, self.id, self._playback.redraw)
-        self._pin = PinMode(server, guard, self._figure, self._newest, self._playback.redraw)
+        self._comparison = LiveComparison(
+            server,
+            guard,
+            self._live,
+            self.id,
+            newest=self._newest,
+            redraw=self._playback.redraw,
+        )
         self._inspection = Inspection(
             server,
             guard,
@@ -188,13 +203,12 @@ class Session(SceneServer):
         content = self._content
         framing = frame_content(content)
         scene = SceneDrawing(self._server, content, framing)
-        self._view = ViewSwitch(scene, self._figure, self._pin)
+        self._view = ViewSwitch(scene, self._comparison)
         self._layers.replace(content, scene.layers, framing, has_surface=scene.may_have_surface)
         self._inspection.replace(content, scene, framing)
         run = self._catalog.run(self._target) if self.kind == "run" else None
         self._export.offer(content)
-        self._pin.offer(content, framing)
-        self._figure.offer(content, framing, run.folder if run is not None else None)
+        self._comparison.offer(content, framing, run.folder if run is not None else None)
         if content.fitted is None or run is None:
             return
         with self._physics_place:
@@ -223,7 +237,7 @@ class Session(SceneServer):
         if state.pose is not None:
             state.pose.give_first(self._server.initial_camera)
         if state.is_figure:
-            self._figure.toggle()
+            self._comparison.toggle_figure()
         self._playback.seek(state.frame)
         self._playback.play(on=state.is_playing)
 
@@ -254,17 +268,14 @@ class Session(SceneServer):
         if not self._has_played:
             self._has_played = True
             self._playback.play()
-        self._let_in(client, self._figure)
-        self._let_in(client, self._pin)
+        self._let_in(client, self._comparison)
 
     def _reset_view(self, event: Any) -> None:
-        if self._figure.is_on:
-            self._figure.reset_view(event.client)
-        elif not self._pin.reset_view(event.client):
+        if not self._comparison.reset_view(event.client):
             self._layers.reset_view(event)
 
     def _forget(self, client: viser.ClientHandle) -> Pose:
-        return self._figure.part(client)
+        return self._comparison.part(client)
 
     def _draw(self, frame: int, is_playing: bool) -> None:
         with self._lock, TURN:
@@ -276,7 +287,7 @@ class Session(SceneServer):
                 frame,
                 rollout_frame,
                 is_playing=is_playing,
-                is_hidden=(self._figure.is_on or self._pin.is_on) and rollout is not None,
+                is_hidden=self._comparison.is_on and rollout is not None,
             )
             if self._object is not None:
                 self._object.show(frame, is_playing=is_playing)
@@ -295,13 +306,12 @@ class Session(SceneServer):
 
 
 class ViewSwitch:
-    """Draws the scene, the figure or two rollouts, and hides the others; used by the clock."""
+    """Draws the scene or a comparison, and hides the other; used by the clock."""
 
-    def __init__(self, scene: SceneDrawing, figure: FigureMode, pin: PinMode) -> None:
+    def __init__(self, scene: SceneDrawing, comparison: LiveComparison) -> None:
         self.scene = scene
-        self._figure = figure
-        self._pin = pin
-        self._shown: SceneDrawing | FigureMode | PinMode = scene
+        self._comparison = comparison
+        self._shown: SceneDrawing | LiveComparison = scene
 
     def draw(
         self, frame: int, rollout: ObjectRollout | None, rollout_frame: int, *, is_playing: bool
@@ -314,37 +324,17 @@ class ViewSwitch:
             rollout_frame: Frame of the rollout, which may lag behind while it is being computed.
             is_playing: Whether the clock is running.
         """
-        mode = self._mode(rollout)
-        now = self.scene if mode is None else mode
-        if now is not self._shown:
+        shown = self._comparison if self._comparison.is_on and rollout is not None else self.scene
+        if shown is not self._shown:
             self._shown.hide()
-            self._shown = now
-        if mode is None or rollout is None:
-            self.scene.draw(frame, rollout, rollout_frame, is_playing=is_playing)
-        else:
-            mode.draw(rollout, rollout_frame, frame, self.scene.layers, is_playing=is_playing)
-
-    def snapshot(
-        self, content: Content, frame: int, rollout: ObjectRollout | None, rollout_frame: int
-    ) -> Snapshot:
-        """Collect what is seen, for the export panel."""
-        snapshot = Snapshot(
-            content=content, frame=frame, rollout=rollout, rollout_frame=rollout_frame
-        )
-        mode = self._mode(rollout)
-        if mode is None or rollout is None:
-            return snapshot
-        sides = mode.sides(rollout, rollout_frame, frame)
-        return replace(snapshot, sides=sides, picture=mode.framed_picture)
-
-    def _mode(self, rollout: ObjectRollout | None) -> FigureMode | PinMode | None:
-        """Tell what is shown instead of the scene."""
-        if rollout is None:
-            return None
-        return next((mode for mode in (self._pin, self._figure) if mode.is_on), None)
+            self._shown = shown
+        if isinstance(shown, SceneDrawing):
+            shown.draw(frame, rollout, rollout_frame, is_playing=is_playing)
+        elif rollout is not None:
+            layers = self.scene.layers
+            shown.draw(rollout, rollout_frame, frame, layers, is_playing=is_playing)
 
     def clear(self) -> None:
         """Remove everything, to make room for another content."""
-        self._pin.stop()
-        self._figure.close()
+        self._comparison.close()
         self.scene.clear()

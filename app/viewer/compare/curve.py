@@ -43,7 +43,7 @@ class DifferenceCurve:
         self._condition = threading.Condition()
         self._pairing: Pairing | None = None
         self._way: Way | None = None
-        self._told: list[FrameDifference] = []
+        self._measured: list[FrameDifference] = []
         self._is_closed = False
         self._thread: threading.Thread | None = None
 
@@ -57,26 +57,26 @@ class DifferenceCurve:
     def count(self) -> int:
         """Number of ticks that are measured, from the first one on."""
         with self._condition:
-            return len(self._told)
+            return len(self._measured)
 
     @property
     def strong(self) -> float:
         """Difference that few nodes exceed at any tick [m]; NaN if nothing is measured."""
         with self._condition:
-            known = [told.strong for told in self._told if np.isfinite(told.strong)]
-        return max(known, default=float("nan"))
+            strong = [d.strong for d in self._measured if np.isfinite(d.strong)]
+        return max(strong, default=float("nan"))
 
     def at(self, tick: int) -> FrameDifference | None:
         """Give the difference at a tick; None if it is not measured."""
         with self._condition:
-            return self._told[tick] if 0 <= tick < len(self._told) else None
+            return self._measured[tick] if 0 <= tick < len(self._measured) else None
 
     def columns(self) -> tuple[Float[ndarray, " tick"], Float[ndarray, " tick"]]:
         """Give mean and largest difference of the ticks that are measured [m]."""
         with self._condition:
-            told = list(self._told)
-        mean = np.array([t.mean for t in told], dtype=np.float64)
-        return mean, np.array([t.largest for t in told], dtype=np.float64)
+            measured = list(self._measured)
+        mean = np.array([d.mean for d in measured], dtype=np.float64)
+        return mean, np.array([d.largest for d in measured], dtype=np.float64)
 
     def follow(self, pairing: Pairing | None) -> None:
         """Measure these rollouts from now on; the same ones go on as their frames get ready."""
@@ -89,7 +89,7 @@ class DifferenceCurve:
                 and pairing.frames == now.frames
             )
             if not is_same:
-                self._pairing, self._told = pairing, []
+                self._pairing, self._measured = pairing, []
                 self._way = None if pairing is None else way_of(pairing.first, pairing.second)
             if self._thread is None and pairing is not None and not self._is_closed:
                 self._thread = threading.Thread(target=self._run, name="difference", daemon=True)
@@ -108,7 +108,7 @@ class DifferenceCurve:
 
     def _next(self) -> tuple[Pairing, Way, int] | None:
         """Find the tick to be measured next, if both rollouts have its frames."""
-        pairing, way, tick = self._pairing, self._way, len(self._told)
+        pairing, way, tick = self._pairing, self._way, len(self._measured)
         if pairing is None or way is None or tick >= len(pairing.frames):
             return None
         first, second = pairing.frames[tick]
@@ -118,11 +118,11 @@ class DifferenceCurve:
     def _patience(self) -> float | None:
         """Tell how long to wait for a call; rollouts that are simulated do not tell of frames."""
         pairing = self._pairing
-        is_done = pairing is None or len(self._told) >= len(pairing.frames)
+        is_done = pairing is None or len(self._measured) >= len(pairing.frames)
         return None if is_done else _REFRESH
 
     def _run(self) -> None:
-        told = time.monotonic()
+        last_call = time.monotonic()
         is_news = False
         while True:
             with self._condition:
@@ -135,8 +135,8 @@ class DifferenceCurve:
                 if due is not None:
                     self._measure(*due)
                     is_news = True
-                if is_news and (due is None or time.monotonic() - told > _REFRESH):
-                    told, is_news = time.monotonic(), False
+                if is_news and (due is None or time.monotonic() - last_call > _REFRESH):
+                    last_call, is_news = time.monotonic(), False
                     self._on_change()
             except Exception:
                 logger.exception("measuring the difference failed")
@@ -144,7 +144,7 @@ class DifferenceCurve:
 
     def _measure(self, pairing: Pairing, way: Way, tick: int) -> None:
         first, second = pairing.frames[tick]
-        found = compare_frames(pairing.first, first, pairing.second, second, way)
+        difference = compare_frames(pairing.first, first, pairing.second, second, way)
         with self._condition:
-            if self._pairing is pairing and len(self._told) == tick:
-                self._told.append(found)
+            if self._pairing is pairing and len(self._measured) == tick:
+                self._measured.append(difference)

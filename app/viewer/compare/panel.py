@@ -10,7 +10,15 @@ import viser
 from app.comparison import Mode
 from app.viewer.color.legend import Legend, legend_html, swatches_html
 from app.viewer.compare.curve import DifferenceCurve
-from app.viewer.compare.look import MODES, SIDES, STYLES, Look, difference_scale
+from app.viewer.compare.drawing import (
+    FIGURE_STYLE,
+    MODES,
+    STYLES,
+    TINTS,
+    Look,
+    difference_scale,
+)
+from app.viewer.compare.sides import SIDES
 from app.viewer.ui.guard import Guard, plain
 from app.viewer.ui.keyboard import bind
 from app.viewer.ui.plot import Curve, FramePlot, rounded_up
@@ -48,7 +56,7 @@ class ComparePanel:
             guard: Wraps the callbacks.
             look: What the switches change.
             curve: The difference.
-            change: Called when the look has changed; `moved` tells whether sides move.
+            change: Called when the look has changed.
             has_keys: Whether C changes the colors; elsewhere it has another meaning.
         """
         self._look = look
@@ -68,12 +76,12 @@ class ComparePanel:
             self._mode = gui.add_dropdown(
                 "Show", tuple(MODES.values()), initial_value=MODES[look.mode], hint="M: the next"
             )
-            self._tint = gui.add_checkbox(
-                "Difference colors",
-                initial_value=look.tint == "difference",
-                hint="C: color nodes by how far they are from the other side"
-                if has_keys
-                else "Color nodes by how far they are from the other side",
+            hint = "Beside each other, both can have the colors of the paper's figure"
+            self._tint = gui.add_dropdown(
+                "Colors of A and B",
+                tuple(TINTS.values()),
+                initial_value=TINTS[look.tint],
+                hint=f"C: the next. {hint}" if has_keys else hint,
             )
             self._fade = gui.add_slider(
                 "A ↔ B", 0.0, 1.0, 0.01, look.fade, hint="Left: A alone, right: B alone"
@@ -94,7 +102,7 @@ class ComparePanel:
         self._commands = bind(server, guard, "swap", lambda _, __: self.swap())
         self._commands += bind(server, guard, "compare_mode", lambda _, __: self.next_mode())
         if has_keys:
-            self._commands += bind(server, guard, "color", lambda _, __: self.toggle_tint())
+            self._commands += bind(server, guard, "color", lambda _, __: self.next_tint())
         self._dress()
 
     def remove(self) -> None:
@@ -106,7 +114,7 @@ class ComparePanel:
     def name(
         self, names: dict[str, str], notes: tuple[str, ...], *, unit: str, tick_count: int
     ) -> None:
-        """Tell who A and B are.
+        """Name A and B.
 
         Args:
             names: Name of each side; of a user's text only what `plain` leaves of it.
@@ -156,16 +164,17 @@ class ComparePanel:
         self._mode.value = MODES[mode]
         self._choose()
 
-    def toggle_tint(self) -> None:
-        """Switch between colors of sides and of the difference."""
-        self._tint.value = not self._tint.value
+    def next_tint(self) -> None:
+        """Go to the next meaning of the colors."""
+        tints = list(TINTS)
+        self._tint.value = TINTS[tints[(tints.index(self._look.tint) + 1) % len(tints)]]
         self._choose()
 
     def _choose(self) -> None:
         look = self._look
         with self._lock:  # What is taken last must be what was read last.
             look.mode = next(mode for mode, label in MODES.items() if label == self._mode.value)
-            look.tint = "difference" if self._tint.value else "side"
+            look.tint = next(tint for tint, label in TINTS.items() if label == self._tint.value)
             look.fade, look.wipe = self._fade.value, self._wipe.value
             self._dress()
         self._change()
@@ -178,7 +187,8 @@ class ComparePanel:
 
     def _write(self) -> None:
         """Write the legend and the difference of the tick on the screen."""
-        names = [(STYLES[name].node, f"{name.upper()} {self._names[name]}") for name in SIDES]
+        styles = dict.fromkeys(SIDES, FIGURE_STYLE) if self._look.is_figure else STYLES
+        names = [(styles[name].node, f"{name.upper()} {self._names[name]}") for name in SIDES]
         if self._look.is_swapped:
             names.reverse()
         written = swatches_html(names, is_list=True)
@@ -186,21 +196,24 @@ class ComparePanel:
             scale = difference_scale(self._look.scale, self._length_unit)
             written += legend_html(Legend(scale=scale))
         self._set(self._legend, written)
-        self._set(self._text, f'<div style="{_STYLE}">{"<br/>".join(self._said())}</div>')
+        self._set(self._text, f'<div style="{_STYLE}">{"<br/>".join(self._lines())}</div>')
 
-    def _said(self) -> list[str]:
-        told = self._curve.at(self._tick)
-        said: list[str] = []
-        if told is not None:
-            mean, largest = (f"{v * self._factor:.3g}" for v in (told.mean, told.largest))
-            said.append(
+    def _lines(self) -> list[str]:
+        """Say how far A and B are apart, how that is measured, and what the pair's notes are."""
+        difference, way = self._curve.at(self._tick), self._curve.way
+        lines: list[str] = []
+        if difference is not None:
+            mean, largest = (
+                f"{v * self._factor:.3g}" for v in (difference.mean, difference.largest)
+            )
+            lines.append(
                 f"{_mark(_MEAN)} mean {mean} {plain(self._unit)} "
                 f"{_mark(_LARGEST)} max {largest} {plain(self._unit)} between A and B"
             )
-        elif self._curve.way is not None:
-            said.append("measuring the difference …")
-        said += [plain(_COMPARED[self._curve.way])] if self._curve.way else []
-        return said + [f"<em>{escape(note)}</em>" for note in self._notes]
+        elif way is not None:
+            lines.append("measuring the difference …")
+        lines += [plain(_COMPARED[way])] if way else []
+        return lines + [f"<em>{escape(note)}</em>" for note in self._notes]
 
     @staticmethod
     def _set(place: Any, content: str) -> None:

@@ -10,12 +10,10 @@ import viser
 from app.comparison import CompareAsk
 from app.viewer.clock.playback import TURN, Playback
 from app.viewer.clock.timeline_panel import TimelinePanel
-from app.viewer.compare.drawing import CompareDrawing
-from app.viewer.compare.figure import Side
-from app.viewer.compare.figure_camera import FigureCameras
-from app.viewer.compare.look import SIDES, Look
+from app.viewer.compare.camera import ComparisonCameras
+from app.viewer.compare.drawing import Look
 from app.viewer.compare.pair import open_pair, pairing_of
-from app.viewer.compare.recorded import Half, Halves
+from app.viewer.compare.sides import SIDES, Side, Sides, compared_rollouts
 from app.viewer.compare.view import CompareView
 from app.viewer.content.content import Catalog, Content
 from app.viewer.content.layers import Layers, default_layers
@@ -55,7 +53,7 @@ class CompareSession(SceneServer):
         self._ask = CompareAsk.parse(target)
         self._pair = open_pair(catalog, self._ask)
         self._has_played = False
-        self._cameras = FigureCameras()
+        self._cameras = ComparisonCameras()
         super().__init__(session_id, owner=owner, title=self._pair.title)
         clock = self._pair.clock
         self._playback = Playback(clock.tick_count, clock.rate, self._draw)
@@ -116,14 +114,14 @@ class CompareSession(SceneServer):
         """Collect what is on the screen, for the export panel."""
         with self._lock:
             tick = self._playback.frame
-            halves = self._halves(tick)
-            first = halves["a"]
+            sides = self._sides(tick)
+            first = sides["a"]
             return Snapshot(
                 content=first.content,
-                frame=first.frame,
-                rollout=first.side.rollout,
-                rollout_frame=first.side.frame,
-                sides={name: half.side for name, half in halves.items()},
+                frame=first.content_frame,
+                rollout=first.rollout,
+                rollout_frame=first.frame,
+                compared=compared_rollouts(sides),
                 picture=self._view.picture(),
                 layers=replace(self._layers),
                 link=self.link,
@@ -146,13 +144,14 @@ class CompareSession(SceneServer):
         self._layers = _first_layers(shown)
         _place_first(server, framing)
         rollouts = [content.fitted for content in pair.contents if content.fitted is not None]
-        drawing = CompareDrawing(server, shown, framing, rollouts)
         self._timeline = TimelinePanel(server, self._playback, guard)
         self._view = CompareView(
             server,
             guard,
-            drawing,
-            self._cameras,
+            content=shown,
+            framing=framing,
+            rollouts=rollouts,
+            cameras=self._cameras,
             look=Look(mode=self._ask.mode, tint=self._ask.color),
             redraw=self._playback.redraw,
             has_keys=True,
@@ -201,24 +200,29 @@ class CompareSession(SceneServer):
 
     def _draw(self, tick: int, is_playing: bool) -> None:
         with self._lock, TURN:
-            self._view.draw(tick, self._halves(tick), self._layers, is_playing=is_playing)
+            self._view.draw(tick, self._sides(tick), self._layers, is_playing=is_playing)
             self._timeline.show(is_playing=is_playing)
 
-    def _halves(self, tick: int) -> Halves:
+    def _sides(self, tick: int) -> Sides:
         frames = self._pair.clock.frames(tick)
         parts = zip(SIDES, self._pair.contents, frames, strict=True)
-        return {side: _half(side, content, frame) for side, content, frame in parts}
+        return {key: _side(key, content, frame) for key, content, frame in parts}
 
 
-def _half(name: str, content: Content, frame: int) -> Half:
+def _side(key: str, content: Content, frame: int) -> Side:
     rollout = content.fitted
-    detail = "no object" if rollout is None else f"{rollout.model.node_count} nodes · frame {frame}"
-    side = Side(
+    detail = "no object"
+    if rollout is not None:
+        detail = f"{rollout.model.node_count} nodes · frame {frame}"
+    return Side(
+        name=key,
+        title=f"{key.upper()} · {content.title}",
+        detail=detail,
         rollout=rollout,
         frame=min(frame, rollout.ready - 1) if rollout is not None else 0,
-        caption=f"{name.upper()} · {content.title}\n{detail}",
+        content=content,
+        content_frame=frame,
     )
-    return Half(side=side, content=content, frame=frame)
 
 
 def _first_layers(content: Content) -> Layers:

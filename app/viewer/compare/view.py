@@ -1,19 +1,21 @@
-"""A comparison in one viser server: what is drawn, its panel, its difference and its cameras."""
+"""One comparison in a viser server: its drawing, panel, difference and cameras."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import viser
 
+from app.viewer.compare.camera import ComparisonCameras, Eye, picture_of_both
 from app.viewer.compare.curve import DifferenceCurve, Pairing
-from app.viewer.compare.drawing import CompareDrawing
-from app.viewer.compare.figure_camera import Eye, FigureCameras, picture_of_figure
-from app.viewer.compare.look import Look
+from app.viewer.compare.drawing import CompareDrawing, Look
 from app.viewer.compare.panel import ComparePanel
-from app.viewer.compare.recorded import Halves
+from app.viewer.compare.sides import Sides
+from app.viewer.content.content import Content
 from app.viewer.content.layers import Layers
 from app.viewer.content.session_state import Pose
+from app.viewer.scene.framing import Framing
 from app.viewer.ui.guard import Guard
+from physhandi.object_rollout import ObjectRollout
 
 
 class CompareView:
@@ -23,9 +25,11 @@ class CompareView:
         self,
         server: viser.ViserServer,
         guard: Guard,
-        drawing: CompareDrawing,
-        cameras: FigureCameras,
         *,
+        content: Content,
+        framing: Framing,
+        rollouts: Iterable[ObjectRollout],
+        cameras: ComparisonCameras,
         look: Look,
         redraw: Callable[[], None],
         has_keys: bool,
@@ -35,27 +39,29 @@ class CompareView:
         Args:
             server: Where to.
             guard: Wraps the callbacks.
-            drawing: The scene.
+            content: Gives the ground, and what has to fit if there are no rollouts.
+            framing: Sizes.
+            rollouts: Complete rollouts, which have to fit.
             cameras: Where the clients' cameras stood before.
             look: How it begins.
             redraw: Draws the current frame again.
-            has_keys: Whether C changes the colors.
+            has_keys: Whether C changes the colors; in a live scene it has another meaning.
         """
         self.look = look
-        self.drawing = drawing
+        self.drawing = CompareDrawing(server, content, framing, rollouts, look)
         self._server = server
         self._cameras = cameras
         self._redraw = redraw
-        self._was_side = look.mode == "side"
+        self._framed_as = (look.mode, look.is_figure)
         self._panel: ComparePanel | None = None
         self.curve = DifferenceCurve(self._measured)
         self.panel = self._panel = ComparePanel(
             server, guard, look, self.curve, change=self._change, has_keys=has_keys
         )
 
-    def draw(self, tick: int, halves: Halves, layers: Layers, *, is_playing: bool) -> None:
+    def draw(self, tick: int, sides: Sides, layers: Layers, *, is_playing: bool) -> None:
         """Bring both sides to a moment; runs in the thread that draws."""
-        self.drawing.draw(halves, self.look, layers, self.curve.way, is_playing=is_playing)
+        self.drawing.draw(sides, layers, self.curve.way, is_playing=is_playing)
         self.panel.show(tick, is_playing=is_playing)
 
     def follow(self, pairing: Pairing | None) -> None:
@@ -103,7 +109,7 @@ class CompareView:
         return self._picture if self.look.mode == "side" else None
 
     def _picture(self, client: viser.ClientHandle) -> dict[str, Any]:
-        return picture_of_figure(client, self.drawing.box(Eye.of(client.camera.wxyz)))
+        return picture_of_both(client, self.drawing.box(Eye.of(client.camera.wxyz)))
 
     def _aim(self, client: viser.ClientHandle, pose: Pose) -> None:
         eye = Eye.at(pose)
@@ -111,11 +117,11 @@ class CompareView:
         self.drawing.turn(eye)
 
     def _change(self) -> None:
-        """Move the cameras if the sides have moved, and draw again."""
-        is_side = self.look.mode == "side"
-        if is_side != self._was_side:
-            self._was_side = is_side
-            (self.enter if is_side else self.leave)()
+        """Move the cameras if the sides or what is around them have moved, and draw again."""
+        framed_as = (self.look.mode, self.look.is_figure)
+        if framed_as != self._framed_as:
+            self._framed_as = framed_as
+            (self.enter if self.look.mode == "side" else self.leave)()
         self._redraw()
 
     def _measured(self) -> None:

@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 import yaml
 
-from app.viewer.compare.figure import Side
 from app.viewer.content.content import Content
 from app.viewer.content.session_state import Pose
 from app.viewer.export.snapshot import Snapshot, write_ply
@@ -92,9 +91,8 @@ def bundle(snapshot: Snapshot, picture: Screenshot) -> bytes:
 
 def _sides(snapshot: Snapshot) -> dict[str, tuple[ObjectRollout, int]]:
     """Name the rollouts that are shown, each with its frame."""
-    if snapshot.sides is not None:
-        sides: dict[str, Side] = dict(snapshot.sides)
-        return {n: (s.rollout, s.frame) for n, s in sides.items() if s.rollout is not None}
+    if snapshot.compared is not None:
+        return dict(snapshot.compared)
     return {} if snapshot.rollout is None else {"shown": (snapshot.rollout, snapshot.rollout_frame)}
 
 
@@ -246,8 +244,8 @@ def _layers_there(content: Content) -> set[str]:
 
 
 _COLUMNS = (
-    "Column 'side': 'shown', or, of the figure that compares topologies, 'ours' and",
-    "'phystwin'. Numbers of nodes, controls and springs start at 0.",
+    "Column 'side': 'shown', or the sides of a comparison: 'ours' and 'phystwin', or 'a' and",
+    "'b'. Numbers of nodes, controls and springs start at 0.",
     "",
 )
 _ABOUT = (

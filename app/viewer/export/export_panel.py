@@ -7,12 +7,13 @@ from typing import Any
 import cv2
 import viser
 
-from app.viewer.compare.figure_export import write_figure_csv, write_figure_npz
 from app.viewer.content.content import Content
 from app.viewer.content.session_state import Pose
 from app.viewer.export.bundle import Screenshot, bundle
 from app.viewer.export.snapshot import (
     Snapshot,
+    write_comparison_csv,
+    write_comparison_npz,
     write_csv,
     write_gltf,
     write_npz,
@@ -29,7 +30,7 @@ _SMALLEST_SIDE = 16
 _FRAME = ("PNG", "PLY", "ZIP")
 _MOTION = ("GLB", "PLYs", "NPZ")
 _TABLES = ("CSV", "YAML")
-_OF_FIGURE = ("PNG", "NPZ", "CSV", "ZIP")
+_OF_COMPARISON = ("PNG", "NPZ", "CSV", "ZIP")
 _RENDER_SECONDS = 20.0
 _RENDER_SECONDS_PER_PIXEL = 5e-6
 _WINDOW, _OWN = "as this window", "own size"
@@ -100,7 +101,7 @@ class ExportPanel:
         """Send a file to a client, as the button of that name does."""
         snapshot = self._snapshot()
         stem = re.sub(r"[^A-Za-z0-9_-]+", "_", snapshot.content.title)[:60] or "physhandi"
-        sides, suffix = snapshot.sides, {"PLYs": "ply.zip"}.get(kind, kind.lower())
+        compared, suffix = snapshot.compared, {"PLYs": "ply.zip"}.get(kind, kind.lower())
         is_of_frame = kind in _FRAME
         if kind in {"PNG", "ZIP"}:
             size = self._picture_size()
@@ -108,12 +109,12 @@ class ExportPanel:
             if kind == "ZIP":
                 picture = Screenshot.of(content, Pose.of(client.camera))
                 content = bundle(snapshot, picture)
-        elif sides is not None and kind in {"NPZ", "CSV"}:
-            content = write_figure_npz(sides) if kind == "NPZ" else write_figure_csv(sides)
+        elif compared is not None and kind in _COMPARISON_WRITERS:
+            content = _COMPARISON_WRITERS[kind](compared)
             is_of_frame = kind == "CSV"
         else:
             content = _MAKERS[kind](snapshot)
-        stem = stem if sides is None or kind not in _OF_FIGURE else f"{stem}_figure"
+        stem = stem if compared is None or kind not in _OF_COMPARISON else f"{stem}_figure"
         name = f"{stem}_{snapshot.frame:05d}" if is_of_frame else stem
         client.send_file_download(f"{name}.{suffix}", content, save_immediately=True)
         notify(client, "Saved", f"{name}.{suffix}, {len(content) / 1e3:.0f} kB", color="blue")
@@ -127,6 +128,7 @@ _MAKERS: dict[str, Callable[[Snapshot], bytes]] = {
     "CSV": write_csv,
     "YAML": write_yaml,
 }
+_COMPARISON_WRITERS = {"NPZ": write_comparison_npz, "CSV": write_comparison_csv}
 
 
 def write_png(

@@ -13,7 +13,6 @@ import numpy as np
 import viser
 import yaml
 
-from app.viewer.compare.figure import Side
 from app.viewer.content.content import Content
 from app.viewer.content.layers import GREEN, RED, SKIN, Layers
 from physhandi.data.exporters import export_scene
@@ -22,6 +21,11 @@ from physhandi.data.exporters.scene_data import HandSurface, SceneData, read_ski
 from physhandi.errors import MissingInputError
 from physhandi.object_rollout import ObjectRollout
 from physhandi.run import Run
+
+_COMPARISON_COLUMNS = (
+    *("side", "frame", "kind", "node", "control"),
+    *("x_m", "y_m", "z_m", "force_x_N", "force_y_N", "force_z_N", "length_m", "rest_length_m"),
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -36,10 +40,10 @@ class Snapshot:
     """The object's rollout."""
     rollout_frame: int
     """Frame of the rollout."""
-    sides: Mapping[str, Side] | None = None
-    """Both halves of the figure, if the figure is shown."""
+    compared: Mapping[str, tuple[ObjectRollout, int]] | None = None
+    """Rollouts of a comparison by the names of its sides, each with its frame; None outside."""
     picture: Callable[[viser.ClientHandle], dict[str, Any]] | None = None
-    """Finds the camera of the figure's picture, if the figure is shown."""
+    """Finds another camera than the client's for a picture; None if the client's will do."""
     run: Run | None = None
     """The run, if it is one that is shown."""
     layers: Layers | None = None
@@ -148,6 +152,73 @@ def write_csv(snapshot: Snapshot) -> bytes:
 def write_yaml(snapshot: Snapshot) -> bytes:
     """Write the parameters of the rollout that is on the screen."""
     return yaml.safe_dump(_rollout(snapshot).parameters.to_dict(), sort_keys=False).encode()
+
+
+def write_comparison_npz(compared: Mapping[str, tuple[ObjectRollout, int]]) -> bytes:
+    """Write all frames of both sides of a comparison.
+
+    For each side, as in ``ours_…`` and ``phystwin_…`` or ``a_…`` and ``b_…``: ``position``
+    "frame node 3" and ``control`` "frame control 3" [m], ``spring_nodes``, ``rest_length`` [m],
+    ``stiffness`` [N], ``object_spring_count``, ``force`` "frame node 3" [N], the sum over virtual
+    springs on each object node, and ``frame``, the frame on the screen.
+
+    Args:
+        compared: Rollouts and frames of the sides by their names.
+    """
+    arrays: dict[str, Any] = {}
+    for name, (rollout, frame) in compared.items():
+        values = {
+            "position": rollout.position[: rollout.ready],
+            "control": rollout.control[: rollout.ready],
+            "spring_nodes": rollout.model.spring_nodes,
+            "rest_length": rollout.model.rest_length,
+            "stiffness": rollout.parameters.stiffness_scale * rollout.model.stiffness,
+            "object_spring_count": np.int64(rollout.model.object_spring_count),
+            "force": np.stack([rollout.forces(ready) for ready in range(rollout.ready)]),
+            "frame": np.int64(frame),
+        }
+        arrays |= {f"{name}_{key}": value for key, value in values.items()}
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **arrays)
+    return stream.getvalue()
+
+
+def write_comparison_csv(compared: Mapping[str, tuple[ObjectRollout, int]]) -> bytes:
+    """Write the frame on the screen of both sides of a comparison as one table.
+
+    A row of kind ``node`` has an object node's position and the sum of the forces on it; one of
+    kind ``virtual_spring`` has its control node's position, its force on the object node, its
+    length and its rest length.
+
+    Args:
+        compared: Rollouts and frames of the sides by their names.
+    """
+    stream = io.StringIO()
+    table = csv.writer(stream)
+    table.writerow(_COMPARISON_COLUMNS)
+    for name, (rollout, frame) in compared.items():
+        table.writerows(_comparison_rows(name, rollout, frame))
+    return stream.getvalue().encode()
+
+
+def _comparison_rows(name: str, rollout: ObjectRollout, frame: int) -> list[list[Any]]:
+    position, control = np.asarray(rollout.position[frame]), np.asarray(rollout.control[frame])
+    rows: list[list[Any]] = []
+    for node, (place, force) in enumerate(zip(position, rollout.forces(frame), strict=True)):
+        rows.append([name, frame, "node", node, "", *_texts(place), *_texts(force), "", ""])
+    first = rollout.model.object_spring_count
+    springs = np.sort(rollout.model.spring_nodes[first:], axis=1)
+    rest = rollout.model.rest_length[first:]
+    for ends, force, length in zip(springs, rollout.spring_forces(frame), rest, strict=True):
+        node, holder = int(ends[0]), int(ends[1]) - rollout.model.node_count
+        stretched = float(np.linalg.norm(control[holder] - position[node]))
+        texts = [*_texts(control[holder]), *_texts(force), *_texts([stretched, length])]
+        rows.append([name, frame, "virtual_spring", node, holder, *texts])
+    return rows
+
+
+def _texts(values: Any) -> list[str]:
+    return [f"{float(value):.7g}" for value in values]
 
 
 def _rollout(snapshot: Snapshot) -> ObjectRollout:

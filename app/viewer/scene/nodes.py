@@ -41,10 +41,11 @@ class SceneNodes:
             node.remove()
         self._nodes.clear()
 
-    def hide(self) -> None:
-        """Hide all nodes."""
-        for node in self._nodes.values():
-            node.visible = False
+    def hide(self, *paths: str) -> None:
+        """Hide all nodes, or those whose path begins with one of these."""
+        for name, node in self._nodes.items():
+            if not paths or name.startswith(paths):
+                node.visible = False
 
     def show(self, name: str, *, is_visible: bool) -> None:
         """Show or hide a node, if it is there."""

@@ -222,6 +222,11 @@ class ObjectDrawing:
             self._model_shown = rollout
         return self._attached
 
+    def hide(self) -> None:
+        """Hide the object until it is drawn again."""
+        parts = ("object/", "springs/", "controls/", "forces")
+        self._nodes.hide(*(f"{self._root}/{part}" for part in parts))
+
     def draw(
         self,
         rollout: ObjectRollout,

@@ -13,7 +13,6 @@ import pytest
 import yaml
 from viewer_world import FRAMES, PARAMETERS, content_of, controls, look_at
 
-from app.viewer.compare.figure import Side
 from app.viewer.content.layers import Layers
 from app.viewer.content.session_state import Pose
 from app.viewer.export.bundle import Screenshot, bundle
@@ -138,11 +137,8 @@ def test_both_halves_of_a_figure_are_told_apart(snapshot: Snapshot) -> None:
     take = snapshot.rollout
     assert take is not None
     other = replace(take, position=take.position + np.float32(1.0))
-    sides = {
-        "ours": Side(rollout=take, frame=4, caption=""),
-        "phystwin": Side(rollout=other, frame=5, caption=""),
-    }
-    files = unpack(bundle(replace(snapshot, sides=sides), picture()))
+    compared = {"ours": (take, 4), "phystwin": (other, 5)}
+    files = unpack(bundle(replace(snapshot, compared=compared), picture()))
     table = rows(files["nodes.csv"])
     shown = column([row for row in table if row["side"] == "phystwin"], "x_m", "y_m", "z_m")
     np.testing.assert_allclose(shown, other.position[5], atol=1e-6)
@@ -167,12 +163,3 @@ def test_the_readme_explains_each_file_that_is_there_and_no_other(snapshot: Snap
     assert "springs.csv" not in few["README.txt"].decode()
     assert bundle(snapshot, picture()) == bundle(snapshot, picture())
     assert FRAMES > 5
-
-
-def test_takes_that_are_not_ready_yet_are_left_out(snapshot: Snapshot) -> None:
-    take = snapshot.rollout
-    assert take is not None
-    waiting = Side(rollout=None, frame=0, caption="simulating")
-    sides = {"ours": Side(rollout=take, frame=4, caption=""), "phystwin": waiting}
-    table = rows(unpack(bundle(replace(snapshot, sides=sides), picture()))["nodes.csv"])
-    assert {row["side"] for row in table} == {"ours"}

@@ -7,7 +7,7 @@ import viser
 
 from app.viewer.color.difference import FrameDifference, Way
 from app.viewer.compare.curve import DifferenceCurve
-from app.viewer.compare.look import Look
+from app.viewer.compare.drawing import Look
 from app.viewer.compare.panel import ComparePanel
 from app.viewer.ui.guard import Guard
 

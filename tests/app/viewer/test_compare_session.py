@@ -10,8 +10,9 @@ from viewer_client import ViewerClient
 from viewer_world import FRAMES, PARAMETERS, FakeSettings, FolderCatalog, make_run
 
 from app.comparison import CompareAsk
-from app.viewer.compare.figure_export import write_figure_npz
 from app.viewer.compare.pair import open_pair
+from app.viewer.compare.sides import Side, compared_rollouts
+from app.viewer.export.snapshot import write_comparison_npz
 from app.viewer.sessions import Sessions
 from physhandi.errors import MissingInputError, PhysHandiError, UsageError
 from physhandi.run import Run
@@ -185,7 +186,7 @@ def test_an_overlay_colors_the_difference_with_numbers(sessions: Sessions) -> No
         # B fades into the white background, and A comes back in its own colors.
         client.set("A ↔ B", 0.0)
         client.until(lambda: client.visible.get("/compare/b/object/compared") is False)
-        client.set("Difference colors", False)
+        client.set("Colors of A and B", "of A and B")
         client.until(lambda: only_color(client, "object/compared", "a").tolist() == [47, 111, 222])
 
 
@@ -275,14 +276,31 @@ def test_a_copy_and_a_closed_session_know_the_pair(sessions: Sessions) -> None:
     assert (closed.kind, closed.target) == ("comparison", session.target)
 
 
+def test_a_side_without_a_rollout_is_left_out_of_files(catalog: FolderCatalog) -> None:
+    content = open_pair(catalog, CompareAsk(a="sheet", b="moved")).contents[0]
+    there, waiting = (
+        Side(
+            name=name,
+            title=name,
+            detail="",
+            rollout=rollout,
+            frame=4,
+            content=content,
+            content_frame=4,
+        )
+        for name, rollout in (("ours", content.fitted), ("phystwin", None))
+    )
+    assert compared_rollouts({"a": there, "b": waiting}) == {"ours": (content.fitted, 4)}
+
+
 def test_the_numbers_of_both_sides_can_be_saved(sessions: Sessions) -> None:
     with watch(sessions, "a=sheet&b=moved&f=3") as client:
         client.until(lambda: client.find("Motion") != "")
         session = sessions.get(sessions.list()[0].id)
         assert session is not None
-        sides = session.snapshot().sides
-        assert sides is not None
-        with np.load(io.BytesIO(write_figure_npz(sides))) as data:
+        compared = session.snapshot().compared
+        assert compared is not None
+        with np.load(io.BytesIO(write_comparison_npz(compared))) as data:
             moved = data["b_position"] - data["a_position"]
         np.testing.assert_allclose(moved[3], np.tile(3 * OFFSET, (moved.shape[1], 1)), atol=1e-6)
 

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from numpy import ndarray
 from viewer_client import ViewerClient
-from viewer_world import FRAMES, PARAMETERS, content_of, controls, hear_all, rest_at, sheet
+from viewer_world import FRAMES, PARAMETERS, content_of, hear_all, rest_at, sheet
 
-from app.viewer.compare.figure import ARROWS, Figure, Side
-from app.viewer.compare.figure_camera import Eye, picture_of_figure
-from app.viewer.compare.figure_export import write_figure_csv, write_figure_npz
+from app.viewer.compare.camera import Eye, picture_of_both
+from app.viewer.compare.drawing import ARROWS, CompareDrawing, Look, legend_force
+from app.viewer.compare.sides import Side
 from app.viewer.content.layers import Layers
+from app.viewer.export.snapshot import write_comparison_csv, write_comparison_npz
 from app.viewer.scene.framing import frame_content
 from app.viewer.sessions import Sessions
 from physhandi.fitted_object import FittedObject
@@ -22,7 +23,8 @@ from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.topology import build_model
 
 FRAME = 12
-SIDES = ("ours", "phystwin")
+SIDES = {"ours": "a", "phystwin": "b"}
+"""Names of both sides in files, and their keys in the scene."""
 TURNED = (0.5**0.5, 0.0, 0.0, 0.5**0.5)
 """A camera whose right hand is the world's y axis."""
 
@@ -38,23 +40,27 @@ def enter(client: ViewerClient) -> None:
     rest_at(client, FRAME)
     client.set("Compare with PhysTwin", True)
     done = f"PhysTwin-style: simulated {FRAMES}/{FRAMES} frames"
-    client.until(lambda: done in client.texts() and "/figure/phystwin/forces" in client.nodes)
+    client.until(lambda: done in said(client) and "/compare/b/figure/forces" in client.nodes)
     # The arrow scale is chosen anew when both rollouts are known.
-    client.until(lambda: legend_force(client) > 0)
+    client.until(lambda: shown_force(client) > 0)
     # The camera is moved before the figure is drawn, but in messages of its own.
     client.until(lambda: client.camera["fov"] < 0.3 and client.camera["position"][0] != 1.0)
 
 
-def legend_force(client: ViewerClient) -> float:
+def said(client: ViewerClient) -> str:
+    return "\n".join(str(p["content"]) for p in client.gui.values() if "content" in p)
+
+
+def shown_force(client: ViewerClient) -> float:
     return float(text_of(client, "legend/text_3").removeprefix("force, ")[:-2] or 0)
 
 
 def text_of(client: ViewerClient, label: str) -> str:
-    return str(client.nodes.get(f"/figure/{label}", {}).get("text", ""))
+    return str(client.nodes.get(f"/compare/{label}", {}).get("text", ""))
 
 
 def place_of(client: ViewerClient, name: str) -> ndarray:
-    return np.array(client.positions.get(f"/figure/{name}", (np.nan,) * 3))
+    return np.array(client.positions.get(f"/compare/{name}", (np.nan,) * 3))
 
 
 def arrows(client: ViewerClient, name: str) -> ndarray:
@@ -93,32 +99,32 @@ def test_both_sides_are_shown_in_one_scale_and_the_scene_comes_back(sessions, ru
         enter(client)
         session = sessions.get(sessions.list()[0].id)
         session._playback.redraw()
-        rival = session._figure._rollout.newest
+        rival = session._comparison._phystwin.newest
         ours = run.array("sequences/lift/rollout.npy")[FRAME]
-        for side, expected in (("ours", ours), ("phystwin", rival.position[FRAME])):
-            name = f"/figure/{side}/object/nodes"
+        for side, expected in (("a", ours), ("b", rival.position[FRAME])):
+            name = f"/compare/{side}/figure/object/nodes"
             client.until(
                 lambda name=name, expected=expected: np.array_equal(
                     client.array(name, "batched_positions"), expected
                 )
             )
         assert np.abs(rival.position[FRAME] - ours).max() > 1e-3
-        client.until(lambda: text_of(client, "title_ours") == "ours")
+        client.until(lambda: text_of(client, "title_a") == "ours")
         detail = f"δ 40 mm · d_max 50 · {recount(run, 0.04, 50)} virtual springs"
-        client.until(lambda: text_of(client, "detail_phystwin") == detail)
+        client.until(lambda: text_of(client, "detail_b") == detail)
         other = f"δ 20 mm · d_max 3 · {recount(run, 0.02, 3)} virtual springs"
-        client.until(lambda: text_of(client, "detail_ours") == other)
-        client.until(lambda: "both sides use them" in client.texts())
+        client.until(lambda: text_of(client, "detail_a") == other)
+        client.until(lambda: "both sides use them" in said(client))
         strengths = {
             side: np.sort(np.linalg.norm(take.forces(FRAME), axis=1))[::-1]
-            for side, take in (("ours", session._content.fitted), ("phystwin", rival))
+            for side, take in (("a", session._content.fitted), ("b", rival))
         }
 
         def is_to_scale() -> bool:
             """Whether one length means one force on both sides, and in the legend."""
-            units = [lengths_of(client, "/figure/legend/force") / legend_force(client)]
+            units = [lengths_of(client, "/compare/legend/force") / shown_force(client)]
             for side, strength in strengths.items():
-                length = lengths_of(client, f"/figure/{side}/forces")
+                length = lengths_of(client, f"/compare/{side}/figure/forces")
                 if len(length) <= 10:
                     return False
                 units.append(length / strength[: len(length)])
@@ -132,10 +138,7 @@ def test_both_sides_are_shown_in_one_scale_and_the_scene_comes_back(sessions, ru
         client.until(lambda: client.visible["/object/nodes"] and client.camera["fov"] > 0.5)
         client.until(lambda: client.camera["look_at"] == pytest.approx([0, 0, 0]))
         client.until(lambda: client.camera["position"] == pytest.approx([1, 1, 1]))
-        hidden = [n for n in client.visible if n.startswith("/figure/") and client.visible[n]]
-        implied = {"/figure/ours/object", "/figure/ours/springs", "/figure/ours/controls"}
-        implied |= {name.replace("ours", "phystwin") for name in implied} | {"/figure/legend"}
-        assert set(hidden) <= implied
+        assert session._comparison._view is None
         assert client.camera["fov"] == pytest.approx(0.8)
 
 
@@ -151,17 +154,17 @@ def test_the_halves_stay_left_and_right_as_the_camera_turns(sessions) -> None:
         enter(client)
         # The camera looks along z with the world's x to its right.
         client.tell_camera(wxyz=(1.0, 0.0, 0.0, 0.0))
-        client.until(lambda: place_of(client, "phystwin")[0] > 0.05)
-        client.until(lambda: np.allclose(place_of(client, "phystwin")[1:], 0, atol=1e-6))
-        right = place_of(client, "phystwin")
-        client.until(lambda: np.allclose(place_of(client, "ours"), -right, atol=1e-6))
+        client.until(lambda: place_of(client, "b")[0] > 0.05)
+        client.until(lambda: np.allclose(place_of(client, "b")[1:], 0, atol=1e-6))
+        right = place_of(client, "b")
+        client.until(lambda: np.allclose(place_of(client, "a"), -right, atol=1e-6))
         client.tell_camera(wxyz=TURNED)
-        client.until(lambda: place_of(client, "phystwin")[1] > 0.05)
-        x, _, z = place_of(client, "phystwin")
+        client.until(lambda: place_of(client, "b")[1] > 0.05)
+        x, _, z = place_of(client, "b")
         assert (x, z) == pytest.approx((0, 0), abs=1e-6)
         up = Eye.of(np.array(TURNED)).up
         client.until(
-            lambda: (place_of(client, "title_ours") - place_of(client, "legend/text_0")) @ up > 0.05
+            lambda: (place_of(client, "title_a") - place_of(client, "legend/text_0")) @ up > 0.05
         )
 
 
@@ -188,11 +191,8 @@ def test_the_live_process_holds_the_object_in_phystwins_way(run) -> None:
 def test_the_downloads_hold_positions_springs_and_forces_of_both_sides(run) -> None:
     content = content_of({}, run.array("sequences/lift/control.npy"))
     ours, rival = replace_rollout(content.fitted, run), rolled_out(run)
-    sides = {
-        "ours": Side(rollout=ours, frame=FRAME, caption=""),
-        "phystwin": Side(rollout=rival, frame=FRAME, caption=""),
-    }
-    with np.load(io.BytesIO(write_figure_npz(sides))) as saved:
+    sides = {"ours": (ours, FRAME), "phystwin": (rival, FRAME)}
+    with np.load(io.BytesIO(write_comparison_npz(sides))) as saved:
         for name, take in (("ours", ours), ("phystwin", rival)):
             np.testing.assert_array_equal(saved[f"{name}_position"], take.position)
             np.testing.assert_array_equal(saved[f"{name}_control"], take.control)
@@ -200,7 +200,7 @@ def test_the_downloads_hold_positions_springs_and_forces_of_both_sides(run) -> N
             np.testing.assert_array_equal(saved[f"{name}_force"][FRAME], take.forces(FRAME))
             assert saved[f"{name}_frame"] == FRAME
         forces = {name: saved[f"{name}_force"][FRAME] for name in SIDES}
-    rows = list(csv.DictReader(io.StringIO(write_figure_csv(sides).decode())))
+    rows = list(csv.DictReader(io.StringIO(write_comparison_csv(sides).decode())))
     for name, take in (("ours", ours), ("phystwin", rival)):
         own = [row for row in rows if row["side"] == name]
         kinds = [row["kind"] for row in own]
@@ -241,16 +241,29 @@ def test_no_side_streams_more_than_300_arrows_or_too_many_bytes(server_client) -
     )
     assert (np.linalg.norm(take.forces(2), axis=1) > 1e-6).sum() > 2 * ARROWS
     server, client = server_client
-    figure = Figure(server, content, take, frame_content(content))
-    sides = {name: Side(rollout=take, frame=1, caption=name) for name in SIDES}
+    look = Look(tint="parts")
+    drawing = CompareDrawing(server, content, frame_content(content), [take], look)
+    sides = {
+        key: Side(
+            name=name,
+            title=name,
+            detail="",
+            rollout=take,
+            frame=1,
+            content=content,
+            content_frame=1,
+        )
+        for name, key in SIDES.items()
+    }
     layers = Layers(object_springs=True)
-    figure.draw(sides, 1, layers, is_playing=True)
+    drawing.draw(sides, layers, "nodes", is_playing=True)
     hear_all(server, client)
     before = client.bytes_received
-    figure.draw({k: replace(s, frame=2) for k, s in sides.items()}, 2, layers, is_playing=True)
+    later = {key: replace(side, frame=2, content_frame=2) for key, side in sides.items()}
+    drawing.draw(later, layers, "nodes", is_playing=True)
     hear_all(server, client)
-    for side in SIDES:
-        assert 100 < len(arrows(client, f"/figure/{side}/forces")) <= ARROWS == 300
+    for side in "ab":
+        assert 100 < len(arrows(client, f"/compare/{side}/figure/forces")) <= ARROWS == 300
     assert 60_000 < client.bytes_received - before < 100_000
 
 
@@ -259,7 +272,7 @@ def test_a_picture_is_centered_on_what_is_seen_beside_the_panel(server_client) -
     (seen,) = (c for c in server.get_clients().values())
     camera = seen.camera
     box = (np.zeros(3), 0.4, 0.1)
-    view = picture_of_figure(seen, box)
+    view = picture_of_both(seen, box)
     # 640 pixels are too few for the panel to be taken into account: all of the width is kept.
     assert (view["width"], view["position"].tolist()) == (1600, camera.position.tolist())
     camera_high = 2 * np.tan(0.4) * np.sqrt(3)
@@ -270,12 +283,8 @@ def test_a_picture_is_centered_on_what_is_seen_beside_the_panel(server_client) -
     assert kept == pytest.approx(view["height"] / 1200, abs=1e-3)
 
 
-def test_every_number_of_the_legend_is_round(server_client) -> None:
-    server, _ = server_client
-    content = content_of({}, controls((0.0, 0.0, 1.0)))
-    figure = Figure(server, content, content.fitted, frame_content(content))
-    extent = frame_content(content).extent
+def test_the_force_of_the_legend_is_round() -> None:
     for exponent, step in itertools.product(range(-3, 4), (1.0, 1.7, 3.3, 9.9)):
-        figure.force_unit = 0.16 * extent / (step * 10.0**exponent)
-        shown = figure.scale_force / 10.0**exponent
-        assert shown == pytest.approx(max(s for s in (1, 2, 5) if s <= step))
+        force = legend_force(0.16 * 0.7 / (step * 10.0**exponent), 0.7) / 10.0**exponent
+        assert force == pytest.approx(max(s for s in (1, 2, 5) if s <= step))
+    assert legend_force(0.0, 0.7) == 0.0

@@ -8,7 +8,7 @@ import pytest
 from viewer_client import ViewerClient
 from viewer_world import FRAMES, FakeSettings
 
-from app.viewer.compare.figure_mode import FigureMode
+from app.viewer.compare.live import LiveComparison
 from app.viewer.export.snapshot import write_csv, write_npz, write_ply, write_yaml
 from app.viewer.sessions import Sessions, TooManySessionsError
 from physhandi.errors import MissingInputError, PhysHandiError, RunError, UsageError
@@ -257,13 +257,13 @@ def test_a_session_that_nobody_looks_at_is_closed(catalog, monkeypatch: pytest.M
 def test_the_clock_starts_before_all_else_so_that_nobody_has_stopped_it_yet(
     sessions: Sessions, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    welcome, was_playing = FigureMode.welcome, list[bool]()
+    welcome, was_playing = LiveComparison.welcome, list[bool]()
 
-    def watched(self: FigureMode, client: Any) -> None:
+    def watched(self: LiveComparison, client: Any) -> None:
         (session,) = sessions._sessions.values()
         was_playing.append(session._playback.is_playing)
         welcome(self, client)
 
-    monkeypatch.setattr(FigureMode, "welcome", watched)
+    monkeypatch.setattr(LiveComparison, "welcome", watched)
     with watch(sessions) as client:
         client.until(lambda: was_playing == [True])

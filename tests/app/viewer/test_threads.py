@@ -16,7 +16,7 @@ import pytest
 from viewer_client import ViewerClient
 from viewer_world import FRAMES, PARAMETERS, rest_at
 
-from app.viewer.compare.figure_camera import Eye
+from app.viewer.compare.camera import Eye
 from app.viewer.content.content import Content
 from app.viewer.live.client import LiveRequest, SimulationClient
 from app.viewer.live.wire import Message
@@ -226,19 +226,19 @@ def test_a_camera_is_not_aimed_at_a_figure_that_is_being_left(
     sessions: Sessions, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with watched(sessions) as (session, _):
-        mode = session._figure
-        mode.toggle()
-        assert mode.is_on
+        comparison = session._comparison
+        comparison.toggle_figure()
+        assert comparison._view is not None
         (viewer,) = session._server.get_clients().values()
         aimed: list[object] = []
-        monkeypatch.setattr(mode, "_aim", lambda client, _: aimed.append(client))
-        monkeypatch.setattr(mode.cameras, "has_lost", lambda _: True)
-        mode.turn(viewer)
+        monkeypatch.setattr(comparison._view, "_aim", lambda client, _: aimed.append(client))
+        monkeypatch.setattr(comparison._cameras, "has_lost", lambda _: True)
+        comparison.turn(viewer)
         assert aimed == [viewer]
-        with mode._lock:
-            late = beside(lambda: mode.turn(viewer))
+        with comparison._lock:
+            late = beside(lambda: comparison.turn(viewer))
             late.join(SHORT)
-            mode._leave()
+            comparison._leave()
         late.join(PATIENCE)
         assert aimed == [viewer]
 
@@ -246,12 +246,12 @@ def test_a_camera_is_not_aimed_at_a_figure_that_is_being_left(
 def test_a_camera_that_is_heard_late_brings_no_comparison_back(sessions: Sessions) -> None:
     with watched(sessions) as (session, client):
         rest_at(client, 7)
-        session._pin.pin(is_fit=True)
+        session._comparison.keep(is_fit=True)
         client.until(lambda: "/compare/a" in client.nodes)
-        view = session._pin._view
+        view = session._comparison._view
         assert view is not None
         assert "/compare/a" in view.drawing._nodes
-        session._pin.stop()
+        session._comparison.stop()
         view.drawing.turn(Eye(right=np.array([0.0, 1.0, 0.0]), up=np.array([0.0, 0.0, 1.0])))
         assert "/compare/a" not in view.drawing._nodes
 

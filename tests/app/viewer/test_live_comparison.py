@@ -26,6 +26,16 @@ def nodes(client: ViewerClient, side: str) -> np.ndarray:
     return client.array(f"/compare/{side}/object/compared", "points")
 
 
+def press(client: ViewerClient, hotkey: str) -> None:
+    """Press a key, as the browser tells it."""
+    commands = {
+        message["props"]["hotkey"]: message["uuid"]
+        for message in client.messages
+        if message["type"] == "RegisterCommandMessage" and message["props"]["modifier"] is None
+    }
+    client.send("CommandTriggerMessage", uuid=commands[hotkey])
+
+
 def is_ready(client: ViewerClient) -> bool:
     return f"simulated {FRAMES}/{FRAMES} frames" in client.texts()
 
@@ -69,17 +79,53 @@ def test_the_fit_is_kept_while_sliders_move_the_other(sessions: Sessions, run: R
         client.until(lambda: is_fitted(client, "b", fitted))
         client.set("Stop comparing", True)
         client.until(lambda: client.visible["/object/nodes"] is True)
-        client.until(lambda: client.find("Difference colors") == "")
+        client.until(lambda: client.find("Colors of A and B") == "")
 
 
-def test_the_figure_and_the_comparison_take_turns(sessions: Sessions) -> None:
+def test_a_key_compares_with_what_was_kept_last_or_with_the_fit(
+    sessions: Sessions, run: Run
+) -> None:
+    fitted = run.array("sequences/lift/rollout.npy")
+    with watch(sessions) as client:
+        client.until(lambda: is_ready(client) and client.find("Keep as A") != "")
+        rest_at(client, FRAME)
+        # Nothing was changed: both are the fit, and the panel says what to do.
+        press(client, "V")
+        client.until(lambda: "Move a slider to change B" in said(client))
+        client.set("stiffness 10^", -1.5)
+        client.until(lambda: is_done(client) and mean_difference(client) > 0.1)
+        client.until(lambda: is_fitted(client, "a", fitted))
+        changed = nodes(client, "b").copy()
+        client.set("Keep as A", "this rollout")
+        client.until(lambda: "mean 0 mm" in said(client))
+        press(client, "V")
+        client.until(lambda: client.visible.get("/object/nodes") is True)
+        # What was kept is on the screen itself, so that the fit tells more.
+        press(client, "V")
+        client.until(lambda: client.find("Colors of A and B") != "")
+        client.until(lambda: is_fitted(client, "a", fitted))
+        press(client, "V")
+        client.until(lambda: client.find("Colors of A and B") == "")
+        client.set("History", "Reset")
+        press(client, "V")
+        client.until(lambda: client.find("Colors of A and B") != "")
+        client.until(lambda: is_fitted(client, "b", fitted))
+        client.until(lambda: np.allclose(nodes(client, "a"), changed, atol=1e-6))
+
+
+def test_the_figure_and_what_was_kept_take_turns(sessions: Sessions) -> None:
     with watch(sessions) as client:
         client.until(lambda: is_ready(client) and client.find("Keep as A") != "")
         client.set("Keep as A", "the fit")
-        client.until(lambda: client.find("Difference colors") != "")
+        client.until(lambda: "A kept: the fit" in said(client))
         client.set("Compare with PhysTwin", True)
         client.until(lambda: client.find("Back to the scene") != "")
-        client.until(lambda: client.find("Difference colors") == "")
+        client.until(lambda: "A ours: δ 20 mm" in said(client))
+        # The figure is a comparison like any other: its difference is measured and colored.
+        client.until(lambda: f"PhysTwin-style: simulated {FRAMES}/{FRAMES}" in said(client))
+        client.until(lambda: re.search(r"mean [\d.]+ mm", said(client)))
+        client.set("Colors of A and B", "of their difference")
+        client.until(lambda: "≥" in said(client))
         client.set("Keep as A", "the fit")
         client.until(lambda: client.find("Compare with PhysTwin") != "")
-        client.until(lambda: client.find("Difference colors") != "")
+        client.until(lambda: "A kept: the fit" in said(client))

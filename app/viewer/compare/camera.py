@@ -1,4 +1,4 @@
-"""Where the cameras stand while the figure is shown, and how they come back."""
+"""Where the cameras stand while two sides are shown beside each other, and how they come back."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +12,7 @@ from numpy import ndarray
 from app.viewer.content.session_state import Pose
 
 PICTURE_WIDTH = 1_600
-"""Width of an exported picture of the figure in pixels."""
+"""Width of an exported picture of both sides [px]."""
 _PANEL_PIXELS = 345
 _FOV = float(np.deg2rad(14.0))
 
@@ -51,8 +51,8 @@ Box = tuple[Float[ndarray, " 3"], float, float]
 """Middle, width and height of something as it is seen."""
 
 
-class FigureCameras:
-    """Moves the clients' cameras to the figure and back."""
+class ComparisonCameras:
+    """Moves the cameras of the clients to both sides and back."""
 
     def __init__(self) -> None:
         self._poses: dict[int, Pose] = {}
@@ -64,14 +64,14 @@ class FigureCameras:
         pose: Pose,
         box: Box,
     ) -> None:
-        """Move a camera back along its view until the figure fits beside the panel.
+        """Move a camera back along its view until both sides fit beside the panel.
 
-        The lens becomes a long one, so that both halves are seen from nearly the same side.
+        The lens becomes a long one, so that both sides are seen from nearly the same side.
 
         Args:
             client: Whose camera.
             pose: Where it stands, or is about to stand if the client has just come.
-            box: The figure.
+            box: Both sides as they are seen.
         """
         camera = client.camera
         self._poses.setdefault(client.client_id, pose)
@@ -89,9 +89,9 @@ class FigureCameras:
             camera.position, camera.look_at = place, center + aside
 
     def has_lost(self, client: viser.ClientHandle) -> bool:
-        """Tell whether a camera that was aimed no longer shows the figure, and no user did that.
+        """Tell whether a camera that was aimed no longer shows both sides, and no user did that.
 
-        A browser may hear where its first camera stands after it was told to look at the figure;
+        A browser may hear where its first camera stands after it was told to look at both sides;
         and the window may have got another size.
         """
         aim, before = self._aims.get(client.client_id), self._poses.get(client.client_id)
@@ -105,7 +105,7 @@ class FigureCameras:
         return all(float(np.linalg.norm(gap)) < near for gap in gaps)
 
     def before(self, client: viser.ClientHandle) -> Pose:
-        """Find where a camera stands, or stood before it was moved to the figure."""
+        """Find where a camera stands, or stood before it was moved to both sides."""
         return self._poses.get(client.client_id) or Pose.of(client.camera)
 
     def forget(self, client: viser.ClientHandle) -> Pose:
@@ -127,14 +127,14 @@ class FigureCameras:
         self._aims.clear()
 
 
-def picture_of_figure(client: viser.ClientHandle, box: Box) -> dict[str, Any]:
-    """Find camera and size of a picture of the figure as a client sees it beside the panel.
+def picture_of_both(client: viser.ClientHandle, box: Box) -> dict[str, Any]:
+    """Find camera and size of a picture of both sides as a client sees it beside the panel.
 
     What is empty above and below is cut off evenly, so that the middle stays.
 
     Args:
         client: Who looks.
-        box: The figure.
+        box: Both sides as they are seen.
 
     Returns:
         Arguments of viser's ``get_render``.
