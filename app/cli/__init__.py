@@ -1,87 +1,61 @@
-"""The `physhandi` command: parses, calls, prints; the only module that prints."""
+"""The `physhandi` command: functions become subcommands, and every failure is one clear line."""
 
-import json
 import logging
 import sys
-from collections.abc import Callable
-from typing import Any, TypeVar
 
 import tyro
+from tyro.extras import SubcommandApp
 
-from app.cli import commands, doctor, speed
-from app.cli.arguments import (
-    Benchmark,
-    Command,
-    Evaluate,
-    EvaluateHands,
-    EvaluateSuite,
-    Export,
-    Import,
-    Reconstruct,
-    Serve,
-    Simulate,
-    Synthesize,
-)
+from app.cli import benchmark, recordings, runs, serving
 from app.cli.suite import evaluate_suite
 from physhandi.errors import PhysHandiError, UsageError, describe
-from physhandi.progress import Progress, watched
-
-Result = TypeVar("Result")
 
 
-def _watched(work: Callable[[Progress], Result]) -> Result:
-    with watched(True) as progress:
-        return work(progress)
-
-
-def _show(result: Any, *, as_json: bool = False) -> None:
-    if as_json:
-        print(json.dumps(commands.as_json_data(result), indent=2, ensure_ascii=False))
-        return
-    for line in commands.lines(result):
-        print(line)
-
-
-_WATCHED: dict[type, Callable[[Any, Progress], dict[str, Any]]] = {
-    Reconstruct: commands.reconstruct,
-    Simulate: commands.simulate,
-    Synthesize: commands.make_sequence,
-}
-
-
-def _dispatch(command: Any) -> int:
-    match command:
-        case Serve():
-            commands.serve(command, on_ready=lambda url: print(url, flush=True))
-        case Reconstruct() | Simulate() | Synthesize():
-            work = _WATCHED[type(command)]
-            _show(_watched(lambda progress: work(command, progress)))
-        case Evaluate(what=EvaluateHands() as what):
-            _show(commands.evaluate_hands(what), as_json=what.json)
-        case Evaluate(what=EvaluateSuite() as what):
-            found = _watched(lambda progress: evaluate_suite(what, progress))
-            _show(found, as_json=what.json)
-        case Evaluate(what=what):
-            _show(commands.evaluate_run(what), as_json=what.json)
-        case Import(source=source):
-            _show(_watched(lambda progress: commands.import_foreign(source, progress)))
-        case Export():
-            print(commands.export(command))
-        case Benchmark(what=what):
-            _show(speed.measure(what), as_json=what.json)
-        case _:
-            healthy, lines = doctor.examine(command.data_dir)
-            print("\n".join(lines))
-            return 0 if healthy else 1
-    return 0
+def build() -> SubcommandApp:
+    """Make the tree of commands; their docstrings and types are the help text."""
+    imports = SubcommandApp()
+    imports.command(name="stereo")(recordings.import_stereo)
+    imports.command(name="mocap")(recordings.import_mocap)
+    imports.command(name="phystwin")(recordings.import_phystwin)
+    imports.command(name="mano")(recordings.import_mano)
+    evaluate = SubcommandApp()
+    evaluate.command(name="run")(runs.evaluate_run)
+    evaluate.command(name="hands")(runs.evaluate_hands)
+    evaluate.command(name="suite")(evaluate_suite)
+    benchmarks = SubcommandApp()
+    for measure in (
+        benchmark.rollout,
+        benchmark.gradient,
+        benchmark.batch,
+        benchmark.scaling,
+        benchmark.substeps,
+        benchmark.live,
+        benchmark.viewer,
+    ):
+        benchmarks.command(measure)
+    app = SubcommandApp()
+    app.command(serving.serve)
+    app.command(runs.reconstruct)
+    app.command(runs.simulate)
+    app.command(evaluate, name="evaluate", help="Measure results.")
+    app.command(recordings.synthesize)
+    app.command(
+        imports,
+        name="import",
+        help="Turn a recording, a result or a hand model of another format into ours.",
+    )
+    app.command(runs.export)
+    app.command(recordings.check)
+    app.command(benchmarks, name="benchmark", help="Measure speed; see docs/benchmarks.")
+    app.command(serving.doctor)
+    return app
 
 
 def main(argv: list[str] | None = None) -> None:
     """Run the command line and exit: 0 done, 1 failed with one clear line, 2 bad usage."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
-    command = tyro.cli(Command, prog="physhandi", args=argv, config=(tyro.conf.OmitArgPrefixes,))  # type: ignore[call-overload]  # tyro types a union of subcommands loosely
     try:
-        code = _dispatch(command)
+        code = build().cli(prog="physhandi", args=argv, config=(tyro.conf.OmitArgPrefixes,)) or 0
     except UsageError as error:
         print(f"physhandi: {error}", file=sys.stderr)
         code = 2

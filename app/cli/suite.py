@@ -1,28 +1,66 @@
-"""`physhandi evaluate suite`: find or make sequences, and compare methods on them."""
+"""`physhandi evaluate suite`: finds or makes sequences, and has methods compared."""
 
 import hashlib
 import shlex
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from functools import partial
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Literal
 
-from app.cli.commands import find_sequence, read_settings
+from tyro.conf import arg
+
+from app.cli.lookup import find_sequence, read_settings
+from app.cli.output import AsJson, DataDir, Device, show
 from physhandi.data.sequence import Sequence
 from physhandi.devices import pick_device
 from physhandi.errors import UsageError
-from physhandi.progress import Progress
+from physhandi.progress import watched
+
+_OF_SUITE = arg(help_behavior_hint="(default: the suite's)")
 
 
-def evaluate_suite(command: Any, progress: Progress) -> dict[str, Any]:
-    """Compare methods on the sequences of a suite, or on named ones.
+def evaluate_suite(
+    *,
+    suite: Annotated[
+        Literal["tiny", "dev", "full"] | None, arg(help_behavior_hint="(default: tiny)")
+    ] = None,
+    methods: Annotated[tuple[str, ...], _OF_SUITE] = (),
+    seeds: Annotated[tuple[int, ...], _OF_SUITE] = (),
+    protocols: Annotated[
+        tuple[Literal["main", "single_view", "unseen", "robustness", "sensitivity"], ...], _OF_SUITE
+    ] = (),
+    sequences: Annotated[
+        tuple[str, ...], arg(help_behavior_hint="(default: the suite's scenes)")
+    ] = (),
+    out: Path | None = None,
+    jobs: int = 1,
+    device: Device = "auto",
+    as_json: AsJson = False,
+    data_dir: DataDir = None,
+) -> None:
+    """Compare methods on a suite of sequences, and write its tables (docs/evaluation.md).
+
+    Args:
+        suite: Which suite; sequences that are not there yet are made. With `--sequences`, whose
+            effort methods may take: without it their profiles' own.
+        methods: Methods: static, rigid_follow, phystwin, paper, ours, quick, oracle_hand,
+            oracle_parameters, each also as NAME+last_residual or NAME@SETTING=VALUE.
+        seeds: Seeds of every scene. From 1000 on they are reserved for verification.
+        protocols: main is reconstruction and future prediction.
+        sequences: Folders or names of sequences to evaluate in place of the suite's scenes.
+        out: Folder to fill, and to go on with; none takes one of its own in `suites/` of the data
+            folder, whose suites the server shows.
+        jobs: How many sequences and cells are computed side by side, each in a process of its own.
+            Then the times in the table are those of a shared machine.
 
     Raises:
         UsageError: If a method, seed or sequence makes no sense, or the folder holds other data.
     """
     from app.cli.suite_workers import MOST_PROCESSES, SuiteWorkers
-    from physhandi.synthetic.suite.evaluation import Order, evaluate_suite
+    from physhandi.synthetic.suite.evaluation import Order
+    from physhandi.synthetic.suite.evaluation import evaluate_suite as compare
     from physhandi.synthetic.suite.folder import check_folder
     from physhandi.synthetic.suite.methods import method_settings, parse_method
     from physhandi.synthetic.suite.suite import (
@@ -34,49 +72,50 @@ def evaluate_suite(command: Any, progress: Progress) -> dict[str, Any]:
     )
 
     start = time.monotonic()
-    suite = find_suite(command.suite or "tiny")
-    if command.sequences and command.seeds:
+    given = {"methods": methods, "seeds": seeds, "protocols": protocols}
+    chosen = find_suite(suite or "tiny")
+    if sequences and seeds:
         raise UsageError("--seeds belongs to a suite's scenes; leave it out with --sequences.")
-    settings = suite.settings if command.suite or not command.sequences else NAMED_SETTINGS
-    methods = command.methods or suite.methods
+    settings = chosen.settings if suite or not sequences else NAMED_SETTINGS
+    methods = methods or chosen.methods
     for method in methods:  # Tells a wrong one before a sequence is made, which takes long.
         method_settings(parse_method(method), settings)
-    seeds = command.seeds or suite.seeds
+    seeds = seeds or chosen.seeds
     check_seeds(seeds)
-    device = pick_device(command.device)
-    named = [find_sequence(sequence, command.data_dir) for sequence in command.sequences]
-    folders = read_settings(data_dir=command.data_dir).suite_dir
+    device = pick_device(device)
+    named = [find_sequence(name, data_dir) for name in sequences]
+    folders = read_settings(data_dir=data_dir).suite_dir
     if named:
         title, cases = "Named sequences", [sequence.name for sequence in named]
-        out = command.out or folders / _name_for(named)
+        out = out or folders / _name_for(named)
     else:
-        title, cases = f"Suite {suite.name}", [s.name(n) for s in suite.scenes for n in seeds]
-        of_seeds = "" if set(seeds) == set(suite.seeds) else f"-seeds-{_joined(seeds)}"
-        out = command.out or folders / f"{suite.name}{of_seeds}"
+        title, cases = f"Suite {chosen.name}", [s.name(n) for s in chosen.scenes for n in seeds]
+        of_seeds = "" if set(seeds) == set(chosen.seeds) else f"-seeds-{_joined(seeds)}"
+        out = out or folders / f"{chosen.name}{of_seeds}"
     check_folder(out, title, cases)
-    if not 1 <= command.jobs <= MOST_PROCESSES:
-        raise UsageError(f"--jobs {command.jobs} makes no sense; choose 1 to {MOST_PROCESSES}.")
-    with ExitStack() as stack:
-        # Every mistake of the user is reported before they are started.
+    if not 1 <= jobs <= MOST_PROCESSES:
+        raise UsageError(f"--jobs {jobs} makes no sense; choose 1 to {MOST_PROCESSES}.")
+    with watched(True) as progress, ExitStack() as stack:
+        # Everything that a user may have got wrong is told before they are started.
         make, workers = partial(make_one_by_one, progress=progress), None
-        if command.jobs > 1:
-            workers = stack.enter_context(SuiteWorkers(command.jobs, progress))
+        if jobs > 1:
+            workers = stack.enter_context(SuiteWorkers(jobs, progress))
             make = workers.make
         order = Order(
             title=title,
-            recordings=tuple(named) or make_recordings(suite, seeds, out / "sequences", make),
+            recordings=tuple(named) or make_recordings(chosen, seeds, out / "sequences", make),
             methods=methods,
-            protocols=command.protocols or suite.protocols,
+            protocols=protocols or chosen.protocols,
             settings=settings,
             device=device,
-            command=_suite_command(command, device),
-            at_once=command.jobs,
+            command=_command(suite, given, sequences, jobs, device),
+            at_once=jobs,
         )
         for recording in order.recordings:
             recording.validate(reads_color=False)
         fill = None if workers is None else workers.fill(order, out)
-        summary = evaluate_suite(order, out, progress, fill=fill)
-    return summary | {"seconds": round(time.monotonic() - start, 1)}
+        result = compare(order, out, progress, fill=fill)
+    show(result | {"seconds": round(time.monotonic() - start, 1)}, as_json=as_json)
 
 
 def _name_for(sequences: list[Sequence]) -> str:
@@ -92,13 +131,18 @@ def _joined(seeds: Iterable[int]) -> str:
     return text if len(text) <= 32 else hashlib.sha256(text.encode()).hexdigest()[:8]
 
 
-def _suite_command(command: Any, device: str) -> str:
+def _command(
+    suite: str | None,
+    given: Mapping[str, tuple[object, ...]],
+    sequences: tuple[str, ...],
+    jobs: int,
+    device: str,
+) -> str:
     """Write the command again, with all that decides the result."""
     parts = ["physhandi", "evaluate", "suite"]
-    if command.suite or not command.sequences:
-        parts += ["--suite", command.suite or "tiny"]
-    for name in ("methods", "seeds", "protocols", "sequences"):
-        given = getattr(command, name)
-        parts += [f"--{name}", *(str(value) for value in given)] if given else []
-    parts += ["--jobs", str(command.jobs)] if command.jobs > 1 else []
+    if suite or not sequences:
+        parts += ["--suite", suite or "tiny"]
+    for name, values in (*given.items(), ("sequences", sequences)):
+        parts += [f"--{name}", *(str(value) for value in values)] if values else []
+    parts += ["--jobs", str(jobs)] if jobs > 1 else []
     return shlex.join([*parts, "--device", device])

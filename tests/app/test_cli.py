@@ -11,7 +11,7 @@ from server_world import tiny_config
 from sheet_sequence import FRAMES, NODE
 
 from app import cli
-from app.cli import commands
+from app.cli import runs
 from physhandi import pipeline
 from physhandi.fitting.artefacts import load_model, load_parameters
 from physhandi.fitting.config import PipelineConfig
@@ -60,7 +60,7 @@ def terminal(
 def quick(monkeypatch: pytest.MonkeyPatch) -> PipelineConfig:
     """Make the quick profile quicker."""
     config = tiny_config()
-    monkeypatch.setattr(commands, "load_profile", lambda _: config)
+    monkeypatch.setattr(runs, "load_profile", lambda _: config)
     return config
 
 
@@ -71,7 +71,6 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> PipelineConfig:
         [],
         ["export", "fitted", "--format", "pkl", "--out", "x"],
         ["export", "fitted", "--format", "npz"],
-        ["reconstruct", "sheet"],
         ["simulate", "fitted", "--out", "x", "--drag", "much"],
         ["simulate", "fitted", "--out", "x", "--substeps-per-frame", "few"],
         ["serve", "--port", "many"],
@@ -97,13 +96,14 @@ def test_help_names_every_command_and_exits_with_0(terminal: Terminal) -> None:
         "synthesize",
         "import",
         "export",
+        "check",
         "benchmark",
         "doctor",
     ):
         assert command in terminal.out
     assert terminal("simulate", "--help") == 0
     assert "--connection-radius" in terminal.out
-    assert "δ of object springs" in terminal.out
+    assert "δ: object nodes nearer than this get a spring" in terminal.out
 
 
 def test_the_doctor_finds_all_well(terminal: Terminal) -> None:
@@ -312,3 +312,44 @@ def test_the_environment_speaks_where_the_arguments_are_silent(
     line = terminal.refused(2, "serve")
     assert "token" in line
     assert "short'" not in line
+
+
+def test_runs_go_to_the_data_folder_unless_told_otherwise(
+    terminal: Terminal, quick: PipelineConfig
+) -> None:
+    data = ("--device", "cpu", "--data-dir", terminal.data_dir)
+    assert terminal("reconstruct", "sheet", *data, "--set", "node_spacing=0.02") == 0
+    (line,) = (line for line in terminal.out.splitlines() if line.startswith("run: "))
+    run = Run.open(line.removeprefix("run: "))
+    assert run.folder.parent == terminal.data_dir.resolve() / "runs"
+    assert run.config["profile"]["node_spacing"] == 0.02
+    assert run.config["overrides"] == {"node_spacing": 0.02}
+    assert run.name.startswith("sheet · ")
+    assert terminal("simulate", run.id, *data, "--drag", 2) == 0
+    assert "None" not in terminal.out
+    (line,) = (line for line in terminal.out.splitlines() if line.startswith("run: "))
+    assert Run.open(line.removeprefix("run: ")).config["parameters"] == {"drag": 2.0}
+
+
+def test_a_setting_or_profile_that_is_wrong_is_refused_before_a_run_is_made(
+    terminal: Terminal, tmp_path: Path
+) -> None:
+    own = tmp_path / "my.yaml"
+    own.write_text("base: quick\nnode_spacing: -1\n")
+    order = ("reconstruct", "sheet", "--device", "cpu", "--out", "x")
+    assert "node_spacing" in terminal.refused(2, *order, "--profile", own)
+    assert "PATH=VALUE" in terminal.refused(2, *order, "--set", "node_spacing")
+    assert "node_spacin" in terminal.refused(2, *order, "--set", "node_spacin=0.02")
+    assert not Path("x").exists()
+
+
+def test_sequences_are_checked_file_by_file(terminal: Terminal) -> None:
+    assert terminal("check", "sheet", "towel_fold", "--json") == 0
+    reports = json.loads(terminal.out)
+    assert reports["sheet"]["hands"] == "not in it"
+    assert reports["towel_fold"]["hands"] == reports["towel_fold"]["object"]
+    marker = terminal.data_dir / "sequences" / "sheet" / "marker.npy"
+    marker.write_bytes(marker.read_bytes()[:-8])
+    assert terminal("check", "sheet", "towel_fold") == 1
+    assert "marker.npy" in terminal.out
+    assert "at least one sequence" in terminal.refused(2, "check")

@@ -10,7 +10,7 @@ from server_world import fit_sheet, tiny_config
 from shared_live import live_process as live_process
 from sheet_sequence import write_sheet
 
-from app.cli import commands
+from app.cli import runs
 
 Copy = Callable[[], Path]
 
@@ -54,6 +54,6 @@ def terminal(
 ) -> Terminal:
     """The command line in a folder of its own, with a quick profile made quicker."""
     config = tiny_config()
-    monkeypatch.setattr(commands, "load_profile", lambda _: config)
+    monkeypatch.setattr(runs, "load_profile", lambda _: config)
     monkeypatch.chdir(tmp_path)
     return Terminal(tmp_path, capsys)

@@ -16,7 +16,7 @@ from property_tests import SAME_EVERYWHERE
 from server_world import make_world
 from starlette.testclient import TestClient
 
-from app.cli.commands import OVERRIDES
+from app.cli.runs import OVERRIDES
 from physhandi import pipeline
 from physhandi.data.sequence import Sequence
 from physhandi.errors import FitError, RunError, SequenceError, UsageError

@@ -24,7 +24,7 @@ from bad_input_world import (
 )
 from server_world import tiny_config
 
-from app.cli import commands
+from app.cli import runs
 
 DEPTH, MASK, VIDEO, KEYPOINT = (
     f"views/front/{part}"
@@ -280,7 +280,7 @@ def test_a_fit_with_mano_needs_a_whole_one(
 ) -> None:
     config = tiny_config()
     config = config.replace(hand=config.hand.replace(model="mano"))
-    monkeypatch.setattr(commands, "load_profile", lambda _: config)
+    monkeypatch.setattr(runs, "load_profile", lambda _: config)
     monkeypatch.setenv("PHYSHANDI_HANDS", str(terminal.folder))
     case.damage(terminal.folder)
     order = ("reconstruct", filmed, "--out", "out", "--device", "cpu")

@@ -1,18 +1,45 @@
-"""Checks that this machine can run the demo."""
+"""`physhandi serve`, and `physhandi doctor`, which checks that this machine can run the demo."""
 
 import shutil
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from app.cli.commands import open_catalog, read_settings
+from app.cli.lookup import open_catalog, read_settings
+from app.cli.output import DataDir
 from physhandi.devices import pick_device
 
 
-def examine(data_dir: Path | None) -> tuple[bool, list[str]]:
-    """Check what the demo needs; returns whether all is well and what was found."""
+def serve(
+    *,
+    host: str | None = None,
+    port: int | None = None,
+    data_dir: DataDir = None,
+    device: str | None = None,
+    demo: bool = False,
+) -> None:
+    """Serve the application and print the address to open, until interrupted.
+
+    Args:
+        host: Address to listen on; others reach anything but loopback (PHYSHANDI_HOST, else
+            127.0.0.1).
+        port: Port to listen on; 0 takes a free one (PHYSHANDI_PORT, else 8080).
+        device: Warp device: auto, cpu or cuda:0 (PHYSHANDI_DEVICE, else auto).
+        demo: Also queue a quick fit of the bundled sequence.
+    """
+    from app.server import serve as serve_application
+
+    settings = read_settings(host=host, port=port, data_dir=data_dir, device=device)
+    named = settings.device if "device" in settings.model_fields_set else "auto"
+    settings = settings.model_copy(update={"device": pick_device(named)})
+    serve_application(settings, on_ready=lambda url: print(url, flush=True), queue_demo=demo)
+
+
+def doctor(*, data_dir: DataDir = None) -> int:
+    """Check that this machine can run the demo."""
     checks = [_check(name, probe) for name, probe in _probes(data_dir)]
-    return all(ok for ok, _ in checks), [line for _, line in checks]
+    print("\n".join(line for _, line in checks))
+    return 0 if all(ok for ok, _ in checks) else 1
 
 
 def _check(name: str, probe: Callable[[], str]) -> tuple[bool, str]:

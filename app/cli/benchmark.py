@@ -1,0 +1,198 @@
+"""Commands that measure speed; see docs/benchmarks."""
+
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from app.benchmarks.parts import PARTS, Part
+from app.cli.lookup import find_result, sequence_of
+from app.cli.output import AsJson, DataDir, Device, show
+from physhandi.devices import pick_device
+
+NodeCount = Annotated[int, arg(name="nodes", help="Object nodes of a made-up block.")]
+Topology = Annotated[
+    Path | None,
+    arg(
+        help="An .npz with position, spring_nodes, rest_length and stiffness to measure instead.",
+    ),
+]
+FrameCount = Annotated[int, arg(name="frames", help="Frames of a rollout.")]
+RunName = Positional[Annotated[str, arg(help="Folder or id of a finished run with an object.")]]
+OfRun = Annotated[str | None, arg(help="One of its sequences; none takes the first one.")]
+
+
+def rollout(
+    *,
+    device: Device = "auto",
+    node_count: NodeCount = 1000,
+    topology: Topology = None,
+    frame_count: FrameCount = 10,
+    as_json: AsJson = False,
+) -> None:
+    """Time simulated frames, beside a simulator built as PhysTwin's is."""
+    from physhandi.benchmarks.rollout import benchmark_rollout
+
+    result = benchmark_rollout(
+        device=pick_device(device),
+        node_count=node_count,
+        topology=topology,
+        frame_count=frame_count,
+    )
+    show(result, as_json=as_json)
+
+
+def gradient(
+    *,
+    device: Device = "auto",
+    node_count: NodeCount = 1000,
+    topology: Topology = None,
+    frame_count: FrameCount = 10,
+    as_json: AsJson = False,
+) -> None:
+    """Time simulated frames and their gradient, beside PhysTwin's way."""
+    from physhandi.benchmarks.gradient import benchmark_gradient
+
+    result = benchmark_gradient(
+        device=pick_device(device),
+        node_count=node_count,
+        topology=topology,
+        frame_count=frame_count,
+    )
+    show(result, as_json=as_json)
+
+
+def batch(
+    *,
+    device: Device = "auto",
+    node_count: NodeCount = 1000,
+    topology: Topology = None,
+    frame_count: FrameCount = 10,
+    candidates: int = 64,
+    as_json: AsJson = False,
+) -> None:
+    """Time many candidates at once, beside one by one.
+
+    Args:
+        candidates: Candidates of the batch.
+    """
+    from physhandi.benchmarks.batch import benchmark_batch
+
+    result = benchmark_batch(
+        device=pick_device(device),
+        node_count=node_count,
+        topology=topology,
+        frame_count=frame_count,
+        candidate_count=candidates,
+    )
+    show(result, as_json=as_json)
+
+
+def scaling(
+    *,
+    device: Device = "auto",
+    nodes: tuple[int, ...] = (500, 1000, 3000, 10_000, 50_000),
+    springs_at_node: tuple[int, ...] = (9, 18, 57),
+    frame_count: Annotated[int, arg(name="frames", help="Frames of a rollout.")] = 3,
+    time_limit_s: float = 300.0,
+    as_json: AsJson = False,
+) -> None:
+    """Time blocks of many sizes, and fit how the time grows.
+
+    Args:
+        nodes: Object nodes of the blocks.
+        springs_at_node: Springs that end at a node on average.
+        time_limit_s: Blocks that would take longer than this in all are left out [s].
+    """
+    from physhandi.benchmarks.scaling import benchmark_scaling
+
+    result = benchmark_scaling(
+        device=pick_device(device),
+        node_counts=nodes,
+        springs_at_node=springs_at_node,
+        frame_count=frame_count,
+        time_limit_s=time_limit_s,
+    )
+    show(result, as_json=as_json)
+
+
+def substeps(
+    run: RunName = "towel_fold_quick",
+    *,
+    sequence: OfRun = None,
+    substeps: tuple[int, ...] = (),
+    device: Device = "auto",
+    as_json: AsJson = False,
+    data_dir: DataDir = None,
+) -> None:
+    """Compare a run's motion with automatic substeps with that of the reference's 667.
+
+    Args:
+        substeps: More numbers of substeps to compare.
+    """
+    from physhandi.benchmarks.substeps import benchmark_substeps
+    from physhandi.fitting import artefacts
+
+    device = pick_device(device)
+    finished = find_result(run, data_dir)
+    name = sequence_of(finished, sequence)
+    result = benchmark_substeps(
+        artefacts.load_model(finished.out, name),
+        artefacts.load_parameters(finished.out),
+        finished.array(f"{artefacts.sequence_folder(name)}/control.npy"),
+        name=f"{finished.id}: {name}",
+        device=device,
+        substeps=substeps,
+    )
+    show(result, as_json=as_json)
+
+
+def live(
+    run: RunName = "towel_fold_quick",
+    *,
+    sequence: OfRun = None,
+    device: Device = "auto",
+    as_json: AsJson = False,
+    data_dir: DataDir = None,
+) -> None:
+    """Time from a slider to the first new frame, in the viewer's simulation process."""
+    from app.benchmarks.latency import measure_latency
+
+    device = pick_device(device)
+    finished = find_result(run, data_dir)
+    show(measure_latency(finished, sequence_of(finished, sequence), device=device), as_json=as_json)
+
+
+def viewer(
+    run: RunName = "towel_fold_quick",
+    *,
+    parts: tuple[Part, ...] = (),
+    quick: bool = False,
+    as_json: AsJson = False,
+    data_dir: DataDir = None,
+) -> None:
+    """Measure the real server, its pages and live scenes, with clients and a real browser.
+
+    It starts a server of its own on a free loopback port, with a data folder of its own. The JSON
+    says for each figure its `value`, its `goal` and whether it is `reached` (`figures`), beside
+    `load_average` before and after, and what each part found:
+    paint: first paint of the home page in new browser profiles (p50_ms, p95_ms, worst_ms);
+    scrub: timeline slider to the message with that frame's nodes;
+    slider: slider message to the first node positions of the new rollout, at a websocket client;
+    browser: mouse press on a slider to the first new frame drawn (arrived_…: received);
+    start: the first slider move after the server's start (first_move_ms), also with nothing
+    compiled (nothing_compiled), and whether the panel said that it was starting (is_start_shown);
+    bytes: size of a playing frame of 2 hands, 3,000 nodes and 300 arrows (frame_bytes);
+    sessions: ten such scenes at once (worst_frames_per_s, worst_skipped_per_s, server_cpu_share);
+    runs: home page and list of 1,000 runs;
+    live: frames simulated in a second with automatic substeps (frames_per_s).
+
+    Args:
+        parts: What to measure; none measures everything.
+        quick: Repeat everything less often.
+    """
+    from app.benchmarks.viewer import measure_viewer
+
+    finished = find_result(run, data_dir)
+    name = finished.sequence_names[0]
+    show(measure_viewer(finished, name, parts=parts or PARTS, is_quick=quick), as_json=as_json)

@@ -1,0 +1,94 @@
+"""Finding what a command names: settings, sequences and runs."""
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from app.jobs.catalog import Catalog
+from app.settings import Settings
+from physhandi.data.sequence import Sequence
+from physhandi.errors import RunError, UsageError
+from physhandi.run import Run
+
+
+def read_settings(**given: Any) -> Settings:
+    """Read the settings; where an argument is None, the environment speaks, then the default.
+
+    Raises:
+        UsageError: If a value is out of range; names it.
+    """
+    try:
+        return Settings(**{name: value for name, value in given.items() if value is not None})
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "settings"
+        raise UsageError(f"{where}: {first['msg']}.") from None
+
+
+def open_catalog(data_dir: Path | None) -> Catalog:
+    """Find sequences and runs in a data folder and among the bundled ones."""
+    return Catalog(read_settings(data_dir=data_dir))
+
+
+def find_sequence(name: str, data_dir: Path | None) -> Sequence:
+    """Open a sequence by folder or by name.
+
+    Raises:
+        UsageError: If there is no such sequence.
+        SequenceError: If it breaks the format.
+    """
+    if (Path(name) / "sequence.yaml").is_file():
+        return Sequence.load(Path(name))
+    catalog = open_catalog(data_dir)
+    names = [entry.id for entry in catalog.sequences()]
+    if name not in names:
+        raise UsageError(
+            f"'{name}' is neither a folder with a sequence.yaml nor a known sequence. "
+            f"Known are: {', '.join(names) or 'none'}."
+        )
+    return catalog.sequence(name)
+
+
+def find_run(name: str, data_dir: Path | None) -> Run:
+    """Open a run by folder or by id.
+
+    Raises:
+        RunError: If there is no such run.
+    """
+    if (Path(name) / "run.yaml").is_file():
+        return Run.open(Path(name))
+    catalog = open_catalog(data_dir)
+    ids = [entry.id for entry in catalog.runs()]
+    if name not in ids:
+        raise RunError(
+            f"'{name}' is neither a run folder nor a known run. "
+            f"Known are: {', '.join(ids) or 'none'}."
+        )
+    return catalog.run(name)
+
+
+def find_result(name: str, data_dir: Path | None) -> Run:
+    """Open a finished run whose files are all as they were published.
+
+    Raises:
+        RunError: If there is no such run, it is not finished, or a file is missing or changed.
+    """
+    run = find_run(name, data_dir)
+    run.verify(allows_more=True)
+    return run
+
+
+def sequence_of(run: Run, name: str | None) -> str:
+    """Choose a sequence of a run; its first one if none is named.
+
+    Raises:
+        UsageError: If the run has no such sequence.
+    """
+    if name is None:
+        return run.sequence_names[0]
+    if name not in run.sequence_names:
+        raise UsageError(
+            f"Run '{run.id}' has no sequence '{name}', but {', '.join(run.sequence_names)}."
+        )
+    return name

@@ -1,0 +1,45 @@
+"""What commands print: results as lines or JSON, and options that several commands share."""
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, cast
+
+from tyro.conf import arg
+
+from physhandi.data.files import plain, without_non_finite
+
+DataDir = Annotated[
+    Path | None,
+    arg(help="Folder with `sequences/` and `runs/` (PHYSHANDI_DATA_DIR, else `data`)."),
+]
+Device = Annotated[str, arg(help="Warp device: auto, cpu, cuda or cuda:0.")]
+AsJson = Annotated[bool, arg(name="json", help="Print JSON instead of lines.")]
+
+
+def show(result: Mapping[str, Any], *, as_json: bool = False) -> None:
+    """Print a result for people or, as JSON, for programs; NaN and infinity are null there."""
+    if as_json:
+        data = without_non_finite(plain(result))
+        print(json.dumps(data, indent=2, ensure_ascii=False))
+        return
+    for line in lines(result):
+        print(line)
+
+
+def lines(result: Mapping[str, Any], indent: int = 0) -> Iterator[str]:
+    """Lay nested results out for reading; what has no value is left out."""
+    start = "  " * indent
+    for key, value in result.items():
+        if value is None:
+            continue
+        if isinstance(value, Mapping):
+            below = list(lines(cast("Mapping[str, Any]", value), indent + 1))
+            if below:
+                yield f"{start}{key}:"
+                yield from below
+        elif isinstance(value, list | tuple):
+            yield f"{start}{key}:"
+            yield from (f"{start}  {item}" for item in cast("list[object]", value))
+        else:
+            yield f"{start}{key}: {f'{value:.6g}' if isinstance(value, float) else value}"

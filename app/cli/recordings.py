@@ -1,0 +1,267 @@
+"""Commands that make, import and check sequences."""
+
+import shutil
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+from app.cli.lookup import find_sequence
+from app.cli.output import AsJson, DataDir, Device, show
+from physhandi.data.sequence import Sequence
+from physhandi.devices import pick_device
+from physhandi.errors import PhysHandiError, UsageError
+from physhandi.progress import watched
+
+
+def check(
+    sequences: Positional[tuple[str, ...]], *, as_json: AsJson = False, data_dir: DataDir = None
+) -> int:
+    """Read every file of sequences, and say what each of them can be used for.
+
+    Args:
+        sequences: Folders or names of sequences.
+    """
+    if not sequences:
+        raise UsageError("Name at least one sequence to check.")
+    reports: dict[str, dict[str, Any]] = {}
+    for name in sequences:
+        try:
+            sequence = find_sequence(name, data_dir)
+            sequence.validate()
+        except PhysHandiError as error:
+            reports[name] = {"error": str(error)}
+            continue
+        hands, control = bool(sequence.hands), sequence.control is not None
+        object_parts = sequence.missing("marker") and sequence.missing("depth", "mask")
+        mover = [] if hands or control else ["hands or control"]
+        reports[name] = {
+            "folder": str(sequence.folder),
+            "frames": sequence.frame_count,
+            "frame_rate": sequence.frame_rate,
+            "views": len(sequence.views),
+            "hands": "can be reconstructed" if hands else "not in it",
+            "object": f"lacks {', '.join([*object_parts, *mover])}"
+            if object_parts or mover
+            else "can be reconstructed",
+        }
+    show(reports, as_json=as_json)
+    return 1 if any("error" in report for report in reports.values()) else 0
+
+
+def synthesize(
+    *,
+    object_: Annotated[str, arg(name="object")],
+    action: str,
+    out: Path,
+    seed: int = 0,
+    preset: str = "default",
+    change: tuple[str, ...] = (),
+    cameras: int = 3,
+    frames: int = 90,
+    hold: Literal["friction", "attachment"] = "friction",
+    images: Literal["all", "none"] = "all",
+    resolution: Literal["fine", "tiny"] = "fine",
+    overwrite: bool = False,
+) -> None:
+    """Make a sequence: hands handle a soft body in MuJoCo, and made-up cameras film it.
+
+    Args:
+        object_: What is handled: cloth, towel, rope, plush or pouch.
+        action: What is done with it: lift, fold, stretch, squeeze, wipe or push.
+        out: Sequence folder to write.
+        seed: Decides size and material, motion, cameras and errors; from 1000 on for verification
+            only.
+        preset: How imperfect sensors and detectors are: clean, default, hard or paper.
+        change: Levels that differ from the preset's, like depth_noise=0.1 (docs/synthhdi.md lists
+            them).
+        cameras: Number of cameras, 1 to 4.
+        frames: Number of frames, 30 a second.
+        hold: Hands hold by friction alone, or what they have touched for 0.1 s sticks to them.
+        images: none writes lifted tracks instead of color, depth and masks: small, and made in
+            seconds.
+        resolution: How many nodes the simulated body has.
+        overwrite: Replace a sequence that is there.
+    """
+    from physhandi.synthetic.synthesize import synthesize as make
+
+    with watched(True) as progress:
+        sequence = make(
+            object_,
+            action=action,
+            out=out,
+            seed=seed,
+            preset=preset,
+            changes=dict(_level(text) for text in change),
+            cameras=cameras,
+            frames=frames,
+            hold=hold,
+            images=images,
+            resolution=resolution,
+            overwrite=overwrite,
+            progress=progress,
+        )
+    show({"sequence": str(sequence.folder), "description": sequence.description})
+
+
+def _level(text: str) -> tuple[str, float]:
+    name, equals, value = text.partition("=")
+    try:
+        return name.strip(), float(value if equals else "")
+    except ValueError:
+        raise UsageError(
+            f"--change {text!r} does not set a level; write it like depth_noise=0.1."
+        ) from None
+
+
+def import_stereo(
+    source: Positional[Path],
+    *,
+    out: Path,
+    hands: tuple[Literal["right", "left"], ...] = ("right",),
+    origin: str = "",
+    licence: str = "",
+    overwrite: bool = False,
+) -> None:
+    """Two calibrated videos of a hand (cam0_test.mp4, c0.dat, rot_trans_c0.dat, …).
+
+    Args:
+        source: Folder of the recording.
+        out: Sequence folder to write.
+        hands: Hands that the recording shows: right, left or both.
+        origin: Who recorded it and where it was published; kept with the sequence.
+        licence: Licence of the recording; kept with the sequence.
+        overwrite: Replace a sequence that is there.
+    """
+    from physhandi.data.importers.stereo import import_stereo as convert
+
+    with watched(True) as progress:
+        sequence = convert(
+            source,
+            out,
+            progress,
+            hands=hands,
+            origin=origin,
+            licence=licence,
+            overwrite=overwrite,
+        )
+    show({"sequence": str(sequence.folder)})
+
+
+def import_mocap(
+    source: Positional[Path],
+    *,
+    out: Path,
+    controlled_markers: tuple[int, ...] = (0, 1, 11, 12),
+    recording_rate: float = 100.0,
+    frame_rate: float = 30.0,
+    nodes_per_segment: int = 4,
+    node_spacing: float | None = None,
+    rest_shape: Literal["straight", "first_frame"] = "straight",
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z",
+    unit: Literal["m", "cm", "mm", "in"] = "m",
+    overwrite: bool = False,
+) -> None:
+    """Motion capture of a rope held by two grippers (one .npy per trajectory).
+
+    Args:
+        source: A trajectory (frame, marker, 3), markers in order along the rope; or a folder of
+            them.
+        out: Folder to write one sequence per trajectory into.
+        controlled_markers: Markers that sit on the grippers, counted from 0.
+        recording_rate: Frames per second of the recording.
+        frame_rate: Frames per second of the sequences.
+        nodes_per_segment: Object nodes from one marker to the next.
+        node_spacing: Distance between nodes [m], in the place of --nodes-per-segment.
+        rest_shape: Shape without tension: straight with median segment lengths, or as in the first
+            frame.
+        up: Axis of the recording that points up.
+        unit: Length unit of the recording.
+        overwrite: Replace sequences that are there.
+    """
+    from physhandi.data.importers.mocap import import_mocap as convert
+
+    with watched(True) as progress:
+        sequences = convert(
+            source,
+            out,
+            progress,
+            controlled_markers=controlled_markers,
+            recording_rate=recording_rate,
+            frame_rate=frame_rate,
+            nodes_per_segment=nodes_per_segment,
+            node_spacing=node_spacing,
+            rest_shape=rest_shape,
+            up=up,
+            unit=unit,
+            overwrite=overwrite,
+        )
+    show({"sequences": [str(sequence.folder) for sequence in sequences]})
+
+
+def import_phystwin(
+    source: Positional[Path],
+    *,
+    out: Path,
+    optimal_params: Path | None = None,
+    checkpoint: Path | None = None,
+    inference: Path | None = None,
+    keep_decimals: bool = False,
+    run: Path | None = None,
+    device: Device = "auto",
+) -> None:
+    """A case of the PhysTwin data set, and what PhysTwin made of it.
+
+    Args:
+        source: Case folder (calibrate.pkl, metadata.json, final_data.pkl, color/, depth/, mask/,
+            …).
+        out: Sequence folder to write.
+        optimal_params: optimal_params.pkl of PhysTwin's search; makes a run of it.
+        checkpoint: best_*.pth of PhysTwin's training, with per-spring stiffness; needs
+            --optimal-params.
+        inference: inference.pkl, PhysTwin's own rollout; the report says how far ours is from it.
+        keep_decimals: Keep the decimals of dashpot and drag, which PhysTwin drops after its search.
+        run: Run folder to write; none takes the sequence folder's name with _phystwin after it.
+    """
+    from physhandi.data.importers.phystwin import import_phystwin as convert
+    from physhandi.fitting.phystwin_run import import_phystwin_run
+
+    if optimal_params is None and (checkpoint or inference or run):
+        raise UsageError(
+            "--checkpoint, --inference and --run need --optimal-params: a checkpoint holds no "
+            "topology, which is built again from optimal_params.pkl."
+        )
+    with watched(True) as progress:
+        folder = convert(source, out, progress)
+        if optimal_params is None:
+            show({"sequence": str(folder)})
+            return
+        try:
+            filled = import_phystwin_run(
+                Sequence.load(folder),
+                optimal_params,
+                checkpoint,
+                run or folder.with_name(f"{folder.name}_phystwin"),
+                device=pick_device(device),
+                inference=inference,
+                truncates_damping=False if keep_decimals else None,
+                progress=progress,
+            )
+        except BaseException:
+            shutil.rmtree(folder)  # All or nothing, so that the same command can be given again.
+            raise
+    show({"sequence": str(folder), "run": str(filled.folder), **filled.json("import.json")})
+
+
+def import_mano(sources: Positional[tuple[Path, ...]], *, out: Path | None = None) -> None:
+    """MANO hand models that you have downloaded under their own licence.
+
+    Args:
+        sources: MANO_LEFT.pkl, MANO_RIGHT.pkl or both.
+        out: Folder of hand models (PHYSHANDI_HANDS, else ~/.local/share/physhandi/hands).
+    """
+    from physhandi.data.importers.mano import import_mano as convert
+    from physhandi.hand.mano import hands_folder
+
+    folder = out or hands_folder()
+    show({"hands": [str(convert(path, folder)) for path in sources]})

@@ -1,0 +1,270 @@
+"""Commands that fill, measure and export runs."""
+
+from collections.abc import Mapping
+from dataclasses import make_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
+
+from app.cli.lookup import (
+    find_result,
+    find_sequence,
+    open_catalog,
+    read_settings,
+)
+from app.cli.output import AsJson, DataDir, Device, show
+from app.jobs.order import default_name
+from physhandi.data.run import RunKind
+from physhandi.data.run_folder import new_run_id
+from physhandi.devices import pick_device
+from physhandi.errors import RunError, UsageError
+from physhandi.fitting.config import (
+    apply_overrides,
+    load_profile,
+    overrides_of,
+    parse_override,
+)
+from physhandi.progress import watched
+from physhandi.run import Run
+from physhandi.simulation.parameters import PARAMETERS, SimulationParameters, changed_parameters
+
+OVERRIDES = (
+    "connection_radius",
+    "max_neighbors",
+    "virtual_connection_radius",
+    "virtual_max_neighbors",
+    "stiffness_scale",
+    "damping",
+    "drag",
+    "restitution",
+    "friction",
+    "self_collision",
+    "collision_distance",
+    "self_restitution",
+    "self_friction",
+    "substeps_per_frame",
+)
+"""Parameters that `physhandi simulate` can change."""
+
+
+def _change_option(name: str) -> tuple[str, Any, None]:
+    """Make an option of `physhandi simulate` from a row of the table of parameters."""
+    parameter = PARAMETERS[name]
+    unit = f" [{parameter.unit}]" if parameter.unit else ""
+    kind: Any = {"number": float, "whole": int, "switch": bool}[parameter.kind]
+    more = ""
+    if name == "substeps_per_frame":
+        kind, more = int | Literal["auto"], "; auto takes as few as are stable, and says how many"
+    about = arg(help=f"{parameter.about.rstrip('.')}{more}{unit}.")
+    return name, Annotated[kind | None, about], None
+
+
+if TYPE_CHECKING:
+
+    class Changes:
+        """New values of parameters."""
+
+else:
+    Changes = make_dataclass("Changes", [_change_option(name) for name in OVERRIDES], frozen=True)
+
+
+def reconstruct(
+    sequences: Positional[tuple[str, ...]],
+    *,
+    out: Path | None = None,
+    profile: str = "default",
+    settings: UseAppendAction[
+        Annotated[tuple[str, ...], arg(name="set", metavar="PATH=VALUE")]
+    ] = (),
+    device: Device = "auto",
+    data_dir: DataDir = None,
+) -> None:
+    """Fit hands and object of one or several sequences of the same object.
+
+    Args:
+        sequences: Folders or names of sequences.
+        out: Run folder to fill; an interrupted run goes on after its last finished stage. None
+            makes one in `runs/` of the data folder, and prints it.
+        profile: Settings: quick, default, paper, phystwin, or a YAML file with what differs from
+            one of them.
+        settings: A setting that differs from the profile's, like object_.search.generations=12;
+            may be given several times.
+    """
+    if not sequences:
+        raise UsageError("Name at least one sequence to reconstruct.")
+    recordings = [find_sequence(name, data_dir) for name in sequences]
+    for recording in recordings:
+        recording.validate(reads_color=False)  # Tells wrong data before a run is made.
+    base = load_profile(profile)
+    config = apply_overrides(base, dict(parse_override(text) for text in settings))
+    changed = overrides_of(config, base)
+    stored = {"profile": config.to_dict()} | ({"overrides": changed} if changed else {})
+    paths = [str(recording.folder) for recording in recordings]
+    device = pick_device(device)
+    if out is None:
+        name = default_name(recordings[0].name, stored)
+        run = _run_at(_new_folder(data_dir), "reconstruction", paths, stored, name)
+    else:
+        run = _run_at(out, "reconstruction", paths, stored)
+    show(_execute(run, device))
+
+
+def simulate(
+    run: Positional[str],
+    changes: OmitArgPrefixes[Changes] = Changes(),  # noqa: B008  # frozen
+    *,
+    out: Path | None = None,
+    sequence: tuple[str, ...] = (),
+    device: Device = "auto",
+    data_dir: DataDir = None,
+) -> None:
+    """Simulate a fitted object again, with other parameters or in other sequences.
+
+    Args:
+        run: Folder or id of a finished run.
+        changes: Parameters that differ from the fitted ones.
+        out: Run folder to fill. None makes one in `runs/` of the data folder, and prints it.
+        sequence: Other sequences of the same object; none takes the run's first one. Substeps are
+            chosen anew where the fitted ones would not be stable.
+    """
+    source = find_result(run, data_dir)
+    device = pick_device(device)
+    changed = {name: value for name, value in vars(changes).items() if value is not None}
+    changed_parameters(SimulationParameters(), changed)  # Tells a wrong value before a run is made.
+    if sequence:
+        recordings = [find_sequence(name, data_dir) for name in sequence]
+    else:
+        recordings = open_catalog(data_dir).sequences_of(source)[:1]
+    config = {"source": str(source.folder.resolve()), "parameters": changed}
+    paths = [str(recording.folder) for recording in recordings]
+    if out is None:
+        name = f"{source.name}, simulated"
+        target = _run_at(_new_folder(data_dir), "simulation", paths, config, name)
+    else:
+        target = _run_at(out, "simulation", paths, config)
+    result = _execute(target, device)
+    chosen = Run.open(target.folder).yaml("object/parameters.yaml")
+    show({"substeps_per_frame": chosen["substeps_per_frame"], **result})
+
+
+def evaluate_run(
+    run: Positional[str], *, as_json: AsJson = False, data_dir: DataDir = None
+) -> None:
+    """Measure a run against its sequences.
+
+    Args:
+        run: Folder or id of a finished run.
+    """
+    show(_measured(run, data_dir), as_json=as_json)
+
+
+def evaluate_hands(
+    run: Positional[str], *, as_json: AsJson = False, data_dir: DataDir = None
+) -> None:
+    """Measure only the hands of a run: reprojection error of every view [px].
+
+    Args:
+        run: Folder or id of a finished run.
+    """
+    measured = _measured(run, data_dir)
+    hands = {name: scores["hands"] for name, scores in measured.items() if scores.get("hands")}
+    if not hands:
+        raise RunError(f"Run '{run}' has no hands to measure.")
+    show(hands, as_json=as_json)
+
+
+def export(
+    run: Positional[str],
+    *,
+    format: Literal["ply", "gltf", "npz", "csv", "yaml", "png", "zip", "viser", "html"],  # noqa: A002  # the option's name
+    out: Path,
+    sequence: str | None = None,
+    frame: int | None = None,
+    link: str = "",
+    width: int = 1280,
+    height: int = 720,
+    overwrite: bool = False,
+    device: Device = "auto",
+    data_dir: DataDir = None,
+) -> None:
+    """Write a run as files that other programs read.
+
+    Args:
+        run: Folder or id of a finished run.
+        format: ply: meshes and points per frame; gltf: one .glb that moves, hands skinned; npz and
+            csv: trajectories; yaml: parameters and metrics; png: a picture; zip: a picture with all
+            its data; viser: a recording for viser's player; html: one file that plays in any
+            browser.
+        out: File or folder to write.
+        sequence: Which sequence of the run; none takes the first one.
+        frame: Only this frame (ply), or which one (png, zip).
+        link: Link of the viewer, or its part after "?": camera, layers, colors; parameters of the
+            simulation that it changes have the object simulated anew.
+        width: Width of a picture in pixels, 16 to 4096.
+        height: Height of a picture in pixels, 16 to 4096.
+        overwrite: Replace what is there.
+    """
+    from app.exports.shell import Wish
+    from app.exports.shell import export as export_file
+
+    finished = find_result(run, data_dir)
+    wish = Wish(
+        format=format,
+        out=out,
+        link=link,
+        sequence=sequence,
+        frame=frame,
+        width=width,
+        height=height,
+        device=pick_device(device) if link else "cpu",
+        overwrite=overwrite,
+    )
+    print(export_file(finished, wish, open_catalog(data_dir)))
+
+
+def _measured(run: str, data_dir: Path | None) -> dict[str, Any]:
+    from physhandi import pipeline
+
+    finished = find_result(run, data_dir)
+    return pipeline.evaluate(finished, open_catalog(data_dir).sequences_of(finished))
+
+
+def _new_folder(data_dir: Path | None) -> Path:
+    return read_settings(data_dir=data_dir).run_dir / new_run_id()
+
+
+def _run_at(
+    folder: Path, kind: RunKind, sequences: list[str], config: Mapping[str, Any], name: str = ""
+) -> Run:
+    """Make a run, or open the unfinished one of the same kind that its folder holds."""
+    if not (folder / "run.yaml").is_file():
+        name = name or folder.resolve().name
+        return Run.create(folder, name=name, kind=kind, sequences=sequences, config=config)
+    run = Run.open(folder)
+    if run.kind != kind or run.config != config or list(run.sequences) != sequences:
+        raise UsageError(
+            f"{folder} already holds another run. Choose a new --out, or delete that folder first."
+        )
+    if run.is_published:
+        raise UsageError(f"{folder} already holds this run, finished. Choose a new --out.")
+    return run
+
+
+def _execute(run: Run, device: str) -> dict[str, Any]:
+    """Fill a run; gives its folder, the losses of its stages and its metrics."""
+    from physhandi import pipeline
+
+    with watched(True) as progress:
+        pipeline.run_job(run, progress, device=device)
+    finished = Run.open(run.folder)
+    result: dict[str, Any] = {"run": str(finished.folder)}
+    if finished.has("losses.json"):
+        result["losses"] = {
+            stage: {key: value[key] for key in ("before", "after")}
+            for stage, value in finished.json("losses.json").items()
+            if "before" in value
+        }
+    if finished.has("metrics.json"):
+        result["metrics"] = finished.json("metrics.json")
+    return result
