@@ -16,7 +16,7 @@ from starlette.requests import cookie_parser
 from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from app.settings import Settings, is_loopback
+from app.settings import ServerSettings, is_loopback
 
 logger = logging.getLogger(__name__)
 
@@ -67,7 +67,7 @@ class Security:
 
     def __init__(
         self,
-        settings: Settings,
+        settings: ServerSettings,
         *,
         port: int | None = None,
         clock: Callable[[], float] = time.monotonic,

@@ -29,7 +29,7 @@ from app.jobs.watch import Feed
 from app.pages import Pages, create_pages
 from app.previews.store import Previews
 from app.security import Gatekeeper, Security
-from app.settings import WEB_ASSETS, Settings
+from app.settings import WEB_ASSETS, ServerSettings
 from app.viewer.gate import create_gate
 from app.viewer.physics.keep_panel import RunSaver, UserStorage
 from app.viewer.physics.presets import PresetStore
@@ -65,7 +65,7 @@ _STATUS: tuple[tuple[type[PhysHandiError], int, str], ...] = (
 
 
 def create_app(
-    settings: Settings,
+    settings: ServerSettings,
     *,
     security: Security | None = None,
     catalog: Catalog | None = None,
@@ -206,7 +206,9 @@ def _status_of(error: PhysHandiError | OSError) -> tuple[int, str]:
     return matches[0] if matches else (409, "conflict")
 
 
-def serve(settings: Settings, on_ready: Callable[[str], None], *, queue_demo: bool = False) -> None:
+def serve(
+    settings: ServerSettings, on_ready: Callable[[str], None], *, queue_demo: bool = False
+) -> None:
     """Serve until interrupted; running fits go on and are found again by the next server.
 
     Args:

@@ -23,7 +23,7 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-class Settings(BaseSettings):
+class ServerSettings(BaseSettings):
     """Settings of a server; every default is safe on one machine."""
 
     model_config = SettingsConfigDict(env_prefix="PHYSHANDI_", extra="forbid", frozen=True)
@@ -69,7 +69,7 @@ class Settings(BaseSettings):
         return value
 
     @model_validator(mode="after")
-    def _protect(self) -> "Settings":
+    def _protect(self) -> "ServerSettings":
         if not self.auth and not is_loopback(self.host):
             raise ValueError(
                 f"auth cannot be switched off on {self.host}, which other machines can reach. "

@@ -28,10 +28,10 @@ from msgspec import Meta
 
 from physhandi.errors import SettingsError
 
-LARGEST = 1e30
+LARGEST_NUMBER = 1e30
 """Larger numbers, squared or multiplied, leave the simulator's float32; no setting exceeds it."""
-Finite = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
-NonNegative = Annotated[float, Meta(ge=0.0, le=LARGEST)]
+Finite = Annotated[float, Meta(ge=-LARGEST_NUMBER, le=LARGEST_NUMBER)]
+NonNegative = Annotated[float, Meta(ge=0.0, le=LARGEST_NUMBER)]
 
 ValueKind = Literal["number", "whole", "switch", "choice", "text", "settings", "mapping"]
 
@@ -330,7 +330,7 @@ _KINDS: dict[Any, ValueKind] = {float: "number", int: "whole", bool: "switch", s
 
 
 def _end(bound: float | None) -> float | None:
-    return None if bound is None or abs(bound) >= LARGEST else float(bound)
+    return None if bound is None or abs(bound) >= LARGEST_NUMBER else float(bound)
 
 
 def _unwrapped(hint: Any) -> tuple[Any, list[Any], bool]:

@@ -18,7 +18,7 @@ from app.jobs.processes import end_processes
 from app.jobs.scheduler import Scheduler
 from app.security import Security
 from app.server import create_app
-from app.settings import Settings
+from app.settings import ServerSettings
 from app.viewer.sessions import TooManySessionsError
 from physhandi.data.run_folder import read_events
 
@@ -110,7 +110,7 @@ class QueueWorld:
 @contextmanager
 def queue_world(data_dir: Path, bundled: Path) -> Iterator[QueueWorld]:
     """Serve a data folder; when it is over, no process of a run is left."""
-    settings = Settings(data_dir=data_dir, cancel_grace_s=1.0)
+    settings = ServerSettings(data_dir=data_dir, cancel_grace_s=1.0)
     catalog = Catalog(settings, bundled=bundled)
     scheduler = Scheduler(settings, catalog, worker="job_worker")
     security = Security(settings)

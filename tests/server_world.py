@@ -12,7 +12,7 @@ from app.jobs.catalog import Catalog
 from app.jobs.scheduler import Scheduler
 from app.security import Security
 from app.server import create_app
-from app.settings import BUNDLED, Settings
+from app.settings import BUNDLED, ServerSettings
 from app.viewer.sessions import Sessions
 from physhandi import pipeline
 from physhandi.fitting.config import PipelineConfig
@@ -27,7 +27,7 @@ ORIGIN = f"http://{HOST}"
 class World:
     """An application with all its parts."""
 
-    settings: Settings
+    settings: ServerSettings
     security: Security
     catalog: Catalog
     scheduler: Scheduler
@@ -52,7 +52,7 @@ class World:
 
 
 def make_world(data_dir: Path, *, bundled: Path = BUNDLED) -> World:
-    settings = Settings(data_dir=data_dir, token=SecretStr(TOKEN), cancel_grace_s=1.0)
+    settings = ServerSettings(data_dir=data_dir, token=SecretStr(TOKEN), cancel_grace_s=1.0)
     security = Security(settings)
     catalog = Catalog(settings, bundled=bundled)
     scheduler = Scheduler(settings, catalog, worker="job_worker")

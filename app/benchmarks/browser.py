@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from app.benchmarks.served import Served, ServerFailedError
-from app.benchmarks.sliders import TOLERANCE, Move, Slider
+from app.benchmarks.sliders import TOLERANCE, MeasuredSlider, Move
 from app.benchmarks.streams import percentiles
 from physhandi.errors import MissingInputError
 
@@ -129,7 +129,7 @@ def measure_first_paint(served: Served, browser: "Browser", visits: int) -> dict
 
 
 def measure_slider_in_browser(
-    served: Served, browser: "Browser", run_id: str, slider: Slider, moves: list[Move]
+    served: Served, browser: "Browser", run_id: str, slider: MeasuredSlider, moves: list[Move]
 ) -> dict[str, Any]:
     """Press on a slider of a playing scene, and wait for the first new frame.
 
@@ -191,7 +191,7 @@ def _new_page(browser: "Browser") -> "Generator[Page]":
         context.close()
 
 
-def _press(page: "Page", scene: "Frame", slider: Slider, move: Move) -> None:
+def _press(page: "Page", scene: "Frame", slider: MeasuredSlider, move: Move) -> None:
     """Press on the slider's track where the value is, as a mouse does."""
     knob = slider.knob
     label = scene.locator("label", has_text=re.compile(f"^(● )?{re.escape(knob.label)}$"))

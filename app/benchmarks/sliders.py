@@ -33,7 +33,7 @@ class Move:
     """Object node positions [m], simulated by the benchmark itself."""
 
 
-class Slider:
+class MeasuredSlider:
     """One slider of a run, and rollouts for some of its positions."""
 
     def __init__(self, run: Run, sequence: str, field: str) -> None:
@@ -102,7 +102,7 @@ def is_new_frame(
 
 
 def measure_slider(
-    served: Served, run_id: str, slider: Slider, moves: list[Move], *, is_playing: bool
+    served: Served, run_id: str, slider: MeasuredSlider, moves: list[Move], *, is_playing: bool
 ) -> dict[str, Any]:
     """Move a slider, most times while the rollout before is still being simulated.
 
@@ -146,7 +146,7 @@ def measure_slider(
 
 
 def measure_first_move(
-    served: Served, run_id: str, slider: Slider, moves: list[Move]
+    served: Served, run_id: str, slider: MeasuredSlider, moves: list[Move]
 ) -> dict[str, Any]:
     """Move a slider of the first scene of a server as soon as it is there, and then again.
 

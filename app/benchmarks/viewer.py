@@ -23,7 +23,7 @@ from app.benchmarks.scenes import (
     make_many_runs,
 )
 from app.benchmarks.served import Served
-from app.benchmarks.sliders import FIELDS, Slider, measure_first_move, measure_slider
+from app.benchmarks.sliders import FIELDS, MeasuredSlider, measure_first_move, measure_slider
 from app.benchmarks.streams import measure_scrub, measure_sessions, percentiles
 from app.settings import BUNDLED
 from physhandi.benchmarks.timing import describe_machine
@@ -203,7 +203,7 @@ class _Bench:
         seconds: list[float] = []
         served = self._served()
         for field in FIELDS:
-            slider = Slider(self._run, self._sequence, field)
+            slider = MeasuredSlider(self._run, self._sequence, field)
             moves = slider.moves(self._effort.moves)
             for is_playing in (True, False):
                 measured = measure_slider(
@@ -215,14 +215,14 @@ class _Bench:
         return {"moves": len(seconds), **percentiles(seconds), "kinds": kinds}
 
     def _browser(self) -> dict[str, Any]:
-        slider = Slider(self._run, self._sequence, FIELDS[0])
+        slider = MeasuredSlider(self._run, self._sequence, FIELDS[0])
         moves = slider.moves(self._effort.moves)
         with open_chromium() as browser:
             served = self._served()
             return measure_slider_in_browser(served, browser, self._run.id, slider, moves)
 
     def _start(self) -> dict[str, Any]:
-        slider = Slider(self._run, self._sequence, FIELDS[0])
+        slider = MeasuredSlider(self._run, self._sequence, FIELDS[0])
         moves = slider.moves(2)
         found: dict[str, Any] = {}
         with Served(self._data("fresh")) as served:

@@ -6,20 +6,20 @@ from typing import Any
 from pydantic import ValidationError
 
 from app.jobs.catalog import Catalog
-from app.settings import Settings
+from app.settings import ServerSettings
 from physhandi.data.sequence import Sequence
 from physhandi.errors import RunError, UsageError
 from physhandi.run import Run
 
 
-def read_settings(**given: Any) -> Settings:
+def read_settings(**given: Any) -> ServerSettings:
     """Read the settings; where an argument is None, the environment speaks, then the default.
 
     Raises:
         UsageError: If a value is out of range; names it.
     """
     try:
-        return Settings(**{name: value for name, value in given.items() if value is not None})
+        return ServerSettings(**{name: value for name, value in given.items() if value is not None})
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"]) or "settings"

@@ -205,11 +205,11 @@ def export(
         height: Height of a picture in pixels, 16 to 4096.
         overwrite: Replace what is there.
     """
-    from app.exports.shell import Wish
+    from app.exports.shell import ExportOptions
     from app.exports.shell import export as export_file
 
     finished = find_result(run, data_dir)
-    wish = Wish(
+    options = ExportOptions(
         format=format,
         out=out,
         link=link,
@@ -220,7 +220,7 @@ def export(
         device=pick_device(device) if link else "cpu",
         overwrite=overwrite,
     )
-    print(export_file(finished, wish, open_catalog(data_dir)))
+    print(export_file(finished, options, open_catalog(data_dir)))
 
 
 def _measured(run: str, data_dir: Path | None) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from app.settings import BUNDLED, Settings
+from app.settings import BUNDLED, ServerSettings
 from physhandi.data.files import named_fields, write_atomically
 from physhandi.data.run_folder import JOB, RUN
 from physhandi.data.sequence import Sequence
@@ -177,7 +177,7 @@ class Catalog:
     its description or its entries have changed; safe to use from several threads.
     """
 
-    def __init__(self, settings: Settings, *, bundled: Path = BUNDLED) -> None:
+    def __init__(self, settings: ServerSettings, *, bundled: Path = BUNDLED) -> None:
         """Prepare; nothing is read yet.
 
         Args:

@@ -6,7 +6,7 @@ from app.jobs.catalog import Catalog
 from app.jobs.machine import Machine
 from app.jobs.scheduler import Scheduler
 from app.jobs.views import describe_run
-from app.settings import Settings
+from app.settings import ServerSettings
 from physhandi.data.environment import describe_environment
 
 
@@ -14,7 +14,7 @@ class Overview:
     """Describes the machine, its queue and the program."""
 
     def __init__(
-        self, settings: Settings, catalog: Catalog, scheduler: Scheduler, machine: Machine
+        self, settings: ServerSettings, catalog: Catalog, scheduler: Scheduler, machine: Machine
     ) -> None:
         """Prepare.
 

@@ -24,7 +24,7 @@ from app.jobs.processes import (
     supervisor_of,
 )
 from app.jobs.supervise import note_end
-from app.settings import Settings
+from app.settings import ServerSettings
 from physhandi.data.files import write_json
 from physhandi.data.lease import live_holder
 from physhandi.data.run_folder import EXIT, new_run_id
@@ -90,7 +90,7 @@ class JobView:
 class Scheduler:
     """Starts queued runs while slots are free; folders hold all state that must not be lost."""
 
-    def __init__(self, settings: Settings, catalog: Catalog, *, worker: str = WORKER) -> None:
+    def __init__(self, settings: ServerSettings, catalog: Catalog, *, worker: str = WORKER) -> None:
         """Prepare; `start` begins.
 
         Args:

@@ -13,7 +13,7 @@ from typing import Literal
 
 from app.jobs.catalog import Catalog, NotFoundError, RunItem
 from app.previews.worker import MOVING, NONE, SECONDS_EACH, STILL
-from app.settings import Settings
+from app.settings import ServerSettings
 from physhandi.child import Child, ChildEndedError
 from physhandi.data.files import write_bytes
 from physhandi.data.run_folder import CURRENT
@@ -70,7 +70,7 @@ class Previews:
     One process at a time draws them, out of the way of all else; a page is never kept waiting.
     """
 
-    def __init__(self, settings: Settings, catalog: Catalog) -> None:
+    def __init__(self, settings: ServerSettings, catalog: Catalog) -> None:
         """Prepare; `start` begins to draw.
 
         Args:

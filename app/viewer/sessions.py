@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import get_args
 
-from app.settings import Settings
+from app.settings import ServerSettings
 from app.viewer.compare.session import CompareSession
 from app.viewer.content.content import Catalog
 from app.viewer.content.session_state import Kind, SessionInfo, SessionState
@@ -55,7 +55,7 @@ class Sessions:
 
     def __init__(
         self,
-        settings: Settings,
+        settings: ServerSettings,
         catalog: Catalog,
         storage: UserStorage | None = None,
     ) -> None:

@@ -17,7 +17,7 @@ from app.jobs import scheduler as scheduler_module
 from app.jobs.catalog import Catalog
 from app.jobs.processes import end_processes, processes_of, supervisor_of
 from app.jobs.scheduler import JobView, Scheduler
-from app.settings import Settings
+from app.settings import ServerSettings
 from physhandi.data.lease import live_holder
 from physhandi.data.run_folder import read_events
 from physhandi.errors import PhysHandiError, RunError, SequenceError, UsageError
@@ -31,7 +31,7 @@ class Desk:
     """A scheduler, and shortcuts to what a test asks it."""
 
     def __init__(self, data_dir: Path, **settings: int) -> None:
-        self.settings = Settings(data_dir=data_dir, cancel_grace_s=GRACE_S, **settings)
+        self.settings = ServerSettings(data_dir=data_dir, cancel_grace_s=GRACE_S, **settings)
         self.catalog = Catalog(self.settings)
         self.scheduler = Scheduler(self.settings, self.catalog, worker="job_worker")
 

@@ -13,7 +13,7 @@ from app.jobs import catalog
 from app.jobs.catalog import Catalog, UnknownRunError
 from app.jobs.listing import RunQuery, page_of, select_runs
 from app.jobs.views import summarize_run, tags_of
-from app.settings import Settings
+from app.settings import ServerSettings
 from physhandi.errors import UsageError
 from physhandi.run import Run
 
@@ -228,7 +228,7 @@ def test_runs_are_remembered_until_their_files_change(
 
     real_open = Run.open
     monkeypatch.setattr(Run, "open", open_run)
-    settings = Settings(data_dir=tmp_path / "data")
+    settings = ServerSettings(data_dir=tmp_path / "data")
     for name in ("one", "two"):
         config = {"profile": {"profile": "quick", "node_spacing": 0.014}}
         folder = settings.run_dir / name

@@ -13,7 +13,7 @@ from starlette.testclient import WebSocketDenialResponse
 from starlette.websockets import WebSocket
 
 from app.security import PAGE_POLICY, Gatekeeper, Security
-from app.settings import Settings
+from app.settings import ServerSettings
 
 HOST = "127.0.0.1:8080"
 OWN = f"http://{HOST}"
@@ -50,7 +50,7 @@ async def frame(request: Request) -> PlainTextResponse:
 class Door:
     def __init__(self, **settings: object) -> None:
         self.now = 0.0
-        self.security = Security(Settings(**settings), clock=lambda: self.now)
+        self.security = Security(ServerSettings(**settings), clock=lambda: self.now)
         routes = [
             Route("/viewer/x/", frame),
             Route("/{rest:path}", answer, methods=["GET", "POST", "DELETE"]),
@@ -97,7 +97,7 @@ def test_two_browsers_are_told_apart_and_a_forged_cookie_is_not_believed(door: D
         door.client.cookies.clear()
         refused = door.client.get("/", headers={"Cookie": f"physhandi_8080={forged}".encode()})
         assert refused.status_code == 401
-    assert Security(Settings()).owner_of(f"{visitor}.{signature}") is None
+    assert Security(ServerSettings()).owner_of(f"{visitor}.{signature}") is None
 
 
 @pytest.mark.parametrize("other", ["_xsrf=2|a|b", '{"a":1}', "a b=1", "x[]=1", "k=a,b c", "="])
@@ -223,23 +223,23 @@ def test_only_a_server_that_nobody_else_can_reach_may_do_without_token() -> None
     assert door.client.get("/").json()["owner"] == "open"
     assert door.client.post("/", headers={"Origin": "http://evil.example"}).status_code == 403
     with pytest.raises(ValidationError, match="auth cannot be switched off"):
-        Settings(auth=False, host=ANY_ADDRESS)
+        ServerSettings(auth=False, host=ANY_ADDRESS)
 
 
 def test_a_given_token_must_be_long() -> None:
     with pytest.raises(ValidationError, match="at least 16"):
-        Settings(token=GIVEN[:5])
-    assert Security(Settings(token=GIVEN)).token == GIVEN
-    assert GIVEN not in repr(Settings(token=GIVEN))
+        ServerSettings(token=GIVEN[:5])
+    assert Security(ServerSettings(token=GIVEN)).token == GIVEN
+    assert GIVEN not in repr(ServerSettings(token=GIVEN))
 
 
 def test_on_all_addresses_only_numbers_and_allowed_names_are_known() -> None:
-    security = Security(Settings(host=ANY_ADDRESS))
+    security = Security(ServerSettings(host=ANY_ADDRESS))
     assert security.is_known_host("192.168.1.7:8080")
     assert not security.is_known_host("rebound.example:8080")
 
 
 def test_the_address_that_is_listened_on_is_known() -> None:
-    assert Security(Settings(host="fd00::7")).is_known_host("[fd00::7]:8080")
-    assert Security(Settings(host="Lab.example")).is_known_host("lab.example:8080")
-    assert not Security(Settings(host="fd00::7")).is_known_host("[fd00::8]:8080")
+    assert Security(ServerSettings(host="fd00::7")).is_known_host("[fd00::7]:8080")
+    assert Security(ServerSettings(host="Lab.example")).is_known_host("lab.example:8080")
+    assert not Security(ServerSettings(host="fd00::7")).is_known_host("[fd00::8]:8080")

@@ -29,7 +29,7 @@ from app.exports.permalink import state_from_query
 from app.jobs.catalog import Catalog
 from app.keys import KEYS
 from app.server import create_app
-from app.settings import Settings
+from app.settings import ServerSettings
 from app.viewer.physics.presets import builtin_presets
 from physhandi import pipeline
 from physhandi.errors import UsageError
@@ -71,7 +71,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def server(data: Path) -> FastAPI:
     """The application as it is served."""
-    settings = Settings(data_dir=data, token=SecretStr(TOKEN))
+    settings = ServerSettings(data_dir=data, token=SecretStr(TOKEN))
     return create_app(settings, catalog=Catalog(settings, bundled=data / "nothing-bundled"))
 
 
@@ -106,7 +106,7 @@ def test_settings_and_profiles(then: dict[str, Any], client: TestClient) -> None
 
 
 def test_settings_of_the_server(then: dict[str, Any]) -> None:
-    now = [f"PHYSHANDI_{name.upper()}" for name in Settings.model_fields]
+    now = [f"PHYSHANDI_{name.upper()}" for name in ServerSettings.model_fields]
     assert_kept("variables", then["server settings"], now)
 
 

@@ -15,7 +15,7 @@ from app.benchmarks.sliders import is_new_frame
 from app.benchmarks.streams import percentiles
 from app.benchmarks.viewer import GOALS, compare_with_goals, measure_viewer
 from app.jobs.catalog import Catalog
-from app.settings import BUNDLED, Settings
+from app.settings import BUNDLED, ServerSettings
 from app.viewer.scene.object_drawing import QUIET_FORCE
 from physhandi.errors import MissingInputError
 from physhandi.object_rollout import load_fitted
@@ -162,7 +162,7 @@ def test_the_heavy_scene_pulls_at_three_hundred_nodes(tmp_path: Path) -> None:
 
 def test_many_runs_are_listed(tmp_path: Path) -> None:
     make_many_runs(tmp_path / "runs", 12)
-    items = Catalog(Settings(data_dir=tmp_path), bundled=tmp_path / "none").runs()
+    items = Catalog(ServerSettings(data_dir=tmp_path), bundled=tmp_path / "none").runs()
     assert {item.id for item in items} == {f"many_{number:04d}" for number in range(12)}
     names = {item.run.name for item in items if item.run is not None}
     assert names == {f"Run {number}" for number in range(12)}
