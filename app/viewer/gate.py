@@ -114,7 +114,7 @@ async def _connect(websocket: WebSocket, port: int) -> ClientConnection | None:
 
 
 async def _is_taken(watching: Counter[str], session_id: str) -> bool:
-    """Tell whether another tab watches a session, and goes on watching it."""
+    """Return whether another tab watches a session and goes on watching it."""
     end = asyncio.get_running_loop().time() + _LEAVING_S
     while watching[session_id] > 0:
         if asyncio.get_running_loop().time() > end:

@@ -28,7 +28,7 @@ from physhandi.simulation.parameters import parameter_changes
 
 
 class Session(SceneServer):
-    """What one browser tab looks at: a viser server with scene, panel and clock."""
+    """The scene of one browser tab: a viser server with scene, panel and clock."""
 
     def __init__(
         self,
@@ -51,7 +51,7 @@ class Session(SceneServer):
             owner: Whose session it is.
             catalog: Finds runs and sequences.
             live: The process that simulates.
-            state: What to begin with, as `state` of another session told it.
+            state: What to begin with, such as the `state` of another session.
             storage: Where presets and runs are kept.
         """
         self.kind: Kind = kind
@@ -90,9 +90,10 @@ class Session(SceneServer):
 
     @property
     def state(self) -> SessionState:
-        """What the user has set up, for a copy of this session."""
+        """Everything that the user has set, for a copy of this session."""
         with self._lock:
             history = self._object.panel.history if self._object is not None else None
+            setting = history.setting if history is not None else None
             theme, prefers_dark = self._layers.theme
             return SessionState(
                 sequence_name=self._content.sequence_name,
@@ -103,24 +104,24 @@ class Session(SceneServer):
                 layers=replace(self._view.scene.layers),
                 theme=theme,
                 prefers_dark=prefers_dark,
-                parameters=history.current if history is not None else None,
-                automatic_substeps=history is not None and history.is_automatic,
+                parameters=setting.parameters if setting is not None else None,
+                automatic_substeps=setting is not None and setting.is_automatic,
                 is_figure=self._comparison.is_figure,
                 pose=self._comparison.pose(),
-                parameter_changes=parameter_changes(history.start, history.current)
-                if history is not None
+                parameter_changes=parameter_changes(history.start, setting.parameters)
+                if history is not None and setting is not None
                 else {},
             )
 
     @property
     def offers(self) -> tuple[str, ...]:
-        """What can be done with it; see `SessionInfo`."""
-        there = {
+        """Features that it has; see `SessionInfo`."""
+        features = {
             "object": self._content.fitted is not None,
             "colors": self._inspection.colors.is_there,
             "figure": self._comparison.offers_figure,
         }
-        return tuple(name for name, is_there in there.items() if is_there)
+        return tuple(name for name, is_there in features.items() if is_there)
 
     def snapshot(self) -> Snapshot:
         """Collect what is on the screen, to be saved."""

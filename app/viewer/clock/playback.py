@@ -173,7 +173,7 @@ class Playback:
                     self._condition.wait(max(due - time.monotonic(), 0.001))
 
     def _until_next(self) -> float:
-        """Tell how long the clock takes to the next frame that is drawn [s].
+        """Compute the time until the next frame is drawn [s].
 
         The time is not a fixed period: its errors would add up until a frame is left out.
         """
@@ -184,7 +184,7 @@ class Playback:
         return (int(self._position) + step - self._position) / rate
 
     def _is_starved(self) -> bool:
-        """Tell whether the clock waits for a frame that is still being computed."""
+        """Return whether the clock waits for a frame that is still being computed."""
         is_limited = self._limit < self.frame_count
         return is_limited and self._position >= self._limit - _SHORT_OF
 

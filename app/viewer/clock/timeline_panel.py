@@ -115,7 +115,7 @@ class TimelinePanel:
                 self._settling = self._loop_of_events.call_later(_SETTLED, self._settle)
 
     def _settle(self) -> None:
-        """Tell the slider where it stands after a scrub that stopped the clock.
+        """Send the slider its value again after a scrub that stopped the clock.
 
         A frame of the running clock may have met the user's choice on its way, and moved the slider
         away from it after it was sent. Viser sends no value that it believes to be there already:

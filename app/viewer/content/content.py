@@ -83,7 +83,7 @@ class Content:
     fitted: ObjectRollout | None = None
     """The object's fitted rollout."""
     observed: Observed | None = None
-    """What the cameras or markers saw."""
+    """Observed points: markers, tracks or depth."""
     tracks: Tracks | None = None
     """Points that were followed over the frames."""
     markers: Markers | None = None
@@ -103,7 +103,7 @@ class Content:
 
 
 def open_run(catalog: Catalog, run_id: str, sequence_name: str | None = None) -> Content:
-    """Collect what a run has found out about one of its sequences.
+    """Collect the results of one of a run's sequences.
 
     Args:
         catalog: Finds the run, and the recording behind it.

@@ -20,7 +20,7 @@ THEMES: tuple[Theme, ...] = ("as the browser", "light", "dark")
 Coloring = Literal[
     "plain", "error", "stiffness", "damping", "strain", "speed", "force", "difference"
 ]
-"""What the colors of an object tell."""
+"""Quantity by which nodes, surface and springs are colored."""
 COLORINGS: tuple[Coloring, ...] = get_args(Coloring)
 
 PLAYING_SPRINGS = 2_000
@@ -60,7 +60,7 @@ class Layers:
     force_scale: float = 1.0
     """Length of the force arrows, relative to the automatic one."""
     color: Coloring = "plain"
-    """What the colors of nodes, surface and springs tell."""
+    """Quantity by which nodes, surface and springs are colored."""
     color_range: tuple[float, float] | None = None
     """Values at the ends of the color scale, in SI units; None for those of the sequence."""
 
@@ -76,5 +76,5 @@ def default_layers(content: Content) -> Layers:
 
 
 def _has_few_springs(rollout: ObjectRollout) -> bool:
-    """Tell whether all springs fit into a playing frame; they make nodes read as cloth or rope."""
+    """Return whether all springs fit into a playing frame; with them nodes look like cloth."""
     return rollout.model.object_spring_count <= PLAYING_SPRINGS

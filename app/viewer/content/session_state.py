@@ -1,4 +1,4 @@
-"""What there is to say about a session, and what a user has set up in it."""
+"""A session as lists show it, and its state as a copy or a link takes it over."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -17,7 +17,7 @@ Kind = Literal["run", "sequence", "comparison"]
 
 @dataclass(frozen=True, kw_only=True)
 class SessionInfo:
-    """What a listing says about a session."""
+    """One entry of the list of sessions."""
 
     id: str
     """Unguessable id, part of its address."""
@@ -34,9 +34,9 @@ class SessionInfo:
     created: float
     """When it was opened [s since 1970]."""
     idle: float
-    """How long nobody has looked at it [s]."""
+    """Time since a browser was connected [s]."""
     offers: tuple[str, ...] = ()
-    """What can be done with it: ``object`` is simulated, ``colors`` and the ``figure`` exist."""
+    """Features that it has: ``object`` (which can be simulated), ``colors``, ``figure``."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -76,7 +76,7 @@ class Pose:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SessionState:
-    """Everything that a copy of a session begins with."""
+    """Everything that a user has set in a session; a copy of it begins with this."""
 
     sequence_name: str | None
     """Sequence of the run; None for its first."""

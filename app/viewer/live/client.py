@@ -25,7 +25,7 @@ logger = logging.getLogger(__name__)
 Listener = Callable[[Message], None]
 
 STARTING = "**The simulation is starting …** The first time on a machine this takes a while."
-"""What a panel says until the live simulation has loaded or compiled what it needs."""
+"""Shown until the process has loaded or compiled what every simulation needs."""
 
 _MAX_CRASHES = 5
 _CRASH_WINDOW = 60.0
@@ -297,7 +297,7 @@ class SimulationClient:
 
 @dataclass(frozen=True, kw_only=True)
 class Readout:
-    """What the physics panel says about the rollout."""
+    """Status of the newest rollout, for the panels."""
 
     object_spring_count: int
     """Springs between object nodes."""
@@ -376,7 +376,7 @@ class LiveRollouts:
         self._is_busy = False
         self._is_held = False
         self._needed: int | None = None
-        live.subscribe(session, self._hear)
+        live.subscribe(session, self._receive)
         if controls is None:
             live.prepare(session, self._wanted)
 
@@ -458,7 +458,7 @@ class LiveRollouts:
 
     @property
     def readout(self) -> Readout:
-        """What there is to say about the newest rollout."""
+        """Status of the newest rollout."""
         with self._lock:
             rollout = self._incoming or self._shown
             durations = self._durations
@@ -482,7 +482,7 @@ class LiveRollouts:
                 error=rollout.error,
             )
 
-    def _hear(self, message: Message) -> None:
+    def _receive(self, message: Message) -> None:
         with self._lock:
             if message.kind not in {"crashed", "ready"} and message["request"] != self._number:
                 return

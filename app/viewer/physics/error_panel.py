@@ -103,7 +103,7 @@ class ErrorPanel:
         self._folder.remove()
 
     def show(self, frame: int, *, is_playing: bool) -> None:
-        """Tell which frame is on the screen."""
+        """Show the errors of the frame on the screen."""
         with self._lock:
             # A clock that stops may leave behind what was not worth writing while it ran.
             if frame != self._frame or (self._is_late and not is_playing):
@@ -145,8 +145,8 @@ class ErrorPanel:
         new = ""
         if self._rollout is not self._fitted:
             new = self._words(_AGAIN, "re-simulated", again, "from the fit")
-        said = "<br/>".join(text for text in (fit, new) if text) or "Move a slider to compare."
-        self._text.content = f'<div style="{_STYLE}">{said}</div>'
+        text = "<br/>".join(line for line in (fit, new) if line) or "Move a slider to compare."
+        self._text.content = f'<div style="{_STYLE}">{text}</div>'
         self._plot.show(self._curves(), self._frame)
 
     def _words(self, color: str, what: str, error: float, other: str) -> str:

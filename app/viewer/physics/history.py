@@ -33,7 +33,7 @@ class History:
 
         Args:
             start: The fitted parameters, to which `reset` returns.
-            clock: Tells the time [s].
+            clock: Gives the time [s].
         """
         self.start = start
         self.setting = Setting(start)

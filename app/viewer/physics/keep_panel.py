@@ -164,7 +164,7 @@ class UserStorage:
 
 
 class PresetChoice:
-    """The list of presets."""
+    """The list of presets in the physics panel."""
 
     def __init__(
         self,
@@ -201,7 +201,7 @@ class PresetChoice:
             (AS_FITTED, BY_HAND),
             hint="Changes made to the fitted parameters, all at once; ★ are your own",
         )
-        choice.on_update(guard.by_user(lambda _: self._hear()))
+        choice.on_update(guard.by_user(lambda _: self._take_choice()))
         self._choice = FollowedChoice(choice, guard)
         self.refresh()
 
@@ -232,7 +232,7 @@ class PresetChoice:
         self._wanted = label
         self.show()
 
-    def _hear(self) -> None:
+    def _take_choice(self) -> None:
         preset = self._presets.get(self._choice.read())
         if preset is None:
             self.show()  # "By hand" is what the list says, nothing to choose.

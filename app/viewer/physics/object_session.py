@@ -83,7 +83,7 @@ class ObjectSession:
         return self._rollouts.newest
 
     def show(self, frame: int, *, is_playing: bool) -> None:
-        """Tell the panel which frame is on the screen."""
+        """Show the errors of the frame on the screen."""
         self._errors.show(frame, is_playing=is_playing)
 
     def close(self) -> None:

@@ -141,8 +141,8 @@ class SubstepsChoice:
             visible=False,
             hint="More are slower and more exact; too few and the object explodes",
         )
-        choice.on_update(guard.by_user(lambda _: self._hear_choice()))
-        self._number.on_update(guard.by_user(lambda _: self._hear_number()))
+        choice.on_update(guard.by_user(lambda _: self._take_choice()))
+        self._number.on_update(guard.by_user(lambda _: self._take_number()))
 
     def show(self) -> None:
         """Follow the history."""
@@ -165,7 +165,7 @@ class SubstepsChoice:
         """Remember what is in use, from which typing a number begins."""
         self._in_use = readout.substeps_per_frame
 
-    def _hear_choice(self) -> None:
+    def _take_choice(self) -> None:
         history, choice = self._history, self._followed.read()
         if choice == SUBSTEPS_BY_HAND:
             # Nothing is simulated anew before another number is typed.
@@ -177,12 +177,12 @@ class SubstepsChoice:
             number = history.start.substeps_per_frame
         self._choose(number, choice == SUBSTEPS_AUTOMATIC)
 
-    def _hear_number(self) -> None:
+    def _take_number(self) -> None:
         self._choose(min(max(int(self._number.value), 1), _MOST), False)
 
 
 def warning(readout: Readout) -> str:
-    """Say that the substeps are too few to be stable; empty if they are enough or nobody knows."""
+    """Warn of too few substeps to be stable; empty if they are enough or the limit is unknown."""
     needed = readout.needed_substeps
     if needed is None or readout.substeps_per_frame >= needed:
         return ""

@@ -1,4 +1,4 @@
-"""A control that follows what is in force, and never takes away what a user has just chosen."""
+"""A control that program and user both set, in which no choice of a user is overwritten."""
 
 import threading
 from typing import Any
@@ -30,7 +30,7 @@ class FollowedChoice:
         self._last: Any = handle.value
 
     def show(self, value: Any) -> None:
-        """Name what is in force, unless a user's choice is about to be heard."""
+        """Set the control, unless a choice of a user waits for its callback."""
 
         def write() -> None:
             with self._lock:

@@ -82,7 +82,7 @@ class Guard:
         return self(by_user)
 
     def on_event_loop(self, action: Callable[[], None]) -> None:
-        """Do something on the event loop that hears the users, where none of them comes between.
+        """Do something on the event loop, where no message of a user comes between.
 
         What is handed in first is done first.
         """

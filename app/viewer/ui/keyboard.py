@@ -1,4 +1,4 @@
-"""Gives the keys of the live scene their meaning."""
+"""Binds the keys of a live scene to functions."""
 
 from collections.abc import Callable
 from typing import Any
