@@ -5,7 +5,8 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query
 from fastapi.responses import HTMLResponse
 
-from app.comparison import CompareAsk, Id
+from app.comparison import CompareAsk
+from app.ids import ItemId
 from app.jobs.catalog import Catalog, RunItem
 from app.jobs.scheduler import Scheduler
 from app.jobs.views import describe_results, describe_run, read_frame_errors
@@ -53,7 +54,7 @@ def create_comparing(catalog: Catalog, scheduler: Scheduler, pages: Pages) -> AP
         )
 
     @router.get("/runs/{run_id}/compare", include_in_schema=False)
-    def choose_other(run_id: Id) -> HTMLResponse:
+    def choose_other(run_id: ItemId) -> HTMLResponse:
         """Offer the runs that one can be compared with, those of the same recordings first."""
         run = describe_run(catalog.run_item(run_id), scheduler)
         others = [describe_run(item, scheduler) for item in catalog.runs() if item.id != run_id]

@@ -5,9 +5,9 @@ from urllib.parse import parse_qsl, urlencode
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from app.ids import ItemId
 from physhandi.errors import UsageError
 
-Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
 Mode = Literal["side", "overlay", "wipe"]
 """Beside each other, one over the other, or A on one side of a line and B on the other."""
 Tint = Literal["side", "difference", "parts"]
@@ -19,9 +19,9 @@ class CompareAsk(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    a: Id
+    a: ItemId
     """Id of run A."""
-    b: Id
+    b: ItemId
     """Id of run B."""
     sequence: Annotated[str | None, Field(min_length=1, max_length=200)] = None
     """A sequence of both; None for the first that both have."""
