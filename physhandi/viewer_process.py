@@ -53,6 +53,8 @@ class ViewerProcess:
             outlives_parent=True,
             stdout=subprocess.PIPE,
             stderr=self._errors,
+            # What the keyboard sends to a notebook's kernel is not meant for the viewer.
+            start_new_session=True,
         )
         atexit.register(self.stop)
         try:
