@@ -13,6 +13,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from physhandi.data.exporters.scene_data import HandSurface, SceneData, read_scene
+from physhandi.data.layout import MATERIAL_FILE, SequenceFiles
 from physhandi.data.run import RunFolder
 from physhandi.data.sequence import Sequence as Recording
 from physhandi.errors import MissingInputError, RunError, UsageError
@@ -113,14 +114,15 @@ class FittedObject:
         wrong = np.argwhere(~np.isfinite(fitted.control))
         if len(wrong):
             raise RunError(
-                f"{folder.out}/sequences/{name}/control.npy is not finite at frame {wrong[0][0]}, "
+                f"{folder.out / SequenceFiles(name).control} is not finite at frame {wrong[0][0]}, "
                 f"control {wrong[0][1]}. Run it again."
             )
-        attachment, rest_node = f"sequences/{name}/attachment.npy", "object/material.safetensors"
+        attachment = SequenceFiles(name).attachment
+        rest = folder.tensors(MATERIAL_FILE) if folder.has(MATERIAL_FILE) else {}
         loaded = cls(
             fitted,
             attachment=folder.array(attachment) if folder.has(attachment) else None,
-            rest_node=folder.tensors(rest_node).get("rest_node") if folder.has(rest_node) else None,
+            rest_node=rest.get("rest_node"),
             run=folder,
             sequence=name,
         )

@@ -10,6 +10,7 @@ from numpy import ndarray
 
 from physhandi.data.exporters.export import export_scene
 from physhandi.data.exporters.scene_data import SceneData
+from physhandi.data.layout import PARAMETERS_FILE, SequenceFiles
 from physhandi.data.run import RunFolder
 from physhandi.errors import UsageError
 from physhandi.simulation.forces import (
@@ -171,24 +172,24 @@ class ObjectRollout:
 
 def load_fitted(run: RunFolder, sequence_name: str) -> ObjectRollout | None:
     """Load the fitted rollout of a run with its model; None if the run has no object."""
-    folder = f"sequences/{sequence_name}"
-    needed = (f"{folder}/rollout.npy", f"{folder}/control.npy", f"{folder}/model.safetensors")
+    files = SequenceFiles(sequence_name)
+    needed = files.rollout, files.control, files.model
     if not all(run.has(name) for name in needed):
         return None
-    position = run.array(needed[0])
-    parameters = SimulationParameters.from_dict(run.yaml("object/parameters.yaml"))
-    if run.has(f"{folder}/meta.yaml"):
+    position = run.array(files.rollout)
+    parameters = SimulationParameters.from_dict(run.yaml(PARAMETERS_FILE))
+    if run.has(files.meta):
         # As the rollout was simulated: what is stored of the world is the profile's, not this one.
-        meta = run.yaml(f"{folder}/meta.yaml")
+        meta = run.yaml(files.meta)
         parameters = parameters.in_world(
             frame_rate=float(meta["frame_rate"]),
             ground_height=meta.get("ground_height"),
             gravity=float(meta.get("gravity", parameters.gravity)),
         )
     return ObjectRollout(
-        model=SpringMassModel.from_tensors(run.tensors(needed[2])),
+        model=SpringMassModel.from_tensors(run.tensors(files.model)),
         parameters=parameters,
-        control=run.array(needed[1])[: len(position)],
+        control=run.array(files.control)[: len(position)],
         position=position,
         ready=len(position),
     )

@@ -16,6 +16,13 @@ from numpy import ndarray
 
 from physhandi.data.attempt import Attempt
 from physhandi.data.environment import ENVIRONMENT, describe_environment
+from physhandi.data.layout import (
+    MATERIAL_FILE,
+    METRICS_FILE,
+    PARAMETERS_FILE,
+    REST_NODE_FILE,
+    SequenceFiles,
+)
 from physhandi.data.run import RunFolder
 from physhandi.data.run_folder import read_mapping
 from physhandi.data.sequence import Sequence
@@ -59,7 +66,6 @@ Rule = Callable[
 
 Problems = Callable[[], list[ObjectProblem]]
 """Gives what the object is fitted to, one for each sequence."""
-METRICS_FILE = "metrics.json"
 
 
 def settings_of(profile: str, overrides: Mapping[str, Any]) -> dict[str, Any]:
@@ -127,10 +133,10 @@ def predict(
     if attempt.stage_done(EVALUATION):
         return
     artefacts.save_hand_vertices(attempt, sequence.name)
-    folder = artefacts.sequence_folder(sequence.name)
-    node = artefacts.load_array(attempt.out / folder / "object_node.npy")
+    files = SequenceFiles(sequence.name)
+    node = artefacts.load_array(attempt.out / files.object_node)
     rollout = rule(node, artefacts.load_control(attempt.out, sequence.name))
-    attempt.save_array(f"{folder}/rollout.npy", np.asarray(rollout, np.float32))
+    attempt.save_array(files.rollout, np.asarray(rollout, np.float32))
     attempt.save_json(METRICS_FILE, {sequence.name: _measure(sequence, attempt)})
     _finish(attempt, EVALUATION, [], [], [])
 
@@ -184,7 +190,7 @@ def _stage_simulation(
     device: str,
 ) -> None:
     source.verify(allows_more=True)
-    if not source.has("object/material.safetensors"):
+    if not source.has(MATERIAL_FILE):
         raise RunError(
             f"Run '{source.id}' holds no fitted object, so there is nothing to simulate."
         )
@@ -212,17 +218,15 @@ def _object_in(
     """Lay a stored object into a recording, and store what the recording shows."""
     name = sequence.name
     artefacts.save_sequence_meta(attempt, sequence)
-    folder = artefacts.sequence_folder(name)
+    files = SequenceFiles(name)
     if source.holds(sequence):
         artefacts.save_observation(attempt, name, artefacts.load_observation(source.out, name))
         artefacts.save_motions(attempt, name, artefacts.load_motions(source.out, name))
         artefacts.copy_hand_vertices(source, name, attempt)
         artefacts.copy_hand_observation(source, name, attempt)
         object_ = FittedObject.of(source, name)
-        if source.has(f"{folder}/attachment.npy"):
-            attempt.save_array(
-                f"{folder}/attachment.npy", artefacts.load_attachment(source.out, name)
-            )
+        if source.has(files.attachment):
+            attempt.save_array(files.attachment, artefacts.load_attachment(source.out, name))
     else:
         object_ = FittedObject.of(source).placed_in(sequence, progress)
         placed = object_.placement
@@ -234,7 +238,7 @@ def _object_in(
             artefacts.save_hand_vertices(attempt, name)
             artefacts.save_hand_observation(attempt, name, placed.hands.keypoint)
             artefacts.save_hand_points(attempt, sequence, progress)
-    attempt.save_array(f"{folder}/control.npy", np.asarray(object_.fitted.control))
+    attempt.save_array(files.control, np.asarray(object_.fitted.control))
     return object_
 
 
@@ -261,8 +265,7 @@ def _store_rollout(
     for frame, _, _ in object_.fill(rollout, device):
         progress.check_cancelled()
         progress.report(ROLLOUT, frame + 1, rollout.frame_count)
-    folder = artefacts.sequence_folder(object_.sequence)
-    attempt.save_array(f"{folder}/rollout.npy", np.asarray(rollout.position))
+    attempt.save_array(SequenceFiles(object_.sequence).rollout, np.asarray(rollout.position))
 
 
 def evaluate(run: RunFolder, sequences: Many[Sequence]) -> dict[str, Any]:
@@ -270,7 +273,7 @@ def evaluate(run: RunFolder, sequences: Many[Sequence]) -> dict[str, Any]:
     scores = {}
     for sequence in sequences:
         points = None
-        if not run.has(f"{artefacts.sequence_folder(sequence.name)}/observation/hand_point.npy"):
+        if not run.has(SequenceFiles(sequence.name).observation("hand_point")):
             points = artefacts.lifted_hand_points(sequence)
         scores[sequence.name] = score_run(run.out, sequence, hand_points=points)
     return scores
@@ -325,12 +328,12 @@ def _stage_observation(
         control = control_trajectory_of(
             sequence, artefacts.load_motions(attempt.out, sequence.name), config
         )
-        folder = artefacts.sequence_folder(sequence.name)
+        files = SequenceFiles(sequence.name)
         artefacts.save_observation(attempt, sequence.name, observation)
-        attempt.save_array(f"{folder}/object_node.npy", node.astype(np.float32))
-        attempt.save_array(f"{folder}/control.npy", control.astype(np.float32))
+        attempt.save_array(files.object_node, node.astype(np.float32))
+        attempt.save_array(files.control, control.astype(np.float32))
         if number == 0:
-            attempt.save_array("object/rest_node.npy", rest_node.astype(np.float32))
+            attempt.save_array(REST_NODE_FILE, rest_node.astype(np.float32))
         progress.report(OBSERVATION, number + 1, len(sequences))
     _finish(attempt, OBSERVATION, [], [], [])
 
@@ -338,15 +341,15 @@ def _stage_observation(
 def _problems(
     sequences: Many[Sequence], config: PipelineConfig, attempt: Attempt
 ) -> list[ObjectProblem]:
-    rest_node = artefacts.load_array(attempt.out / "object/rest_node.npy")
+    rest_node = artefacts.load_array(attempt.out / REST_NODE_FILE)
     problems = []
     for sequence in sequences:
-        folder = attempt.out / artefacts.sequence_folder(sequence.name)
+        files = SequenceFiles(sequence.name)
         problems.append(
             build_problem(
                 name=sequence.name,
                 observation=artefacts.load_observation(attempt.out, sequence.name),
-                object_node=artefacts.load_array(folder / "object_node.npy"),
+                object_node=artefacts.load_array(attempt.out / files.object_node),
                 rest_node=rest_node,
                 control=artefacts.load_control(attempt.out, sequence.name),
                 frame_count=len(sequence.reconstruction_frames),
@@ -373,7 +376,7 @@ def _stage_search(
     if attempt.stage_done(SEARCH):
         return
     result = search_object(problems(), config.simulation, config.object_, progress, device=device)
-    attempt.save_yaml("object/parameters.yaml", result.parameters.to_dict())
+    attempt.save_yaml(PARAMETERS_FILE, result.parameters.to_dict())
     _finish(attempt, SEARCH, [result.loss_before], [result.loss_after], result.curve)
 
 
@@ -454,8 +457,7 @@ def _stage_evaluation(
 def _measure(sequence: Sequence, attempt: Attempt) -> dict[str, Any]:
     """Score one sequence, and store the error of every frame for charts."""
     scores, frames = measure_run(attempt.out, sequence)
-    folder = artefacts.sequence_folder(sequence.name)
-    attempt.save_json(f"{folder}/frame_errors.json", frames)
+    attempt.save_json(SequenceFiles(sequence.name).frame_errors, frames)
     return scores
 
 

@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
+from physhandi.data.layout import METRICS_FILE
 from physhandi.data.run import RunFolder
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ class Run(RunFolder):
         Raises:
             RunError: If the run has not been measured yet.
         """
-        return self.json("metrics.json")
+        return self.json(METRICS_FILE)
 
     @property
     def object(self) -> "FittedObject":

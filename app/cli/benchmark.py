@@ -8,6 +8,7 @@ from tyro.conf import Positional, arg
 from app.benchmarks.parts import PARTS, Part
 from app.cli.lookup import find_result, sequence_of
 from app.cli.output import AsJson, DataDir, Device, show
+from physhandi.data.layout import SequenceFiles
 from physhandi.devices import pick_device
 
 NodeCount = Annotated[int, arg(name="nodes", help="Object nodes of a made-up block.")]
@@ -139,7 +140,7 @@ def substeps(
     result = benchmark_substeps(
         artefacts.load_model(finished.out, name),
         artefacts.load_parameters(finished.out),
-        finished.array(f"{artefacts.sequence_folder(name)}/control.npy"),
+        finished.array(SequenceFiles(name).control),
         name=f"{finished.id}: {name}",
         device=device,
         substeps=substeps,

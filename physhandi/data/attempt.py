@@ -29,6 +29,7 @@ from physhandi.data.files import (
     write_json,
     write_yaml,
 )
+from physhandi.data.layout import LOSSES_FILE
 from physhandi.data.lease import Lease, locked
 from physhandi.data.run_folder import (
     ATTEMPTS,
@@ -389,8 +390,7 @@ class RunProgress(Progress):
                 self._write(b"\n")
 
 
-_LOSSES = "losses.json"
-_ATTEMPT_FILES = {_LOSSES, ENVIRONMENT}
+_ATTEMPT_FILES = {LOSSES_FILE, ENVIRONMENT}
 """Written anew by every attempt, so that no stage can stand for them."""
 
 
@@ -604,4 +604,6 @@ class Attempt:
         return {rel: record for rel, (_, record) in records.items()}
 
     def _save_losses(self) -> None:
-        write_json(self._path(_LOSSES), {stage["name"]: stage["summary"] for stage in self._stages})
+        write_json(
+            self._path(LOSSES_FILE), {stage["name"]: stage["summary"] for stage in self._stages}
+        )

@@ -21,6 +21,7 @@ from physhandi.data.files import (
     write_bytes,
     write_yaml,
 )
+from physhandi.data.layout import SequenceFiles
 from physhandi.data.lease import Lease, live_holder, locked
 from physhandi.data.run_folder import (
     ATTEMPTS,
@@ -272,7 +273,7 @@ class RunFolder:
         """
         if sequence.name not in self.sequence_names:
             return False
-        meta = f"sequences/{sequence.name}/meta.yaml"
+        meta = SequenceFiles(sequence.name).meta
         fingerprint = self.yaml(meta).get("fingerprint") if self.has(meta) else None
         if fingerprint is not None:
             return fingerprint == sequence.content_fingerprint()

@@ -13,6 +13,7 @@ from safetensors.numpy import load_file
 
 from physhandi.data.attempt import Attempt
 from physhandi.data.files import named_fields, parse_yaml, read_array
+from physhandi.data.layout import MATERIAL_FILE, PARAMETERS_FILE, SequenceFiles
 from physhandi.data.observation import ObjectObservation
 from physhandi.data.run import RunFolder
 from physhandi.data.run_folder import reading
@@ -32,15 +33,10 @@ STORED_HAND = 300
 """Most points that a run keeps of one hand in one frame; evenly picked."""
 
 
-def sequence_folder(name: str) -> str:
-    """Where the artefacts of one sequence lie."""
-    return f"sequences/{name}"
-
-
 def save_sequence_meta(output: Attempt, sequence: Sequence) -> None:
     """Keep what a viewer needs of a sequence, so that a run can be shown without it."""
     output.save_yaml(
-        f"{sequence_folder(sequence.name)}/meta.yaml",
+        SequenceFiles(sequence.name).meta,
         {
             "name": sequence.name,
             "frame_rate": sequence.frame_rate,
@@ -58,20 +54,20 @@ def save_sequence_meta(output: Attempt, sequence: Sequence) -> None:
 
 def save_observation(output: Attempt, name: str, observation: ObjectObservation) -> None:
     """Store what was seen of the object."""
-    folder = f"{sequence_folder(name)}/observation"
-    output.save_array(f"{folder}/point.npy", observation.point.astype(np.float32))
-    output.save_array(f"{folder}/is_visible.npy", observation.is_visible)
-    output.save_array(f"{folder}/is_motion_valid.npy", observation.is_motion_valid)
+    file_of = SequenceFiles(name).observation
+    output.save_array(file_of("point"), observation.point.astype(np.float32))
+    output.save_array(file_of("is_visible"), observation.is_visible)
+    output.save_array(file_of("is_motion_valid"), observation.is_motion_valid)
     if observation.node_of_track is not None:
-        output.save_array(f"{folder}/node_of_track.npy", observation.node_of_track.astype(np.int32))
+        output.save_array(file_of("node_of_track"), observation.node_of_track.astype(np.int32))
     if observation.cloud:
         # A cloud of identified points is what the losses and metrics are defined on.
         identified = 0 if observation.node_of_track is None else observation.track_count
         most = max(STORED_CLOUD, identified)
         clouds = [_thinned(cloud, most) for cloud in observation.cloud]
         end = np.cumsum([len(cloud) for cloud in clouds]).astype(np.int64)
-        output.save_array(f"{folder}/cloud.npy", np.concatenate(clouds))
-        output.save_array(f"{folder}/cloud_end.npy", end)
+        output.save_array(file_of("cloud"), np.concatenate(clouds))
+        output.save_array(file_of("cloud_end"), end)
 
 
 def _thinned(cloud: Float[ndarray, "point 3"], most: int) -> Float[ndarray, "kept 3"]:
@@ -91,22 +87,23 @@ def load_array(path: Path) -> ndarray:
 
 def load_observation(out: Path, name: str) -> ObjectObservation:
     """Read back what `save_observation` stored."""
-    folder = out / sequence_folder(name) / "observation"
+    files = SequenceFiles(name)
 
-    def read(file: str) -> ndarray | None:
-        return load_array(folder / file) if (folder / file).exists() else None
+    def read(part: str) -> ndarray | None:
+        path = out / files.observation(part)
+        return load_array(path) if path.exists() else None
 
-    cloud, cloud_end = read("cloud.npy"), read("cloud_end.npy")
+    cloud, cloud_end = read("cloud"), read("cloud_end")
     clouds: tuple[ndarray, ...] = ()
     if cloud is not None and cloud_end is not None:
         clouds = tuple(np.split(cloud, cloud_end[:-1]))
-    with reading(folder):
+    with reading(out / files.folder / "observation"):
         return ObjectObservation(
-            point=load_array(folder / "point.npy"),
-            is_visible=load_array(folder / "is_visible.npy"),
-            is_motion_valid=load_array(folder / "is_motion_valid.npy"),
+            point=load_array(out / files.observation("point")),
+            is_visible=load_array(out / files.observation("is_visible")),
+            is_motion_valid=load_array(out / files.observation("is_motion_valid")),
             cloud=clouds,
-            node_of_track=read("node_of_track.npy"),
+            node_of_track=read("node_of_track"),
         )
 
 
@@ -134,16 +131,15 @@ def save_hand_points(output: Attempt, sequence: Sequence, progress: Progress) ->
     """Store what the views measured on the hands, for scoring; nothing if they measured nothing."""
     found = lifted_hand_points(sequence, progress)
     if found is not None:
-        folder = f"{sequence_folder(sequence.name)}/observation"
-        output.save_array(f"{folder}/hand_point.npy", found[0])
-        output.save_array(f"{folder}/hand_point_end.npy", found[1])
+        file_of = SequenceFiles(sequence.name).observation
+        output.save_array(file_of("hand_point"), found[0])
+        output.save_array(file_of("hand_point_end"), found[1])
 
 
 def save_motions(output: Attempt, name: str, motions: tuple[HandMotion, ...]) -> None:
     """Store the fitted motion of each hand."""
     for motion in motions:
-        rel = f"{sequence_folder(name)}/hand_{motion.side}.safetensors"
-        output.save_tensors(rel, motion.to_tensors())
+        output.save_tensors(SequenceFiles(name).hand_motion(motion.side), motion.to_tensors())
 
 
 def save_refinement(
@@ -154,10 +150,10 @@ def save_refinement(
     after: tuple[HandMotion, ...],
 ) -> None:
     """Store refined hands, the hands as they were, and where these held the object at frame 0."""
-    folder = sequence_folder(name)
+    files = SequenceFiles(name)
     for motion in before:
-        output.save_tensors(f"{folder}/hand_{motion.side}_initial.safetensors", motion.to_tensors())
-    output.save_array(f"{folder}/attachment.npy", attachment.astype(np.float32))
+        output.save_tensors(files.hand_motion(motion.side, is_initial=True), motion.to_tensors())
+    output.save_array(files.attachment, attachment.astype(np.float32))
     save_motions(output, name, after)
 
 
@@ -166,9 +162,9 @@ def load_attachment(out: Path, name: str) -> Float[ndarray, "control 3"]:
 
     That is frame 0 of the control nodes, unless refinement has moved the hands since.
     """
-    folder = out / sequence_folder(name)
-    if (folder / "attachment.npy").exists():
-        return load_array(folder / "attachment.npy")
+    path = out / SequenceFiles(name).attachment
+    if path.exists():
+        return load_array(path)
     return load_control(out, name)[0].copy()
 
 
@@ -178,7 +174,7 @@ def load_control(out: Path, name: str) -> Float[ndarray, "frame control 3"]:
     Raises:
         RunError: If the file is missing or damaged, or a position is not finite.
     """
-    path = out / sequence_folder(name) / "control.npy"
+    path = out / SequenceFiles(name).control
     control = load_array(path)
     wrong = np.argwhere(~np.isfinite(control))
     if len(wrong):
@@ -189,8 +185,8 @@ def load_control(out: Path, name: str) -> Float[ndarray, "frame control 3"]:
 
 def load_motions(out: Path, name: str) -> tuple[HandMotion, ...]:
     """Read the hand motions of one sequence, the right hand first."""
-    folder = out / sequence_folder(name)
-    paths = [folder / f"hand_{side}.safetensors" for side in ("right", "left")]
+    files = SequenceFiles(name)
+    paths = [out / files.hand_motion(side) for side in ("right", "left")]
     motions = []
     for path in paths:
         if path.exists():
@@ -207,9 +203,9 @@ def save_object(
 ) -> None:
     """Store the object by itself: rest shape, its springs and the global parameters."""
     count = model.object_spring_count
-    output.save_yaml("object/parameters.yaml", parameters.to_dict())
+    output.save_yaml(PARAMETERS_FILE, parameters.to_dict())
     output.save_tensors(
-        "object/material.safetensors",
+        MATERIAL_FILE,
         {
             "rest_node": rest_node.astype(np.float32),
             "object_spring_nodes": model.spring_nodes[:count].copy(),
@@ -222,7 +218,7 @@ def save_object(
 
 def load_parameters(out: Path) -> SimulationParameters:
     """Read the global parameters of a run."""
-    path = out / "object/parameters.yaml"
+    path = out / PARAMETERS_FILE
     with reading(path):
         content = named_fields(parse_yaml(path.read_text(encoding="utf-8")))
         if content is None:
@@ -232,7 +228,7 @@ def load_parameters(out: Path) -> SimulationParameters:
 
 def load_rest_node(out: Path) -> Float[ndarray, "node 3"]:
     """Read the rest shape of a run's object [m]."""
-    path = out / "object/material.safetensors"
+    path = out / MATERIAL_FILE
     with reading(path):
         return load_file(path)["rest_node"]
 
@@ -240,12 +236,12 @@ def load_rest_node(out: Path) -> Float[ndarray, "node 3"]:
 def save_model(output: Attempt, name: str, model: SpringMassModel) -> None:
     """Store the springs of one sequence, object springs and virtual springs."""
     tensors = {key: np.ascontiguousarray(value) for key, value in model.to_tensors().items()}
-    output.save_tensors(f"{sequence_folder(name)}/model.safetensors", tensors)
+    output.save_tensors(SequenceFiles(name).model, tensors)
 
 
 def load_model(out: Path, name: str) -> SpringMassModel:
     """Read the springs of one sequence."""
-    path = out / sequence_folder(name) / "model.safetensors"
+    path = out / SequenceFiles(name).model
     with reading(path):
         return SpringMassModel.from_tensors(load_file(path))
 
@@ -254,35 +250,37 @@ def save_hand_observation(
     output: Attempt, name: str, keypoint: Float[ndarray, "view frame hand 21 3"]
 ) -> None:
     """Store the keypoints that stage 1 compared the hands with [px]."""
-    output.save_array(f"{sequence_folder(name)}/keypoint.npy", keypoint.astype(np.float32))
+    output.save_array(SequenceFiles(name).keypoint, keypoint.astype(np.float32))
 
 
 def copy_hand_observation(source: RunFolder, name: str, output: Attempt) -> None:
     """Take over what another run keeps of what the views saw of the hands."""
-    folder = sequence_folder(name)
-    for file in ("keypoint.npy", "observation/hand_point.npy", "observation/hand_point_end.npy"):
-        if source.has(f"{folder}/{file}"):
-            output.save_array(f"{folder}/{file}", source.array(f"{folder}/{file}"))
+    files = SequenceFiles(name)
+    hands = (files.observation(part) for part in ("hand_point", "hand_point_end"))
+    for file in (files.keypoint, *hands):
+        if source.has(file):
+            output.save_array(file, source.array(file))
 
 
 def save_hand_vertices(output: Attempt, name: str) -> None:
     """Store mesh, joints and skin of every hand, for viewers, exports and metrics."""
+    files = SequenceFiles(name)
     for motion in load_motions(output.out, name):
         model = load_hand_model(motion.side, motion.model)
-        stem = f"{sequence_folder(name)}/hand_{motion.side}"
-        output.save_array(f"{stem}_vertex.npy", motion.vertices(model).astype(np.float32))
-        output.save_array(f"{stem}_face.npy", np.asarray(model.faces, np.int32))
-        output.save_array(f"{stem}_keypoint.npy", motion.keypoints(model).astype(np.float32))
-        output.save_tensors(f"{stem}_skin.safetensors", hand_skin(model, motion).to_tensors())
+        side = motion.side
+        output.save_array(files.hand_vertex(side), motion.vertices(model).astype(np.float32))
+        output.save_array(files.hand_face(side), np.asarray(model.faces, np.int32))
+        output.save_array(files.hand_keypoint(side), motion.keypoints(model).astype(np.float32))
+        output.save_tensors(files.hand_skin(side), hand_skin(model, motion).to_tensors())
 
 
 def copy_hand_vertices(source: RunFolder, name: str, output: Attempt) -> None:
     """Take over what `save_hand_vertices` stored in another run, which needs no hand model."""
+    files = SequenceFiles(name)
     for motion in load_motions(output.out, name):
-        stem = f"{sequence_folder(name)}/hand_{motion.side}"
-        for part in ("vertex", "face", "keypoint"):
-            if source.has(f"{stem}_{part}.npy"):
-                output.save_array(f"{stem}_{part}.npy", source.array(f"{stem}_{part}.npy"))
-        if source.has(f"{stem}_skin.safetensors"):
-            tensors = source.tensors(f"{stem}_skin.safetensors")
-            output.save_tensors(f"{stem}_skin.safetensors", tensors)
+        side = motion.side
+        for file in (files.hand_vertex(side), files.hand_face(side), files.hand_keypoint(side)):
+            if source.has(file):
+                output.save_array(file, source.array(file))
+        if source.has(files.hand_skin(side)):
+            output.save_tensors(files.hand_skin(side), source.tensors(files.hand_skin(side)))

@@ -21,6 +21,7 @@ from physhandi.data.importers.phystwin_experiment import (
     read_optimum,
     read_phystwin_checkpoint,
 )
+from physhandi.data.layout import METRICS_FILE, REST_NODE_FILE, SequenceFiles
 from physhandi.data.run import RunFolder
 from physhandi.data.sequence import Sequence
 from physhandi.devices import describe_device
@@ -365,14 +366,14 @@ def _fill(
     progress: Progress,
 ) -> None:
     """Store what a fit would have stored, and simulate all frames."""
-    folder = artefacts.sequence_folder(sequence.name)
+    files = SequenceFiles(sequence.name)
     environment = describe_environment(device, describe_device(device))
     attempt.save_json(ENVIRONMENT, environment)
     artefacts.save_sequence_meta(attempt, sequence)
     artefacts.save_observation(attempt, sequence.name, observe_object(sequence, progress))
-    attempt.save_array(f"{folder}/object_node.npy", model.object_node)
-    attempt.save_array(f"{folder}/control.npy", np.asarray(sequence.control, np.float32))
-    attempt.save_array("object/rest_node.npy", model.object_node)
+    attempt.save_array(files.object_node, model.object_node)
+    attempt.save_array(files.control, np.asarray(sequence.control, np.float32))
+    attempt.save_array(REST_NODE_FILE, model.object_node)
     artefacts.save_model(attempt, sequence.name, model)
     artefacts.save_object(attempt, parameters, model, model.object_node)
     frames = []
@@ -381,7 +382,7 @@ def _fill(
         progress.check_cancelled()
         frames.append(position)
         progress.report("rollout", frame + 1, len(control))
-    attempt.save_array(f"{folder}/rollout.npy", np.stack(frames))
+    attempt.save_array(files.rollout, np.stack(frames))
 
 
 def _finish(
@@ -391,15 +392,15 @@ def _finish(
     expected: Float[ndarray, "frame node 3"] | None,
 ) -> None:
     """Compare and measure."""
-    folder = artefacts.sequence_folder(sequence.name)
+    files = SequenceFiles(sequence.name)
     comparison: dict[str, Any] = {}
     if expected is not None:
-        rollout = np.load(attempt.out / folder / "rollout.npy", allow_pickle=False)
+        rollout = np.load(attempt.out / files.rollout, allow_pickle=False)
         comparison = compare_rollouts(rollout, expected)
     attempt.save_json(REPORT, {**report, "inference": comparison or None})
     metrics, errors = measure_run(attempt.out, sequence)
-    attempt.save_json("metrics.json", {sequence.name: metrics})
-    attempt.save_json(f"{folder}/frame_errors.json", errors)
+    attempt.save_json(METRICS_FILE, {sequence.name: metrics})
+    attempt.save_json(files.frame_errors, errors)
     attempt.finish_stage(_STAGE, {"curve": [], **comparison})
 
 

@@ -11,6 +11,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from physhandi.data.attempt import Attempt
+from physhandi.data.layout import SequenceFiles
 from physhandi.data.observation import ObjectObservation
 from physhandi.data.run import RunFolder
 from physhandi.data.sequence import Sequence
@@ -129,8 +130,7 @@ def refine_sequence(
     motions = artefacts.load_motions(output.out, sequence.name)
     models = _hand_models(motions)
     vertex = control_trajectory(motions, models)
-    folder = output.out / artefacts.sequence_folder(sequence.name)
-    keypoint = np.load(folder / "keypoint.npy", allow_pickle=False)
+    keypoint = artefacts.load_array(output.out / SequenceFiles(sequence.name).keypoint)
     cameras = [view.camera for view in sequence.views]
     seen = keypoint[:, : problem.frame_count]
     return refine_hands(
@@ -166,8 +166,7 @@ def store_refined(
     """
     motions = artefacts.load_motions(output.out, sequence.name)
     artefacts.save_refinement(output, sequence.name, motions, problem.control[0], refined.motions)
-    folder = artefacts.sequence_folder(sequence.name)
-    output.save_array(f"{folder}/control.npy", refined.control.astype(np.float32))
+    output.save_array(SequenceFiles(sequence.name).control, refined.control.astype(np.float32))
 
 
 def _hand_models(motions: tuple[HandMotion, ...]) -> tuple[HandModel, ...]:

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from physhandi.data.files import read_array, read_tensors
+from physhandi.data.layout import PARAMETERS_FILE, REST_NODE_FILE, SequenceFiles
 from physhandi.data.sequence import Sequence
 from physhandi.data.truth import read_truth
 from physhandi.errors import RunError
@@ -82,12 +83,12 @@ class ScoringReference:
 
 
 def read_reference(
-    folder: Path, sequence: Sequence, rollout: Float[ndarray, "frame node 3"] | None
+    out: Path, sequence: Sequence, rollout: Float[ndarray, "frame node 3"] | None
 ) -> ScoringReference | None:
     """Collect what a run and its sequence know; None if there is no object to score.
 
     Args:
-        folder: The run's folder of this sequence.
+        out: Output folder of the run.
         sequence: The sequence.
         rollout: What the run simulated.
 
@@ -95,10 +96,11 @@ def read_reference(
         RunError: If a file of the run is damaged.
         SequenceError: If the sequence tells a true surface that cannot be one.
     """
-    point = read_scoring_inputs(folder / "observation" / "point.npy")
-    is_visible = read_scoring_inputs(folder / "observation" / "is_visible.npy")
-    node_of_track = read_scoring_inputs(folder / "observation" / "node_of_track.npy")
-    node = read_scoring_inputs(folder / "object_node.npy")
+    files = SequenceFiles(sequence.name)
+    point = read_scoring_inputs(out / files.observation("point"))
+    is_visible = read_scoring_inputs(out / files.observation("is_visible"))
+    node_of_track = read_scoring_inputs(out / files.observation("node_of_track"))
+    node = read_scoring_inputs(out / files.object_node)
     if node is None:
         node = sequence.object_node if rollout is None else rollout[0]
     if node is None or (point is None and sequence.marker is None):
@@ -107,6 +109,7 @@ def read_reference(
         free = [m for m in range(point.shape[1]) if m not in sequence.controlled_markers]
         point, is_visible = point[:, free], is_visible[:, free]
         node_of_track = None if node_of_track is None else node_of_track[free]
+    clouds = read_split(*(out / files.observation(part) for part in ("cloud", "cloud_end")))
     return ScoringReference(
         object_node=node,
         surface_count=sequence.surface_node_count,
@@ -114,12 +117,14 @@ def read_reference(
         is_visible=is_visible,
         node_of_track=node_of_track,
         validation=sequence.validation_track,
-        cloud=tuple(read_split(folder / "observation", "cloud") or ()),
+        cloud=tuple(
+            read_split(out / files.observation("cloud"), out / files.observation("cloud_end")) or ()
+        ),
         marker=sequence.marker,
         marker_node=sequence.marker_node,
         controlled_markers=sequence.controlled_markers,
         true_surface=true_surface(read_truth(sequence.folder)),
-        contact=_contact(folder, sequence, node, point, is_visible),
+        contact=_contact(out, sequence, node, point, is_visible),
     )
 
 
@@ -133,8 +138,8 @@ def read_topology(out: Path, object_node: Float[ndarray, "node 3"]) -> dict[str,
     Raises:
         RunError: If a file of the run is damaged.
     """
-    path = out / "object" / "parameters.yaml"
-    node = read_scoring_inputs(out / "object" / "rest_node.npy")
+    path = out / PARAMETERS_FILE
+    node = read_scoring_inputs(out / REST_NODE_FILE)
     node = object_node if node is None else node
     if not path.is_file() or len(node) < 2:
         return None
@@ -169,27 +174,25 @@ def read_scoring_inputs(path: Path) -> Any:
         raise RunError(f"{path} is not a readable array: {error}.") from error
 
 
-def read_split(folder: Path, name: str) -> list[ndarray] | None:
+def read_split(point: Path, end: Path) -> list[ndarray] | None:
     """Read point sets that are stored one after the other, with where each of them ends."""
-    points, end = (
-        read_scoring_inputs(folder / f"{name}.npy"),
-        read_scoring_inputs(folder / f"{name}_end.npy"),
-    )
-    return None if points is None or end is None else np.split(points, end.reshape(-1)[:-1])
+    points, ends = read_scoring_inputs(point), read_scoring_inputs(end)
+    return None if points is None or ends is None else np.split(points, ends.reshape(-1)[:-1])
 
 
 def _contact(
-    folder: Path,
+    out: Path,
     sequence: Sequence,
     node: Float[ndarray, "node 3"],
     point: ndarray | None,
     is_visible: ndarray | None,
 ) -> ContactReference | None:
     """Prepare the judgement of contacts; None without hands or without springs to judge."""
-    vertices = [read_scoring_inputs(folder / f"hand_{side}_vertex.npy") for side in sequence.hands]
+    files = SequenceFiles(sequence.name)
+    vertices = [read_scoring_inputs(out / files.hand_vertex(side)) for side in sequence.hands]
     whole = [held_where_missing(vertex)[0] for vertex in vertices if vertex is not None]
     known = [vertex for vertex in whole if vertex is not None]
-    path = folder / "model.safetensors"
+    path = out / files.model
     if not known or not path.is_file():
         return None
     try:
@@ -342,12 +345,12 @@ StoredPoints = tuple[Float[ndarray, "point 3"], Int[ndarray, "hand frame"]]
 
 
 def score_hands(
-    folder: Path, sequence: Sequence, given: StoredPoints | None = None
+    out: Path, sequence: Sequence, given: StoredPoints | None = None
 ) -> tuple[dict[str, Any], dict[str, Curves]]:
     """Compare each hand with detected keypoints, measured points and the truth.
 
     Args:
-        folder: The run's folder of this sequence.
+        out: Output folder of the run.
         sequence: Gives cameras and, if it has it, the truth.
         given: What the views measured on the hands; None reads it from the run.
 
@@ -359,15 +362,17 @@ def score_hands(
         RunError: If a file of the run is damaged.
     """
     truth = read_truth(sequence.folder)
-    detected = read_scoring_inputs(folder / "keypoint.npy")
-    points = read_split(folder / "observation", "hand_point")
+    files = SequenceFiles(sequence.name)
+    detected = read_scoring_inputs(out / files.keypoint)
+    stored = (out / files.observation(part) for part in ("hand_point", "hand_point_end"))
+    points = read_split(*stored)
     if given is not None:
         points = np.split(given[0], given[1].reshape(-1)[:-1])
     scores: dict[str, Any] = {}
     curves: dict[str, Curves] = {}
     for hand, side in enumerate(sequence.hands):
-        joint = read_scoring_inputs(folder / f"hand_{side}_keypoint.npy")
-        vertex = read_scoring_inputs(folder / f"hand_{side}_vertex.npy")
+        joint = read_scoring_inputs(out / files.hand_keypoint(side))
+        vertex = read_scoring_inputs(out / files.hand_vertex(side))
         true_joint, true_vertex = truth.hand_keypoint.get(side), truth.hand_vertex.get(side)
         score: dict[str, Any] = {}
         if joint is not None and detected is not None:
@@ -498,9 +503,9 @@ def measure_run(
     Raises:
         RunError: If a file of the run is damaged.
     """
-    folder = out / "sequences" / sequence.name
-    rollout = read_scoring_inputs(folder / "rollout.npy")
-    reference = read_reference(folder, sequence, rollout)
+    files = SequenceFiles(sequence.name)
+    rollout = read_scoring_inputs(out / files.rollout)
+    reference = read_reference(out, sequence, rollout)
     report: dict[str, Any] = {}
     frames: dict[str, Any] = {"unit": "m", "frames": list(range(sequence.frame_count))}
     if reference is not None:
@@ -509,7 +514,7 @@ def measure_run(
             "future": sequence.future_frames,
         }
         motions, substituted = _motions(
-            rollout, reference, read_scoring_inputs(folder / "control.npy"), sequence.frame_count
+            rollout, reference, read_scoring_inputs(out / files.control), sequence.frame_count
         )
         if not with_baselines:
             motions = {"rollout": motions["rollout"]}
@@ -519,7 +524,7 @@ def measure_run(
         topology = read_topology(out, reference.object_node)
         if topology is not None:
             report["topology"] = topology
-    hands, hand_curves = score_hands(folder, sequence, hand_points)
+    hands, hand_curves = score_hands(out, sequence, hand_points)
     if hands:
         report["hands"] = hands
     if hand_curves:

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from physhandi.data.layout import SequenceFiles
 from physhandi.data.run import RunFolder
 from physhandi.errors import RunError, UsageError
 
@@ -85,29 +86,28 @@ def read_scene(
             f"Run '{run.id}' has no sequence '{sequence}'. It has: {', '.join(run.sequence_names)}."
         )
     name = sequence or run.sequence_names[0]
-    folder = f"sequences/{name}"
-    if not run.has(f"{folder}/meta.yaml"):
+    files = SequenceFiles(name)
+    if not run.has(files.meta):
         raise RunError(f"Run '{run.id}' has nothing of sequence '{name}'; it is {run.state}.")
-    meta = run.yaml(f"{folder}/meta.yaml")
+    meta = run.yaml(files.meta)
     hands: dict[str, HandSurface] = {}
     for side in SIDES:
-        if run.has(f"{folder}/hand_{side}_vertex.npy"):
+        if run.has(files.hand_vertex(side)):
             face = None if faces is None else faces.get(side)
-            if run.has(f"{folder}/hand_{side}_face.npy"):
-                face = run.array(f"{folder}/hand_{side}_face.npy")
-            vertex = run.array(f"{folder}/hand_{side}_vertex.npy")
+            if run.has(files.hand_face(side)):
+                face = run.array(files.hand_face(side))
+            vertex = run.array(files.hand_vertex(side))
             hands[side] = HandSurface(vertex=vertex, face=face)
     rollout, control = (
-        run.array(f"{folder}/{part}.npy") if run.has(f"{folder}/{part}.npy") else None
-        for part in ("rollout", "control")
+        run.array(file) if run.has(file) else None for file in (files.rollout, files.control)
     )
     if rollout is None and not hands:
         raise RunError(f"Run '{run.id}' holds neither hands nor an object of sequence '{name}'.")
     frame_count = len(rollout) if rollout is not None else len(next(iter(hands.values())).vertex)
     nothing = np.zeros((frame_count, 0, 3), np.float32)
     model: dict[str, ndarray] = {}
-    if run.has(f"{folder}/model.safetensors"):
-        model = run.tensors(f"{folder}/model.safetensors")
+    if run.has(files.model):
+        model = run.tensors(files.model)
     return SceneData(
         sequence=name,
         frame_rate=float(meta["frame_rate"]),
@@ -126,7 +126,7 @@ def read_scene(
 
 def read_joints(run: RunFolder, sequence: str) -> dict[str, ndarray]:
     """Read where the joints of the hands are, by side (frame joint 3) [m]."""
-    stored = {side: f"sequences/{sequence}/hand_{side}_keypoint.npy" for side in SIDES}
+    stored = {side: SequenceFiles(sequence).hand_keypoint(side) for side in SIDES}
     return {side: run.array(rel) for side, rel in stored.items() if run.has(rel)}
 
 
@@ -141,5 +141,5 @@ def read_skins(run: RunFolder, sequence: str) -> dict[str, Mapping[str, ndarray]
         By side: ``name``, ``parent``, ``T_bone_hand``, ``vertex``, ``faces``, ``vertex_bone``,
         ``vertex_weight``, ``translation`` and ``rotation``, as docs/formats.md describes them.
     """
-    stored = {side: f"sequences/{sequence}/hand_{side}_skin.safetensors" for side in SIDES}
+    stored = {side: SequenceFiles(sequence).hand_skin(side) for side in SIDES}
     return {side: run.tensors(rel) for side, rel in stored.items() if run.has(rel)}

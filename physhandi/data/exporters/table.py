@@ -18,13 +18,14 @@ from physhandi.data.files import (
     write_bytes,
     write_yaml,
 )
+from physhandi.data.layout import LOSSES_FILE, METRICS_FILE, PARAMETERS_FILE
 from physhandi.data.run import RunFolder
 
 _FORMULA_START = ("=", "+", "-", "@", "\t", "\r")
 _SHARED_FILES = (
-    ("parameters", "object/parameters.yaml"),
-    ("losses", "losses.json"),
-    ("metrics", "metrics.json"),
+    ("parameters", PARAMETERS_FILE),
+    ("losses", LOSSES_FILE),
+    ("metrics", METRICS_FILE),
 )
 TRAJECTORY_COLUMNS = ("sequence", "frame", "time_s", "kind", "index", "x", "y", "z")
 

@@ -19,7 +19,9 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from physhandi.data.environment import processor_name
+from physhandi.data.exporters.scene_data import SIDES
 from physhandi.data.files import write_array, write_json
+from physhandi.data.layout import SequenceFiles
 from physhandi.data.lease import locked_file
 from physhandi.data.run import RunFolder
 from physhandi.data.run_folder import EXIT, artefacts, read_json, read_mapping
@@ -80,23 +82,23 @@ def assemble(
     folder: Path, run: RunFolder | None, reference: RunFolder, recording: Sequence
 ) -> None:
     """Lay out what is scored: the run's motion beside the reference's observations."""
-    inside = f"sequences/{recording.name}"
-    observed = (f"{inside}/observation/", f"{inside}/keypoint.npy")
-    left_out = ("rollout.npy", "control.npy") if run is None else ()
+    files = SequenceFiles(recording.name)
+    observed = (f"{files.folder}/observation/", files.keypoint)
+    left_out = (files.rollout, files.control) if run is None else ()
     chosen = {r: path for r, path in artefacts(reference.out) if r.startswith(observed)} | {
         rel: path
         for rel, path in artefacts((reference if run is None else run).out)
-        if not rel.startswith(observed) and not rel.endswith(left_out)
+        if not rel.startswith(observed) and rel not in left_out
     }
     for rel, path in chosen.items():
         target = folder / rel
         target.parent.mkdir(parents=True, exist_ok=True)
         target.symlink_to(path.resolve())
     truth = read_truth(recording.folder).hand_vertex
-    if run is not None and not any("_vertex.npy" in rel for rel in chosen):
+    if run is not None and not any(files.hand_vertex(side) in chosen for side in SIDES):
         for side in recording.hands:  # An oracle moves the object with the true hand itself.
             if side in truth:
-                write_array(folder / inside / f"hand_{side}_vertex.npy", truth[side])
+                write_array(folder / files.hand_vertex(side), truth[side])
 
 
 def add_photometric(
@@ -127,10 +129,9 @@ def add_photometric(
 
 def _complete(run: RunFolder, recording: Sequence) -> Float[ndarray, "frame node 3"]:
     """Give a run's rollout in every frame; where it is missing or not finite, nothing moves."""
-    inside = f"sequences/{recording.name}"
-    rollout = run.array(f"{inside}/rollout.npy")
-    known = f"{inside}/object_node.npy"
-    still = run.array(known) if run.has(known) else rollout[0]
+    files = SequenceFiles(recording.name)
+    rollout = run.array(files.rollout)
+    still = run.array(files.object_node) if run.has(files.object_node) else rollout[0]
     complete = np.repeat(still[None].astype(rollout.dtype), recording.frame_count, axis=0)
     count = min(len(rollout), recording.frame_count)
     is_usable = np.isfinite(rollout[:count]).all(axis=(1, 2))

@@ -10,6 +10,7 @@ from typing import Any
 
 from physhandi.data.environment import describe_environment
 from physhandi.data.files import named_fields
+from physhandi.data.layout import SequenceFiles
 from physhandi.data.sequence import Sequence
 from physhandi.devices import describe_device
 from physhandi.errors import MissingInputError, SequenceError, UsageError
@@ -298,7 +299,7 @@ class _Work:
         unmoved = None
         if outcome.error and task.method.rule is None:
             static = self.bench.reference(task.recording)
-            unmoved = static.array(f"sequences/{task.recording.name}/rollout.npy")[0]
+            unmoved = static.array(SequenceFiles(task.recording.name).rollout)[0]
         figures = figures_of(outcome, task.recording, task.protocol, task.split, unmoved)
         return {
             "protocol": task.protocol,

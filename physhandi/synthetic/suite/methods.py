@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from physhandi import pipeline
 from physhandi.data.attempt import Attempt
 from physhandi.data.environment import ENVIRONMENT, describe_environment
+from physhandi.data.layout import METRICS_FILE, SequenceFiles
 from physhandi.data.run import RunFolder
 from physhandi.data.run_folder import artefacts
 from physhandi.data.sequence import Sequence
@@ -288,25 +289,25 @@ def correct(
     run = open_suite_run(folder, title, recording, config)
     if run.is_published:
         return run
-    inside = f"sequences/{recording.name}"
+    files = SequenceFiles(recording.name)
     with run.begin_attempt() as attempt:
         for rel, path in artefacts(base.out):
             _copy(path, attempt.out / rel)
-        seen = {n: base.array(f"{inside}/observation/{n}.npy") for n in ("point", "is_visible")}
-        name = f"{inside}/observation/node_of_track.npy"
+        seen = {n: base.array(files.observation(n)) for n in ("point", "is_visible")}
+        name = files.observation("node_of_track")
         try:
             rollout = last_residual_baseline(
-                base.array(f"{inside}/rollout.npy"),
+                base.array(files.rollout),
                 **seen,
                 first_future=len(recording.reconstruction_frames),
                 node_of_track=base.array(name) if base.has(name) else None,
             )
         except ValueError as error:
             raise MissingInputError(f"Sequence '{recording.name}': {error}.") from error
-        attempt.save_array(f"{inside}/rollout.npy", rollout.astype(np.float32))
+        attempt.save_array(files.rollout, rollout.astype(np.float32))
         scores, frames = measure_run(attempt.out, recording)
-        attempt.save_json(f"{inside}/frame_errors.json", frames)
-        attempt.save_json("metrics.json", {recording.name: scores})
+        attempt.save_json(files.frame_errors, frames)
+        attempt.save_json(METRICS_FILE, {recording.name: scores})
         attempt.finish_stage(CORRECTION)
         attempt.publish()
     return RunFolder.open(folder)
@@ -392,7 +393,7 @@ def take_disturbed_hands(source: RunFolder, attempt: Attempt, name: str, noise: 
     (stage,) = (stage for stage in source.stages() if stage["name"] == pipeline.HANDS)
     for rel in stage["files"]:
         _copy(source.out / rel, attempt.out / rel)
-    disturb_hands(attempt, f"sequences/{name}", noise)
+    disturb_hands(attempt, SequenceFiles(name).folder, noise)
     attempt.finish_stage(pipeline.HANDS, stage["summary"])
 
 
