@@ -117,9 +117,7 @@ def read_reference(
         is_visible=is_visible,
         node_of_track=node_of_track,
         validation=sequence.validation_track,
-        cloud=tuple(
-            read_split(out / files.observation("cloud"), out / files.observation("cloud_end")) or ()
-        ),
+        cloud=tuple(clouds or ()),
         marker=sequence.marker,
         marker_node=sequence.marker_node,
         controlled_markers=sequence.controlled_markers,

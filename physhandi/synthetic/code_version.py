@@ -16,7 +16,8 @@ from physhandi.data.sequence import Sequence
 INPUTS = ("synthetic/suite/variants.py", "data/sequence_writer.py", "data/truth.py")
 """Makes what methods are given."""
 PREDICTIONS = (
-    *("pipeline.py", "data", "hand", "perception", "simulation", "fitting"),
+    *("pipeline.py", "fitted_object.py", "object_rollout.py", "settings.py"),
+    *("data", "hand", "perception", "simulation", "fitting"),
     *("metrics/baselines.py", "metrics/alignment.py", "metrics/geometry.py"),
     *("synthetic/suite/methods.py", "synthetic/suite/cells.py"),
     *INPUTS[:1],

@@ -132,7 +132,7 @@ def needed(start: tuple[str, ...], without: tuple[str, ...]) -> set[str]:
 
 # Words and looks, and the metrics that a run notes of itself, which no table takes.
 NO_MATTER = (
-    *("errors.py", "progress.py", "synthetic/code_hash.py", "synthetic/generator_version.py"),
+    *("errors.py", "progress.py", "child.py", "devices.py", "synthetic/code_version.py"),
     "metrics/report.py",
 )
 
@@ -140,8 +140,8 @@ NO_MATTER = (
 @pytest.mark.parametrize(
     ("parts", "start", "without"),
     [
-        (PREDICTIONS, ("synthetic/cells.py",), (*NO_MATTER, "synthetic/cell_scores.py")),
-        (SCORES, ("synthetic/cell_scores.py",), NO_MATTER[:-1]),
+        (PREDICTIONS, ("synthetic/suite/methods.py",), NO_MATTER),
+        (SCORES, ("metrics/report.py", "metrics/photometric.py"), NO_MATTER[:-1]),
         (PREDICTIONS, INPUTS, NO_MATTER),
     ],
     ids=["predictions", "scores", "inputs"],
