@@ -70,13 +70,19 @@ def reconstruct(
         FitError: If an optimisation has no usable result.
         RunError: If another process works on the run.
     """
-    from physhandi.fitting.config import PipelineConfig, apply_overrides, load_profile
+    from physhandi.fitting.config import (
+        PipelineConfig,
+        apply_overrides,
+        load_profile,
+        overrides_of,
+    )
 
     recordings = _listed(sequences)
-    config = profile if isinstance(profile, PipelineConfig) else load_profile(profile)
-    config = apply_overrides(config, overrides or {})
+    base = profile if isinstance(profile, PipelineConfig) else load_profile(profile)
+    config = apply_overrides(base, overrides or {})
+    changed = overrides_of(config, base)
     folder = out or Path("runs") / f"{recordings[0].name}_{config.profile}"
-    settings = {"profile": config.to_dict()}
+    settings = {"profile": config.to_dict()} | ({"overrides": changed} if changed else {})
     return _execute(
         folder, "reconstruction", recordings, settings, progress=progress, device=device
     )
@@ -125,7 +131,12 @@ def simulate(
 
 
 def prepare_run(
-    folder: Path | str, kind: RunKind, recordings: Many[Sequence], settings: Mapping[str, Any]
+    folder: Path | str,
+    kind: RunKind,
+    recordings: Many[Sequence],
+    settings: Mapping[str, Any],
+    *,
+    name: str = "",
 ) -> Run:
     """Make the run in a folder, or open it if it is there and was asked for the same.
 
@@ -134,6 +145,7 @@ def prepare_run(
         kind: What is to be done.
         recordings: What it is done with.
         settings: Its configuration, in plain data.
+        name: What a new run is called; its folder's name if left out.
 
     Raises:
         UsageError: If the folder holds another run.
@@ -142,7 +154,7 @@ def prepare_run(
     path = Path(folder)
     paths = [str(recording.folder) for recording in recordings]
     if not (path / "run.yaml").is_file():
-        name = path.resolve().name
+        name = name or path.resolve().name
         return Run.create(path, name=name, kind=kind, sequences=paths, config=settings)
     run = Run.open(path)
     if run.kind != kind or run.config != settings or list(run.sequences) != paths:

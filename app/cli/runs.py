@@ -15,8 +15,10 @@ from app.cli.lookup import (
 )
 from app.cli.output import AsJson, DataDir, Device, show
 from app.jobs.order import default_name
+from physhandi.api import prepare_run
 from physhandi.data.run import RunKind
 from physhandi.data.run_folder import new_run_id
+from physhandi.data.sequence import Sequence
 from physhandi.devices import pick_device
 from physhandi.errors import RunError, UsageError
 from physhandi.fitting.config import (
@@ -100,13 +102,12 @@ def reconstruct(
     config = apply_overrides(base, dict(parse_override(text) for text in settings))
     changed = overrides_of(config, base)
     stored = {"profile": config.to_dict()} | ({"overrides": changed} if changed else {})
-    paths = [str(recording.folder) for recording in recordings]
     device = pick_device(device)
     if out is None:
         name = default_name(recordings[0].name, stored)
-        run = _run_at(_new_folder(data_dir), "reconstruction", paths, stored, name)
+        run = _run_at(_new_folder(data_dir), "reconstruction", recordings, stored, name)
     else:
-        run = _run_at(out, "reconstruction", paths, stored)
+        run = _run_at(out, "reconstruction", recordings, stored)
     show(_execute(run, device))
 
 
@@ -137,12 +138,11 @@ def simulate(
     else:
         recordings = open_catalog(data_dir).sequences_of(source)[:1]
     config = {"source": str(source.folder.resolve()), "parameters": changed}
-    paths = [str(recording.folder) for recording in recordings]
     if out is None:
         name = f"{source.name}, simulated"
-        target = _run_at(_new_folder(data_dir), "simulation", paths, config, name)
+        target = _run_at(_new_folder(data_dir), "simulation", recordings, config, name)
     else:
-        target = _run_at(out, "simulation", paths, config)
+        target = _run_at(out, "simulation", recordings, config)
     result = _execute(target, device)
     chosen = Run.open(target.folder).yaml("object/parameters.yaml")
     show({"substeps_per_frame": chosen["substeps_per_frame"], **result})
@@ -235,17 +235,14 @@ def _new_folder(data_dir: Path | None) -> Path:
 
 
 def _run_at(
-    folder: Path, kind: RunKind, sequences: list[str], config: Mapping[str, Any], name: str = ""
+    folder: Path,
+    kind: RunKind,
+    recordings: list[Sequence],
+    config: Mapping[str, Any],
+    name: str = "",
 ) -> Run:
     """Make a run, or open the unfinished one of the same kind that its folder holds."""
-    if not (folder / "run.yaml").is_file():
-        name = name or folder.resolve().name
-        return Run.create(folder, name=name, kind=kind, sequences=sequences, config=config)
-    run = Run.open(folder)
-    if run.kind != kind or run.config != config or list(run.sequences) != sequences:
-        raise UsageError(
-            f"{folder} already holds another run. Choose a new --out, or delete that folder first."
-        )
+    run = prepare_run(folder, kind, recordings, config, name=name)
     if run.is_published:
         raise UsageError(f"{folder} already holds this run, finished. Choose a new --out.")
     return run
