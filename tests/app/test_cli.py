@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line_page import PAGE, page
 from server_world import tiny_config
 from sheet_sequence import FRAMES, NODE
 
@@ -353,3 +354,10 @@ def test_sequences_are_checked_file_by_file(terminal: Terminal) -> None:
     assert terminal("check", "sheet", "towel_fold") == 1
     assert "marker.npy" in terminal.out
     assert "at least one sequence" in terminal.refused(2, "check")
+
+
+def test_the_page_of_the_command_line_tells_what_the_commands_take() -> None:
+    text = page()
+    assert text == PAGE.read_text(encoding="utf-8"), "run tests/command_line_page.py"
+    for name in ("`--connection-radius`", "`--set`", "### `physhandi import mocap`"):
+        assert name in text

@@ -17,7 +17,7 @@ from physhandi.progress import NullProgress, Preview
 
 
 def read_preview(run_folder: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """What a preview shows, and the points of each kind [m], as docs/monitoring.md has them."""
+    """What a preview shows, and the points of each kind [m], as docs/viewer.md has them."""
     with safe_open(run_folder / PREVIEW, framework="numpy") as stream:
         about = json.loads(stream.metadata()["about"])
         arrays = {kind: stream.get_tensor(kind) for kind in stream.keys()}  # noqa: SIM118
