@@ -15,6 +15,7 @@ from scipy.spatial import KDTree  # pyright: ignore[reportMissingTypeStubs]  # i
 from physhandi.data.truth import Truth
 from physhandi.errors import SequenceError
 from physhandi.metrics.geometry import chamfer_one_way
+from physhandi.triangles import triangle_distance
 
 SAMPLE_COUNT = 2000
 """Points of the true surface that are asked for the nearest node."""
@@ -135,28 +136,4 @@ def surface_distance(
     count = min(CANDIDATES, len(triangle))
     tree: Any = KDTree(triangle.mean(axis=1))
     near = np.reshape(tree.query(point, k=count)[1], (len(point), count))
-    return _triangle_distance(point[:, None], triangle[near]).min(axis=1)
-
-
-def _triangle_distance(
-    point: Float[ndarray, "point 1 3"], triangle: Float[ndarray, "point near 3 3"]
-) -> Float[ndarray, "point near"]:
-    """Measure each point against its triangles: above their inside, or at their edges."""
-    corner = [triangle[:, :, k] for k in range(3)]
-    edge = [corner[(k + 1) % 3] - corner[k] for k in range(3)]
-    offset = [point - corner[k] for k in range(3)]
-    normal = np.cross(edge[0], edge[1])
-    size = np.maximum(np.linalg.norm(normal, axis=-1), 1e-300)
-    height = np.abs(_dot(offset[0], normal)) / size
-    is_inside = np.ones(height.shape, dtype=bool)
-    nearest = np.full(height.shape, np.inf)
-    for e, o in zip(edge, offset, strict=True):
-        is_inside &= _dot(np.cross(normal, e), o) >= 0.0
-        along = np.clip(_dot(o, e) / np.maximum(_dot(e, e), 1e-300), 0.0, 1.0)
-        nearest = np.minimum(nearest, np.linalg.norm(o - along[..., None] * e, axis=-1))
-    # A triangle without area has no inside, but every sign above is zero.
-    return np.where(is_inside & (size > 1e-300), height, nearest)
-
-
-def _dot(first: Float[ndarray, "*item 3"], second: Float[ndarray, "*item 3"]) -> ndarray:
-    return np.einsum("...d,...d->...", first, second)
+    return triangle_distance(point[:, None], triangle[near]).min(axis=1)

@@ -1,8 +1,11 @@
 """Areas and normals in closed form."""
 
 import numpy as np
+import pytest
+from numpy import ndarray
+from scipy.optimize import minimize
 
-from physhandi.triangles import triangle_areas, vertex_normals
+from physhandi.triangles import segment_distance, triangle_areas, triangle_distance, vertex_normals
 
 
 def test_vertex_normals_of_a_roof_lie_between_its_sides() -> None:
@@ -23,3 +26,38 @@ def test_a_larger_triangle_counts_more() -> None:
 def test_areas_are_half_of_base_times_height() -> None:
     vertex = np.array([[0.0, 0, 1], [4, 0, 1], [1, 3, 1], [2, 0, 1]])
     np.testing.assert_allclose(triangle_areas(vertex, np.array([[0, 1, 2], [0, 1, 3]])), [6, 0])
+
+
+def brute(point: ndarray, corner: ndarray) -> float:
+    """The nearest point of a triangle, found by descent over its two coordinates."""
+    a, b, c = corner
+
+    def at(uv: ndarray) -> float:
+        u, v = uv
+        return float(np.sum((a + u * (b - a) + v * (1 - u) * (c - a) - point) ** 2))
+
+    starts = [(x, y) for x in (0.1, 0.5, 0.9) for y in (0.1, 0.5, 0.9)]
+    found = [minimize(at, start, bounds=[(0, 1), (0, 1)], tol=1e-14).fun for start in starts]
+    return float(np.sqrt(min(found)))
+
+
+def test_the_distance_to_a_triangle_is_that_of_its_nearest_point() -> None:
+    rng = np.random.default_rng(2)
+    point, corner = rng.normal(size=(12, 3)), rng.normal(size=(12, 3, 3))
+    point[0] = [0.2, 0.3, 2.5]
+    corner[0] = [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+    found = triangle_distance(point, corner)
+    assert found[0] == pytest.approx(2.5)
+    expected = [brute(p, c) for p, c in zip(point, corner, strict=True)]
+    np.testing.assert_allclose(found, expected, rtol=1e-4)
+    # All corners on a line: the triangle is that line.
+    line = np.array([[[0.0, 0, 0], [1.0, 0, 0], [0.4, 0, 0]]])
+    assert triangle_distance(np.array([[0.5, 0.3, 0.4]]), line) == pytest.approx([0.5])
+    assert triangle_distance(np.array([[4.0, 0.0, 4.0]]), line) == pytest.approx([5.0])
+
+
+def test_the_distance_to_a_segment_is_to_its_line_or_its_ends() -> None:
+    start, end = np.zeros((3, 3)), np.tile([2.0, 0.0, 0.0], (3, 1))
+    point = np.array([[1.0, 3.0, 4.0], [-3.0, 4.0, 0.0], [2.5, 0.0, 0.0]])
+    assert segment_distance(point, start, end) == pytest.approx([5.0, 5.0, 0.5])
+    assert segment_distance(point[:1], start[:1], start[:1]) == pytest.approx([26**0.5])

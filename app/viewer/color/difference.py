@@ -14,6 +14,7 @@ from numpy import ndarray
 from scipy.spatial import KDTree  # pyright: ignore[reportMissingTypeStubs]  # it has none
 
 from physhandi.object_rollout import ObjectRollout
+from physhandi.triangles import segment_distance, triangle_distance
 
 Way = Literal["nodes", "surface"]
 """Whether a node is compared with the same node, or with the other object's surface."""
@@ -127,45 +128,7 @@ def surface_difference(
     distance = np.asarray(far[:, 0], dtype=np.float64)
     corner = other[near]
     if count == 2:
-        return np.minimum(distance, _edge_distance(point, corner[:, 0], corner[:, 1]))
-    for a, b, c in combinations(range(count), 3):
-        found = triangle_distance(point, corner[:, a], corner[:, b], corner[:, c])
-        distance = np.minimum(distance, found)
+        return np.minimum(distance, segment_distance(point, corner[:, 0], corner[:, 1]))
+    for three in combinations(range(count), 3):
+        distance = np.minimum(distance, triangle_distance(point, corner[:, three]))
     return distance
-
-
-def triangle_distance(
-    point: Float[ndarray, "point 3"],
-    a: Float[ndarray, "point 3"],
-    b: Float[ndarray, "point 3"],
-    c: Float[ndarray, "point 3"],
-) -> Float[ndarray, " point"]:
-    """Measure how far each point is from a triangle of its own [m]; a flat one is its edges."""
-    ab, ac, ap = b - a, c - a, point - a
-    aa, bb, cross = _dot(ab, ab), _dot(ac, ac), _dot(ab, ac)
-    along_b, along_c = _dot(ab, ap), _dot(ac, ap)
-    area = aa * bb - cross**2
-    is_flat = area <= 1e-12 * aa * bb
-    safe = np.where(is_flat, 1.0, area)
-    u = (bb * along_b - cross * along_c) / safe
-    v = (aa * along_c - cross * along_b) / safe
-    is_above = ~is_flat & (u >= 0) & (v >= 0) & (u + v <= 1)
-    off_plane = np.linalg.norm(ap - u[:, None] * ab - v[:, None] * ac, axis=-1)
-    found = _edge_distance(point, a, b)
-    for start, end in ((b, c), (c, a)):
-        found = np.minimum(found, _edge_distance(point, start, end))
-    found[is_above] = off_plane[is_above]
-    return found
-
-
-def _edge_distance(
-    point: Float[ndarray, "point 3"], a: Float[ndarray, "point 3"], b: Float[ndarray, "point 3"]
-) -> Float[ndarray, " point"]:
-    edge = b - a
-    length = np.maximum(_dot(edge, edge), 1e-300)
-    share = np.clip(_dot(point - a, edge) / length, 0.0, 1.0)
-    return np.linalg.norm(point - a - share[:, None] * edge, axis=-1)
-
-
-def _dot(one: Float[ndarray, "row 3"], other: Float[ndarray, "row 3"]) -> Float[ndarray, " row"]:
-    return np.sum(one * other, axis=-1)

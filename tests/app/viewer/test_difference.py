@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy import ndarray
-from scipy.optimize import minimize
 from viewer_world import FRAMES, PARAMETERS, content_of, controls, sheet
 
 from app.viewer.color.difference import (
@@ -13,7 +12,6 @@ from app.viewer.color.difference import (
     rollout_difference,
     summarize,
     surface_difference,
-    triangle_distance,
     way_of,
 )
 from physhandi.object_rollout import ObjectRollout
@@ -82,34 +80,6 @@ def test_other_nodes_are_compared_with_the_surface() -> None:
     told = compare_frames(first, 0, second, 0, "surface")
     assert told.largest == max(found.max(), there.max())
     assert told.mean == pytest.approx(np.concatenate([found, there]).mean())
-
-
-def brute(point: ndarray, corner: ndarray) -> float:
-    """The nearest point of a triangle, found by descent over its two coordinates."""
-    a, b, c = corner
-
-    def at(uv: ndarray) -> float:
-        u, v = uv
-        return float(np.sum((a + u * (b - a) + v * (1 - u) * (c - a) - point) ** 2))
-
-    starts = [(x, y) for x in (0.1, 0.5, 0.9) for y in (0.1, 0.5, 0.9)]
-    found = [minimize(at, start, bounds=[(0, 1), (0, 1)], tol=1e-14).fun for start in starts]
-    return float(np.sqrt(min(found)))
-
-
-def test_the_distance_to_a_triangle_is_that_of_its_nearest_point() -> None:
-    rng = np.random.default_rng(2)
-    point, corner = rng.normal(size=(12, 3)), rng.normal(size=(12, 3, 3))
-    point[0] = [0.2, 0.3, 2.5]
-    corner[0] = [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
-    found = triangle_distance(point, *corner.transpose(1, 0, 2))
-    assert found[0] == pytest.approx(2.5)
-    expected = [brute(p, c) for p, c in zip(point, corner, strict=True)]
-    np.testing.assert_allclose(found, expected, rtol=1e-4)
-    # All corners on a line: the triangle is that line.
-    line = np.array([[[0.0, 0, 0], [1.0, 0, 0], [0.4, 0, 0]]]).transpose(1, 0, 2)
-    assert triangle_distance(np.array([[0.5, 0.3, 0.4]]), *line) == pytest.approx([0.5])
-    assert triangle_distance(np.array([[4.0, 0.0, 4.0]]), *line) == pytest.approx([5.0])
 
 
 def test_few_or_no_nodes_are_a_surface_too() -> None:
