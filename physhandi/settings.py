@@ -102,7 +102,7 @@ class Field:
     @property
     def range(self) -> str:
         """Its bounds in words, such as ``from 0 to 2``."""
-        low, high = (None if end is None else f"{end:g}" for end in (self.low, self.high))
+        low, high = (None if end is None else f"{end:.10g}" for end in (self.low, self.high))
         if low is not None and high is not None:
             return f"from {low} to {high}"
         return (

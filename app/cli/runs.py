@@ -14,7 +14,7 @@ from app.cli.lookup import (
     read_settings,
 )
 from app.cli.output import AsJson, DataDir, Device, show
-from app.jobs.order import default_name
+from app.jobs.order import default_name, fit_settings
 from physhandi.api import prepare_run
 from physhandi.data.run import RunKind
 from physhandi.data.run_folder import new_run_id
@@ -22,9 +22,7 @@ from physhandi.data.sequence import Sequence
 from physhandi.devices import pick_device
 from physhandi.errors import RunError, UsageError
 from physhandi.fitting.config import (
-    apply_overrides,
     load_profile,
-    overrides_of,
     parse_override,
 )
 from physhandi.progress import watched
@@ -99,9 +97,7 @@ def reconstruct(
     for recording in recordings:
         recording.validate(reads_color=False)  # Tells wrong data before a run is made.
     base = load_profile(profile)
-    config = apply_overrides(base, dict(parse_override(text) for text in settings))
-    changed = overrides_of(config, base)
-    stored = {"profile": config.to_dict()} | ({"overrides": changed} if changed else {})
+    stored = fit_settings(base, dict(parse_override(text) for text in settings))
     device = pick_device(device)
     if out is None:
         name = default_name(recordings[0].name, stored)

@@ -40,15 +40,16 @@ def fit_config(
         UsageError: If there is no such profile.
         SettingsError: If settings are unknown or wrong; names all of them.
     """
-    base = named_profile(profile)
-    config = apply_overrides(base, overrides or {})
+    settings = fit_settings(named_profile(profile), overrides or {})
+    return settings | ({"parent": parent} if parent else {})
+
+
+def fit_settings(base: PipelineConfig, overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """Make what a run stores of a profile that some settings differ from; see `fit_config`."""
+    config = apply_overrides(base, overrides)
     changed = overrides_of(config, base)
     stored: dict[str, Any] = {"profile": config.to_dict()}
-    return (
-        stored
-        | ({"overrides": changed} if changed else {})
-        | ({"parent": parent} if parent else {})
-    )
+    return stored | ({"overrides": changed} if changed else {})
 
 
 def default_name(sequence: str, config: Mapping[str, Any]) -> str:

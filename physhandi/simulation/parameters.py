@@ -222,17 +222,7 @@ class SimulationParameters(Settings, frozen=True, kw_only=True):
     ] = 0.3
     """Coulomb friction coefficient of the ground."""
     ground_height: Annotated[
-        Finite | None,
-        Role(
-            label="ground height",
-            is_length=True,
-            is_searched=False,
-            slider=Slider(
-                group="ground",
-                hint="Height of the ground, at most that of the object's lowest node at frame 0.",
-                step=0.001,
-            ),
-        ),
+        Finite | None, Role(label="ground height", is_length=True, is_searched=False)
     ] = 0.0
     """Height of the ground plane [m]; none for no ground."""
     gravity: Annotated[
@@ -467,7 +457,7 @@ def parameter_changes(
         is_automatic: Whether the substeps are chosen automatically.
     """
     automatic = {"substeps_per_frame": AUTOMATIC} if is_automatic else {}
-    return changes(fitted, now) | automatic
+    return changes(fitted, now.to_dict() | automatic)
 
 
 def _of_parameters(error: SettingsError) -> SettingsError:

@@ -3,7 +3,9 @@
 import json
 import shutil
 import socket
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from sheet_sequence import FRAMES, NODE
 from app import cli
 from app.cli import runs
 from physhandi import pipeline
+from physhandi.data.run import RunFolder
 from physhandi.fitting.artefacts import load_model, load_parameters
 from physhandi.fitting.config import PipelineConfig
 from physhandi.run import Run
@@ -138,6 +141,29 @@ def test_a_fit_is_made_told_and_not_made_twice(terminal: Terminal, quick: Pipeli
     other = ("reconstruct", "sheet", "sheet", "--out", "mine", "--device", "cpu")
     assert "another run" in terminal.refused(2, *other)
     assert Run.open("mine").state == "succeeded"
+
+
+def test_a_fit_takes_a_profile_file_and_single_settings(
+    terminal: Terminal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[Mapping[str, Any]] = []
+
+    def keep(run: RunFolder, _progress: object, *, device: str) -> None:
+        made.append(run.config)
+
+    monkeypatch.setattr(pipeline, "run_job", keep)
+    Path("mine.yaml").write_text("base: quick\nnode_spacing: 0.03\n")
+    settings = ("--set", "object_.search.variables.stiffness.high=1e6", "--set", "control_count=7")
+    order = ("reconstruct", "sheet", "--out", "mine", "--profile", "mine.yaml", "--device", "cpu")
+    assert terminal(*order, *settings) == 0
+    stored = PipelineConfig.from_dict(made[0]["profile"])
+    assert (stored.profile, stored.node_spacing, stored.control_count) == ("mine", 0.03, 7)
+    assert stored.object_.search.variables["stiffness"].high == 1e6
+    assert set(made[0]["overrides"]) == {"control_count", "object_.search.variables.stiffness"}
+    wrong = ("--set", "simulation.frictio=1", "--set", "node_spacing=9")
+    line = terminal.refused(2, *order[:3], "other", *order[4:], *wrong)
+    assert "Do you mean 'simulation.friction'" in line
+    assert "node_spacing is 9; expected a number from 0.001 to 0.5" in line
 
 
 def test_an_interrupted_fit_goes_on(terminal: Terminal, quick: PipelineConfig) -> None:

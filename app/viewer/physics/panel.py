@@ -20,8 +20,7 @@ from app.viewer.physics.parameters import (
     Switch,
     changes_in,
     ground_knobs,
-    knobs,
-    self_collision_knobs,
+    knobs_of,
 )
 from app.viewer.ui.followed import FollowedChoice
 from app.viewer.ui.guard import Guard
@@ -192,7 +191,6 @@ def warning(readout: Readout) -> str:
     )
 
 
-_FIRST_KNOBS = 5
 _REFRESH = 0.2
 _UNDO, _REDO, _RESET = "Undo", "Redo", "Reset"
 _HOLD, _STEP, _GO = "Hold", "1 frame", "Go"
@@ -241,7 +239,6 @@ class PhysicsPanel:
         gui, unit, parameters = server.gui, content.length_unit, fitted.parameters
         height = np.asarray(fitted.position[0])[:, 2]
         low, high = float(height.min()), float(height.max())
-        main_knobs = knobs(parameters, length_unit=unit)
         store = None if storage is None else storage.presets
         self._folder = gui.add_folder("Physics")
         with self._folder:
@@ -250,7 +247,7 @@ class PhysicsPanel:
                 gui, guard, self.history, length_unit=unit, store=store, choose=self._replace
             )
             self._sliders = SliderSet(gui, guard, self.history, self._move)
-            self._sliders.add(*main_knobs[:_FIRST_KNOBS])
+            self._sliders.add(*knobs_of("springs", parameters, length_unit=unit))
             buttons = gui.add_button_group(
                 "History", (_UNDO, _REDO, _RESET), hint="Ctrl+Z and Ctrl+Shift+Z"
             )
@@ -273,12 +270,12 @@ class PhysicsPanel:
             )
             self._put_back.handle.on_update(guard.by_user(lambda _: self._put_one_back()))
             with gui.add_folder("More physics", expand_by_default=False):
-                self._sliders.add(*main_knobs[_FIRST_KNOBS:])
+                self._sliders.add(*knobs_of("more", parameters, length_unit=unit))
                 self._substeps = SubstepsChoice(gui, guard, self.history, self._set_substeps)
             with gui.add_folder("Ground", expand_by_default=False):
                 self._sliders.add(*ground_knobs(parameters, length_unit=unit, low=low, high=high))
             with gui.add_folder("Self-collision", expand_by_default=False):
-                self._sliders.add(*self_collision_knobs(parameters, length_unit=unit))
+                self._sliders.add(*knobs_of("self-collision", parameters, length_unit=unit))
             if storage is not None:
                 self.keep = KeepPanel(
                     gui,

@@ -1,17 +1,21 @@
-"""The parameters that sliders move: their ranges, their history and how to say what changed."""
+"""Sliders and tick boxes that the table of parameters asks for, and the words for what changed."""
 
 import math
 from dataclasses import dataclass
 
-from physhandi.simulation.parameters import SimulationParameters
+from physhandi.simulation.parameters import (
+    AUTOMATIC,
+    PARAMETERS,
+    Parameter,
+    SimulationParameters,
+    Slider,
+    SliderGroup,
+    parameter_changes,
+)
 
 _DIGITS = 3
-_OTHERS = {
-    "substeps_per_frame": "substeps",
-    "rest_length_floor": "shortest object spring [m]",
-    "virtual_rest_length_floor": "shortest virtual spring [m]",
-    "use_control_velocity": "dashpots see the hand move",
-}
+_POWERS = (-2.0, 1.0)
+"""Ends of a slider of a power of ten."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,96 +106,86 @@ def name_of(knob: Knob | Switch) -> str:
     return (knob.name or knob.label).replace(" 10^", "")
 
 
-def knobs(parameters: SimulationParameters, *, length_unit: str) -> tuple[Knob, ...]:
+def knobs(parameters: SimulationParameters, *, length_unit: str) -> tuple[Knob | Switch, ...]:
     """List the sliders of an object; each range includes the fitted value.
 
     Args:
         parameters: The fitted parameters.
         length_unit: Unit of lengths; ``"m"`` is shown as millimetres.
     """
-
-    def radius(field: str, label: str, hint: str) -> Knob:
-        return length_knob(parameters, field, label, hint, length_unit, widest=80.0, step=0.5)
-
-    def neighbors(field: str, label: str, hint: str) -> Knob:
-        high = max(80, getattr(parameters, field))
-        return Knob(field=field, label=label, low=1, high=high, step=1, hint=hint, is_integer=True)
-
-    def plain(field: str, label: str, high: float, step: float, hint: str) -> Knob:
-        high = max(high, round_up(2 * getattr(parameters, field)))
-        return Knob(field=field, label=label, low=0.0, high=high, step=step, hint=hint)
-
-    def apart(field: str, label: str, hint: str) -> tuple[Knob, ...]:
-        """Make a slider that multiplies one kind of stiffness; none where it was fitted to 0."""
-        fitted = getattr(parameters, field)
-        knob = Knob(
-            field=field,
-            label=label,
-            low=-2.0,
-            high=1.0,
-            step=0.05,
-            hint=hint,
-            scale=1.0 / max(fitted, 1e-30),
-            is_logarithm=True,
-        )
-        return (knob,) if fitted > 0 else ()
-
     return (
-        radius("connection_radius", "δ object", "Object nodes nearer than this get a spring."),
-        neighbors("max_neighbors", "d_max object", "Most object springs that one node starts."),
-        radius(
-            "virtual_connection_radius",
-            "δ virtual",
-            "A control node holds the object nodes nearer than this.",
-        ),
-        neighbors(
-            "virtual_max_neighbors", "d_max virtual", "Most virtual springs of one control node."
-        ),
-        Knob(
-            field="stiffness_scale",
-            label="stiffness 10^",
-            low=-2.0,
-            high=1.0,
-            step=0.05,
-            hint="Multiplies the stiffness of every spring: 0 is as fitted, -1 a tenth.",
-            is_logarithm=True,
-        ),
-        *apart("stiffness", "k object 10^", "Multiplies the stiffness of object springs alone."),
-        *apart(
-            "virtual_stiffness",
-            "k virtual 10^",
-            "Multiplies the stiffness of virtual springs alone.",
-        ),
-        plain("damping", "damping [N·s/m]", 300.0, 1.0, "Dashpot along each spring."),
-        plain("drag", "drag [1/s]", 20.0, 0.1, "How fast every motion dies out."),
-        plain("gravity", "gravity [m/s²]", 20.0, 0.1, "Acceleration downwards."),
+        *knobs_of("springs", parameters, length_unit=length_unit),
+        *knobs_of("more", parameters, length_unit=length_unit),
     )
 
 
-def length_knob(
-    parameters: SimulationParameters,
-    field: str,
-    label: str,
-    hint: str,
-    length_unit: str,
-    *,
-    widest: float,
-    step: float,
-) -> Knob:
-    """Make the slider of a length; `widest` and `step` are in millimetres."""
-    is_metric = length_unit == "m"
-    per_metre, unit = (1e3, "mm") if is_metric else (1.0, length_unit)
-    fitted = getattr(parameters, field) * per_metre
-    high = max(widest, round_up(1.5 * fitted)) if is_metric else max(4 * fitted, 1e-6)
-    step = step if is_metric else high / 200
+def knobs_of(
+    group: SliderGroup, parameters: SimulationParameters, *, length_unit: str
+) -> tuple[Knob | Switch, ...]:
+    """List the controls of one folder of the panel; see `knobs`."""
+    made = (
+        _control(parameter, parameter.slider, parameters, length_unit)
+        for parameter in PARAMETERS.values()
+        if parameter.slider and parameter.slider.group == group
+    )
+    return tuple(control for control in made if control is not None)
+
+
+def _control(
+    parameter: Parameter, slider: Slider, fitted: SimulationParameters, length_unit: str
+) -> Knob | Switch | None:
+    """Make the control of a parameter; none where it multiplies what was fitted to 0."""
+    name, label, value = parameter.name, parameter.title, float(getattr(fitted, parameter.name))
+    if parameter.kind == "switch":
+        return Switch(field=name, label=label, hint=slider.hint)
+    if slider.scale != "linear":
+        is_relative = slider.scale == "relative power"
+        if is_relative and value <= 0:
+            return None
+        return Knob(
+            field=name,
+            label=f"{label} 10^",
+            low=_POWERS[0],
+            high=_POWERS[1],
+            step=slider.step,
+            hint=slider.hint,
+            scale=1.0 / max(value, 1e-30) if is_relative else 1.0,
+            is_logarithm=True,
+        )
+    if parameter.unit == "m":
+        return _length_knob(parameter, slider, value, length_unit)
+    low, high = 0.0, parameter.high or math.inf
+    if slider.widest is not None:
+        is_whole = parameter.kind == "whole"
+        low = 1.0 if is_whole else 0.0
+        high = max(slider.widest, value if is_whole else round_up(2 * value))
     return Knob(
-        field=field,
-        label=f"{label} [{unit}]",
+        field=name,
+        label=f"{label} [{parameter.unit}]" if parameter.unit else label,
+        low=low,
+        high=high,
+        step=slider.step,
+        hint=slider.hint,
+        is_integer=parameter.kind == "whole",
+    )
+
+
+def _length_knob(parameter: Parameter, slider: Slider, value: float, length_unit: str) -> Knob:
+    """Make the slider of a length: in millimetres, or in the recording's unit."""
+    if length_unit == "m":
+        scale, unit, step = 1e3, "mm", round(1e3 * slider.step, 9)
+        high = max(round(1e3 * (slider.widest or 0.0), 9), round_up(1.5e3 * value))
+    else:
+        scale, unit, high = 1.0, length_unit, max(4 * value, 1e-6)
+        step = high / 200
+    return Knob(
+        field=parameter.name,
+        label=f"{parameter.title} [{unit}]",
         low=step,
         high=high,
         step=step,
-        hint=hint,
-        scale=per_metre,
+        hint=slider.hint,
+        scale=scale,
     )
 
 
@@ -228,25 +222,27 @@ def changes_in(
         now: Those in force.
         is_automatic: Whether the substeps are chosen automatically.
     """
-    changes = [
+    said = [
         Change(name := name_of(k), (k.field,), f"{name} {k.text(start)} → {k.text(now)}")
         for k in knobs
         if k.differs(start, now)
     ]
-    shown = {knob.field for knob in knobs}
-    was, values = start.to_dict(), now.to_dict()
-    if is_automatic:
-        values["substeps_per_frame"] = "automatic"
-    for field, value in values.items():
-        if field not in shown and value != was[field]:
-            name = _OTHERS.get(field, field)
-            changes.append(Change(name, (field,), f"{name} {_said(was[field])} → {_said(value)}"))
-    return tuple(changes)
+    moved = {knob.field for knob in knobs}
+    for field, value in parameter_changes(start, now, is_automatic=is_automatic).items():
+        if field not in moved:
+            parameter = PARAMETERS[field]
+            unit = f" [{parameter.unit}]" if parameter.label and parameter.unit else ""
+            name = f"{parameter.title}{unit}"
+            texts = f"{_said(getattr(start, field))} → {_said(value)}"
+            said.append(Change(name, (field,), f"{name} {texts}"))
+    return tuple(said)
 
 
 def _said(value: object) -> str:
     if isinstance(value, bool):
         return "on" if value else "off"
+    if value == AUTOMATIC:
+        return "automatic"
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
@@ -313,7 +309,7 @@ def ground_knobs(
         HeightKnob(
             field="ground_height",
             label=f"height [{unit}]",
-            name=f"ground height [{unit}]",
+            name=f"{PARAMETERS['ground_height'].title} [{unit}]",
             low=math.floor(ends[0] / step) * step,
             high=max(math.floor(ends[1] / step) * step, base * per_metre),
             step=step,
@@ -321,63 +317,5 @@ def ground_knobs(
             scale=per_metre,
             base=base,
         ),
-        Knob(
-            field="friction",
-            label="friction",
-            low=0.0,
-            high=2.0,
-            step=0.05,
-            hint="How much nodes on the ground resist sliding; 0 is ice.",
-        ),
-        Knob(
-            field="restitution",
-            label="restitution",
-            low=0.0,
-            high=1.0,
-            step=0.05,
-            hint="Part of its speed that a node that hits the ground bounces back with.",
-        ),
-    )
-
-
-def self_collision_knobs(
-    parameters: SimulationParameters, *, length_unit: str
-) -> tuple[Knob | Switch, ...]:
-    """List what changes the collisions of object nodes with each other; see `knobs`."""
-    return (
-        Switch(
-            field="self_collision",
-            label="nodes collide",
-            hint="Object nodes bounce off each other, so that layers of cloth stay apart.",
-        ),
-        length_knob(
-            parameters,
-            "collision_distance",
-            "distance",
-            "Nodes that approach each other nearer than this collide.",
-            length_unit,
-            widest=20.0,
-            step=0.1,
-        ),
-        Knob(
-            field="self_restitution",
-            label="restitution of nodes",
-            low=0.0,
-            high=1.0,
-            step=0.05,
-            hint="Part of the approach speed that a collision gives back.",
-        ),
-        Knob(
-            field="self_friction",
-            label="friction of nodes",
-            low=0.0,
-            high=2.0,
-            step=0.05,
-            hint="How much nodes that touch resist sliding past each other.",
-        ),
-        Switch(
-            field="collides_rest_neighbors",
-            label="also rest neighbors",
-            hint="Also collide nodes nearer than the distance at frame 0, as PhysTwin does.",
-        ),
+        *knobs_of("ground", parameters, length_unit=length_unit),
     )

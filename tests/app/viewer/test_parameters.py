@@ -1,6 +1,6 @@
 import pytest
 
-from app.viewer.physics.parameters import changes_in, ground_knobs, knobs, self_collision_knobs
+from app.viewer.physics.parameters import changes_in, ground_knobs, knobs, knobs_of
 from physhandi.simulation.parameters import SimulationParameters
 
 
@@ -15,7 +15,7 @@ def test_every_slider_shows_the_fitted_value_and_gives_it_back() -> None:
     for unit in ("m", "squares"):
         for knob in (
             *knobs(START, length_unit=unit),
-            *(k for k in self_collision_knobs(START, length_unit=unit) if hasattr(k, "low")),
+            *(k for k in knobs_of("self-collision", START, length_unit=unit) if hasattr(k, "low")),
         ):
             value = knob.to_slider(START)
             assert knob.low <= value <= knob.high
@@ -60,7 +60,7 @@ def test_what_changed_is_said_in_the_sliders_units() -> None:
 
 def test_self_collision_is_a_box_and_its_sliders() -> None:
     on = SimulationParameters(self_collision=True, collision_distance=0.008, self_friction=1.0)
-    controls = {knob.field: knob for knob in self_collision_knobs(on, length_unit="m")}
+    controls = {knob.field: knob for knob in knobs_of("self-collision", on, length_unit="m")}
     box, distance = controls["self_collision"], controls["collision_distance"]
     assert (box.to_slider(START), box.to_slider(on)) == (False, True)
     assert (box.from_slider(True), box.from_slider(False)) == (True, False)
@@ -98,5 +98,5 @@ def test_stiffness_of_both_kinds_of_springs_is_moved_apart() -> None:
 
 def test_a_wider_collision_distance_widens_its_slider() -> None:
     wide = SimulationParameters(collision_distance=0.05)
-    distance = self_collision_knobs(wide, length_unit="m")[1]
+    distance = knobs_of("self-collision", wide, length_unit="m")[1]
     assert distance.to_slider(wide) == pytest.approx(50.0)
