@@ -22,7 +22,7 @@ from app.exports.request import SMALLEST, SUFFIXES, FileRequest
 from app.exports.schema import MEDIA_TYPES, RunFormat, errors, files
 from app.ids import ItemId
 from app.jobs.catalog import Catalog
-from app.viewer.export.snapshot import write_yaml
+from app.viewer.export.snapshot import snapshot_yaml
 from app.viewer.session import Session
 from app.viewer.sessions import Sessions
 from physhandi.data.exporters import export_run
@@ -106,7 +106,7 @@ def create_files(catalog: Catalog, sessions: Sessions, file_cache: FileCache) ->
             raise HTTPException(404, CLOSED)
         snapshot, state = session.snapshot(), session.state
         if kind == "yaml":
-            return _attached(write_yaml(snapshot), f"{session.target}.yaml", kind)
+            return _attached(snapshot_yaml(snapshot), f"{session.target}.yaml", kind)
         query = state_to_query(state)
         if "theme" not in query and state.prefers_dark:
             query["theme"] = "dark"

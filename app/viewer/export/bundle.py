@@ -15,7 +15,7 @@ import yaml
 
 from app.viewer.content.content import Content
 from app.viewer.content.session_state import Pose
-from app.viewer.export.snapshot import Snapshot, write_ply
+from app.viewer.export.snapshot import Snapshot, snapshot_ply
 from physhandi import __version__
 from physhandi.data.files import plain, without_non_finite
 from physhandi.errors import MissingInputError
@@ -72,7 +72,7 @@ def bundle(snapshot: Snapshot, picture: Screenshot) -> bytes:
         files["frame.npz"] = _arrays(sides, snapshot)
         files["parameters.yaml"] = _parameters(sides)
     try:
-        files["frame.ply"] = write_ply(snapshot)
+        files["frame.ply"] = snapshot_ply(snapshot)
     except MissingInputError:
         logger.info("no geometry is in the archive: the recording shows images alone")
     files["camera.json"] = _json(_camera(picture, snapshot))

@@ -12,14 +12,14 @@ from app.viewer.content.session_state import Pose
 from app.viewer.export.bundle import Screenshot, bundle
 from app.viewer.export.snapshot import (
     Snapshot,
-    write_comparison_csv,
-    write_comparison_npz,
-    write_csv,
-    write_gltf,
-    write_npz,
-    write_ply,
-    write_plys,
-    write_yaml,
+    comparison_csv,
+    comparison_npz,
+    snapshot_csv,
+    snapshot_gltf,
+    snapshot_npz,
+    snapshot_ply,
+    snapshot_plys,
+    snapshot_yaml,
 )
 from app.viewer.ui.guard import Guard, notify
 from physhandi.errors import UsageError
@@ -121,14 +121,14 @@ class ExportPanel:
 
 
 _MAKERS: dict[str, Callable[[Snapshot], bytes]] = {
-    "PLY": write_ply,
-    "PLYs": write_plys,
-    "GLB": write_gltf,
-    "NPZ": write_npz,
-    "CSV": write_csv,
-    "YAML": write_yaml,
+    "PLY": snapshot_ply,
+    "PLYs": snapshot_plys,
+    "GLB": snapshot_gltf,
+    "NPZ": snapshot_npz,
+    "CSV": snapshot_csv,
+    "YAML": snapshot_yaml,
 }
-_COMPARISON_WRITERS = {"NPZ": write_comparison_npz, "CSV": write_comparison_csv}
+_COMPARISON_WRITERS = {"NPZ": comparison_npz, "CSV": comparison_csv}
 
 
 def write_png(

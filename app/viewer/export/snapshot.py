@@ -86,7 +86,7 @@ def scene_data(snapshot: Snapshot) -> SceneData:
     )
 
 
-def write_ply(snapshot: Snapshot) -> bytes:
+def snapshot_ply(snapshot: Snapshot) -> bytes:
     """Write the frame: the object with its controls and hands, or else what is there of them."""
     content, rollout = snapshot.content, snapshot.rollout
     if rollout is not None:
@@ -109,7 +109,7 @@ def write_ply(snapshot: Snapshot) -> bytes:
     )
 
 
-def write_npz(snapshot: Snapshot) -> bytes:
+def snapshot_npz(snapshot: Snapshot) -> bytes:
     """Write all frames: rollout, springs and controls, as they are on the screen."""
     rollout, content = snapshot.rollout, snapshot.content
     arrays: dict[str, Any] = {}
@@ -133,7 +133,7 @@ def write_npz(snapshot: Snapshot) -> bytes:
     return stream.getvalue()
 
 
-def write_csv(snapshot: Snapshot) -> bytes:
+def snapshot_csv(snapshot: Snapshot) -> bytes:
     """Write a table with one row a frame: mean position and force, largest speed."""
     rollout = _rollout(snapshot)
     stream = io.StringIO()
@@ -149,12 +149,12 @@ def write_csv(snapshot: Snapshot) -> bytes:
     return stream.getvalue().encode()
 
 
-def write_yaml(snapshot: Snapshot) -> bytes:
+def snapshot_yaml(snapshot: Snapshot) -> bytes:
     """Write the parameters of the rollout that is on the screen."""
     return yaml.safe_dump(_rollout(snapshot).parameters.to_dict(), sort_keys=False).encode()
 
 
-def write_comparison_npz(compared: Mapping[str, tuple[ObjectRollout, int]]) -> bytes:
+def comparison_npz(compared: Mapping[str, tuple[ObjectRollout, int]]) -> bytes:
     """Write all frames of both sides of a comparison.
 
     For each side, as in ``ours_…`` and ``phystwin_…`` or ``a_…`` and ``b_…``: ``position``
@@ -183,7 +183,7 @@ def write_comparison_npz(compared: Mapping[str, tuple[ObjectRollout, int]]) -> b
     return stream.getvalue()
 
 
-def write_comparison_csv(compared: Mapping[str, tuple[ObjectRollout, int]]) -> bytes:
+def comparison_csv(compared: Mapping[str, tuple[ObjectRollout, int]]) -> bytes:
     """Write the frame on the screen of both sides of a comparison as one table.
 
     A row of kind ``node`` has an object node's position and the sum of the forces on it; one of
@@ -227,13 +227,13 @@ def _rollout(snapshot: Snapshot) -> ObjectRollout:
     return snapshot.rollout
 
 
-def write_gltf(snapshot: Snapshot) -> bytes:
+def snapshot_gltf(snapshot: Snapshot) -> bytes:
     """Write all frames that are ready as one binary glTF file, as they are on the screen."""
     with tempfile.TemporaryDirectory(prefix="physhandi-export-") as folder:
         return export_scene(scene_data(snapshot), "gltf", Path(folder) / "x.glb").read_bytes()
 
 
-def write_plys(snapshot: Snapshot) -> bytes:
+def snapshot_plys(snapshot: Snapshot) -> bytes:
     """Write all frames that are ready as PLY files in a ZIP archive."""
     with tempfile.TemporaryDirectory(prefix="physhandi-export-") as folder:
         frames = export_scene(scene_data(snapshot), "ply", Path(folder) / "frames")

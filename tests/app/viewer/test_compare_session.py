@@ -12,7 +12,7 @@ from viewer_world import FRAMES, PARAMETERS, FakeSettings, FolderCatalog, make_r
 from app.comparison import CompareAsk
 from app.viewer.compare.pair import open_pair
 from app.viewer.compare.sides import Side, compared_rollouts
-from app.viewer.export.snapshot import write_comparison_npz
+from app.viewer.export.snapshot import comparison_npz
 from app.viewer.sessions import Sessions
 from physhandi.errors import MissingInputError, PhysHandiError, UsageError
 from physhandi.run import Run
@@ -300,7 +300,7 @@ def test_the_numbers_of_both_sides_can_be_saved(sessions: Sessions) -> None:
         assert session is not None
         compared = session.snapshot().compared
         assert compared is not None
-        with np.load(io.BytesIO(write_comparison_npz(compared))) as data:
+        with np.load(io.BytesIO(comparison_npz(compared))) as data:
             moved = data["b_position"] - data["a_position"]
         np.testing.assert_allclose(moved[3], np.tile(3 * OFFSET, (moved.shape[1], 1)), atol=1e-6)
 

@@ -9,7 +9,7 @@ from viewer_client import ViewerClient
 from viewer_world import FRAMES, FakeSettings
 
 from app.viewer.compare.live import LiveComparison
-from app.viewer.export.snapshot import write_csv, write_npz, write_ply, write_yaml
+from app.viewer.export.snapshot import snapshot_csv, snapshot_npz, snapshot_ply, snapshot_yaml
 from app.viewer.sessions import Sessions, TooManySessionsError
 from physhandi.errors import MissingInputError, PhysHandiError, RunError, UsageError
 from physhandi.run import Run
@@ -169,7 +169,7 @@ def test_downloads_hold_what_is_on_the_screen(sessions, run) -> None:
     session = sessions.get(sessions.open("run", "sheet", "me"))
     session._playback.seek(4)
     snapshot = session.snapshot()
-    ply = write_ply(snapshot)
+    ply = snapshot_ply(snapshot)
     header, _, body = ply.partition(b"end_header\n")
     assert b"element vertex 111\n" in header
     row = np.frombuffer(body[: 111 * 15], dtype="<3f4, 3u1")
@@ -177,13 +177,13 @@ def test_downloads_hold_what_is_on_the_screen(sessions, run) -> None:
     np.testing.assert_array_equal(row["f0"][81:], run.array("sequences/lift/control.npy")[4])
     import io
 
-    with np.load(io.BytesIO(write_npz(snapshot))) as rollout:
+    with np.load(io.BytesIO(snapshot_npz(snapshot))) as rollout:
         np.testing.assert_array_equal(rollout["position"], run.array("sequences/lift/rollout.npy"))
-    rows = write_csv(snapshot).decode().splitlines()
+    rows = snapshot_csv(snapshot).decode().splitlines()
     assert len(rows) == FRAMES + 1
     import yaml
 
-    parameters = SimulationParameters.from_dict(yaml.safe_load(write_yaml(snapshot)))
+    parameters = SimulationParameters.from_dict(yaml.safe_load(snapshot_yaml(snapshot)))
     assert parameters == session._content.fitted.parameters
 
 
