@@ -10,7 +10,7 @@ import viser
 from numpy import ndarray
 
 from app.benchmarks.viewer_client import ViewerClient
-from app.viewer.content.content import Content, HandSurface
+from app.viewer.content.content import Content, ShownHand
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import SequenceMeta, ViewMeta
@@ -134,7 +134,7 @@ def content_of(
         model=model, parameters=PARAMETERS, control=control, position=position, ready=len(control)
     )
     surfaces = tuple(
-        HandSurface(side=side, vertex=np.repeat(vertex[None], len(control), axis=0), face=face)
+        ShownHand(side=side, vertex=np.repeat(vertex[None], len(control), axis=0), face=face)
         for side, (vertex, face) in hands.items()
     )
     return Content(

@@ -11,7 +11,7 @@ from numpy import ndarray
 from app.viewer.color.coloring import Painted, nearly_all
 from app.viewer.color.legend import ColorScale, Legend, Limits
 from app.viewer.color.quantities import Quantity, Values
-from app.viewer.content.content import Content, HandSurface
+from app.viewer.content.content import Content, ShownHand
 from app.viewer.content.layers import Coloring, Layers
 
 _NEAR = 3
@@ -55,9 +55,7 @@ class HandPainter:
             return replace(quantity, unit=f"{self._content.length_unit}/s")
         return quantity
 
-    def measure(
-        self, coloring: Coloring, hand: HandSurface, frame: int
-    ) -> Float[ndarray, " vertex"]:
+    def measure(self, coloring: Coloring, hand: ShownHand, frame: int) -> Float[ndarray, " vertex"]:
         """Measure a quantity at the vertices of a hand, in its own unit; NaN where not known."""
         vertex = hand.vertex
         frame = min(frame, len(vertex) - 1)
@@ -102,7 +100,7 @@ class HandPainter:
         )
         return painted
 
-    def _error(self, hand: HandSurface) -> Float[ndarray, "frame joint"] | None:
+    def _error(self, hand: ShownHand) -> Float[ndarray, "frame joint"] | None:
         """Measure the errors of a hand's joints once [px]."""
         if hand.side not in self._errors:
             self._errors[hand.side] = reprojection_errors(self._content, hand)
@@ -120,9 +118,7 @@ class HandPainter:
         return self._ranges[coloring]
 
 
-def reprojection_errors(
-    content: Content, hand: HandSurface
-) -> Float[ndarray, "frame joint"] | None:
+def reprojection_errors(content: Content, hand: ShownHand) -> Float[ndarray, "frame joint"] | None:
     """Measure how far a hand's joints are from its keypoints in the images [px].
 
     Args:

@@ -16,7 +16,7 @@ from app.viewer.color.difference import Way, rollout_difference
 from app.viewer.color.legend import ColorScale
 from app.viewer.color.quantities import QUANTITIES, Values, from_nodes, in_length_unit
 from app.viewer.compare.camera import Box, Eye
-from app.viewer.compare.sides import SIDES, Side, Sides
+from app.viewer.compare.sides import SIDES, ComparedSide, Sides
 from app.viewer.content.content import Content
 from app.viewer.content.layers import GREEN, SKIN, YELLOW, Layers
 from app.viewer.scene.framing import Framing
@@ -255,7 +255,7 @@ class CompareDrawing:
                 self._draw_object(key, layers, is_playing=is_playing)
                 self._nodes.plane = None
 
-    def _draw_hands(self, key: str, side: Side, *, is_visible: bool) -> None:
+    def _draw_hands(self, key: str, side: ComparedSide, *, is_visible: bool) -> None:
         for hand in side.content.hands:
             path, color = f"{_ROOT}/{key}/hand/{hand.side}", SKIN[hand.side]
             frame = min(side.content_frame, len(hand.vertex) - 1)
@@ -268,7 +268,9 @@ class CompareDrawing:
                     path, vertex, hand.face, color, is_visible=is_visible, opacity=_HAND_OPACITY
                 )
 
-    def _draw_observed(self, key: str, side: Side, *, is_playing: bool, is_visible: bool) -> None:
+    def _draw_observed(
+        self, key: str, side: ComparedSide, *, is_playing: bool, is_visible: bool
+    ) -> None:
         observed, path = side.content.observed, f"{_ROOT}/{key}/observed"
         if observed is None or not is_visible:
             self._nodes.show(path, is_visible=False)
@@ -328,7 +330,7 @@ class CompareDrawing:
         is_visible = layers.nodes and strength > 0.0
         self._nodes.points(colored_path, point, color, size, is_visible=is_visible)
 
-    def _painted(self, key: str, side: Side, other: Side) -> Painted | None:
+    def _painted(self, key: str, side: ComparedSide, other: ComparedSide) -> Painted | None:
         """Choose the colors of the difference; None for those of the side."""
         rollout, compared, look, way = side.rollout, other.rollout, self._look, self._way
         if rollout is None or compared is None or compared.ready == 0 or way is None:

@@ -12,7 +12,7 @@ from app.viewer.compare.camera import ComparisonCameras
 from app.viewer.compare.curve import Pairing
 from app.viewer.compare.drawing import Look
 from app.viewer.compare.phystwin_baseline import PhysTwinBaseline
-from app.viewer.compare.sides import ComparedRollouts, Side, Sides, compared_rollouts
+from app.viewer.compare.sides import ComparedRollouts, ComparedSide, Sides, compared_rollouts
 from app.viewer.compare.view import CompareView
 from app.viewer.content.content import Content
 from app.viewer.content.layers import Layers
@@ -312,7 +312,7 @@ class LiveComparison:
             detail = self._topology(other) if is_figure else self._changes(other)
         else:
             other = None
-        compared = Side(
+        compared = ComparedSide(
             name="phystwin" if is_figure else "a",
             title=title,
             detail=detail,
@@ -323,12 +323,12 @@ class LiveComparison:
         )
         return {"a": shown, "b": compared} if is_figure else {"a": compared, "b": shown}
 
-    def _shown_side(self, rollout: ObjectRollout, rollout_frame: int, frame: int) -> Side:
+    def _shown_side(self, rollout: ObjectRollout, rollout_frame: int, frame: int) -> ComparedSide:
         """Describe the side that the sliders move."""
         if self._content is None:
             raise MissingInputError("There is no simulated object here to compare.")
         is_figure = self.is_figure
-        return Side(
+        return ComparedSide(
             name="ours" if is_figure else "b",
             title="ours" if is_figure else "B · now",
             detail=self._topology(rollout) if is_figure else self._changes(rollout),

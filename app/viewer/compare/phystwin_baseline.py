@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from app.viewer.content.content import Content, HandSurface
+from app.viewer.content.content import Content, ShownHand
 from physhandi.fitting.config import named_profile
 from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.parameters import SimulationParameters
@@ -103,8 +103,8 @@ def _candidates(
 
 
 def _hands_in_order(
-    hands: Listing[HandSurface], control: Float[ndarray, "control 3"]
-) -> tuple[HandSurface, ...] | None:
+    hands: Listing[ShownHand], control: Float[ndarray, "control 3"]
+) -> tuple[ShownHand, ...] | None:
     """Find the order in which the hands' vertices are the control nodes; None if they are not."""
     for order in permutations(hands):
         if order and sum(hand.vertex.shape[1] for hand in order) == len(control):

@@ -13,7 +13,7 @@ from app.viewer.clock.timeline_panel import TimelinePanel
 from app.viewer.compare.camera import ComparisonCameras
 from app.viewer.compare.drawing import Look
 from app.viewer.compare.pair import open_pair, pairing_of
-from app.viewer.compare.sides import SIDES, Side, Sides, compared_rollouts
+from app.viewer.compare.sides import SIDES, ComparedSide, Sides, compared_rollouts
 from app.viewer.compare.view import CompareView
 from app.viewer.content.content import Catalog, Content
 from app.viewer.content.layers import Layers, default_layers
@@ -209,12 +209,12 @@ class CompareSession(SceneServer):
         return {key: _side(key, content, frame) for key, content, frame in parts}
 
 
-def _side(key: str, content: Content, frame: int) -> Side:
+def _side(key: str, content: Content, frame: int) -> ComparedSide:
     rollout = content.fitted
     detail = "no object"
     if rollout is not None:
         detail = f"{rollout.model.node_count} nodes · frame {frame}"
-    return Side(
+    return ComparedSide(
         name=key,
         title=f"{key.upper()} · {content.title}",
         detail=detail,

@@ -11,7 +11,7 @@ SIDES = ("a", "b")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Side:
+class ComparedSide:
     """One side of a comparison at a moment: a run, the fit, a kept rollout or PhysTwin's way."""
 
     name: str
@@ -30,7 +30,7 @@ class Side:
     """Frame of hands and observation."""
 
 
-Sides = Mapping[str, Side]
+Sides = Mapping[str, ComparedSide]
 """Both sides by their keys, `SIDES`."""
 ComparedRollouts = Mapping[str, tuple[ObjectRollout, int]]
 """Rollouts of both sides, each with its frame, by the sides' names in exported files."""

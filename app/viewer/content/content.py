@@ -41,7 +41,7 @@ class Catalog(Protocol):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class HandSurface:
+class ShownHand:
     """The moving surface of one hand."""
 
     side: Literal["right", "left"]
@@ -74,7 +74,7 @@ class Content:
     """Unit of all lengths, ``"m"`` if metric."""
     ground_height: float | None
     """Height of the ground [m]; None if there is none."""
-    hands: tuple[HandSurface, ...] = ()
+    hands: tuple[ShownHand, ...] = ()
     """Reconstructed hands."""
     skeletons: tuple[Float[ndarray, "frame keypoint 3"], ...] = ()
     """Hand keypoints lifted from the views, if there are no reconstructed hands."""
@@ -175,10 +175,10 @@ def _recording(catalog: Catalog, run: Run, name: str) -> Sequence | None:
         return None
 
 
-def _hands(run: Run, folder: str, recorded: Listing[str]) -> tuple[HandSurface, ...]:
+def _hands(run: Run, folder: str, recorded: Listing[str]) -> tuple[ShownHand, ...]:
     """Load the hands; `recorded` are the sides in the order of the keypoints."""
     seen = run.array(f"{folder}/keypoint.npy") if run.has(f"{folder}/keypoint.npy") else None
-    hands: list[HandSurface] = []
+    hands: list[ShownHand] = []
     sides: tuple[Literal["right", "left"], ...] = ("right", "left")
     for side in sides:
         if run.has(f"{folder}/hand_{side}_vertex.npy"):
@@ -191,7 +191,7 @@ def _hands(run: Run, folder: str, recorded: Listing[str]) -> tuple[HandSurface, 
             is_seen = seen is not None and 0 <= at < seen.shape[2]
             keypoint = seen[:, :, at] if seen is not None and is_seen else None
             hands.append(
-                HandSurface(side=side, vertex=vertex, face=face, joint=joint, keypoint=keypoint)
+                ShownHand(side=side, vertex=vertex, face=face, joint=joint, keypoint=keypoint)
             )
     return tuple(hands)
 

@@ -11,7 +11,7 @@ from viewer_world import FRAMES, PARAMETERS, FakeSettings, FolderCatalog, make_r
 
 from app.comparison import CompareAsk
 from app.viewer.compare.pair import open_pair
-from app.viewer.compare.sides import Side, compared_rollouts
+from app.viewer.compare.sides import ComparedSide, compared_rollouts
 from app.viewer.export.snapshot import comparison_npz
 from app.viewer.sessions import Sessions
 from physhandi.errors import MissingInputError, PhysHandiError, UsageError
@@ -279,7 +279,7 @@ def test_a_copy_and_a_closed_session_know_the_pair(sessions: Sessions) -> None:
 def test_a_side_without_a_rollout_is_left_out_of_files(catalog: FolderCatalog) -> None:
     content = open_pair(catalog, CompareAsk(a="sheet", b="moved")).contents[0]
     there, waiting = (
-        Side(
+        ComparedSide(
             name=name,
             title=name,
             detail="",

@@ -11,7 +11,7 @@ from viewer_world import FRAMES, PARAMETERS, content_of, hear_all, rest_at, shee
 
 from app.viewer.compare.camera import Eye, picture_of_both
 from app.viewer.compare.drawing import ARROWS, CompareDrawing, Look, legend_force
-from app.viewer.compare.sides import Side
+from app.viewer.compare.sides import ComparedSide
 from app.viewer.content.layers import Layers
 from app.viewer.export.snapshot import comparison_csv, comparison_npz
 from app.viewer.scene.framing import frame_content
@@ -244,7 +244,7 @@ def test_no_side_streams_more_than_300_arrows_or_too_many_bytes(server_client) -
     look = Look(tint="parts")
     drawing = CompareDrawing(server, content, frame_content(content), [take], look)
     sides = {
-        key: Side(
+        key: ComparedSide(
             name=name,
             title=name,
             detail="",

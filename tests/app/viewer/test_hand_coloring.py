@@ -9,7 +9,7 @@ from app.exports.permalink import state_from_query
 from app.viewer.color.coloring import Painter
 from app.viewer.color.hand_coloring import HandPainter, joint_weights
 from app.viewer.color.legend import legend_html
-from app.viewer.content.content import Content, HandSurface
+from app.viewer.content.content import Content, ShownHand
 from app.viewer.content.layers import Layers
 from app.viewer.inspect.picking import Pick
 from app.viewer.inspect.readings import Readings
@@ -43,7 +43,7 @@ def content() -> Content:
     keypoint[1, 2] = np.nan  # In frame 2 the second view sees nothing,
     keypoint[:, 1] = np.nan  # and in frame 1 none does.
     face = np.array([[0, 1, 2], [18, 19, 20]], np.int32)
-    hand = HandSurface(side="right", vertex=joint, face=face, joint=joint, keypoint=keypoint)
+    hand = ShownHand(side="right", vertex=joint, face=face, joint=joint, keypoint=keypoint)
     return Content(
         title="t",
         sequence_name="s",

@@ -6,7 +6,7 @@ import viser
 from viewer_client import ViewerClient
 from viewer_world import hear_all
 
-from app.viewer.content.content import Content, HandSurface
+from app.viewer.content.content import Content, ShownHand
 from app.viewer.content.layers import PLAYING_SPRINGS
 from app.viewer.scene.framing import frame_content
 from app.viewer.scene.scene import SceneDrawing
@@ -40,8 +40,8 @@ def large_content() -> Content:
         length_unit="m",
         ground_height=0.0,
         hands=(
-            HandSurface(side="right", vertex=vertex[0], face=face),
-            HandSurface(side="left", vertex=vertex[1], face=face),
+            ShownHand(side="right", vertex=vertex[0], face=face),
+            ShownHand(side="left", vertex=vertex[1], face=face),
         ),
         control=control,
         fitted=fitted,
