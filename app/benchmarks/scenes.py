@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy import ndarray
 
+from physhandi.data.layout import MATERIAL_FILE, METRICS_FILE, PARAMETERS_FILE, SequenceFiles
 from physhandi.hand.loading import load_hand_model
 from physhandi.run import Run
 from physhandi.simulation.parameters import SimulationParameters
@@ -60,18 +61,18 @@ def make_heavy_run(folder: Path) -> Run:
         folder / HEAVY, name="Heavy scene", kind="reconstruction", sequences=[HEAVY], config={}
     )
     with run.begin_attempt() as attempt:
-        at = f"sequences/{HEAVY}"
-        attempt.save_yaml("object/parameters.yaml", parameters.to_dict())
-        attempt.save_tensors("object/material.safetensors", {"rest_node": node})
-        attempt.save_array(f"{at}/rollout.npy", (node + 0.5 * way).astype(np.float32))
-        attempt.save_array(f"{at}/control.npy", (top + way).astype(np.float32))
-        attempt.save_tensors(f"{at}/model.safetensors", model.to_tensors())
+        files = SequenceFiles(HEAVY)
+        attempt.save_yaml(PARAMETERS_FILE, parameters.to_dict())
+        attempt.save_tensors(MATERIAL_FILE, {"rest_node": node})
+        attempt.save_array(files.rollout, (node + 0.5 * way).astype(np.float32))
+        attempt.save_array(files.control, (top + way).astype(np.float32))
+        attempt.save_tensors(files.model, model.to_tensors())
         for side, offset in _HANDS:
             vertex, face = _hand(side, offset)
-            attempt.save_array(f"{at}/hand_{side}_vertex.npy", vertex + way)
-            attempt.save_array(f"{at}/hand_{side}_face.npy", face)
+            attempt.save_array(files.hand_vertex(side), vertex + way)
+            attempt.save_array(files.hand_face(side), face)
         about = {"frame_rate": 30.0, "frame_count": HEAVY_FRAMES, "ground_height": 0.0}
-        attempt.save_yaml(f"{at}/meta.yaml", about)
+        attempt.save_yaml(files.meta, about)
         attempt.publish()
     return Run.open(run.folder)
 
@@ -87,8 +88,8 @@ def make_many_runs(folder: Path, count: int) -> None:
         folder / "many_0000", name="Run 0", kind="reconstruction", sequences=["cloth"], config={}
     )
     with first.begin_attempt() as attempt:
-        attempt.save_yaml("object/parameters.yaml", SimulationParameters().to_dict())
-        attempt.save_json("metrics.json", {"cloth": {"track_error": 0.004}})
+        attempt.save_yaml(PARAMETERS_FILE, SimulationParameters().to_dict())
+        attempt.save_json(METRICS_FILE, {"cloth": {"track_error": 0.004}})
         attempt.finish_stage("first_order", {"before": 2.0, "after": 0.5, "curve": [[0, 2.0]]})
         attempt.publish()
     about = (first.folder / "run.yaml").read_text()

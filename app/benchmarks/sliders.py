@@ -12,6 +12,7 @@ from app.benchmarks.served import Served
 from app.benchmarks.streams import Screen, percentiles
 from app.viewer.live.client import STARTING
 from app.viewer.physics.parameters import Knob, knobs
+from physhandi.data.layout import SequenceFiles
 from physhandi.fitted_object import FittedObject
 from physhandi.run import Run
 
@@ -45,7 +46,7 @@ class MeasuredSlider:
             field: Parameter that the slider moves.
         """
         self._fitted = FittedObject.of(run, sequence)
-        meta = run.yaml(f"sequences/{sequence}/meta.yaml")
+        meta = run.yaml(SequenceFiles(sequence).meta)
         unit = "m" if meta.get("metric", True) else str(meta.get("length_unit", "units"))
         start = self._fitted.parameters
         known = {knob.field: knob for knob in knobs(start, length_unit=unit)}

@@ -27,6 +27,7 @@ from app.benchmarks.sliders import FIELDS, MeasuredSlider, measure_first_move, m
 from app.benchmarks.streams import measure_scrub, measure_sessions, percentiles
 from app.settings import BUNDLED
 from physhandi.benchmarks.timing import describe_machine
+from physhandi.data.layout import SequenceFiles
 from physhandi.devices import start_warp
 from physhandi.errors import MissingInputError
 from physhandi.run import Run
@@ -101,7 +102,7 @@ def measure_viewer(
     start_warp()
     about = describe_machine("cpu")
     effort = _QUICK if is_quick else _FULL
-    position = f"sequences/{sequence}/rollout.npy"
+    position = SequenceFiles(sequence).rollout
     if not run.has(position):
         raise MissingInputError(f"Run '{run.name}' has no object in '{sequence}' to simulate.")
     with (
@@ -195,7 +196,7 @@ class _Bench:
             return measure_first_paint(self._served(), browser, self._effort.visits)
 
     def _scrub(self) -> dict[str, Any]:
-        rollout = self._run.array(f"sequences/{self._sequence}/rollout.npy")
+        rollout = self._run.array(SequenceFiles(self._sequence).rollout)
         return measure_scrub(self._served(), self._run.id, rollout, 3 * self._effort.moves)
 
     def _slider(self) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from app.cli.lookup import (
 from app.cli.output import AsJson, DataDir, Device, show
 from app.jobs.order import default_name, fit_settings
 from physhandi.api import prepare_run
+from physhandi.data.layout import LOSSES_FILE, METRICS_FILE, PARAMETERS_FILE
 from physhandi.data.run import RunKind
 from physhandi.data.run_folder import new_run_id
 from physhandi.data.sequence import Sequence
@@ -140,7 +141,7 @@ def simulate(
     else:
         target = _run_at(out, "simulation", recordings, config)
     result = _execute(target, device)
-    chosen = Run.open(target.folder).yaml("object/parameters.yaml")
+    chosen = Run.open(target.folder).yaml(PARAMETERS_FILE)
     show({"substeps_per_frame": chosen["substeps_per_frame"], **result})
 
 
@@ -252,12 +253,12 @@ def _execute(run: Run, device: str) -> dict[str, Any]:
         pipeline.run_job(run, progress, device=device)
     finished = Run.open(run.folder)
     result: dict[str, Any] = {"run": str(finished.folder)}
-    if finished.has("losses.json"):
+    if finished.has(LOSSES_FILE):
         result["losses"] = {
             stage: {key: value[key] for key in ("before", "after")}
-            for stage, value in finished.json("losses.json").items()
+            for stage, value in finished.json(LOSSES_FILE).items()
             if "before" in value
         }
-    if finished.has("metrics.json"):
-        result["metrics"] = finished.json("metrics.json")
+    if finished.has(METRICS_FILE):
+        result["metrics"] = finished.json(METRICS_FILE)
     return result

@@ -26,6 +26,7 @@ from app.viewer.export.snapshot import snapshot_yaml
 from app.viewer.session import Session
 from app.viewer.sessions import Sessions
 from physhandi.data.exporters import export_run
+from physhandi.data.layout import SequenceFiles
 from physhandi.errors import PhysHandiError, RunError, UsageError
 from physhandi.run import Run
 
@@ -176,7 +177,7 @@ def _check_frame(run: Run, query: Mapping[str, str]) -> None:
     if name not in run.sequence_names:
         names = ", ".join(run.sequence_names)
         raise UsageError(f"sequence: run '{run.id}' has no sequence '{name[:80]}', but {names}.")
-    meta = f"sequences/{name}/meta.yaml"
+    meta = SequenceFiles(name).meta
     count = int(run.yaml(meta).get("frame_count", 0)) if run.has(meta) else 0
     frame = state_from_query(query).frame
     if count and frame >= count:

@@ -15,14 +15,14 @@ from app.jobs.scheduler import AT_WORK, JobView, Scheduler
 from physhandi import errors
 from physhandi.data.environment import ENVIRONMENT
 from physhandi.data.files import named_fields
+from physhandi.data.layout import LOSSES_FILE, METRICS_FILE, PARAMETERS_FILE, SequenceFiles
 from physhandi.data.run_folder import EXIT, read_events, read_mapping
 from physhandi.errors import PhysHandiError
 from physhandi.fitting.config import SIMULATION, STAGES
 from physhandi.run import Run
 
-_METRICS = "metrics.json"
 PARTS = ("color", "depth", "mask", "keypoint", "track", "control", "marker", "object_node")
-_RESULTS = ("losses.json", "metrics.json", "object/parameters.yaml", ENVIRONMENT)
+_RESULTS = (LOSSES_FILE, METRICS_FILE, PARAMETERS_FILE, ENVIRONMENT)
 CURVE_LIMIT = 2000
 """Most points of a curve that are sent to a browser."""
 # Runs and the views of ended runs stay the same objects while nothing changes on disk, so a long
@@ -367,9 +367,9 @@ def _duration(run: Run) -> float | None:
 
 
 def _track_errors(run: Run) -> tuple[float | None, float | None]:
-    if not run.has(_METRICS):
+    if not run.has(METRICS_FILE):
         return None, None
-    metrics = named_fields(run.json(_METRICS)) or {}
+    metrics = named_fields(run.json(METRICS_FILE)) or {}
     unseen = _unseen_sequences(run)
     fitted: list[tuple[float, float]] = []
     predicted: list[tuple[float, float]] = []
@@ -385,7 +385,7 @@ def _track_errors(run: Run) -> tuple[float | None, float | None]:
 
 def _reprojection(run: Run) -> float | None:
     """Give the median reprojection error, weighted by the keypoints of each hand."""
-    metrics = (named_fields(run.json(_METRICS)) if run.has(_METRICS) else None) or {}
+    metrics = (named_fields(run.json(METRICS_FILE)) if run.has(METRICS_FILE) else None) or {}
     errors_of_hands: list[tuple[float, float]] = []
     for scores in metrics.values():
         hands = named_fields((named_fields(scores) or {}).get("hands")) or {}
@@ -435,8 +435,8 @@ def describe_results(run: Run) -> dict[str, dict[str, Any]]:
                 results[name] = named_fields(run.json(f"{name}.json")) or {}
         if run.has(ENVIRONMENT):
             results["environment"] = named_fields(run.json(ENVIRONMENT)) or {}
-        if run.has("object/parameters.yaml"):
-            results["parameters"] = named_fields(run.yaml("object/parameters.yaml")) or {}
+        if run.has(PARAMETERS_FILE):
+            results["parameters"] = named_fields(run.yaml(PARAMETERS_FILE)) or {}
     except PhysHandiError as error:
         results["problem"] = {"message": str(error)}
     return results
@@ -452,7 +452,7 @@ def read_frame_errors(run: Run) -> dict[str, dict[str, Any]]:
     metrics = describe_results(run).get("metrics", {})
     errors_of: dict[str, dict[str, Any]] = {}
     for name in run.sequence_names:
-        rel = f"sequences/{name}/frame_errors.json"
+        rel = SequenceFiles(name).frame_errors
         if not run.has(rel):
             continue
         content = named_fields(run.json(rel)) or {}

@@ -7,12 +7,12 @@ from typing import Any
 from app.pages.metrics import scaled
 from app.pages.render import short
 from physhandi.data.files import named_fields
+from physhandi.data.layout import PARAMETERS_FILE
 from physhandi.errors import PhysHandiError
 from physhandi.run import Run
 from physhandi.settings import changes
 from physhandi.simulation.parameters import PARAMETERS
 
-_FOUND = "object/parameters.yaml"
 _TOLERANCE = 1e-9
 """Numbers that differ by a smaller share were only rounded on the way."""
 
@@ -53,7 +53,7 @@ def _start_of(run: Run) -> dict[str, Any]:
     if run.kind == "simulation":
         try:
             source = Run.open(Path(str(run.config.get("source", ""))))
-            return named_fields(source.yaml(_FOUND)) or {}
+            return named_fields(source.yaml(PARAMETERS_FILE)) or {}
         except (PhysHandiError, OSError):
             return {}  # The run that it began from was deleted since.
     profile = named_fields(run.config.get("profile")) or {}

@@ -12,6 +12,7 @@ from numpy import ndarray
 from app.previews.draw import HEIGHT, WIDTH, Motion, draw_motion
 from app.previews.links import marker_links
 from physhandi.data.files import named_fields, temporary_name
+from physhandi.data.layout import SequenceFiles
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
 from physhandi.run import Run
@@ -99,7 +100,7 @@ def clip_of_run(folder: Path, *, is_still: bool = False) -> Clip | None:
     """
     run = Run.open(folder)
     for name in run.sequence_names:
-        motion = _found_motion(run, f"sequences/{name}")
+        motion = _found_motion(run, SequenceFiles(name))
         if motion.frame_count:
             rate = _rate_of(run, name)
             frames, frame_ms = _sampled(motion.frame_count, rate, is_still=is_still)
@@ -117,27 +118,26 @@ def _sampled(count: int, rate: float, *, is_still: bool) -> tuple[list[int], int
 
 
 def _rate_of(run: Run, name: str) -> float:
-    rel = f"sequences/{name}/meta.yaml"
+    rel = SequenceFiles(name).meta
     about = named_fields(run.yaml(rel)) if run.has(rel) else None
     rate = (about or {}).get("frame_rate")
     return float(rate) if isinstance(rate, int | float) and rate > 0 else _USUAL_RATE
 
 
-def _found_motion(run: Run, folder: str) -> Motion:
+def _found_motion(run: Run, files: SequenceFiles) -> Motion:
     hands: list[tuple[Float[ndarray, "frame vertex 3"], Int[ndarray, "face 3"] | None]] = []
     for side in _SIDES:
-        stored, face = f"{folder}/hand_{side}_vertex.npy", f"{folder}/hand_{side}_face.npy"
+        stored, face = files.hand_vertex(side), files.hand_face(side)
         if run.has(stored):
             hands.append((run.array(stored), run.array(face) if run.has(face) else None))
-    if not run.has(f"{folder}/rollout.npy"):
+    if not run.has(files.rollout):
         return Motion(hands=tuple(hands))
-    node = run.array(f"{folder}/rollout.npy")
-    control = f"{folder}/control.npy"
+    node = run.array(files.rollout)
     return Motion(
         hands=tuple(hands),
         node=node,
-        control=run.array(control) if not hands and run.has(control) else None,
-        spring=_springs(run, f"{folder}/model.safetensors", node.shape[1]),
+        control=run.array(files.control) if not hands and run.has(files.control) else None,
+        spring=_springs(run, files.model, node.shape[1]),
     )
 
 

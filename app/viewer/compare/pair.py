@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from app.comparison import CompareAsk
 from app.viewer.compare.curve import Pairing
 from app.viewer.content.content import Catalog, Content, open_run
+from physhandi.data.layout import SequenceFiles
 from physhandi.errors import UsageError
 from physhandi.run import Run
 
@@ -152,4 +153,4 @@ def chosen_sequences(first: Run, second: Run, wanted: str | None) -> tuple[str, 
 
 
 def _has(run: Run, name: str) -> bool:
-    return run.has(f"sequences/{name}/meta.yaml")
+    return run.has(SequenceFiles(name).meta)

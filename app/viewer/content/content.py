@@ -19,6 +19,7 @@ from app.viewer.content.observed import (
     Tracks,
     lift_keypoints,
 )
+from physhandi.data.layout import SequenceFiles
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
 from physhandi.errors import MissingInputError, PhysHandiError, UsageError
@@ -120,15 +121,15 @@ def open_run(catalog: Catalog, run_id: str, sequence_name: str | None = None) ->
     name = sequence_name or run.sequence_names[0]
     if name not in run.sequence_names:
         raise UsageError(f"Run '{run.name}' has no sequence '{name}'.")
-    folder = f"sequences/{name}"
-    if not run.has(f"{folder}/meta.yaml"):
+    files = SequenceFiles(name)
+    if not run.has(files.meta):
         raise MissingInputError(
-            f"Run '{run.name}' has no result for sequence '{name}' yet ({folder}/meta.yaml is "
+            f"Run '{run.name}' has no result for sequence '{name}' yet ({files.meta} is "
             "missing). Open it when its first stage is finished."
         )
-    meta = run.yaml(f"{folder}/meta.yaml")
+    meta = run.yaml(files.meta)
     sequence = _recording(catalog, run, name)
-    control = run.array(f"{folder}/control.npy") if run.has(f"{folder}/control.npy") else None
+    control = run.array(files.control) if run.has(files.control) else None
     return Content(
         title=run.name,
         sequence_name=name,
@@ -137,11 +138,11 @@ def open_run(catalog: Catalog, run_id: str, sequence_name: str | None = None) ->
         reconstruction_count=int(meta.get("reconstruction_frames", meta["frame_count"])),
         length_unit="m" if meta.get("metric", True) else str(meta.get("length_unit", "units")),
         ground_height=meta.get("ground_height"),
-        hands=_hands(run, folder, [str(side) for side in meta.get("hands", [])]),
+        hands=_hands(run, files, [str(side) for side in meta.get("hands", [])]),
         control=control,
         fitted=load_fitted(run, name),
-        observed=_run_observation(run, folder) or (_observation(sequence) if sequence else None),
-        tracks=_run_tracks(run, folder),
+        observed=_run_observation(run, files) or (_observation(sequence) if sequence else None),
+        tracks=_run_tracks(run, files),
         views=sequence.views if sequence else (),
     )
 
@@ -175,17 +176,17 @@ def _recording(catalog: Catalog, run: Run, name: str) -> Sequence | None:
         return None
 
 
-def _hands(run: Run, folder: str, recorded: Listing[str]) -> tuple[ShownHand, ...]:
+def _hands(run: Run, files: SequenceFiles, recorded: Listing[str]) -> tuple[ShownHand, ...]:
     """Load the hands; `recorded` are the sides in the order of the keypoints."""
-    seen = run.array(f"{folder}/keypoint.npy") if run.has(f"{folder}/keypoint.npy") else None
+    seen = run.array(files.keypoint) if run.has(files.keypoint) else None
     hands: list[ShownHand] = []
     sides: tuple[Literal["right", "left"], ...] = ("right", "left")
     for side in sides:
-        if run.has(f"{folder}/hand_{side}_vertex.npy"):
-            vertex = run.array(f"{folder}/hand_{side}_vertex.npy")
-            stored = f"{folder}/hand_{side}_face.npy"
+        if run.has(files.hand_vertex(side)):
+            vertex = run.array(files.hand_vertex(side))
+            stored = files.hand_face(side)
             face = run.array(stored) if run.has(stored) else _faces(side, vertex.shape[1])
-            stored = f"{folder}/hand_{side}_keypoint.npy"
+            stored = files.hand_keypoint(side)
             joint = run.array(stored) if run.has(stored) else None
             at = recorded.index(side) if side in recorded else -1
             is_seen = seen is not None and 0 <= at < seen.shape[2]
@@ -207,22 +208,22 @@ def _faces(side: Literal["right", "left"], vertex_count: int) -> Int[ndarray, "f
     return np.asarray(model.faces, dtype=np.int32)
 
 
-def _run_observation(run: Run, folder: str) -> Observed | None:
-    clouds = (f"{folder}/observation/cloud.npy", f"{folder}/observation/cloud_end.npy")
+def _run_observation(run: Run, files: SequenceFiles) -> Observed | None:
+    clouds = files.observation("cloud"), files.observation("cloud_end")
     if all(run.has(name) for name in clouds):
         return CloudSet(run.array(clouds[0]), run.array(clouds[1]))
-    files = (f"{folder}/observation/point.npy", f"{folder}/observation/is_visible.npy")
-    if not all(run.has(name) for name in files):
+    seen = files.observation("point"), files.observation("is_visible")
+    if not all(run.has(name) for name in seen):
         return None
-    return PointSet(run.array(files[0]), run.array(files[1]))
+    return PointSet(run.array(seen[0]), run.array(seen[1]))
 
 
-def _run_tracks(run: Run, folder: str) -> Tracks | None:
-    files = (f"{folder}/observation/point.npy", f"{folder}/observation/is_visible.npy")
-    if not all(run.has(name) for name in files):
+def _run_tracks(run: Run, files: SequenceFiles) -> Tracks | None:
+    seen = files.observation("point"), files.observation("is_visible")
+    if not all(run.has(name) for name in seen):
         return None
-    point, is_visible = (run.array(name) for name in files)
-    nodes = f"{folder}/observation/node_of_track.npy"
+    point, is_visible = (run.array(name) for name in seen)
+    nodes = files.observation("node_of_track")
     node = run.array(nodes) if run.has(nodes) else None
     return Tracks(point=point, is_visible=is_visible, node=node) if point.shape[1] else None
 

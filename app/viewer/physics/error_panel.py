@@ -13,6 +13,7 @@ from app.viewer.content.content import Content
 from app.viewer.ui.guard import plain
 from app.viewer.ui.plot import Curve, FramePlot
 from physhandi.data.files import named_fields
+from physhandi.data.layout import SequenceFiles
 from physhandi.object_rollout import ObjectRollout
 from physhandi.run import Run
 
@@ -34,7 +35,7 @@ def load_track_error(
     Returns:
         The errors, or None if the run has none.
     """
-    name = f"sequences/{sequence_name}/frame_errors.json"
+    name = SequenceFiles(sequence_name).frame_errors
     if not run.has(name):
         return None
     content = named_fields(run.json(name)) or {}

@@ -22,6 +22,7 @@ from app.viewer.physics.presets import (
 )
 from app.viewer.ui.followed import FollowedChoice
 from app.viewer.ui.guard import Guard, notify
+from physhandi.data.layout import PARAMETERS_FILE
 from physhandi.data.run_folder import new_run_id
 from physhandi.errors import UsageError
 from physhandi.run import Run
@@ -138,7 +139,7 @@ def run_changes(
         is_automatic: Whether its substeps are chosen automatically.
     """
     changes = parameter_changes(fitted, now, is_automatic=is_automatic)
-    stored = SimulationParameters.from_dict(source.yaml("object/parameters.yaml"))
+    stored = SimulationParameters.from_dict(source.yaml(PARAMETERS_FILE))
     # A ground or gravity other than the recording's must not be taken from it again.
     for field, switch in (
         ("ground_height", "uses_sequence_ground"),
