@@ -13,6 +13,7 @@ from app.benchmarks.streams import Screen, percentiles
 from app.viewer.live.client import STARTING
 from app.viewer.physics.parameters import Knob, knobs
 from physhandi.data.layout import SequenceFiles
+from physhandi.errors import UsageError
 from physhandi.fitted_object import FittedObject
 from physhandi.run import Run
 
@@ -49,8 +50,11 @@ class MeasuredSlider:
         meta = run.yaml(SequenceFiles(sequence).meta)
         unit = "m" if meta.get("metric", True) else str(meta.get("length_unit", "units"))
         start = self._fitted.parameters
-        known = {knob.field: knob for knob in knobs(start, length_unit=unit)}
-        self.knob: Knob = known[field]
+        controls = {knob.field: knob for knob in knobs(start, length_unit=unit)}
+        knob = controls[field]
+        if not isinstance(knob, Knob):
+            raise UsageError(f"{field} is a switch, which has no way to be moved along.")
+        self.knob = knob
         self._start = start
 
     @property
