@@ -12,6 +12,7 @@ from physhandi.data.exporters.export import export_scene
 from physhandi.data.exporters.scene_data import SceneData
 from physhandi.data.layout import PARAMETERS_FILE, SequenceFiles
 from physhandi.data.run import RunFolder
+from physhandi.data.run_folder import reading
 from physhandi.errors import UsageError
 from physhandi.simulation.forces import (
     spring_strains,
@@ -186,8 +187,10 @@ def load_fitted(run: RunFolder, sequence_name: str) -> ObjectRollout | None:
             ground_height=meta.get("ground_height"),
             gravity=float(meta.get("gravity", parameters.gravity)),
         )
+    with reading(run.out / files.model):
+        model = SpringMassModel.from_tensors(run.tensors(files.model))
     return ObjectRollout(
-        model=SpringMassModel.from_tensors(run.tensors(files.model)),
+        model=model,
         parameters=parameters,
         control=run.array(files.control)[: len(position)],
         position=position,

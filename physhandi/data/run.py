@@ -255,7 +255,7 @@ class RunFolder:
         try:
             return read_tensors(path)
         except (SafetensorError, ValueError, OSError) as error:
-            raise RunError(f"Run '{self.id}': {rel} is not readable: {error}.") from error
+            raise RunError(f"Run '{self.id}': {rel} is damaged: {error}. Run it again.") from error
 
     def yaml(self, rel: str) -> Any:
         """Read plain data from YAML."""
