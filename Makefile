@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 PORT ?= 8080
 DATA ?= data
-# Without an NVIDIA GPU install torch's CPU build first (README, "Installing torch"); this variable is passed to pip.
+# Without an NVIDIA GPU install torch's CPU build first (docs/getting-started.md); this variable is passed to pip.
 TORCH ?= torch==2.13.0
 
 .PHONY: install demo test races check fmt bench test-gpu pictures browser clean
