@@ -23,7 +23,7 @@ PREDICTIONS = (
     *INPUTS[:1],
 )
 """Makes what methods predict: fits, rules, corrections and disturbances."""
-SCORES = ("metrics", "synthetic/suite/cells.py", "data", "hand")
+SCORES = ("metrics", "synthetic/suite/cells.py", "data", "hand", "triangles.py")
 """Makes figures of predictions."""
 PACKAGES = ("torch", "warp-lang", "numpy", "scipy", "cma", "safetensors")
 """Libraries that predictions and figures are computed with, beside OpenCV."""

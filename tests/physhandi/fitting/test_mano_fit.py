@@ -47,7 +47,7 @@ def test_without_mano_the_fit_says_how_to_bring_it(
     sequence = scene.write_scene(tmp_path / "a", [truth], CAMERAS, keypoint)
     with pytest.raises(MissingInputError, match="physhandi import mano"):
         reconstruct_hands(sequence, HandFitConfig(model="mano"))
-    with pytest.raises(UsageError, match=r"hand: model is 'smpl'; expected one of 'open', 'mano'"):
+    with pytest.raises(UsageError, match=r"hand.model is 'smpl'; expected one of open, mano"):
         PipelineConfig.from_dict({"hand": {"model": "smpl"}})
 
 

@@ -108,7 +108,7 @@ def test_what_other_code_made_is_not_used_again(
 
     monkeypatch.setattr(variants, "code_version", other)
     assert make_variant(recording, "noisy_tracks", tmp_path / "inputs").folder != first.folder
-    assert "synthetic/variants.py" in asked[0]
+    assert "synthetic/suite/variants.py" in asked[0]
 
 
 def test_a_variant_is_made_once_and_anew_for_another_recording(
