@@ -34,9 +34,16 @@ STORED_HAND = 300
 
 
 def save_sequence_meta(output: Attempt, sequence: Sequence) -> None:
-    """Keep what a viewer needs of a sequence, so that a run can be shown without it."""
+    """Keep what a viewer needs of a sequence, so that a run can be shown without it.
+
+    What a finished stage of an earlier attempt has stored stays: another content, as of another
+    version of this program, would make that stage count as damaged.
+    """
+    file = SequenceFiles(sequence.name).meta
+    if (output.out / file).is_file():
+        return
     output.save_yaml(
-        SequenceFiles(sequence.name).meta,
+        file,
         {
             "name": sequence.name,
             "frame_rate": sequence.frame_rate,
