@@ -1,7 +1,6 @@
-"""What the stages leave in a run's folder, and how later stages read it back.
+"""Writes and reads the files that the stages store in a run.
 
-Everything here is relative to the output folder of one attempt; names are those of
-docs/formats.md.
+Paths are relative to the output folder of one attempt; docs/formats.md lists them.
 """
 
 from pathlib import Path
@@ -28,16 +27,16 @@ from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 
 STORED_CLOUD = 500
-"""Most points of one frame's cloud that a run keeps, evenly picked, unless they are markers."""
+"""Most points of one frame's cloud that a run stores, evenly picked, unless they are markers."""
 STORED_HAND = 300
-"""Most points that a run keeps of one hand in one frame; evenly picked."""
+"""Most points of one hand in one frame that a run stores, evenly picked."""
 
 
 def save_sequence_meta(output: Attempt, sequence: Sequence) -> None:
-    """Keep what a viewer needs of a sequence, so that a run can be shown without it.
+    """Store what a viewer needs of a sequence, so that a run can be shown without the recording.
 
-    What a finished stage of an earlier attempt has stored stays: another content, as of another
-    version of this program, would make that stage count as damaged.
+    A file that a finished stage of an earlier attempt stored is not replaced: other content, such
+    as of another version of this program, would make that stage count as damaged.
     """
     file = SequenceFiles(sequence.name).meta
     if (output.out / file).is_file():
@@ -60,7 +59,7 @@ def save_sequence_meta(output: Attempt, sequence: Sequence) -> None:
 
 
 def save_observation(output: Attempt, name: str, observation: ObjectObservation) -> None:
-    """Store what was seen of the object."""
+    """Store the observation of the object."""
     file_of = SequenceFiles(name).observation
     output.save_array(file_of("point"), observation.point.astype(np.float32))
     output.save_array(file_of("is_visible"), observation.is_visible)
@@ -68,7 +67,7 @@ def save_observation(output: Attempt, name: str, observation: ObjectObservation)
     if observation.node_of_track is not None:
         output.save_array(file_of("node_of_track"), observation.node_of_track.astype(np.int32))
     if observation.cloud:
-        # A cloud of identified points is what the losses and metrics are defined on.
+        # Losses and metrics are defined on all points of a cloud of markers.
         identified = 0 if observation.node_of_track is None else observation.track_count
         most = max(STORED_CLOUD, identified)
         clouds = [_thinned(cloud, most) for cloud in observation.cloud]
@@ -78,8 +77,8 @@ def save_observation(output: Attempt, name: str, observation: ObjectObservation)
 
 
 def _thinned(cloud: Float[ndarray, "point 3"], most: int) -> Float[ndarray, "kept 3"]:
-    kept = np.linspace(0, len(cloud) - 1, min(most, len(cloud))).round().astype(int)
-    return np.asarray(cloud, np.float32).reshape(-1, 3)[kept]
+    index = np.linspace(0, len(cloud) - 1, min(most, len(cloud))).round().astype(int)
+    return np.asarray(cloud, np.float32).reshape(-1, 3)[index]
 
 
 def load_array(path: Path) -> ndarray:
@@ -93,7 +92,7 @@ def load_array(path: Path) -> ndarray:
 
 
 def load_observation(out: Path, name: str) -> ObjectObservation:
-    """Read back what `save_observation` stored."""
+    """Read an observation that `save_observation` stored."""
     files = SequenceFiles(name)
 
     def read(part: str) -> ndarray | None:
@@ -117,11 +116,11 @@ def load_observation(out: Path, name: str) -> ObjectObservation:
 def lifted_hand_points(
     sequence: Sequence, progress: Progress | None = None
 ) -> tuple[Float[ndarray, "point 3"], Int[ndarray, "hand frame"]] | None:
-    """Lift what the views measured on the hands, thinned as a run keeps it.
+    """Lift the hands' depth pixels of all views, thinned as a run stores them.
 
     Returns:
-        The points of the first hand's frames, then those of the next hand [m], and where each
-        frame's points end; None without hands, or if no view has both depth and masks.
+        The points of the first hand's frames, then those of the next hand [m], and the end of each
+        frame's points; None without hands, or if no view has both depth and masks.
     """
     if not sequence.hands or not any(view.has_depth and view.has_mask for view in sequence.views):
         return None
@@ -135,12 +134,12 @@ def lifted_hand_points(
 
 
 def save_hand_points(output: Attempt, sequence: Sequence, progress: Progress) -> None:
-    """Store what the views measured on the hands, for scoring; nothing if they measured nothing."""
-    found = lifted_hand_points(sequence, progress)
-    if found is not None:
+    """Store the measured points of the hands for scoring, if there are any."""
+    stored = lifted_hand_points(sequence, progress)
+    if stored is not None:
         file_of = SequenceFiles(sequence.name).observation
-        output.save_array(file_of("hand_point"), found[0])
-        output.save_array(file_of("hand_point_end"), found[1])
+        output.save_array(file_of("hand_point"), stored[0])
+        output.save_array(file_of("hand_point_end"), stored[1])
 
 
 def save_motions(output: Attempt, name: str, motions: tuple[HandMotion, ...]) -> None:
@@ -156,7 +155,7 @@ def save_refinement(
     attachment: Float[ndarray, "control 3"],
     after: tuple[HandMotion, ...],
 ) -> None:
-    """Store refined hands, the hands as they were, and where these held the object at frame 0."""
+    """Store refined hands, the hands before, and the latter's control nodes at frame 0."""
     files = SequenceFiles(name)
     for motion in before:
         output.save_tensors(files.hand_motion(motion.side, is_initial=True), motion.to_tensors())
@@ -165,7 +164,7 @@ def save_refinement(
 
 
 def load_attachment(out: Path, name: str) -> Float[ndarray, "control 3"]:
-    """Read where the control nodes of a sequence were when its virtual springs were laid [m].
+    """Read the control nodes to which a sequence's virtual springs were attached [m].
 
     That is frame 0 of the control nodes, unless refinement has moved the hands since.
     """
@@ -208,7 +207,7 @@ def save_object(
     model: SpringMassModel,
     rest_node: Float[ndarray, "node 3"],
 ) -> None:
-    """Store the object by itself: rest shape, its springs and the global parameters."""
+    """Store the object without controls: rest shape, object springs and global parameters."""
     count = model.object_spring_count
     output.save_yaml(PARAMETERS_FILE, parameters.to_dict())
     output.save_tensors(
@@ -256,7 +255,7 @@ def load_model(out: Path, name: str) -> SpringMassModel:
 def save_hand_observation(
     output: Attempt, name: str, keypoint: Float[ndarray, "view frame hand 21 3"]
 ) -> None:
-    """Store the keypoints that stage 1 compared the hands with [px]."""
+    """Store the keypoints that stage 1 fitted the hands to [px]."""
     output.save_array(SequenceFiles(name).keypoint, keypoint.astype(np.float32))
 
 

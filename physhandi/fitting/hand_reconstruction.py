@@ -1,4 +1,9 @@
-"""Stage 1: a hand mesh in every frame, from keypoints and depth of all views (paper, 3.2)."""
+"""Stage 1: reconstructs the hands of a sequence from keypoints and depth (paper, 3.2).
+
+`reconstruct_hands` fits one hand after the other: `guess_wrist` places the palm in every frame,
+then `HandProblem` refines pose and shape by gradient descent, first on the keypoints, then on
+keypoints and depth.
+"""
 
 import math
 from collections.abc import Callable, Iterator
@@ -30,145 +35,9 @@ from physhandi.progress import NullProgress, Preview, Progress
 PALM = (0, 1, 5, 9, 13, 17)
 """Keypoints that move with the palm."""
 _PALM_BONES = ((0, 5), (0, 9), (0, 13), (0, 17), (5, 17))
+"""Pairs of palm keypoints whose distances give the scale."""
 _MIN_PALM_POINTS = 4
-
-
-@dataclass(frozen=True)
-class WristGuess:
-    """Where the wrist is in every frame, roughly."""
-
-    rotation: Float[ndarray, "frame 4"]
-    """Unit quaternion (x, y, z, w) of the hand, without jumps of sign."""
-    translation: Float[ndarray, "frame 3"]
-    """Position of the wrist [m, before scale]."""
-    scale: float
-    """Length units of the sequence per metre."""
-
-
-def guess_wrist(
-    cameras: Many[PinholeCamera],
-    keypoint: Float[ndarray, "view frame 21 3"],
-    model: HandModel,
-    *,
-    metric: bool,
-    tolerance: float,
-) -> WristGuess:
-    """Place the template's palm on the triangulated palm, and bridge the frames without one.
-
-    Args:
-        cameras: Camera of each view.
-        keypoint: Pixel x, pixel y and confidence; NaN where not seen [px].
-        model: The hand.
-        metric: Whether lengths are metres; otherwise the scale is estimated too.
-        tolerance: Largest error at which views agree about a keypoint [px].
-
-    Raises:
-        FitError: If no frame shows enough of the palm.
-    """
-    template = _template(model)
-    view_count, frame_count = keypoint.shape[:2]
-    flat = keypoint.reshape(view_count, -1, 3)
-    weight = np.nan_to_num(flat[..., 2])
-    point = triangulate(cameras, flat[..., :2], weight, tolerance).reshape(frame_count, 21, 3)
-    scale = 1.0 if metric else _scale(point, template)
-    palm = list(PALM)
-    rotation, translation = np.zeros((frame_count, 4)), np.zeros((frame_count, 3))
-    is_known = np.zeros(frame_count, dtype=bool)
-    for frame in range(frame_count):
-        is_seen = np.isfinite(point[frame, palm]).all(-1)
-        if is_seen.sum() >= _MIN_PALM_POINTS:
-            pose = _align(template[palm][is_seen], point[frame, palm][is_seen] / scale)
-            rotation[frame], translation[frame] = pose[0].as_quat(), pose[1]
-            is_known[frame] = True
-    if not is_known.any():
-        for frame in range(frame_count):
-            pose = _guess_from_one_view(cameras, keypoint[:, frame, palm], template[palm] * scale)
-            if pose is not None:
-                rotation[frame], translation[frame] = pose[0].as_quat(), pose[1] / scale
-                is_known[frame] = True
-    if not is_known.any():
-        raise FitError(
-            f"The {model.side} hand cannot be placed: no frame shows "
-            f"{_MIN_PALM_POINTS} keypoints of its palm apart from each other. Check the keypoints "
-            "and the calibration."
-        )
-    rotation, translation = _bridge(rotation, translation, is_known)
-    return WristGuess(rotation, translation, scale)
-
-
-def _template(model: HandModel) -> Float[ndarray, "21 3"]:
-    zero = torch.zeros(1, 3, dtype=torch.float64)
-    keypoint = model.keypoints(zero.new_zeros(10), zero.new_zeros(1, 15, 3), zero, zero)
-    return keypoint[0].numpy()
-
-
-def _scale(point: Float[ndarray, "frame 21 3"], template: Float[ndarray, "21 3"]) -> float:
-    """Compare the palm's lengths, medians over frames, with the template's."""
-    ratio = [
-        np.linalg.norm(point[:, i] - point[:, j], axis=-1)
-        / np.linalg.norm(template[i] - template[j])
-        for i, j in _PALM_BONES
-    ]
-    known = np.array(ratio)
-    return float(np.nanmedian(known)) if np.isfinite(known).any() else 1.0
-
-
-def _align(
-    source: Float[ndarray, "point 3"], target: Float[ndarray, "point 3"]
-) -> tuple[Rotation, Float[ndarray, " 3"]]:
-    """Find the rigid motion that takes one set of points closest to another (Kabsch)."""
-    covariance = (target - target.mean(0)).T @ (source - source.mean(0))
-    left, _, right = np.linalg.svd(covariance)
-    flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    rotation = Rotation.from_matrix(left @ flip @ right)
-    return rotation, target.mean(0) - rotation.apply(source.mean(0))
-
-
-def _guess_from_one_view(
-    cameras: Many[PinholeCamera],
-    keypoint: Float[ndarray, "view point 3"],
-    template: Float[ndarray, "point 3"],
-) -> tuple[Rotation, Float[ndarray, " 3"]] | None:
-    """Solve perspective-n-point in the view that is surest of the palm."""
-    is_seen = np.asarray(np.isfinite(keypoint).all(-1))
-    usable = np.where(is_seen.sum(1) >= _MIN_PALM_POINTS, np.nansum(keypoint[..., 2], 1), 0.0)
-    view = int(np.argmax(usable))
-    if usable[view] <= 0:
-        return None
-    camera, seen = cameras[view], np.flatnonzero(is_seen[view, :])
-    pixel = camera.undistort(keypoint[view, seen, :2].astype(np.float64))
-    try:
-        found, vector, offset = cv2.solvePnP(
-            template[seen], pixel, camera.K, None, flags=cv2.SOLVEPNP_SQPNP
-        )
-    except cv2.error:  # The keypoints are all in one place.
-        return None
-    if not found:
-        return None
-    pose = camera.T_world_camera
-    rotation = Rotation.from_matrix(pose[:3, :3]) * Rotation.from_rotvec(vector[:, 0])
-    return rotation, pose[:3, :3] @ offset[:, 0] + pose[:3, 3]
-
-
-def _bridge(
-    rotation: Float[ndarray, "frame 4"],
-    translation: Float[ndarray, "frame 3"],
-    is_known: Bool[ndarray, " frame"],
-) -> tuple[Float[ndarray, "frame 4"], Float[ndarray, "frame 3"]]:
-    """Interpolate over unknown frames; the first and last known pose are kept outside."""
-    frame, known = np.arange(len(is_known)), np.flatnonzero(is_known)
-    if len(known) > 1:
-        between = np.clip(frame, known[0], known[-1])
-        rotation = Slerp(known, Rotation.from_quat(rotation[known]))(between).as_quat()
-    else:
-        rotation = np.repeat(rotation[known], len(frame), axis=0)
-    for t in range(1, len(frame)):
-        if rotation[t] @ rotation[t - 1] < 0:
-            rotation[t] = -rotation[t]
-    columns = [np.interp(frame, known, translation[known, axis]) for axis in range(3)]
-    return rotation, np.stack(columns, axis=1)
-
-
+"""Palm keypoints that a frame must show for a first guess."""
 _KNUCKLE = ((-1.7, 0.6), (-0.4, 0.4), (-0.25, 0.25))
 _MIDDLE = ((-2.0, 0.2), (-0.08, 0.08), (-0.08, 0.08))
 _LAST = ((-1.5, 0.4), (-0.08, 0.08), (-0.08, 0.08))
@@ -179,241 +48,146 @@ _THUMB = (
 )
 JOINT_LIMIT = np.array([*_THUMB, *([_KNUCKLE, _MIDDLE, _LAST] * 4)])
 """Lower and upper bound of each joint's rotation vector, for a right hand [rad]."""
+_CANDIDATES = 8
+"""Nearest vertices among which a measured point looks for one that faces the camera."""
+_REFRESH = 10
+"""Evaluations of the depth loss between two searches for corresponding vertices."""
+_DOUBT = 3.0
+"""Depth errors beyond this many standard deviations lose their pull (Cauchy's loss)."""
+HAND_STAGE = "hand_reconstruction"
+"""Name of the stage in progress reports."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HandFit:
+    """The result of stage 1."""
+
+    motions: tuple[HandMotion, ...]
+    """Motion of each hand, in the order of the sequence's hands."""
+    keypoint: Float[ndarray, "view frame hand 21 3"]
+    """Keypoints that the hands were fitted to; NaN where not seen [px]."""
+    loss_before: float
+    """Loss of the first guess, without depth."""
+    loss_after: float
+    """Loss of the result, without depth."""
+    curve: list[tuple[int, float]] = field(default_factory=list)
+    """Loss of every tenth iteration, summed over the hands."""
+
+
+def reconstruct_hands(
+    sequence: Sequence,
+    config: HandFitConfig | None = None,
+    progress: Progress | None = None,
+    *,
+    keypoint: Float[ndarray, "view frame hand 21 3"] | None = None,
+) -> HandFit:
+    """Fit a hand model to all frames of a sequence at once.
+
+    Shape is constant; a sequence that is not metric gets one scale for each hand. Frames that no
+    view saw are bridged by smoothness; no frame is left out.
+
+    Args:
+        sequence: The recording; its `hands` are fitted.
+        config: Settings of the fit.
+        progress: Receives a report every tenth iteration.
+        keypoint: Keypoints to fit to [px]; None takes those of the views, or detects them.
+
+    Raises:
+        MissingInputError: If there is no hand, no view, no color image to detect keypoints in, or
+            no MANO model although the settings name it.
+        FitError: If no frame shows a hand well enough for a first guess.
+    """
+    config, progress = config or HandFitConfig(), progress or NullProgress()
+    if not sequence.hands or not sequence.views:
+        raise MissingInputError(
+            f"Sequence '{sequence.name}': stage 1 needs at least one view and one hand; "
+            f"there are {len(sequence.views)} views and {len(sequence.hands)} hands."
+        )
+    if keypoint is None:
+        keypoint = given_keypoints(sequence)
+    if keypoint is None:
+        keypoint = detect_sequence(sequence, progress)
+    fits = []
+    for hand, side in enumerate(sequence.hands):
+        model = load_hand_model(side, config.model)
+        try:
+            problem = HandProblem(sequence, keypoint[:, :, hand], model, config)
+            fits.append(problem.solve(progress))
+        except FitError as error:
+            raise FitError(f"Sequence '{sequence.name}': {error}") from error
+    losses = zip(*(fit.curve for fit in fits), strict=False)
+    curve = [(at[0][0], float(sum(loss for _, loss in at))) for at in losses]
+    return HandFit(
+        motions=tuple(fit.motion for fit in fits),
+        keypoint=keypoint.astype(np.float32),
+        loss_before=sum(fit.loss_before for fit in fits),
+        loss_after=sum(fit.loss_after for fit in fits),
+        curve=curve,
+    )
+
+
+def given_keypoints(sequence: Sequence) -> Float[ndarray, "view frame hand 21 3"] | None:
+    """Stack the keypoints stored in the sequence [px]; None unless every view has them."""
+    keypoint = [view.keypoint for view in sequence.views]
+    if any(one is None for one in keypoint):
+        return None
+    return np.stack([one for one in keypoint if one is not None])
+
+
+@dataclass(frozen=True)
+class WristGuess:
+    """First guess of the wrist's pose in every frame."""
+
+    rotation: Float[ndarray, "frame 4"]
+    """Unit quaternion (x, y, z, w) of the hand; its sign is continuous over frames."""
+    translation: Float[ndarray, "frame 3"]
+    """Position of the wrist [m, before scale]."""
+    scale: float
+    """Length units of the sequence per metre."""
 
 
 @dataclass(frozen=True)
 class KeypointTarget:
-    """Keypoints of one hand in all views, with the lens distortion taken out."""
+    """Undistorted keypoints of one hand in all views."""
 
     pixel: Float[Tensor, "view frame 21 2"]
-    """Where the keypoints were seen; zero where they were not [px]."""
+    """Position in the image; zero where not seen [px]."""
     weight: Float[Tensor, "view frame 21"]
-    """Confidence; zero where a keypoint was not seen."""
+    """Confidence; zero where not seen."""
     noise: Float[Tensor, " view"]
-    """Error to be expected of a keypoint in each view [px]."""
+    """Expected keypoint error of each view [px]."""
     projection: Float[Tensor, "view 3 4"]
     """Maps homogeneous world points to pixels without lens distortion."""
 
 
-def keypoint_target(
-    cameras: Many[PinholeCamera],
-    keypoint: Float[ndarray, "view frame 21 3"],
-    relative_noise: float,
-) -> KeypointTarget:
-    """Prepare keypoints for `reprojection_loss`.
-
-    Args:
-        cameras: Camera of each view.
-        keypoint: Pixel x, pixel y and confidence; NaN where not seen [px].
-        relative_noise: Expected error as a share of the hand's size in the image.
-    """
-    is_seen = np.isfinite(keypoint).all(-1) & (keypoint[..., 2] > 0)
-    filled = np.where(is_seen[..., None], keypoint, 0.0).astype(np.float64)
-    pixel = np.stack([c.undistort(k[..., :2]) for c, k in zip(cameras, filled, strict=True)])
-    projection = np.stack([camera.K @ camera.T_camera_world[:3] for camera in cameras])
-    noise = np.maximum(relative_noise * np.array([_hand_size(view) for view in keypoint]), 0.5)
-    return KeypointTarget(
-        pixel=torch.tensor(pixel, dtype=torch.float32),
-        weight=torch.tensor(filled[..., 2] * is_seen, dtype=torch.float32),
-        noise=torch.tensor(noise, dtype=torch.float32),
-        projection=torch.tensor(projection, dtype=torch.float32),
-    )
-
-
-def _hand_size(keypoint: Float[ndarray, "frame 21 3"]) -> float:
-    """Measure how large a hand usually is in a view: the diagonal of its keypoints' box [px]."""
-    is_whole = np.isfinite(keypoint).all(-1).sum(1) >= 15
-    if not is_whole.any():
-        return 100.0
-    pixel = keypoint[is_whole, :, :2]
-    diagonal = np.linalg.norm(np.nanmax(pixel, 1) - np.nanmin(pixel, 1), axis=-1)
-    return float(np.median(diagonal))
-
-
-def reprojection_loss(
-    point: Float[Tensor, "frame 21 3"], target: KeypointTarget, breadth: float
-) -> Float[Tensor, ""]:
-    """Compare projected keypoints with seen ones, a frame's sum averaged over frames.
-
-    Cauchy's robust loss ``c² log(1 + (r / c)²)`` of the distance ``r`` in units of the expected
-    noise: an observation that is wrong by many ``c`` no longer pulls.
-
-    Args:
-        point: Keypoints in the world frame.
-        target: What was seen.
-        breadth: ``c``, the distance in units of noise beyond which an observation is doubted.
-    """
-    frame_count = point.shape[0]
-    homogeneous = torch.cat([point, torch.ones_like(point[..., :1])], -1)
-    seen = torch.einsum("vij,fkj->vfki", target.projection, homogeneous)
-    depth = seen[..., 2:]
-    nearest = 1e-3 * depth.detach().abs().median()
-    pixel = seen[..., :2] / depth.clamp(min=float(nearest) + 1e-9)
-    squared = ((pixel - target.pixel) ** 2).sum(-1) / target.noise[:, None, None] ** 2
-    robust = breadth**2 * torch.log1p(squared / breadth**2)
-    return (target.weight * robust).sum() / frame_count
-
-
-def limit_loss(articulation: Float[Tensor, "frame 15 3"], model: HandModel) -> Float[Tensor, ""]:
-    """Sum the squares of what the joints turn beyond their limits, averaged over frames [rad²]."""
-    mirror = torch.tensor([1.0, -1.0, -1.0] if model.side == "left" else [1.0, 1.0, 1.0])
-    limit = torch.tensor(JOINT_LIMIT, dtype=articulation.dtype)
-    turned = articulation * mirror
-    beyond = (limit[..., 0] - turned).relu() + (turned - limit[..., 1]).relu()
-    return (beyond**2).sum() / articulation.shape[0]
-
-
-def hand_acceleration_loss(point: Float[Tensor, "frame 21 3"]) -> Float[Tensor, ""]:
-    """Sum the squared second differences of the keypoints over time, averaged over frames."""
-    if point.shape[0] < 3:
-        return point.sum() * 0
-    second = point[2:] - 2 * point[1:-1] + point[:-2]
-    return (second**2).sum() / point.shape[0]
-
-
-def velocity_loss(point: Float[Tensor, "frame joint 3"]) -> Float[Tensor, ""]:
-    """Sum the squared differences from frame to frame, averaged over frames."""
-    return ((point[1:] - point[:-1]) ** 2).sum() / point.shape[0]
-
-
-_CANDIDATES = 8
-_REFRESH = 10
-_DOUBT = 3.0
-
-
 @dataclass(eq=False)
 class DepthTarget:
-    """Points that the views measured on one hand, and the vertices they belong to."""
+    """Measured surface points of one hand, and the vertices they correspond to."""
 
     point: Float[Tensor, "frame point 3"]
     """Measured points; zero where a frame has fewer [m]."""
     towards_camera: Float[Tensor, "frame point 3"]
     """Unit vector from each point to the camera that measured it."""
     weight: Float[Tensor, "frame point"]
-    """One divided by the frame's number of points; zero where there is none."""
+    """One over the frame's number of points; zero on padding."""
     vertex: Tensor | None = None
-    """Vertex that each point is compared with, renewed now and then."""
+    """Vertex that each point corresponds to; None before the first evaluation."""
     age: int = 0
-    """Uses since it was renewed."""
-
-
-def depth_target(sequence: Sequence, side: HandSide, point_count: int) -> DepthTarget | None:
-    """Collect the measured points of one hand from all views with depth and masks.
-
-    Args:
-        sequence: The recording.
-        side: Which hand.
-        point_count: Most points kept in a frame, evenly spread over the image.
-
-    Returns:
-        The points; None if no view has depth and masks of this hand.
-    """
-    views = [view for view in sequence.views if view.has_depth and view.has_mask]
-    frames = []
-    for frame in range(sequence.frame_count):
-        point, camera = np.zeros((0, 3)), np.zeros((0, 3))
-        for view in views:
-            is_hand = view.mask(frame) == HAND_LABEL[side]
-            seen = surface_points(view, view.depth(frame), is_hand)
-            point = np.concatenate([point, seen])
-            camera = np.concatenate([camera, view.camera.T_world_camera[:3, 3] - seen])
-        chosen = np.linspace(0, len(point) - 1, min(point_count, len(point))).round().astype(int)
-        frames.append((point[chosen], camera[chosen]))
-    if not any(len(point) for point, _ in frames):
-        return None
-    shape = (len(frames), point_count, 3)
-    point, ray, weight = np.zeros(shape), np.zeros(shape), np.zeros(shape[:2])
-    for frame, (seen, camera) in enumerate(frames):
-        count = len(seen)
-        if count:
-            point[frame, :count] = seen
-            ray[frame, :count] = camera / np.linalg.norm(camera, axis=1, keepdims=True)
-            weight[frame, :count] = 1 / count
-    return DepthTarget(
-        point=torch.tensor(point, dtype=torch.float32),
-        towards_camera=torch.tensor(ray, dtype=torch.float32),
-        weight=torch.tensor(weight, dtype=torch.float32),
-    )
-
-
-def depth_loss(
-    vertex: Float[Tensor, "frame vertex 3"],
-    faces: Tensor,
-    target: DepthTarget,
-    noise: float,
-) -> Float[Tensor, ""]:
-    """Compare measured points with the surface, along its normal (one way, Cauchy's robust loss).
-
-    Args:
-        vertex: The hand's surface in the world frame [m].
-        faces: Its triangles.
-        target: The measured points; the vertices they belong to are renewed every tenth call.
-        noise: Expected error of a measurement [m].
-
-    Returns:
-        Mean over points, then frames, in units of the noise, squared.
-    """
-    normal = vertex_normals_torch(vertex, faces)
-    if target.vertex is None or target.age >= _REFRESH:
-        target.vertex, target.age = _correspond(vertex.detach(), normal.detach(), target), 0
-    target.age += 1
-    index = target.vertex[..., None].expand(-1, -1, 3)
-    offset = target.point - vertex.gather(1, index)
-    along = (offset * normal.gather(1, index)).sum(-1)
-    aside = ((offset**2).sum(-1) - along**2).clamp(min=0)
-    squared = (along**2 + 0.1 * aside) / noise**2
-    robust = _DOUBT**2 * torch.log1p(squared / _DOUBT**2)
-    return (target.weight * robust).sum() / max(int((target.weight.sum(1) > 0).sum()), 1)
-
-
-def vertex_normals_torch(
-    vertex: Float[Tensor, "frame vertex 3"], faces: Tensor
-) -> Float[Tensor, "frame vertex 3"]:
-    """Compute unit normals of vertices, the area-weighted mean of their triangles'."""
-    a, b, c = (vertex[:, faces[:, corner]] for corner in range(3))
-    normal = torch.cross(b - a, c - a, dim=-1)
-    total = torch.zeros_like(vertex)
-    for corner in range(3):
-        total = total.index_add(1, faces[:, corner], normal)
-    return total / total.norm(dim=-1, keepdim=True).clamp(min=1e-12)
-
-
-def _correspond(vertex: Tensor, normal: Tensor, target: DepthTarget) -> Tensor:
-    """Find for each point the nearest vertex among its neighbours that faces the camera."""
-    chosen = torch.zeros(target.weight.shape, dtype=torch.int64)
-    for frame in range(len(vertex)):
-        count = int((target.weight[frame] > 0).sum())
-        if not count:
-            continue
-        tree = KDTree(vertex[frame].numpy())
-        near = np.asarray(tree.query(target.point[frame, :count].numpy(), k=_CANDIDATES)[1])
-        facing = normal[frame][near] * target.towards_camera[frame, :count, None]
-        first = (facing.sum(-1) > 0).numpy().argmax(axis=1)
-        chosen[frame, :count] = torch.from_numpy(
-            np.take_along_axis(near, first[:, None], axis=1)[:, 0]
-        )
-    return chosen
-
-
-HAND_STAGE = "hand_reconstruction"
+    """Evaluations since `vertex` was last updated."""
 
 
 @dataclass(frozen=True, eq=False)
 class SolvedHand:
-    """The fit of one hand."""
+    """The fit of one hand; the fields mean what they mean in `HandFit`."""
 
     motion: HandMotion
-    """Its motion."""
     loss_before: float
-    """Loss of the first guess, without depth."""
     loss_after: float
-    """Loss of the result, without depth."""
     curve: list[tuple[int, float]]
-    """Loss of every tenth iteration."""
 
 
 class HandProblem:
-    """One hand: what was seen of it, and the parameters that explain it."""
+    """The fit of one hand: observations, parameters, loss and optimizer."""
 
     def __init__(
         self,
@@ -431,7 +205,7 @@ class HandProblem:
         self.parameters = _parameters(guess, len(keypoint[0]))
         self.name = sequence.name
         self.joints: Tensor | None = None
-        """The 21 keypoints of every frame, as the latest loss saw them."""
+        """The 21 keypoints of every frame in the latest evaluation, for previews."""
         self.depth: DepthTarget | None = None
         if sequence.metric and config.depth_iterations:
             self.depth = depth_target(sequence, model.side, config.depth_points)
@@ -443,7 +217,7 @@ class HandProblem:
         return 3 * torch.tanh(p["shape"] / 3), rotation, p["translation"], p["log_scale"].exp()
 
     def loss(self, breadth: float) -> Tensor:
-        """Compute the loss without depth."""
+        """Compute the keypoint loss and the priors; depth is not in it."""
         config, articulation = self.config, self.parameters["articulation"]
         shape, rotation, translation, scale = self.hand()
         still = torch.zeros_like(translation)
@@ -513,7 +287,7 @@ class HandProblem:
         return SolvedHand(self._motion(), before, after, curve)
 
     def _show(self, loss: float, progress: Progress) -> None:
-        """Let people see the hand as it is."""
+        """Send the hand's current keypoints to a preview, if one is due."""
         joints = self.joints
         if joints is not None and progress.wants_preview():
             progress.preview(
@@ -575,7 +349,7 @@ class HandProblem:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Keep torch from spreading small tensors over busy cores, which costs more than it gains."""
+    """Run torch on one thread: on small tensors, threads cost more than they gain."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -597,7 +371,7 @@ def _parameters(guess: WristGuess, frame_count: int) -> dict[str, Tensor]:
 
 
 def _without_jumps(vector: Float[ndarray, "frame 3"]) -> Float[ndarray, "frame 3"]:
-    """Describe each rotation by whichever of its two vectors is nearer to the frame before."""
+    """Choose of a rotation's two vectors the one nearer to that of the frame before."""
     vector = vector.copy()
     for frame in range(1, len(vector)):
         angle = np.linalg.norm(vector[frame])
@@ -608,77 +382,298 @@ def _without_jumps(vector: Float[ndarray, "frame 3"]) -> Float[ndarray, "frame 3
     return vector
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class HandFit:
-    """The result of stage 1."""
-
-    motions: tuple[HandMotion, ...]
-    """Motion of each hand, in the order of the sequence's hands."""
-    keypoint: Float[ndarray, "view frame hand 21 3"]
-    """Keypoints that the hands were fitted to; NaN where not seen [px]."""
-    loss_before: float
-    """Loss of the first guess, without depth."""
-    loss_after: float
-    """Loss of the result, without depth."""
-    curve: list[tuple[int, float]] = field(default_factory=list)
-    """Loss of every tenth iteration, summed over the hands."""
-
-
-def reconstruct_hands(
-    sequence: Sequence,
-    config: HandFitConfig | None = None,
-    progress: Progress | None = None,
+def guess_wrist(
+    cameras: Many[PinholeCamera],
+    keypoint: Float[ndarray, "view frame 21 3"],
+    model: HandModel,
     *,
-    keypoint: Float[ndarray, "view frame hand 21 3"] | None = None,
-) -> HandFit:
-    """Fit a hand model to all frames of a sequence at once.
-
-    Shape is constant; a sequence that is not metric gets one scale for each hand. Frames that no
-    view saw are bridged by smoothness; no frame is left out.
+    metric: bool,
+    tolerance: float,
+) -> WristGuess:
+    """Align the template's palm with the triangulated palm; interpolate frames that lack one.
 
     Args:
-        sequence: The recording; its `hands` say what is to be fitted.
-        config: Settings.
-        progress: Told after every tenth iteration.
-        keypoint: Keypoints to fit to; if None, the views' own, or else what the networks find.
+        cameras: Camera of each view.
+        keypoint: Pixel x, pixel y and confidence; NaN where not seen [px].
+        model: Model of the hand.
+        metric: Whether lengths are metres; otherwise the scale is estimated too.
+        tolerance: Largest reprojection error at which views agree about a keypoint [px].
 
     Raises:
-        MissingInputError: If there is no hand, no view, nothing to find keypoints in, or no MANO
-            when it is asked for.
-        FitError: If a hand is not seen well enough to start from.
+        FitError: If no frame shows enough of the palm.
     """
-    config, progress = config or HandFitConfig(), progress or NullProgress()
-    if not sequence.hands or not sequence.views:
-        raise MissingInputError(
-            f"Sequence '{sequence.name}': stage 1 needs at least one view and one hand; "
-            f"there are {len(sequence.views)} views and {len(sequence.hands)} hands."
+    template = _template(model)
+    view_count, frame_count = keypoint.shape[:2]
+    flat = keypoint.reshape(view_count, -1, 3)
+    weight = np.nan_to_num(flat[..., 2])
+    point = triangulate(cameras, flat[..., :2], weight, tolerance).reshape(frame_count, 21, 3)
+    scale = 1.0 if metric else _scale(point, template)
+    palm = list(PALM)
+    rotation, translation = np.zeros((frame_count, 4)), np.zeros((frame_count, 3))
+    is_known = np.zeros(frame_count, dtype=bool)
+    for frame in range(frame_count):
+        is_seen = np.isfinite(point[frame, palm]).all(-1)
+        if is_seen.sum() >= _MIN_PALM_POINTS:
+            pose = _align(template[palm][is_seen], point[frame, palm][is_seen] / scale)
+            rotation[frame], translation[frame] = pose[0].as_quat(), pose[1]
+            is_known[frame] = True
+    if not is_known.any():
+        for frame in range(frame_count):
+            pose = _guess_from_one_view(cameras, keypoint[:, frame, palm], template[palm] * scale)
+            if pose is not None:
+                rotation[frame], translation[frame] = pose[0].as_quat(), pose[1] / scale
+                is_known[frame] = True
+    if not is_known.any():
+        raise FitError(
+            f"The {model.side} hand cannot be placed: no frame shows "
+            f"{_MIN_PALM_POINTS} keypoints of its palm apart from each other. Check the keypoints "
+            "and the calibration."
         )
-    if keypoint is None:
-        keypoint = given_keypoints(sequence)
-    if keypoint is None:
-        keypoint = detect_sequence(sequence, progress)
-    fits = []
-    for hand, side in enumerate(sequence.hands):
-        model = load_hand_model(side, config.model)
-        try:
-            problem = HandProblem(sequence, keypoint[:, :, hand], model, config)
-            fits.append(problem.solve(progress))
-        except FitError as error:
-            raise FitError(f"Sequence '{sequence.name}': {error}") from error
-    losses = zip(*(fit.curve for fit in fits), strict=False)
-    curve = [(at[0][0], float(sum(loss for _, loss in at))) for at in losses]
-    return HandFit(
-        motions=tuple(fit.motion for fit in fits),
-        keypoint=keypoint.astype(np.float32),
-        loss_before=sum(fit.loss_before for fit in fits),
-        loss_after=sum(fit.loss_after for fit in fits),
-        curve=curve,
+    rotation, translation = _bridge(rotation, translation, is_known)
+    return WristGuess(rotation, translation, scale)
+
+
+def _template(model: HandModel) -> Float[ndarray, "21 3"]:
+    zero = torch.zeros(1, 3, dtype=torch.float64)
+    keypoint = model.keypoints(zero.new_zeros(10), zero.new_zeros(1, 15, 3), zero, zero)
+    return keypoint[0].numpy()
+
+
+def _scale(point: Float[ndarray, "frame 21 3"], template: Float[ndarray, "21 3"]) -> float:
+    """Compare the palm's lengths, medians over frames, with the template's."""
+    ratio = [
+        np.linalg.norm(point[:, i] - point[:, j], axis=-1)
+        / np.linalg.norm(template[i] - template[j])
+        for i, j in _PALM_BONES
+    ]
+    ratios = np.array(ratio)
+    return float(np.nanmedian(ratios)) if np.isfinite(ratios).any() else 1.0
+
+
+def _align(
+    source: Float[ndarray, "point 3"], target: Float[ndarray, "point 3"]
+) -> tuple[Rotation, Float[ndarray, " 3"]]:
+    """Find the rigid motion that takes one set of points closest to another (Kabsch)."""
+    covariance = (target - target.mean(0)).T @ (source - source.mean(0))
+    left, _, right = np.linalg.svd(covariance)
+    flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    rotation = Rotation.from_matrix(left @ flip @ right)
+    return rotation, target.mean(0) - rotation.apply(source.mean(0))
+
+
+def _guess_from_one_view(
+    cameras: Many[PinholeCamera],
+    keypoint: Float[ndarray, "view point 3"],
+    template: Float[ndarray, "point 3"],
+) -> tuple[Rotation, Float[ndarray, " 3"]] | None:
+    """Solve perspective-n-point in the view with the most confident palm keypoints."""
+    is_seen = np.asarray(np.isfinite(keypoint).all(-1))
+    usable = np.where(is_seen.sum(1) >= _MIN_PALM_POINTS, np.nansum(keypoint[..., 2], 1), 0.0)
+    view = int(np.argmax(usable))
+    if usable[view] <= 0:
+        return None
+    camera, indices = cameras[view], np.flatnonzero(is_seen[view, :])
+    pixel = camera.undistort(keypoint[view, indices, :2].astype(np.float64))
+    try:
+        is_solved, vector, offset = cv2.solvePnP(
+            template[indices], pixel, camera.K, None, flags=cv2.SOLVEPNP_SQPNP
+        )
+    except cv2.error:  # The keypoints are all in one place.
+        return None
+    if not is_solved:
+        return None
+    pose = camera.T_world_camera
+    rotation = Rotation.from_matrix(pose[:3, :3]) * Rotation.from_rotvec(vector[:, 0])
+    return rotation, pose[:3, :3] @ offset[:, 0] + pose[:3, 3]
+
+
+def _bridge(
+    rotation: Float[ndarray, "frame 4"],
+    translation: Float[ndarray, "frame 3"],
+    is_known: Bool[ndarray, " frame"],
+) -> tuple[Float[ndarray, "frame 4"], Float[ndarray, "frame 3"]]:
+    """Interpolate unknown frames; before the first and after the last known one, hold the pose."""
+    frame, known_frame = np.arange(len(is_known)), np.flatnonzero(is_known)
+    if len(known_frame) > 1:
+        between = np.clip(frame, known_frame[0], known_frame[-1])
+        rotation = Slerp(known_frame, Rotation.from_quat(rotation[known_frame]))(between).as_quat()
+    else:
+        rotation = np.repeat(rotation[known_frame], len(frame), axis=0)
+    for t in range(1, len(frame)):
+        if rotation[t] @ rotation[t - 1] < 0:
+            rotation[t] = -rotation[t]
+    columns = [np.interp(frame, known_frame, translation[known_frame, axis]) for axis in range(3)]
+    return rotation, np.stack(columns, axis=1)
+
+
+def keypoint_target(
+    cameras: Many[PinholeCamera],
+    keypoint: Float[ndarray, "view frame 21 3"],
+    relative_noise: float,
+) -> KeypointTarget:
+    """Undistort keypoints for `reprojection_loss`.
+
+    Args:
+        cameras: Camera of each view.
+        keypoint: Pixel x, pixel y and confidence; NaN where not seen [px].
+        relative_noise: Expected error as a share of the hand's size in the image.
+    """
+    is_seen = np.isfinite(keypoint).all(-1) & (keypoint[..., 2] > 0)
+    filled = np.where(is_seen[..., None], keypoint, 0.0).astype(np.float64)
+    pixel = np.stack([c.undistort(k[..., :2]) for c, k in zip(cameras, filled, strict=True)])
+    projection = np.stack([camera.K @ camera.T_camera_world[:3] for camera in cameras])
+    noise = np.maximum(relative_noise * np.array([_hand_size(view) for view in keypoint]), 0.5)
+    return KeypointTarget(
+        pixel=torch.tensor(pixel, dtype=torch.float32),
+        weight=torch.tensor(filled[..., 2] * is_seen, dtype=torch.float32),
+        noise=torch.tensor(noise, dtype=torch.float32),
+        projection=torch.tensor(projection, dtype=torch.float32),
     )
 
 
-def given_keypoints(sequence: Sequence) -> Float[ndarray, "view frame hand 21 3"] | None:
-    """Collect the keypoints that the sequence itself holds; None unless all views have them."""
-    keypoint = [view.keypoint for view in sequence.views]
-    if any(one is None for one in keypoint):
+def _hand_size(keypoint: Float[ndarray, "frame 21 3"]) -> float:
+    """Compute the median diagonal of the keypoints' bounding box in one view [px]."""
+    is_whole = np.isfinite(keypoint).all(-1).sum(1) >= 15
+    if not is_whole.any():
+        return 100.0
+    pixel = keypoint[is_whole, :, :2]
+    diagonal = np.linalg.norm(np.nanmax(pixel, 1) - np.nanmin(pixel, 1), axis=-1)
+    return float(np.median(diagonal))
+
+
+def reprojection_loss(
+    point: Float[Tensor, "frame 21 3"], target: KeypointTarget, breadth: float
+) -> Float[Tensor, ""]:
+    """Compare projected with observed keypoints: sum over keypoints, mean over frames.
+
+    Cauchy's robust loss ``c² log(1 + (r / c)²)`` of the distance ``r`` in units of the expected
+    noise, so that gross outliers have almost no gradient.
+
+    Args:
+        point: Keypoints in the world frame.
+        target: Observed keypoints.
+        breadth: ``c``, in units of noise.
+    """
+    frame_count = point.shape[0]
+    homogeneous = torch.cat([point, torch.ones_like(point[..., :1])], -1)
+    projected = torch.einsum("vij,fkj->vfki", target.projection, homogeneous)
+    depth = projected[..., 2:]
+    nearest = 1e-3 * depth.detach().abs().median()
+    pixel = projected[..., :2] / depth.clamp(min=float(nearest) + 1e-9)
+    squared = ((pixel - target.pixel) ** 2).sum(-1) / target.noise[:, None, None] ** 2
+    robust = breadth**2 * torch.log1p(squared / breadth**2)
+    return (target.weight * robust).sum() / frame_count
+
+
+def limit_loss(articulation: Float[Tensor, "frame 15 3"], model: HandModel) -> Float[Tensor, ""]:
+    """Sum the squared violations of the joint limits, averaged over frames [rad²]."""
+    mirror = torch.tensor([1.0, -1.0, -1.0] if model.side == "left" else [1.0, 1.0, 1.0])
+    limit = torch.tensor(JOINT_LIMIT, dtype=articulation.dtype)
+    turned = articulation * mirror
+    beyond = (limit[..., 0] - turned).relu() + (turned - limit[..., 1]).relu()
+    return (beyond**2).sum() / articulation.shape[0]
+
+
+def hand_acceleration_loss(point: Float[Tensor, "frame 21 3"]) -> Float[Tensor, ""]:
+    """Sum the squared second differences of the keypoints over time, averaged over frames."""
+    if point.shape[0] < 3:
+        return point.sum() * 0
+    second = point[2:] - 2 * point[1:-1] + point[:-2]
+    return (second**2).sum() / point.shape[0]
+
+
+def velocity_loss(point: Float[Tensor, "frame joint 3"]) -> Float[Tensor, ""]:
+    """Sum the squared differences from frame to frame, averaged over frames."""
+    return ((point[1:] - point[:-1]) ** 2).sum() / point.shape[0]
+
+
+def depth_target(sequence: Sequence, side: HandSide, point_count: int) -> DepthTarget | None:
+    """Collect one hand's depth points of all views, at most `point_count` a frame.
+
+    None if no view has depth and masks of this hand.
+    """
+    views = [view for view in sequence.views if view.has_depth and view.has_mask]
+    frames = []
+    for frame in range(sequence.frame_count):
+        point, camera = np.zeros((0, 3)), np.zeros((0, 3))
+        for view in views:
+            is_hand = view.mask(frame) == HAND_LABEL[side]
+            seen = surface_points(view, view.depth(frame), is_hand)
+            point = np.concatenate([point, seen])
+            camera = np.concatenate([camera, view.camera.T_world_camera[:3, 3] - seen])
+        chosen = np.linspace(0, len(point) - 1, min(point_count, len(point))).round().astype(int)
+        frames.append((point[chosen], camera[chosen]))
+    if not any(len(point) for point, _ in frames):
         return None
-    return np.stack([one for one in keypoint if one is not None])
+    shape = (len(frames), point_count, 3)
+    point, ray, weight = np.zeros(shape), np.zeros(shape), np.zeros(shape[:2])
+    for frame, (seen, camera) in enumerate(frames):
+        count = len(seen)
+        if count:
+            point[frame, :count] = seen
+            ray[frame, :count] = camera / np.linalg.norm(camera, axis=1, keepdims=True)
+            weight[frame, :count] = 1 / count
+    return DepthTarget(
+        point=torch.tensor(point, dtype=torch.float32),
+        towards_camera=torch.tensor(ray, dtype=torch.float32),
+        weight=torch.tensor(weight, dtype=torch.float32),
+    )
+
+
+def depth_loss(
+    vertex: Float[Tensor, "frame vertex 3"],
+    faces: Tensor,
+    target: DepthTarget,
+    noise: float,
+) -> Float[Tensor, ""]:
+    """Measure how far points lie from the surface, mostly along its normal (Cauchy's loss).
+
+    Args:
+        vertex: The hand's surface in the world frame [m].
+        faces: Its triangles.
+        target: Measured points; every tenth call updates the vertices they correspond to.
+        noise: Expected error of a measurement [m].
+
+    Returns:
+        Mean over points, then frames, in units of the noise, squared.
+    """
+    normal = vertex_normals_torch(vertex, faces)
+    if target.vertex is None or target.age >= _REFRESH:
+        target.vertex, target.age = _correspond(vertex.detach(), normal.detach(), target), 0
+    target.age += 1
+    index = target.vertex[..., None].expand(-1, -1, 3)
+    offset = target.point - vertex.gather(1, index)
+    along = (offset * normal.gather(1, index)).sum(-1)
+    aside = ((offset**2).sum(-1) - along**2).clamp(min=0)
+    squared = (along**2 + 0.1 * aside) / noise**2
+    robust = _DOUBT**2 * torch.log1p(squared / _DOUBT**2)
+    return (target.weight * robust).sum() / max(int((target.weight.sum(1) > 0).sum()), 1)
+
+
+def vertex_normals_torch(
+    vertex: Float[Tensor, "frame vertex 3"], faces: Tensor
+) -> Float[Tensor, "frame vertex 3"]:
+    """Compute unit normals of vertices, the area-weighted mean of their triangles'."""
+    a, b, c = (vertex[:, faces[:, corner]] for corner in range(3))
+    normal = torch.cross(b - a, c - a, dim=-1)
+    total = torch.zeros_like(vertex)
+    for corner in range(3):
+        total = total.index_add(1, faces[:, corner], normal)
+    return total / total.norm(dim=-1, keepdim=True).clamp(min=1e-12)
+
+
+def _correspond(vertex: Tensor, normal: Tensor, target: DepthTarget) -> Tensor:
+    """Find for each point the nearest vertex among its neighbours that faces the camera."""
+    chosen = torch.zeros(target.weight.shape, dtype=torch.int64)
+    for frame in range(len(vertex)):
+        count = int((target.weight[frame] > 0).sum())
+        if not count:
+            continue
+        tree = KDTree(vertex[frame].numpy())
+        near = np.asarray(tree.query(target.point[frame, :count].numpy(), k=_CANDIDATES)[1])
+        facing = normal[frame][near] * target.towards_camera[frame, :count, None]
+        first = (facing.sum(-1) > 0).numpy().argmax(axis=1)
+        chosen[frame, :count] = torch.from_numpy(
+            np.take_along_axis(near, first[:, None], axis=1)[:, 0]
+        )
+    return chosen

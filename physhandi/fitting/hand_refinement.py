@@ -1,6 +1,8 @@
-"""Stage 3: correct the hands until the object that they move moves as it was seen to.
+"""Stage 3: corrects the hands so that the object they move follows its observed motion.
 
-Paper, section 3.3 ("Hand Refinement") and its supplement; physics.md §9 and §10.9-10.
+`refine_hands` owns the loop, `Refinement` the loss and its gradient, `HandOffsets` the corrections
+of one hand and `OffsetDescent` their optimizer. Paper, section 3.3 ("Hand Refinement") and its
+supplement; physics.md §9 and §10.9-10.
 """
 
 from collections.abc import Sequence
@@ -31,196 +33,18 @@ Offset = dict[str, Tensor]
 """A correction of one hand, frames first: of its joints (``articulation``, added to their rotation
 vectors [rad]), of the wrist's ``rotation`` (in the hand's own frame [rad]) and of its
 ``translation`` [m]."""
-
 BETA_1 = 0.9
-"""Decay of the first moment."""
+"""Decay of Adam's first moment."""
 FLAT_GRADIENT = 1e-12
-"""A step that changes the loss by less than a square micrometre is not worth taking [m²]."""
-
-
-class HandOffsets:
-    """Corrections of one hand in the frames that are fitted; all zero is the hand as it was."""
-
-    def __init__(self, motion: HandMotion, model: HandModel, frame_count: int) -> None:
-        """Begin with no correction.
-
-        Args:
-            motion: The hand as stage 1 found it, over all frames.
-            model: Its model.
-            frame_count: Frames to correct, counted from 0.
-        """
-        self.before = motion
-        self.model = model
-        self.frame_count = frame_count
-        shapes = {"articulation": (15, 3), "rotation": (3,), "translation": (3,)}
-        self.value: Offset = {
-            name: torch.zeros(frame_count, *shape, requires_grad=True)
-            for name, shape in shapes.items()
-        }
-        self._shape = _tensor(motion.shape)
-        self._articulation = _tensor(motion.articulation[:frame_count])
-        self._rotation = rotation_matrix(_tensor(motion.wrist_rotation[:frame_count]))
-        self._translation = _tensor(motion.wrist_translation[:frame_count])
-        with torch.no_grad():
-            self._vertex = self.pose().vertex
-
-    def pose(self) -> HandPose:
-        """Pose the corrected hand in the frames to fit."""
-        offset = self.value
-        still = torch.zeros_like(self._translation)
-        hand = self.model(self._shape, self._articulation + offset["articulation"], still, still)
-        turn = (self._rotation @ rotation_matrix(offset["rotation"])).transpose(-1, -2)
-        place = (self._translation + offset["translation"])[:, None]
-        scale = self.before.scale
-        return HandPose(
-            scale * (hand.vertex @ turn + place), scale * (hand.keypoint @ turn + place)
-        )
-
-    def displacement(self, pose: HandPose) -> Float[Tensor, "frame vertex 3"]:
-        """Tell how far the surface has moved from where stage 1 had it [m]."""
-        return pose.vertex - self._vertex
-
-    def copy(self) -> Offset:
-        """Copy the correction, to come back to it later."""
-        return {name: tensor.detach().clone() for name, tensor in self.value.items()}
-
-    def forget_gradient(self) -> None:
-        """Drop the gradient of the last evaluation."""
-        for tensor in self.value.values():
-            tensor.grad = None
-
-    def restore(self, offset: Offset) -> None:
-        """Go back to a copied correction."""
-        with torch.no_grad():
-            for name, tensor in self.value.items():
-                tensor.copy_(offset[name])
-
-    def motion(self, carried: float) -> HandMotion:
-        """Give the corrected motion over all frames.
-
-        Frames after the fitted ones cannot tell their own correction: they get the last one,
-        fading, so that the hand neither jumps nor keeps for ever what one frame said.
-
-        Args:
-            carried: Frames in which a carried correction falls to 1/e; 0 carries nothing.
-        """
-        before = self.before
-        offset = {
-            name: _carry(tensor.detach().double().numpy(), before.frame_count, carried)
-            for name, tensor in self.value.items()
-        }
-        turned = (
-            Rotation.from_rotvec(before.wrist_rotation) * Rotation.from_rotvec(offset["rotation"])
-        ).as_rotvec()
-        wrist_rotation = _nearer_vector(turned, before.wrist_rotation)
-        return replace(
-            before,
-            articulation=(before.articulation + offset["articulation"]).astype(np.float32),
-            wrist_rotation=wrist_rotation.astype(np.float32),
-            wrist_translation=(before.wrist_translation + offset["translation"]).astype(np.float32),
-        )
-
-
-class OffsetDescent:
-    """Adam on the corrections of one hand, in units of each kind's step.
-
-    Adam gives every number a step of about the same size, however little hangs on it: joints
-    whose effect on the object is almost nil turn as far as those that hold it. Here all numbers
-    of a frame share one second moment instead, so that a frame moves along its gradient, in units
-    of what each kind of correction is expected to need, and by one step in all. `by_parameter`
-    gives Adam as it is, as the paper uses it.
-    """
-
-    def __init__(
-        self, hand: HandOffsets, rates: dict[str, float], beta_2: float, *, by_parameter: bool
-    ) -> None:
-        """Begin with no momentum.
-
-        Args:
-            hand: The corrections to update.
-            rates: Step of every kind [rad, rad, m].
-            beta_2: Decay of the second moment.
-            by_parameter: Whether every number has its own second moment.
-        """
-        self.hand = hand
-        self.rates = rates
-        self.beta_2 = beta_2
-        self.by_parameter = by_parameter
-        self.count = 0
-        self.first = {name: torch.zeros_like(value) for name, value in hand.value.items()}
-        self.second = {name: torch.zeros_like(value) for name, value in hand.value.items()}
-
-    def step(self, share: float) -> None:
-        """Update the corrections by their gradient.
-
-        Args:
-            share: How long this step is, beside a whole one.
-        """
-        self.count += 1
-        gradient = {
-            name: self.rates[name] * (torch.zeros_like(v) if v.grad is None else v.grad)
-            for name, v in self.hand.value.items()
-        }
-        squared = {name: value**2 for name, value in gradient.items()}
-        if not self.by_parameter:
-            frame = torch.stack([value.flatten(1).sum(1) for value in squared.values()]).sum(0)
-            squared = {
-                name: frame.reshape(-1, *[1] * (value.ndim - 1)).expand_as(value)
-                for name, value in squared.items()
-            }
-        with torch.no_grad():
-            for name, offset in self.hand.value.items():
-                self.first[name].lerp_(gradient[name], 1 - BETA_1)
-                self.second[name].lerp_(squared[name], 1 - self.beta_2)
-                mean = self.first[name] / (1 - BETA_1**self.count)
-                size = (self.second[name] / (1 - self.beta_2**self.count)).sqrt()
-                offset.sub_(share * self.rates[name] * mean / (size + FLAT_GRADIENT))
-
-
-def control_nodes(
-    vertices: Sequence[Float[Tensor, "frame _ 3"]], chosen: Int[ndarray, " control"] | None
-) -> Float[Tensor, "frame control 3"]:
-    """Join the vertices of all hands, and keep those that are control nodes.
-
-    Args:
-        vertices: Surface of each hand, in the order of the sequence's hands.
-        chosen: Which of the joined vertices are control nodes; all of them if None.
-    """
-    joined = torch.cat(list(vertices), dim=1)
-    return joined if chosen is None else joined[:, torch.from_numpy(chosen.astype(np.int64))]
-
-
-def _carry(
-    offset: Float[ndarray, "frame ..."], frame_count: int, carried: float
-) -> Float[ndarray, "all_frame ..."]:
-    """Append the last correction to the frames that have none, ever weaker."""
-    later = np.arange(1, frame_count - len(offset) + 1)
-    share = np.exp(-later / carried) if carried > 0 else np.zeros(len(later))
-    faded = share.reshape(-1, *[1] * (offset.ndim - 1)) * offset[-1:]
-    return np.concatenate([offset, faded])
-
-
-def _nearer_vector(
-    vector: Float[ndarray, "frame 3"], to: Float[ndarray, "frame 3"]
-) -> Float[ndarray, "frame 3"]:
-    """Describe each rotation by whichever of its two vectors is nearer to a given one."""
-    angle = np.linalg.norm(vector, axis=1, keepdims=True)
-    other = vector * (1 - 2 * np.pi / np.maximum(angle, 1e-9))
-    near, far = (np.linalg.norm(v - to, axis=1, keepdims=True) for v in (vector, other))
-    return np.where((far < near) & (angle > 1e-3), other, vector)
-
-
-def _tensor(array: ndarray) -> Tensor:
-    return torch.from_numpy(np.array(array, dtype=np.float32))
-
-
+"""Adam's ε: change of the loss by one step below which the step shrinks [m²]."""
 REFINEMENT_STAGE = "hand_refinement"
 STEEPEST = 50.0
-"""A gradient this many times as steep as that of an object tied rigidly to its hand is chaos."""
+"""Gradients steeper than this many times that of an object tied rigidly to the hand count as
+chaotic."""
 HALVINGS = 4
-"""How often a correction that diverges in later frames is tried, each time half as large."""
+"""Attempts to simulate a correction that diverges in later frames, each half as large."""
 DOUBT = 3.0
-"""Keypoints that are wrong by more than so many times the expected error lose their pull."""
+"""Keypoint errors beyond this many expected errors lose their pull (Cauchy's loss)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -228,19 +52,19 @@ class RefinementProblem:
     """The hands of one sequence, and the fitted object that they move."""
 
     object_: ObjectProblem
-    """What was seen of the object in the frames to fit; nothing of later frames is in it."""
+    """Observations of the object in the frames to fit, none of later frames."""
     model: SpringMassModel
-    """The fitted springs, virtual springs included; they stay as they are."""
+    """The fitted springs, virtual springs included; they are not changed."""
     parameters: SimulationParameters
     """The global parameters of the object."""
     motions: tuple[HandMotion, ...]
     """Hands of stage 1 over all frames, in the order of the control nodes."""
     hand_models: tuple[HandModel, ...]
-    """The model of each hand."""
+    """Model of each hand."""
     chosen: Int[ndarray, " control"] | None = None
-    """Which of all hands' vertices are control nodes; all of them if None."""
+    """Indices of control nodes among the vertices of all hands; None for all."""
     targets: tuple[KeypointTarget, ...] = ()
-    """Keypoints of each hand in the frames to fit; without any there is no keypoint term."""
+    """Keypoints of each hand in the frames to fit; empty for no keypoint term."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -252,9 +76,9 @@ class RefinedHands:
     control: Float[ndarray, "all_frame control 3"]
     """Control nodes of the corrected hands [m]."""
     loss_before: float
-    """Mean frame loss that the hands of stage 1 leave [m²]."""
+    """Mean frame loss with the hands of stage 1 [m²]."""
     loss_after: float
-    """Mean frame loss that the corrected hands leave, simulated again from what is stored [m²]."""
+    """Mean frame loss with the corrected hands, simulated from the stored result [m²]."""
     curve: list[list[float]]
     """Iteration and mean frame loss."""
 
@@ -266,29 +90,29 @@ def refine_hands(
     *,
     device: str = "cpu",
 ) -> RefinedHands:
-    """Correct pose and place of the hands by gradient descent through the simulator.
+    """Correct the poses of the hands by gradient descent through the simulator.
 
     Minimises the mean frame loss of the object's simulated motion over articulation, wrist
-    rotation and wrist position in all frames to fit; shape, scale and the object stay as they
-    are. Only what lies near a virtual spring decides the motion: the rest of the hand follows
-    because a frame takes one step as a whole (`OffsetDescent`) and is tied to stage 1.
+    rotation and wrist position in all frames to fit; shape, scale and the object do not change.
+    Only vertices near a virtual spring act on the object; the rest of the hand follows because
+    a frame takes one step as a whole (`OffsetDescent`) and is tied to stage 1.
 
-    The virtual springs keep the rest lengths that stage 2 gave them, so a correction of frame 0
-    moves the hand *against* the object, which shows. Were they laid anew, a correction that all
-    frames share would move nothing and could never be found. The other side of it: an error that
-    all frames shared when stage 2 laid the springs is part of the object by now and stays.
+    The virtual springs keep the rest lengths of stage 2, so a correction of frame 0 moves the hand
+    *relative to* the object, which the loss sees. With springs rebuilt at every step, a correction
+    common to all frames would have no effect and could not be found. Conversely, an error common
+    to all frames when stage 2 built the springs has become part of the object and remains.
 
     Args:
-        problem: Hands, object and what was seen.
-        config: Settings.
-        progress: Told once an iteration.
+        problem: Hands, object and observations.
+        config: Settings of the stage.
+        progress: Receives a report each iteration.
         device: Warp device.
 
     Returns:
-        The best correction found; the hands as they were if none explains the object better.
+        The best correction; the hands of stage 1 if none explains the object better.
 
     Raises:
-        SimulationDivergedError: If the object runs away with the hands of stage 1 already.
+        SimulationDivergedError: If the object diverges with the hands of stage 1 already.
         CancelledError: If the user asked to stop.
     """
     refinement = Refinement(problem, config, device)
@@ -307,7 +131,7 @@ def refine_hands(
         curve.append([float(iteration), loss])
         progress.report(REFINEMENT_STAGE, iteration, config.iterations, loss, message)
         if refinement.simulated is not None:
-            preview.see(problem.object_, *refinement.simulated)
+            preview.update(problem.object_, *refinement.simulated)
             preview.show(loss)
         if iteration < config.iterations:
             refinement.step()
@@ -336,13 +160,13 @@ class Refinement:
         self._begin_descent()
 
     def evaluate(self) -> float:
-        """Simulate, remember what is best, and leave the gradient in the corrections.
+        """Simulate, update the best correction, and compute the gradient of the corrections.
 
         Returns:
             Mean frame loss [m²].
 
         Raises:
-            SimulationDivergedError: If the motion runs away.
+            SimulationDivergedError: If the simulation diverges.
         """
         poses = [hand.pose() for hand in self.hands]
         control = control_nodes([pose.vertex for pose in poses], self.problem.chosen)
@@ -359,20 +183,23 @@ class Refinement:
         return loss
 
     def step(self) -> None:
-        """Correct the hands along the gradient, each time a little less."""
+        """Update the corrections along the gradient and decay the step."""
         for descent in self.descents:
             descent.step(self.rate)
         self.rate *= self.config.decay
 
     def go_back(self) -> float:
-        """Return to the best correction, to go on from there in half as long steps."""
+        """Return to the best correction and continue from it with half the step."""
         self._restore(1.0)
         self.rate /= 2
         self._begin_descent()
         return self.evaluate()
 
     def result(self, curve: list[list[float]], progress: Progress) -> RefinedHands:
-        """Simulate the best correction over all frames; what diverges is halved, then dropped."""
+        """Simulate the best correction over all frames; halve it while it diverges, then drop it.
+
+        A correction that does not lower the loss is dropped too.
+        """
         before = curve[0][1]
         motions, after = self.problem.motions, before
         for halving in range(HALVINGS):
@@ -406,10 +233,10 @@ class Refinement:
     def _pull_of_object(
         self, control: Float[Tensor, "frame control 3"]
     ) -> tuple[float, Float[Tensor, "frame control 3"]]:
-        """Give the mean frame loss [m²] and its gradient to the control nodes [m].
+        """Compute the mean frame loss [m²] and its gradient by the control nodes [m].
 
-        Where motion is chaotic the gradient grows without bound with the frames that it reaches
-        back over and points nowhere; it then reaches half as far, from now on.
+        Where motion is chaotic, the gradient grows without bound with the frames that it reaches
+        back over; the reach is then halved for this and all later evaluations.
         """
         while True:
             moved = control.clone().requires_grad_()
@@ -431,15 +258,15 @@ class Refinement:
         return object_.frame_losses(node[1:], track_weight=self.config.track_weight).mean()
 
     def _ties(self, number: int, pose: HandPose) -> Float[Tensor, ""]:
-        """Weigh what keeps one hand near stage 1, smooth against it, and in the images [m²]."""
+        """Sum one hand's weighted priors: distance to stage 1, smoothness, keypoints [m²]."""
         config = self.config
         moved = self.hands[number].displacement(pose)
         change = moved[1:] - moved[:-1]
         total = config.prior_weight * (moved**2).sum(-1).mean()
         total = total + config.smoothness_weight * (change**2).sum(-1).mean()
         if self.problem.targets and config.keypoint_weight > 0:
-            seen = reprojection_loss(pose.keypoint, self.problem.targets[number], DOUBT)
-            total = total + config.keypoint_weight * seen
+            keypoint_loss = reprojection_loss(pose.keypoint, self.problem.targets[number], DOUBT)
+            total = total + config.keypoint_weight * keypoint_loss
         return total
 
     def _control(self, motions: tuple[HandMotion, ...]) -> Float[ndarray, "frame control 3"]:
@@ -447,7 +274,7 @@ class Refinement:
         return control if self.problem.chosen is None else control[:, self.problem.chosen]
 
     def _simulated_loss(self, control: Float[ndarray, "frame control 3"]) -> float:
-        """Simulate all frames as the evaluation will, and score those that are fitted [m²]."""
+        """Simulate all frames as an evaluation does; return the loss of the fitted ones [m²]."""
         rollout = Simulator(self.problem.model, self.parameters, self.device).rollout(control)
         node = torch.from_numpy(rollout.position[: self.problem.object_.frame_count])
         return float(self._object_loss(node))
@@ -455,3 +282,169 @@ class Refinement:
     def _restore(self, share: float) -> None:
         for hand, offset in zip(self.hands, self.best, strict=True):
             hand.restore({name: share * value for name, value in offset.items()})
+
+
+class HandOffsets:
+    """Corrections of one hand in the frames to fit; zero is the hand of stage 1."""
+
+    def __init__(self, motion: HandMotion, model: HandModel, frame_count: int) -> None:
+        """Start from zero.
+
+        Args:
+            motion: The hand of stage 1 over all frames.
+            model: Model of that hand.
+            frame_count: Frames to correct, counted from 0.
+        """
+        self.before = motion
+        self.model = model
+        self.frame_count = frame_count
+        shapes = {"articulation": (15, 3), "rotation": (3,), "translation": (3,)}
+        self.value: Offset = {
+            name: torch.zeros(frame_count, *shape, requires_grad=True)
+            for name, shape in shapes.items()
+        }
+        self._shape = _tensor(motion.shape)
+        self._articulation = _tensor(motion.articulation[:frame_count])
+        self._rotation = rotation_matrix(_tensor(motion.wrist_rotation[:frame_count]))
+        self._translation = _tensor(motion.wrist_translation[:frame_count])
+        with torch.no_grad():
+            self._vertex = self.pose().vertex
+
+    def pose(self) -> HandPose:
+        """Pose the corrected hand in the frames to fit."""
+        offset = self.value
+        still = torch.zeros_like(self._translation)
+        hand = self.model(self._shape, self._articulation + offset["articulation"], still, still)
+        turn = (self._rotation @ rotation_matrix(offset["rotation"])).transpose(-1, -2)
+        place = (self._translation + offset["translation"])[:, None]
+        scale = self.before.scale
+        return HandPose(
+            scale * (hand.vertex @ turn + place), scale * (hand.keypoint @ turn + place)
+        )
+
+    def displacement(self, pose: HandPose) -> Float[Tensor, "frame vertex 3"]:
+        """Displacement of the surface since stage 1 [m]."""
+        return pose.vertex - self._vertex
+
+    def copy(self) -> Offset:
+        """Copy the correction, for `restore`."""
+        return {name: tensor.detach().clone() for name, tensor in self.value.items()}
+
+    def forget_gradient(self) -> None:
+        """Drop the gradient of the last evaluation."""
+        for tensor in self.value.values():
+            tensor.grad = None
+
+    def restore(self, offset: Offset) -> None:
+        """Return to a copied correction."""
+        with torch.no_grad():
+            for name, tensor in self.value.items():
+                tensor.copy_(offset[name])
+
+    def motion(self, carried: float) -> HandMotion:
+        """Apply the correction to the motion of all frames.
+
+        Frames after the fitted ones get the last correction, which decays exponentially: the hand
+        does not jump, and the correction of a single frame does not last.
+
+        Args:
+            carried: Frames in which the last correction decays to 1/e; 0 drops it at once.
+        """
+        before = self.before
+        offset = {
+            name: _carry(tensor.detach().double().numpy(), before.frame_count, carried)
+            for name, tensor in self.value.items()
+        }
+        turned = (
+            Rotation.from_rotvec(before.wrist_rotation) * Rotation.from_rotvec(offset["rotation"])
+        ).as_rotvec()
+        wrist_rotation = _nearer_vector(turned, before.wrist_rotation)
+        return replace(
+            before,
+            articulation=(before.articulation + offset["articulation"]).astype(np.float32),
+            wrist_rotation=wrist_rotation.astype(np.float32),
+            wrist_translation=(before.wrist_translation + offset["translation"]).astype(np.float32),
+        )
+
+
+class OffsetDescent:
+    """Adam on the corrections of one hand, with one second moment for each frame.
+
+    Plain Adam gives every number a step of about the same size, so joints with almost no effect on
+    the object turn as far as those that hold it. With a shared second moment a frame moves along
+    its gradient, scaled by the expected size of each kind of correction, by one step in all.
+    `by_parameter` selects plain Adam, as the paper uses it.
+    """
+
+    def __init__(
+        self, hand: HandOffsets, rates: dict[str, float], beta_2: float, *, by_parameter: bool
+    ) -> None:
+        """Start without momentum.
+
+        Args:
+            hand: The corrections to update.
+            rates: Step of each kind of correction [rad, rad, m].
+            beta_2: Decay of the second moment.
+            by_parameter: Whether every number has its own second moment.
+        """
+        self.hand = hand
+        self.rates = rates
+        self.beta_2 = beta_2
+        self.by_parameter = by_parameter
+        self.count = 0
+        self.first = {name: torch.zeros_like(value) for name, value in hand.value.items()}
+        self.second = {name: torch.zeros_like(value) for name, value in hand.value.items()}
+
+    def step(self, share: float) -> None:
+        """Update the corrections by their gradient, by this share of a full step."""
+        self.count += 1
+        gradient = {
+            name: self.rates[name] * (torch.zeros_like(v) if v.grad is None else v.grad)
+            for name, v in self.hand.value.items()
+        }
+        squared = {name: value**2 for name, value in gradient.items()}
+        if not self.by_parameter:
+            frame = torch.stack([value.flatten(1).sum(1) for value in squared.values()]).sum(0)
+            squared = {
+                name: frame.reshape(-1, *[1] * (value.ndim - 1)).expand_as(value)
+                for name, value in squared.items()
+            }
+        with torch.no_grad():
+            for name, offset in self.hand.value.items():
+                self.first[name].lerp_(gradient[name], 1 - BETA_1)
+                self.second[name].lerp_(squared[name], 1 - self.beta_2)
+                mean = self.first[name] / (1 - BETA_1**self.count)
+                size = (self.second[name] / (1 - self.beta_2**self.count)).sqrt()
+                offset.sub_(share * self.rates[name] * mean / (size + FLAT_GRADIENT))
+
+
+def control_nodes(
+    vertices: Sequence[Float[Tensor, "frame _ 3"]], chosen: Int[ndarray, " control"] | None
+) -> Float[Tensor, "frame control 3"]:
+    """Join the vertices of all hands, in order, and select the control nodes (None for all)."""
+    joined = torch.cat(list(vertices), dim=1)
+    return joined if chosen is None else joined[:, torch.from_numpy(chosen.astype(np.int64))]
+
+
+def _carry(
+    offset: Float[ndarray, "frame ..."], frame_count: int, carried: float
+) -> Float[ndarray, "all_frame ..."]:
+    """Append the exponentially decaying last correction for the frames that have none."""
+    later = np.arange(1, frame_count - len(offset) + 1)
+    share = np.exp(-later / carried) if carried > 0 else np.zeros(len(later))
+    faded = share.reshape(-1, *[1] * (offset.ndim - 1)) * offset[-1:]
+    return np.concatenate([offset, faded])
+
+
+def _nearer_vector(
+    vector: Float[ndarray, "frame 3"], to: Float[ndarray, "frame 3"]
+) -> Float[ndarray, "frame 3"]:
+    """Choose of each rotation's two vectors the one nearer to that of `to`."""
+    angle = np.linalg.norm(vector, axis=1, keepdims=True)
+    other = vector * (1 - 2 * np.pi / np.maximum(angle, 1e-9))
+    near, far = (np.linalg.norm(v - to, axis=1, keepdims=True) for v in (vector, other))
+    return np.where((far < near) & (angle > 1e-3), other, vector)
+
+
+def _tensor(array: ndarray) -> Tensor:
+    return torch.from_numpy(np.array(array, dtype=np.float32))

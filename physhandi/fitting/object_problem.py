@@ -1,4 +1,8 @@
-"""What the object fit is given of one sequence: nodes, controls and observations."""
+"""The object fit's view of one sequence: nodes, controls, observations and the loss.
+
+`build_problem` reduces a sequence to an `ObjectProblem`; `mean_loss` simulates problems and
+compares them with what was observed (physics.md §4.1).
+"""
 
 import math
 from collections.abc import Callable
@@ -22,103 +26,17 @@ from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.stability import stable_substeps
 from physhandi.simulation.topology import build_model
 
-
-def chamfer_loss(
-    observed: Float[Tensor, "frame point 3"],
-    is_observed: Bool[Tensor, "frame point"],
-    node: Float[Tensor, "frame node 3"],
-    *,
-    count: Float[Tensor, " frame"] | None = None,
-) -> Float[Tensor, " frame"]:
-    """Measure how far observed points lie from the nearest node, one way, squared [m²].
-
-    The nearest node is held fixed in the gradient (physics.md §4.1; PhysTwin's Chamfer term).
-
-    Args:
-        observed: Observed points, padded to one length [m].
-        is_observed: Which of them are real.
-        node: Simulated object nodes [m].
-        count: What to divide by instead of the number of points of each frame.
-
-    Returns:
-        Mean squared distance of each frame; 0 where a frame saw nothing.
-    """
-    nearest = _nearest(observed, is_observed, node)
-    chosen = torch.gather(node, 1, nearest[..., None].expand(-1, -1, 3))
-    squared = ((torch.nan_to_num(observed) - chosen) ** 2).sum(dim=2) * is_observed
-    divisor = is_observed.sum(dim=1) if count is None else count
-    return squared.sum(dim=1) / divisor.clamp(min=1)
-
-
-def track_loss(
-    observed: Float[Tensor, "frame track 3"],
-    is_valid: Bool[Tensor, "frame track"],
-    predicted: Float[Tensor, "frame track 3"],
-    *,
-    count: Float[Tensor, " frame"] | None = None,
-) -> Float[Tensor, " frame"]:
-    """Measure how far followed surface points are from where the simulation carried them [m²].
-
-    PhysTwin's smooth L1 with β = 1 m, averaged over coordinates, is one sixth of this value.
-
-    Args:
-        observed: Observed tracks [m].
-        is_valid: Where a track can be trusted.
-        predicted: The same surface points, carried by the simulated nodes [m].
-        count: What to divide by instead of the number of valid tracks of each frame.
-
-    Returns:
-        Mean squared distance of each frame; 0 where a frame has no valid track.
-    """
-    squared = ((torch.nan_to_num(observed) - predicted) ** 2).sum(dim=2) * is_valid
-    divisor = is_valid.sum(dim=1) if count is None else count
-    return squared.sum(dim=1) / divisor.clamp(min=1)
-
-
-def node_acceleration_loss(
-    velocity: Float[Tensor, "frame node 3"],
-) -> Float[Tensor, " frame"]:
-    """Measure how abruptly frame-to-frame changes of velocity differ, half-squared [m²/s²].
-
-    PhysTwin's regulariser of the zeroth-order stage: smooth L1 with β = 1 of the difference of
-    two successive velocity changes, averaged over nodes and coordinates.
-
-    Args:
-        velocity: Node velocities at the frames [m/s].
-
-    Returns:
-        One value a frame, 0 for the first two.
-    """
-    change = velocity[1:] - velocity[:-1]
-    jerk = change[1:] - change[:-1]
-    value = torch.nn.functional.smooth_l1_loss(jerk, torch.zeros_like(jerk), reduction="none")
-    return torch.cat([velocity.new_zeros(2), value.mean(dim=(1, 2))])[: velocity.shape[0]]
-
-
-def _nearest(
-    observed: Float[Tensor, "frame point 3"],
-    is_observed: Bool[Tensor, "frame point"],
-    node: Float[Tensor, "frame node 3"],
-) -> Int[Tensor, "frame point"]:
-    """Find the nearest node of each observed point, by a tree: all distances would take longer."""
-    nearest = torch.zeros(is_observed.shape, dtype=torch.int64)
-    for frame, nodes in enumerate(node.detach().cpu().numpy()):
-        seen = is_observed[frame].cpu()
-        if len(nodes) and seen.any():
-            _, found = KDTree(nodes).query(observed[frame].cpu()[seen].numpy())
-            nearest[frame, seen] = torch.from_numpy(found)
-    return nearest.to(node.device)
-
-
-TRACK_CARRIERS = 4  # nodes that carry one observed surface point
+TRACK_CARRIERS = 4
+"""Nodes that carry one observed surface point."""
+SUBSTEP_SAFETY = 1.25
+"""Factor by which the substeps exceed the stability limit."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectProblem:
-    """One sequence, reduced to what the object fit needs of it."""
+    """One sequence as tensors for the object fit."""
 
     name: str
-    """Name of the sequence."""
     object_node: Float[ndarray, "node 3"]
     """Object nodes at frame 0 [m]."""
     rest_node: Float[ndarray, "node 3"]
@@ -128,7 +46,7 @@ class ObjectProblem:
     frame_rate: float
     """Frames a second [Hz]."""
     ground_height: float | None
-    """Height of the ground plane, none if the object hangs free [m]."""
+    """Height of the ground plane; None without ground [m]."""
     gravity: float
     """Acceleration along -z [m/s²]."""
     initial_velocity: Float[ndarray, "node 3"]
@@ -144,11 +62,11 @@ class ObjectProblem:
     carrier: Int[Tensor, "track carrier"]
     """The nodes that carry each track."""
     carrier_weight: Float[Tensor, "track carrier"]
-    """How much each of them counts; rows sum to one."""
+    """Weight of each carrier; rows sum to one."""
     track_offset: Float[Tensor, "track 3"]
     """Position of a track less the weighted mean of its carriers, at frame 0 [m]."""
     surface_count: int | None = None
-    """Chamfer sees only so many of the first nodes, those on the surface; all if not known."""
+    """Leading nodes that lie on the surface, which alone enter the Chamfer term; None for all."""
 
     @property
     def frame_count(self) -> int:
@@ -196,43 +114,6 @@ class ObjectProblem:
         return chamfer + track_weight * track
 
 
-def _pad_clouds(
-    clouds: tuple[ndarray, ...], frame_count: int, most: int | None
-) -> tuple[Float[Tensor, "frame point 3"], Bool[Tensor, "frame point"]]:
-    picked = []
-    for cloud in clouds[:frame_count]:
-        count = len(cloud) if most is None else min(most, len(cloud))
-        keep = np.linspace(0, len(cloud) - 1, count).round().astype(int)
-        picked.append(np.asarray(cloud, np.float32).reshape(-1, 3)[keep])
-    width = max((len(points) for points in picked), default=0)
-    padded = np.zeros((frame_count, width, 3), np.float32)
-    real = np.zeros((frame_count, width), bool)
-    for frame, points in enumerate(picked):
-        padded[frame, : len(points)] = points
-        real[frame, : len(points)] = True
-    return torch.from_numpy(padded), torch.from_numpy(real)
-
-
-def _carriers(
-    observation: ObjectObservation, object_node: Float[ndarray, "node 3"]
-) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-    """Attach each track to the node that it is, or to those nearest where frame 0 shows it."""
-    if observation.node_of_track is not None:
-        kept = np.arange(observation.track_count)
-        carrier = np.asarray(observation.node_of_track)[:, None].astype(np.int64)
-        weight = np.ones((len(kept), 1), np.float32)
-        return kept, carrier, weight, np.zeros((len(kept), 3), np.float32)
-    kept = np.flatnonzero(observation.is_visible[0])
-    start = np.asarray(observation.point[0, kept], np.float32)
-    count = min(TRACK_CARRIERS, len(object_node))
-    distance, carrier = KDTree(object_node).query(start, k=count)
-    distance, carrier = np.reshape(distance, (-1, count)), np.reshape(carrier, (-1, count))
-    weight = 1.0 / (distance + 1e-4)
-    weight = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
-    offset = start - (object_node[carrier] * weight[..., None]).sum(axis=1)
-    return kept, carrier.astype(np.int64), weight, offset.astype(np.float32)
-
-
 def build_problem(
     *,
     name: str,
@@ -257,14 +138,14 @@ def build_problem(
         object_node: Object nodes at frame 0 [m].
         rest_node: The same nodes in the rest shape [m].
         control: Control node positions over all frames [m].
-        frame_count: Frames to fit, counted from 0; later ones are never looked at.
+        frame_count: Frames to fit, counted from 0; later ones are never read.
         frame_rate: Frames a second [Hz].
-        ground_height: Height of the ground, or none [m].
+        ground_height: Height of the ground; None without ground [m].
         gravity: Acceleration along -z [m/s²].
-        surface_count: Number of leading nodes that lie on the surface, if that is known.
-        chamfer_points: Whether the Chamfer term compares with the fused cloud or with the tracks
-            that are visible.
-        cloud_points: Most points of a frame that enter the Chamfer term; none for all.
+        surface_count: Number of leading nodes that lie on the surface; None if unknown.
+        chamfer_points: Whether the Chamfer term compares with the fused cloud or with the visible
+            tracks.
+        cloud_points: Most points of a frame that enter the Chamfer term; None for all.
         starts_at_rest: Whether the object rests at frame 0, whatever the tracks say.
 
     Returns:
@@ -286,12 +167,12 @@ def build_problem(
                 f"Sequence '{name}' has no tracks of the object, but chamfer_points is 'tracks': "
                 "add markers or track.npy, or choose chamfer_points: cloud."
             )
-        seen = zip(observation.point, observation.is_visible, strict=True)
-        clouds = tuple(point[is_visible] for point, is_visible in seen)
+        pairs = zip(observation.point, observation.is_visible, strict=True)
+        clouds = tuple(point[is_visible] for point, is_visible in pairs)
     cloud, is_observed = _pad_clouds(clouds, frame_count, cloud_points)
-    kept, carrier, weight, offset = _carriers(observation, np.asarray(object_node, np.float32))
+    track, carrier, weight, offset = _carriers(observation, np.asarray(object_node, np.float32))
     is_there = np.isfinite(observation.point).all(axis=2)
-    valid = (is_there & observation.is_motion_valid)[:frame_count, kept]
+    valid = (is_there & observation.is_motion_valid)[:frame_count, track]
     if not is_observed[1:].any() and not valid[1:].any():
         raise FitError(
             f"Sequence '{name}' shows the object in no frame after frame 0 of the {frame_count} to "
@@ -312,7 +193,7 @@ def build_problem(
         initial_velocity=velocity,
         cloud=cloud,
         is_observed=is_observed,
-        track=torch.from_numpy(np.asarray(observation.point[:frame_count, kept], np.float32)),
+        track=torch.from_numpy(np.asarray(observation.point[:frame_count, track], np.float32)),
         is_valid=torch.from_numpy(np.asarray(valid)),
         carrier=torch.from_numpy(carrier),
         carrier_weight=torch.from_numpy(weight),
@@ -321,21 +202,61 @@ def build_problem(
     )
 
 
+def _pad_clouds(
+    clouds: tuple[ndarray, ...], frame_count: int, most: int | None
+) -> tuple[Float[Tensor, "frame point 3"], Bool[Tensor, "frame point"]]:
+    picked = []
+    for cloud in clouds[:frame_count]:
+        count = len(cloud) if most is None else min(most, len(cloud))
+        keep = np.linspace(0, len(cloud) - 1, count).round().astype(int)
+        picked.append(np.asarray(cloud, np.float32).reshape(-1, 3)[keep])
+    width = max((len(points) for points in picked), default=0)
+    padded = np.zeros((frame_count, width, 3), np.float32)
+    real = np.zeros((frame_count, width), bool)
+    for frame, points in enumerate(picked):
+        padded[frame, : len(points)] = points
+        real[frame, : len(points)] = True
+    return torch.from_numpy(padded), torch.from_numpy(real)
+
+
+def _carriers(
+    observation: ObjectObservation, object_node: Float[ndarray, "node 3"]
+) -> tuple[ndarray, ndarray, ndarray, ndarray]:
+    """Attach each track to its own node, or to the nodes nearest to it in frame 0.
+
+    Returns the indices of the attached tracks, then carriers, weights and offsets [m] of each.
+    """
+    if observation.node_of_track is not None:
+        track = np.arange(observation.track_count)
+        carrier = np.asarray(observation.node_of_track)[:, None].astype(np.int64)
+        weight = np.ones((len(track), 1), np.float32)
+        return track, carrier, weight, np.zeros((len(track), 3), np.float32)
+    track = np.flatnonzero(observation.is_visible[0])
+    start = np.asarray(observation.point[0, track], np.float32)
+    count = min(TRACK_CARRIERS, len(object_node))
+    distance, carrier = KDTree(object_node).query(start, k=count)
+    distance, carrier = np.reshape(distance, (-1, count)), np.reshape(carrier, (-1, count))
+    weight = 1.0 / (distance + 1e-4)
+    weight = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
+    offset = start - (object_node[carrier] * weight[..., None]).sum(axis=1)
+    return track, carrier.astype(np.int64), weight, offset.astype(np.float32)
+
+
 def initial_velocity(
     observation: ObjectObservation, object_node: Float[ndarray, "node 3"], frame_rate: float
 ) -> Float[ndarray, "node 3"]:
-    """Estimate how fast the object moves at frame 0 [m/s].
+    """Estimate the velocity of every node at frame 0 [m/s].
 
-    Identified points' velocity between the first two frames is spread over all nodes; without
-    identified points the object is taken to be at rest. Only frames 0 and 1 are read, so a
-    prediction that starts at frame 0 knows its initial state and nothing of what follows.
+    The velocity of identified points between the first two frames is interpolated over all nodes;
+    without identified points the object starts at rest. Only frames 0 and 1 are read, so a
+    prediction from frame 0 uses no later observation.
     """
-    seen = observation.is_visible[:2].all(axis=0)
-    if observation.node_of_track is None or not seen.any():
+    is_visible = observation.is_visible[:2].all(axis=0)
+    if observation.node_of_track is None or not is_visible.any():
         return np.zeros(object_node.shape, np.float32)
-    moved = (observation.point[1] - observation.point[0])[seen] * frame_rate
-    count = min(2, int(seen.sum()))
-    source = object_node[np.asarray(observation.node_of_track)[seen]]
+    moved = (observation.point[1] - observation.point[0])[is_visible] * frame_rate
+    count = min(2, int(is_visible.sum()))
+    source = object_node[np.asarray(observation.node_of_track)[is_visible]]
     distance, near = KDTree(source).query(object_node, k=count)
     distance, near = np.reshape(distance, (-1, count)), np.reshape(near, (-1, count))
     weight = 1.0 / (distance + 1e-6)
@@ -343,14 +264,92 @@ def initial_velocity(
     return (moved[near] * weight[..., None]).sum(axis=1).astype(np.float32)
 
 
-SUBSTEP_SAFETY = 1.25
-"""Margin of the substeps over the stability limit."""
+def chamfer_loss(
+    observed: Float[Tensor, "frame point 3"],
+    is_observed: Bool[Tensor, "frame point"],
+    node: Float[Tensor, "frame node 3"],
+    *,
+    count: Float[Tensor, " frame"] | None = None,
+) -> Float[Tensor, " frame"]:
+    """Average the squared distance from observed points to the nearest node, one way [m²].
+
+    The choice of the nearest node has no gradient (physics.md §4.1; PhysTwin's Chamfer term).
+
+    Args:
+        observed: Observed points, padded to one length [m].
+        is_observed: False on padding.
+        node: Simulated object nodes [m].
+        count: Divisor of each frame; None takes its number of points.
+
+    Returns:
+        One value a frame; 0 where a frame has no points.
+    """
+    nearest = _nearest(observed, is_observed, node)
+    chosen = torch.gather(node, 1, nearest[..., None].expand(-1, -1, 3))
+    squared = ((torch.nan_to_num(observed) - chosen) ** 2).sum(dim=2) * is_observed
+    divisor = is_observed.sum(dim=1) if count is None else count
+    return squared.sum(dim=1) / divisor.clamp(min=1)
+
+
+def track_loss(
+    observed: Float[Tensor, "frame track 3"],
+    is_valid: Bool[Tensor, "frame track"],
+    predicted: Float[Tensor, "frame track 3"],
+    *,
+    count: Float[Tensor, " frame"] | None = None,
+) -> Float[Tensor, " frame"]:
+    """Average the squared distance between observed and simulated tracks [m²].
+
+    PhysTwin's smooth L1 with β = 1 m, averaged over coordinates, is one sixth of this value.
+
+    Args:
+        observed: Observed tracks [m].
+        is_valid: Where a track can be trusted.
+        predicted: The same surface points, carried by the simulated nodes [m].
+        count: Divisor of each frame; None takes its number of valid tracks.
+
+    Returns:
+        One value a frame; 0 where a frame has no valid track.
+    """
+    squared = ((torch.nan_to_num(observed) - predicted) ** 2).sum(dim=2) * is_valid
+    divisor = is_valid.sum(dim=1) if count is None else count
+    return squared.sum(dim=1) / divisor.clamp(min=1)
+
+
+def node_acceleration_loss(
+    velocity: Float[Tensor, "frame node 3"],
+) -> Float[Tensor, " frame"]:
+    """Penalise second differences of the velocity, half-squared [m²/s²].
+
+    PhysTwin's regulariser of the zeroth-order stage: smooth L1 with β = 1 of the difference of
+    two successive velocity changes [m/s], averaged over nodes and coordinates. One value a frame,
+    0 for the first two.
+    """
+    change = velocity[1:] - velocity[:-1]
+    jerk = change[1:] - change[:-1]
+    value = torch.nn.functional.smooth_l1_loss(jerk, torch.zeros_like(jerk), reduction="none")
+    return torch.cat([velocity.new_zeros(2), value.mean(dim=(1, 2))])[: velocity.shape[0]]
+
+
+def _nearest(
+    observed: Float[Tensor, "frame point 3"],
+    is_observed: Bool[Tensor, "frame point"],
+    node: Float[Tensor, "frame node 3"],
+) -> Int[Tensor, "frame point"]:
+    """Find the nearest node of each observed point; a tree is faster than all pairs."""
+    nearest = torch.zeros(is_observed.shape, dtype=torch.int64)
+    for frame, nodes in enumerate(node.detach().cpu().numpy()):
+        is_real = is_observed[frame].cpu()
+        if len(nodes) and is_real.any():
+            _, index = KDTree(nodes).query(observed[frame].cpu()[is_real].numpy())
+            nearest[frame, is_real] = torch.from_numpy(index)
+    return nearest.to(node.device)
 
 
 def problem_parameters(
     parameters: SimulationParameters, problem: ObjectProblem
 ) -> SimulationParameters:
-    """Set the frame rate, ground and gravity of one sequence, as far as the parameters let it."""
+    """Fill in frame rate, ground and gravity of one sequence (`SimulationParameters.in_world`)."""
     return parameters.in_world(
         frame_rate=problem.frame_rate,
         ground_height=problem.ground_height,
@@ -374,7 +373,7 @@ def build_problem_model(
 def simulate_problem(
     problem: ObjectProblem, model: SpringMassModel, parameters: SimulationParameters, device: str
 ) -> tuple[Float[Tensor, "frame node 3"], Float[Tensor, "frame node 3"]]:
-    """Roll the model out over the frames to fit; positions [m] and velocities [m/s]."""
+    """Simulate the frames to fit; returns positions [m] and velocities [m/s]."""
     simulator = Simulator(model, problem_parameters(parameters, problem), device=device)
     rollout = simulator.rollout(problem.control[: problem.frame_count])
     return torch.from_numpy(rollout.position), torch.from_numpy(rollout.velocity)
@@ -388,12 +387,12 @@ def mean_loss(
     device: str,
     *,
     acceleration_weight: float = 0.0,
-    seen: Callable[[ObjectProblem, Float[Tensor, "frame node 3"]], None] | None = None,
+    on_rollout: Callable[[ObjectProblem, Float[Tensor, "frame node 3"]], None] | None = None,
 ) -> float:
     """Simulate every sequence and average its frame losses; infinite if one diverges [m²].
 
-    The mean is over the frames 1, 2, … to fit (physics.md §4.1); frame 0 is given. `seen` is
-    handed each simulated motion [m].
+    The mean is over the frames 1, 2, … to fit (physics.md §4.1); frame 0 is the initial state.
+    `on_rollout` receives each simulated motion [m].
     """
     losses = []
     for problem in problems:
@@ -401,8 +400,8 @@ def mean_loss(
             node, velocity = simulate_problem(problem, models[problem.name], parameters, device)
         except SimulationDivergedError:
             return math.inf
-        if seen is not None:
-            seen(problem, node)
+        if on_rollout is not None:
+            on_rollout(problem, node)
         frame_losses = problem.frame_losses(
             node[1:], track_weight=config.track_weight, freeze_counts=config.freezes_counts
         )
@@ -419,10 +418,10 @@ def settle_substeps(
     *,
     safety: float = SUBSTEP_SAFETY,
 ) -> SimulationParameters:
-    """Choose the substeps that keep all models stable, if the configuration says so.
+    """Choose substeps that keep all models stable, if the configuration sets them automatically.
 
-    A step near the limit may stay bounded and still be noise: a search without this finds
-    parameters whose simulation no longer has useful gradients.
+    Near the limit a simulation may stay bounded and still be noise: without the margin a search
+    finds parameters whose gradients are useless.
     """
     if not config.automatic_substeps:
         return parameters

@@ -1,4 +1,8 @@
-"""Stage 2: find the spring-mass object whose simulated motion explains what was seen."""
+"""Stage 2, zeroth order: searches the global parameters of the spring-mass object.
+
+`search_object` runs CMA-ES on the losses that `CandidateEvaluator` computes; `check_problem` and
+`check_springs` refuse objects that no parameters, or not these, can hold together.
+"""
 
 from collections.abc import Sequence as Many
 
@@ -28,160 +32,40 @@ from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.topology import MINIMUM_LENGTH
 
 
-class Judge:
-    """Finds the loss of candidates over all sequences.
+def search_object(
+    problems: Many[ObjectProblem],
+    start: SimulationParameters,
+    config: ObjectFitConfig,
+    progress: Progress,
+    *,
+    device: str = "cpu",
+) -> SearchResult:
+    """Search the global parameters, topology included, that explain all sequences best.
 
-    On CUDA a generation is one batch for each sequence, and the host waits for each batch once;
-    on a CPU, or with self-collision, candidates take turns.
+    Args:
+        problems: One for each sequence; all must have the same object nodes at rest.
+        start: Initial parameters.
+        config: Settings of stage 2.
+        progress: Receives a report each generation.
+        device: Warp device.
+
+    Raises:
+        FitError: If no spring can form, or every candidate diverges.
     """
-
-    def __init__(
-        self,
-        problems: Many[ObjectProblem],
-        config: ObjectFitConfig,
-        progress: Progress,
-        *,
-        device: str = "cpu",
-    ) -> None:
-        """Reduce the observations to what is compared.
-
-        Args:
-            problems: One for each sequence.
-            config: Weights and substeps.
-            progress: Asked between simulations whether to stop.
-            device: Warp device.
-        """
-        self._problems, self._config, self._progress = problems, config, progress
-        self._device = device
-        self._targets = [motion_target(problem, config) for problem in problems]
-        self._preview = RolloutPreview(SEARCH_STAGE, progress)
-        self._best_loss = np.inf
-        self._best: tuple[SimulationParameters, SpringMassModel] | None = None
-
-    def __call__(
-        self, candidates: Many[SimulationParameters]
-    ) -> list[tuple[SimulationParameters, float]]:
-        """Return each candidate with its substeps, and its loss [m²].
-
-        The loss is infinite for a candidate that diverges, has no springs or needs more substeps
-        than the configuration allows.
-        """
-        candidates = [problem_parameters(p, self._problems[0]) for p in candidates]
-        masters = [
-            MasterTopology.of(
-                problem.object_node,
-                problem.control[0],
-                candidates,
-                rest_node=problem.rest_node,
-                initial_velocity=problem.initial_velocity,
-            )
-            for problem in self._problems
-        ]
-        settled, possible = [], []
-        for index, parameters in enumerate(candidates):
-            models = [master.model(parameters) for master in masters]
-            settled.append(settle_substeps(models, parameters, self._config))
-            if self._is_possible(models, settled[-1]):
-                possible.append(index)
-        losses = np.full((len(masters), len(candidates)), np.inf)
-        for row, master in enumerate(masters):
-            self._simulate(row, master, settled, possible, losses[row])
-        mean = [float(value) for value in losses.mean(axis=0)]
-        winner = int(np.argmin(mean))
-        if mean[winner] < self._best_loss:
-            self._best_loss = mean[winner]
-            self._best = settled[winner], masters[0].model(settled[winner])
-        self._show_best()
-        return list(zip(settled, mean, strict=True))
-
-    def _show_best(self) -> None:
-        """Simulate the best candidate for whoever watches, at most once for each."""
-        if self._best is None or not self._progress.wants_preview():
-            return
-        (parameters, model), self._best = self._best, None
-        problem = self._problems[0]
-        self._preview.show_made(
-            problem,
-            self._best_loss,
-            lambda: simulate_problem(problem, model, parameters, self._device)[0],
-        )
-
-    def _is_possible(self, models: Many[SpringMassModel], parameters: SimulationParameters) -> bool:
-        has_springs = all(len(model.spring_nodes) > 0 for model in models)
-        return has_springs and parameters.substeps_per_frame <= self._config.most_substeps
-
-    def _simulate(
-        self,
-        row: int,
-        master: MasterTopology,
-        candidates: Many[SimulationParameters],
-        possible: list[int],
-        losses: np.ndarray,
-    ) -> None:
-        """Fill in the losses of the candidates that can be simulated, in one sequence."""
-        problem = self._problems[row]
-        is_shared = wp.get_device(self._device).is_cuda
-        batch = []
-        for index in possible:
-            if not candidates[index].self_collision:
-                batch.append(index)
-                continue
-            self._progress.check_cancelled()
-            models = {problem.name: master.model(candidates[index])}
-            losses[index] = mean_loss(
-                [problem],
-                models,
-                candidates[index],
-                self._config,
-                self._device,
-                acceleration_weight=self._config.acceleration_weight,
-            )
-        for part in [batch] if is_shared and batch else [[index] for index in batch]:
-            self._progress.check_cancelled()
-            parameters = [problem_parameters(candidates[index], problem) for index in part]
-            simulator = BatchSimulator(master, parameters, self._device)
-            control = problem.control[: problem.frame_count]
-            losses[part] = simulator.losses(control, self._targets[row]).loss
-
-
-def motion_target(problem: ObjectProblem, config: ObjectFitConfig) -> MotionTarget:
-    """Reduce what was observed of a sequence to points, tracks and their weights.
-
-    The loss that it stands for is that of `ObjectProblem.frame_losses`.
-    """
-
-    def weights(counts: torch.Tensor, factor: float) -> np.ndarray:
-        divisor = counts.sum(dim=1)
-        if config.freezes_counts:
-            divisor = divisor[1].expand(len(counts))
-        return (factor * counts / divisor.clamp(min=1)[:, None]).numpy().astype(np.float32)
-
-    return MotionTarget(
-        cloud=torch.nan_to_num(problem.cloud).numpy(),
-        cloud_weight=weights(problem.is_observed, 1.0),
-        surface_count=problem.surface_count,
-        track=torch.nan_to_num(problem.track).numpy(),
-        track_weight=weights(problem.is_valid, config.track_weight),
-        carrier=problem.carrier.numpy(),
-        carrier_weight=problem.carrier_weight.numpy(),
-        track_offset=problem.track_offset.numpy(),
-        acceleration_weight=config.acceleration_weight,
-    )
+    for problem in problems:
+        check_problem(problem, start, config.search)
+    evaluate = CandidateEvaluator(problems, config, progress, device=device)
+    return search_parameters(evaluate, start, config.search, progress)
 
 
 def check_problem(
     problem: ObjectProblem, start: SimulationParameters, config: SearchConfig
 ) -> None:
-    """Refuse an object whose springs no candidate of the search could form.
-
-    Args:
-        problem: One sequence of the search.
-        start: Values that the search starts from.
-        config: Intervals of the search.
+    """Refuse an object for which no candidate of the search can form springs.
 
     Raises:
-        FitError: If control nodes are too far from the object, or its nodes from each other, or in
-            one place; names both the distance and the widest radius.
+        FitError: If control nodes are too far from the object, or its nodes from each other, or
+            all in one place; names the distance and the widest radius of the search.
     """
 
     def widest(field: str) -> float:
@@ -216,17 +100,17 @@ def check_springs(
     control_0: Float[ndarray, "control 3"],
     rest_node: Float[ndarray, "node 3"],
 ) -> None:
-    """Refuse parameters under which a sequence's object falls to pieces or is held by nothing.
+    """Refuse parameters that form no object spring or no virtual spring in sequence `name`.
 
     Args:
-        name: Name of the sequence.
-        model: Springs that the parameters make.
-        parameters: Radii and neighbor limits, for the message.
-        control_0: Positions of the control nodes at frame 0 [m].
+        name: Name of the sequence, for the message.
+        model: Model that `parameters` build.
+        parameters: Radii and neighbor limits.
+        control_0: Control nodes at frame 0 [m].
         rest_node: The object's rest shape [m].
 
     Raises:
-        UsageError: If there is no object spring, or no virtual one; names the value to change.
+        UsageError: If one kind of spring is missing; names the value to change.
     """
     if model.object_spring_count == 0 and model.node_count > 1:
         raise UsageError(
@@ -250,41 +134,150 @@ def _cause(parameters: SimulationParameters, prefix: str) -> str:
 
 
 def _control_gap(control: ndarray, node: ndarray) -> float:
-    """Distance between the object and the nearest control node [m]."""
+    """Compute the distance between the object and the nearest control node [m]."""
     return float(KDTree(node).query(control)[0].min(initial=np.inf))
 
 
 def _node_gap(node: ndarray) -> float:
-    """Distance of the nearest two nodes that may be joined; infinite if there are none [m]."""
+    """Compute the least distance of two nodes that a spring may join; infinite if none [m]."""
     count = min(len(node), 64)
     distance = np.reshape(KDTree(node).query(node, k=count)[0], -1)
     return float(distance[distance > MINIMUM_LENGTH].min(initial=np.inf))
 
 
-def search_object(
-    problems: Many[ObjectProblem],
-    start: SimulationParameters,
-    config: ObjectFitConfig,
-    progress: Progress,
-    *,
-    device: str = "cpu",
-) -> SearchResult:
-    """Find the global parameters, topology included, that explain all sequences best.
+class CandidateEvaluator:
+    """Computes the loss of candidate parameters over all sequences.
 
-    Args:
-        problems: One for each sequence; all must have the same object nodes at rest.
-        start: Parameters to start from.
-        config: What stage 2 does.
-        progress: Told once a generation.
-        device: Warp device.
-
-    Returns:
-        The best global parameters.
-
-    Raises:
-        FitError: If no spring can form, or every candidate diverges.
+    On CUDA each sequence simulates a generation as one batch; on a CPU, or with self-collision,
+    candidates are simulated one after the other.
     """
-    for problem in problems:
-        check_problem(problem, start, config.search)
-    judge = Judge(problems, config, progress, device=device)
-    return search_parameters(judge, start, config.search, progress)
+
+    def __init__(
+        self,
+        problems: Many[ObjectProblem],
+        config: ObjectFitConfig,
+        progress: Progress,
+        *,
+        device: str = "cpu",
+    ) -> None:
+        """Prepare the observations of all sequences.
+
+        Args:
+            problems: One for each sequence.
+            config: Weights of the loss and bounds of the substeps.
+            progress: Can cancel between two simulations; shows the best candidate.
+            device: Warp device.
+        """
+        self._problems, self._config, self._progress = problems, config, progress
+        self._device = device
+        self._targets = [motion_target(problem, config) for problem in problems]
+        self._preview = RolloutPreview(SEARCH_STAGE, progress)
+        self._best_loss = np.inf
+        self._best: tuple[SimulationParameters, SpringMassModel] | None = None
+
+    def __call__(
+        self, candidates: Many[SimulationParameters]
+    ) -> list[tuple[SimulationParameters, float]]:
+        """Return each candidate with its substeps filled in, and its loss [m²].
+
+        The loss is infinite if a candidate diverges, has no springs or needs more substeps than
+        the configuration allows.
+        """
+        candidates = [problem_parameters(p, self._problems[0]) for p in candidates]
+        masters = [
+            MasterTopology.of(
+                problem.object_node,
+                problem.control[0],
+                candidates,
+                rest_node=problem.rest_node,
+                initial_velocity=problem.initial_velocity,
+            )
+            for problem in self._problems
+        ]
+        settled, possible = [], []
+        for index, parameters in enumerate(candidates):
+            models = [master.model(parameters) for master in masters]
+            settled.append(settle_substeps(models, parameters, self._config))
+            if self._is_possible(models, settled[-1]):
+                possible.append(index)
+        losses = np.full((len(masters), len(candidates)), np.inf)
+        for row, master in enumerate(masters):
+            self._simulate(row, master, settled, possible, losses[row])
+        mean = [float(value) for value in losses.mean(axis=0)]
+        winner = int(np.argmin(mean))
+        if mean[winner] < self._best_loss:
+            self._best_loss = mean[winner]
+            self._best = settled[winner], masters[0].model(settled[winner])
+        self._show_best()
+        return list(zip(settled, mean, strict=True))
+
+    def _show_best(self) -> None:
+        """Show the best candidate in a preview, at most once for each."""
+        if self._best is None or not self._progress.wants_preview():
+            return
+        (parameters, model), self._best = self._best, None
+        problem = self._problems[0]
+        self._preview.show_simulated(
+            problem,
+            self._best_loss,
+            lambda: simulate_problem(problem, model, parameters, self._device)[0],
+        )
+
+    def _is_possible(self, models: Many[SpringMassModel], parameters: SimulationParameters) -> bool:
+        has_springs = all(len(model.spring_nodes) > 0 for model in models)
+        return has_springs and parameters.substeps_per_frame <= self._config.most_substeps
+
+    def _simulate(
+        self,
+        row: int,
+        master: MasterTopology,
+        candidates: Many[SimulationParameters],
+        possible: list[int],
+        losses: np.ndarray,
+    ) -> None:
+        """Write one sequence's losses of the possible candidates into `losses`."""
+        problem = self._problems[row]
+        is_batched = wp.get_device(self._device).is_cuda
+        batch = []
+        for index in possible:
+            if not candidates[index].self_collision:
+                batch.append(index)
+                continue
+            self._progress.check_cancelled()
+            models = {problem.name: master.model(candidates[index])}
+            losses[index] = mean_loss(
+                [problem],
+                models,
+                candidates[index],
+                self._config,
+                self._device,
+                acceleration_weight=self._config.acceleration_weight,
+            )
+        for part in [batch] if is_batched and batch else [[index] for index in batch]:
+            self._progress.check_cancelled()
+            parameters = [problem_parameters(candidates[index], problem) for index in part]
+            simulator = BatchSimulator(master, parameters, self._device)
+            control = problem.control[: problem.frame_count]
+            losses[part] = simulator.losses(control, self._targets[row]).loss
+
+
+def motion_target(problem: ObjectProblem, config: ObjectFitConfig) -> MotionTarget:
+    """Express the loss of `ObjectProblem.frame_losses` as weighted points and tracks."""
+
+    def weights(counts: torch.Tensor, factor: float) -> np.ndarray:
+        divisor = counts.sum(dim=1)
+        if config.freezes_counts:
+            divisor = divisor[1].expand(len(counts))
+        return (factor * counts / divisor.clamp(min=1)[:, None]).numpy().astype(np.float32)
+
+    return MotionTarget(
+        cloud=torch.nan_to_num(problem.cloud).numpy(),
+        cloud_weight=weights(problem.is_observed, 1.0),
+        surface_count=problem.surface_count,
+        track=torch.nan_to_num(problem.track).numpy(),
+        track_weight=weights(problem.is_valid, config.track_weight),
+        carrier=problem.carrier.numpy(),
+        carrier_weight=problem.carrier_weight.numpy(),
+        track_offset=problem.track_offset.numpy(),
+        acceleration_weight=config.acceleration_weight,
+    )

@@ -1,4 +1,4 @@
-"""Imports what PhysTwin optimised for a case as a finished run, and compares the two simulators."""
+"""Imports PhysTwin's optimised result of a case as a finished run, and compares the simulators."""
 
 import hashlib
 from collections.abc import Mapping
@@ -37,187 +37,16 @@ from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.topology import MINIMUM_LENGTH, build_model
 
 STIFFEST = 1e5
-"""PhysTwin simulates no spring stiffer than this [N]."""
+"""Stiffness to which PhysTwin's simulator clamps [N]."""
 _LIMITS = {
     "restitution": ("collide_elas", 1.0),
     "friction": ("collide_fric", 2.0),
     "self_restitution": ("collide_object_elas", 1.0),
     "self_friction": ("collide_object_fric", 2.0),
 }
-
-
-def phystwin_parameters(
-    base: SimulationParameters,
-    optimum: Optimum,
-    contact: Contact,
-    *,
-    truncates_damping: bool,
-    self_collision: bool,
-) -> tuple[SimulationParameters, list[str]]:
-    """Turn what PhysTwin found into the parameters with which its simulator moves.
-
-    Args:
-        base: PhysTwin's fixed choices (profile ``phystwin``).
-        optimum: Result of its search.
-        contact: Collision coefficients of the search, or of the checkpoint.
-        truncates_damping: Whether dashpot and drag lose their decimals, as PhysTwin's second stage
-            and its inference do when they load the search's result.
-        self_collision: Whether nodes collide.
-
-    Returns:
-        The parameters, and a sentence for each number that is not the stored one.
-    """
-    notes: list[str] = []
-    stiffness = min(optimum.stiffness, STIFFEST)
-    if stiffness != optimum.stiffness:
-        notes.append(_changed("global_spring_Y", optimum.stiffness, stiffness, "simulated"))
-    bounced: dict[str, float] = {}
-    for name, (field, most) in _LIMITS.items():
-        value = getattr(contact, name)
-        bounced[name] = min(max(value, 0.0), most)
-        if bounced[name] != value:
-            notes.append(_changed(field, value, bounced[name], "simulated"))
-    damping, drag = optimum.damping, optimum.drag
-    if truncates_damping:
-        damping, drag = float(int(damping)), float(int(drag))
-        for field, value, used in (
-            ("dashpot_damping", optimum.damping, damping),
-            ("drag_damping", optimum.drag, drag),
-        ):
-            if used != value:
-                notes.append(_changed(field, value, used, "loaded (as a whole number)"))
-    parameters = base.replace(
-        connection_radius=optimum.object_radius,
-        # PhysTwin counts the node itself.
-        max_neighbors=optimum.object_max_neighbours - 1,
-        virtual_connection_radius=optimum.controller_radius,
-        virtual_max_neighbors=optimum.controller_max_neighbours,
-        stiffness=stiffness,
-        virtual_stiffness=stiffness,
-        damping=damping,
-        drag=drag,
-        self_collision=self_collision,
-        collision_distance=optimum.collision_distance,
-        **bounced,
-    )
-    return parameters, notes
-
-
-def phystwin_model(
-    object_node: Float[ndarray, "node 3"],
-    control_0: Float[ndarray, "control 3"],
-    parameters: SimulationParameters,
-    checkpoint: Checkpoint | None = None,
-    *,
-    source: Path | None = None,
-) -> tuple[SpringMassModel, list[str]]:
-    """Build PhysTwin's springs, and give each the stiffness that a checkpoint has for it.
-
-    Args:
-        object_node: Object nodes at frame 0, in PhysTwin's order [m].
-        control_0: Controller points at frame 0 [m].
-        parameters: What `phystwin_parameters` returned.
-        checkpoint: Stiffnesses; without one, all springs get the global one.
-        source: File of the checkpoint, for messages.
-
-    Returns:
-        The model at rest, and a sentence about stiffnesses that are not the stored ones.
-
-    Raises:
-        ImportFailedError: If the checkpoint has another number of springs than the topology.
-    """
-    model = build_model(object_node, control_0, parameters)
-    if checkpoint is None:
-        return model, []
-    found = (model.object_spring_count, len(model.spring_nodes))
-    stored = (checkpoint.object_spring_count, len(checkpoint.stiffness))
-    if found != stored:
-        raise ImportFailedError(
-            f"{source}: has {stored[1]} springs, {stored[0]} of them between object nodes, but "
-            f"final_data.pkl and optimal_params.pkl give {found[1]}, {found[0]} of them between "
-            "object nodes. Give the files of one and the same experiment."
-        )
-    number, tie_count = spring_numbers(model, parameters, control_0)
-    stiffness = checkpoint.stiffness[number]
-    too_stiff = int((stiffness > STIFFEST).sum())
-    notes = [f"{too_stiff} springs stiffer than {STIFFEST:g} N are simulated with that."]
-    notes = notes if too_stiff else []
-    if tie_count:
-        notes.append(
-            f"{tie_count} pairs of neighbors are at the same distance from a node. Which of them "
-            "PhysTwin found first is not defined, so their stiffnesses may be exchanged."
-        )
-    # PhysTwin leaves a spring without stiffness out, its dashpot included.
-    damping = np.where(stiffness > 0.0, model.damping, 0.0)
-    fitted = replace(
-        model,
-        stiffness=np.minimum(stiffness, STIFFEST).astype(np.float32),
-        damping=damping.astype(np.float32),
-    )
-    return fitted, notes
-
-
-def spring_numbers(
-    model: SpringMassModel,
-    parameters: SimulationParameters,
-    control_0: Float[ndarray, "control 3"],
-) -> tuple[Int[ndarray, " spring"], int]:
-    """Tell for each spring of a model which number it has in PhysTwin's list.
-
-    PhysTwin walks over the nodes; each searches its neighbours by ascending distance, drops the
-    first hit (itself) and adds every pair that is not there yet. Then the controllers add all their
-    hits, one controller after the other.
-
-    Args:
-        model: A model that `build_model` made from `parameters`.
-        parameters: Radii and neighbor limits.
-        control_0: Controller points at frame 0 [m].
-
-    Returns:
-        A permutation of the springs' numbers, and how many pairs of neighbors have no defined order
-        because they are at exactly the same distance.
-    """
-    node = model.object_node.astype(np.float64)
-    tree, count = KDTree(node), len(node)
-    distance, hit = _search(tree, node, parameters.max_neighbors + 1)
-    hit, distance = hit[:, 1:], distance[:, 1:]
-    own = np.broadcast_to(np.arange(count)[:, None], hit.shape)
-    joined = (distance < parameters.connection_radius) & (distance > MINIMUM_LENGTH) & (hit != own)
-    first, second = own[joined], hit[joined]  # row by row: in the order of the walk
-    key = np.minimum(first, second) * count + np.maximum(first, second)
-    # The model's springs ascend as the unique keys do.
-    discovery = np.unique(key, return_index=True)[1]
-    tie_count = _ties(distance, joined)
-    control_point = np.asarray(control_0, np.float64)
-    distance, hit = _search(tree, control_point, parameters.virtual_max_neighbors)
-    held = distance < parameters.virtual_connection_radius
-    control = np.broadcast_to(np.arange(len(control_0))[:, None], hit.shape)
-    order = np.argsort(hit[held] * len(control_0) + control[held])
-    number = np.concatenate([np.argsort(np.argsort(discovery)), len(discovery) + order])
-    return number, tie_count + _ties(distance, held)
-
-
-def _ties(distance: ndarray, is_kept: ndarray) -> int:
-    """Count neighbors in a row that are at the same distance."""
-    is_same = (distance[:, 1:] == distance[:, :-1]) & is_kept[:, 1:] & is_kept[:, :-1]
-    return int(is_same.sum())
-
-
-def _search(tree: KDTree, query: ndarray, most: int) -> tuple[ndarray, ndarray]:
-    """Give distance and index of the nearest nodes, ascending, a row for each query."""
-    count = min(most, tree.n)
-    distance, hit = tree.query(query, k=count)
-    shape = (len(query), count)
-    return np.reshape(distance, shape), np.reshape(hit, shape)
-
-
-def _changed(field: str, stored: float, used: float, how: str) -> str:
-    return f"{field} {stored:.6g} is {how} as {used:g}, as PhysTwin does."
-
-
 _STAGE = "import"
 REPORT = "import.json"
-"""Output that tells what was imported, what was changed, and how far the simulators differ."""
+"""Report on imported files, changed values, and the difference between the simulators."""
 _SELF_COLLIDING = ("cloth", "package")
 
 
@@ -233,14 +62,14 @@ def import_phystwin_run(
     self_collision: bool | None = None,
     progress: Progress | None = None,
 ) -> RunFolder:
-    """Make a finished run of what PhysTwin optimised for a case, simulated by our simulator.
+    """Make a finished run of PhysTwin's result for a case, simulated by our simulator.
 
     Args:
         sequence: The case, as `import_phystwin` made it.
         optimal_params: ``experiments_optimization/{case}/optimal_params.pkl``.
         checkpoint: ``experiments/{case}/train/best_{epoch}.pth``; without one, all springs have the
             stiffness of the search.
-        out: Where the run shall be.
+        out: Folder of the new run.
         device: Warp device.
         inference: ``experiments/{case}/inference.pkl``, to compare our rollout with.
         truncates_damping: Whether dashpot and drag lose their decimals. PhysTwin's search simulated
@@ -248,17 +77,17 @@ def import_phystwin_run(
             out, they are truncated exactly if there is a checkpoint.
         self_collision: Whether nodes collide; left out, if the case's name has "cloth" or
             "package" in it, which is how PhysTwin chooses.
-        progress: Told about every simulated frame; may ask to stop.
+        progress: Receives a report for every simulated frame; may cancel.
 
     Returns:
-        The published run. ``import.json`` tells every number that is not used as it is stored, and
-        the difference from `inference`.
+        The published run. ``import.json`` lists every number that is not used as stored, and the
+        difference from `inference`.
 
     Raises:
         ImportFailedError: If a file is malformed, or does not belong to the sequence. Nothing is
             left behind then, as after any other error.
         RunError: If `out` exists already.
-        SimulationDivergedError: If the motion runs away.
+        SimulationDivergedError: If the simulation diverges.
         CancelledError: If the user asked to stop.
     """
     watched = progress or NullProgress()
@@ -305,8 +134,8 @@ def import_phystwin_run(
     )
     try:
         with run.begin_attempt() as attempt:
-            told = attempt.progress(watched)
-            _fill(attempt, sequence, model, parameters, device=device, progress=told)
+            attempt_progress = attempt.progress(watched)
+            _fill(attempt, sequence, model, parameters, device=device, progress=attempt_progress)
             _finish(attempt, sequence, report, expected)
             attempt.publish()
     except BaseException:
@@ -316,7 +145,7 @@ def import_phystwin_run(
 
 
 def _parts(sequence: Sequence) -> tuple[ndarray, ndarray, str]:
-    """Give object nodes, controls and the case's name."""
+    """Get the object nodes [m], the controls [m] and the case's name."""
     if sequence.provenance.get("importer") != "phystwin":
         raise ImportFailedError(
             f"Sequence '{sequence.name}' is not an imported PhysTwin case, so PhysTwin's results "
@@ -335,7 +164,7 @@ def _collides(case: str) -> bool:
 
 
 def _up(sequence: Sequence) -> Float[ndarray, "3 3"]:
-    """Turn the case's world as the importer did."""
+    """Rotation by which the importer made the case's world z-up."""
     is_down = sequence.provenance.get("z_axis_pointed") == "down"
     return np.diag([1.0, -1.0, -1.0]) if is_down else np.eye(3)
 
@@ -365,7 +194,7 @@ def _fill(
     device: str,
     progress: Progress,
 ) -> None:
-    """Store what a fit would have stored, and simulate all frames."""
+    """Store the artefacts of a fit, and simulate all frames."""
     files = SequenceFiles(sequence.name)
     environment = describe_environment(device, describe_device(device))
     attempt.save_json(ENVIRONMENT, environment)
@@ -391,7 +220,7 @@ def _finish(
     report: Mapping[str, Any],
     expected: Float[ndarray, "frame node 3"] | None,
 ) -> None:
-    """Compare and measure."""
+    """Compare with PhysTwin's rollout, measure the run, and finish the stage."""
     files = SequenceFiles(sequence.name)
     comparison: dict[str, Any] = {}
     if expected is not None:
@@ -407,7 +236,7 @@ def _finish(
 def compare_rollouts(
     rollout: Float[ndarray, "frame node 3"], expected: Float[ndarray, "frame node 3"]
 ) -> dict[str, Any]:
-    """Tell how far two rollouts of the same nodes are from each other.
+    """Measure the difference between two rollouts of the same nodes.
 
     Returns:
         ``max_difference`` and ``mean_difference`` of all nodes and frames [m], the frame and node
@@ -422,3 +251,172 @@ def compare_rollouts(
         "node": int(node),
         "largest_motion": float(np.linalg.norm(expected - expected[0], axis=-1).max()),
     }
+
+
+def phystwin_parameters(
+    base: SimulationParameters,
+    optimum: Optimum,
+    contact: Contact,
+    *,
+    truncates_damping: bool,
+    self_collision: bool,
+) -> tuple[SimulationParameters, list[str]]:
+    """Convert PhysTwin's result to the parameters that its simulator effectively uses.
+
+    Args:
+        base: PhysTwin's fixed choices (profile ``phystwin``).
+        optimum: Result of its search.
+        contact: Collision coefficients of the search, or of the checkpoint.
+        truncates_damping: Whether dashpot and drag lose their decimals, as PhysTwin's second stage
+            and its inference do when they load the search's result.
+        self_collision: Whether nodes collide.
+
+    Returns:
+        The parameters, and a sentence for each number that differs from the stored one.
+    """
+    notes: list[str] = []
+    stiffness = min(optimum.stiffness, STIFFEST)
+    if stiffness != optimum.stiffness:
+        notes.append(_changed("global_spring_Y", optimum.stiffness, stiffness, "simulated"))
+    bounced: dict[str, float] = {}
+    for name, (field, most) in _LIMITS.items():
+        value = getattr(contact, name)
+        bounced[name] = min(max(value, 0.0), most)
+        if bounced[name] != value:
+            notes.append(_changed(field, value, bounced[name], "simulated"))
+    damping, drag = optimum.damping, optimum.drag
+    if truncates_damping:
+        damping, drag = float(int(damping)), float(int(drag))
+        for field, value, used in (
+            ("dashpot_damping", optimum.damping, damping),
+            ("drag_damping", optimum.drag, drag),
+        ):
+            if used != value:
+                notes.append(_changed(field, value, used, "loaded (as a whole number)"))
+    parameters = base.replace(
+        connection_radius=optimum.object_radius,
+        # PhysTwin counts the node itself.
+        max_neighbors=optimum.object_max_neighbours - 1,
+        virtual_connection_radius=optimum.controller_radius,
+        virtual_max_neighbors=optimum.controller_max_neighbours,
+        stiffness=stiffness,
+        virtual_stiffness=stiffness,
+        damping=damping,
+        drag=drag,
+        self_collision=self_collision,
+        collision_distance=optimum.collision_distance,
+        **bounced,
+    )
+    return parameters, notes
+
+
+def phystwin_model(
+    object_node: Float[ndarray, "node 3"],
+    control_0: Float[ndarray, "control 3"],
+    parameters: SimulationParameters,
+    checkpoint: Checkpoint | None = None,
+    *,
+    source: Path | None = None,
+) -> tuple[SpringMassModel, list[str]]:
+    """Build PhysTwin's springs with the stiffnesses of a checkpoint.
+
+    Args:
+        object_node: Object nodes at frame 0, in PhysTwin's order [m].
+        control_0: Controller points at frame 0 [m].
+        parameters: What `phystwin_parameters` returned.
+        checkpoint: Stiffnesses; without one, all springs get the global one.
+        source: File of the checkpoint, for messages.
+
+    Returns:
+        The model at rest, and sentences about stiffnesses that differ from the stored ones.
+
+    Raises:
+        ImportFailedError: If the checkpoint has another number of springs than the topology.
+    """
+    model = build_model(object_node, control_0, parameters)
+    if checkpoint is None:
+        return model, []
+    built = (model.object_spring_count, len(model.spring_nodes))
+    stored = (checkpoint.object_spring_count, len(checkpoint.stiffness))
+    if built != stored:
+        raise ImportFailedError(
+            f"{source}: has {stored[1]} springs, {stored[0]} of them between object nodes, but "
+            f"final_data.pkl and optimal_params.pkl give {built[1]}, {built[0]} of them between "
+            "object nodes. Give the files of one and the same experiment."
+        )
+    number, tie_count = spring_numbers(model, parameters, control_0)
+    stiffness = checkpoint.stiffness[number]
+    too_stiff = int((stiffness > STIFFEST).sum())
+    notes = [f"{too_stiff} springs stiffer than {STIFFEST:g} N are simulated with that."]
+    notes = notes if too_stiff else []
+    if tie_count:
+        notes.append(
+            f"{tie_count} pairs of neighbors are at the same distance from a node. Which of them "
+            "PhysTwin found first is not defined, so their stiffnesses may be exchanged."
+        )
+    # PhysTwin leaves a spring without stiffness out, its dashpot included.
+    damping = np.where(stiffness > 0.0, model.damping, 0.0)
+    fitted = replace(
+        model,
+        stiffness=np.minimum(stiffness, STIFFEST).astype(np.float32),
+        damping=damping.astype(np.float32),
+    )
+    return fitted, notes
+
+
+def spring_numbers(
+    model: SpringMassModel,
+    parameters: SimulationParameters,
+    control_0: Float[ndarray, "control 3"],
+) -> tuple[Int[ndarray, " spring"], int]:
+    """Find the number of each of a model's springs in PhysTwin's list.
+
+    PhysTwin walks over the nodes; each searches its neighbours by ascending distance, drops the
+    first hit (itself) and adds every pair that is not there yet. Then the controllers add all their
+    hits, one controller after the other.
+
+    Args:
+        model: A model that `build_model` made from `parameters`.
+        parameters: Radii and neighbor limits.
+        control_0: Controller points at frame 0 [m].
+
+    Returns:
+        A permutation of the springs' numbers, and how many pairs of neighbors have no defined order
+        because they are at exactly the same distance.
+    """
+    node = model.object_node.astype(np.float64)
+    tree, count = KDTree(node), len(node)
+    distance, hit = _search(tree, node, parameters.max_neighbors + 1)
+    hit, distance = hit[:, 1:], distance[:, 1:]
+    own = np.broadcast_to(np.arange(count)[:, None], hit.shape)
+    joined = (distance < parameters.connection_radius) & (distance > MINIMUM_LENGTH) & (hit != own)
+    first, second = own[joined], hit[joined]  # row by row: in the order of the walk
+    key = np.minimum(first, second) * count + np.maximum(first, second)
+    # The model's springs ascend as the unique keys do.
+    discovery = np.unique(key, return_index=True)[1]
+    tie_count = _ties(distance, joined)
+    control_point = np.asarray(control_0, np.float64)
+    distance, hit = _search(tree, control_point, parameters.virtual_max_neighbors)
+    is_joined = distance < parameters.virtual_connection_radius
+    control = np.broadcast_to(np.arange(len(control_0))[:, None], hit.shape)
+    order = np.argsort(hit[is_joined] * len(control_0) + control[is_joined])
+    number = np.concatenate([np.argsort(np.argsort(discovery)), len(discovery) + order])
+    return number, tie_count + _ties(distance, is_joined)
+
+
+def _ties(distance: ndarray, is_kept: ndarray) -> int:
+    """Count neighbors in a row that are at the same distance."""
+    is_same = (distance[:, 1:] == distance[:, :-1]) & is_kept[:, 1:] & is_kept[:, :-1]
+    return int(is_same.sum())
+
+
+def _search(tree: KDTree, query: ndarray, most: int) -> tuple[ndarray, ndarray]:
+    """Find the nearest nodes: distance [m] and index, ascending, a row for each query."""
+    count = min(most, tree.n)
+    distance, hit = tree.query(query, k=count)
+    shape = (len(query), count)
+    return np.reshape(distance, shape), np.reshape(hit, shape)
+
+
+def _changed(field: str, stored: float, used: float, how: str) -> str:
+    return f"{field} {stored:.6g} is {how} as {used:g}, as PhysTwin does."

@@ -1,4 +1,8 @@
-"""Object nodes and control nodes of a sequence, where its recording shows them."""
+"""Places a fitted object and its control nodes in a recording.
+
+`place_object` does so in a recording that the object was not fitted in; the pipeline uses the parts
+for the recordings of a run.
+"""
 
 from collections.abc import Sequence as Listing
 from dataclasses import dataclass
@@ -29,166 +33,62 @@ from physhandi.perception.lifting import observe_object
 from physhandi.perception.shape import object_nodes_from_observation
 from physhandi.progress import Progress
 
-
-def farthest_points(point: Float[ndarray, "point 3"], count: int) -> Int[ndarray, " chosen"]:
-    """Pick points that are far from each other, beginning with the first one."""
-    chosen = [0]
-    distance = np.linalg.norm(point - point[0], axis=1)
-    while len(chosen) < min(count, len(point)):
-        chosen.append(int(distance.argmax()))
-        distance = np.minimum(distance, np.linalg.norm(point - point[chosen[-1]], axis=1))
-    return np.array(chosen)
+LEAST_CLOUD = 10
+"""Object points that frame 0 must show for the object to be located."""
 
 
-def visible_vertices(
-    views: Listing[View], vertex: Float[ndarray, "vertex 3"], faces: Int[ndarray, "face 3"]
-) -> Int[ndarray, " visible"]:
-    """Find the hand vertices whose surface faces at least one camera.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlacedObject:
+    """A known object in a recording that it was not fitted in."""
 
-    Occlusion by the object or by other fingers is not considered.
-    """
-    corner = vertex[faces]
-    face_normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    normal = np.zeros_like(vertex)
-    for k in range(3):
-        np.add.at(normal, faces[:, k], face_normal)
-    seen = np.zeros(len(vertex), bool)
-    for view in views:
-        eye = view.camera.T_world_camera[:3, 3]
-        seen |= ((eye - vertex) * normal).sum(axis=1) > 0
-    return np.flatnonzero(seen)
+    hands: HandFit | None
+    """The hands of the recording; None if it shows none."""
+    observation: ObjectObservation
+    """Observation of the object."""
+    node: Float[ndarray, "node 3"]
+    """Object nodes at frame 0 [m]."""
+    velocity: Float[ndarray, "node 3"]
+    """Their velocities at frame 0 [m/s]."""
+    control: Float[ndarray, "frame control 3"]
+    """Control nodes [m]."""
 
 
-def lay_object(
-    template: Float[ndarray, "node 3"], cloud: Float[ndarray, "point 3"], *, iterations: int = 40
-) -> Float[ndarray, "node 3"]:
-    """Move a known object rigidly to where another sequence shows it at frame 0.
-
-    Point-to-point ICP from eight headings around the vertical; the best end wins. It supposes that
-    the object starts in about the shape in which it was first reconstructed.
+def place_object(
+    run: RunFolder,
+    sequence: Sequence,
+    template: tuple[Float[ndarray, "node 3"], Float[ndarray, "node 3"]],
+    progress: Progress,
+) -> PlacedObject:
+    """Reconstruct the hands of another recording and locate a known object in its frame 0.
 
     Args:
-        template: Nodes of the object in the sequence that it was fitted on [m].
-        cloud: Object points seen at frame 0 of the other sequence [m].
-        iterations: Alignment steps from each heading.
-
-    Returns:
-        The nodes in the other sequence [m].
-    """
-    tree = KDTree(cloud)
-    best, best_error = template, np.inf
-    for turn in np.arange(8) * np.pi / 4:
-        heading = Rotation.from_euler("z", turn).as_matrix()
-        node = (template - template.mean(axis=0)) @ heading.T + cloud.mean(axis=0)
-        for _ in range(iterations):
-            target = cloud[tree.query(node)[1]]
-            centred = node - node.mean(axis=0)
-            rotation = Rotation.align_vectors(target - target.mean(axis=0), centred)[0]
-            node = rotation.apply(centred) + target.mean(axis=0)
-        error = float(
-            np.mean(tree.query(node)[0] ** 2) + np.mean(KDTree(node).query(cloud)[0] ** 2)
-        )
-        if error < best_error:
-            best, best_error = node, error
-    return best.astype(np.float32)
-
-
-LEAST_CLOUD = 10
-
-
-def control_trajectory_of(
-    sequence: Sequence, motions: tuple[HandMotion, ...], config: PipelineConfig
-) -> Float[ndarray, "frame control 3"]:
-    """Give the control nodes of a sequence over all frames [m].
+        run: Run that fitted the object; its settings are used.
+        sequence: The other recording.
+        template: Nodes in a sequence of the run, and at rest [m].
+        progress: Receives reports of the stages.
 
     Raises:
-        MissingInputError: If the sequence has neither hands nor point controllers.
+        MissingInputError: If the recording lacks hands, controls or observations of the object.
+        FitError: If it shows another object, or its hands too poorly.
+        RunError: If the run's settings cannot be read.
     """
-    if sequence.control is not None:
-        return np.asarray(sequence.control, np.float32)
-    if not motions:
-        raise MissingInputError(
-            f"Sequence '{sequence.name}' has neither hands nor control.npy: nothing moves its "
-            "object."
-        )
-    models = _hand_models(motions)
-    vertex = control_trajectory(motions, models)
-    chosen = _chosen_vertices(sequence, vertex[0], models, config)
-    return vertex if chosen is None else vertex[:, chosen]
-
-
-def refine_sequence(
-    output: Attempt,
-    sequence: Sequence,
-    problem: ObjectProblem,
-    config: PipelineConfig,
-    progress: Progress,
-    *,
-    device: str,
-) -> RefinedHands:
-    """Correct the stored hands of a sequence so that its stored object moves as it was seen to."""
-    motions = artefacts.load_motions(output.out, sequence.name)
-    models = _hand_models(motions)
-    vertex = control_trajectory(motions, models)
-    keypoint = artefacts.load_array(output.out / SequenceFiles(sequence.name).keypoint)
-    cameras = [view.camera for view in sequence.views]
-    seen = keypoint[:, : problem.frame_count]
-    return refine_hands(
-        RefinementProblem(
-            object_=problem,
-            model=artefacts.load_model(output.out, sequence.name),
-            parameters=artefacts.load_parameters(output.out),
-            motions=motions,
-            hand_models=models,
-            chosen=_chosen_vertices(sequence, vertex[0], models, config),
-            targets=tuple(
-                keypoint_target(
-                    cameras,
-                    seen[:, :, sequence.hands.index(motion.side)],
-                    config.hand.keypoint_noise,
-                )
-                for motion in motions
-            ),
-        ),
-        config.refinement,
-        progress,
-        device=device,
+    while run.kind == "simulation":
+        run = RunFolder.open(Path(run.config["source"]))
+    config = PipelineConfig.from_dict(run.config["profile"])
+    hands = reconstruct_hands(sequence, config.hand, progress) if sequence.hands else None
+    observation = observe_object(sequence, progress)
+    node, _ = object_nodes_of(sequence, observation, config.node_spacing, template)
+    velocity = np.zeros_like(node)
+    if not config.object_.starts_at_rest:
+        velocity = initial_velocity(observation, node, sequence.frame_rate)
+    motions = () if hands is None else hands.motions
+    return PlacedObject(
+        hands=hands,
+        observation=observation,
+        node=node,
+        velocity=velocity,
+        control=control_trajectory_of(sequence, motions, config),
     )
-
-
-def store_refined(
-    output: Attempt, sequence: Sequence, problem: ObjectProblem, refined: RefinedHands
-) -> None:
-    """Put corrected hands in the place of the stored ones.
-
-    The hands as they were are kept as ``hand_<side>_initial``, and where their control nodes were
-    when the springs were laid as ``attachment``: a topology built anew must begin there.
-    """
-    motions = artefacts.load_motions(output.out, sequence.name)
-    artefacts.save_refinement(output, sequence.name, motions, problem.control[0], refined.motions)
-    output.save_array(SequenceFiles(sequence.name).control, refined.control.astype(np.float32))
-
-
-def _hand_models(motions: tuple[HandMotion, ...]) -> tuple[HandModel, ...]:
-    return tuple(load_hand_model(motion.side, motion.model) for motion in motions)
-
-
-def _chosen_vertices(
-    sequence: Sequence,
-    vertex: Float[ndarray, "vertex 3"],
-    models: tuple[HandModel, ...],
-    config: PipelineConfig,
-) -> Int[ndarray, " control"] | None:
-    """Choose among all hands' vertices of frame 0 those that become control nodes; None is all."""
-    if config.control_nodes == "all":
-        return None
-    offset, seen = 0, []
-    for model in models:
-        surface = vertex[offset : offset + model.vertex_count]
-        seen.append(visible_vertices(sequence.views, surface, model.faces) + offset)
-        offset += model.vertex_count
-    candidates = np.concatenate(seen)
-    return candidates[farthest_points(vertex[candidates], config.control_count)]
 
 
 def object_nodes_of(
@@ -197,17 +97,17 @@ def object_nodes_of(
     spacing: float,
     template: tuple[ndarray, ndarray] | None,
 ) -> tuple[Float[ndarray, "node 3"], Float[ndarray, "node 3"]]:
-    """Give the object nodes at frame 0 and their rest shape [m].
+    """Find the object nodes at frame 0 and their rest shape [m].
 
     Args:
-        sequence: Where the object is to be placed.
-        observation: What was seen of it there.
-        spacing: Distance between nodes that are sampled from what was seen [m].
+        sequence: Recording in which the object is placed.
+        observation: Observation of the object in it.
+        spacing: Distance between nodes if they are sampled from the observation [m].
         template: Nodes and rest shape in the first sequence, if the object is known already.
 
     Raises:
-        FitError: If the sequence identifies another number of nodes than the template has.
-        MissingInputError: If frame 0 shows nothing of the object.
+        FitError: If the sequence has another number of object nodes than the template.
+        MissingInputError: If frame 0 shows too little of the object.
     """
     if sequence.object_node is not None:
         node = np.asarray(sequence.object_node, np.float32)
@@ -231,55 +131,156 @@ def object_nodes_of(
     return lay_object(template[0], cloud), template[1]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PlacedObject:
-    """A known object in a recording that it was not fitted in."""
+def lay_object(
+    template: Float[ndarray, "node 3"], cloud: Float[ndarray, "point 3"], *, iterations: int = 40
+) -> Float[ndarray, "node 3"]:
+    """Move a known object rigidly onto the cloud of another sequence's frame 0.
 
-    hands: HandFit | None
-    """The hands of the recording; None if it shows none."""
-    observation: ObjectObservation
-    """What the recording shows of the object."""
-    node: Float[ndarray, "node 3"]
-    """Object nodes at frame 0 [m]."""
-    velocity: Float[ndarray, "node 3"]
-    """Their velocities at frame 0 [m/s]."""
-    control: Float[ndarray, "frame control 3"]
-    """Control nodes [m]."""
-
-
-def place_object(
-    run: RunFolder,
-    sequence: Sequence,
-    template: tuple[Float[ndarray, "node 3"], Float[ndarray, "node 3"]],
-    progress: Progress,
-) -> PlacedObject:
-    """Reconstruct the hands of another recording and lay a known object into its frame 0.
+    Point-to-point ICP from eight headings around the vertical; the best result wins. It assumes
+    that the object starts in about the shape in which it was first reconstructed.
 
     Args:
-        run: Run that fitted the object; its settings are used.
-        sequence: The other recording.
-        template: Nodes in a sequence of the run, and at rest [m].
-        progress: Told about every iteration.
+        template: Nodes of the object in the sequence that it was fitted on [m].
+        cloud: Object points at frame 0 of the other sequence [m].
+        iterations: Alignment steps from each heading.
+    """
+    tree = KDTree(cloud)
+    best, best_error = template, np.inf
+    for turn in np.arange(8) * np.pi / 4:
+        heading = Rotation.from_euler("z", turn).as_matrix()
+        node = (template - template.mean(axis=0)) @ heading.T + cloud.mean(axis=0)
+        for _ in range(iterations):
+            target = cloud[tree.query(node)[1]]
+            centred = node - node.mean(axis=0)
+            rotation = Rotation.align_vectors(target - target.mean(axis=0), centred)[0]
+            node = rotation.apply(centred) + target.mean(axis=0)
+        error = float(
+            np.mean(tree.query(node)[0] ** 2) + np.mean(KDTree(node).query(cloud)[0] ** 2)
+        )
+        if error < best_error:
+            best, best_error = node, error
+    return best.astype(np.float32)
+
+
+def control_trajectory_of(
+    sequence: Sequence, motions: tuple[HandMotion, ...], config: PipelineConfig
+) -> Float[ndarray, "frame control 3"]:
+    """Compute the control nodes of a sequence over all frames [m].
 
     Raises:
-        MissingInputError: If the recording lacks what moves or shows the object.
-        FitError: If it shows another object, or its hands are not seen well enough.
-        RunError: If the run's settings cannot be read.
+        MissingInputError: If the sequence has neither hands nor point controllers.
     """
-    while run.kind == "simulation":
-        run = RunFolder.open(Path(run.config["source"]))
-    config = PipelineConfig.from_dict(run.config["profile"])
-    hands = reconstruct_hands(sequence, config.hand, progress) if sequence.hands else None
-    observation = observe_object(sequence, progress)
-    node, _ = object_nodes_of(sequence, observation, config.node_spacing, template)
-    velocity = np.zeros_like(node)
-    if not config.object_.starts_at_rest:
-        velocity = initial_velocity(observation, node, sequence.frame_rate)
-    motions = () if hands is None else hands.motions
-    return PlacedObject(
-        hands=hands,
-        observation=observation,
-        node=node,
-        velocity=velocity,
-        control=control_trajectory_of(sequence, motions, config),
+    if sequence.control is not None:
+        return np.asarray(sequence.control, np.float32)
+    if not motions:
+        raise MissingInputError(
+            f"Sequence '{sequence.name}' has neither hands nor control.npy: nothing moves its "
+            "object."
+        )
+    models = _hand_models(motions)
+    vertex = control_trajectory(motions, models)
+    chosen = _chosen_vertices(sequence, vertex[0], models, config)
+    return vertex if chosen is None else vertex[:, chosen]
+
+
+def _hand_models(motions: tuple[HandMotion, ...]) -> tuple[HandModel, ...]:
+    return tuple(load_hand_model(motion.side, motion.model) for motion in motions)
+
+
+def _chosen_vertices(
+    sequence: Sequence,
+    vertex: Float[ndarray, "vertex 3"],
+    models: tuple[HandModel, ...],
+    config: PipelineConfig,
+) -> Int[ndarray, " control"] | None:
+    """Choose control nodes among all hands' vertices of frame 0; None for all."""
+    if config.control_nodes == "all":
+        return None
+    offset, visible = 0, []
+    for model in models:
+        surface = vertex[offset : offset + model.vertex_count]
+        visible.append(visible_vertices(sequence.views, surface, model.faces) + offset)
+        offset += model.vertex_count
+    candidates = np.concatenate(visible)
+    return candidates[farthest_points(vertex[candidates], config.control_count)]
+
+
+def visible_vertices(
+    views: Listing[View], vertex: Float[ndarray, "vertex 3"], faces: Int[ndarray, "face 3"]
+) -> Int[ndarray, " visible"]:
+    """Find the hand vertices whose surface faces at least one camera.
+
+    Occlusion by the object or by other fingers is not considered.
+    """
+    corner = vertex[faces]
+    face_normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal = np.zeros_like(vertex)
+    for k in range(3):
+        np.add.at(normal, faces[:, k], face_normal)
+    is_visible = np.zeros(len(vertex), bool)
+    for view in views:
+        eye = view.camera.T_world_camera[:3, 3]
+        is_visible |= ((eye - vertex) * normal).sum(axis=1) > 0
+    return np.flatnonzero(is_visible)
+
+
+def farthest_points(point: Float[ndarray, "point 3"], count: int) -> Int[ndarray, " chosen"]:
+    """Sample indices of points that are far from each other, beginning with the first one."""
+    chosen = [0]
+    distance = np.linalg.norm(point - point[0], axis=1)
+    while len(chosen) < min(count, len(point)):
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(point - point[chosen[-1]], axis=1))
+    return np.array(chosen)
+
+
+def refine_sequence(
+    output: Attempt,
+    sequence: Sequence,
+    problem: ObjectProblem,
+    config: PipelineConfig,
+    progress: Progress,
+    *,
+    device: str,
+) -> RefinedHands:
+    """Run stage 3 on the stored hands and the stored object of a sequence."""
+    motions = artefacts.load_motions(output.out, sequence.name)
+    models = _hand_models(motions)
+    vertex = control_trajectory(motions, models)
+    keypoint = artefacts.load_array(output.out / SequenceFiles(sequence.name).keypoint)
+    cameras = [view.camera for view in sequence.views]
+    fitted_keypoint = keypoint[:, : problem.frame_count]
+    return refine_hands(
+        RefinementProblem(
+            object_=problem,
+            model=artefacts.load_model(output.out, sequence.name),
+            parameters=artefacts.load_parameters(output.out),
+            motions=motions,
+            hand_models=models,
+            chosen=_chosen_vertices(sequence, vertex[0], models, config),
+            targets=tuple(
+                keypoint_target(
+                    cameras,
+                    fitted_keypoint[:, :, sequence.hands.index(motion.side)],
+                    config.hand.keypoint_noise,
+                )
+                for motion in motions
+            ),
+        ),
+        config.refinement,
+        progress,
+        device=device,
     )
+
+
+def store_refined(
+    output: Attempt, sequence: Sequence, problem: ObjectProblem, refined: RefinedHands
+) -> None:
+    """Replace the stored hands by the corrected ones.
+
+    The previous hands remain as ``hand_<side>_initial``, and their control nodes of frame 0 as
+    ``attachment``, because a topology that is rebuilt must attach its springs there.
+    """
+    motions = artefacts.load_motions(output.out, sequence.name)
+    artefacts.save_refinement(output, sequence.name, motions, problem.control[0], refined.motions)
+    output.save_array(SequenceFiles(sequence.name).control, refined.control.astype(np.float32))

@@ -1,4 +1,4 @@
-"""Shows how the object moves as it is fitted, mostly from simulations that are made anyway."""
+"""Previews of the simulated object during a fit."""
 
 import math
 from collections.abc import Callable
@@ -11,60 +11,47 @@ from physhandi.progress import Preview, Progress
 
 
 class RolloutPreview:
-    """Hands simulated motions on to whoever watches."""
+    """Sends simulated motions of one stage to the progress receiver, when it wants a preview.
+
+    Most are rollouts that the fit computes anyway (`update`, then `show`).
+    """
 
     def __init__(self, stage: str, progress: Progress) -> None:
-        """Prepare.
-
-        Args:
-            stage: Name of the stage.
-            progress: Says when it is time for a preview, and takes it.
-        """
         self._stage = stage
         self._progress = progress
-        self._seen: tuple[ObjectProblem, Tensor, Tensor | None] | None = None
+        self._latest: tuple[ObjectProblem, Tensor, Tensor | None] | None = None
 
-    def see(
+    def update(
         self,
         problem: ObjectProblem,
         node: Float[Tensor, "frame node 3"],
         control: Float[Tensor, "frame control 3"] | None = None,
     ) -> None:
-        """Take note of a simulated motion; of several sequences the first one is shown.
+        """Remember a simulated motion; of several sequences only the first is shown.
 
         Args:
             problem: The sequence.
             node: Its object nodes [m].
-            control: Its control nodes, if they are not those of the problem [m].
+            control: Its control nodes, if they differ from those of the problem [m].
         """
-        if self._seen is None or self._seen[0].name == problem.name:
-            self._seen = problem, node, control
+        if self._latest is None or self._latest[0].name == problem.name:
+            self._latest = problem, node, control
 
     def show(self, loss: float) -> None:
-        """Show the motion seen last, if it is time.
-
-        Args:
-            loss: Its loss [m²].
-        """
-        if self._seen is not None and self._progress.wants_preview():
-            problem, node, control = self._seen
+        """Show the remembered motion and its loss [m²], if a preview is due."""
+        if self._latest is not None and self._progress.wants_preview():
+            problem, node, control = self._latest
             self._progress.preview(lambda: self._preview(problem, loss, node, control))
 
-    def show_made(
+    def show_simulated(
         self,
         problem: ObjectProblem,
         loss: float,
-        make: Callable[[], Float[Tensor, "frame node 3"]],
+        simulate: Callable[[], Float[Tensor, "frame node 3"]],
     ) -> None:
-        """Show a motion that is simulated for this alone, if it is time; the rarer the longer.
-
-        Args:
-            problem: The sequence.
-            loss: Loss of the motion [m²].
-            make: Simulates it.
-        """
+        """Simulate a motion for the preview alone and show it with its loss [m²], if one is due."""
         if self._progress.wants_preview():
-            self._progress.preview(lambda: self._preview(problem, loss, make()))
+            self._progress.preview(lambda: self._preview(problem, loss, simulate()))
 
     def _preview(
         self,
@@ -75,12 +62,12 @@ class RolloutPreview:
     ) -> Preview:
         frames = len(node)
         moved = problem.control[:frames] if control is None else control.detach().cpu().numpy()
-        # Markers have no cloud, but tracks.
+        # A sequence of markers has tracks and no cloud.
         point, is_known = problem.cloud, problem.is_observed
         if not point.shape[1]:
             point, is_known = problem.track, problem.is_valid
         unknown = point.new_tensor(math.nan)
-        seen = where(is_known[:frames, :, None], point[:frames], unknown)
+        observed = where(is_known[:frames, :, None], point[:frames], unknown)
         return Preview(
             stage=self._stage,
             sequence=problem.name,
@@ -89,6 +76,6 @@ class RolloutPreview:
             points={
                 "object": node.detach().cpu().numpy(),
                 "control": moved,
-                "seen": seen.cpu().numpy(),
+                "seen": observed.cpu().numpy(),
             },
         )

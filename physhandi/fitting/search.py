@@ -1,4 +1,4 @@
-"""The zeroth-order stage: search the few global parameters that no gradient reaches."""
+"""Stage 2, zeroth order: CMA-ES over the global parameters that have no gradient."""
 
 import math
 import warnings
@@ -16,14 +16,18 @@ from physhandi.progress import Progress
 from physhandi.simulation.parameters import SimulationParameters
 
 SEARCH_STAGE = "zeroth_order"
+"""Name of the stage in progress reports."""
+Evaluate = Callable[[list[SimulationParameters]], Many[tuple[SimulationParameters, float]]]
+"""Fills in what follows from each candidate's values, such as its substeps, and computes its loss
+[m²], infinite where its simulation diverges."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SearchResult:
-    """The best global parameters that the search saw."""
+    """The best global parameters of a search."""
 
     parameters: SimulationParameters
-    """Best parameters; the start itself if nothing was better."""
+    """Best parameters; those of the start if nothing was better."""
     loss_before: float
     """Loss of the start values [m²]."""
     loss_after: float
@@ -32,35 +36,27 @@ class SearchResult:
     """Evaluations so far and best loss, once a generation."""
 
 
-Judgement = Callable[[list[SimulationParameters]], Many[tuple[SimulationParameters, float]]]
-"""Completes candidates by what follows from their values, such as their substeps, and gives each
-its loss [m²], infinite where its simulation diverges."""
-
-
 def search_parameters(
-    judge: Judgement, start: SimulationParameters, config: SearchConfig, progress: Progress
+    evaluate: Evaluate, start: SimulationParameters, config: SearchConfig, progress: Progress
 ) -> SearchResult:
     """Search global parameters with CMA-ES (paper, zeroth-order stage; PhysTwin §4.2).
 
     Args:
-        judge: Called once with the start and once with each generation.
-        start: Parameters to start from; those that are not searched keep their values.
+        evaluate: Called once with the start and once with each generation.
+        start: Initial parameters; those that are not searched keep their values.
         config: Intervals and effort.
-        progress: Told once a generation.
-
-    Returns:
-        The best parameters ever seen and how the loss went.
+        progress: Receives a report each generation.
 
     Raises:
         FitError: If every candidate diverges.
     """
     with warnings.catch_warnings():
-        # It only misses matplotlib, whose plots are not used.
+        # cma warns that it cannot import matplotlib, which only its unused plots need.
         warnings.filterwarnings("ignore", message="Could not import matplotlib")
         import cma
 
     names = list(config.variables)
-    ((start, loss_before),) = judge([start])
+    ((start, loss_before),) = evaluate([start])
     best, best_loss = start, loss_before
     curve = [[1.0, loss_before]]
     if not names or config.generations == 0:
@@ -77,7 +73,7 @@ def search_parameters(
 
     if not config.keeps_start:
         best_loss = math.inf
-    # pycma 4.5 fails when it shortens the step of a single variable, so there it is left alone.
+    # pycma 4.5 fails when it bounds the step of a single variable.
     longest = config.longest_step if len(names) > 1 else None
     options = {
         "bounds": [0, 1],
@@ -91,19 +87,19 @@ def search_parameters(
     first = np.array(
         [config.variables[name].to_unit(float(getattr(start, name))) for name in names]
     )
-    # Exactly on a bound CMA's transform has no slope, so a start there could never leave it.
+    # CMA's transform has zero slope exactly on a bound, so a start there could never leave it.
     strategy = cma.CMAEvolutionStrategy(np.clip(first, 0.01, 0.99), config.sigma, options)
     evaluations = 1
     for generation in range(config.generations):
         progress.check_cancelled()
         units = strategy.ask()
-        judged = judge([candidate(unit) for unit in units])
-        losses = [loss for _, loss in judged]
+        evaluated = evaluate([candidate(unit) for unit in units])
+        losses = [loss for _, loss in evaluated]
         evaluations += len(losses)
         winner = int(np.argmin(losses))
         if losses[winner] < best_loss:
-            best, best_loss = judged[winner]
-        # Rank decides in CMA, so any value above all finite ones stands for "diverged".
+            best, best_loss = evaluated[winner]
+        # CMA uses ranks only, so any value above all finite ones stands for "diverged".
         finite = [loss for loss in losses if math.isfinite(loss)]
         worst = max(finite, default=1.0)
         strategy.tell(units, [loss if math.isfinite(loss) else 10.0 * worst for loss in losses])

@@ -1,4 +1,7 @@
-"""Stage 2, first order: a stiffness and a damping for every spring, by gradient descent."""
+"""Stage 2, first order: fits a stiffness and a damping of every spring by gradient descent.
+
+`optimise_springs` owns the loop, `Material` the learned values, `SpringDescent` the gradients.
+"""
 
 import logging
 import math
@@ -34,16 +37,161 @@ CONTACT = {
     "self_restitution": (0.0, 1.0),
     "self_friction": (0.0, 2.0),
 }
-"""Interval of each contact coefficient; outside it acts as at the nearer end (physics.md §3.2)."""
+"""Interval to which the simulator clamps each contact coefficient (physics.md §3.2)."""
 SMALLEST_VALUE = 1e-6
-"""Stands for a zero, which has no logarithm, in a spring's stiffness [N] or damping [N·s/m]."""
+"""Lower bound of stiffness [N] and damping [N·s/m] before the logarithm is taken."""
+State = tuple[Float[Tensor, "node 3"], Float[Tensor, "node 3"]]
+"""Positions [m] and velocities [m/s] of the object nodes."""
+SPRING_STAGE = "first_order"
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FirstOrderResult:
+    """Models with a fitted stiffness and damping for every spring."""
+
+    models: dict[str, SpringMassModel]
+    """The fitted model of each sequence; object springs are the same in all."""
+    parameters: SimulationParameters
+    """The global parameters, with the substeps that the fitted springs need and, if contact is
+    learned, its coefficients."""
+    loss_before: float
+    """Mean loss of the start [m²]."""
+    loss_after: float
+    """Mean loss of the returned models [m²]."""
+    curve: list[list[float]]
+    """Iteration and the mean loss that ranks it [m²]."""
+    stopped: str = ""
+    """Why the descent ended early; empty if all iterations were made."""
+
+
+def optimise_springs(
+    problems: Many[ObjectProblem],
+    parameters: SimulationParameters,
+    config: ObjectFitConfig,
+    progress: Progress,
+    *,
+    device: str = "cpu",
+) -> FirstOrderResult:
+    """Fit each spring's own stiffness and damping by gradient descent through the simulator.
+
+    The gradient reaches back over `FirstOrderConfig.window` frames, or the whole sequence.
+
+    Args:
+        problems: One for each sequence; all show the same object.
+        parameters: Global parameters that the search found.
+        config: Settings of stage 2.
+        progress: Receives a report each iteration.
+        device: Warp device.
+
+    Returns:
+        The best models, as `FirstOrderConfig` ranks them.
+
+    Raises:
+        FitError: If the start diverges or has no usable gradient, or if the best-ranked springs
+            diverge. A later failure ends the descent, and the best so far is returned.
+    """
+    settings = config.first_order
+    if settings.truncates_damping:
+        parameters = _truncated(parameters)
+    models = {p.name: build_problem_model(p, parameters) for p in problems}
+    # Springs may stiffen while they are fitted, so the limit is kept farther away.
+    parameters = settle_substeps(
+        list(models.values()), parameters, config, safety=SUBSTEP_SAFETY * SUBSTEP_SAFETY
+    )
+    material = Material(models, parameters, settings)
+    loss_before = _finite(
+        mean_loss(problems, models, parameters, config, device),
+        "The searched parameters diverge; raise substeps_per_frame in the profile.",
+    )
+    best, best_parameters = dict(models), parameters
+    best_loss = math.inf if settings.judges_online else loss_before
+    curve = [[0.0, loss_before]]
+    descent = SpringDescent(material, parameters, config, device)
+    preview = RolloutPreview(SPRING_STAGE, progress)
+    stopped = ""
+    for iteration in range(settings.iterations):
+        progress.check_cancelled()
+        try:
+            losses = [
+                descent.fit_pass(p, models[p.name], _horizon(iteration, settings, p.frame_count))
+                for p in problems
+            ]
+            message = _skipped_message(problems, losses)
+        except (SimulationDivergedError, FitError) as error:
+            if isinstance(error, FitError) and iteration == 0:
+                raise
+            stopped = f"Stopped after {iteration} of {settings.iterations} iterations. {error}"
+            logger.warning("%s: %s", SPRING_STAGE, stopped)
+            progress.report(SPRING_STAGE, iteration, settings.iterations, best_loss, stopped)
+            break
+        now = {name: material.model(name, model) for name, model in models.items()}
+        now_parameters = material.parameters(parameters)
+        if settings.judges_online:
+            loss = float(np.mean([value for value in losses if value is not None]))
+        else:
+            loss = mean_loss(
+                problems, now, now_parameters, config, device, on_rollout=preview.update
+            )
+            preview.show(loss)
+        if _is_judged(iteration, settings) and loss < best_loss:
+            best, best_parameters, best_loss = now, now_parameters, loss
+        curve.append([float(iteration + 1), loss])
+        progress.report(SPRING_STAGE, iteration + 1, settings.iterations, loss, message)
+    if settings.judges_online:
+        best_loss = _finite(
+            mean_loss(problems, best, best_parameters, config, device),
+            "The springs that did best while they were fitted diverge when simulated from start "
+            "to end; raise substeps_per_frame or switch judges_online off in the profile.",
+        )
+    return FirstOrderResult(
+        models=best,
+        parameters=best_parameters,
+        loss_before=loss_before,
+        loss_after=best_loss,
+        curve=curve,
+        stopped=stopped,
+    )
+
+
+def _truncated(parameters: SimulationParameters) -> SimulationParameters:
+    damping, drag = math.trunc(parameters.damping), math.trunc(parameters.drag)
+    return parameters.replace(damping=float(damping), drag=float(drag))
+
+
+def _horizon(iteration: int, config: FirstOrderConfig, frame_count: int) -> int:
+    if not config.is_annealed or config.window is not None:
+        return frame_count
+    done = min(1.0, (iteration + 1) / max(1.0, config.iterations / 2))
+    return max(2, round(frame_count * (0.25 + 0.75 * done)))
+
+
+def _is_judged(iteration: int, config: FirstOrderConfig) -> bool:
+    return iteration % config.judged_every == 0 or iteration == config.iterations - 1
+
+
+def _skipped_message(problems: Many[ObjectProblem], losses: list[float | None]) -> str:
+    """Name the sequences without a usable gradient; at least one must have had one."""
+    skipped = [p.name for p, loss in zip(problems, losses, strict=True) if loss is None]
+    if len(skipped) == len(problems):
+        raise FitError(
+            "No sequence has a usable gradient, not even over one frame. Raise substeps_per_frame, "
+            "or lower the upper ends of the stiffness and damping intervals."
+        )
+    return f"too chaotic to learn from: {', '.join(skipped)}" if skipped else ""
+
+
+def _finite(loss: float, otherwise: str) -> float:
+    if not math.isfinite(loss):
+        raise FitError(otherwise)
+    return loss
 
 
 class Material:
-    """Logarithms of stiffness and damping, object springs shared, virtual springs per sequence.
+    """Learned logarithms of stiffness and damping: object springs shared, virtual ones a sequence.
 
-    A spring that starts without stiffness is off and stays off, dashpot included: where PhysTwin's
-    linear search reaches 0 N, its springs have the logarithm -∞ and no gradient.
+    A spring that starts without stiffness stays off, dashpot included: where PhysTwin's linear
+    search reaches 0 N, the logarithm is -∞ and has no gradient.
     """
 
     def __init__(
@@ -56,8 +204,8 @@ class Material:
 
         Args:
             models: Model of each sequence; they must share their object springs.
-            parameters: Where the contact coefficients start.
-            config: What is learned.
+            parameters: Initial contact coefficients.
+            config: Says whether damping and contact are learned.
 
         Raises:
             FitError: If two sequences connect the object's nodes differently.
@@ -86,11 +234,11 @@ class Material:
             }
 
     def logarithms(self) -> list[Tensor]:
-        """The learned logarithms, of stiffness (row 0) and damping (row 1) of some springs."""
+        """The learned logarithms: stiffness (row 0) and damping (row 1) of a group of springs."""
         return [self._shared, *self._own.values()]
 
     def tensors(self) -> list[Tensor]:
-        """All that is learned."""
+        """All learned tensors, for the optimizer."""
         return [*self.logarithms(), *self._contact.values()]
 
     def of(self, name: str) -> tuple[Float[Tensor, " spring"], Float[Tensor, " spring"]]:
@@ -109,7 +257,7 @@ class Material:
         return dict(self._contact)
 
     def gradient(self, name: str) -> Float[Tensor, " spring"]:
-        """Gradient that a backward pass left in the log stiffness of one sequence's springs."""
+        """Gradient of the latest backward pass with respect to one sequence's log stiffness."""
         parts = (self._shared, self._own[name])
         rows = [torch.zeros_like(part[0]) if part.grad is None else part.grad[0] for part in parts]
         return torch.cat(rows)
@@ -120,7 +268,7 @@ class Material:
         return torch.stack([((now - then) ** 2).sum() for now, then in pairs]).sum()
 
     def model(self, name: str, model: SpringMassModel) -> SpringMassModel:
-        """Put what was learned of the springs into one sequence's model."""
+        """Replace the springs of one sequence's model by the learned ones."""
         log_stiffness, damping = self.of(name)
         return replace(
             model,
@@ -129,7 +277,7 @@ class Material:
         )
 
     def parameters(self, parameters: SimulationParameters) -> SimulationParameters:
-        """Put what was learned of contact into the global parameters, as it acts."""
+        """Replace the contact coefficients by the learned ones, clamped as the simulator does."""
         learned = {
             name: min(max(float(value.detach()), CONTACT[name][0]), CONTACT[name][1])
             for name, value in self._contact.items()
@@ -142,22 +290,18 @@ def _logarithms(model: SpringMassModel, part: slice) -> Tensor:
     return torch.log(torch.from_numpy(both).clamp(min=SMALLEST_VALUE)).requires_grad_()
 
 
-State = tuple[Float[Tensor, "node 3"], Float[Tensor, "node 3"]]
-"""Positions [m] and velocities [m/s] of the object nodes."""
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FitWindow:
-    """A few simulated frames whose gradient lies in the material."""
+    """A window of simulated frames whose gradient has been computed."""
 
     frame_losses: Float[Tensor, " frame"]
-    """Loss of each frame, with the material as it was [m²]."""
+    """Loss of each frame before the update [m²]."""
     state: State
-    """Where the nodes were in the last frame."""
+    """State of the nodes in the last frame."""
 
 
-class Descent:
-    """Walks through sequences and learns the material on the way, from sane gradients only."""
+class SpringDescent:
+    """Adam on the material, window by window, by gradients of bounded norm only."""
 
     def __init__(
         self,
@@ -179,19 +323,19 @@ class Descent:
     def fit_pass(
         self, problem: ObjectProblem, model: SpringMassModel, horizon: int
     ) -> float | None:
-        """Walk once through a sequence and update after every window of frames.
+        """Simulate a sequence once and update the material after every window of frames.
 
-        Each window starts where the last one ended, with the material that has since changed
+        Each window starts in the state in which the last one ended, with the updated material
         (physics.md §4.3).
 
         Args:
             problem: The sequence.
-            model: Its springs, as they were at the start.
+            model: Its springs before any update.
             horizon: Frames of the pass, frame 0 included.
 
         Returns:
-            Mean loss met on the way [m²], or none if a window had no usable gradient; the rest of
-            the sequence is then left out.
+            Mean loss over all windows [m²]; None if a window had no usable gradient, where the
+            pass ends.
 
         Raises:
             SimulationDivergedError: If the motion runs away.
@@ -217,20 +361,20 @@ class Descent:
         frames: tuple[int, int],
         state: State,
     ) -> FitWindow | None:
-        """Simulate one window and leave the gradient of its mean loss in the material.
+        """Simulate one window and compute the gradient of its mean loss.
 
-        Motion that is chaotic over the window has gradients that grow without bound and point
-        nowhere. The gradient then reaches back over half as many frames, and again half as many
-        until it is sane; how far it came is tried first the next time.
+        Where motion is chaotic, gradients grow without bound and have no useful direction. The
+        number of frames that the gradient reaches back over is then halved until its norm is
+        within `FirstOrderConfig.steepest`; that reach is where the next window begins.
 
         Args:
             problem: The sequence.
             model: Its springs.
-            frames: First frame, whose state is given, and last frame.
+            frames: First and last frame of the window.
             state: The nodes in the first frame.
 
         Returns:
-            What was simulated, or none if not even one frame has a sane gradient.
+            The simulated window; None if even over one frame the gradient is too steep.
         """
         begin, end = frames
         steepest = self._config.first_order.steepest
@@ -260,7 +404,7 @@ class Descent:
             prior = self._config.first_order.prior_weight * self.material.distance_from_start()
             loss = frame_losses.mean() + prior
             loss.backward()
-            if steepest is None or self._slope() <= steepest * float(loss.detach()):
+            if steepest is None or self._steepness() <= steepest * float(loss.detach()):
                 if reach < end - begin:
                     self._reach[problem.name] = reach
                 last = node[-1].detach(), velocity[-1].detach()
@@ -268,149 +412,7 @@ class Descent:
             reach //= 2
         return None
 
-    def _slope(self) -> float:
+    def _steepness(self) -> float:
+        """Largest norm of the gradients of the logarithms."""
         gradients = [t.grad for t in self.material.logarithms() if t.grad is not None]
         return max(float(gradient.double().norm()) for gradient in gradients)
-
-
-SPRING_STAGE = "first_order"
-logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, kw_only=True)
-class FirstOrderResult:
-    """Models with a fitted stiffness and damping for every spring."""
-
-    models: dict[str, SpringMassModel]
-    """The fitted model of each sequence; object springs are the same in all."""
-    parameters: SimulationParameters
-    """The global parameters, with the substeps that the fitted springs need and, where contact is
-    learned, its coefficients."""
-    loss_before: float
-    """Mean loss of the start [m²]."""
-    loss_after: float
-    """Mean loss of the returned models [m²]."""
-    curve: list[list[float]]
-    """Iteration and mean loss, as iterations are ranked by."""
-    stopped: str = ""
-    """Why it went no further than it did; empty if all iterations were made."""
-
-
-def _horizon(iteration: int, config: FirstOrderConfig, frame_count: int) -> int:
-    if not config.is_annealed or config.window is not None:
-        return frame_count
-    done = min(1.0, (iteration + 1) / max(1.0, config.iterations / 2))
-    return max(2, round(frame_count * (0.25 + 0.75 * done)))
-
-
-def optimise_springs(
-    problems: Many[ObjectProblem],
-    parameters: SimulationParameters,
-    config: ObjectFitConfig,
-    progress: Progress,
-    *,
-    device: str = "cpu",
-) -> FirstOrderResult:
-    """Give each spring its own stiffness and damping by gradient descent through the simulator.
-
-    The gradient reaches back over `FirstOrderConfig.window` frames, or the whole sequence.
-
-    Args:
-        problems: One for each sequence, with one object between them.
-        parameters: Global parameters found before.
-        config: What stage 2 does.
-        progress: Told once an iteration.
-        device: Warp device.
-
-    Returns:
-        The best models, as `FirstOrderConfig` ranks them.
-
-    Raises:
-        FitError: If the start already diverges or has no usable gradient, or what was ranked best
-            diverges. What goes wrong later ends the descent, and the best so far is returned.
-    """
-    settings = config.first_order
-    if settings.truncates_damping:
-        parameters = _truncated(parameters)
-    models = {p.name: build_problem_model(p, parameters) for p in problems}
-    # Springs may stiffen while they are fitted, so the limit is kept farther away.
-    parameters = settle_substeps(
-        list(models.values()), parameters, config, safety=SUBSTEP_SAFETY * SUBSTEP_SAFETY
-    )
-    material = Material(models, parameters, settings)
-    loss_before = _finite(
-        mean_loss(problems, models, parameters, config, device),
-        "The searched parameters diverge; raise substeps_per_frame in the profile.",
-    )
-    best, best_parameters = dict(models), parameters
-    best_loss = math.inf if settings.judges_online else loss_before
-    curve = [[0.0, loss_before]]
-    descent = Descent(material, parameters, config, device)
-    preview = RolloutPreview(SPRING_STAGE, progress)
-    stopped = ""
-    for iteration in range(settings.iterations):
-        progress.check_cancelled()
-        try:
-            met = [
-                descent.fit_pass(p, models[p.name], _horizon(iteration, settings, p.frame_count))
-                for p in problems
-            ]
-            note = _tell(problems, met)
-        except (SimulationDivergedError, FitError) as error:
-            if isinstance(error, FitError) and iteration == 0:
-                raise
-            stopped = f"Stopped after {iteration} of {settings.iterations} iterations. {error}"
-            logger.warning("%s: %s", SPRING_STAGE, stopped)
-            progress.report(SPRING_STAGE, iteration, settings.iterations, best_loss, stopped)
-            break
-        now = {name: material.model(name, model) for name, model in models.items()}
-        now_parameters = material.parameters(parameters)
-        if settings.judges_online:
-            loss = float(np.mean([value for value in met if value is not None]))
-        else:
-            loss = mean_loss(problems, now, now_parameters, config, device, seen=preview.see)
-            preview.show(loss)
-        if _is_judged(iteration, settings) and loss < best_loss:
-            best, best_parameters, best_loss = now, now_parameters, loss
-        curve.append([float(iteration + 1), loss])
-        progress.report(SPRING_STAGE, iteration + 1, settings.iterations, loss, note)
-    if settings.judges_online:
-        best_loss = _finite(
-            mean_loss(problems, best, best_parameters, config, device),
-            "The springs that did best while they were fitted diverge when simulated from start "
-            "to end; raise substeps_per_frame or switch judges_online off in the profile.",
-        )
-    return FirstOrderResult(
-        models=best,
-        parameters=best_parameters,
-        loss_before=loss_before,
-        loss_after=best_loss,
-        curve=curve,
-        stopped=stopped,
-    )
-
-
-def _finite(loss: float, otherwise: str) -> float:
-    if not math.isfinite(loss):
-        raise FitError(otherwise)
-    return loss
-
-
-def _truncated(parameters: SimulationParameters) -> SimulationParameters:
-    damping, drag = math.trunc(parameters.damping), math.trunc(parameters.drag)
-    return parameters.replace(damping=float(damping), drag=float(drag))
-
-
-def _is_judged(iteration: int, config: FirstOrderConfig) -> bool:
-    return iteration % config.judged_every == 0 or iteration == config.iterations - 1
-
-
-def _tell(problems: Many[ObjectProblem], met: list[float | None]) -> str:
-    """Say which sequences gave no usable gradient; there must be one that did."""
-    skipped = [p.name for p, loss in zip(problems, met, strict=True) if loss is None]
-    if len(skipped) == len(problems):
-        raise FitError(
-            "No sequence has a usable gradient, not even over one frame. Raise substeps_per_frame, "
-            "or lower the upper ends of the stiffness and damping intervals."
-        )
-    return f"too chaotic to learn from: {', '.join(skipped)}" if skipped else ""

@@ -15,7 +15,7 @@ from physhandi.fitting.object_problem import (
     build_problem_model,
     mean_loss,
 )
-from physhandi.fitting.object_reconstruction import Judge
+from physhandi.fitting.object_reconstruction import CandidateEvaluator
 from physhandi.progress import NullProgress, Preview, Progress
 from physhandi.simulation.parameters import SimulationParameters
 
@@ -92,7 +92,7 @@ def test_a_judgement_is_the_mean_loss_of_all_sequences(
 ) -> None:
     problems = [sheet("slow", 0.05, **more), sheet("quicker", 0.2, **more)]
     candidates = drawn(4)
-    judged = Judge(problems, config, NullProgress(), device=device)(candidates)
+    judged = CandidateEvaluator(problems, config, NullProgress(), device=device)(candidates)
     assert [p.stiffness for p, _ in judged] == [p.stiffness for p in candidates]
     if device != "cpu":  # There all take the substeps of the one that needs most.
         most = max(p.substeps_per_frame for p, _ in judged)
@@ -119,13 +119,18 @@ def test_what_cannot_be_simulated_is_infinitely_bad_and_harms_nobody(device: str
     bare = good[0].replace(connection_radius=1e-3, virtual_connection_radius=1e-3)
     wild = good[0].replace(stiffness=1e9)
     config = ObjectFitConfig()
-    alone = [loss for _, loss in Judge(problems, config, NullProgress(), device=device)(good)]
-    mixed = Judge(problems, config, NullProgress(), device=device)([good[0], bare, wild, good[1]])
+    alone = [
+        loss
+        for _, loss in CandidateEvaluator(problems, config, NullProgress(), device=device)(good)
+    ]
+    mixed = CandidateEvaluator(problems, config, NullProgress(), device=device)(
+        [good[0], bare, wild, good[1]]
+    )
     losses = [loss for _, loss in mixed]
     assert losses[1:3] == [math.inf, math.inf]
     assert [losses[0], losses[3]] == pytest.approx(alone, rel=1e-6)
     frugal = config.replace(automatic_substeps=True, most_substeps=300)
-    ((greedy, loss),) = Judge(problems, frugal, NullProgress(), device=device)([wild])
+    ((greedy, loss),) = CandidateEvaluator(problems, frugal, NullProgress(), device=device)([wild])
     assert greedy.substeps_per_frame > 300
     assert loss == math.inf
 
@@ -137,7 +142,9 @@ def test_colliding_candidates_are_judged_with_their_collisions(device: str) -> N
         self_collision=True, collision_distance=0.12, collides_rest_neighbors=True
     )
     config = ObjectFitConfig()
-    (_, apart), (_, loss) = Judge([problem], config, NullProgress(), device=device)([free, crowded])
+    (_, apart), (_, loss) = CandidateEvaluator([problem], config, NullProgress(), device=device)(
+        [free, crowded]
+    )
     models = {"slow": build_problem_model(problem, crowded)}
     assert loss == pytest.approx(mean_loss([problem], models, crowded, config, device), rel=1e-6)
     assert abs(loss - apart) > 1e-8
@@ -155,7 +162,7 @@ def test_the_best_motion_is_shown_once_to_whoever_watches() -> None:
             self.shown.append(make())
 
     watcher, problem = Watcher(), sheet("slow", 0.05)
-    judge = Judge([problem], ObjectFitConfig(), watcher)
+    judge = CandidateEvaluator([problem], ObjectFitConfig(), watcher)
     judged = judge(drawn(3))
     best, loss = min(judged, key=lambda pair: pair[1])
     judge(drawn(1))
@@ -178,5 +185,5 @@ def test_judging_stops_between_candidates() -> None:
 
     progress = Impatient()
     with pytest.raises(CancelledError):
-        Judge([sheet("slow", 0.05)], ObjectFitConfig(), progress)(drawn(4))
+        CandidateEvaluator([sheet("slow", 0.05)], ObjectFitConfig(), progress)(drawn(4))
     assert progress.asked == 3

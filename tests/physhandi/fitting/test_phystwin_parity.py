@@ -21,7 +21,7 @@ from physhandi.fitting.object_problem import (
     mean_loss,
     simulate_problem,
 )
-from physhandi.fitting.spring_optimisation import Descent, Material
+from physhandi.fitting.spring_optimisation import Material, SpringDescent
 from physhandi.simulation.model import SpringMassModel
 
 UP = np.array([1.0, -1.0, -1.0], np.float32)
@@ -148,7 +148,7 @@ def test_one_frame_gradients_agree_with_phystwin(device: str, made: Any, start: 
     case, config, problem = made
     model = model_of(case, problem, config)
     material = Material({NAME: model}, config.simulation, config.object_.first_order)
-    descent = Descent(material, config.simulation, config.object_, device)
+    descent = SpringDescent(material, config.simulation, config.object_, device)
     assert config.object_.first_order.window == 1
     state = torch.from_numpy(model.object_node), torch.from_numpy(model.initial_velocity)
     for frame, expected in enumerate(case["grad_log_stiffness"]):

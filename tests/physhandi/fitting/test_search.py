@@ -10,7 +10,7 @@ import pytest
 from physhandi.errors import CancelledError, FitError, SettingsError
 from physhandi.fitting.config import SearchConfig, SearchVariable, load_profile
 from physhandi.fitting.search import (
-    Judgement,
+    Evaluate,
     search_parameters,
 )
 from physhandi.progress import NullProgress, Progress
@@ -32,8 +32,8 @@ def bowl(parameters: SimulationParameters) -> float:
     )
 
 
-def each(evaluate: Callable[[SimulationParameters], float]) -> Judgement:
-    """Judge one candidate after the other."""
+def each(evaluate: Callable[[SimulationParameters], float]) -> Evaluate:
+    """Evaluate one candidate after the other."""
     return lambda candidates: [(candidate, evaluate(candidate)) for candidate in candidates]
 
 

@@ -19,9 +19,9 @@ from physhandi.fitting.object_problem import (
 )
 from physhandi.fitting.object_reconstruction import search_object
 from physhandi.fitting.spring_optimisation import (
-    Descent,
     FirstOrderResult,
     Material,
+    SpringDescent,
     optimise_springs,
 )
 from physhandi.progress import NullProgress
@@ -107,7 +107,7 @@ def returned_iteration(
     """Walk without simulating: each pass stiffens by a tenth and meets the next of the losses."""
     waiting = iter(losses)
 
-    def fit_pass(self: Descent, *_: object) -> float:
+    def fit_pass(self: SpringDescent, *_: object) -> float:
         with torch.no_grad():
             self.material.logarithms()[0][0] += 0.1
         return next(waiting)
@@ -115,7 +115,7 @@ def returned_iteration(
     def simulated(*_: object, **__: object) -> float:
         return 2.0
 
-    monkeypatch.setattr(Descent, "fit_pass", fit_pass)
+    monkeypatch.setattr(SpringDescent, "fit_pass", fit_pass)
     monkeypatch.setattr(spring_optimisation, "mean_loss", simulated)
     chosen = config(iterations=len(losses), **settings)
     result = optimise_springs([sliding_pair(0.3)], PARAMETERS, chosen, NullProgress())
@@ -162,12 +162,12 @@ def test_a_gradient_that_is_lost_on_the_way_ends_the_descent_with_the_best_so_fa
     met: list[float | None] = [1.5, 1.0, 1.2, None]
     waiting = iter(met)
 
-    def fit_pass(self: Descent, *_: object) -> float | None:
+    def fit_pass(self: SpringDescent, *_: object) -> float | None:
         with torch.no_grad():
             self.material.logarithms()[0][0] += 0.1
         return next(waiting)
 
-    monkeypatch.setattr(Descent, "fit_pass", fit_pass)
+    monkeypatch.setattr(SpringDescent, "fit_pass", fit_pass)
     monkeypatch.setattr(spring_optimisation, "mean_loss", lambda *_, **__: 2.0)
     chosen = config(iterations=50, judges_online=True, judged_every=1)
     result = optimise_springs([sliding_pair(0.3)], PARAMETERS, chosen, Heard())
@@ -176,7 +176,7 @@ def test_a_gradient_that_is_lost_on_the_way_ends_the_descent_with_the_best_so_fa
     assert result.stopped.startswith("Stopped after 3 of 50 iterations. No sequence has a usable")
     assert told[-1] == result.stopped
     assert result.stopped in caplog.text
-    monkeypatch.setattr(Descent, "fit_pass", lambda *_: None)
+    monkeypatch.setattr(SpringDescent, "fit_pass", lambda *_: None)
     with pytest.raises(FitError, match="usable gradient"):
         optimise_springs([sliding_pair(0.3)], PARAMETERS, chosen, NullProgress())
 
@@ -197,7 +197,7 @@ def test_a_walk_tells_the_mean_loss_it_met() -> None:
     model = build_problem_model(problem, still)
     settings = config(learning_rate=1e-9)
     material = Material({"pair": model}, still, settings.first_order)
-    met = Descent(material, still, settings).fit_pass(problem, model, FRAMES)
+    met = SpringDescent(material, still, settings).fit_pass(problem, model, FRAMES)
     # Chamfer sees nothing; a track is off by half (0.8 - 0.3) g t², squared.
     time = np.arange(1, FRAMES) / 30.0
     assert met == pytest.approx(np.mean((0.25 * 9.81 * time**2) ** 2), rel=0.05)
