@@ -10,9 +10,9 @@ from scipy.spatial import KDTree  # pyright: ignore[reportMissingTypeStubs]  # i
 CARRIERS = 8
 """Nodes whose common rigid motion carries a point."""
 LEAST_CARRIERS = 3
-"""Fewer than this many carriers tell nothing about a rotation, so the point is unknown."""
+"""Carriers that determine a rotation; with fewer the carried point is unknown."""
 REACH = 0.03
-"""An observed point farther away than this in frame 0 carries nothing [m]."""
+"""Largest distance in frame 0 at which an observed point carries another [m]."""
 _LINE = 1e-9
 """Share of the largest spread below which points are taken to lie on a line."""
 
@@ -54,11 +54,11 @@ def similarity_aligned(
 ) -> Float[ndarray, "frame point 3"]:
     """Turn, shift and scale the points of each frame onto the target's (Procrustes) [m]."""
     source_mean, target_mean = (x.mean(axis=1, keepdims=True) for x in (source, target))
-    moved, wanted = source - source_mean, target - target_mean
-    rotation = best_rotations(np.einsum("fpi,fpj->fij", wanted, moved))
+    moved, aim = source - source_mean, target - target_mean
+    rotation = best_rotations(np.einsum("fpi,fpj->fij", aim, moved))
     turned = moved @ rotation.transpose(0, 2, 1)
     size = (moved**2).sum(axis=(1, 2))
-    scale = (turned * wanted).sum(axis=(1, 2)) / np.maximum(size, 1e-300)
+    scale = (turned * aim).sum(axis=(1, 2)) / np.maximum(size, 1e-300)
     return scale[:, None, None] * turned + target_mean
 
 
@@ -79,11 +79,11 @@ def carried_points(
         point: Points in frame 0 [m].
         carrier: Carriers in every frame [m].
         is_visible: Which of them are known; all of them if left out.
-        reach: Carriers farther away than this in frame 0 are not asked [m].
+        reach: Carriers farther away than this in frame 0 are ignored [m].
 
     Returns:
         The points in every frame [m]; NaN where fewer than `LEAST_CARRIERS` carriers are near.
-        With fewer carriers than that in all, whatever there is carries the points.
+        If there are fewer carriers in all, those there are suffice.
     """
     frame_count, carrier_count = carrier.shape[:2]
     if is_visible is None:
@@ -91,10 +91,10 @@ def carried_points(
     moved = np.full((frame_count, len(point), 3), np.nan)
     least = min(LEAST_CARRIERS, carrier_count)
     for frame in range(frame_count):
-        known = np.flatnonzero(is_visible[0] & is_visible[frame])
-        if not len(point) or len(known) < max(least, 1):
+        usable = np.flatnonzero(is_visible[0] & is_visible[frame])
+        if not len(point) or len(usable) < max(least, 1):
             continue
-        moved[frame] = _carried(point, carrier[0, known], carrier[frame, known], least, reach)
+        moved[frame] = _carried(point, carrier[0, usable], carrier[frame, usable], least, reach)
     return moved
 
 

@@ -1,4 +1,4 @@
-"""What any prediction must beat."""
+"""Baseline predictions: static object, rigid motion with the hands, last residual."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ from physhandi.metrics.alignment import CARRIERS, carried_points, rigid_transfor
 def static_baseline(
     object_node: Float[ndarray, "node 3"], frame_count: int
 ) -> Float[ndarray, "frame node 3"]:
-    """Leave the object where it is in frame 0 [m]."""
+    """Keep the object in its state of frame 0 [m]."""
     return np.broadcast_to(object_node, (frame_count, *object_node.shape))
 
 
@@ -36,7 +36,7 @@ def last_residual_baseline(
     first_future: int,
     node_of_track: Int[ndarray, " track"] | None = None,
 ) -> Float[ndarray, "frame node 3"]:
-    """Shift the predicted frames of a rollout by what it missed in the last observed frame [m].
+    """Shift the predicted frames of a rollout by its residual in the last observed frame [m].
 
     Args:
         rollout: Simulated nodes [m].
@@ -56,17 +56,17 @@ def last_residual_baseline(
     if not 0 < first_future <= len(rollout):
         raise ValueError(f"first_future is {first_future} of {len(rollout)} frames")
     last = first_future - 1
-    seen = is_visible[last] if node_of_track is not None else is_visible[last] & is_visible[0]
-    if not seen.any():
+    is_usable = is_visible[last] if node_of_track is not None else is_visible[last] & is_visible[0]
+    if not is_usable.any():
         raise ValueError(f"frame {last} shows no track that frame 0 places on the object")
     start = rollout[0].astype(np.float64)
     if node_of_track is not None:
-        anchor = start[node_of_track[seen]]
-        predicted = rollout[last, node_of_track[seen]].astype(np.float64)
+        anchor = start[node_of_track[is_usable]]
+        predicted = rollout[last, node_of_track[is_usable]].astype(np.float64)
     else:
-        anchor = point[0, seen].astype(np.float64)
+        anchor = point[0, is_usable].astype(np.float64)
         predicted = carried_points(anchor, rollout[[0, last]].astype(np.float64))[1]
-    residual = point[last, seen] - predicted
+    residual = point[last, is_usable] - predicted
     tree: Any = KDTree(anchor)
     count = min(CARRIERS, len(anchor))
     distance, near = tree.query(start, k=count)

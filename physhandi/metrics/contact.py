@@ -1,8 +1,8 @@
-"""Which object nodes a hand touches: predicted by the virtual springs, against labels.
+"""Contact scores: nodes that the virtual springs predict to touch a hand, against labels.
 
 The paper's contact accuracy (appendix, contact consistency) is the share of nodes on which
-prediction and label agree. As most nodes touch nothing, agreement is cheap; precision, recall, F1
-and both shares of touching nodes stand beside it.
+prediction and label agree. As most nodes touch nothing, high accuracy is easy; precision, recall,
+F1 and both shares of touching nodes are given too.
 """
 
 from collections.abc import Iterable
@@ -23,25 +23,25 @@ THRESHOLDS = {"5mm": 0.005, "10mm": 0.010}
 """Nodes nearer to a hand than this count as touched [m]."""
 
 _PLACES = 20_000
-"""Places of the true surface among which each node's own is looked up; on the objects of a table
-they are 1 to 2 mm apart."""
+"""Samples of the true surface among which each node's own is searched; on table-top objects they
+are 1 to 2 mm apart."""
 
 LabelKind = Literal["true", "proximity"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ContactLabels:
-    """What is held to be in contact, for one threshold."""
+    """Contact labels for one threshold."""
 
     is_contact: Bool[ndarray, "frame node"]
     """Whether a hand touches the node."""
     is_known: Bool[ndarray, "frame node"]
-    """Where that can be told; other nodes are not scored."""
+    """Whether the label is known; other nodes are not scored."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ContactReference:
-    """What contacts are judged by."""
+    """Hands, springs and labels that contacts are scored by."""
 
     hand: Float[ndarray, "frame point 3"]
     """Vertices of all hands [m]."""
@@ -58,7 +58,7 @@ class ContactReference:
 def joined_nodes(
     virtual_spring_nodes: Int[ndarray, "spring 2"], node_count: int
 ) -> Bool[ndarray, " node"]:
-    """Tell which object nodes at least one virtual spring holds."""
+    """Mark the object nodes at which at least one virtual spring ends."""
     ends = virtual_spring_nodes.reshape(-1)
     is_joined = np.zeros(node_count, dtype=bool)
     is_joined[ends[ends < node_count]] = True
@@ -75,7 +75,7 @@ def hand_distance(
 
 
 def true_labels(truth: Truth, node: Float[ndarray, "node 3"]) -> ContactLabels | None:
-    """Take a node's label from the nearest true place of frame 0; None if there is no truth."""
+    """Take each node's label from the nearest true point of frame 0; None without truth."""
     if truth.contact_point is None or truth.contact is None or not len(truth.contact_point):
         return None
     nearest = nearest_node(node.astype(np.float64), truth.contact_point.astype(np.float64))
@@ -86,10 +86,10 @@ def true_labels(truth: Truth, node: Float[ndarray, "node 3"]) -> ContactLabels |
 def true_proximity_labels(
     truth: Truth, node: Float[ndarray, "node 3"], sides: Iterable[Side]
 ) -> dict[str, ContactLabels]:
-    """Call nodes touched whose place on the true surface is near a vertex of a true hand.
+    """Label nodes as touched if their point of the true surface is near a true hand.
 
-    This is the paper's label, taken where nothing was fitted or observed. A node's place is the
-    point of the true surface that is nearest to it in frame 0.
+    This is the paper's label, computed from the truth alone. A node's point of the true surface is
+    the one nearest to it in frame 0.
 
     Args:
         truth: The truth of a recording.
@@ -100,17 +100,17 @@ def true_proximity_labels(
         Labels of each of `THRESHOLDS`; empty if surface or hands are not known.
 
     Raises:
-        SequenceError: If the true surface cannot be one.
+        SequenceError: If the true surface is invalid.
     """
     hands = [truth.hand_vertex.get(side) for side in sides]
-    known = [hand for hand in hands if hand is not None]
+    known_hands = [hand for hand in hands if hand is not None]
     surface = true_surface(truth, _PLACES)
-    if surface is None or not known or len(known) < len(hands):
+    if surface is None or not known_hands or len(known_hands) < len(hands):
         return {}
     place = surface.picked(nearest_node(node.astype(np.float64), surface.samples(0)))
     distance = hand_distance(
         np.stack([place.samples(frame) for frame in range(len(place.point))]),
-        np.concatenate(known, axis=1).astype(np.float64),
+        np.concatenate(known_hands, axis=1).astype(np.float64),
     )
     return {
         name: ContactLabels(
@@ -126,10 +126,10 @@ def proximity_labels(
     point: Float[ndarray, "frame track 3"] | None,
     is_visible: Bool[ndarray, "frame track"] | None,
 ) -> dict[str, ContactLabels]:
-    """Call nodes touched that are near a fitted hand, whatever a simulation says of them.
+    """Label nodes as touched if they are near a fitted hand, independently of the simulation.
 
-    In frame 0 the nodes lie where they were given. In later frames the observed tracks carry them,
-    so that a simulation is not its own judge; a node without visible tracks around it is unknown.
+    In frame 0 the nodes are at their initial positions. In later frames the observed tracks carry
+    them; a node without visible tracks around it is unknown.
 
     Args:
         node: Nodes in frame 0 [m].
@@ -152,7 +152,7 @@ def proximity_labels(
 def agreement(
     is_predicted: Bool[ndarray, "frame node"], labels: ContactLabels
 ) -> Float[ndarray, " frame"]:
-    """Give the share of known nodes on which prediction and label agree; NaN where none is."""
+    """Compute the share of known nodes on which prediction and label agree; NaN without any."""
     right = (is_predicted == labels.is_contact) & labels.is_known
     count = labels.is_known.sum(axis=1)
     return np.where(count > 0, right.sum(axis=1) / np.maximum(count, 1), np.nan)
@@ -174,19 +174,19 @@ def contact_scores(
         shares of touching nodes, and ``known_share``, that of labelled ones. None where there is
         nothing to divide by.
     """
-    known = labels.is_known
-    hit = int((is_predicted & labels.is_contact & known).sum())
-    predicted = int((is_predicted & known).sum())
-    positive = int((labels.is_contact & known).sum())
+    is_known = labels.is_known
+    hit = int((is_predicted & labels.is_contact & is_known).sum())
+    predicted = int((is_predicted & is_known).sum())
+    positive = int((labels.is_contact & is_known).sum())
     shares = agreement(is_predicted, labels)
     scores = {
         "accuracy": float(np.nanmean(shares)) if np.isfinite(shares).any() else None,
         "precision": _ratio(hit, predicted),
         "recall": _ratio(hit, positive),
         "f1": _ratio(2 * hit, predicted + positive),
-        "predicted_share": _ratio(predicted, int(known.sum())),
-        "label_share": _ratio(positive, int(known.sum())),
-        "known_share": _ratio(int(known.sum()), known.size),
+        "predicted_share": _ratio(predicted, int(is_known.sum())),
+        "label_share": _ratio(positive, int(is_known.sum())),
+        "known_share": _ratio(int(is_known.sum()), is_known.size),
     }
     return {f"{name}_{suffix}": value for name, value in scores.items()}
 

@@ -52,7 +52,7 @@ def dynamic_tracks(
     is_visible: Bool[ndarray, "frame track"],
     threshold: float = DYNAMIC_THRESHOLD,
 ) -> Bool[ndarray, " track"]:
-    """Tell which tracks move farther than `threshold` [m] from frame 0 in any frame.
+    """Mark the tracks that move farther than `threshold` [m] from frame 0 in any frame.
 
     This is the paper's deforming set ``|x_i - x_1|² > τ_dyn``, with τ_dyn = 1e-4 m². A track that
     frame 0 does not show counts from the first frame that shows it.
@@ -69,7 +69,7 @@ def dynamic_nodes(
     point: Float[ndarray, "track 3"],
     is_dynamic: Bool[ndarray, " track"],
 ) -> Bool[ndarray, " node"]:
-    """Tell which nodes lie in the dynamic part: their nearest track of frame 0 is dynamic.
+    """Mark the nodes in the dynamic part: those whose nearest track of frame 0 is dynamic.
 
     Args:
         node: Nodes in frame 0 [m].
@@ -101,9 +101,9 @@ def track_error_phystwin(
     Each track that frame 0 shows belongs to the node nearest to it there, among all nodes; what
     lies between the two stays in the error. A frame that shows none of them counts as 0.
     """
-    known = np.flatnonzero(is_visible[0])
-    node = nearest_node(point[0, known], rollout[0])
-    return np.nan_to_num(track_error(point[:, known], is_visible[:, known], rollout[:, node]))
+    shown = np.flatnonzero(is_visible[0])
+    node = nearest_node(point[0, shown], rollout[0])
+    return np.nan_to_num(track_error(point[:, shown], is_visible[:, shown], rollout[:, node]))
 
 
 def marker_error(

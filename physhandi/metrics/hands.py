@@ -1,4 +1,4 @@
-"""How well fitted hands agree with the keypoints that the views saw."""
+"""Errors of fitted hands against detected keypoints, measured points and the truth."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -11,6 +11,11 @@ from numpy import ndarray
 from physhandi.data.camera import PinholeCamera
 from physhandi.metrics.alignment import similarity_aligned
 from physhandi.metrics.geometry import chamfer_one_way, chamfer_symmetric
+
+Curve = Float[ndarray, " frame"]
+"""One value a frame; NaN where it cannot be measured."""
+WRIST = 0
+"""Number of the wrist among the keypoints."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,14 +73,14 @@ def evaluate_hands(
     """
     scores: list[HandScore] = []
     for hand, points in enumerate(joint):
-        seen = np.asarray(keypoint[:, :, hand], dtype=np.float64)
-        is_seen = np.isfinite(seen).all(-1)
+        detected = np.asarray(keypoint[:, :, hand], dtype=np.float64)
+        is_seen = np.isfinite(detected).all(-1)
         is_scored = is_seen.any(-1).sum(0) >= least_views
         is_seen &= is_scored[:, None]
         distance = np.stack(
             [
                 np.linalg.norm(camera.project(points.astype(np.float64)) - view[..., :2], axis=-1)
-                for camera, view in zip(cameras, seen, strict=True)
+                for camera, view in zip(cameras, detected, strict=True)
             ]
         )
         distance = np.where(np.isfinite(distance), distance, np.inf)
@@ -104,11 +109,6 @@ def _score(distance: Float[ndarray, " keypoint"]) -> ReprojectionScore:
     )
 
 
-Curve = Float[ndarray, " frame"]
-WRIST = 0
-"""Number of the wrist among the keypoints."""
-
-
 def hand_chamfer(
     vertex: Float[ndarray, "frame vertex 3"], points: tuple[Float[ndarray, "_ 3"], ...]
 ) -> dict[str, Curve]:
@@ -126,10 +126,10 @@ def hand_chamfer(
         name: np.full(len(vertex), np.nan)
         for name in ("chamfer_symmetric", "chamfer_points_to_mesh", "chamfer_mesh_to_points")
     }
-    for frame, (mesh, seen) in enumerate(zip(vertex, points, strict=True)):
-        if not len(seen):
+    for frame, (mesh, measured) in enumerate(zip(vertex, points, strict=True)):
+        if not len(measured):
             continue
-        mesh64, seen64 = mesh.astype(np.float64), seen.astype(np.float64)
+        mesh64, seen64 = mesh.astype(np.float64), measured.astype(np.float64)
         curves["chamfer_points_to_mesh"][frame] = chamfer_one_way(seen64, mesh64)
         curves["chamfer_mesh_to_points"][frame] = chamfer_one_way(mesh64, seen64)
     both = curves["chamfer_points_to_mesh"] + curves["chamfer_mesh_to_points"]

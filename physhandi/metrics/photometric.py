@@ -68,32 +68,32 @@ def draw_nodes(
 
 
 def silhouette_iou(drawing: Drawing, mask: UInt8[ndarray, "row column"]) -> float:
-    """Divide what is object in both by what is in either, where no hand is; NaN if nothing is."""
-    seen = mask == OBJECT
+    """Compute intersection over union of the object outside the hands; NaN if both are empty."""
+    is_object = mask == OBJECT
     drawn = drawing.is_covered & (mask <= OBJECT)
-    either = int((seen | drawn).sum())
-    return int((seen & drawn).sum()) / either if either else float("nan")
+    either = int((is_object | drawn).sum())
+    return int((is_object & drawn).sum()) / either if either else float("nan")
 
 
 def shaded_psnr(
     drawing: Drawing, color: UInt8[ndarray, "row column 3"], mask: UInt8[ndarray, "row column"]
 ) -> float:
-    """Compare colors over the whole image [dB]: all but the object black, hands left out of both.
+    """Compute the PSNR of the object on black over the whole image, hands left out of both [dB].
 
     This is PhysTwin's protocol, in which the black background counts.
     """
-    seen = np.where((mask == OBJECT)[..., None], color, 0).astype(np.float64)
+    observed = np.where((mask == OBJECT)[..., None], color, 0).astype(np.float64)
     drawn = np.where((mask <= OBJECT)[..., None], drawing.image, 0).astype(np.float64)
-    error = float(((seen - drawn) ** 2).mean())
+    error = float(((observed - drawn) ** 2).mean())
     return 10.0 * float(np.log10(_FULL**2 / max(error, _LEAST_ERROR)))
 
 
 def frame_0_colors(
     views: Sequence[View], node: Float[ndarray, "node 3"]
 ) -> UInt8[ndarray, "node 3"] | None:
-    """Give each node the mean color of the views that see it in frame 0.
+    """Assign each node the mean color of the views that see it in frame 0.
 
-    A node that none sees takes the color of the nearest that one does; None if there is none.
+    A node that no view sees takes the color of the nearest visible one; None without visible nodes.
     """
     total, count = np.zeros((len(node), 3)), np.zeros(len(node))
     for view in views:
@@ -111,10 +111,10 @@ def frame_0_colors(
             is_seen &= view.camera.camera_depth(node) < measured + _BEHIND
         total[is_seen] += color[row, column][is_seen]
         count[is_seen] += 1
-    known = np.flatnonzero(count)
-    if not len(known):
+    colored = np.flatnonzero(count)
+    if not len(colored):
         return None
-    nearest = known[nearest_node(node, node[known])]
+    nearest = colored[nearest_node(node, node[colored])]
     return (total[nearest] / count[nearest, None]).round().astype(np.uint8)
 
 

@@ -1,5 +1,6 @@
-"""How well a run did: one table per sequence, with the baselines beside it.
+"""Scores a run: one table per sequence, with the baselines beside it.
 
+`measure_run` reads a run and its sequence; `score_rollout` and `score_hands` do the measuring.
 Definitions, units and the paper's columns are in docs/metrics.md.
 """
 
@@ -50,172 +51,6 @@ from physhandi.metrics.hands import (
 from physhandi.metrics.topology import radius_deviation, resolution
 from physhandi.metrics.truth_metrics import TrueSurface, true_surface, truth_curves
 
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ScoringReference:
-    """What a rollout is compared with; any part may be absent."""
-
-    object_node: Float[ndarray, "node 3"]
-    """Object nodes in frame 0 [m]."""
-    surface_count: int | None = None
-    """Leading nodes that lie on the surface, which alone enter Chamfer distances; None: all."""
-    point: Float[ndarray, "frame track 3"] | None = None
-    """Observed tracks [m]; NaN where not visible."""
-    is_visible: Bool[ndarray, "frame track"] | None = None
-    """Whether a track is visible."""
-    node_of_track: Int[ndarray, " track"] | None = None
-    """Node that each track observes; None lets the nodes around it carry it."""
-    validation: Float[ndarray, "frame validation 3"] | None = None
-    """Annotated points that no fit saw [m]; NaN where not annotated. They replace the tracks where
-    tracks are scored."""
-    cloud: tuple[Float[ndarray, "_ 3"], ...] = ()
-    """Observed points per frame [m]; none takes the visible tracks."""
-    marker: Float[ndarray, "frame marker 3"] | None = None
-    """Identified points [m]; NaN where not seen."""
-    marker_node: Int[ndarray, " marker"] | None = None
-    """Node that each marker observes."""
-    controlled_markers: tuple[int, ...] = ()
-    """Markers that are not scored because they move with the controls."""
-    true_surface: TrueSurface | None = None
-    """Where the object really was."""
-    contact: ContactReference | None = None
-    """What contacts are judged by."""
-
-
-def read_reference(
-    out: Path, sequence: Sequence, rollout: Float[ndarray, "frame node 3"] | None
-) -> ScoringReference | None:
-    """Collect what a run and its sequence know; None if there is no object to score.
-
-    Args:
-        out: Output folder of the run.
-        sequence: The sequence.
-        rollout: What the run simulated.
-
-    Raises:
-        RunError: If a file of the run is damaged.
-        SequenceError: If the sequence tells a true surface that cannot be one.
-    """
-    files = SequenceFiles(sequence.name)
-    point = read_scoring_inputs(out / files.observation("point"))
-    is_visible = read_scoring_inputs(out / files.observation("is_visible"))
-    node_of_track = read_scoring_inputs(out / files.observation("node_of_track"))
-    node = read_scoring_inputs(out / files.object_node)
-    if node is None:
-        node = sequence.object_node if rollout is None else rollout[0]
-    if node is None or (point is None and sequence.marker is None):
-        return None
-    if sequence.marker is not None and point is not None and is_visible is not None:
-        free = [m for m in range(point.shape[1]) if m not in sequence.controlled_markers]
-        point, is_visible = point[:, free], is_visible[:, free]
-        node_of_track = None if node_of_track is None else node_of_track[free]
-    clouds = read_split(*(out / files.observation(part) for part in ("cloud", "cloud_end")))
-    return ScoringReference(
-        object_node=node,
-        surface_count=sequence.surface_node_count,
-        point=point,
-        is_visible=is_visible,
-        node_of_track=node_of_track,
-        validation=sequence.validation_track,
-        cloud=tuple(clouds or ()),
-        marker=sequence.marker,
-        marker_node=sequence.marker_node,
-        controlled_markers=sequence.controlled_markers,
-        true_surface=true_surface(read_truth(sequence.folder)),
-        contact=_contact(out, sequence, node, point, is_visible),
-    )
-
-
-def read_topology(out: Path, object_node: Float[ndarray, "node 3"]) -> dict[str, Any] | None:
-    """Relate the fitted connection radii to the resolution; None if there is no fitted object.
-
-    Args:
-        out: Output folder of the run; its rest shape has the resolution that counts.
-        object_node: Nodes that stand in where the run stores no rest shape [m].
-
-    Raises:
-        RunError: If a file of the run is damaged.
-    """
-    path = out / PARAMETERS_FILE
-    node = read_scoring_inputs(out / REST_NODE_FILE)
-    node = object_node if node is None else node
-    if not path.is_file() or len(node) < 2:
-        return None
-    try:
-        parameters = yaml.safe_load(path.read_text(encoding="utf-8"))
-        radius, virtual = (
-            float(parameters[name]) for name in ("connection_radius", "virtual_connection_radius")
-        )
-    except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError) as error:
-        raise RunError(f"{path} does not tell the connection radii: {error}.") from error
-    spacing = resolution(node.astype(np.float64))
-    return {
-        "resolution": spacing,
-        "connection_radius": radius,
-        "virtual_connection_radius": virtual,
-        "rrd_object": radius_deviation(radius, spacing),
-        "rrd_virtual": radius_deviation(virtual, spacing),
-    }
-
-
-def read_scoring_inputs(path: Path) -> Any:
-    """Read an array of a run; None if it is not there.
-
-    Raises:
-        RunError: If it is damaged.
-    """
-    if not path.is_file():
-        return None
-    try:
-        return read_array(path)
-    except (ValueError, OSError) as error:
-        raise RunError(f"{path} is not a readable array: {error}.") from error
-
-
-def read_split(point: Path, end: Path) -> list[ndarray] | None:
-    """Read point sets that are stored one after the other, with where each of them ends."""
-    points, ends = read_scoring_inputs(point), read_scoring_inputs(end)
-    return None if points is None or ends is None else np.split(points, ends.reshape(-1)[:-1])
-
-
-def _contact(
-    out: Path,
-    sequence: Sequence,
-    node: Float[ndarray, "node 3"],
-    point: ndarray | None,
-    is_visible: ndarray | None,
-) -> ContactReference | None:
-    """Prepare the judgement of contacts; None without hands or without springs to judge."""
-    files = SequenceFiles(sequence.name)
-    vertices = [read_scoring_inputs(out / files.hand_vertex(side)) for side in sequence.hands]
-    whole = [held_where_missing(vertex)[0] for vertex in vertices if vertex is not None]
-    known = [vertex for vertex in whole if vertex is not None]
-    path = out / files.model
-    if not known or not path.is_file():
-        return None
-    try:
-        tensors = read_tensors(path)
-        virtual = tensors["spring_nodes"][int(tensors["object_spring_count"][0]) :]
-    except Exception as error:  # safetensors has no common class of errors
-        raise RunError(f"{path} is not a readable model: {error}.") from error
-    hand = np.concatenate(known, axis=1).astype(np.float64)
-    start = node.astype(np.float64)
-    told = read_truth(sequence.folder)
-    truth = true_labels(told, start)
-    if truth is not None:
-        labels = dict.fromkeys(THRESHOLDS, truth)
-    else:
-        seen = None if point is None else point.astype(np.float64)
-        labels = proximity_labels(start, hand, seen, is_visible)
-    return ContactReference(
-        hand=hand,
-        is_joined=joined_nodes(virtual, len(node)),
-        kind="proximity" if truth is None else "true",
-        labels=labels,
-        true_proximity=true_proximity_labels(told, start, sequence.hands),
-    )
-
-
 CURVES = (
     "chamfer_phystwin",
     "chamfer_l1",
@@ -232,8 +67,261 @@ CURVES = (
     "marker_error",
 )
 """Metrics that have a value [m] for every frame."""
-
 Curves = dict[str, Float[ndarray, " frame"]]
+"""Values of every frame by metric; NaN where a frame cannot be measured."""
+HAND_AGGREGATION = (
+    "reprojection [px] over all seen keypoints of all views and frames; "
+    "distances as mean over frames, frame 0 included"
+)
+StoredPoints = tuple[Float[ndarray, "point 3"], Int[ndarray, "hand frame"]]
+"""Points of all hands and frames one after the other [m], and where those of each frame end."""
+AGGREGATION = (
+    "mean over frames of the mean over points; frame 0 is not scored; "
+    "contact F1 over all nodes and frames"
+)
+_BY_PROXIMITY = "proximity_"
+CONTACT_METRICS = tuple(
+    f"contact_{kind}_{labels}{threshold}"
+    for labels in ("", _BY_PROXIMITY)
+    for threshold in THRESHOLDS
+    for kind in ("accuracy", "f1")
+)
+METRICS = (*CURVES, *CONTACT_METRICS)
+"""Metrics of every method: distances [m], then shares from 0 to 1."""
+_DIGITS = 7
+"""Decimal places of stored frame errors."""
+Motions = dict[str, Float[ndarray, "frame node 3"]]
+"""Nodes of the rollout and of each baseline by method [m]."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScoringReference:
+    """Observations and truth that a rollout is compared with; any part may be absent."""
+
+    object_node: Float[ndarray, "node 3"]
+    """Object nodes in frame 0 [m]."""
+    surface_count: int | None = None
+    """Leading nodes that lie on the surface, which alone enter Chamfer distances; None: all."""
+    point: Float[ndarray, "frame track 3"] | None = None
+    """Observed tracks [m]; NaN where not visible."""
+    is_visible: Bool[ndarray, "frame track"] | None = None
+    """Whether a track is visible."""
+    node_of_track: Int[ndarray, " track"] | None = None
+    """Node that each track observes; None lets the nodes around it carry it."""
+    validation: Float[ndarray, "frame validation 3"] | None = None
+    """Annotated points that no fit saw [m]; NaN where not annotated. They replace the tracks where
+    tracks are scored."""
+    cloud: tuple[Float[ndarray, "_ 3"], ...] = ()
+    """Observed points per frame [m]; if empty, the visible tracks take their place."""
+    marker: Float[ndarray, "frame marker 3"] | None = None
+    """Identified points [m]; NaN where not seen."""
+    marker_node: Int[ndarray, " marker"] | None = None
+    """Node that each marker observes."""
+    controlled_markers: tuple[int, ...] = ()
+    """Markers that are not scored because they move with the controls."""
+    true_surface: TrueSurface | None = None
+    """The object's true surface."""
+    contact: ContactReference | None = None
+    """Labels that contacts are scored against."""
+
+
+def measure_run(
+    out: Path,
+    sequence: Sequence,
+    *,
+    hand_points: StoredPoints | None = None,
+    with_baselines: bool = True,
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Measure once and return the results of `score_run` and `frame_errors`.
+
+    Args:
+        out: Output folder of the run.
+        sequence: The sequence.
+        hand_points: As for `score_run`.
+        with_baselines: Whether to measure the static and the rigid baseline too, which takes twice
+            as long as the rollout alone.
+
+    Raises:
+        RunError: If a file of the run is damaged.
+    """
+    files = SequenceFiles(sequence.name)
+    rollout = read_scoring_inputs(out / files.rollout)
+    reference = read_reference(out, sequence, rollout)
+    report: dict[str, Any] = {}
+    frames: dict[str, Any] = {"unit": "m", "frames": list(range(sequence.frame_count))}
+    if reference is not None:
+        splits = {
+            "reconstruction": sequence.reconstruction_frames,
+            "future": sequence.future_frames,
+        }
+        motions, substituted = _motions(
+            rollout, reference, read_scoring_inputs(out / files.control), sequence.frame_count
+        )
+        if not with_baselines:
+            motions = {"rollout": motions["rollout"]}
+        curves = {name: error_curves(nodes, reference) for name, nodes in motions.items()}
+        report |= _tabulated(motions, curves, substituted, reference, splits)
+        frames |= {name: _plain(of_method) for name, of_method in curves.items()}
+        topology = read_topology(out, reference.object_node)
+        if topology is not None:
+            report["topology"] = topology
+    hands, hand_curves = score_hands(out, sequence, hand_points)
+    if hands:
+        report["hands"] = hands
+    if hand_curves:
+        frames["hands"] = {side: _plain(of_hand) for side, of_hand in hand_curves.items()}
+    return report, frames
+
+
+def score_run(
+    out: Path, sequence: Sequence, *, hand_points: StoredPoints | None = None
+) -> dict[str, Any]:
+    """Score a run's result for one sequence.
+
+    Args:
+        out: Output folder of the run.
+        sequence: The sequence; gives the split, markers, cameras and the truth.
+        hand_points: Measured points of the hands; None reads those stored in the run.
+
+    Returns:
+        The table of `score_rollout` if the sequence has an object, with ``topology`` if one was
+        fitted; and ``hands`` with each hand's figures if there is anything to compare it with.
+
+    Raises:
+        RunError: If a file of the run is damaged.
+    """
+    return measure_run(out, sequence, hand_points=hand_points)[0]
+
+
+def frame_errors(out: Path, sequence: Sequence) -> dict[str, Any]:
+    """Compute the error of every frame of a run, for charts.
+
+    Args:
+        out: Output folder of the run.
+        sequence: The sequence.
+
+    Returns:
+        ``unit`` (m), ``frames`` (all of them, frame 0 included), for each of ``rollout static
+        rigid_follow`` a list a metric, and the same for each hand in ``hands``; None where a frame
+        cannot be measured. Metrics that cannot be measured in any frame are left out.
+
+    Raises:
+        RunError: If a file of the run is damaged.
+    """
+    return measure_run(out, sequence)[1]
+
+
+def score_rollout(
+    rollout: Float[ndarray, "frame node 3"] | None,
+    reference: ScoringReference,
+    *,
+    control: Float[ndarray, "frame control 3"] | None = None,
+    reconstruction_frames: range,
+    future_frames: range = range(0),
+) -> dict[str, Any]:
+    """Compare a rollout and the baselines with the observations.
+
+    Args:
+        rollout: Simulated nodes [m]. Where it is missing or not finite, the object counts as
+            static; nothing is dropped.
+        reference: Observations.
+        control: Control nodes, for the rigid-follow baseline [m].
+        reconstruction_frames: Frames that were fitted.
+        future_frames: Frames that were held out.
+
+    Returns:
+        For ``reconstruction`` and (if there are such frames) ``future``: the frames, and for each
+        of ``rollout static rigid_follow`` the `METRICS`; None where nothing can be measured.
+        ``contact`` has the details of contact for the rollout, if contact can be scored. Also
+        ``aggregation``, ``unit`` and ``substituted_frames``, the number of static stand-ins.
+    """
+    frame_count = max(reconstruction_frames.stop, future_frames.stop)
+    motions, substituted = _motions(rollout, reference, control, frame_count)
+    curves = {name: error_curves(nodes, reference) for name, nodes in motions.items()}
+    splits = {"reconstruction": reconstruction_frames, "future": future_frames}
+    return _tabulated(motions, curves, substituted, reference, splits)
+
+
+def _motions(
+    rollout: ndarray | None, reference: ScoringReference, control: ndarray | None, frame_count: int
+) -> tuple[Motions, int]:
+    """Collect the completed rollout and the baselines, and count the substituted frames."""
+    static = np.asarray(static_baseline(reference.object_node.astype(np.float64), frame_count))
+    complete, substituted = _complete(rollout, static)
+    motions = {"rollout": complete, "static": static}
+    if control is not None and len(control) >= frame_count and control.shape[1] > 0:
+        motions["rigid_follow"] = rigid_follow_baseline(static[0], control[:frame_count])
+    return motions, substituted
+
+
+def _complete(rollout: ndarray | None, static: ndarray) -> tuple[ndarray, int]:
+    """Replace missing and non-finite frames by the static object, and count them."""
+    complete = static.copy()
+    if rollout is None or rollout.shape[1:] != static.shape[1:]:
+        return complete, len(static)
+    count = min(len(rollout), len(static))
+    is_usable = np.isfinite(rollout[:count]).all(axis=(1, 2))
+    complete[:count][is_usable] = rollout[:count][is_usable]
+    return complete, len(static) - int(is_usable.sum())
+
+
+def _tabulated(
+    motions: Motions,
+    curves: dict[str, Curves],
+    substituted: int,
+    reference: ScoringReference,
+    splits: dict[str, range],
+) -> dict[str, Any]:
+    report: dict[str, Any] = {
+        "aggregation": AGGREGATION,
+        "unit": "m",
+        "substituted_frames": substituted,
+    }
+    contact = reference.contact
+    contacts = {name: _predicted(contact, nodes) for name, nodes in motions.items()}
+    detail: dict[str, Any] = {}
+    if contact is not None:
+        detail = {"labels": contact.kind, "frame_0": _judged(contact, contacts["rollout"], [0])}
+    for split, frames in splits.items():
+        scored = [frame for frame in frames if frame > 0]
+        if not scored:
+            continue
+        report[split] = {"frames": [scored[0], scored[-1] + 1]}
+        for name, of_method in curves.items():
+            judged = _judged(contact, contacts[name], scored)
+            if name == "rollout" and judged:
+                detail[split] = judged
+            report[split][name] = {
+                metric: _mean(of_method[metric][scored]) if metric in of_method else None
+                for metric in CURVES
+            } | {metric: judged.get(metric.removeprefix("contact_")) for metric in CONTACT_METRICS}
+    if detail:
+        report["contact"] = detail
+    return report
+
+
+def _predicted(
+    contact: ContactReference | None, nodes: Float[ndarray, "frame node 3"]
+) -> dict[str, Bool[ndarray, "frame node"]]:
+    if contact is None:
+        return {}
+    return {name: predicted_contacts(contact, nodes, value) for name, value in THRESHOLDS.items()}
+
+
+def _judged(
+    contact: ContactReference | None, predicted: dict[str, ndarray], frames: list[int]
+) -> dict[str, float | None]:
+    """Score contacts in the given frames, by every threshold and all available labels."""
+    scores: dict[str, float | None] = {}
+    if contact is None:
+        return scores
+    for prefix, all_labels in (("", contact.labels), (_BY_PROXIMITY, contact.true_proximity)):
+        for name, labels in all_labels.items():
+            chosen = ContactLabels(
+                is_contact=labels.is_contact[frames], is_known=labels.is_known[frames]
+            )
+            scores |= contact_scores(predicted[name][frames], chosen, prefix + name)
+    return scores
 
 
 def error_curves(nodes: Float[ndarray, "frame node 3"], reference: ScoringReference) -> Curves:
@@ -241,7 +329,7 @@ def error_curves(nodes: Float[ndarray, "frame node 3"], reference: ScoringRefere
 
     Args:
         nodes: Simulated nodes, finite in every frame [m].
-        reference: What was observed, and the true surface if it is known.
+        reference: Observations, and the true surface if it is known.
     """
     surface = nodes[:, : reference.surface_count]
     curves = _shape_curves(surface, reference) | _track_curves(nodes, reference)
@@ -313,9 +401,9 @@ def _track_curves(nodes: Float[ndarray, "frame node 3"], reference: ScoringRefer
     if node_of_track is not None:
         curves["track_error"] = track_error(point, is_visible, nodes[:, node_of_track])
     else:  # A track that frame 0 does not show has no known place on the object.
-        known = np.flatnonzero(is_visible[0])
-        carried = carried_points(point[0, known], nodes)
-        curves["track_error"] = track_error(point[:, known], is_visible[:, known], carried)
+        shown = np.flatnonzero(is_visible[0])
+        carried = carried_points(point[0, shown], nodes)
+        curves["track_error"] = track_error(point[:, shown], is_visible[:, shown], carried)
     return curves
 
 
@@ -333,24 +421,15 @@ def _each(
     return np.array([chamfer_one_way(o, nodes[frame], norm) for frame, o in enumerate(observed)])
 
 
-HAND_AGGREGATION = (
-    "reprojection [px] over all seen keypoints of all views and frames; "
-    "distances as mean over frames, frame 0 included"
-)
-
-StoredPoints = tuple[Float[ndarray, "point 3"], Int[ndarray, "hand frame"]]
-"""Points of all hands and frames one after the other [m], and where those of each frame end."""
-
-
 def score_hands(
-    out: Path, sequence: Sequence, given: StoredPoints | None = None
+    out: Path, sequence: Sequence, hand_points: StoredPoints | None = None
 ) -> tuple[dict[str, Any], dict[str, Curves]]:
     """Compare each hand with detected keypoints, measured points and the truth.
 
     Args:
         out: Output folder of the run.
-        sequence: Gives cameras and, if it has it, the truth.
-        given: What the views measured on the hands; None reads it from the run.
+        sequence: The sequence, with its cameras and, if known, the truth.
+        hand_points: Measured points of the hands; None reads those stored in the run.
 
     Returns:
         For each hand its figures, and the same distances [m] frame by frame. A hand that has a
@@ -364,8 +443,8 @@ def score_hands(
     detected = read_scoring_inputs(out / files.keypoint)
     stored = (out / files.observation(part) for part in ("hand_point", "hand_point_end"))
     points = read_split(*stored)
-    if given is not None:
-        points = np.split(given[0], given[1].reshape(-1)[:-1])
+    if hand_points is not None:
+        points = np.split(hand_points[0], hand_points[1].reshape(-1)[:-1])
     scores: dict[str, Any] = {}
     curves: dict[str, Curves] = {}
     for hand, side in enumerate(sequence.hands):
@@ -387,7 +466,7 @@ def score_hands(
             score["mpjpe"] = None
         if not score and not errors:
             continue
-        score |= {name: _mean_error(curve) for name, curve in errors.items()}
+        score |= {name: _mean(curve) for name, curve in errors.items()}
         scores[side] = score | {
             "unit": "m",
             "aggregation": HAND_AGGREGATION,
@@ -428,231 +507,144 @@ def _truth_errors(
     return errors
 
 
-def _mean_error(curve: Float[ndarray, " frame"]) -> float | None:
-    known = curve[np.isfinite(curve)]
-    return float(known.mean()) if len(known) else None
-
-
-AGGREGATION = (
-    "mean over frames of the mean over points; frame 0 is not scored; "
-    "contact F1 over all nodes and frames"
-)
-_BY_PROXIMITY = "proximity_"
-CONTACT_METRICS = tuple(
-    f"contact_{kind}_{labels}{threshold}"
-    for labels in ("", _BY_PROXIMITY)
-    for threshold in THRESHOLDS
-    for kind in ("accuracy", "f1")
-)
-METRICS = (*CURVES, *CONTACT_METRICS)
-"""What every method is scored by: distances [m], then shares from 0 to 1."""
-_DIGITS = 7
-
-Motions = dict[str, Float[ndarray, "frame node 3"]]
-
-
-def score_rollout(
-    rollout: Float[ndarray, "frame node 3"] | None,
-    reference: ScoringReference,
-    *,
-    control: Float[ndarray, "frame control 3"] | None = None,
-    reconstruction_frames: range,
-    future_frames: range = range(0),
-) -> dict[str, Any]:
-    """Compare a rollout and the baselines with what was observed.
-
-    Args:
-        rollout: Simulated nodes [m]. Where it is missing or not finite, the object counts as
-            static; nothing is dropped.
-        reference: What was observed.
-        control: Control nodes, for the rigid-follow baseline [m].
-        reconstruction_frames: Frames that were fitted.
-        future_frames: Frames that were held out.
-
-    Returns:
-        For ``reconstruction`` and (if there are such frames) ``future``: the frames, and for each
-        of ``rollout static rigid_follow`` the `METRICS`; None where nothing can be measured.
-        ``contact`` has the details of contact for the rollout, if contact can be judged. Also
-        ``aggregation``, ``unit`` and ``substituted_frames``, the number of static stand-ins.
-    """
-    frame_count = max(reconstruction_frames.stop, future_frames.stop)
-    motions, substituted = _motions(rollout, reference, control, frame_count)
-    curves = {name: error_curves(nodes, reference) for name, nodes in motions.items()}
-    splits = {"reconstruction": reconstruction_frames, "future": future_frames}
-    return _tabulated(motions, curves, substituted, reference, splits)
-
-
-def measure_run(
-    out: Path,
-    sequence: Sequence,
-    *,
-    hand_points: StoredPoints | None = None,
-    with_baselines: bool = True,
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Give what `score_run` and `frame_errors` give, measured once.
+def read_reference(
+    out: Path, sequence: Sequence, rollout: Float[ndarray, "frame node 3"] | None
+) -> ScoringReference | None:
+    """Collect observations and truth from a run and its sequence; None without an object to score.
 
     Args:
         out: Output folder of the run.
         sequence: The sequence.
-        hand_points: As for `score_run`.
-        with_baselines: Whether to measure the static and the rigid baseline too, which takes twice
-            as long as the rollout alone.
+        rollout: Simulated nodes of the run [m].
 
     Raises:
         RunError: If a file of the run is damaged.
+        SequenceError: If the sequence's true surface is invalid.
     """
     files = SequenceFiles(sequence.name)
-    rollout = read_scoring_inputs(out / files.rollout)
-    reference = read_reference(out, sequence, rollout)
-    report: dict[str, Any] = {}
-    frames: dict[str, Any] = {"unit": "m", "frames": list(range(sequence.frame_count))}
-    if reference is not None:
-        splits = {
-            "reconstruction": sequence.reconstruction_frames,
-            "future": sequence.future_frames,
-        }
-        motions, substituted = _motions(
-            rollout, reference, read_scoring_inputs(out / files.control), sequence.frame_count
+    point = read_scoring_inputs(out / files.observation("point"))
+    is_visible = read_scoring_inputs(out / files.observation("is_visible"))
+    node_of_track = read_scoring_inputs(out / files.observation("node_of_track"))
+    node = read_scoring_inputs(out / files.object_node)
+    if node is None:
+        node = sequence.object_node if rollout is None else rollout[0]
+    if node is None or (point is None and sequence.marker is None):
+        return None
+    if sequence.marker is not None and point is not None and is_visible is not None:
+        free = [m for m in range(point.shape[1]) if m not in sequence.controlled_markers]
+        point, is_visible = point[:, free], is_visible[:, free]
+        node_of_track = None if node_of_track is None else node_of_track[free]
+    clouds = read_split(*(out / files.observation(part) for part in ("cloud", "cloud_end")))
+    return ScoringReference(
+        object_node=node,
+        surface_count=sequence.surface_node_count,
+        point=point,
+        is_visible=is_visible,
+        node_of_track=node_of_track,
+        validation=sequence.validation_track,
+        cloud=tuple(clouds or ()),
+        marker=sequence.marker,
+        marker_node=sequence.marker_node,
+        controlled_markers=sequence.controlled_markers,
+        true_surface=true_surface(read_truth(sequence.folder)),
+        contact=_contact(out, sequence, node, point, is_visible),
+    )
+
+
+def read_topology(out: Path, object_node: Float[ndarray, "node 3"]) -> dict[str, Any] | None:
+    """Relate the fitted connection radii to the resolution; None if there is no fitted object.
+
+    Args:
+        out: Output folder of the run; the resolution is that of its rest shape.
+        object_node: Nodes to use if the run stores no rest shape [m].
+
+    Raises:
+        RunError: If a file of the run is damaged.
+    """
+    path = out / PARAMETERS_FILE
+    node = read_scoring_inputs(out / REST_NODE_FILE)
+    node = object_node if node is None else node
+    if not path.is_file() or len(node) < 2:
+        return None
+    try:
+        parameters = yaml.safe_load(path.read_text(encoding="utf-8"))
+        radius, virtual = (
+            float(parameters[name]) for name in ("connection_radius", "virtual_connection_radius")
         )
-        if not with_baselines:
-            motions = {"rollout": motions["rollout"]}
-        curves = {name: error_curves(nodes, reference) for name, nodes in motions.items()}
-        report |= _tabulated(motions, curves, substituted, reference, splits)
-        frames |= {name: _plain(of_method) for name, of_method in curves.items()}
-        topology = read_topology(out, reference.object_node)
-        if topology is not None:
-            report["topology"] = topology
-    hands, hand_curves = score_hands(out, sequence, hand_points)
-    if hands:
-        report["hands"] = hands
-    if hand_curves:
-        frames["hands"] = {side: _plain(of_hand) for side, of_hand in hand_curves.items()}
-    return report, frames
-
-
-def score_run(
-    out: Path, sequence: Sequence, *, hand_points: StoredPoints | None = None
-) -> dict[str, Any]:
-    """Measure what a run found for one sequence.
-
-    Args:
-        out: Output folder of the run.
-        sequence: The sequence; gives the split, markers, cameras and the truth.
-        hand_points: What the views measured on the hands, for a run that does not hold it.
-
-    Returns:
-        The table of `score_rollout` if the sequence has an object, with ``topology`` if one was
-        fitted; and ``hands`` with each hand's figures if there is anything to compare it with.
-
-    Raises:
-        RunError: If a file of the run is damaged.
-    """
-    return measure_run(out, sequence, hand_points=hand_points)[0]
-
-
-def frame_errors(out: Path, sequence: Sequence) -> dict[str, Any]:
-    """Give the error of every frame of a run, for charts.
-
-    Args:
-        out: Output folder of the run.
-        sequence: The sequence.
-
-    Returns:
-        ``unit`` (m), ``frames`` (all of them, frame 0 included), for each of ``rollout static
-        rigid_follow`` a list a metric, and the same for each hand in ``hands``; None where a frame
-        cannot be measured. Metrics that cannot be measured in any frame are left out.
-
-    Raises:
-        RunError: If a file of the run is damaged.
-    """
-    return measure_run(out, sequence)[1]
-
-
-def _motions(
-    rollout: ndarray | None, reference: ScoringReference, control: ndarray | None, frame_count: int
-) -> tuple[Motions, int]:
-    """Put the rollout, completed, beside the baselines; return also the number of stand-ins."""
-    static = np.asarray(static_baseline(reference.object_node.astype(np.float64), frame_count))
-    complete, substituted = _complete(rollout, static)
-    motions = {"rollout": complete, "static": static}
-    if control is not None and len(control) >= frame_count and control.shape[1] > 0:
-        motions["rigid_follow"] = rigid_follow_baseline(static[0], control[:frame_count])
-    return motions, substituted
-
-
-def _tabulated(
-    motions: Motions,
-    curves: dict[str, Curves],
-    substituted: int,
-    reference: ScoringReference,
-    splits: dict[str, range],
-) -> dict[str, Any]:
-    report: dict[str, Any] = {
-        "aggregation": AGGREGATION,
-        "unit": "m",
-        "substituted_frames": substituted,
+    except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError) as error:
+        raise RunError(f"{path} does not tell the connection radii: {error}.") from error
+    spacing = resolution(node.astype(np.float64))
+    return {
+        "resolution": spacing,
+        "connection_radius": radius,
+        "virtual_connection_radius": virtual,
+        "rrd_object": radius_deviation(radius, spacing),
+        "rrd_virtual": radius_deviation(virtual, spacing),
     }
-    contact = reference.contact
-    contacts = {name: _predicted(contact, nodes) for name, nodes in motions.items()}
-    detail: dict[str, Any] = {}
-    if contact is not None:
-        detail = {"labels": contact.kind, "frame_0": _judged(contact, contacts["rollout"], [0])}
-    for split, frames in splits.items():
-        scored = [frame for frame in frames if frame > 0]
-        if not scored:
-            continue
-        report[split] = {"frames": [scored[0], scored[-1] + 1]}
-        for name, of_method in curves.items():
-            judged = _judged(contact, contacts[name], scored)
-            if name == "rollout" and judged:
-                detail[split] = judged
-            report[split][name] = {
-                metric: _mean(of_method[metric][scored]) if metric in of_method else None
-                for metric in CURVES
-            } | {metric: judged.get(metric.removeprefix("contact_")) for metric in CONTACT_METRICS}
-    if detail:
-        report["contact"] = detail
-    return report
 
 
-def _predicted(
-    contact: ContactReference | None, nodes: Float[ndarray, "frame node 3"]
-) -> dict[str, Bool[ndarray, "frame node"]]:
-    if contact is None:
-        return {}
-    return {name: predicted_contacts(contact, nodes, value) for name, value in THRESHOLDS.items()}
+def read_scoring_inputs(path: Path) -> Any:
+    """Read an array of a run; None if it is not there.
+
+    Raises:
+        RunError: If it is damaged.
+    """
+    if not path.is_file():
+        return None
+    try:
+        return read_array(path)
+    except (ValueError, OSError) as error:
+        raise RunError(f"{path} is not a readable array: {error}.") from error
 
 
-def _judged(
-    contact: ContactReference | None, predicted: dict[str, ndarray], frames: list[int]
-) -> dict[str, float | None]:
-    """Score contacts in some frames, by every threshold and all labels that there are."""
-    scores: dict[str, float | None] = {}
-    if contact is None:
-        return scores
-    for prefix, all_labels in (("", contact.labels), (_BY_PROXIMITY, contact.true_proximity)):
-        for name, labels in all_labels.items():
-            chosen = ContactLabels(
-                is_contact=labels.is_contact[frames], is_known=labels.is_known[frames]
-            )
-            scores |= contact_scores(predicted[name][frames], chosen, prefix + name)
-    return scores
+def read_split(point: Path, end: Path) -> list[ndarray] | None:
+    """Read concatenated point sets and the array of their ends; None if one is missing."""
+    points, ends = read_scoring_inputs(point), read_scoring_inputs(end)
+    return None if points is None or ends is None else np.split(points, ends.reshape(-1)[:-1])
 
 
-def _complete(rollout: ndarray | None, static: ndarray) -> tuple[ndarray, int]:
-    """Fill what a rollout lacks with the static object; return the number of filled frames."""
-    complete = static.copy()
-    if rollout is None or rollout.shape[1:] != static.shape[1:]:
-        return complete, len(static)
-    count = min(len(rollout), len(static))
-    is_usable = np.isfinite(rollout[:count]).all(axis=(1, 2))
-    complete[:count][is_usable] = rollout[:count][is_usable]
-    return complete, len(static) - int(is_usable.sum())
+def _contact(
+    out: Path,
+    sequence: Sequence,
+    node: Float[ndarray, "node 3"],
+    point: ndarray | None,
+    is_visible: ndarray | None,
+) -> ContactReference | None:
+    """Prepare the contact labels; None without hands or without virtual springs."""
+    files = SequenceFiles(sequence.name)
+    vertices = [read_scoring_inputs(out / files.hand_vertex(side)) for side in sequence.hands]
+    whole = [held_where_missing(vertex)[0] for vertex in vertices if vertex is not None]
+    hands = [vertex for vertex in whole if vertex is not None]
+    path = out / files.model
+    if not hands or not path.is_file():
+        return None
+    try:
+        tensors = read_tensors(path)
+        virtual = tensors["spring_nodes"][int(tensors["object_spring_count"][0]) :]
+    except Exception as error:  # safetensors has no common class of errors
+        raise RunError(f"{path} is not a readable model: {error}.") from error
+    hand = np.concatenate(hands, axis=1).astype(np.float64)
+    start = node.astype(np.float64)
+    recorded = read_truth(sequence.folder)
+    truth = true_labels(recorded, start)
+    if truth is not None:
+        labels = dict.fromkeys(THRESHOLDS, truth)
+    else:
+        tracks = None if point is None else point.astype(np.float64)
+        labels = proximity_labels(start, hand, tracks, is_visible)
+    return ContactReference(
+        hand=hand,
+        is_joined=joined_nodes(virtual, len(node)),
+        kind="proximity" if truth is None else "true",
+        labels=labels,
+        true_proximity=true_proximity_labels(recorded, start, sequence.hands),
+    )
 
 
-def _mean(value: ndarray) -> float | None:
-    known = value[np.isfinite(value)]
-    return float(known.mean()) if len(known) else None
+def _mean(value: Float[ndarray, " frame"]) -> float | None:
+    """Average the finite values; None if there are none."""
+    finite = value[np.isfinite(value)]
+    return float(finite.mean()) if len(finite) else None
 
 
 def _plain(curves: Curves) -> dict[str, list[float | None]]:

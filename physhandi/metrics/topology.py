@@ -1,4 +1,4 @@
-"""How the fitted connection radii relate to the object's resolution."""
+"""Radius-to-resolution deviation of a fitted topology."""
 
 from typing import Any
 

@@ -1,7 +1,7 @@
-"""Distances between a simulated object and the true surface, which no sensor has blurred.
+"""Distances between a simulated object and its true surface.
 
-Everything here is measured in the world of the truth, so that errors of calibration and of the
-clocks, which observations share with a fit, are in it.
+They are measured in the world of the truth and so include the errors of calibration and
+synchronisation that observations and fit have in common.
 """
 
 from dataclasses import dataclass
@@ -18,9 +18,9 @@ from physhandi.metrics.geometry import chamfer_one_way
 from physhandi.triangles import triangle_distance
 
 SAMPLE_COUNT = 2000
-"""Points of the true surface that are asked for the nearest node."""
+"""Samples of the true surface."""
 CANDIDATES = 12
-"""Triangles, those with the nearest centres, that are asked for the point nearest to a node."""
+"""Triangles with the nearest centres among which the point nearest to a node is searched."""
 _SEED = 20260
 
 
@@ -35,7 +35,7 @@ class TrueSurface:
     sample_face: Int[ndarray, " sample"]
     """Triangle that each sample lies on."""
     sample_weight: Float[ndarray, "sample 3"]
-    """How much each corner of that triangle counts."""
+    """Barycentric weights of the triangle's corners."""
 
     def samples(self, frame: int) -> Float[ndarray, "sample 3"]:
         """Find the samples in a frame [m]."""
@@ -53,7 +53,7 @@ class TrueSurface:
 
 
 def true_surface(truth: Truth, count: int = SAMPLE_COUNT) -> TrueSurface | None:
-    """Prepare the true surface; None if the recording tells none or it has no area.
+    """Prepare the true surface; None if the recording has none or its area is zero.
 
     Samples are spread evenly over the area of frame 0 from a fixed seed, and are the same places of
     the object in all frames.
@@ -63,7 +63,7 @@ def true_surface(truth: Truth, count: int = SAMPLE_COUNT) -> TrueSurface | None:
         count: Number of samples.
 
     Raises:
-        SequenceError: If a triangle has a corner that is not there.
+        SequenceError: If a triangle has a corner that does not exist.
     """
     point, face = truth.object_point, truth.object_face
     if point is None or face is None or not face.size:

@@ -1,4 +1,8 @@
-"""Keypoints of hands in images and in the views of a sequence."""
+"""Detects the keypoints of hands in images and in the views of a sequence.
+
+MediaPipe's palm and landmark networks run locally (`KeypointDetector`); `detect_sequence` follows
+the hands of a sequence through all its views.
+"""
 
 import threading
 from collections.abc import Sequence as SequenceOf
@@ -22,7 +26,62 @@ _PALM_SIZE, _LANDMARK_SIZE = 192, 224
 _STRIDES = ((8, 2), (16, 6))
 """Anchor grids of the palm network: cell size [px] and anchors per cell."""
 _PALM_SCORE = 0.5
+"""Least probability of a detected palm."""
 _OVERLAP = 0.3
+"""Intersection over union from which two palms count as one."""
+_PRESENCE = 0.5
+"""Least probability that a region shows a hand."""
+_SAME_HAND = 0.5
+"""Intersection over union from which two detected hands count as one."""
+_MAX_HANDS = 2
+KEYPOINT_STAGE = "keypoint_detection"
+
+
+@dataclass(frozen=True)
+class DetectedHand:
+    """One hand in one image."""
+
+    side: HandSide
+    """Which hand it looks like, in an image that is not mirrored."""
+    keypoint: Float[ndarray, "21 2"]
+    """Keypoints in MediaPipe's order [px]."""
+    confidence: float
+    """Probability that this is a hand, 0 to 1."""
+    right: float
+    """Probability that it is a right hand, 0 to 1."""
+
+
+def detect_sequence(
+    sequence: Sequence, progress: Progress | None = None
+) -> Float[ndarray, "view frame hand 21 3"]:
+    """Find the keypoints of a sequence's hands in all frames of all views.
+
+    Args:
+        sequence: The sequence; it must say which hands it shows and have color images.
+        progress: Told after every frame.
+
+    Returns:
+        Pixel x, pixel y and confidence of each keypoint; NaN where a hand was not found.
+
+    Raises:
+        MissingInputError: If the sequence names no hand, or a view has no color images.
+    """
+    if not sequence.hands:
+        raise MissingInputError(
+            f"Sequence '{sequence.name}': no hand is named. "
+            "Add 'hands: [right]' to sequence.yaml, or left, or both."
+        )
+    blind = [view.name for view in sequence.views if not view.has_color]
+    if blind or not sequence.views:
+        raise MissingInputError(
+            f"Sequence '{sequence.name}': view '{(blind or ['?'])[0]}' has no color images to find "
+            "keypoints in. Add color.mp4 or color/, or give keypoint.npy for the view."
+        )
+    detector = KeypointDetector()
+    progress = progress or NullProgress()
+    return np.stack(
+        [detect_view(view, sequence.hands, progress, detector) for view in sequence.views]
+    )
 
 
 @dataclass(frozen=True)
@@ -45,7 +104,7 @@ class Region:
 
 @dataclass(frozen=True)
 class Landmarks:
-    """What the landmark network says about one region."""
+    """Output of the landmark network for one region."""
 
     pixel: Float[ndarray, "21 2"]
     """Keypoints in the image [px]."""
@@ -53,6 +112,113 @@ class Landmarks:
     """Probability that the region shows a hand."""
     right: float
     """Probability that it is a right hand."""
+
+
+class KeypointDetector:
+    """Runs the palm and the landmark network on images; nothing leaves the machine."""
+
+    def __init__(self, threads: int = 2) -> None:
+        """Load both networks.
+
+        Args:
+            threads: CPU threads that each network may use.
+        """
+        self._find_palms = PalmNetwork(threads)
+        self._find_landmarks = LandmarkNetwork(threads)
+
+    def detect(
+        self,
+        image: UInt8[ndarray, "row column 3"],
+        existing: SequenceOf[DetectedHand] = (),
+        max_hands: int = _MAX_HANDS,
+    ) -> list[DetectedHand]:
+        """Search a whole RGB image for hands.
+
+        Args:
+            image: The image (RGB).
+            existing: Hands that are already detected in it; they come first in the result.
+            max_hands: Most hands to return, the existing ones included.
+        """
+        hands = list(existing)
+        for region in self._find_palms(image):
+            if len(hands) >= max_hands:
+                break
+            first = self._find_landmarks(image, region)
+            if first.presence > _PRESENCE:
+                # The palm's region is coarse; its keypoints give a better one.
+                self._add(hands, image, landmark_region(first.pixel))
+        return hands[:max_hands]
+
+    def follow(
+        self, image: UInt8[ndarray, "row column 3"], previous: SequenceOf[DetectedHand]
+    ) -> list[DetectedHand]:
+        """Search for the hands of the previous frame near their positions in it."""
+        hands: list[DetectedHand] = []
+        for hand in previous:
+            self._add(hands, image, landmark_region(hand.keypoint))
+        return hands
+
+    def _add(
+        self, hands: list[DetectedHand], image: UInt8[ndarray, "row column 3"], region: Region
+    ) -> None:
+        """Append the hand in a region, if there is one that is not listed yet."""
+        hand = self._find_landmarks(image, region)
+        is_new = all(overlap(hand.pixel, other.keypoint) < _SAME_HAND for other in hands)
+        if hand.presence > _PRESENCE and is_new:
+            side: HandSide = "right" if hand.right > 0.5 else "left"
+            hands.append(DetectedHand(side, hand.pixel, hand.presence, hand.right))
+
+
+def detect_view(
+    view: View, hands: tuple[HandSide, ...], progress: Progress, detector: KeypointDetector
+) -> Float[ndarray, "frame hand 21 3"]:
+    """Follow the given hands through one view.
+
+    Args:
+        view: The view; needs color images.
+        hands: Hands to look for, in the order of the result's hand axis.
+        progress: Told after every frame.
+        detector: The networks.
+
+    Returns:
+        Pixel x, pixel y and confidence of each keypoint; NaN where a hand was not found.
+    """
+    result = np.full((view.frame_count, len(hands), 21, 3), np.nan, dtype=np.float32)
+    previous: list[DetectedHand] = []
+    for frame in range(view.frame_count):
+        progress.check_cancelled()
+        image = view.color(frame)
+        detected = detector.follow(image, previous)
+        if len(detected) < len(hands):
+            detected = detector.detect(image, detected)
+        assigned = assign_hands(detected, hands)
+        for index, hand in assigned.items():
+            result[frame, index, :, :2] = hand.keypoint
+            result[frame, index, :, 2] = hand.confidence
+        previous = list(assigned.values())
+        progress.report(KEYPOINT_STAGE, frame + 1, view.frame_count, None, f"View {view.name}")
+    return result
+
+
+def assign_hands(
+    detected: SequenceOf[DetectedHand], hands: tuple[HandSide, ...]
+) -> dict[int, DetectedHand]:
+    """Assign the detected hands of one image to the hands of a sequence.
+
+    A single hand gets the detection that looks most like it, whatever side the network names;
+    of two hands, the right one gets the detection that looks more like a right hand.
+
+    Returns:
+        Detection by index in `hands`.
+    """
+    ordered = sorted(detected, key=lambda hand: -hand.right)
+    if not ordered:
+        return {}
+    if len(hands) == 1:
+        return {0: ordered[0] if hands[0] == "right" else ordered[-1]}
+    if len(ordered) == 1:
+        return {hands.index(ordered[0].side): ordered[0]}
+    return {hands.index("right"): ordered[0], hands.index("left"): ordered[-1]}
 
 
 class PalmNetwork:
@@ -98,7 +264,7 @@ class LandmarkNetwork:
 
 
 def landmark_region(pixel: Float[ndarray, "21 2"]) -> Region:
-    """Guess from a hand's keypoints where the same hand is going to be in the next frame."""
+    """Predict the region of a hand in the next frame from its keypoints."""
     part = pixel[[0, 1, 2, 3, 5, 6, 9, 10, 13, 14, 17, 18]]
     knuckle = (pixel[5] + pixel[13]) / 4 + pixel[9] / 2
     angle = _turn_to_up(pixel[0], knuckle)
@@ -158,14 +324,14 @@ def _merge(
 ) -> list[Float[ndarray, "9 2"]]:
     """Average detections that overlap, weighted by score (weighted non-maximum suppression)."""
     merged = []
-    left = np.argsort(-score, kind="stable")
-    while len(left):
-        best = palm[left[0]]
-        is_same = _box_overlap(best, palm[left]) > _OVERLAP
+    remaining = np.argsort(-score, kind="stable")
+    while len(remaining):
+        best = palm[remaining[0]]
+        is_same = _box_overlap(best, palm[remaining]) > _OVERLAP
         is_same[0] = True
-        same = left[is_same]
+        same = remaining[is_same]
         merged.append(np.average(palm[same], axis=0, weights=score[same]))
-        left = left[~is_same]
+        remaining = remaining[~is_same]
     return merged
 
 
@@ -201,170 +367,3 @@ def _region_around(
 def _turn_to_up(wrist: Float[ndarray, " 2"], knuckle: Float[ndarray, " 2"]) -> float:
     x, y = knuckle - wrist
     return float(np.arctan2(x, -y))
-
-
-_PRESENCE = 0.5
-_SAME_HAND = 0.5
-_MAX_HANDS = 2
-KEYPOINT_STAGE = "keypoint_detection"
-
-
-@dataclass(frozen=True)
-class DetectedHand:
-    """One hand in one image."""
-
-    side: HandSide
-    """Which hand it looks like, in an image that is not mirrored."""
-    keypoint: Float[ndarray, "21 2"]
-    """Keypoints in MediaPipe's order [px]."""
-    confidence: float
-    """Probability that this is a hand, 0 to 1."""
-    right: float
-    """Probability that it is a right hand, 0 to 1."""
-
-
-class KeypointDetector:
-    """Runs the palm and the landmark network on images; nothing leaves the machine."""
-
-    def __init__(self, threads: int = 2) -> None:
-        """Load both networks.
-
-        Args:
-            threads: CPU threads that each network may use.
-        """
-        self._find_palms = PalmNetwork(threads)
-        self._find_landmarks = LandmarkNetwork(threads)
-
-    def detect(
-        self,
-        image: UInt8[ndarray, "row column 3"],
-        known: SequenceOf[DetectedHand] = (),
-        max_hands: int = _MAX_HANDS,
-    ) -> list[DetectedHand]:
-        """Search a whole RGB image for hands.
-
-        Args:
-            image: The image (RGB).
-            known: Hands that have been found in it already.
-            max_hands: Most hands to return, the known ones included.
-
-        Returns:
-            The known hands, then the others.
-        """
-        found = list(known)
-        for region in self._find_palms(image):
-            if len(found) >= max_hands:
-                break
-            first = self._find_landmarks(image, region)
-            if first.presence > _PRESENCE:
-                # The palm's region is coarse; the keypoints in it say where the hand really is.
-                self._add(found, image, landmark_region(first.pixel))
-        return found[:max_hands]
-
-    def follow(
-        self, image: UInt8[ndarray, "row column 3"], previous: SequenceOf[DetectedHand]
-    ) -> list[DetectedHand]:
-        """Look for the hands of the frame before where they were; return those that still are."""
-        found: list[DetectedHand] = []
-        for hand in previous:
-            self._add(found, image, landmark_region(hand.keypoint))
-        return found
-
-    def _add(
-        self, found: list[DetectedHand], image: UInt8[ndarray, "row column 3"], region: Region
-    ) -> None:
-        """Keep what a region shows, if it is a hand that is not known yet."""
-        hand = self._find_landmarks(image, region)
-        is_new = all(overlap(hand.pixel, other.keypoint) < _SAME_HAND for other in found)
-        if hand.presence > _PRESENCE and is_new:
-            side: HandSide = "right" if hand.right > 0.5 else "left"
-            found.append(DetectedHand(side, hand.pixel, hand.presence, hand.right))
-
-
-def detect_view(
-    view: View, hands: tuple[HandSide, ...], progress: Progress, detector: KeypointDetector
-) -> Float[ndarray, "frame hand 21 3"]:
-    """Follow the given hands through one view.
-
-    Args:
-        view: The view; needs color images.
-        hands: Hands to look for, in the order of the result's hand axis.
-        progress: Told after every frame.
-        detector: The networks.
-
-    Returns:
-        Pixel x, pixel y and confidence of each keypoint; NaN where a hand was not found.
-    """
-    result = np.full((view.frame_count, len(hands), 21, 3), np.nan, dtype=np.float32)
-    previous: list[DetectedHand] = []
-    for frame in range(view.frame_count):
-        progress.check_cancelled()
-        image = view.color(frame)
-        found = detector.follow(image, previous)
-        if len(found) < len(hands):
-            found = detector.detect(image, found)
-        assigned = assign_hands(found, hands)
-        for index, hand in assigned.items():
-            result[frame, index, :, :2] = hand.keypoint
-            result[frame, index, :, 2] = hand.confidence
-        previous = list(assigned.values())
-        progress.report(KEYPOINT_STAGE, frame + 1, view.frame_count, None, f"View {view.name}")
-    return result
-
-
-def detect_sequence(
-    sequence: Sequence, progress: Progress | None = None
-) -> Float[ndarray, "view frame hand 21 3"]:
-    """Find the keypoints of a sequence's hands in all frames of all views.
-
-    Args:
-        sequence: The sequence; it must say which hands it shows and have color images.
-        progress: Told after every frame.
-
-    Returns:
-        Pixel x, pixel y and confidence of each keypoint; NaN where a hand was not found.
-
-    Raises:
-        MissingInputError: If the sequence names no hand, or a view has no color images.
-    """
-    if not sequence.hands:
-        raise MissingInputError(
-            f"Sequence '{sequence.name}': no hand is named. "
-            "Add 'hands: [right]' to sequence.yaml, or left, or both."
-        )
-    blind = [view.name for view in sequence.views if not view.has_color]
-    if blind or not sequence.views:
-        raise MissingInputError(
-            f"Sequence '{sequence.name}': view '{(blind or ['?'])[0]}' has no color images to find "
-            "keypoints in. Add color.mp4 or color/, or give keypoint.npy for the view."
-        )
-    detector = KeypointDetector()
-    progress = progress or NullProgress()
-    return np.stack(
-        [detect_view(view, sequence.hands, progress, detector) for view in sequence.views]
-    )
-
-
-def assign_hands(
-    found: SequenceOf[DetectedHand], hands: tuple[HandSide, ...]
-) -> dict[int, DetectedHand]:
-    """Say which of the wanted hands each found one is.
-
-    A single wanted hand is the one that looks most like it, whatever the network calls its side;
-    two wanted hands are told apart by which looks more like a right hand.
-
-    Args:
-        found: Hands of one image.
-        hands: Wanted hands.
-
-    Returns:
-        Found hand by position in `hands`.
-    """
-    ordered = sorted(found, key=lambda hand: -hand.right)
-    if not ordered:
-        return {}
-    if len(hands) == 1:
-        return {0: ordered[0] if hands[0] == "right" else ordered[-1]}
-    if len(ordered) == 1:
-        return {hands.index(ordered[0].side): ordered[0]}
-    return {hands.index("right"): ordered[0], hands.index("left"): ordered[-1]}

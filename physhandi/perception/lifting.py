@@ -1,4 +1,4 @@
-"""Depth, masks and tracks of all views lifted into the world and fused."""
+"""Lifts depth, masks and tracks of all views into the world and fuses them."""
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -18,7 +18,7 @@ HAND_LABEL = {"right": 2, "left": 3}
 VOXEL = 0.0045
 """Edge of the voxels to which a fused cloud is thinned [m]."""
 OUTLIER_RADIUS = 0.012
-"""Radius within which a fused point needs company [m]."""
+"""Radius within which a fused point needs neighbours [m]."""
 OUTLIER_COUNT = 6
 """Voxels, its own included, that must be occupied within `OUTLIER_RADIUS` of a point."""
 
@@ -27,16 +27,16 @@ _SOLID_NEIGHBORS = 5
 
 
 def observe_object(sequence: Sequence, progress: Progress | None = None) -> ObjectObservation:
-    """Collect what a sequence shows of its object, in the world frame.
+    """Collect the observations of a sequence's object in the world frame.
 
-    Markers, where the sequence has them, become the tracks and name their nodes; where it also says
-    which of their motions to trust, they are the cloud too, and no depth is read. Otherwise the
-    pixel tracks of every view are lifted by depth; those that frame 0 does not show on the object
-    are left out.
+    Markers, where the sequence has them, become the tracks and name their nodes; where it also
+    marks which of their motions are valid, they are the cloud too, and no depth is read. Otherwise
+    the pixel tracks of every view are lifted by depth; tracks that frame 0 does not show on the
+    object are left out.
 
     Args:
         sequence: Recording with markers, or with views that have depth and masks.
-        progress: Told after every frame; may ask to stop.
+        progress: Receives a report after every frame; may cancel.
 
     Returns:
         Tracks of all views side by side and one fused cloud a frame [m].
@@ -83,7 +83,7 @@ def hand_points(
 
     Args:
         sequence: Recording whose views have depth and masks.
-        progress: May ask to stop.
+        progress: May cancel.
 
     Returns:
         Fused surface points of each hand of `sequence.hands` in each frame, indexed
@@ -116,10 +116,10 @@ def hand_points(
 def surface_points(
     view: View, depth: Float[ndarray, "row column"], is_labelled: Bool[ndarray, "row column"]
 ) -> Float[ndarray, "point 3"]:
-    """Lift the labelled pixels of one depth image, without those that float at an edge.
+    """Lift the labelled pixels of one depth image, without mixed pixels at depth edges.
 
     A pixel counts if at least five of the eight around it have the same label and a depth within
-    `EDGE_STEP`; a sensor's mixed pixels between fore- and background have fewer.
+    `EDGE_STEP`; a sensor's mixed pixels between foreground and background have fewer.
 
     Args:
         view: View that recorded the image.
@@ -144,7 +144,7 @@ def surface_points(
 
 
 def fuse(parts: list[Float[ndarray, "_ 3"]]) -> Float[ndarray, "point 3"]:
-    """Join the clouds of several views, thin them to `VOXEL` and drop lonely points.
+    """Join the clouds of several views, thin them to `VOXEL` and drop outliers.
 
     Args:
         parts: Cloud of each view in the world frame [m].
@@ -201,10 +201,10 @@ def _join(paths: list[list[ndarray]], frame_count: int) -> Float[ndarray, "frame
 
 
 def _from_surface_markers(sequence: Sequence, progress: Progress) -> ObjectObservation:
-    """Take markers that sample the visible surface as tracks, and the seen ones as the cloud.
+    """Use markers that sample the visible surface as tracks, and the visible ones as the cloud.
 
-    The recording has judged their motion already, so its depth is not lifted again: PhysTwin's
-    Chamfer term compares with the visible tracked points alone.
+    The recording marks valid motions itself, so no depth is lifted: PhysTwin's Chamfer term
+    compares with the visible tracked points alone.
     """
     progress.check_cancelled()
     marker = np.asarray(sequence.marker, dtype=np.float32)
@@ -214,7 +214,7 @@ def _from_surface_markers(sequence: Sequence, progress: Progress) -> ObjectObser
 
 
 def _from_markers(sequence: Sequence, cloud: tuple[ndarray, ...]) -> ObjectObservation:
-    """Take identified markers as tracks; identity makes every seen motion valid."""
+    """Use identified markers as tracks; identity makes every observed motion valid."""
     marker = np.asarray(sequence.marker, dtype=np.float32)
     is_visible = np.asarray(np.isfinite(marker).all(axis=-1))
     is_motion_valid = np.zeros_like(is_visible)

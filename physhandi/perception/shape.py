@@ -24,14 +24,18 @@ from physhandi.errors import MissingInputError
 from physhandi.perception.lifting import OBJECT_LABEL
 
 HiddenTest = Callable[[Float[ndarray, "point 3"]], Bool[ndarray, " point"]]
-"""Tells for world points whether the object may be there although no cloud point is."""
+"""Whether the object may occupy world points at which no cloud point lies."""
 
 MAX_GAP = 0.04
 """Widest gap in a sheet that is closed without knowing whether a hand hides it [m]."""
 _STANDING_HEIGHT = 0.03
+"""An object whose lowest point is nearer to the ground than this stands on it [m]."""
 _SHEET_THICKNESS = 1.5
+"""Largest thickness of a sheet, in distances between nodes."""
 _LEAST_FILL = 0.25
+"""Points of an occupied cell, as a share of the median over cells."""
 _SMOOTHED = 13
+"""Points over which a sheet's height is smoothed."""
 
 
 def object_nodes_from_observation(
@@ -108,10 +112,10 @@ def object_nodes(
 def silhouette_test(
     views: list[View], frame: int, point: Float[ndarray, "point 3"]
 ) -> Bool[ndarray, " point"]:
-    """Tell which points the object may occupy, judged by the masks of all views.
+    """Mark the points that the object may occupy according to the masks of all views.
 
-    A point is ruled out if any view sees background within one pixel of it: the object would have
-    covered that. Outside of an image nothing is ruled out.
+    A point is ruled out if a view sees background all around its pixel, which the object would
+    cover. Outside of an image nothing is ruled out.
     """
     possible = np.ones(len(point), dtype=bool)
     for view in views:
@@ -125,7 +129,7 @@ def silhouette_test(
 
 
 def _is_sheet(local: Float[ndarray, "point 3"], spacing: float) -> bool:
-    """Judge thickness without the outermost points; wide and thin makes a sheet."""
+    """Whether a cloud is wide and thin, its outermost points left out."""
     low, high = np.percentile(local, [2, 98], axis=0)
     _, width, thickness = high - low
     return bool(thickness < _SHEET_THICKNESS * spacing and thickness < max(0.02, width))
@@ -148,13 +152,13 @@ def _sheet_nodes(
     cell = np.clip(cell, 0, shape - 1)
     count = np.zeros(tuple(shape), dtype=np.int64)
     np.add.at(count, (cell[:, 0], cell[:, 1]), 1)
-    seen = count >= max(1.0, _LEAST_FILL * float(np.median(count[count > 0])))
+    is_seen = count >= max(1.0, _LEAST_FILL * float(np.median(count[count > 0])))
     grid = start + (np.indices(tuple(shape)).reshape(2, -1).T + 0.5) * spacing
     height = _heights(local, grid)
     position = center + np.concatenate([grid, height[:, None]], axis=1) @ basis
-    filled = seen.ravel()
+    filled = is_seen.ravel()
     if is_hidden is None:
-        filled = filled | _close_gaps(seen, spacing).ravel()
+        filled = filled | _close_gaps(is_seen, spacing).ravel()
     else:
         filled = filled | (_in_hull(grid, grid[filled], spacing) & is_hidden(position))
     return position[filled]
@@ -236,8 +240,8 @@ def _solid_nodes(
             for place, level in zip(column, top, strict=True)
         ]
     )
-    taken = {tuple(place) for place in key.tolist()}
-    empty = np.array([place for place in inside.tolist() if tuple(place) not in taken])
+    occupied = {tuple(place) for place in key.tolist()}
+    empty = np.array([place for place in inside.tolist() if tuple(place) not in occupied])
     if len(empty) == 0:
         return surface
     return np.concatenate([surface, origin + (empty + 0.5) * spacing])

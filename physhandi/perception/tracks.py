@@ -38,9 +38,9 @@ def lift_pixels(
         Points in the world frame [m]; NaN where the position cannot be lifted.
     """
     row_count, column_count = depth.shape
-    known = np.asarray(np.isfinite(pixel).all(axis=1))
-    corner = np.floor(np.where(known[:, None], pixel, 0.0)).astype(np.int64)
-    inside = known & (corner >= 0).all(axis=1)
+    is_finite = np.asarray(np.isfinite(pixel).all(axis=1))
+    corner = np.floor(np.where(is_finite[:, None], pixel, 0.0)).astype(np.int64)
+    inside = is_finite & (corner >= 0).all(axis=1)
     inside &= (corner[:, 0] < column_count - 1) & (corner[:, 1] < row_count - 1)
     corner[~inside] = 0
     rows = corner[:, 1, None] + np.array([0, 0, 1, 1])
@@ -48,7 +48,7 @@ def lift_pixels(
     around = depth[rows, columns].astype(np.float64)
     inside &= (around > 0).all(axis=1) & is_object[rows, columns].all(axis=1)
     inside &= np.ptp(around, axis=1) < EDGE_STEP
-    x, y = (np.where(known[:, None], pixel, 0.0) - corner).T
+    x, y = (np.where(is_finite[:, None], pixel, 0.0) - corner).T
     weight = np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], axis=1)
     point = np.full((len(pixel), 3), np.nan)
     if inside.any():
@@ -76,15 +76,15 @@ def motion_validity(
     """
     valid = np.zeros(is_visible.shape, dtype=bool)
     for frame in range(1, len(point)):
-        seen = np.flatnonzero(is_visible[frame - 1] & is_visible[frame])
-        if len(seen) < NEIGHBOR_COUNT:
+        tracks = np.flatnonzero(is_visible[frame - 1] & is_visible[frame])
+        if len(tracks) < NEIGHBOR_COUNT:
             continue
-        start = point[frame - 1, seen]
-        motion = point[frame, seen] - start
+        start = point[frame - 1, tracks]
+        motion = point[frame, tracks] - start
         tree = KDTree(start)
         spacing = np.median(tree.query(start, k=NEIGHBOR_COUNT)[0][:, -1])
         radius = max(NEIGHBOR_RADIUS, 2.0 * float(spacing))
-        valid[frame, seen] = _agrees(tree.query_pairs(radius, output_type="ndarray"), motion)
+        valid[frame, tracks] = _agrees(tree.query_pairs(radius, output_type="ndarray"), motion)
     return valid
 
 

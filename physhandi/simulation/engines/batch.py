@@ -34,6 +34,13 @@ from physhandi.simulation.master_topology import MasterTopology
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import SPEED_LIMIT, Simulator, checked_control
 
+_BUSY_WARPS = 24
+"""Warps that a multiprocessor needs to be busy."""
+BLOCK_NODES = 4
+"""Nodes are ordered so that so many neighbours in memory are neighbours in space."""
+batch_kernel = lru_cache(maxsize=None)(make_batch_kernel)
+_COMMON = ("rest_length_floor", "virtual_rest_length_floor", "frame_rate", "frame_duration")
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MotionTarget:
@@ -162,14 +169,6 @@ class LossSum:
     def _array(self, value: ndarray, dtype: Any) -> wp.array:
         flat = np.int32 if dtype is wp.int32 else np.float32
         return wp.array(np.ascontiguousarray(value, dtype=flat), dtype=dtype, device=self._device)
-
-
-_BUSY_WARPS = 24
-"""Warps that a multiprocessor needs to be busy."""
-BLOCK_NODES = 4
-"""Nodes are ordered so that so many neighbours in memory are neighbours in space."""
-
-batch_kernel = lru_cache(maxsize=None)(make_batch_kernel)
 
 
 @dataclass(frozen=True, eq=False)
@@ -421,9 +420,6 @@ def _number(parameters: SimulationParameters, name: str, substeps: int) -> float
         "virtual_damping": parameters.damping * (parameters.virtual_stiffness > 0.0),
     }
     return float(derived.get(name, getattr(parameters, name, 0.0)))
-
-
-_COMMON = ("rest_length_floor", "virtual_rest_length_floor", "frame_rate", "frame_duration")
 
 
 class BatchSimulator:

@@ -27,6 +27,17 @@ TRIAL = 64
 """Substeps by which a number of threads is judged."""
 FIRST_PAUSE, LONGEST_PAUSE = 0.25, 8.0
 """How long the slower number of threads is not tried again, at first and at most [s]."""
+PART_COUNTS = 2
+"""Parts of an object, on every processor the same, because they decide the order of sums."""
+LEAST_SPRINGS = 512
+"""Fewer are not worth it that threads meet."""
+_NEVER = np.iinfo(np.int32).max
+_RECORD: Any = Record
+_PARTS: Any = Parts
+_MATERIAL: Any = SpringMaterial
+_BARS: Any = Bars
+PartState = tuple[wp.array, wp.array]
+"""Positions and velocities."""
 
 
 class Pace:
@@ -185,20 +196,6 @@ def _processor_count() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-PART_COUNTS = 2
-"""Parts of an object, on every processor the same, because they decide the order of sums."""
-LEAST_SPRINGS = 512
-"""Fewer are not worth it that threads meet."""
-_NEVER = np.iinfo(np.int32).max
-_RECORD: Any = Record
-_PARTS: Any = Parts
-_MATERIAL: Any = SpringMaterial
-_BARS: Any = Bars
-
-PartState = tuple[wp.array, wp.array]
-"""Positions and velocities."""
 
 
 class CpuEngine:

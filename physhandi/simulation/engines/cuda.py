@@ -28,6 +28,27 @@ from physhandi.simulation.kernels.cuda_large_frame import (
 
 WARP = 32
 """Threads that read side by side."""
+LARGE_BLOCK_SIZES = {512: 14, 768: 6}
+"""Threads of a block, and the most half-edges for which each has registers."""
+LANES_PER_NODE = (8, 4, 2, 1)
+"""Threads that may sum one node's springs."""
+LOCALS_STEP = 512
+"""Room for nodes grows by so many, so that few sizes are compiled."""
+_BYTES_OF_A_LOCAL = 4 * FLOATS_OF_A_LOCAL
+_BYTES_OF_A_THREAD = 4
+"""What Warp's own bookkeeping takes of shared memory."""
+large_frame_kernel = lru_cache(maxsize=None)(make_large_frame_kernel)
+LEAST_OWN = 4
+"""Fewer nodes in a block cost more waiting than they save work."""
+MOST_LANES = 576
+"""A block's nodes get as many threads each as keep them below this sum."""
+MOST_KEPT = 6
+"""Most half-edges that a thread keeps in registers."""
+BLOCK_SIZES = (256, 384, 576, 768)
+"""Threads of a block; few sizes, because each is compiled on its own."""
+_LAST_TAG = 2**31 - 2**20
+frame_kernel = lru_cache(maxsize=None)(make_frame_kernel)
+adjoint_kernel = lru_cache(maxsize=None)(make_adjoint_kernel)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -81,19 +102,6 @@ def arrange_columns(partition: Partition, lanes: int, threads: int) -> HalfEdgeC
         place=place.astype(np.int32),
         spring=spring.astype(np.int32),
     )
-
-
-LARGE_BLOCK_SIZES = {512: 14, 768: 6}
-"""Threads of a block, and the most half-edges for which each has registers."""
-LANES_PER_NODE = (8, 4, 2, 1)
-"""Threads that may sum one node's springs."""
-LOCALS_STEP = 512
-"""Room for nodes grows by so many, so that few sizes are compiled."""
-_BYTES_OF_A_LOCAL = 4 * FLOATS_OF_A_LOCAL
-_BYTES_OF_A_THREAD = 4
-"""What Warp's own bookkeeping takes of shared memory."""
-
-large_frame_kernel = lru_cache(maxsize=None)(make_large_frame_kernel)
 
 
 def most_large_locals(device: Any) -> int:
@@ -189,20 +197,6 @@ class LargeFrames:
             block_dim=layout.threads,
             device=simulator.device,
         )
-
-
-LEAST_OWN = 4
-"""Fewer nodes in a block cost more waiting than they save work."""
-MOST_LANES = 576
-"""A block's nodes get as many threads each as keep them below this sum."""
-MOST_KEPT = 6
-"""Most half-edges that a thread keeps in registers."""
-BLOCK_SIZES = (256, 384, 576, 768)
-"""Threads of a block; few sizes, because each is compiled on its own."""
-_LAST_TAG = 2**31 - 2**20
-
-frame_kernel = lru_cache(maxsize=None)(make_frame_kernel)
-adjoint_kernel = lru_cache(maxsize=None)(make_adjoint_kernel)
 
 
 @dataclass(frozen=True)

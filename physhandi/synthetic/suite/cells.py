@@ -53,92 +53,6 @@ from physhandi.synthetic.suite.methods import (
 )
 from physhandi.synthetic.suite.variants import DISTURBED_HAND, make_variant, noise_seed
 
-
-def measure_cell(
-    run: RunFolder | None, reference: RunFolder, recording: Sequence
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Measure what a run predicted.
-
-    The run brings its motion, hands and springs; observations are the reference's, whatever
-    the run itself was given. Without a run the static object stands in.
-
-    Args:
-        run: What is scored.
-        reference: The static object on the same recording.
-        recording: The whole recording, with its truth.
-
-    Returns:
-        The report and the errors of the rollout frame by frame.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        assemble(Path(folder), run, reference, recording)
-        report, frames = measure_run(Path(folder), recording, with_baselines=False)
-    curves: dict[str, Any] = frames.get("rollout", {})
-    add_photometric(report, curves, run, reference, recording)
-    return report, curves
-
-
-def assemble(
-    folder: Path, run: RunFolder | None, reference: RunFolder, recording: Sequence
-) -> None:
-    """Lay out what is scored: the run's motion beside the reference's observations."""
-    files = SequenceFiles(recording.name)
-    observed = (f"{files.folder}/observation/", files.keypoint)
-    left_out = (files.rollout, files.control) if run is None else ()
-    chosen = {r: path for r, path in artefacts(reference.out) if r.startswith(observed)} | {
-        rel: path
-        for rel, path in artefacts((reference if run is None else run).out)
-        if not rel.startswith(observed) and rel not in left_out
-    }
-    for rel, path in chosen.items():
-        target = folder / rel
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.symlink_to(path.resolve())
-    truth = read_truth(recording.folder).hand_vertex
-    if run is not None and not any(files.hand_vertex(side) in chosen for side in SIDES):
-        for side in recording.hands:  # An oracle moves the object with the true hand itself.
-            if side in truth:
-                write_array(folder / files.hand_vertex(side), truth[side])
-
-
-def add_photometric(
-    report: dict[str, Any],
-    curves: dict[str, Any],
-    run: RunFolder | None,
-    reference: RunFolder,
-    recording: Sequence,
-) -> None:
-    """Put IoU and PSNR beside the other figures of the rollout.
-
-    Nodes are the run's own, however many they are, in the colors that frame 0 shows where it has
-    them there. Frames that it lacks show its object as it was in frame 0.
-    """
-    rollout = _complete(run or reference, recording)
-    found = photometric_curves(recording.views, rollout[:, : recording.surface_node_count])
-    splits = {
-        "reconstruction": recording.reconstruction_frames,
-        "future": recording.future_frames,
-    }
-    for metric, curve in found.items():
-        curves[metric] = [float(value) if np.isfinite(value) else None for value in curve]
-        for split, scored in splits.items():
-            known = [float(curve[f]) for f in scored if f > 0 and np.isfinite(curve[f])]
-            if known and split in report:
-                report[split]["rollout"][metric] = sum(known) / len(known)
-
-
-def _complete(run: RunFolder, recording: Sequence) -> Float[ndarray, "frame node 3"]:
-    """Give a run's rollout in every frame; where it is missing or not finite, nothing moves."""
-    files = SequenceFiles(recording.name)
-    rollout = run.array(files.rollout)
-    still = run.array(files.object_node) if run.has(files.object_node) else rollout[0]
-    complete = np.repeat(still[None].astype(rollout.dtype), recording.frame_count, axis=0)
-    count = min(len(rollout), recording.frame_count)
-    is_usable = np.isfinite(rollout[:count]).all(axis=(1, 2))
-    complete[:count][is_usable] = rollout[:count][is_usable]
-    return complete
-
-
 FAILURES = (FitError, MissingInputError, SimulationDivergedError, SimulationError)
 """What a method may fail with; its output then counts as missing. Anything else stops the suite,
 a setting that only a fit finds wrong too."""
@@ -454,3 +368,88 @@ def _given(method: Method, variant: str) -> str:
 def _as_one_split(recording: Sequence) -> Sequence:
     meta = replace(recording.meta, reconstruction=recording.frame_count)
     return Sequence(recording.folder, meta)
+
+
+def measure_cell(
+    run: RunFolder | None, reference: RunFolder, recording: Sequence
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Measure what a run predicted.
+
+    The run brings its motion, hands and springs; observations are the reference's, whatever
+    the run itself was given. Without a run the static object stands in.
+
+    Args:
+        run: What is scored.
+        reference: The static object on the same recording.
+        recording: The whole recording, with its truth.
+
+    Returns:
+        The report and the errors of the rollout frame by frame.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        assemble(Path(folder), run, reference, recording)
+        report, frames = measure_run(Path(folder), recording, with_baselines=False)
+    curves: dict[str, Any] = frames.get("rollout", {})
+    add_photometric(report, curves, run, reference, recording)
+    return report, curves
+
+
+def assemble(
+    folder: Path, run: RunFolder | None, reference: RunFolder, recording: Sequence
+) -> None:
+    """Lay out what is scored: the run's motion beside the reference's observations."""
+    files = SequenceFiles(recording.name)
+    observed = (f"{files.folder}/observation/", files.keypoint)
+    left_out = (files.rollout, files.control) if run is None else ()
+    chosen = {r: path for r, path in artefacts(reference.out) if r.startswith(observed)} | {
+        rel: path
+        for rel, path in artefacts((reference if run is None else run).out)
+        if not rel.startswith(observed) and rel not in left_out
+    }
+    for rel, path in chosen.items():
+        target = folder / rel
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.symlink_to(path.resolve())
+    truth = read_truth(recording.folder).hand_vertex
+    if run is not None and not any(files.hand_vertex(side) in chosen for side in SIDES):
+        for side in recording.hands:  # An oracle moves the object with the true hand itself.
+            if side in truth:
+                write_array(folder / files.hand_vertex(side), truth[side])
+
+
+def add_photometric(
+    report: dict[str, Any],
+    curves: dict[str, Any],
+    run: RunFolder | None,
+    reference: RunFolder,
+    recording: Sequence,
+) -> None:
+    """Put IoU and PSNR beside the other figures of the rollout.
+
+    Nodes are the run's own, however many they are, in the colors that frame 0 shows where it has
+    them there. Frames that it lacks show its object as it was in frame 0.
+    """
+    rollout = _complete(run or reference, recording)
+    found = photometric_curves(recording.views, rollout[:, : recording.surface_node_count])
+    splits = {
+        "reconstruction": recording.reconstruction_frames,
+        "future": recording.future_frames,
+    }
+    for metric, curve in found.items():
+        curves[metric] = [float(value) if np.isfinite(value) else None for value in curve]
+        for split, scored in splits.items():
+            known = [float(curve[f]) for f in scored if f > 0 and np.isfinite(curve[f])]
+            if known and split in report:
+                report[split]["rollout"][metric] = sum(known) / len(known)
+
+
+def _complete(run: RunFolder, recording: Sequence) -> Float[ndarray, "frame node 3"]:
+    """Give a run's rollout in every frame; where it is missing or not finite, nothing moves."""
+    files = SequenceFiles(recording.name)
+    rollout = run.array(files.rollout)
+    still = run.array(files.object_node) if run.has(files.object_node) else rollout[0]
+    complete = np.repeat(still[None].astype(rollout.dtype), recording.frame_count, axis=0)
+    count = min(len(rollout), recording.frame_count)
+    is_usable = np.isfinite(rollout[:count]).all(axis=(1, 2))
+    complete[:count][is_usable] = rollout[:count][is_usable]
+    return complete

@@ -31,6 +31,10 @@ SENSITIVITY = ((0.001, 3), (0.002, 3), (0.02, 3), (0.04, 3), (0.002, 1), (0.002,
 """Start values of virtual δ [m] and d_max: the rows of the paper's sensitivity table."""
 ROBUSTNESS = ("noisy_depth", "noisy_tracks", "noisy_hand")
 """The paper's three disturbances."""
+_LOG = logging.getLogger(__name__)
+WRITE_EVERY = 600.0
+"""Tables are written after every protocol, and after this time [s]."""
+_SCORES = "synthetic/suite/folder.py"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,82 +77,8 @@ class Task:
     """Where the object is fitted, if that is another recording."""
 
 
-def list_tasks(order: Order, methods: Many[Method]) -> Iterator[Task]:
-    """List the cells of an order, protocol by protocol and sequence by sequence.
-
-    Args:
-        order: What is to be evaluated.
-        methods: Its methods, read.
-
-    Yields:
-        Cells; an unseen interaction without `fitted` lacks another recording of the same body.
-    """
-    for protocol in order.protocols:
-        for recording in order.recordings:
-            for method in methods:
-                yield from _asked(protocol, order, method, recording)
-
-
-def _asked(protocol: Protocol, order: Order, method: Method, recording: Sequence) -> Iterator[Task]:
-    task = Task(protocol=protocol, split=protocol, method=method, recording=recording)
-    is_plain = method.gets == "recording"
-    if protocol == "main":
-        yield task
-    elif protocol == "single_view" and is_plain:
-        yield replace(task, variant="one_view")
-    elif protocol == "robustness" and is_plain:
-        for variant in ROBUSTNESS:
-            yield replace(task, variant=variant, split=variant)
-    elif protocol == "unseen" and not method.is_corrected:
-        yield replace(task, fitted=_other_of_same_object(recording, order.recordings))
-    elif protocol == "sensitivity" and is_plain and recording is order.recordings[0]:
-        starts = () if method.rule else SENSITIVITY
-        yield from (_started(task, *start) for start in starts)
-
-
-def _started(task: Task, radius: float, most: int) -> Task:
-    """Start a method's search elsewhere; it keeps its name, and the split tells where."""
-    start = {
-        "simulation.virtual_connection_radius": radius,
-        "simulation.virtual_max_neighbors": most,
-    }
-    method = replace(task.method, overrides={**task.method.overrides, **start})
-    return replace(task, method=method, split=f"start δ={1000 * radius:g} mm d_max={most}")
-
-
-def _other_of_same_object(recording: Sequence, others: Many[Sequence]) -> Sequence | None:
-    """Find the next recording of the same body in another action; around the end of the list."""
-    own, action = _body(recording)
-    order = list(others)
-    place = order.index(recording)
-    if own is None or action is None:
-        return None
-    for other in order[place + 1 :] + order[:place]:
-        body, done = _body(other)
-        if body == own and done is not None and done != action:
-            return other
-    return None
-
-
-def _body(recording: Sequence) -> tuple[tuple[Any, ...] | None, Any]:
-    """Identify the made body of a recording, and what is done with it.
-
-    Seed and object decide a body's size and material, for one version of the generator.
-    """
-    made = named_fields(recording.provenance.get("synthesize"))
-    if made is None:
-        return None, None
-    body = tuple(made.get(name) for name in ("object", "seed", "resolution"))
-    return (*body, told_version(recording)), made.get("action")
-
-
-_LOG = logging.getLogger(__name__)
-
 Fill = Callable[[Many[Task]], Iterator[int]]
 """Has cells filled, and yields their numbers as they are finished, each once."""
-WRITE_EVERY = 600.0
-"""Tables are written after every protocol, and after this time [s]."""
-_SCORES = "synthetic/suite/folder.py"
 
 
 def evaluate_suite(
@@ -316,8 +246,23 @@ class _Work:
         }
 
 
-def _environment(order: Order) -> dict[str, Any]:
-    return describe_environment(order.device, describe_device(order.device))
+def _read(order: Order) -> tuple[Order, tuple[Method, ...], list[Task]]:
+    """Read an order: each protocol once, its methods, and the cells that it asks for."""
+    methods = tuple(parse_method(name) for name in dict.fromkeys(order.methods))
+    order = replace(order, protocols=tuple(dict.fromkeys(order.protocols)))
+    _check(order, methods)
+    return order, methods, list(list_tasks(order, methods))
+
+
+def _check(order: Order, methods: Many[Method]) -> None:
+    names = [recording.name for recording in order.recordings]
+    if not names or not methods:
+        raise UsageError("There is nothing to evaluate: name at least one sequence and one method.")
+    doubled = [name for name in names if names.count(name) > 1]
+    if doubled:
+        raise UsageError(f"Two sequences are named '{doubled[0]}'. Rename one of them.")
+    for method in methods:
+        method_settings(method, order.settings)
 
 
 def _about(order: Order, methods: Many[Method]) -> dict[str, Any]:
@@ -349,20 +294,74 @@ def _about(order: Order, methods: Many[Method]) -> dict[str, Any]:
     }
 
 
-def _read(order: Order) -> tuple[Order, tuple[Method, ...], list[Task]]:
-    """Read an order: each protocol once, its methods, and the cells that it asks for."""
-    methods = tuple(parse_method(name) for name in dict.fromkeys(order.methods))
-    order = replace(order, protocols=tuple(dict.fromkeys(order.protocols)))
-    _check(order, methods)
-    return order, methods, list(list_tasks(order, methods))
+def _environment(order: Order) -> dict[str, Any]:
+    return describe_environment(order.device, describe_device(order.device))
 
 
-def _check(order: Order, methods: Many[Method]) -> None:
-    names = [recording.name for recording in order.recordings]
-    if not names or not methods:
-        raise UsageError("There is nothing to evaluate: name at least one sequence and one method.")
-    doubled = [name for name in names if names.count(name) > 1]
-    if doubled:
-        raise UsageError(f"Two sequences are named '{doubled[0]}'. Rename one of them.")
-    for method in methods:
-        method_settings(method, order.settings)
+def list_tasks(order: Order, methods: Many[Method]) -> Iterator[Task]:
+    """List the cells of an order, protocol by protocol and sequence by sequence.
+
+    Args:
+        order: What is to be evaluated.
+        methods: Its methods, read.
+
+    Yields:
+        Cells; an unseen interaction without `fitted` lacks another recording of the same body.
+    """
+    for protocol in order.protocols:
+        for recording in order.recordings:
+            for method in methods:
+                yield from _asked(protocol, order, method, recording)
+
+
+def _asked(protocol: Protocol, order: Order, method: Method, recording: Sequence) -> Iterator[Task]:
+    task = Task(protocol=protocol, split=protocol, method=method, recording=recording)
+    is_plain = method.gets == "recording"
+    if protocol == "main":
+        yield task
+    elif protocol == "single_view" and is_plain:
+        yield replace(task, variant="one_view")
+    elif protocol == "robustness" and is_plain:
+        for variant in ROBUSTNESS:
+            yield replace(task, variant=variant, split=variant)
+    elif protocol == "unseen" and not method.is_corrected:
+        yield replace(task, fitted=_other_of_same_object(recording, order.recordings))
+    elif protocol == "sensitivity" and is_plain and recording is order.recordings[0]:
+        starts = () if method.rule else SENSITIVITY
+        yield from (_started(task, *start) for start in starts)
+
+
+def _started(task: Task, radius: float, most: int) -> Task:
+    """Start a method's search elsewhere; it keeps its name, and the split tells where."""
+    start = {
+        "simulation.virtual_connection_radius": radius,
+        "simulation.virtual_max_neighbors": most,
+    }
+    method = replace(task.method, overrides={**task.method.overrides, **start})
+    return replace(task, method=method, split=f"start δ={1000 * radius:g} mm d_max={most}")
+
+
+def _other_of_same_object(recording: Sequence, others: Many[Sequence]) -> Sequence | None:
+    """Find the next recording of the same body in another action; around the end of the list."""
+    own, action = _body(recording)
+    order = list(others)
+    place = order.index(recording)
+    if own is None or action is None:
+        return None
+    for other in order[place + 1 :] + order[:place]:
+        body, done = _body(other)
+        if body == own and done is not None and done != action:
+            return other
+    return None
+
+
+def _body(recording: Sequence) -> tuple[tuple[Any, ...] | None, Any]:
+    """Identify the made body of a recording, and what is done with it.
+
+    Seed and object decide a body's size and material, for one version of the generator.
+    """
+    made = named_fields(recording.provenance.get("synthesize"))
+    if made is None:
+        return None, None
+    body = tuple(made.get(name) for name in ("object", "seed", "resolution"))
+    return (*body, told_version(recording)), made.get("action")

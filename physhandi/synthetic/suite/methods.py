@@ -41,74 +41,6 @@ HAND_NOISE = 0.010
 _PLACE, _TURN, _POSE = 0.01, 0.1, 0.1
 _HALVINGS = 30
 _MOST = 8.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class HandNoise:
-    """How hands are made wrong."""
-
-    error: float
-    """Mean distance of the joints from where they were [m]."""
-    seed: int
-    """Of the noise; another one for every recording, or all would be wrong in the same way."""
-
-
-def disturb_hands(attempt: Attempt, folder: str, noise: HandNoise) -> None:
-    """Replace the stored hands of a sequence by wrong ones; twice would be too much.
-
-    Args:
-        attempt: Holds hands as they were fitted.
-        folder: Folder of the sequence in it.
-        noise: How wrong they become.
-
-    Raises:
-        MissingInputError: If there is no hand.
-    """
-    paths = sorted((attempt.out / folder).glob("hand_*.safetensors"))
-    if not paths:
-        raise MissingInputError(f"{attempt.out / folder} has no hand to disturb.")
-    for number, path in enumerate(paths):
-        motion = HandMotion.from_tensors(load_file(path))
-        wrong = disturbed(motion, noise.error, seed=(noise.seed, number))
-        attempt.save_tensors(f"{folder}/{path.name}", wrong.to_tensors())
-
-
-def disturbed(motion: HandMotion, error: float, *, seed: tuple[int, ...]) -> HandMotion:
-    """Disturb place, turn and pose of a hand in every frame by itself.
-
-    Each wrist coordinate gets normal noise of 10 mm, wrist and joints 0.1 rad about each axis;
-    everything is then scaled by one factor, so that the mean joint error is what was asked for.
-
-    Args:
-        motion: The hand.
-        error: Mean distance of its 21 joints from where they were [m].
-        seed: Of the noise.
-    """
-    random = np.random.default_rng([4, *seed])
-    count = motion.frame_count
-    place = _PLACE * random.standard_normal((count, 3))
-    turn = _TURN * random.standard_normal((count, 3))
-    pose = _POSE * random.standard_normal((count, 15, 3))
-    model = load_hand_model(motion.side, motion.model)
-    before = motion.keypoints(model)
-
-    def moved(share: float) -> HandMotion:
-        rotation = Rotation.from_rotvec(motion.wrist_rotation) * Rotation.from_rotvec(share * turn)
-        return replace(
-            motion,
-            articulation=(motion.articulation + share * pose).astype(np.float32),
-            wrist_rotation=rotation.as_rotvec().astype(np.float32),
-            wrist_translation=(motion.wrist_translation + share * place).astype(np.float32),
-        )
-
-    low, high = 0.0, _MOST
-    for _ in range(_HALVINGS):
-        middle = (low + high) / 2
-        gap = np.linalg.norm(moved(middle).keypoints(model) - before, axis=2).mean()
-        low, high = (middle, high) if gap < error else (low, middle)
-    return moved(high)
-
-
 Given = Literal["recording", "true_hand", "all_frames"]
 CORRECTION = "last_residual"
 """Ends the name of a method whose predicted frames are shifted by its last residual."""
@@ -214,6 +146,18 @@ def parse_method(text: str) -> Method:
     return method
 
 
+def _split(settings: str) -> list[str]:
+    """Split at commas, but not inside of brackets."""
+    parts, depth = [""], 0
+    for letter in settings:
+        depth += (letter in _OPENING) - (letter in _CLOSING)
+        if letter == "," and depth == 0:
+            parts.append("")
+        else:
+            parts[-1] += letter
+    return parts
+
+
 def method_settings(method: Method, common: Mapping[str, Any]) -> dict[str, Any]:
     """Give all settings of a method, in plain data.
 
@@ -225,6 +169,16 @@ def method_settings(method: Method, common: Mapping[str, Any]) -> dict[str, Any]
         UsageError: If a setting is unknown or out of bounds.
     """
     return pipeline.settings_of(method.profile, {**common, **method.overrides})
+
+
+@dataclass(frozen=True, kw_only=True)
+class HandNoise:
+    """How hands are made wrong."""
+
+    error: float
+    """Mean distance of the joints from where they were [m]."""
+    seed: int
+    """Of the noise; another one for every recording, or all would be wrong in the same way."""
 
 
 def execute(
@@ -275,6 +229,62 @@ def execute(
             pipeline.predict(recording, config, rule, attempt, watched)
         attempt.publish()
     return RunFolder.open(folder)
+
+
+def disturb_hands(attempt: Attempt, folder: str, noise: HandNoise) -> None:
+    """Replace the stored hands of a sequence by wrong ones; twice would be too much.
+
+    Args:
+        attempt: Holds hands as they were fitted.
+        folder: Folder of the sequence in it.
+        noise: How wrong they become.
+
+    Raises:
+        MissingInputError: If there is no hand.
+    """
+    paths = sorted((attempt.out / folder).glob("hand_*.safetensors"))
+    if not paths:
+        raise MissingInputError(f"{attempt.out / folder} has no hand to disturb.")
+    for number, path in enumerate(paths):
+        motion = HandMotion.from_tensors(load_file(path))
+        wrong = disturbed(motion, noise.error, seed=(noise.seed, number))
+        attempt.save_tensors(f"{folder}/{path.name}", wrong.to_tensors())
+
+
+def disturbed(motion: HandMotion, error: float, *, seed: tuple[int, ...]) -> HandMotion:
+    """Disturb place, turn and pose of a hand in every frame by itself.
+
+    Each wrist coordinate gets normal noise of 10 mm, wrist and joints 0.1 rad about each axis;
+    everything is then scaled by one factor, so that the mean joint error is what was asked for.
+
+    Args:
+        motion: The hand.
+        error: Mean distance of its 21 joints from where they were [m].
+        seed: Of the noise.
+    """
+    random = np.random.default_rng([4, *seed])
+    count = motion.frame_count
+    place = _PLACE * random.standard_normal((count, 3))
+    turn = _TURN * random.standard_normal((count, 3))
+    pose = _POSE * random.standard_normal((count, 15, 3))
+    model = load_hand_model(motion.side, motion.model)
+    before = motion.keypoints(model)
+
+    def moved(share: float) -> HandMotion:
+        rotation = Rotation.from_rotvec(motion.wrist_rotation) * Rotation.from_rotvec(share * turn)
+        return replace(
+            motion,
+            articulation=(motion.articulation + share * pose).astype(np.float32),
+            wrist_rotation=rotation.as_rotvec().astype(np.float32),
+            wrist_translation=(motion.wrist_translation + share * place).astype(np.float32),
+        )
+
+    low, high = 0.0, _MOST
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        gap = np.linalg.norm(moved(middle).keypoints(model) - before, axis=2).mean()
+        low, high = (middle, high) if gap < error else (low, middle)
+    return moved(high)
 
 
 def correct(
@@ -395,18 +405,6 @@ def take_disturbed_hands(source: RunFolder, attempt: Attempt, name: str, noise: 
         _copy(source.out / rel, attempt.out / rel)
     disturb_hands(attempt, SequenceFiles(name).folder, noise)
     attempt.finish_stage(pipeline.HANDS, stage["summary"])
-
-
-def _split(settings: str) -> list[str]:
-    """Split at commas, but not inside of brackets."""
-    parts, depth = [""], 0
-    for letter in settings:
-        depth += (letter in _OPENING) - (letter in _CLOSING)
-        if letter == "," and depth == 0:
-            parts.append("")
-        else:
-            parts[-1] += letter
-    return parts
 
 
 def _moved(node: np.ndarray, control: np.ndarray, *, rule: str) -> np.ndarray:
