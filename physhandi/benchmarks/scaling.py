@@ -90,7 +90,7 @@ def _growth_over(
     rows: list[dict[str, Any]], size: str, fixed: str, values: Iterable[int]
 ) -> list[dict[str, Any]]:
     """Fit time ~ size^p to the rows that have the same value of another quantity."""
-    found = []
+    growths = []
     for value in sorted(values):
         alike = [row for row in rows if row[fixed] == value]
         if len(alike) < 2:
@@ -100,8 +100,8 @@ def _growth_over(
             growth[name.replace("ms_per_frame", "exponent")] = _exponent(alike, size, name)
             last = name.replace("ms_per_frame", "exponent_of_last_two")
             growth[last] = _exponent(alike[-2:], size, name)
-        found.append(growth)
-    return found
+        growths.append(growth)
+    return growths
 
 
 def _exponent(rows: list[dict[str, Any]], size: str, name: str) -> float:

@@ -64,12 +64,12 @@ def copy_bandwidth(device: str) -> float:
 
 def describe_machine(device: str) -> dict[str, Any]:
     """Say on what is measured, and how busy the machine was in the minute before."""
-    told = describe_environment(device, describe_device(device))
+    environment = describe_environment(device, describe_device(device))
     return {
         "device": device,
-        "device_name": told["device_name"],
+        "device_name": environment["device_name"],
         "warp": wp.__version__,
-        "commit": told["commit"],
+        "commit": environment["commit"],
         "load_average": os.getloadavg()[0],
     }
 

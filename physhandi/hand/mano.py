@@ -41,8 +41,8 @@ _NAMES = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "f", 
 
 def hands_folder() -> Path:
     """Where imported hand models lie: ``$PHYSHANDI_HANDS``, or else the user's data folder."""
-    given = os.environ.get(FOLDER_VARIABLE)
-    return Path(given) if given else Path.home() / ".local/share/physhandi/hands"
+    folder = os.environ.get(FOLDER_VARIABLE)
+    return Path(folder) if folder else Path.home() / ".local/share/physhandi/hands"
 
 
 @dataclass(frozen=True)

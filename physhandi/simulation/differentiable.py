@@ -88,7 +88,7 @@ def rollout(
         raise ValueError(f"window is {window}; expected at least one frame, or none.")
     bridge = _bridge(model, parameters, device)
     log_default = np.log(np.maximum(model.stiffness, np.finfo(np.float32).tiny))
-    given = (
+    arguments = (
         (control, None),
         (log_stiffness, log_default),
         (damping, model.damping),
@@ -103,7 +103,7 @@ def rollout(
     where = {"dtype": torch.float32, "device": bridge.torch_device}
     tensors = [
         torch.as_tensor(default if value is None else value, **where).contiguous()
-        for value, default in given
+        for value, default in arguments
     ]
     bridge.check(tensors)
     trajectory = bridge.trajectory(tensors, memory)

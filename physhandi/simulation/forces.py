@@ -94,9 +94,14 @@ def virtual_forces(  # noqa: PLR0917  (model, then state in the order of the equ
         Force on each object node in the world frame [N]; zero for a node that nothing holds.
     """
     pull = virtual_spring_forces(model, parameters, position, velocity, control, control_velocity)
-    held = model.spring_nodes[model.object_spring_count :].min(axis=1, initial=model.node_count)
+    held_node = model.spring_nodes[model.object_spring_count :].min(
+        axis=1, initial=model.node_count
+    )
     return np.stack(
-        [np.bincount(held, weights=pull[:, axis], minlength=model.node_count) for axis in range(3)],
+        [
+            np.bincount(held_node, weights=pull[:, axis], minlength=model.node_count)
+            for axis in range(3)
+        ],
         axis=1,
     )
 

@@ -87,7 +87,7 @@ class MasterTopology:
         """Tell which springs a candidate has."""
         object_part = slice(None, self.object_spring_count)
         virtual_part = slice(self.object_spring_count, None)
-        found = np.empty(len(self.length), dtype=bool)
+        exists = np.empty(len(self.length), dtype=bool)
         for part, radius, most in (
             (object_part, parameters.connection_radius, parameters.max_neighbors),
             (
@@ -96,8 +96,8 @@ class MasterTopology:
                 parameters.virtual_max_neighbors,
             ),
         ):
-            found[part] = (self.length[part] < radius) & (self.rank[part] < most)
-        return found
+            exists[part] = (self.length[part] < radius) & (self.rank[part] < most)
+        return exists
 
     def rest_length(self, parameters: SimulationParameters) -> Float32[ndarray, " spring"]:
         """Give the rest length of every spring under a candidate's floors [m]."""
@@ -108,27 +108,27 @@ class MasterTopology:
 
     def model(self, parameters: SimulationParameters) -> SpringMassModel:
         """Build the model of one candidate, as `topology.build_model` does."""
-        kept = self.has(parameters)
-        return self._model(parameters, kept)
+        exists = self.has(parameters)
+        return self._model(parameters, exists)
 
     def whole(self, parameters: SimulationParameters) -> SpringMassModel:
         """Build a model that has all springs."""
         return self._model(parameters, np.ones(len(self.length), dtype=bool))
 
     def _model(
-        self, parameters: SimulationParameters, kept: Bool[ndarray, " spring"]
+        self, parameters: SimulationParameters, exists: Bool[ndarray, " spring"]
     ) -> SpringMassModel:
-        is_object = np.arange(len(kept)) < self.object_spring_count
+        is_object = np.arange(len(exists)) < self.object_spring_count
         stiffness = np.where(is_object, parameters.stiffness, parameters.virtual_stiffness)
         damping = np.where(stiffness > 0.0, parameters.damping, 0.0)
         return SpringMassModel(
             object_node=self.object_node,
             initial_velocity=self.initial_velocity,
-            spring_nodes=self.spring_nodes[kept],
-            rest_length=self.rest_length(parameters)[kept],
-            stiffness=stiffness[kept].astype(np.float32),
-            damping=damping[kept].astype(np.float32),
-            object_spring_count=int(kept[: self.object_spring_count].sum()),
+            spring_nodes=self.spring_nodes[exists],
+            rest_length=self.rest_length(parameters)[exists],
+            stiffness=stiffness[exists].astype(np.float32),
+            damping=damping[exists].astype(np.float32),
+            object_spring_count=int(exists[: self.object_spring_count].sum()),
             control_count=self.control_count,
         )
 
@@ -145,14 +145,14 @@ def _ranked_neighbors(node: ndarray, radius: float, most: int) -> _Ranked:
     own = np.arange(len(node))[:, None]
     is_other = neighbor != own
     place = np.cumsum(is_other, axis=1) - 1
-    kept = is_other & (place < most) & (distance < radius) & (distance > MINIMUM_LENGTH)
-    first, second = np.broadcast_to(own, neighbor.shape)[kept], neighbor[kept]
+    is_spring = is_other & (place < most) & (distance < radius) & (distance > MINIMUM_LENGTH)
+    first, second = np.broadcast_to(own, neighbor.shape)[is_spring], neighbor[is_spring]
     key = np.minimum(first, second) * len(node) + np.maximum(first, second)
-    order = np.lexsort((place[kept], key))
+    order = np.lexsort((place[is_spring], key))
     unique, index = np.unique(key[order], return_index=True)
     springs = np.stack(np.divmod(unique, len(node)), axis=1)
     length = np.linalg.norm(node[springs[:, 1]] - node[springs[:, 0]], axis=1)
-    return springs, length, place[kept][order][index]
+    return springs, length, place[is_spring][order][index]
 
 
 def _ranked_holds(control: ndarray, node: ndarray, radius: float, most: int) -> _Ranked:
@@ -163,9 +163,9 @@ def _ranked_holds(control: ndarray, node: ndarray, radius: float, most: int) -> 
     distance, neighbor = (
         np.reshape(found, (len(control), count)) for found in KDTree(node).query(control, k=count)
     )
-    kept = distance < radius
-    control_index = np.broadcast_to(np.arange(len(control))[:, None], neighbor.shape)[kept]
-    rank = np.broadcast_to(np.arange(count), neighbor.shape)[kept]
-    order = np.lexsort((control_index, neighbor[kept]))
-    springs = np.stack([neighbor[kept], len(node) + control_index], axis=1)[order]
-    return springs, distance[kept][order], rank[order]
+    is_spring = distance < radius
+    control_index = np.broadcast_to(np.arange(len(control))[:, None], neighbor.shape)[is_spring]
+    rank = np.broadcast_to(np.arange(count), neighbor.shape)[is_spring]
+    order = np.lexsort((control_index, neighbor[is_spring]))
+    springs = np.stack([neighbor[is_spring], len(node) + control_index], axis=1)[order]
+    return springs, distance[is_spring][order], rank[order]

@@ -167,22 +167,22 @@ class _SpringOperator:
         }
         node = model.object_node.astype(np.float64)
         ends, virtual = model.spring_nodes[:own], model.spring_nodes[own:]
-        held = virtual.min(axis=1, initial=count)
+        held_node = virtual.min(axis=1, initial=count)
         direction = _unit(node[ends[:, 1]] - node[ends[:, 0]])
         value = np.concatenate([-direction, direction], axis=1).ravel()
         column = _coordinates(ends)
         row_end = 6 * np.arange(own + 1)
         if control is None:
             anchor = {
-                name: np.repeat(np.bincount(held, value[own:], minlength=count), 3)
+                name: np.repeat(np.bincount(held_node, value[own:], minlength=count), 3)
                 for name, value in rate.items()
             }
             rate = {name: value[:own] for name, value in rate.items()}
         else:
             place = np.asarray(control, dtype=np.float64)[virtual.max(axis=1, initial=0) - count]
-            value = np.concatenate([value, _unit(node[held] - place).ravel()])
-            column = np.concatenate([column, _coordinates(held)])
-            row_end = np.concatenate([row_end, row_end[-1] + 3 * np.arange(1, len(held) + 1)])
+            value = np.concatenate([value, _unit(node[held_node] - place).ravel()])
+            column = np.concatenate([column, _coordinates(held_node)])
+            row_end = np.concatenate([row_end, row_end[-1] + 3 * np.arange(1, len(held_node) + 1)])
             anchor = {name: np.zeros(3 * count) for name in rate}
         shape = (len(row_end) - 1, 3 * count)
         return cls(csr_array((value, column, row_end), shape=shape), rate, anchor)
@@ -190,11 +190,11 @@ class _SpringOperator:
     def of_mode(self, mode: ndarray) -> tuple[float, float]:
         """Return stiffness and damping of a mode of length 1."""
         squared, own = (self.stretch @ mode) ** 2, mode**2
-        found = (
+        values = (
             _dot(squared, self.rate[name]) + _dot(own, self.anchor[name])
             for name in ("stiffness", "damping")
         )
-        return next(found), next(found)
+        return next(values), next(values)
 
     def highest_load(self, name: str) -> float:
         """Return the largest sum at one coordinate: the scale of the highest eigenvalue."""

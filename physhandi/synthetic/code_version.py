@@ -93,10 +93,10 @@ def outdated(recording: Sequence) -> str:
     """Say that a made recording comes of another generator than this one; empty if it does not."""
     if "synthesize" not in recording.provenance:
         return ""
-    made, present = told_version(recording), generator_version()
-    if made == present or (present.endswith("-none") and made.startswith(present[:12])):
+    recorded, present = told_version(recording), generator_version()
+    if recorded == present or (present.endswith("-none") and recorded.startswith(present[:12])):
         return ""
-    by = f"another version of the generator ({made})" if made else "an unknown generator"
+    by = f"another version of the generator ({recorded})" if recorded else "an unknown generator"
     return (
         f"Sequence '{recording.name}' was made by {by}; the present one ({present}) may make it "
         f"otherwise. To have it made anew, delete {recording.folder} first."

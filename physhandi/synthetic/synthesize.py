@@ -166,12 +166,12 @@ def _check(
         raise UsageError(f"cameras is {cameras}; expected 1 to {MOST_CAMERAS}.")
     if not LEAST_FRAMES <= frames <= MOST_SYNTHETIC_FRAMES:
         raise UsageError(f"frames is {frames}; expected {LEAST_FRAMES} to {MOST_SYNTHETIC_FRAMES}.")
-    for name, value, known in (
+    for name, value, choices in (
         ("hold", hold, get_args(Hold)),
         ("images", images, get_args(Images)),
     ):
-        if value not in known:
-            raise UsageError(f"{name} is {value!r}; expected one of: {', '.join(known)}.")
+        if value not in choices:
+            raise UsageError(f"{name} is {value!r}; expected one of: {', '.join(choices)}.")
     if find_spec("mujoco") is None:
         raise UsageError(
             "Making sequences needs MuJoCo, which is not installed: pip install 'physhandi[synth]'."

@@ -1,4 +1,4 @@
-"""One door to all formats: checks what is asked, writes atomically, overwrites only if told."""
+"""Exports runs and simulated motion to all formats, atomically."""
 
 import shutil
 from collections.abc import Callable, Mapping
@@ -37,7 +37,7 @@ def export_run(
     """Write a run, or one sequence of it, in another format.
 
     Args:
-        run: What to export.
+        run: The run to export.
         format: ``ply`` (nodes, hand meshes and virtual springs), ``npz`` (motion and springs),
             ``csv`` (a file: trajectories; a folder: also parameters and metrics) or ``yaml``
             (settings, parameters, losses and metrics of the whole run), or ``gltf`` (one ``.glb``
@@ -49,11 +49,11 @@ def export_run(
         faces: Triangles of the hands by side, for runs that do not hold them.
 
     Returns:
-        What was written.
+        The file or folder written.
 
     Raises:
         UsageError: If format, sequence or frame do not exist, or the path is in use.
-        RunError: If the run does not hold what is asked for.
+        RunError: If the run does not contain the requested data.
     """
     out = Path(out_path)
     if format not in FORMATS:
@@ -78,7 +78,7 @@ def export_scene(
     frame: int | None = None,
     overwrite: bool = False,
 ) -> Path:
-    """Write motion that need not be in any run, such as one that was simulated just now.
+    """Write motion that is not stored in a run, such as a simulation in memory.
 
     Args:
         scene: The motion.
@@ -88,15 +88,15 @@ def export_scene(
         overwrite: Whether to replace an export that is there.
 
     Returns:
-        What was written.
+        The file or folder written.
 
     Raises:
         UsageError: If format or frame do not exist, or the path is in use.
     """
     out = Path(out_path)
     if format not in SCENE_FORMATS:
-        known = ", ".join(SCENE_FORMATS)
-        raise UsageError(f"'{format}' is not a format of motion; choose one of {known}.")
+        formats = ", ".join(SCENE_FORMATS)
+        raise UsageError(f"'{format}' is not a format of motion; choose one of {formats}.")
     is_folder = format == "ply" and out.suffix != ".ply"
     _check_target(out, format, is_folder=is_folder, overwrite=overwrite)
     return _write_scene(scene, format, out, frame, is_folder=is_folder)
@@ -146,7 +146,7 @@ def _check_target(out: Path, suffix: str, *, is_folder: bool, overwrite: bool) -
 
 
 def _publish(out: Path, write: Callable[[Path], None], *, is_folder: bool) -> Path:
-    """Write beside the target and move it there in one step; a failure leaves nothing."""
+    """Write to a temporary path and move it to the target in one step; a failure leaves nothing."""
     out.parent.mkdir(parents=True, exist_ok=True)
     if not is_folder:
         write(out)

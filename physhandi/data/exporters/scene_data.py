@@ -1,4 +1,4 @@
-"""What exporters take from a run: the motion of one sequence."""
+"""The motion of one sequence of a run, as the exporters read it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -125,13 +125,13 @@ def read_scene(
 
 
 def read_joints(run: RunFolder, sequence: str) -> dict[str, ndarray]:
-    """Read where the joints of the hands are, by side (frame joint 3) [m]."""
+    """Read the joints of the hands by side (frame joint 3) [m]."""
     stored = {side: SequenceFiles(sequence).hand_keypoint(side) for side in SIDES}
     return {side: run.array(rel) for side, rel in stored.items() if run.has(rel)}
 
 
 def read_skins(run: RunFolder, sequence: str) -> dict[str, Mapping[str, ndarray]]:
-    """Read what moves the hands' surfaces; runs of version 0.1 do not hold it.
+    """Read skeletons and skin weights of the hands; runs of version 0.1 have none.
 
     Args:
         run: The run.

@@ -1,6 +1,6 @@
-"""The user's own MANO files, converted once to arrays that nothing has to unpickle.
+"""Converts the user's own MANO files to plain arrays without pickles.
 
-MANO's licence asks for registration: the project ships no such file and downloads none.
+MANO's licence requires registration, so the project neither ships nor downloads its files.
 """
 
 import hashlib
@@ -27,10 +27,10 @@ SHAPES: dict[str, tuple[int, ...]] = {
     "hands_mean": (45,),
     "hands_components": (45, 45),
 }
-"""Arrays of a MANO file that are kept, and their shapes."""
+"""Arrays of a MANO file that are stored, and their shapes."""
 _PARENT = [-1, 0, 1, 2, 0, 4, 5, 0, 7, 8, 0, 10, 11, 0, 13, 14]
 _LENGTH = (0.1, 0.4)
-"""Extent of a hand [m]; beyond it the file has other units."""
+"""Plausible extent of a hand [m]; beyond it the file has other units."""
 
 
 def import_mano(source: Path | str, out: Path | str) -> Path:
@@ -99,9 +99,9 @@ def _checked(path: Path, tree: Any) -> dict[str, ndarray]:
 def _array(path: Path, name: str, value: Any, shape: tuple[int, ...]) -> ndarray:
     array = cast("Any", value) if isinstance(value, ndarray) else None
     if array is None or array.shape != shape or array.dtype.kind not in "iuf":
-        found = "no array" if array is None else f"{array.dtype} of shape {array.shape}"
+        actual = "no array" if array is None else f"{array.dtype} of shape {array.shape}"
         raise ImportFailedError(
-            f"{path}: the field '{name}' is {found}; MANO has numbers of shape {shape}."
+            f"{path}: the field '{name}' is {actual}; MANO has numbers of shape {shape}."
         )
     array = array.astype(np.float64)
     if not np.isfinite(array).all():

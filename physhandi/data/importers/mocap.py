@@ -58,8 +58,8 @@ def import_mocap(
 
     Args:
         source: One ``.npy`` file, or a folder of them.
-        out: Folder that the sequences go to.
-        progress: Told about every trajectory.
+        out: Folder of the new sequences.
+        progress: Receives a report of every trajectory.
         controlled_markers: Markers that sit on the grippers; they become the controls.
         recording_rate: Frames per second of the recording [Hz].
         frame_rate: Frames per second of the sequence [Hz].
@@ -167,14 +167,14 @@ def refine(
     return np.concatenate(nodes), np.arange(len(marker)) * nodes_per_segment
 
 
-def _interpolate(at: ndarray, known: ndarray, value: ndarray) -> Any:
-    return np.interp(at, known, value)
+def _interpolate(at: ndarray, x: ndarray, value: ndarray) -> Any:
+    return np.interp(at, x, value)
 
 
 def straight_chain(
     marker: Float[ndarray, "frame marker 3"], nodes_per_segment: int
 ) -> Float[ndarray, "node 3"]:
-    """Give the rope without tension: straight along x, each segment as long as its median [m]."""
+    """Lay out the rope straight along x, each segment as long as its median [m]."""
     length = np.median(_segment_length(marker), axis=0)
     step = np.repeat(length / nodes_per_segment, nodes_per_segment)
     node = np.zeros((len(step) + 1, 3))

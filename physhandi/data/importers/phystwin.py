@@ -1,8 +1,8 @@
 """Imports a case of PhysTwin (``data/different_types/{case}``): three RGB-D views and their tracks.
 
-The case's world is a ChArUco board on the table, whose z axis usually points down into it, and
-upwards with other OpenCV versions. Which it is, is read off the data; if down, the world is turned
-about its x axis by diag(1, -1, -1), a rotation, so that handedness and distances stay.
+The case's world is a ChArUco board on the table, whose z axis points down or up, depending on the
+version of OpenCV. `points_down` decides it from the data; if down, the world is rotated by
+diag(1, -1, -1).
 """
 
 from dataclasses import dataclass
@@ -48,7 +48,7 @@ class Case:
     """Everything of a case but its images, in the case's own world."""
 
     folder: Path
-    """Where the case lies."""
+    """Folder of the case."""
     frame_count: int
     """Number of frames."""
     metadata: CaseMetadata | None
@@ -82,16 +82,16 @@ def import_phystwin(
 ) -> Path:
     """Convert a PhysTwin case into a sequence.
 
-    What the case lacks, the sequence lacks: without ``metadata.json`` there are no views, without
-    ``final_data.pkl`` there are no object nodes, markers and controls. Object nodes keep PhysTwin's
-    order: tracked points, surface points, interior points. The tracked points become markers, one a
-    node. Which hand a mask shows is not known: 2 and 3 tell the first and the other hand masks of a
-    camera apart, and the sequence names no hands.
+    Without ``metadata.json`` the sequence has no views, without ``final_data.pkl`` no object nodes,
+    markers and controls. Object nodes keep PhysTwin's order: tracked points, surface points,
+    interior points. The tracked points become markers, one a node. A case does not say which hand a
+    mask shows: 2 and 3 tell the first and the other hand masks of a camera apart, and the sequence
+    names no hands.
 
     Args:
         case: Folder of the case.
-        out: Where the sequence shall appear; its last part names the sequence.
-        progress: Told after every frame of every camera; may ask to stop.
+        out: Folder of the new sequence; its last part names the sequence.
+        progress: Receives a report after every frame of every camera; may cancel.
         overwrite: Whether to replace a sequence that is there.
 
     Returns:
@@ -104,36 +104,36 @@ def import_phystwin(
         CancelledError: If the user asked to stop.
     """
     watched = progress or NullProgress()
-    found = read_case(Path(case))
-    is_down = points_down(found)
+    tables = read_case(Path(case))
+    is_down = points_down(tables)
     up = np.diag([1.0, -1.0, -1.0]) if is_down else np.eye(3)
-    views = tuple(_view(number, camera, up) for number, camera in enumerate(found.cameras))
+    views = tuple(_view(number, camera, up) for number, camera in enumerate(tables.cameras))
     with SequenceWriter(out, overwrite=overwrite) as writer:
-        _save_motion(found, up, writer)
-        _save_images(found, views, writer, watched)
+        _save_motion(tables, up, writer)
+        _save_images(tables, views, writer, watched)
         meta = SequenceMeta(
             name=Path(out).resolve().name,
-            description=f"PhysTwin case '{found.folder.name}'.",
-            frame_rate=found.metadata.frame_rate if found.metadata else PHYSTWIN_FRAME_RATE,
-            frame_count=found.frame_count,
+            description=f"PhysTwin case '{tables.folder.name}'.",
+            frame_rate=tables.metadata.frame_rate if tables.metadata else PHYSTWIN_FRAME_RATE,
+            frame_count=tables.frame_count,
             ground_height=0.0,
             gravity=GRAVITY,
             views=views,
-            reconstruction=found.reconstruction,
-            surface_node_count=found.motion.surface_node_count if found.motion else None,
+            reconstruction=tables.reconstruction,
+            surface_node_count=tables.motion.surface_node_count if tables.motion else None,
             provenance={
                 "importer": "phystwin",
-                "case": found.folder.name,
+                "case": tables.folder.name,
                 "z_axis_pointed": "down" if is_down else "up",
-                "frame_rate_was_given": found.metadata is not None,
-                "split_was_given": (found.folder / "split.json").is_file(),
-                "serial_numbers": list(found.metadata.serial_numbers) if found.metadata else [],
+                "frame_rate_was_given": tables.metadata is not None,
+                "split_was_given": (tables.folder / "split.json").is_file(),
+                "serial_numbers": list(tables.metadata.serial_numbers) if tables.metadata else [],
             },
         )
         try:
             sequence = writer.finish(meta)
         except SequenceError as error:
-            raise ImportFailedError(f"{found.folder} makes no valid sequence: {error}") from error
+            raise ImportFailedError(f"{tables.folder} makes no valid sequence: {error}") from error
     watched.report(_STAGE, 1, 1, None, "Checked every frame")
     return sequence.folder
 
@@ -228,19 +228,19 @@ def read_case(folder: Path) -> Case:
 
 
 def _frame_count(folder: Path, motion: CaseMotion | None, metadata: CaseMetadata | None) -> int:
-    """Agree on the number of frames, or count the color images of a case that nobody numbered."""
-    given = None if metadata is None else metadata.frame_count
+    """Determine the number of frames from the tables, or else by counting color images."""
+    frame_num = None if metadata is None else metadata.frame_count
     if motion is not None:
         count = len(motion.point)
-        if given is not None and given != count:
+        if frame_num is not None and frame_num != count:
             fail(
                 folder / "final_data.pkl",
-                f"object_points has {count} frames, but frame_num in metadata.json is {given}. "
+                f"object_points has {count} frames, but frame_num in metadata.json is {frame_num}. "
                 "Both must be of the same recording",
             )
         return count
-    if given is not None:
-        return given
+    if frame_num is not None:
+        return frame_num
     path = folder / "metadata.json"
     if metadata is not None and metadata.is_raw:
         fail(
@@ -260,10 +260,10 @@ def _frame_count(folder: Path, motion: CaseMotion | None, metadata: CaseMetadata
 
 
 def points_down(case: Case) -> bool:
-    """Tell whether the board's z axis points down, as the object and the cameras are above it.
+    """Whether the board's z axis points down, given that object and cameras are above it.
 
     Raises:
-        ImportFailedError: If neither object nor cameras tell, or they contradict each other.
+        ImportFailedError: If neither object nor cameras decide it, or they contradict each other.
     """
     height = case.pose[:, 2, 3]
     point = np.zeros((0, 3)) if case.motion is None else case.motion.point.reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Reads what PhysTwin's optimisation leaves behind for a case: numbers, but no topology."""
+"""Reads the results of PhysTwin's optimisation of a case; they contain no topology."""
 
 import math
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ from physhandi.data.importers.phystwin_files import fail, named, numbers
 
 @dataclass(frozen=True, kw_only=True)
 class Contact:
-    """Collision coefficients as they were optimised, which may be outside what is simulated."""
+    """Optimised collision coefficients, before the simulator clamps them."""
 
     restitution: float
     """``collide_elas``, of the ground."""
@@ -134,9 +134,9 @@ def _contact(path: Path, table: Mapping[str, Any]) -> Contact:
 
 
 def _scalar(path: Path, table: Mapping[str, Any], field: str, *, least: float = -math.inf) -> float:
-    """Take a field as one finite number; an array of one will do."""
-    given = {field: np.ravel(table[field])} if field in table else table
-    value = float(numbers(path, given, field, (1,))[0])
+    """Read a field as one finite number, or an array of one."""
+    fields = {field: np.ravel(table[field])} if field in table else table
+    value = float(numbers(path, fields, field, (1,))[0])
     if not math.isfinite(value) or value < least:
         expected = "a finite number" if math.isinf(least) else f"a number from {least:g} on"
         fail(path, f"{field} is {value}; expected {expected}")

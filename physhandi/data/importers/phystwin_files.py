@@ -1,4 +1,4 @@
-"""Fields of a foreign case's files: taken by name, checked for kind, shape and plausible values."""
+"""Reads the files of a PhysTwin case and checks types, shapes and plausible values."""
 
 import json
 import math
@@ -69,7 +69,7 @@ class CaseMetadata:
 
 @dataclass(frozen=True)
 class CaseImages:
-    """The images of one camera; what is not there is None."""
+    """Paths of the images of one camera; None for what is missing."""
 
     case: Path
     camera: int
@@ -110,7 +110,7 @@ class CaseImages:
         return path
 
     def check_frame_count(self, folder: Path, suffix: str) -> None:
-        """Refuse a folder with frames beyond the last one: it was not cut with the others."""
+        """Refuse a folder with frames beyond the last one, which is not synchronised."""
         extra = sorted(
             int(path.stem)
             for path in folder.glob(f"*{suffix}")
@@ -141,7 +141,7 @@ class MaskSource:
     """Labels of one camera's pixels, from per-object masks or from PhysTwin's cleaned ones."""
 
     def __init__(self, images: CaseImages, cleaned: Any | None) -> None:
-        """Find out which mask is which.
+        """Read the labels of the masks.
 
         Args:
             images: The camera.
@@ -200,11 +200,11 @@ def _read_labels(images: CaseImages) -> list[tuple[Path, int]]:
     order = sorted(names, key=int)
     objects = [number for number in order if names[number] != CONTROLLER]
     if len(objects) != 1:
-        found = ", ".join(f"{number}: {names[number]!r}" for number in objects) or "none"
+        listing = ", ".join(f"{number}: {names[number]!r}" for number in objects) or "none"
         fail(
             path,
             f"must label exactly one mask with the object's name beside '{CONTROLLER}', found "
-            f"{found}. Merge or remove masks",
+            f"{listing}. Merge or remove masks",
         )
     hands = [number for number in order if number not in objects]
     labels = [OBJECT_MASK, FIRST_HAND_MASK, *[OTHER_HAND_MASK] * len(hands)]
@@ -267,7 +267,7 @@ def read_motion(path: Path) -> CaseMotion:
 
 
 def _shifted(path: Path, is_valid_next: ndarray, is_visible: ndarray) -> Bool[ndarray, "frame _"]:
-    """Move the flag of a motion from the frame where it starts to the one where it ends."""
+    """Shift the flag of a motion from the frame where it starts to the one where it ends."""
     is_seen = np.zeros_like(is_visible)
     is_seen[:-1] = is_visible[1:] & is_visible[:-1]
     wrong = np.argwhere(is_valid_next & ~is_seen)
@@ -391,7 +391,7 @@ def _interval(value: Any) -> tuple[int, int]:
 
 
 def copy_color(images: CaseImages, frame: int, writer: SequenceWriter, view: str) -> None:
-    """Take over the color image of a frame, or with frame 0 the whole video.
+    """Copy the color image of a frame, or with frame 0 the whole video.
 
     Raises:
         ImportFailedError: If it is missing, unreadable or of another size or length.
@@ -427,7 +427,7 @@ def _check_video(path: Path, images: CaseImages) -> None:
 
 
 def copy_depth(images: CaseImages, frame: int, writer: SequenceWriter, view: str) -> None:
-    """Turn the depth array of a frame into a 16-bit image; both are in millimetres.
+    """Convert the depth array of a frame to a 16-bit image; both are in millimetres.
 
     Raises:
         ImportFailedError: If it is missing or holds something else.
@@ -446,7 +446,7 @@ def copy_depth(images: CaseImages, frame: int, writer: SequenceWriter, view: str
 
 
 def copy_tracks(images: CaseImages, writer: SequenceWriter, view: str) -> None:
-    """Take over CoTracker's tracks; PhysTwin stores them as (row, column), we as pixel x and y.
+    """Copy CoTracker's tracks; PhysTwin stores them as (row, column), we as pixel x and y.
 
     Raises:
         ImportFailedError: If the file is broken, or a visible track is not finite.
@@ -462,7 +462,7 @@ def copy_tracks(images: CaseImages, writer: SequenceWriter, view: str) -> None:
     if lost.size:
         frame, number = lost[0]
         fail(path, f"tracks: frame {frame}, track {number} is not finite, but called visible")
-    # What is not visible may stand anywhere, also at infinity.
+    # Invisible tracks may be anywhere, also at infinity.
     track = np.where(np.isfinite(track), track, np.nan)
     writer.save_array(f"views/{view}/track.npy", track.astype(np.float32))
     writer.save_array(f"views/{view}/track_visible.npy", visible)
@@ -494,7 +494,7 @@ def read_image(path: Path, mode: int) -> ndarray:
 
 
 def fail(path: Path, reason: str) -> NoReturn:
-    """Refuse a file; `reason` goes on after the file's name."""
+    """Refuse a file; the message is the file's name and `reason`."""
     raise ImportFailedError(f"{path}: {reason}.")
 
 
@@ -515,7 +515,7 @@ def read_foreign_json(path: Path) -> dict[str, Any]:
 
 
 def named(path: Path, content: Any) -> dict[str, Any]:
-    """Take content as named fields.
+    """Check that content is a dictionary of named fields.
 
     Raises:
         ImportFailedError: If it is something else.
@@ -528,13 +528,13 @@ def named(path: Path, content: Any) -> dict[str, Any]:
 def numbers(
     path: Path, table: Mapping[str, Any], field: str, axes: tuple[str | int, ...]
 ) -> Float[ndarray, "*axis"]:
-    """Take a field as float64 numbers.
+    """Read a field as float64 numbers.
 
     Args:
         path: File that the field is from, for messages.
         table: The file's fields.
         field: Name of the field.
-        axes: Size of each axis, or a word for a size that is free.
+        axes: Size of each axis, or a name for an arbitrary size.
 
     Raises:
         ImportFailedError: If it is missing or something else.
@@ -543,7 +543,7 @@ def numbers(
 
 
 def optional_points(path: Path, table: Mapping[str, Any], field: str) -> Float[ndarray, "point 3"]:
-    """Take a field as points; without it, or if it is empty in any shape, there are none."""
+    """Read a field as points; none if it is missing or empty."""
     if np.size(table.get(field, ())) == 0:
         return np.zeros((0, 3))
     return numbers(path, table, field, ("point", 3))
@@ -552,7 +552,7 @@ def optional_points(path: Path, table: Mapping[str, Any], field: str) -> Float[n
 def flags(
     path: Path, table: Mapping[str, Any], field: str, axes: tuple[str | int, ...]
 ) -> Bool[ndarray, "*axis"]:
-    """Take a field as booleans; the numbers 0 and 1 will do.
+    """Read a field as booleans; the numbers 0 and 1 are accepted.
 
     Raises:
         ImportFailedError: If it is missing or something else.
@@ -569,7 +569,7 @@ def check_points(
     point: Float[ndarray, "frame point 3"],
     is_visible: Bool[ndarray, "frame point"] | None = None,
 ) -> None:
-    """Check that visible points are finite, near, and not at PhysTwin's mark for invisible ones.
+    """Check that visible points are finite, near, and not (0, 0, 0), PhysTwin's mark for invisible.
 
     Raises:
         ImportFailedError: At the first one that is not; names frame and point.
@@ -591,8 +591,8 @@ def _array(
 ) -> ndarray:
     text = "(" + ", ".join(map(str, axes)) + ")"
     if field not in table:
-        known = ", ".join(map(str, table)) or "none"
-        fail(path, f"field '{field}' {text} is missing; it has the fields {known}")
+        names = ", ".join(map(str, table)) or "none"
+        fail(path, f"field '{field}' {text} is missing; it has the fields {names}")
     try:
         value = np.asarray(table[field])
     except ValueError:

@@ -53,8 +53,8 @@ def import_stereo(
 
     Args:
         source_folder: The recording.
-        out_folder: Where the sequence shall appear; its last part names the sequence.
-        progress: Told after every step.
+        out_folder: Folder of the new sequence; its last part names the sequence.
+        progress: Receives a report after every step.
         hands: Hands that the recording shows.
         origin: Who recorded it, and where it was published; kept with the sequence if given.
         licence: Under which licence; kept with the sequence if given.
@@ -116,9 +116,9 @@ def import_stereo(
 def _find_video(source: Path, camera: int) -> _Video:
     paths = sorted(source.glob(f"cam{camera}*.mp4"))
     if len(paths) != 1:
-        found = ", ".join(path.name for path in paths) or "none"
+        names = ", ".join(path.name for path in paths) or "none"
         raise ImportFailedError(
-            f"{source}: expected one video cam{camera}*.mp4, found {found}. "
+            f"{source}: expected one video cam{camera}*.mp4, found {names}. "
             "Keep one video for each camera."
         )
     capture = cv2.VideoCapture(str(paths[0]))

@@ -1,4 +1,8 @@
-"""Many candidates of one object at once: one launch moves them all by a substep on CUDA."""
+"""Simulates many candidates of one object together: on CUDA, one launch a substep for all.
+
+`BatchSimulator` is the entry; `Population` holds the candidates on the device, `LossSum` their
+losses.
+"""
 
 from collections.abc import Iterator
 from collections.abc import Sequence as Many
@@ -35,37 +39,37 @@ from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import SPEED_LIMIT, Simulator, checked_control
 
 _BUSY_WARPS = 24
-"""Warps that a multiprocessor needs to be busy."""
+"""Warps that keep a multiprocessor busy."""
 BLOCK_NODES = 4
-"""Nodes are ordered so that so many neighbours in memory are neighbours in space."""
+"""Consecutive nodes in memory that are also neighbours in space."""
 batch_kernel = lru_cache(maxsize=None)(make_batch_kernel)
 _COMMON = ("rest_length_floor", "virtual_rest_length_floor", "frame_rate", "frame_duration")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MotionTarget:
-    """What was observed of an object, and how much each observation counts.
+    """Weighted observations of an object.
 
     The loss of a frame is the weighted sum over points of the squared distance to the nearest
     surface node (Chamfer, one way), plus the weighted sum over tracks of the squared distance
-    to where the nodes carried them, plus the weighted acceleration term (physics.md §4.1).
+    to their simulated positions, plus the weighted acceleration term (physics.md §4.1).
     The loss of a motion is the mean over the frames after frame 0.
     """
 
     cloud: Float[ndarray, "frame point 3"]
-    """Observed points; what counts nothing must still be finite [m]."""
+    """Observed points; finite also where the weight is 0 [m]."""
     cloud_weight: Float[ndarray, "frame point"]
-    """How much each point counts; 0 for none."""
+    """Weight of each point; 0 on padding."""
     surface_count: int | None
-    """Points see only so many of the first nodes; all if None."""
+    """Leading nodes that the points are compared with; None for all."""
     track: Float[ndarray, "frame track 3"]
-    """Observed tracks; what counts nothing must still be finite [m]."""
+    """Observed tracks; finite also where the weight is 0 [m]."""
     track_weight: Float[ndarray, "frame track"]
-    """How much each track counts; 0 for none."""
+    """Weight of each track; 0 where it is not valid."""
     carrier: Int[ndarray, "track carrier"]
     """Nodes that carry each track."""
     carrier_weight: Float[ndarray, "track carrier"]
-    """How much each of them counts; rows sum to one."""
+    """Weight of each carrier; rows sum to one."""
     track_offset: Float[ndarray, "track 3"]
     """Position of a track less the weighted mean of its carriers [m]."""
     acceleration_weight: float = 0.0
@@ -78,7 +82,7 @@ class MotionTarget:
 
 
 class LossSum:
-    """Adds up the losses of candidates whose states lie side by side on a device."""
+    """Sums the losses of candidates whose states are interleaved on a device."""
 
     def __init__(
         self,
@@ -89,12 +93,12 @@ class LossSum:
         width: int,
         device: Any,
     ) -> None:
-        """Place the observations on the device.
+        """Copy the observations to the device.
 
         Args:
-            target: What was observed.
-            node_number: Place in the states of each of the model's nodes.
-            lanes: Candidates in the states, those included that only fill a group.
+            target: Observations.
+            node_number: Index in the states of each of the model's nodes.
+            lanes: Candidates in the states, padding included.
             width: Candidates of a group; see `kernels.batch`.
             device: Warp device.
         """
@@ -131,12 +135,12 @@ class LossSum:
         """Loss of each candidate so far [m²]; infinite once it diverged."""
 
     def add(self, frame: int, state: wp.array, diverged_frame: wp.array) -> None:
-        """Compare the states at the end of a frame with what was observed in it.
+        """Add the losses of a frame.
 
         Args:
-            frame: Its number; frame 0 only tells the velocities that others differ from.
-            state: Positions and velocities of all candidates.
-            diverged_frame: Frame in which each candidate diverged; -1 where none was.
+            frame: Number of the frame; frame 0 only provides velocities for later differences.
+            state: Positions and velocities of all candidates at the end of the frame.
+            diverged_frame: Frame in which each candidate diverged; -1 for none.
         """
         if frame > 0:
             self._launch(sum_chamfer, 0, [frame, *self._layout, *self._cloud, state])
@@ -183,7 +187,7 @@ class BatchRollout:
 
 @dataclass(frozen=True, eq=False)
 class BatchLosses:
-    """How far every candidate's motion is from what was observed."""
+    """Loss of every candidate."""
 
     loss: Float[ndarray, " candidate"]
     """Mean over the frames after frame 0 [m²]; infinite where the candidate diverged."""
@@ -192,7 +196,7 @@ class BatchLosses:
 
 
 class Population:
-    """The arrays of a batch of candidates on a CUDA device, where one launch moves them all."""
+    """The arrays of a batch of candidates on a CUDA device; one launch advances them all."""
 
     def __init__(
         self,
@@ -205,14 +209,14 @@ class Population:
         self._substeps = substeps
         self._count = len(parameters)
         self._nodes = len(master.object_node)
-        # More candidates a thread share more of the reading, but small batches need all threads.
+        # More candidates a thread share more memory reads, but small batches need all threads.
         self._each = 1 if self._count <= 64 else 2
         self._width = 32 * self._each
         self._groups = -(-self._count // self._width)
-        # A few candidates of a small object leave most of the device idle: more warps a node then.
-        wanted = _BUSY_WARPS * device.sm_count / (self._groups * max(self._nodes, 1))
-        self._parts = next((parts for parts in (1, 8, 16) if parts >= wanted), 32)
-        # Candidates with like reach share a group, so that few of them wait for others.
+        # A few candidates of a small object leave most of the device idle, so nodes get more warps.
+        needed_warps = _BUSY_WARPS * device.sm_count / (self._groups * max(self._nodes, 1))
+        self._parts = next((parts for parts in (1, 8, 16) if parts >= needed_warps), 32)
+        # Candidates with similar radii share a group, so that few of them wait for others.
         reach = np.array([(p.connection_radius, p.virtual_connection_radius) for p in parameters])
         self._order = np.lexsort(reach.T[::-1])
         lanes = np.full(self._groups * self._width, self._order[-1])
@@ -251,22 +255,22 @@ class Population:
     def rollout(self, control: Float32[ndarray, "frame control 3"]) -> BatchRollout:
         """Simulate all frames; the host waits once, at the end."""
         shape = (len(control), self._count, self._nodes)
-        found = wp.zeros(shape, dtype=wp.vec3, device=self._device)
+        positions = wp.zeros(shape, dtype=wp.vec3, device=self._device)
         for frame in self._frames(control):
             self._launch(
                 take_batch,
                 (self._nodes, self._count),
                 [self._width, self._node_of, self._state[0]],
-                [found[frame]],
+                [positions[frame]],
             )
         position = np.empty((self._count, len(control), self._nodes, 3), dtype=np.float32)
-        position[self._order] = found.numpy().swapaxes(0, 1)
+        position[self._order] = positions.numpy().swapaxes(0, 1)
         return BatchRollout(position, self._by_candidate(self._diverged_frame))
 
     def losses(
         self, control: Float32[ndarray, "frame control 3"], target: MotionTarget
     ) -> BatchLosses:
-        """Simulate the frames that were observed and compare; the host waits once, at the end."""
+        """Simulate the observed frames and compare; the host waits once, at the end."""
         number = np.empty(self._nodes, dtype=np.int64)
         number[self._model_node] = np.arange(self._nodes)
         lanes = len(self._diverged)
@@ -304,9 +308,9 @@ class Population:
             yield frame
 
     def _by_candidate(self, value: wp.array) -> ndarray:
-        found = value.numpy()[: self._count]
-        ordered = np.empty_like(found)
-        ordered[self._order] = found
+        by_lane = value.numpy()[: self._count]
+        ordered = np.empty_like(by_lane)
+        ordered[self._order] = by_lane
         return ordered
 
     def _launch_frame(self) -> None:
@@ -432,7 +436,7 @@ class BatchSimulator:
     def __init__(
         self, master: MasterTopology, parameters: Many[SimulationParameters], device: str = "cpu"
     ) -> None:
-        """Place candidates on a device.
+        """Copy candidates to a device.
 
         Args:
             master: Springs of all candidates; see `MasterTopology.of`.
@@ -483,17 +487,17 @@ class BatchSimulator:
     def losses(
         self, control: Float[ndarray, "frame control 3"], target: MotionTarget
     ) -> BatchLosses:
-        """Simulate the observed frames and compare every candidate with what was observed.
+        """Simulate the observed frames and compare every candidate with the observations.
 
-        On CUDA the losses are added up on the device, and the host waits for it once.
+        On CUDA the losses are summed on the device, and the host waits for it once.
 
         Args:
             control: Positions of the control nodes, in the observed frames at least [m].
-            target: What was observed.
+            target: Observations.
 
         Raises:
             ValueError: If the trajectory does not fit the master topology, is not finite, or is
-                shorter than what was observed.
+                shorter than the observations.
         """
         control = checked_control(control, self.master.control_count)
         if len(control) < target.frame_count:

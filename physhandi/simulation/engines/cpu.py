@@ -1,4 +1,8 @@
-"""Frames and their adjoints on a CPU: springs by its vector units, parts by its threads."""
+"""The CPU engine: frames and their adjoints by vector units, on one or two threads.
+
+`CpuEngine` simulates, `CpuAdjoint` differentiates; `SubstepLoop` launches their kernels with the
+number of threads that `Pace` measures to be faster.
+"""
 
 import ctypes
 import os
@@ -24,14 +28,13 @@ from physhandi.simulation.kernels.cpu_frame import advance_parts
 from physhandi.simulation.kernels.simd import LANES, Bars, Parts, Record, SpringMaterial
 
 TRIAL = 64
-"""Substeps by which a number of threads is judged."""
+"""Substeps of one measurement of a number of threads."""
 FIRST_PAUSE, LONGEST_PAUSE = 0.25, 8.0
-"""How long the slower number of threads is not tried again, at first and at most [s]."""
+"""Time until the slower number of threads is measured again, at first and at most [s]."""
 PART_COUNTS = 2
-"""Parts of an object, on every processor the same, because they decide the order of sums."""
+"""Parts of an object; the same on every processor, because they determine the order of sums."""
 LEAST_SPRINGS = 512
-"""Fewer are not worth it that threads meet."""
-_NEVER = np.iinfo(np.int32).max
+"""Springs from which a second thread can pay for the synchronisation."""
 _RECORD: Any = Record
 _PARTS: Any = Parts
 _MATERIAL: Any = SpringMaterial
@@ -41,20 +44,19 @@ PartState = tuple[wp.array, wp.array]
 
 
 class Pace:
-    """Finds by measurement whether two threads are faster than one, and keeps looking.
+    """Chooses one or two threads by repeated measurement.
 
-    On a machine with other work they are slower, because each waits for the other until both
-    have a processor.
+    On a busy machine two threads are slower, because each waits until the other gets a processor.
     """
 
     def __init__(
         self, processors: int | None = None, clock: Callable[[], float] = time.perf_counter
     ) -> None:
-        """Know nothing yet.
+        """Start without measurements.
 
         Args:
-            processors: How many this process may use; if left out, as the system says.
-            clock: Gives the time in seconds.
+            processors: Processors available to this process; None asks the system.
+            clock: Current time [s].
         """
         self._choices = (1, 2) if (processors or _processor_count()) > 1 else (1,)
         self._clock = clock
@@ -63,7 +65,7 @@ class Pace:
         self._next_trial = 0.0
 
     def choose(self, left: int) -> tuple[int, int]:
-        """Return with how many threads to take how many of the substeps that are left."""
+        """Return the number of threads, and for how many of the remaining substeps."""
         for threads in self._choices:
             if threads not in self._cost:
                 return threads, left if len(self._choices) == 1 else min(left, TRIAL)
@@ -73,10 +75,10 @@ class Pace:
         return (best, left - TRIAL) if left > TRIAL else (3 - best, left)
 
     def learn(self, threads: int, seconds: float) -> None:
-        """Hear how long a substep took with a number of threads."""
+        """Record the time of a substep with a number of threads."""
         is_new = threads not in self._cost
         best = None if is_new else self._best()
-        # One slow frame does not decide, but a trial is all that is known of the other.
+        # The current choice is averaged; of the other one the latest measurement counts.
         is_trial = threads != best
         self._cost[threads] = seconds if is_trial else 0.5 * (seconds + self._cost[threads])
         if self._best() != best:
@@ -95,11 +97,12 @@ class SubstepLoop:
     """A kernel of `kernels.threaded` with its arguments."""
 
     def __init__(self, kernel: Any, substeps: int, inputs: list[Any], device: Any) -> None:
-        """Prepare its launches.
+        """Record its launches.
 
         Args:
-            kernel: Takes thread, threads, substeps, a function's address, `job`, `meeting`.
-            substeps: In a frame.
+            kernel: Its first arguments are thread, number of threads, number of substeps, the
+                address of a function that yields the processor, `job` and `meeting`.
+            substeps: Substeps of a frame.
             inputs: The kernel's other arguments.
             device: Warp device.
         """
@@ -120,7 +123,7 @@ class SubstepLoop:
         self._together = record(0, 2), record(1, 2)
 
     def aim(self, **arrays: wp.array) -> None:
-        """Let the kernel's arguments of these names be other arrays from now on."""
+        """Replace the kernel's array arguments of these names."""
         for name, array in arrays.items():
             if self._aims.get(name) is array:
                 continue
@@ -129,15 +132,13 @@ class SubstepLoop:
                 launch.set_param_by_name(name, array)
 
     def run(self, threads: int | None = None) -> None:
-        """Take all substeps.
-
-        Args:
-            threads: 1 or 2; if none, as is fastest.
-        """
+        """Simulate all substeps with 1 or 2 threads; None for whichever is faster."""
         done = 0
         while done < self._substeps:
-            left = self._substeps - done
-            chosen, count = self._pace.choose(left) if threads is None else (threads, left)
+            remaining = self._substeps - done
+            chosen, count = (
+                self._pace.choose(remaining) if threads is None else (threads, remaining)
+            )
             start = time.perf_counter()
             reached, used = self._launch(chosen, done, done + count)
             if threads is None:
@@ -145,7 +146,7 @@ class SubstepLoop:
             done = reached
 
     def _launch(self, threads: int, first: int, last: int) -> tuple[int, int]:
-        """Take substeps; return how far that came, and with how many threads."""
+        """Simulate substeps; return the next substep, and the number of threads used."""
         job = self._job.numpy()
         job[:2] = first, last
         companion = _companion(os.getpid())
@@ -159,7 +160,7 @@ class SubstepLoop:
             others.append(companion.pool.submit(self._together[1].launch))
             self._together[0].launch()
         except BaseException:
-            # Otherwise the other thread would wait for this one for ever.
+            # Otherwise the other thread would wait for this one forever.
             meeting[1] = ABORT
             raise
         finally:
@@ -170,7 +171,7 @@ class SubstepLoop:
 
 
 class _Companion:
-    """One more thread of this process, for one launch at a time."""
+    """A second thread of this process, for one launch at a time."""
 
     def __init__(self) -> None:
         self.lock = Lock()
@@ -183,7 +184,7 @@ def _companion(process: int) -> _Companion:  # noqa: ARG001  (a fork has none of
 
 
 def _give_way() -> int:
-    """Return the address of the function that lets other threads have the processor."""
+    """Return the address of the system function that yields the processor."""
     if sys.platform == "win32":
         function = ctypes.windll.kernel32.SwitchToThread
     else:
@@ -199,19 +200,19 @@ def _processor_count() -> int:
 
 
 class CpuEngine:
-    """The arrays of one model that a CPU's threads work on."""
+    """The arrays of one model for the CPU kernels."""
 
     def __init__(self, simulator: EngineHost, parts: SpringParts) -> None:
-        """Place a partition in memory.
+        """Allocate the arrays.
 
         Args:
-            simulator: Whose controls, material and world are read.
-            parts: Of its model.
+            simulator: Its controls, material and world are read.
+            parts: Parts of its model.
         """
         self._simulator = simulator
         self.partition = parts
         self.threads: int | None = None if len(parts.spring) >= LEAST_SPRINGS else 1
-        """Threads of a launch; if none, as many as measurement finds best. The bits are equal."""
+        """Threads of a launch; None for whichever is faster. The bits are the same."""
         self.parts = _PARTS()
         for field in fields(parts):
             dtype = wp.vec2i if field.name == "ends" else wp.int32
@@ -220,7 +221,7 @@ class CpuEngine:
         for name in ("rest", "elastic", "dashpot"):
             setattr(self.material, name, self.zeros(len(parts.spring), wp.float32))
         self.state = self.zeros((2, parts.place_count), _RECORD)
-        """States of two substeps in turn, while no tape is written."""
+        """States of two alternating substeps, used when no tape is written."""
         self._force = self.zeros(parts.place_count, wp.vec4)
         self.no_tape = self.zeros((0, 0), wp.vec4)
         self._first = self.zeros(len(parts.own_start) - 1, wp.int32)
@@ -228,7 +229,7 @@ class CpuEngine:
 
     @staticmethod
     def of(simulator: EngineHost) -> "CpuEngine | None":
-        """Make one for a simulator; none on a GPU, or if there is no node."""
+        """Create one for a simulator; None on a GPU, or without nodes."""
         if simulator.device.is_cuda or simulator.model.node_count == 0:
             return None
         return CpuEngine(simulator, group_springs(simulator.model, PART_COUNTS, LANES))
@@ -242,8 +243,8 @@ class CpuEngine:
 
         Args:
             before: State at its start.
-            after: Where the state at its end goes; may be the same arrays.
-            tape: Where each substep's state and velocity before contact go.
+            after: Receives the state at its end; may be the same arrays.
+            tape: Receives each substep's state and velocity before contact.
         """
         simulator = self._simulator
         loop = self._loops.get(tape is None)
@@ -263,8 +264,8 @@ class CpuEngine:
             velocity_out=after[1],
         )
         loop.run(self.threads)
-        told = simulator.first_divergence.numpy()
-        told[0] = min(told[0], *self._first.numpy())
+        first = simulator.first_divergence.numpy()
+        first[0] = min(first[0], *self._first.numpy())
 
     def substep_loop(self, kernel: Any, *arguments: list[Any]) -> SubstepLoop:
         """Prepare the launches of a kernel over the substeps of a frame."""
@@ -276,29 +277,29 @@ class CpuEngine:
 
 
 def cpu_tape_layout(places: int, nodes: int, substeps: int) -> TapeLayout:
-    """Say what is kept of a frame: states in all places, and velocities before contact.
+    """Shape the tape of a frame: states in all places, and velocities before contact.
 
     Args:
         places: Nodes, and control nodes once for each part that they hold.
         nodes: Object nodes.
-        substeps: In a frame.
+        substeps: Substeps of a frame.
     """
     return ((substeps + 1, places), _RECORD), ((substeps, nodes), wp.vec4)
 
 
 class CpuAdjoint:
-    """Simulates frames and carries derivatives back; as `GraphAdjoint`, by threads."""
+    """Simulates frames and propagates derivatives back; `GraphAdjoint` on the CPU engine."""
 
     def __init__(self, simulator: EngineHost, engine: CpuEngine) -> None:
-        """Make room for the derivatives.
+        """Allocate the derivatives.
 
         Args:
-            simulator: Whose frames; its controls, material and world are read, its state moved.
-            engine: The simulator's.
+            simulator: Its controls, material and world are read, its state is advanced.
+            engine: Engine of the simulator.
         """
         self._engine = engine
         model, parts = simulator.model, engine.partition
-        nodes, held = model.node_count, len(parts.control)
+        nodes, held_count = model.node_count, len(parts.control)
         substeps = simulator.parameters.substeps_per_frame
         self.layout = cpu_tape_layout(parts.place_count, nodes, substeps)
         self._state = simulator.position, simulator.velocity
@@ -312,8 +313,8 @@ class CpuAdjoint:
             ("log_stiffness", len(parts.spring), wp.float32),
             ("damping", len(parts.spring), wp.float32),
             ("coefficients", nodes, wp.vec3),
-            ("start", held, wp.vec3),
-            ("end", held, wp.vec3),
+            ("start", held_count, wp.vec3),
+            ("end", held_count, wp.vec3),
         ):
             setattr(self._bars, name, engine.zeros(shape, dtype))
         self._adjoint = engine.substep_loop(
@@ -325,17 +326,17 @@ class CpuAdjoint:
 
     @staticmethod
     def of(simulator: EngineHost, engine: Any) -> "CpuAdjoint | None":
-        """Make one for a simulator; none if its engine is another, or nodes collide."""
+        """Create one for a simulator; None with another engine or with self-collision."""
         if not isinstance(engine, CpuEngine) or simulator.parameters.self_collision:
             return None
         return CpuAdjoint(simulator, engine)
 
     def record(self, tape: Tape) -> None:
-        """Advance the simulator by one frame and keep its substeps in `tape`."""
+        """Advance the simulator by one frame and record its substeps in `tape`."""
         self._engine.advance(self._state, self._state, tape)
 
     def backward(self, tape: Tape) -> None:
-        """Carry `position_bar` and `velocity_bar` back; see `GraphAdjoint.backward`."""
+        """Propagate `position_bar` and `velocity_bar` back; see `GraphAdjoint.backward`."""
         engine = self._engine
         state, free_tape = tape
         self._adjoint.aim(state=state, free_tape=free_tape)

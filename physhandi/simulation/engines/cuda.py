@@ -1,4 +1,8 @@
-"""Frames and their adjoints in one launch each on CUDA, for models whose blocks fit."""
+"""The CUDA engine: a frame, or its adjoint, in one launch, for models whose blocks fit.
+
+`CudaEngine` keeps blocks in static shared memory; larger blocks use `LargeFrames`. `CudaAdjoint`
+differentiates.
+"""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -27,42 +31,43 @@ from physhandi.simulation.kernels.cuda_large_frame import (
 )
 
 WARP = 32
-"""Threads that read side by side."""
-LARGE_BLOCK_SIZES = {512: 14, 768: 6}
-"""Threads of a block, and the most half-edges for which each has registers."""
-LANES_PER_NODE = (8, 4, 2, 1)
-"""Threads that may sum one node's springs."""
-LOCALS_STEP = 512
-"""Room for nodes grows by so many, so that few sizes are compiled."""
-_BYTES_OF_A_LOCAL = 4 * FLOATS_OF_A_LOCAL
-_BYTES_OF_A_THREAD = 4
-"""What Warp's own bookkeeping takes of shared memory."""
-large_frame_kernel = lru_cache(maxsize=None)(make_large_frame_kernel)
+"""Threads of a warp."""
 LEAST_OWN = 4
-"""Fewer nodes in a block cost more waiting than they save work."""
+"""Nodes of a block; with fewer, synchronisation costs more than the parallel work saves."""
 MOST_LANES = 576
-"""A block's nodes get as many threads each as keep them below this sum."""
+"""Bound on a block's nodes times the threads of each."""
 MOST_KEPT = 6
 """Most half-edges that a thread keeps in registers."""
 BLOCK_SIZES = (256, 384, 576, 768)
-"""Threads of a block; few sizes, because each is compiled on its own."""
+"""Threads of a block; few sizes, because each is compiled separately."""
 _LAST_TAG = 2**31 - 2**20
 frame_kernel = lru_cache(maxsize=None)(make_frame_kernel)
 adjoint_kernel = lru_cache(maxsize=None)(make_adjoint_kernel)
+
+LARGE_BLOCK_SIZES = {512: 14, 768: 6}
+"""Large frames: threads of a block, and the most half-edges for which each has registers."""
+LANES_PER_NODE = (8, 4, 2, 1)
+"""Large frames: threads that may sum one node's springs."""
+LOCALS_STEP = 512
+"""Large frames: step of the number of local nodes, so that few sizes are compiled."""
+_BYTES_OF_A_LOCAL = 4 * FLOATS_OF_A_LOCAL
+_BYTES_OF_A_THREAD = 4
+"""Shared memory that Warp itself uses for each thread [B]."""
+large_frame_kernel = lru_cache(maxsize=None)(make_large_frame_kernel)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HalfEdgeColumns:
     """Columns of 32 half-edges, one for each thread of a warp, group by group.
 
-    A block's nodes take turns if it has more than rows of threads: each turn is a chunk. A group
-    is what one warp does in one chunk; its columns are as many as its thread with the most needs.
+    A block with more nodes than rows of threads processes them in chunks. A group is the work of
+    one warp in one chunk; it has as many columns as its thread with the most half-edges.
     """
 
     chunk_count: int
-    """Turns that each block takes."""
+    """Chunks of each block."""
     start: Int32[ndarray, " group_1"]
-    """Where each group's half-edges begin: block by block, chunk by chunk, warp by warp."""
+    """Start of each group's half-edges: block by block, chunk by chunk, warp by warp."""
     place: Int32[ndarray, " slot"]
     """Place of the other end in the block's part of `local_node`; padding ends where it begins."""
     spring: Int32[ndarray, " slot"]
@@ -70,7 +75,7 @@ class HalfEdgeColumns:
 
 
 def arrange_columns(partition: Partition, lanes: int, threads: int) -> HalfEdgeColumns:
-    """Share out half-edges to threads.
+    """Assign half-edges to threads.
 
     Args:
         partition: Blocks and their nodes' half-edges.
@@ -105,14 +110,14 @@ def arrange_columns(partition: Partition, lanes: int, threads: int) -> HalfEdgeC
 
 
 def most_large_locals(device: Any) -> int:
-    """Return how many nodes, its own and its halo, a block of a device has room for."""
+    """Return how many nodes, own and halo, fit the shared memory of a block."""
     free = int(device.max_shared_memory_per_block) - _BYTES_OF_A_THREAD * max(LARGE_BLOCK_SIZES)
     return max(0, free // _BYTES_OF_A_LOCAL)
 
 
 @dataclass(frozen=True)
 class LargeLayout:
-    """How many threads do what."""
+    """Launch configuration of a large frame."""
 
     lanes: int
     """Threads that sum one node's springs."""
@@ -121,11 +126,11 @@ class LargeLayout:
     threads: int
     """Threads of a block."""
     locals: int
-    """Nodes that a block has room for."""
+    """Nodes for which a block reserves shared memory."""
 
     @classmethod
     def of(cls, partition: Partition, most_locals: int) -> "LargeLayout":
-        """Use as many lanes as leave no node waiting for a turn.
+        """Use the most lanes with which all nodes of a block are processed at once.
 
         Args:
             partition: Blocks of nodes.
@@ -145,11 +150,11 @@ class LargeFrames:
     """The half-edges of one model as the large frame kernel reads them."""
 
     def __init__(self, simulator: EngineHost, partition: Partition) -> None:
-        """Place half-edges on the device.
+        """Copy the half-edges to the device.
 
         Args:
-            simulator: Whose state, controls, material and world are read and written.
-            partition: Of its model; its blocks must fit the device.
+            simulator: Its state, controls, material and world are read and written.
+            partition: Blocks of its model; they must fit the device.
         """
         self._simulator = simulator
         self._block_count = partition.block_count
@@ -179,7 +184,7 @@ class LargeFrames:
             after: Where the state at its end goes; may be the same arrays.
         """
         simulator, layout = self._simulator, self.layout
-        # Material and world may have changed on the device, unseen from here; a frame costs more.
+        # Material and world may have changed on the device; packing is cheap beside a frame.
         wp.launch(
             pack_half_edges,
             dim=len(self._place),
@@ -201,7 +206,7 @@ class LargeFrames:
 
 @dataclass(frozen=True)
 class BlockLayout:
-    """How many threads do what."""
+    """Launch configuration of a frame."""
 
     lanes: int
     """Threads that sum one node's springs."""
@@ -221,14 +226,14 @@ class BlockLayout:
 
 
 class CudaEngine:
-    """The arrays of one model that blocks of nodes work on."""
+    """The arrays of one model for the CUDA kernels."""
 
     def __init__(self, simulator: EngineHost, partition: Partition) -> None:
-        """Place a partition on the device.
+        """Copy a partition to the device.
 
         Args:
-            simulator: Whose state, controls, material and world are read and written.
-            partition: Of its model.
+            simulator: Its state, controls, material and world are read and written.
+            partition: Blocks of its model.
         """
         self._simulator = simulator
         self.partition = partition
@@ -245,7 +250,7 @@ class CudaEngine:
 
     @staticmethod
     def of(simulator: EngineHost) -> "CudaEngine | None":
-        """Make one for a simulator; none on a CPU, or if the model's blocks do not fit.
+        """Create one for a simulator; None on a CPU, or if the model's blocks do not fit.
 
         Blocks that fit static shared memory are moved by the kernel that keeps all in registers,
         others by the one of `LargeFrames`, as far as the device has shared memory for them.
@@ -259,7 +264,7 @@ class CudaEngine:
         return CudaEngine(simulator, partition) if fits else None
 
     def next_tags(self, count: int) -> int:
-        """Reserve tags that no value in the relay bears."""
+        """Reserve tags that no value in the relay has."""
         if self._tag > _LAST_TAG:
             self._relay.zero_()
             self._tag = 1
@@ -280,7 +285,7 @@ class CudaEngine:
             tape: Where each substep's position, velocity and velocity before contact go.
 
         Raises:
-            ValueError: If a tape is wanted of blocks whose adjoint does not fit.
+            ValueError: If a tape is requested for blocks whose adjoint does not fit.
         """
         simulator = self._simulator
         substeps = simulator.parameters.substeps_per_frame
@@ -337,24 +342,24 @@ class CudaEngine:
 
 
 def cuda_tape_layout(nodes: int, substeps: int) -> TapeLayout:
-    """Say what is kept of a frame: position, velocity and velocity before contact, side by side."""
+    """Shape the tape of a frame: position, velocity and velocity before contact, side by side."""
     return (((substeps, 3 * nodes), wp.vec4),)
 
 
 class CudaAdjoint:
-    """Simulates frames and carries derivatives back; as `GraphAdjoint`, in a launch each."""
+    """Simulates frames and propagates derivatives back; `GraphAdjoint` in one launch each."""
 
     def __init__(self, simulator: EngineHost, engine: CudaEngine) -> None:
-        """Make room for the derivatives.
+        """Allocate the derivatives.
 
         Args:
-            simulator: Whose frames; its controls, material and world are read, its state moved.
-            engine: The simulator's.
+            simulator: Its controls, material and world are read, its state is advanced.
+            engine: Engine of the simulator.
         """
         self._engine = engine
         model, device = simulator.model, simulator.device
         nodes = model.node_count
-        held = len(model.spring_nodes) - model.object_spring_count
+        virtual_count = len(model.spring_nodes) - model.object_spring_count
 
         def zeros(count: int, dtype: Any) -> wp.array:
             return wp.zeros(count, dtype=dtype, device=device)
@@ -362,7 +367,7 @@ class CudaAdjoint:
         self.layout = cuda_tape_layout(nodes, simulator.parameters.substeps_per_frame)
         self._state = simulator.position, simulator.velocity
         self.position_bar, self.velocity_bar = zeros(nodes, wp.vec3), zeros(nodes, wp.vec3)
-        self._held_bars = [zeros(held, wp.vec3) for _ in range(2)]
+        self._held_bars = [zeros(virtual_count, wp.vec3) for _ in range(2)]
         self.sums = FrameSums.zeros(model, device)
         self._is_first = simulator.array(engine.partition.is_first, wp.int32)
         control = model.spring_nodes[model.object_spring_count :].max(axis=1, initial=0) - nodes
@@ -375,7 +380,7 @@ class CudaAdjoint:
 
     @staticmethod
     def of(simulator: EngineHost, engine: Any) -> "CudaAdjoint | None":
-        """Make one for a simulator; none if its engine is another or its blocks do not fit."""
+        """Create one for a simulator; None with another engine, or if its blocks do not fit."""
         if not isinstance(engine, CudaEngine) or simulator.parameters.self_collision:
             return None
         partition, layout = engine.partition, engine.layout
@@ -387,11 +392,11 @@ class CudaAdjoint:
         return CudaAdjoint(simulator, engine) if fits else None
 
     def record(self, tape: Tape) -> None:
-        """Advance the simulator by one frame and keep its substeps in `tape`."""
+        """Advance the simulator by one frame and record its substeps in `tape`."""
         self._engine.advance(self._state, self._state, *tape)
 
     def backward(self, tape: Tape) -> None:
-        """Carry `position_bar` and `velocity_bar` back; see `GraphAdjoint.backward`."""
+        """Propagate `position_bar` and `velocity_bar` back; see `GraphAdjoint.backward`."""
         sums, (substeps,) = self.sums, tape
         for value in self._held_bars:
             value.zero_()

@@ -101,9 +101,9 @@ def partition_model(model: SpringMassModel, block_count: int) -> Partition:
     spring = np.concatenate([springs, springs])
     is_object = spring < model.object_spring_count
     is_first = np.concatenate([springs >= 0, springs < 0]) | ~is_object
-    kept = np.flatnonzero(source < count)
-    kept = kept[np.lexsort((other[kept], source[kept]))]
-    source, other, spring, is_first = source[kept], other[kept], spring[kept], is_first[kept]
+    own = np.flatnonzero(source < count)
+    own = own[np.lexsort((other[own], source[own]))]
+    source, other, spring, is_first = source[own], other[own], spring[own], is_first[own]
 
     block = np.repeat(np.arange(blocks), np.diff(own_start))
     is_beyond = (other >= count) | (block[np.minimum(other, count - 1)] != block[source])
@@ -185,9 +185,9 @@ def group_springs(model: SpringMassModel, part_count: int, group: int) -> Spring
 
     # Each part has places of its own for the control nodes that it needs.
     width = len(number)
-    held, place = np.unique(home[is_held] * width + ends[is_held, 1], return_inverse=True)
+    held_keys, place = np.unique(home[is_held] * width + ends[is_held, 1], return_inverse=True)
     ends[is_held, 1] = count + place.reshape(-1)
-    held_start = count + np.searchsorted(held, np.arange(parts + 1) * width)
+    held_start = count + np.searchsorted(held_keys, np.arange(parts + 1) * width)
 
     springs = np.arange(len(ends))
     inner = [springs[(home == index) & (away == index)] for index in range(parts)]
@@ -217,7 +217,7 @@ def group_springs(model: SpringMassModel, part_count: int, group: int) -> Spring
         inner_start=start[: parts + 1].astype(np.int32),
         cut_start=start[parts:].astype(np.int32),
         node=order.astype(np.int32),
-        control=(held % width - count).astype(np.int32),
+        control=(held_keys % width - count).astype(np.int32),
         spring=entry[:, 2].copy(),
         spoken=entry[:, 3].copy(),
         ends=4 * entry[:, :2],

@@ -33,9 +33,9 @@ def free_memory(device: Any) -> int:
     # A machine with a GPU can do without it.
     import psutil
 
-    left = int(psutil.virtual_memory().available)
-    within = container_memory(_CGROUP)
-    return left if within is None else min(left, within)
+    free = int(psutil.virtual_memory().available)
+    container = container_memory(_CGROUP)
+    return free if container is None else min(free, container)
 
 
 def container_memory(folder: Path) -> int | None:
@@ -46,12 +46,12 @@ def container_memory(folder: Path) -> int | None:
     """
     for limit, used, statistics, droppable in _FILES:
         try:
-            told = (folder / limit).read_text().strip()
-            if told == "max":
+            limit_text = (folder / limit).read_text().strip()
+            if limit_text == "max":
                 return None
             fields = dict(line.split() for line in (folder / statistics).read_text().splitlines())
             use = int((folder / used).read_text()) - int(fields.get(droppable, 0))
-            return max(0, int(told) - use)
+            return max(0, int(limit_text) - use)
         except FileNotFoundError:
             continue
     return None
@@ -166,14 +166,14 @@ _lock = Lock()
 def _take(device: Any, layout: TapeLayout, count: int) -> list[Tape]:
     """Take room for some frames from what was given back, the rest from the device."""
     with _lock:
-        known, spare = _spare.pop(device.alias, (layout, []))
-        taken = spare[:count] if known == layout else []
-        if known == layout and spare[count:]:
+        spare_layout, spare = _spare.pop(device.alias, (layout, []))
+        tapes = spare[:count] if spare_layout == layout else []
+        if spare_layout == layout and spare[count:]:
             _spare[device.alias] = layout, spare[count:]
     del spare
-    for _ in range(count - len(taken)):
-        taken.append(tuple(_room(device, shape, dtype) for shape, dtype in layout))
-    return taken
+    for _ in range(count - len(tapes)):
+        tapes.append(tuple(_room(device, shape, dtype) for shape, dtype in layout))
+    return tapes
 
 
 def _room(device: Any, shape: tuple[int, ...], dtype: Any) -> wp.array:
@@ -187,5 +187,5 @@ def _room(device: Any, shape: tuple[int, ...], dtype: Any) -> wp.array:
 def _give_back(device: Any, layout: TapeLayout, tapes: list[Tape]) -> None:
     """Keep the room of some frames for the next trajectory; forget that of another layout."""
     with _lock:
-        known, spare = _spare.pop(device.alias, (layout, []))
-        _spare[device.alias] = layout, (spare if known == layout else []) + tapes
+        spare_layout, spare = _spare.pop(device.alias, (layout, []))
+        _spare[device.alias] = layout, (spare if spare_layout == layout else []) + tapes

@@ -92,8 +92,8 @@ def make_body(name: BodyName, random: Generator, *, resolution: Resolution = "fi
         UsageError: If there is no such body or resolution.
     """
     if name not in get_args(BodyName):
-        known = ", ".join(get_args(BodyName))
-        raise UsageError(f"There is no object named {name!r}. Choose one of: {known}.")
+        names = ", ".join(get_args(BodyName))
+        raise UsageError(f"There is no object named {name!r}. Choose one of: {names}.")
     if resolution not in get_args(Resolution):
         raise UsageError(f"There is no resolution named {resolution!r}. Choose fine or tiny.")
     is_fine = resolution == "fine"

@@ -181,9 +181,9 @@ def _largest_piece(
     row, column = elements[:, [0, 0, 0]].ravel(), elements[:, 1:].ravel()
     graph = coo_array((np.ones(len(row)), (row, column)), shape=(len(node), len(node)))
     label = connected_components(graph, directed=False)[1]
-    kept = label == np.argmax(np.bincount(label))
-    place = np.cumsum(kept) - 1
-    return node[kept], place[elements[kept[elements].all(axis=1)]]
+    is_kept = label == np.argmax(np.bincount(label))
+    place = np.cumsum(is_kept) - 1
+    return node[is_kept], place[elements[is_kept[elements].all(axis=1)]]
 
 
 def _surface(elements: Int[ndarray, "element 4"]) -> Int[ndarray, "face 3"]:

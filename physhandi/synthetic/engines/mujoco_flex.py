@@ -147,16 +147,16 @@ class _World:
         Args:
             time: Now [s]; bones without capsules are where the script has them at this time.
         """
-        found: dict[Side, ndarray] = {
+        transforms: dict[Side, ndarray] = {
             script.side: np.array(self._hands[script.side].bone_transforms(script.at(time)))
             for script in self._scripts
         }
         for bone, number in zip(self._bones, self._bone_body, strict=True):
             turn = self._data.xmat[number].reshape(3, 3)
-            transform = found[bone.side][bone.index]
+            transform = transforms[bone.side][bone.index]
             transform[:3, :3] = turn
             transform[:3, 3] = self._data.xpos[number] - turn @ bone.center
-        return found
+        return transforms
 
     def attach_what_was_touched(self) -> None:
         """Tie nodes of the surface that a bone has touched for some frames to it."""

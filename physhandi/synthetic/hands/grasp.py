@@ -109,8 +109,8 @@ def reach(
         SequenceError: Thumb, index or middle finger stays more than 6 mm away from its target.
     """
     tips = {finger: fingertip(hand, finger) for finger in targets}
-    held = Rotation.from_rotvec(orientation if start is None else start.orientation)
-    wrist = _first_place(hand, targets, held, joints) if start is None else start.position
+    palm = Rotation.from_rotvec(orientation if start is None else start.orientation)
+    wrist = _first_place(hand, targets, palm, joints) if start is None else start.position
     tightness = 1.0 if start is None else 0.15
     guess = np.concatenate([np.zeros(3), wrist, joints])
     scale = np.repeat(
@@ -122,7 +122,7 @@ def reach(
     high = np.concatenate([np.full(3, _TURN_RANGE), *reach_high])
 
     def pose_of(value: ndarray) -> TrueHandPose:
-        turn = Rotation.from_rotvec(value[:3]) * held
+        turn = Rotation.from_rotvec(value[:3]) * palm
         return TrueHandPose(
             orientation=turn.as_rotvec(), position=value[3:6].copy(), bend=bend_of(value[6:])
         )

@@ -121,10 +121,10 @@ class Handler:
         for gap in np.linspace(place.closed_gap, place.open_gap, 4)[1:]:
             lower.append(pinch(self._hand, place, float(gap), lower[-1]))
         lower.reverse()
-        held = replace(place, point=place.point + raised)
+        raised_place = replace(place, point=place.point + raised)
         outside = moved(lower[0], -_ASIDE * place.forward)
         return Grasp(
-            place=held,
+            place=raised_place,
             poses=(moved(closed, raised),),
             approach=(
                 HandMove(_BEGIN, _TOUCH, (outside, lower[0])),

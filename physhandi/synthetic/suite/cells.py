@@ -1,8 +1,8 @@
-"""Cells of a suite: one method on one sequence, a run folder that is filled once and kept.
+"""Cells of a suite: one method on one sequence, a run folder that is computed once and reused.
 
-A cell's folder is named by a hash of its sequence, method and code, so that a suite that is run
-again goes on where it stopped, and anything that changed is computed anew. Several processes may
-fill cells of one folder: who needs a cell that another one is filling waits for it.
+A cell's folder is named by a hash of its sequence, method and code, so that a repeated suite
+continues where it stopped and recomputes what has changed. Several processes may compute cells of
+one folder; a process that needs a cell in progress waits for it.
 """
 
 import hashlib
@@ -54,34 +54,34 @@ from physhandi.synthetic.suite.methods import (
 from physhandi.synthetic.suite.variants import DISTURBED_HAND, make_variant, noise_seed
 
 FAILURES = (FitError, MissingInputError, SimulationDivergedError, SimulationError)
-"""What a method may fail with; its output then counts as missing. Anything else stops the suite,
-a setting that only a fit finds wrong too."""
+"""Errors after which a method's output counts as missing. Any other error stops the suite, also a
+setting that only the fit finds invalid."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What came out of a cell."""
+    """Result of a cell."""
 
     method: str
     """Name of the method."""
     case: str
     """Name of the sequence."""
     variant: str
-    """What the method was given."""
+    """Variant of the sequence that was the method's input."""
     run: str
-    """Name of the run folder below ``cells/``; empty if the method could not even begin."""
+    """Name of the run folder below ``cells/``; empty if the method could not start."""
     error: str = ""
-    """Why there is no output, so that the static object stands in; empty if there is one."""
+    """Why there is no output and the static object is scored instead; empty if there is one."""
     seconds: Mapping[str, float] = field(default_factory=dict[str, float])
     """Time of each stage [s]."""
     report: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    """What `physhandi.metrics.report.score_run` says of it, against the whole recording."""
+    """Scores against the whole recording, as `physhandi.metrics.report.score_run` returns them."""
     curves: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    """Its errors frame by frame."""
+    """Errors frame by frame."""
 
 
 class Bench:
-    """Fills the cells of one suite folder."""
+    """Computes and scores the cells of one suite folder."""
 
     def __init__(
         self, out: Path, *, common: Mapping[str, Any], device: str, progress: Progress
@@ -92,7 +92,7 @@ class Bench:
             out: Folder of the suite.
             common: Settings that all methods share.
             device: Warp device.
-            progress: Told about every iteration.
+            progress: Receives a report of every iteration.
         """
         self.out = out
         self.common = dict(common)
@@ -104,23 +104,24 @@ class Bench:
         self._finished: dict[Path, RunFolder] = {}
 
     def reference(self, recording: Sequence) -> RunFolder:
-        """Give the run of the static object on a recording: its observations are scored against.
+        """Get the run of the static object on a recording, whose observations all scores use.
 
         Raises:
-            PhysHandiError: If hands or observations cannot be found; then nothing can be scored.
+            PhysHandiError: If hands or observations cannot be reconstructed, so that nothing can be
+                scored.
         """
         return self._run(METHODS["static"], recording, "recording")
 
     def outcome(self, method: Method, recording: Sequence, variant: str = "recording") -> Outcome:
-        """Run a method on a recording, or find what it gave before, and score it.
+        """Run a method on a recording, or reuse its finished run, and score it.
 
         Args:
             method: The method.
             recording: The whole recording, which it is scored against.
-            variant: What it is given; an oracle gets what its nature asks for.
+            variant: Input of the method; an oracle has an input of its own.
 
         Raises:
-            UsageError: If the fit finds that a setting makes no sense.
+            UsageError: If the fit finds a setting invalid.
         """
         variant = _given(method, variant)
         reference = self.reference(recording)
@@ -151,7 +152,7 @@ class Bench:
         )
 
     def lacks(self, method: Method, recording: Sequence, variant: str = "recording") -> str:
-        """Say what a recording lacks for a variant of it to be given; empty if nothing."""
+        """Explain what a recording lacks for a variant of it; empty if nothing."""
         try:
             self._make_variant(recording, _given(method, variant))
         except MissingInputError as error:
@@ -159,15 +160,15 @@ class Bench:
         return ""
 
     def unseen(self, method: Method, fitted: Sequence, recording: Sequence) -> Outcome:
-        """Simulate the object that was fitted in one recording in another one.
+        """Simulate the object fitted on one recording in another one.
 
-        The object is laid into the new first frame, keeps its rest lengths, and is joined to the
-        hands anew; no frame after the first one is fitted. A rule needs no fit.
+        The object is aligned with the new first frame, keeps its rest lengths, and gets new virtual
+        springs; no frame after the first one is fitted. A rule needs no fit.
 
         Args:
-            method: The method, not corrected.
-            fitted: Where its object is fitted.
-            recording: Where it is simulated and scored, over all frames.
+            method: The method, without correction.
+            fitted: Recording on which the object is fitted.
+            recording: Recording in which it is simulated and scored, over all frames.
         """
         whole = _as_one_split(recording)
         reference = self.reference(recording)
@@ -182,14 +183,14 @@ class Bench:
                 report=report,
                 curves=curves,
             )
-        given = "true_hand" if method.gets == "true_hand" else "recording"
+        variant = "true_hand" if method.gets == "true_hand" else "recording"
         name, error = "", ""
         run: RunFolder | None = None
         try:
             source = self._run(method, fitted, method.gets)
-            target = self._make_variant(recording, given)
+            target = self._make_variant(recording, variant)
             folder = self._cell(
-                recording.name, f"{method.name}_unseen", [source.folder.name, given], recording
+                recording.name, f"{method.name}_unseen", [source.folder.name, variant], recording
             )
             name = folder.name
             run = self._simulated(
@@ -214,14 +215,7 @@ class Bench:
     def score(
         self, run: RunFolder | None, reference: RunFolder, recording: Sequence
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Measure what a run predicted against what the whole recording shows.
-
-        The run brings its motion, hands and springs; observations are the reference's, whatever
-        the run itself was given. Without a run the static object stands in.
-
-        Returns:
-            The report and the errors frame by frame.
-        """
+        """Score a run against the whole recording (`measure_cell`), or reuse stored scores."""
         parts = [reference.folder.name, "" if run is None else run.folder.name]
         parts += [str(len(recording.reconstruction_frames)), code_version(SCORES)]
         key = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
@@ -230,8 +224,8 @@ class Bench:
             report, curves = measure_cell(run, reference, recording)
             path.parent.mkdir(parents=True, exist_ok=True)
             write_json(path, {"report": report, "curves": curves})
-        known = read_json(path)
-        return known["report"], known["curves"]
+        stored = read_json(path)
+        return stored["report"], stored["curves"]
 
     def _run(self, method: Method, recording: Sequence, variant: str) -> RunFolder:
         folder = self._folder(method, recording, variant)
@@ -246,9 +240,9 @@ class Bench:
 
     @contextmanager
     def _alone(self, name: str) -> Generator[None]:
-        """Make sure that no other process works on something; wait until that one is finished.
+        """Hold a lock between processes while a cell or variant is computed.
 
-        Who holds one only waits for what it is made from, so none waits for itself.
+        The holder waits only for locks of its own inputs, so there are no deadlocks.
         """
         folder = self.out / "locks"
         folder.mkdir(parents=True, exist_ok=True)
@@ -257,11 +251,11 @@ class Bench:
 
     def _filled(self, method: Method, recording: Sequence, variant: str, folder: Path) -> RunFolder:
         _raise_again(folder)
-        given = self._make_variant(recording, variant)
+        inputs = self._make_variant(recording, variant)
         title = f"{method.name} on {recording.name}"
         if method.is_corrected:
             base = self._run(method.base, recording, variant)
-            return correct(base, given, folder, title=title, method=method)
+            return correct(base, inputs, folder, title=title, method=method)
         still, hands, noise = self._still(method), None, None
         if method.name != still.name:
             hands = self._run(still, recording, variant)
@@ -271,7 +265,7 @@ class Bench:
         try:
             return execute(
                 method,
-                given,
+                inputs,
                 folder,
                 title=title,
                 common=self.common,
@@ -281,13 +275,13 @@ class Bench:
                 progress=self.progress,
             )
         except UsageError as error:
-            told = f"Method '{method.name}' on sequence '{recording.name}': {error}"
-            raise UsageError(told) from error
+            message = f"Method '{method.name}' on sequence '{recording.name}': {error}"
+            raise UsageError(message) from error
 
     def _simulated(
         self, source: RunFolder, target: Sequence, folder: Path, *, title: str
     ) -> RunFolder:
-        """Simulate what was fitted elsewhere; a radius that reaches nothing there is no misuse."""
+        """Simulate an object fitted elsewhere; springs that do not form count as a failed fit."""
         try:
             with self._alone(folder.name):
                 _raise_again(folder, also=UsageError)
@@ -298,7 +292,7 @@ class Bench:
             raise FitError(str(error)) from error
 
     def _still(self, method: Method) -> Method:
-        """Give the method whose run has the hands of a method: the static one, if they agree."""
+        """Get the method whose run provides a method's hands: the static one, if settings agree."""
         static, own = METHODS["static"], method.base
         if shared_stages(self._settings_of(static), self._settings_of(method)):
             return static
@@ -309,9 +303,9 @@ class Bench:
     def _seconds(
         self, method: Method, recording: Sequence, variant: str, run: RunFolder
     ) -> dict[str, float]:
-        """Give the time of each stage; one that was taken over took as long as where it was run.
+        """Get the time of each stage [s]; a reused stage counts with the time of its own run.
 
-        A run that was stopped and went on does not know how long it took, so it has no times.
+        Empty for a run that was interrupted, whose times are unknown.
         """
         if run.attempt != 1:
             return {}
@@ -323,11 +317,11 @@ class Bench:
         still = self._still(base)
         if base.name != still.name:
             first = self._run(still, recording, variant)
-            taken = self._seconds(still, recording, variant, first)
+            first_seconds = self._seconds(still, recording, variant, first)
             shared = shared_stages(first.config["profile"], self._settings_of(base))
-            if not taken:
+            if not first_seconds:
                 return {}
-            seconds |= {name: taken[name] for name in shared if name in taken}
+            seconds |= {name: first_seconds[name] for name in shared if name in first_seconds}
         return seconds
 
     def _settings_of(self, method: Method) -> dict[str, Any]:
@@ -354,11 +348,11 @@ class Bench:
 
 
 def _raise_again(folder: Path, *, also: type[PhysHandiError] | None = None) -> None:
-    """Repeat how a cell failed before, rather than failing again for as long."""
-    found = read_mapping(folder / EXIT) if (folder / EXIT).is_file() else {}
+    """Raise the stored error of a cell that failed before, without running it again."""
+    outcome = read_mapping(folder / EXIT) if (folder / EXIT).is_file() else {}
     kinds = {kind.__name__ for kind in (*FAILURES, also) if kind is not None}
-    if found.get("state") == "failed" and str(found.get("error_type", "")) in kinds:
-        raise FitError(str(found.get("error")))
+    if outcome.get("state") == "failed" and str(outcome.get("error_type", "")) in kinds:
+        raise FitError(str(outcome.get("error")))
 
 
 def _given(method: Method, variant: str) -> str:
@@ -373,13 +367,13 @@ def _as_one_split(recording: Sequence) -> Sequence:
 def measure_cell(
     run: RunFolder | None, reference: RunFolder, recording: Sequence
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Measure what a run predicted.
+    """Score a run's prediction.
 
-    The run brings its motion, hands and springs; observations are the reference's, whatever
-    the run itself was given. Without a run the static object stands in.
+    Motion, hands and springs are the run's; observations are the reference's, whatever the input of
+    the run was. Without a run the static object is scored.
 
     Args:
-        run: What is scored.
+        run: The run to score.
         reference: The static object on the same recording.
         recording: The whole recording, with its truth.
 
@@ -397,7 +391,7 @@ def measure_cell(
 def assemble(
     folder: Path, run: RunFolder | None, reference: RunFolder, recording: Sequence
 ) -> None:
-    """Lay out what is scored: the run's motion beside the reference's observations."""
+    """Link the files to score into a folder: the run's motion, the reference's observations."""
     files = SequenceFiles(recording.name)
     observed = (f"{files.folder}/observation/", files.keypoint)
     left_out = (files.rollout, files.control) if run is None else ()
@@ -424,27 +418,27 @@ def add_photometric(
     reference: RunFolder,
     recording: Sequence,
 ) -> None:
-    """Put IoU and PSNR beside the other figures of the rollout.
+    """Add IoU and PSNR to the other figures of the rollout.
 
-    Nodes are the run's own, however many they are, in the colors that frame 0 shows where it has
-    them there. Frames that it lacks show its object as it was in frame 0.
+    The run's own nodes are drawn in the colors that they have in frame 0. Missing frames show the
+    object of frame 0.
     """
     rollout = _complete(run or reference, recording)
-    found = photometric_curves(recording.views, rollout[:, : recording.surface_node_count])
+    measured = photometric_curves(recording.views, rollout[:, : recording.surface_node_count])
     splits = {
         "reconstruction": recording.reconstruction_frames,
         "future": recording.future_frames,
     }
-    for metric, curve in found.items():
+    for metric, curve in measured.items():
         curves[metric] = [float(value) if np.isfinite(value) else None for value in curve]
         for split, scored in splits.items():
-            known = [float(curve[f]) for f in scored if f > 0 and np.isfinite(curve[f])]
-            if known and split in report:
-                report[split]["rollout"][metric] = sum(known) / len(known)
+            values = [float(curve[f]) for f in scored if f > 0 and np.isfinite(curve[f])]
+            if values and split in report:
+                report[split]["rollout"][metric] = sum(values) / len(values)
 
 
 def _complete(run: RunFolder, recording: Sequence) -> Float[ndarray, "frame node 3"]:
-    """Give a run's rollout in every frame; where it is missing or not finite, nothing moves."""
+    """Complete a run's rollout: missing and non-finite frames show the object of frame 0 [m]."""
     files = SequenceFiles(recording.name)
     rollout = run.array(files.rollout)
     still = run.array(files.object_node) if run.has(files.object_node) else rollout[0]

@@ -1,4 +1,7 @@
-"""Evaluating methods on sequences: fills the cells of an order, and has tables written."""
+"""Evaluates methods on sequences: computes the cells of an order and writes its tables.
+
+`evaluate_suite` owns the loop, `list_tasks` says which cells the protocols consist of.
+"""
 
 import logging
 import time
@@ -39,10 +42,10 @@ _SCORES = "synthetic/suite/folder.py"
 
 @dataclass(frozen=True, kw_only=True)
 class Order:
-    """What is to be evaluated."""
+    """What to evaluate: sequences, methods and protocols."""
 
     title: str
-    """What the report is called."""
+    """Title of the report."""
     recordings: tuple[Sequence, ...]
     """Sequences that methods are scored on."""
     methods: tuple[str, ...]
@@ -54,57 +57,57 @@ class Order:
     device: str = "cpu"
     """Warp device."""
     command: str = ""
-    """The command that asks for it, which the report repeats."""
+    """Command line of the evaluation, for the report."""
     at_once: int = 1
-    """How many cells are computed side by side, which share the machine."""
+    """Cells that are computed in parallel and share the machine."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """One cell that a protocol asks for."""
+    """One cell of a protocol: a method on a sequence."""
 
     protocol: Protocol
-    """What asks for it."""
+    """Protocol that the cell belongs to."""
     split: str
-    """What the protocol calls it."""
+    """Name of the cell's split in the protocol."""
     method: Method
-    """Who is to fill it."""
+    """Method that is evaluated."""
     recording: Sequence
-    """What it is scored against."""
+    """Sequence that the result is scored against."""
     variant: str = "recording"
-    """What the method is given."""
+    """Variant of the sequence that is the method's input."""
     fitted: Sequence | None = None
-    """Where the object is fitted, if that is another recording."""
+    """Sequence on which the object is fitted, if it is another one."""
 
 
 Fill = Callable[[Many[Task]], Iterator[int]]
-"""Has cells filled, and yields their numbers as they are finished, each once."""
+"""Computes cells elsewhere and yields their indices as they finish, each once."""
 
 
 def evaluate_suite(
     order: Order, out: Path, progress: Progress | None = None, *, fill: Fill | None = None
 ) -> dict[str, Any]:
-    """Run what is missing of an order, and write its tables.
+    """Compute the missing cells of an order, and write its tables.
 
-    Tables are written on the way too, and when the user stops it or something fails. What an
-    earlier order found out about the same sequences with the same code stays in them.
+    Tables are also written during the evaluation, and when it is cancelled or fails. Results of an
+    earlier order on the same sequences with the same code remain in them.
 
     Args:
-        order: What is to be evaluated.
+        order: Sequences, methods and protocols.
         out: Folder of the suite; finished cells in it are not computed again.
-        progress: Told about every cell, and about every iteration in it.
-        fill: Has others fill the cells ahead, by `filler`; without it they are filled here, one
-            after the other.
+        progress: Receives reports of every cell and of every iteration in it.
+        fill: Computes the cells in other processes, by `filler`; None computes them here, one after
+            the other.
 
     Returns:
         ``out``, ``table`` and ``report`` (paths), ``cells`` and ``failed`` (numbers of cells),
-        ``skipped`` (why some could not be asked for) and ``notes`` (what to know of the data).
+        ``skipped`` (why some cells are not possible) and ``notes`` (on the data).
 
     Raises:
         UsageError: If a method is unknown, there is nothing to evaluate, or the folder holds the
             table of other sequences.
         MissingInputError: If no recording can be observed at all.
-        CancelledError: If the user asked to stop; what is finished stays.
+        CancelledError: If the user asked to stop; finished cells remain.
     """
     progress = progress or NullProgress()
     order, methods, tasks = _read(order)
@@ -125,8 +128,8 @@ def evaluate_suite(
             if folder.done and (is_other or time.monotonic() - written > WRITE_EVERY):
                 paths, written = write(), time.monotonic()
             progress.check_cancelled()
-            told = f"{task.method.name}, {task.recording.name}"
-            progress.report("suite", finished, len(tasks), message=told)
+            message = f"{task.method.name}, {task.recording.name}"
+            progress.report("suite", finished, len(tasks), message=message)
             cell = work.cell(task)
             finished += 1
             if cell is not None:
@@ -145,16 +148,12 @@ def evaluate_suite(
 
 
 def filler(order: Order, out: Path, progress: Progress) -> Callable[[int], None]:
-    """Prepare to fill single cells of an order, beside other processes that fill others.
+    """Return a function that computes the cell of an index, for one of several processes.
 
     Args:
-        order: The order, the same for all of them.
+        order: The order, the same in all processes.
         out: Folder of the suite.
-        progress: Told about every iteration.
-
-    Returns:
-        Fills the cell of a number, as `evaluate` counts them; nothing is to be done for one that
-        nobody could fill.
+        progress: Receives a report of every iteration.
     """
     order, _, tasks = _read(order)
     work = _Work(order, out, progress)
@@ -166,7 +165,7 @@ def filler(order: Order, out: Path, progress: Progress) -> Callable[[int], None]
 
 
 class _Work:
-    """Fills cells, and remembers which could not be asked for."""
+    """Computes cells, and collects the reasons why some are skipped."""
 
     def __init__(self, order: Order, out: Path, progress: Progress) -> None:
         self.bench = Bench(out, common=order.settings, device=order.device, progress=progress)
@@ -175,12 +174,12 @@ class _Work:
         self._blind: dict[str, str] = {}
 
     def cell(self, task: Task) -> dict[str, Any] | None:
-        """Fill a cell and describe it; None if it cannot be asked for."""
+        """Compute a cell and describe it; None if it is skipped."""
         outcome = self.outcome(task)
         return None if outcome is None else self._described(task, outcome)
 
     def outcome(self, task: Task) -> Outcome | None:
-        """Fill a cell; None if it cannot be asked for."""
+        """Compute a cell; None if it is skipped."""
         for recording in filter(None, (task.recording, task.fitted)):
             reason = self._why_blind(recording)
             if reason:
@@ -202,7 +201,7 @@ class _Work:
         return self.bench.outcome(task.method, task.recording, task.variant)
 
     def raise_if_blind(self) -> None:
-        """Tell that nothing can be scored at all.
+        """Check that at least one recording can be scored.
 
         Raises:
             MissingInputError: If no recording can be observed.
@@ -211,7 +210,7 @@ class _Work:
             raise MissingInputError(f"No sequence can be evaluated. {' '.join(self.skipped)}")
 
     def _why_blind(self, recording: Sequence) -> str:
-        """Say why nothing of a recording can be scored, whatever the method; empty if it can."""
+        """Explain why no method can be scored on a recording; empty if it can."""
         if recording.name not in self._blind:
             reason = ""
             try:
@@ -247,7 +246,7 @@ class _Work:
 
 
 def _read(order: Order) -> tuple[Order, tuple[Method, ...], list[Task]]:
-    """Read an order: each protocol once, its methods, and the cells that it asks for."""
+    """Check an order, remove duplicates, and return it with its methods and tasks."""
     methods = tuple(parse_method(name) for name in dict.fromkeys(order.methods))
     order = replace(order, protocols=tuple(dict.fromkeys(order.protocols)))
     _check(order, methods)
@@ -267,9 +266,9 @@ def _check(order: Order, methods: Many[Method]) -> None:
 
 def _about(order: Order, methods: Many[Method]) -> dict[str, Any]:
     environment = _environment(order)
-    made = [named_fields(r.provenance.get("synthesize")) or {} for r in order.recordings]
-    seeds = sorted({one["seed"] for one in made if isinstance(one.get("seed"), int)})
-    told = [told_version(recording) for recording in order.recordings]
+    settings = [named_fields(r.provenance.get("synthesize")) or {} for r in order.recordings]
+    seeds = sorted({one["seed"] for one in settings if isinstance(one.get("seed"), int)})
+    versions = [told_version(recording) for recording in order.recordings]
     return {
         "title": order.title,
         "command": order.command,
@@ -281,8 +280,8 @@ def _about(order: Order, methods: Many[Method]) -> dict[str, Any]:
         "at_once": order.at_once,
         "seeds": seeds,
         "is_verification": any(seed >= RESERVED_SEED for seed in seeds),
-        "presets": sorted({str(one["preset"]) for one in made if "preset" in one}),
-        "generators": sorted({version for version in told if version}),
+        "presets": sorted({str(one["preset"]) for one in settings if "preset" in one}),
+        "generators": sorted({version for version in versions if version}),
         "notes": [note for recording in order.recordings if (note := outdated(recording))],
         "made_from": {
             "code": code_version((*PREDICTIONS, *SCORES, _SCORES)),
@@ -302,8 +301,8 @@ def list_tasks(order: Order, methods: Many[Method]) -> Iterator[Task]:
     """List the cells of an order, protocol by protocol and sequence by sequence.
 
     Args:
-        order: What is to be evaluated.
-        methods: Its methods, read.
+        order: Sequences and protocols.
+        methods: The order's methods.
 
     Yields:
         Cells; an unseen interaction without `fitted` lacks another recording of the same body.
@@ -332,7 +331,7 @@ def _asked(protocol: Protocol, order: Order, method: Method, recording: Sequence
 
 
 def _started(task: Task, radius: float, most: int) -> Task:
-    """Start a method's search elsewhere; it keeps its name, and the split tells where."""
+    """Change the start of a method's search; the name stays, the split states the start."""
     start = {
         "simulation.virtual_connection_radius": radius,
         "simulation.virtual_max_neighbors": most,
@@ -342,7 +341,7 @@ def _started(task: Task, radius: float, most: int) -> Task:
 
 
 def _other_of_same_object(recording: Sequence, others: Many[Sequence]) -> Sequence | None:
-    """Find the next recording of the same body in another action; around the end of the list."""
+    """Find the next recording of the same body in another action, cyclically."""
     own, action = _body(recording)
     order = list(others)
     place = order.index(recording)
@@ -356,12 +355,12 @@ def _other_of_same_object(recording: Sequence, others: Many[Sequence]) -> Sequen
 
 
 def _body(recording: Sequence) -> tuple[tuple[Any, ...] | None, Any]:
-    """Identify the made body of a recording, and what is done with it.
+    """Identify the body and the action of a synthetic recording.
 
-    Seed and object decide a body's size and material, for one version of the generator.
+    Object and seed determine a body's size and material within one version of the generator.
     """
-    made = named_fields(recording.provenance.get("synthesize"))
-    if made is None:
+    settings = named_fields(recording.provenance.get("synthesize"))
+    if settings is None:
         return None, None
-    body = tuple(made.get(name) for name in ("object", "seed", "resolution"))
-    return (*body, told_version(recording)), made.get("action")
+    body = tuple(settings.get(name) for name in ("object", "seed", "resolution"))
+    return (*body, told_version(recording)), settings.get("action")

@@ -1,7 +1,7 @@
-"""What a suite's folder tells: its cells, and the tables made of them.
+"""The folder of a suite: its cells, and the tables made of them (`SuiteFolder`).
 
-Tables are made of cells alone, so that they can be written while others are still computed, and so
-that cells of an earlier order for the same sequences stay in them.
+Tables depend on cells alone, so that they can be written while others are still computed, and so
+that cells of an earlier order on the same sequences remain in them.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -31,10 +31,10 @@ from physhandi.metrics.suite_report import (
 from physhandi.synthetic.suite.cells import Outcome
 
 DENSE_ACTIONS = ("squeeze", "wipe")
-"""Actions of made recordings in which the whole hand is on the body; others use fingertips."""
+"""Synthetic actions in which the whole hand is on the body; others use fingertips."""
 DENSE = 0.05
-"""Of other recordings contact is dense if a hand touches more than this share of the object's
-places on average, in the frames in which it touches any."""
+"""In other recordings contact is dense if a hand touches more than this share of the object's
+contact points on average, over the frames in which it touches any."""
 _SPLITS = ("reconstruction", "future")
 _HANDS = {"chamfer_symmetric": "hand_chamfer", "mpjpe": "mpjpe", "surface_error": "hand_surface"}
 _SHADED = ("iou", "psnr")
@@ -42,7 +42,7 @@ _TOPOLOGY = ("rrd_object", "rrd_virtual")
 Figures = dict[str, dict[str, float]]
 """Figures by split and metric."""
 CELLS = "cells.json"
-"""What was asked for, and every cell with its figures."""
+"""Description of the orders, and every cell with its figures."""
 CURVES_FILE = "curves.json"
 """Errors frame by frame of the same cells, in the same order."""
 _KEY = ("protocol", "split", "method", "case")
@@ -50,14 +50,14 @@ CellScores = dict[str, Any]
 
 
 class SuiteFolder:
-    """The tables in a folder, which grow with every cell."""
+    """The tables of a suite, which grow with every cell."""
 
     def __init__(self, out: Path, about: Mapping[str, Any]) -> None:
-        """Read what is there; nothing is written yet.
+        """Read existing tables; nothing is written yet.
 
         Args:
             out: The folder.
-            about: What is asked for now: ``title methods oracles cases protocols made_from`` and
+            about: Description of the order: ``title methods oracles cases protocols made_from`` and
                 more.
 
         Raises:
@@ -72,14 +72,16 @@ class SuiteFolder:
         self.notes: list[str] = []
         if before is None:
             return
-        told = before["about"]
-        methods = {n: text for n, text in told["methods"].items() if n not in about["methods"]}
-        if told.get("made_from") == about["made_from"]:
+        earlier = before["about"]
+        methods = {n: text for n, text in earlier["methods"].items() if n not in about["methods"]}
+        if earlier.get("made_from") == about["made_from"]:
             self._earlier = _with_curves(out, before["cells"])
-            self._skipped = list(told["skipped"])
-            self.about["methods"] = {**told["methods"], **about["methods"]}
-            self.about["oracles"] = list(dict.fromkeys([*told["oracles"], *about["oracles"]]))
-            self.about["protocols"] = list(dict.fromkeys([*told["protocols"], *about["protocols"]]))
+            self._skipped = list(earlier["skipped"])
+            self.about["methods"] = {**earlier["methods"], **about["methods"]}
+            self.about["oracles"] = list(dict.fromkeys([*earlier["oracles"], *about["oracles"]]))
+            self.about["protocols"] = list(
+                dict.fromkeys([*earlier["protocols"], *about["protocols"]])
+            )
         elif methods:
             self.notes.append(
                 "Left out, because they were computed with other code, settings or data: "
@@ -89,12 +91,12 @@ class SuiteFolder:
     def write(
         self, environment: Mapping[str, Any], skipped: Many[str], missing: int
     ) -> dict[str, Any]:
-        """Write cells, tables, report and charts of what is known by now.
+        """Write cells, tables, report and charts of the finished cells.
 
         Args:
-            environment: What it was computed with.
-            skipped: What could not be asked for, and why.
-            missing: Number of cells that are asked for and not finished.
+            environment: Machine and library versions.
+            skipped: Reasons for skipped cells.
+            missing: Number of unfinished cells of the order.
 
         Returns:
             ``out``, ``table`` and ``report``: paths.
@@ -129,9 +131,9 @@ class SuiteFolder:
         }
 
     def _all_cells(self) -> list[CellScores]:
-        """Put what is finished beside what is kept of earlier orders, in the order of tables."""
+        """Merge finished cells with those of earlier orders, in the order of the tables."""
         new = {_key(cell) for cell in self.done}
-        kept = [
+        earlier = [
             cell
             for cell in self._earlier
             if _key(cell) not in new and (not cell["run"] or self._has_run(cell["run"]))
@@ -140,20 +142,20 @@ class SuiteFolder:
 
         def place(cell: CellScores) -> tuple[int, ...]:
             named = (cell["protocol"], cell["case"], cell["method"])
-            return tuple(known.index(name) for known, name in zip(places, named, strict=True))
+            return tuple(names.index(name) for names, name in zip(places, named, strict=True))
 
-        return sorted([*kept, *self.done], key=place)
+        return sorted([*earlier, *self.done], key=place)
 
     def _has_run(self, name: str) -> bool:
         return (self.out / "cells" / name / "run.yaml").is_file()
 
 
 def check_folder(out: Path, title: str, cases: Iterable[str]) -> dict[str, Any] | None:
-    """Read what a folder holds, and refuse it if that is the table of another order.
+    """Read the tables in a folder, and refuse those of another order.
 
     Args:
         out: The folder.
-        title: Title of what is asked for now.
+        title: Title of the present order.
         cases: Names of its sequences.
 
     Returns:
@@ -168,8 +170,8 @@ def check_folder(out: Path, title: str, cases: Iterable[str]) -> dict[str, Any] 
     content = named_fields(read_json(path)) or {}
     about = named_fields(content.get("about"))
     cells = content.get("cells")
-    wanted = ("title", "methods", "cases", "protocols", "skipped")
-    if about is None or not isinstance(cells, list) or any(name not in about for name in wanted):
+    fields = ("title", "methods", "cases", "protocols", "skipped")
+    if about is None or not isinstance(cells, list) or any(name not in about for name in fields):
         raise UsageError(f"{path} is damaged. Delete it; finished cells are kept without it.")
     wanted_cases = list(cases)
     if about["title"] != title or set(about["cases"]) != set(wanted_cases):
@@ -194,10 +196,10 @@ def _key(cell: CellScores) -> tuple[str, ...]:
 
 
 def contact_kind(recording: Sequence) -> Literal["dense", "point"] | None:
-    """Tell by its action, else by its true contact, how much is held; None if unknown."""
-    made = named_fields(recording.provenance.get("synthesize")) or {}
-    if made.get("action") is not None:
-        return "dense" if made["action"] in DENSE_ACTIONS else "point"
+    """Classify contact by the action, else by the true contact; None if unknown."""
+    settings = named_fields(recording.provenance.get("synthesize")) or {}
+    if settings.get("action") is not None:
+        return "dense" if settings["action"] in DENSE_ACTIONS else "point"
     contact = read_truth(recording.folder).contact
     if contact is None or not contact.any():
         return None
@@ -215,40 +217,40 @@ def figures_of(
     """Collect the figures of a cell.
 
     Args:
-        outcome: What came out of it.
-        recording: What it was scored against.
-        protocol: Protocol that asked for it.
-        name: What the protocol calls it; the first part of every split but those of ``main``.
+        outcome: Result of the cell.
+        recording: Sequence that it was scored against.
+        protocol: Protocol of the cell.
+        name: The cell's split in the protocol; prefix of every split but those of ``main``.
         unmoved: Object nodes of frame 0, if the method predicts contact [m].
 
     Returns:
-        Every figure that is known. A method without output has those of the static object, which
-        touches nothing; and none of hands, topology and time. Nor has an object in a sequence that
-        it was not fitted in.
+        Every known figure. A method without output gets those of the static object, which touches
+        nothing, and none of hands, topology and time; nor does an object in a sequence that it was
+        not fitted on.
     """
 
     def named(split: str) -> str:
         return split if protocol == "main" else f"{name}/{split}"
 
-    found: dict[str, Mapping[str, Any]] = {}
+    by_split: dict[str, Mapping[str, Any]] = {}
     for split in _SPLITS[:1] if protocol == "unseen" else _SPLITS:
         rollout = outcome.report.get(split, {}).get("rollout", {})
         figures = {metric: rollout.get(metric) for metric in (*METRICS, *_SHADED)}
         if outcome.error and rollout and unmoved is not None:
             figures |= no_contact_scores(recording, unmoved, _frames(recording, protocol, split))
         # All frames of an unseen interaction are in the first split.
-        found["unseen" if protocol == "unseen" else named(split)] = figures
+        by_split["unseen" if protocol == "unseen" else named(split)] = figures
     if not outcome.error and protocol != "unseen":
-        found[named("hands")] = _hand_figures(outcome.report.get("hands", {}))
+        by_split[named("hands")] = _hand_figures(outcome.report.get("hands", {}))
         topology = outcome.report.get("topology", {})
-        found[named("topology")] = {metric: topology.get(metric) for metric in _TOPOLOGY}
+        by_split[named("topology")] = {metric: topology.get(metric) for metric in _TOPOLOGY}
         if protocol == "main":
-            found["runtime"] = _times(outcome.seconds, recording.frame_count)
-    known = {
+            by_split["runtime"] = _times(outcome.seconds, recording.frame_count)
+    numeric = {
         split: {m: float(v) for m, v in figures.items() if isinstance(v, int | float)}
-        for split, figures in found.items()
+        for split, figures in by_split.items()
     }
-    return {split: figures for split, figures in known.items() if figures}
+    return {split: figures for split, figures in numeric.items() if figures}
 
 
 def scores_of(cells: Iterable[Mapping[str, Any]]) -> Iterator[Score]:
@@ -276,9 +278,9 @@ def scores_of(cells: Iterable[Mapping[str, Any]]) -> Iterator[Score]:
 def no_contact_scores(
     recording: Sequence, node: Float[ndarray, "node 3"], frames: Iterable[int]
 ) -> dict[str, float | None]:
-    """Score a prediction that nothing is ever touched, where the true contact is known.
+    """Score the prediction that nothing is ever touched, where the true contact is known.
 
-    Without it a method that fails where contact is hard would be averaged over what is easy.
+    Otherwise a method that fails on hard contacts would be averaged over the easy ones only.
 
     Args:
         recording: The recording; without true contact there is no figure.
@@ -308,15 +310,15 @@ def _frames(recording: Sequence, protocol: str, split: str) -> range:
 
 def _hand_figures(hands: Mapping[str, Any]) -> dict[str, Any]:
     """Average over the hands that have a figure."""
-    found: dict[str, Any] = {}
+    means: dict[str, Any] = {}
     for key, name in _HANDS.items():
-        known = [hand[key] for hand in hands.values() if isinstance(hand.get(key), float)]
-        if known:
-            found[name] = sum(known) / len(known)
-    return found
+        values = [hand[key] for hand in hands.values() if isinstance(hand.get(key), float)]
+        if values:
+            means[name] = sum(values) / len(values)
+    return means
 
 
 def _times(seconds: Mapping[str, float], frame_count: int) -> dict[str, Any]:
-    """Give the time that a video frame took in each stage, and in all of them."""
+    """Divide the time of each stage, and of all, by the number of video frames [s]."""
     times = {f"seconds_per_frame_{stage}": s / frame_count for stage, s in seconds.items()}
     return times | ({"seconds_per_frame": sum(times.values())} if times else {})

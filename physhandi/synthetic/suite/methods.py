@@ -1,4 +1,4 @@
-"""Methods of a suite: every baseline and every profile as one kind of run of the pipeline.
+"""Methods of a suite: every baseline and every profile as a run of the pipeline.
 
 A method is written ``BASE[@SETTING=VALUE,…][+last_residual]``: `METHODS` has the bases, and the
 settings are those of a profile.
@@ -117,9 +117,9 @@ def parse_method(text: str) -> Method:
         UsageError: If there is no such base, setting or correction, or nothing to be corrected;
             names it.
     """
-    found = _NAME.fullmatch(text)
+    match = _NAME.fullmatch(text)
     base, settings, correction = (
-        found.group("base", "settings", "correction") if found else (text,) * 3
+        match.group("base", "settings", "correction") if match else (text,) * 3
     )
     if base not in METHODS:
         raise UsageError(f"There is no method '{base}'. Choose from: {', '.join(METHODS)}.")
@@ -173,12 +173,12 @@ def method_settings(method: Method, common: Mapping[str, Any]) -> dict[str, Any]
 
 @dataclass(frozen=True, kw_only=True)
 class HandNoise:
-    """How hands are made wrong."""
+    """Noise added to fitted hands."""
 
     error: float
-    """Mean distance of the joints from where they were [m]."""
+    """Mean displacement of the joints [m]."""
     seed: int
-    """Of the noise; another one for every recording, or all would be wrong in the same way."""
+    """Seed of the noise, different for every recording."""
 
 
 def execute(
@@ -232,12 +232,12 @@ def execute(
 
 
 def disturb_hands(attempt: Attempt, folder: str, noise: HandNoise) -> None:
-    """Replace the stored hands of a sequence by wrong ones; twice would be too much.
+    """Add noise to the stored hands of a sequence; must be called once only.
 
     Args:
-        attempt: Holds hands as they were fitted.
+        attempt: Attempt with the fitted hands.
         folder: Folder of the sequence in it.
-        noise: How wrong they become.
+        noise: Size and seed of the noise.
 
     Raises:
         MissingInputError: If there is no hand.
@@ -252,15 +252,15 @@ def disturb_hands(attempt: Attempt, folder: str, noise: HandNoise) -> None:
 
 
 def disturbed(motion: HandMotion, error: float, *, seed: tuple[int, ...]) -> HandMotion:
-    """Disturb place, turn and pose of a hand in every frame by itself.
+    """Add independent noise to position, rotation and pose of a hand in every frame.
 
     Each wrist coordinate gets normal noise of 10 mm, wrist and joints 0.1 rad about each axis;
-    everything is then scaled by one factor, so that the mean joint error is what was asked for.
+    everything is then scaled by one factor, so that the mean joint error is `error`.
 
     Args:
         motion: The hand.
-        error: Mean distance of its 21 joints from where they were [m].
-        seed: Of the noise.
+        error: Mean displacement of its 21 joints [m].
+        seed: Seed of the noise.
     """
     random = np.random.default_rng([4, *seed])
     count = motion.frame_count

@@ -190,11 +190,11 @@ def make_recordings(
         for scene in suite.scenes
         for seed in seeds
     }
-    found = {target: Sequence.load(target) for target in makings if target.is_dir()}
-    for target, recording in found.items():
+    recordings = {target: Sequence.load(target) for target in makings if target.is_dir()}
+    for target, recording in recordings.items():
         _check_made(suite, recording, makings[target])
-    make({target: making for target, making in makings.items() if target not in found})
-    return tuple(found.get(target) or Sequence.load(target) for target in makings)
+    make({target: making for target, making in makings.items() if target not in recordings})
+    return tuple(recordings.get(target) or Sequence.load(target) for target in makings)
 
 
 def make_one_by_one(makings: Mapping[Path, Making], progress: Progress) -> None:
@@ -235,16 +235,18 @@ def _check_made(suite: Suite, recording: Sequence, making: Making) -> None:
     """
     from physhandi.synthetic.synthesize import synthesize
 
-    known = inspect.signature(synthesize).parameters.values()
-    wanted = {p.name: p.default for p in known if p.default is not inspect.Parameter.empty}
-    wanted |= {"changes": {}} | dict(making)
-    made = named_fields(recording.provenance.get("synthesize"))
-    if made is None or not {"object", "action", "seed"} <= made.keys():
+    signature = inspect.signature(synthesize).parameters.values()
+    expected = {p.name: p.default for p in signature if p.default is not inspect.Parameter.empty}
+    expected |= {"changes": {}} | dict(making)
+    recorded = named_fields(recording.provenance.get("synthesize"))
+    if recorded is None or not {"object", "action", "seed"} <= recorded.keys():
         differs = "was not made by `physhandi synthesize`"
     else:
         # Settings that did not exist yet when it was made belong to another generator.
-        others = [n for n in wanted if n in made and made[n] != wanted[n]]
-        listed = ", ".join(f"{name} {made[name]} in place of {wanted[name]}" for name in others)
+        others = [n for n in expected if n in recorded and recorded[n] != expected[n]]
+        listed = ", ".join(
+            f"{name} {recorded[name]} in place of {expected[name]}" for name in others
+        )
         differs = f"was made with {listed}" if others else ""
     if differs:
         raise UsageError(

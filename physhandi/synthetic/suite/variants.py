@@ -204,8 +204,8 @@ def noise_seed(recording: Sequence, variant: str) -> int:
 
     Recordings made wrong by the same noise would not be independent.
     """
-    made = named_fields(recording.provenance.get("synthesize")) or {}
-    parts = [variant, recording.name, str(made.get("seed", ""))]
+    settings = named_fields(recording.provenance.get("synthesize")) or {}
+    parts = [variant, recording.name, str(settings.get("seed", ""))]
     return int.from_bytes(hashlib.sha256("\0".join(parts).encode()).digest()[:8])
 
 
