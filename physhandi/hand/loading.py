@@ -1,4 +1,4 @@
-"""Which hand model a hand is fitted with: the built-in open hand, or the user's MANO."""
+"""Loads hand models: the built-in open hand, or the user's MANO."""
 
 from physhandi.hand.model import HandKind, HandModel, HandSide
 
@@ -13,7 +13,7 @@ def load_hand_model(side: HandSide, kind: HandKind = "open") -> HandModel:
     Raises:
         MissingInputError: If MANO was not imported; says how to.
     """
-    # These load torch, without which the server starts and the library is imported.
+    # These import torch, which neither the server nor `import physhandi` may load at start.
     from physhandi.hand.mano import ManoHand
     from physhandi.hand.open_hand import OpenHand
 

@@ -1,4 +1,4 @@
-"""MANO (Romero et al. 2017), from the file that `physhandi import mano` made of the user's own.
+"""MANO (Romero et al. 2017), from the user's own file as `physhandi import mano` converted it.
 
 The model is registration-only: it is neither shipped nor downloaded. An articulation of zero is
 its flat template; the file's mean pose is not added (`ManoHand.mean_articulation` has it).
@@ -40,7 +40,7 @@ _NAMES = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "f", 
 
 
 def hands_folder() -> Path:
-    """Where imported hand models lie: ``$PHYSHANDI_HANDS``, or else the user's data folder."""
+    """Folder of imported hand models: ``$PHYSHANDI_HANDS``, or else the user's data folder."""
     folder = os.environ.get(FOLDER_VARIABLE)
     return Path(folder) if folder else Path.home() / ".local/share/physhandi/hands"
 
@@ -155,13 +155,13 @@ class ManoHand(HandModel):
         return joint - joint[:1]
 
     def mano_pose(self, articulation: Float[ndarray, "frame 15 3"]) -> Float[ndarray, "frame 45"]:
-        """Give MANO's own pose (axis-angle in MANO's frame and order, no mean added) [rad]."""
+        """Convert an articulation to MANO's pose (axis-angle, MANO's frame and order) [rad]."""
         turned = np.einsum("jca,fja->fjc", self.joint_axes, articulation)
         order = np.argsort(MANO_JOINT)
         return turned[:, order].reshape(len(articulation), 45)
 
     def articulation(self, mano_pose: Float[ndarray, "frame 45"]) -> Float[ndarray, "frame 15 3"]:
-        """Give the articulation of MANO's own pose; undoes `mano_pose` [rad]."""
+        """Convert MANO's pose to an articulation, the inverse of `mano_pose` [rad]."""
         turned = mano_pose.reshape(-1, JOINT_COUNT, 3)[:, [joint - 1 for joint in MANO_JOINT]]
         return np.einsum("jca,fjc->fja", self.joint_axes, turned)
 
@@ -205,7 +205,7 @@ class ManoHand(HandModel):
 
 @cache
 def _read(path: Path, _changed: int, side: HandSide) -> ManoHand:
-    """Read an imported file; `_changed` makes a file that was imported anew another one."""
+    """Read an imported file; `_changed`, its time of change, keys the cache."""
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
             return ManoHand({name: stored[name] for name in _NAMES}, side)

@@ -1,4 +1,4 @@
-"""What every articulated hand offers: pose and shape in, vertices and keypoints out."""
+"""The interface of articulated hands: pose and shape in, vertices and keypoints out."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -44,7 +44,7 @@ JOINT_NAMES = tuple(name for name in KEYPOINT_NAMES if name != "wrist" and not n
 
 @dataclass(frozen=True)
 class HandPose:
-    """A posed hand, differentiable with respect to what posed it."""
+    """A posed hand, differentiable with respect to shape and pose."""
 
     vertex: Float[Tensor, "batch vertex 3"]
     """Vertices of the surface [length unit of the sequence; m when metric]."""
@@ -66,7 +66,7 @@ class HandModel(ABC):
     template: Float[ndarray, "vertex 3"]
     """The unposed surface of shape zero, relative to the wrist [m]."""
     weight: Float[ndarray, "vertex 16"]
-    """Share of each bone in a vertex: the palm, then the bones that `JOINT_NAMES` move."""
+    """Skinning weights of each vertex: the palm, then the bones that `JOINT_NAMES` move."""
     joint_position: Float[ndarray, "15 3"]
     """The unposed joints of shape zero, relative to the wrist [m]."""
     joint_axes: Float[ndarray, "15 3 3"]

@@ -1,4 +1,4 @@
-"""A moving hand as a skeleton with a skin, as glTF and other animation formats have it."""
+"""A moving hand as a skinned skeleton, for glTF and other animation formats."""
 
 from dataclasses import dataclass
 
@@ -12,9 +12,9 @@ from physhandi.hand.model import JOINT_COUNT, JOINT_NAMES, HandModel
 from physhandi.hand.motion import HandMotion
 
 BONES_PER_VERTEX = 4
-"""Most bones that hold one vertex; more is more than viewers read."""
+"""Most bones of one vertex; viewers read no more."""
 PARENT = tuple(-1 if bone == 0 else 0 if bone % 3 == 1 else bone - 1 for bone in range(16))
-"""Bone that each bone hangs on: the wrist on none, knuckles on the wrist."""
+"""Parent of each bone: -1 for the wrist, the wrist for knuckles."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -28,7 +28,7 @@ class HandSkin:
     names: tuple[str, ...]
     """Name of each bone."""
     parent: Int[ndarray, " bone"]
-    """Bone that each bone hangs on, -1 for the wrist."""
+    """Parent of each bone, -1 for the wrist."""
     T_bone_hand: Float[ndarray, "bone 4 4"]
     """Inverse bind matrices: map the rest pose to each bone [length unit of the sequence]."""
     vertex: Float[ndarray, "vertex 3"]
@@ -36,9 +36,9 @@ class HandSkin:
     faces: Int[ndarray, "face 3"]
     """Vertices of each triangle, counter-clockwise from outside."""
     vertex_bone: Int[ndarray, "vertex 4"]
-    """Bones that hold each vertex."""
+    """Bones of each vertex."""
     vertex_weight: Float[ndarray, "vertex 4"]
-    """Share of each of them; rows sum to one."""
+    """Skinning weight of each of them; rows sum to one."""
     translation: Float[ndarray, "frame bone 3"]
     """Origin of each bone in its parent's axes, the wrist's in the world [length unit]."""
     rotation: Float[ndarray, "frame bone 4"]
@@ -60,10 +60,10 @@ class HandSkin:
 
 
 def hand_skin(model: HandModel, motion: HandMotion) -> HandSkin:
-    """Describe a hand's motion by a skeleton.
+    """Convert a hand's motion to a skinned skeleton.
 
     Exact for the open hand. MANO's pose blend shapes, which move vertices by millimetres where
-    joints bend, have no place in a skin and are left out.
+    joints bend, cannot be expressed by a skin and are left out.
 
     Args:
         model: The hand.
@@ -108,7 +108,7 @@ def hand_skin(model: HandModel, motion: HandMotion) -> HandSkin:
 def _strongest(
     weight: Float[ndarray, "vertex bone"],
 ) -> tuple[Int[ndarray, "vertex 4"], Float[ndarray, "vertex 4"]]:
-    """Keep the strongest bones of each vertex and let their shares sum to one."""
+    """Keep the strongest bones of each vertex and normalise their weights."""
     bone = np.argsort(-weight, axis=1, kind="stable")[:, :BONES_PER_VERTEX]
     share = np.take_along_axis(weight, bone, axis=1).clip(min=0)
     return bone, share / share.sum(axis=1, keepdims=True)

@@ -47,7 +47,7 @@ def blend(
 
     Args:
         point: Points of the unposed hand, the same for the whole batch or not [m].
-        weight: Share of each bone in a point; rows sum to one.
+        weight: Skinning weights; rows sum to one.
         joint: Where the bones begin in the unposed hand [m].
         rotation: Rotation of each bone, less the identity.
         moved: How far each bone's origin moved [m].
@@ -63,6 +63,6 @@ def place(
     wrist_translation: Float[Tensor, "batch 3"],
     scale: float | Float[Tensor, ""],
 ) -> Float[Tensor, "batch point 3"]:
-    """Put points that are relative to the wrist into the world, as `HandModel` defines it."""
+    """Transform points from the wrist's frame to the world, as `HandModel` defines it."""
     turned = point + point @ rotation_offset(wrist_rotation).transpose(-1, -2)
     return scale * (turned + wrist_translation[:, None])

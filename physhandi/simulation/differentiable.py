@@ -1,8 +1,8 @@
-"""Rollouts that PyTorch can differentiate, by a hand-written adjoint over any number of frames.
+"""Differentiable rollouts for PyTorch, by a hand-written adjoint over any number of frames.
 
-The forward pass keeps the state at each frame, and the substeps of as many frames as memory
-allows (`trajectory`); the backward pass simulates the other frames again and walks back through
-all. No atomics: gradients are the same bits run after run, and however many frames are kept.
+The forward pass stores the state at each frame, and the substeps of as many frames as memory
+allows (`engines.tape.Trajectory`); the backward pass simulates the other frames again. No atomics:
+gradients are the same bits run after run, however many frames are stored.
 """
 
 from collections.abc import Iterator, Sequence
@@ -26,7 +26,7 @@ from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
 
 CACHED_SIMULATORS = 16
-"""How many models keep their captured graphs and tape between calls of `rollout`."""
+"""Models whose captured graphs and tapes are reused between calls of `rollout`."""
 
 
 def rollout(
@@ -47,10 +47,10 @@ def rollout(
     window: int | None = None,
     memory: int | None = None,
 ) -> tuple[Float[Tensor, "frame node 3"], Float[Tensor, "frame node 3"]]:
-    """Simulate and remember how, so that a loss of the result can be differentiated.
+    """Simulate all frames so that a loss of the result can be differentiated.
 
     Arguments that are left out take their value from the model or the parameters. The first
-    call with a model captures graphs, later ones with the same model object use them again.
+    call with a model captures graphs, which later calls with the same model object reuse.
 
     Args:
         model: Nodes and springs; not modified.
@@ -72,8 +72,8 @@ def rollout(
             `control` is.
         window: Frames after which gradients are cut: 1 is PhysTwin's one-frame gradient,
             none the gradient over the whole horizon.
-        memory: That substeps may take until the backward pass is done [B], one frame's at the
-            least; if none, as `trajectory.memory_budget` says. Changes no bit, only the time.
+        memory: Memory that substeps may use until the backward pass [B], at least one frame's;
+            None for `engines.tape.memory_budget`. Changes the time, but no bit of the result.
 
     Returns:
         Positions [m] and velocities [m/s] of the object nodes in every frame; frame 0 is the
@@ -114,7 +114,7 @@ def rollout(
 def tape_layout(
     model: SpringMassModel, parameters: SimulationParameters, device: str
 ) -> TapeLayout:
-    """Say what a rollout with these arguments keeps of a frame; see `trajectory.frame_bytes`."""
+    """Return the layout of the tapes of such a rollout; see `engines.tape.frame_bytes`."""
     return _bridge(model, parameters, device).adjoint.layout
 
 
@@ -163,7 +163,7 @@ class _DifferentiableSimulator:
 
     @cached_property
     def adjoint(self) -> GraphAdjoint | CudaAdjoint | CpuAdjoint:
-        """The adjoint of one frame; made on first use, since many rollouts never walk back."""
+        """The adjoint of one frame; built on first use, since many rollouts have no backward."""
         simulator = self.simulator
         if simulator.collision is not None:
             return GraphAdjoint(simulator)
@@ -172,7 +172,7 @@ class _DifferentiableSimulator:
         return fast or GraphAdjoint(simulator)
 
     def trajectory(self, tensors: list[Tensor], memory: int | None) -> Trajectory | None:
-        """Decide which frames to keep; none if nobody can ask for a gradient."""
+        """Decide which frames to store; None if no gradient can be requested."""
         if not torch.is_grad_enabled() or not any(tensor.requires_grad for tensor in tensors):
             return None
         return Trajectory(self.adjoint, self.simulator.device, len(tensors[0]) - 1, memory)
@@ -208,7 +208,7 @@ class _DifferentiableSimulator:
     def forward(
         self, tensors: Sequence[Tensor], trajectory: Trajectory | None
     ) -> tuple[Tensor, Tensor]:
-        """Simulate all frames, keep the substeps of some; return positions and velocities."""
+        """Simulate all frames, store the substeps of some; return positions and velocities."""
         control, *material, position, velocity = tensors
         self._place_material(material)
         simulator = self.simulator
@@ -235,7 +235,7 @@ class _DifferentiableSimulator:
         trajectory: Trajectory,
         window: int,
     ) -> list[Tensor]:
-        """Return the gradients of all tensors, in their order, and let the trajectory go."""
+        """Return the gradients of all tensors, in their order, and release the trajectory."""
         control, *material, _, _ = tensors
         self._place_material(material)
         simulator, adjoint = self.simulator, self.adjoint
@@ -258,7 +258,7 @@ class _DifferentiableSimulator:
             for total, value in zip(sums[1:], rest, strict=True):
                 total.add_(value.double().sum() if total.ndim == 0 else value)
             is_cut = (frame - 1) % window == 0 and frame > 1
-            # What the loss says of this frame's state, after forgetting later frames if cut.
+            # The loss's own gradient of this frame's state; later frames count unless cut.
             for bar, output in zip(bars, outputs, strict=True):
                 earlier = output[frame - 1]
                 _copy_in(bar, earlier if is_cut else _copy_out(bar) + earlier)

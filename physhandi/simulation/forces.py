@@ -1,4 +1,4 @@
-"""Strain and force of springs in one frame, in float64: what the viewer draws and colors."""
+"""Strain and force of springs in one frame, in float64, for drawing and coloring."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -13,7 +13,7 @@ def spring_strains(
     position: Float[ndarray, "node 3"],
     control: Float[ndarray, "control 3"],
 ) -> Float[ndarray, " spring"]:
-    """Measure how much longer each spring is than at rest, ``L / r - 1``; below 0 if shorter.
+    """Compute the strain of each spring, ``L / r - 1``; negative if it is shorter than at rest.
 
     Args:
         model: Springs.
@@ -35,7 +35,7 @@ def spring_tensions(  # noqa: PLR0917  (model, then state in the order of the eq
     control: Float[ndarray, "control 3"],
     control_velocity: Float[ndarray, "control 3"] | None = None,
 ) -> Float[ndarray, " spring"]:
-    """Compute how hard each spring pulls its two ends together [N]; below 0 if it pushes.
+    """Compute the tension of each spring [N]; negative under compression.
 
     Follows ``T = Y (L / r - 1) + c (v_j - v_i)·d``, which is `Y` times strain plus the dashpot.
 
@@ -63,7 +63,7 @@ def virtual_spring_forces(  # noqa: PLR0917  (model, then state in the order of 
     control: Float[ndarray, "control 3"],
     control_velocity: Float[ndarray, "control 3"] | None = None,
 ) -> Float[ndarray, "virtual 3"]:
-    """Compute the force that each virtual spring puts on its object node.
+    """Compute the force of each virtual spring on its object node.
 
     Follows ``F = [Y (L / r - 1) + c (v_j - v_i)·d] d``; the arguments are those of
     `spring_tensions`.
@@ -85,7 +85,7 @@ def virtual_forces(  # noqa: PLR0917  (model, then state in the order of the equ
     control: Float[ndarray, "control 3"],
     control_velocity: Float[ndarray, "control 3"] | None = None,
 ) -> Float[ndarray, "node 3"]:
-    """Sum the forces that virtual springs put on each object node.
+    """Sum the forces of virtual springs on each object node.
 
     The arguments are those of `spring_tensions`; object springs, gravity, drag and contact
     are not included.
@@ -128,7 +128,7 @@ def _control_velocity(
     control: Float[ndarray, "control 3"],
     control_velocity: Float[ndarray, "control 3"] | None,
 ) -> Float[ndarray, "control 3"]:
-    """Take the control nodes' velocity as the simulator does."""
+    """Get the control nodes' velocity as the simulator uses it [m/s]."""
     if control_velocity is None or not parameters.use_control_velocity:
         return np.zeros_like(control, dtype=np.float64)
     return np.asarray(control_velocity, dtype=np.float64)

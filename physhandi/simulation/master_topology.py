@@ -1,4 +1,4 @@
-"""All springs that any candidate of a search may have, and which of them each one has."""
+"""The superset of springs of all candidates of a search, and the subset of each candidate."""
 
 from collections.abc import Sequence as Many
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from physhandi.simulation.topology import MINIMUM_LENGTH, MINIMUM_VIRTUAL_REST_L
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MasterTopology:
-    """The springs of the largest radii and neighbor limits; a candidate is a cut-off.
+    """The springs of the largest radii and neighbor limits; each candidate has a subset.
 
     A spring exists for a candidate if its length is below the candidate's radius and its rank
     below its neighbor limit: the rank is the place of one end among the other's neighbors,
@@ -84,7 +84,7 @@ class MasterTopology:
         )
 
     def has(self, parameters: SimulationParameters) -> Bool[ndarray, " spring"]:
-        """Tell which springs a candidate has."""
+        """Mark the springs that a candidate has."""
         object_part = slice(None, self.object_spring_count)
         virtual_part = slice(self.object_spring_count, None)
         exists = np.empty(len(self.length), dtype=bool)
@@ -100,7 +100,7 @@ class MasterTopology:
         return exists
 
     def rest_length(self, parameters: SimulationParameters) -> Float32[ndarray, " spring"]:
-        """Give the rest length of every spring under a candidate's floors [m]."""
+        """Compute the rest length of every spring with a candidate's floors [m]."""
         virtual_floor = max(parameters.virtual_rest_length_floor, MINIMUM_VIRTUAL_REST_LENGTH)
         floor = np.full(len(self.length), virtual_floor)
         floor[: self.object_spring_count] = parameters.rest_length_floor
@@ -137,7 +137,7 @@ _Ranked = tuple[Int[ndarray, "spring 2"], Float[ndarray, " spring"], Int[ndarray
 
 
 def _ranked_neighbors(node: ndarray, radius: float, most: int) -> _Ranked:
-    """List pairs of nodes, how far they are apart and the better of their two ranks."""
+    """List pairs of nodes, their distances [m] and the better of their two ranks."""
     if most < 1 or len(node) < 2:
         return np.zeros((0, 2), dtype=np.int64), np.zeros(0), np.zeros(0, dtype=np.int64)
     count = min(most + 1, len(node))
@@ -156,7 +156,7 @@ def _ranked_neighbors(node: ndarray, radius: float, most: int) -> _Ranked:
 
 
 def _ranked_holds(control: ndarray, node: ndarray, radius: float, most: int) -> _Ranked:
-    """List which control nodes may hold which object nodes, how far apart and in which order."""
+    """List pairs of object node and control node, their distances [m] and ranks."""
     if most < 1 or len(node) == 0 or len(control) == 0:
         return np.zeros((0, 2), dtype=np.int64), np.zeros(0), np.zeros(0, dtype=np.int64)
     count = min(most, len(node))

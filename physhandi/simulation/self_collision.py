@@ -1,4 +1,4 @@
-"""Which object nodes may hit each other in a frame, and the launches that let them."""
+"""Self-collision: finds candidate pairs of object nodes in a frame and launches the collisions."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from physhandi.simulation.kernels.collision_candidates import count_candidates, 
 from physhandi.simulation.kernels.self_collision import collide_nodes, free_nodes
 
 FIRST_CAPACITY = 32
-"""Candidates of a node, in the mean, for which there is room at first."""
+"""Initial capacity: candidates of a node on average."""
 MOST_CANDIDATES = 2**25
 """Most candidates of all nodes together (128 MiB)."""
 _GRID = 64
@@ -46,7 +46,7 @@ class SelfCollision:
         self.candidate = self._zeros(FIRST_CAPACITY * self._count, wp.int32)
         """Candidates of all nodes; those of a node are in ascending order."""
         self.position = self._zeros(self._count, wp.vec3)
-        """Room for every other substep's positions."""
+        """Positions of every other substep [m]."""
         self._free_velocity = self._zeros(self._count, wp.vec3)
         self._version = 1
 

@@ -40,11 +40,11 @@ class Rollout:
 
 
 class Simulator:
-    """Moves the object nodes of one model; holds model and state on a device.
+    """Simulates one model; holds model and state on a device.
 
-    An engine moves a frame in one launch; with self-collision, or where the engine does not fit,
+    An engine advances a frame in one launch; with self-collision, or where the engine does not fit,
     a frame is captured as a graph of two or three kernels a substep. Everything tunable lives in
-    device arrays, so that both see it. The same input gives the same bits, run after run.
+    device arrays, so that both see changes. The same input gives the same bits, run after run.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class Simulator:
 
         Args:
             model: Nodes, springs and material; not modified.
-            parameters: Global parameters; radii and floors have done their work in the model.
+            parameters: Global parameters; radii and floors are already part of the model.
             device: Warp device to run on, for example ``"cuda:0"``.
         """
         start_warp()
@@ -82,7 +82,7 @@ class Simulator:
 
         Args:
             parameters: The new values. Radii, floors, `stiffness` and `damping` belong to
-                the model and are not looked at.
+                the model and are ignored.
 
         Raises:
             ValueError: If the length of a substep differs; build another simulator then.
@@ -215,24 +215,24 @@ class Simulator:
         return checked_control(control, self.model.control_count)
 
     def replay_frame(self) -> None:
-        """Advance the state on the device by one frame, with the controls that are there."""
+        """Advance the state on the device by one frame, with the controls on the device."""
         if self.collision is None and self.engine is not None:
             state = self.position, self.velocity
             self.engine.advance(state, state)
             return
-        # Arrays that launches use cannot be made while they are captured.
+        # Arrays of the launches cannot be allocated during capture.
         _ = self.sums
         version = self.find_candidates(self.position)
         self._recordings[self.parameters.self_collision].replay(version)
 
     @cached_property
     def engine(self) -> CudaEngine | CpuEngine | None:
-        """Moves frames without self-collision, where it can; laid out when it is first asked to."""
+        """Engine for frames without self-collision, if one fits; built on first use."""
         return CudaEngine.of(self) or CpuEngine.of(self)
 
     @cached_property
     def sums(self) -> SpringSums:
-        """What the recorded kernels need of the springs; laid out when they first run."""
+        """Springs as the captured kernels read them; built on first use."""
         return SpringSums(self.model, self.device)
 
     @property
@@ -242,12 +242,12 @@ class Simulator:
 
     @property
     def controls(self) -> tuple[wp.array, wp.array]:
-        """Where the control nodes are at the start and the end of the frame."""
+        """Positions of the control nodes at the start and the end of the frame [m]."""
         return self.control_start, self.control_end
 
     @property
     def collision(self) -> SelfCollision | None:
-        """What collisions of object nodes need; none while they are switched off."""
+        """Self-collision of the object nodes; None while it is switched off."""
         if not self.parameters.self_collision:
             return None
         if self._collision is None:
@@ -269,7 +269,7 @@ class Simulator:
         return collision.find(position, self.parameters.collision_distance)
 
     def spring_inputs(self, fraction: float, state: tuple[wp.array, wp.array]) -> list[Any]:
-        """List what a spring kernel reads, a `fraction` of a frame after its start."""
+        """List the inputs of a spring kernel, a `fraction` of a frame after its start."""
         model = [self.world, self.sums.spring_nodes, *self.material]
         return [fraction, *model, *state, *self.controls]
 
@@ -286,10 +286,10 @@ class Simulator:
         Args:
             substep: Its number in the frame.
             before: State at its start.
-            after: Where the state at its end goes; with self-collision, positions of its own.
-            free_velocity: Where the velocity before all contacts goes, for the adjoint.
-            contact_velocity: Where the velocity after self-collision and before the ground
-                goes; only looked at with self-collision.
+            after: Receives the state at its end; with self-collision, in another position array.
+            free_velocity: Receives the velocity before all contacts, for the adjoint.
+            contact_velocity: Receives the velocity after self-collision and before the ground;
+                used with self-collision only.
         """
         fraction = (substep + 1) / self.parameters.substeps_per_frame
         wp.launch(
@@ -337,7 +337,7 @@ class Simulator:
         return wp.array(np.ascontiguousarray(value), dtype=dtype, device=self.device)
 
     def _launch_frame(self) -> None:
-        # Nodes that collide read each other's position, so the new ones need their own place.
+        # Colliding nodes read each other's positions, so the new ones need another array.
         collision = self.collision
         places = (self.position, self.position if collision is None else collision.position)
         count = self.parameters.substeps_per_frame

@@ -1,4 +1,4 @@
-"""How long a substep may be before the springs explode."""
+"""The longest stable substep of a model, and automatic substeps."""
 
 import math
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ def largest_stable_step(
     parameters: SimulationParameters,
     control: Float[ndarray, "control 3"] | None = None,
 ) -> float:
-    """Estimate the longest substep that semi-implicit Euler survives [s].
+    """Estimate the longest substep for which semi-implicit Euler is stable [s].
 
     A mode with stiffness k and damping c (unit mass) is stable if ``dt² k + 2 dt c < 4``. For a
     guess of dt, Lanczos iterations find the mode of all springs at frame 0 for which the left
@@ -107,7 +107,7 @@ def with_stable_substeps(
 
 
 def explain_divergence(model: SpringMassModel, parameters: SimulationParameters, node: int) -> str:
-    """Name the two parameters most likely to blame for a node that blew up, and the remedy."""
+    """Name the two most likely causes of a node's divergence, and the remedy."""
     dt = parameters.dt
     spring = np.flatnonzero(np.any(model.spring_nodes == node, axis=1))
     if len(spring) == 0:
@@ -153,7 +153,7 @@ class _SpringOperator:
     rate: dict[str, ndarray]
     """Stiffness [N/m] and damping [N·s/m] of those springs."""
     anchor: dict[str, ndarray]
-    """What springs of unknown direction add to each coordinate."""
+    """Contribution of springs of unknown direction to each coordinate."""
 
     @classmethod
     def of(

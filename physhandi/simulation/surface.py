@@ -1,4 +1,4 @@
-"""A triangulated surface through an object's nodes, for looking at it.
+"""Triangulates a surface through an object's nodes, for display.
 
 A sheet (nodes that lie flat around every node) is triangulated in the tangent planes of its nodes
 and stays open at its borders. A volume gets the outside of its alpha shape: of the tetrahedra
@@ -114,10 +114,10 @@ class _Patch:
         """Take in the triangles that fit and share at least some edges with those before."""
         for face in candidates.tolist():
             sides = [(edge, self._side(face, *edge)) for edge in combinations(face, 2)]
-            known = [(self._sides.get(edge, []), side) for edge, side in sides]
-            if sum(len(found) for found, _ in known) < least:
+            pairs = [(self._sides.get(edge, []), side) for edge, side in sides]
+            if sum(len(present) for present, _ in pairs) < least:
                 continue
-            if all(len(found) < 2 and _lies_beside(found, side) for found, side in known):
+            if all(len(present) < 2 and _lies_beside(present, side) for present, side in pairs):
                 self.faces.append(face)
                 for edge, side in sides:
                     self._sides.setdefault(edge, []).append(side)

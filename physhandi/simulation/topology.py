@@ -1,4 +1,4 @@
-"""Which springs exist: connection radius δ and most neighbors d_max, evaluated on frame 0."""
+"""Builds springs from connection radius δ and neighbor limit d_max on frame 0."""
 
 from dataclasses import replace
 
@@ -11,9 +11,9 @@ from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 
 MINIMUM_LENGTH = 1e-4
-"""Object nodes this near to each other are not joined [m]."""
+"""Object nodes that are no farther apart than this are not joined [m]."""
 MINIMUM_VIRTUAL_REST_LENGTH = 1e-6
-"""A control node on top of an object node must not divide by zero [m]."""
+"""Floor for control nodes on top of object nodes, against division by zero [m]."""
 
 SpringList = tuple[Int32[ndarray, "spring 2"], Float[ndarray, " spring"]]
 
@@ -145,7 +145,7 @@ def retopologize(
     fitted: SimulationParameters,
     rest_node: Float[ndarray, "node 3"] | None = None,
 ) -> SpringMassModel:
-    """Rebuild the springs for other radii or neighbor limits, keeping what was fitted.
+    """Rebuild the springs for other radii or neighbor limits, keeping fitted values.
 
     A spring that both topologies have keeps the ratio of its stiffness and damping to the
     global value under which it was fitted; a new spring gets the global value.
@@ -178,7 +178,7 @@ def retopologize(
 def half_edges(
     spring_nodes: Int32[ndarray, "spring 2"], count: int
 ) -> tuple[Int32[ndarray, " row"], Int32[ndarray, " half_edge"]]:
-    """List the springs of every node, so that a node can sum its forces in a fixed order.
+    """List the springs of every node, so that forces are summed in a fixed order.
 
     Args:
         spring_nodes: The two nodes of each spring.
@@ -226,5 +226,5 @@ def _spring_keys(spring_nodes: ndarray, node_count: int) -> ndarray:
 
 
 def _ratio(value: ndarray, reference: ndarray) -> ndarray:
-    """Return value / reference, and 1 where the reference is 0 and says nothing."""
+    """Return value / reference, and 1 where the reference is 0."""
     return np.divide(value, reference, out=np.ones(len(value)), where=reference > 0.0)

@@ -1,7 +1,4 @@
-"""Hash of the code and libraries that a result depends on.
-
-What is stored under it is found again only as long as they are the same.
-"""
+"""Hash of the code and libraries that a result depends on, as a key of stored results."""
 
 import hashlib
 from functools import lru_cache
@@ -14,7 +11,7 @@ import physhandi
 from physhandi.data.sequence import Sequence
 
 INPUTS = ("synthetic/suite/variants.py", "data/sequence_writer.py", "data/truth.py")
-"""Makes what methods are given."""
+"""Code that makes the inputs of methods."""
 PREDICTIONS = (
     *("pipeline.py", "fitted_object.py", "object_rollout.py", "settings.py"),
     *("data", "hand", "perception", "simulation", "fitting"),
@@ -22,9 +19,9 @@ PREDICTIONS = (
     *("synthetic/suite/methods.py", "synthetic/suite/cells.py"),
     *INPUTS[:1],
 )
-"""Makes what methods predict: fits, rules, corrections and disturbances."""
+"""Code that makes predictions: fits, rules, corrections and noise."""
 SCORES = ("metrics", "synthetic/suite/cells.py", "data", "hand", "triangles.py")
-"""Makes figures of predictions."""
+"""Code that scores predictions."""
 PACKAGES = ("torch", "warp-lang", "numpy", "scipy", "cma", "safetensors")
 """Libraries that predictions and figures are computed with, beside OpenCV."""
 
@@ -39,7 +36,7 @@ def code_version(parts: tuple[str, ...]) -> str:
         parts: Files and folders, relative to the library.
 
     Raises:
-        FileNotFoundError: If one is not there, for then nothing would tell that it has changed.
+        FileNotFoundError: If one does not exist, as its changes would go unnoticed.
     """
     code = code_hash(Path(physhandi.__file__).parent, parts)
     # Several distributions carry OpenCV.
@@ -51,7 +48,7 @@ def code_hash(folder: Path, parts: tuple[str, ...]) -> str:
     """Hash files, and all sources and assets in folders.
 
     Args:
-        folder: Where they lie.
+        folder: Folder that contains them.
         parts: Names of files and folders in it.
 
     Raises:
@@ -73,9 +70,9 @@ _PARTS = ("assets", "bodies", "engines", "film", "hands", "synthesize.py")
 
 @lru_cache(maxsize=1)
 def generator_version() -> str:
-    """Name the version of the generator, ``CODE-mujoco-VERSION``.
+    """Return the version of the generator, ``CODE-mujoco-VERSION``.
 
-    Any change of its code counts, for which sequences of other code may differ.
+    Any change of its code counts, since it may change sequences.
     """
     try:
         engine = version("mujoco")
@@ -85,12 +82,12 @@ def generator_version() -> str:
 
 
 def told_version(recording: Sequence) -> str:
-    """Give the version of the generator that made a recording; empty if it does not tell."""
+    """Return the version of the generator that made a recording; empty if unknown."""
     return str(recording.provenance.get("generator") or "")
 
 
 def outdated(recording: Sequence) -> str:
-    """Say that a made recording comes of another generator than this one; empty if it does not."""
+    """Explain that another generator made a synthetic recording; empty if this one did."""
     if "synthesize" not in recording.provenance:
         return ""
     recorded, present = told_version(recording), generator_version()

@@ -1,4 +1,4 @@
-"""SynthHDI's generator: another physics engine, another hand and honest sensors make a sequence."""
+"""SynthHDI's generator: synthesizes sequences with another physics engine and hand model."""
 
 import logging
 from collections.abc import Generator, Mapping
@@ -31,7 +31,7 @@ from physhandi.synthetic.hands.true_hand import TrueHand, load_true_hand
 _LOG = logging.getLogger(__name__)
 
 FRAMES = 90
-"""Frames of a sequence if nothing else is asked for: three seconds."""
+"""Default number of frames: three seconds."""
 LEAST_FRAMES, MOST_SYNTHETIC_FRAMES = 2, 1000
 """A sequence has at least and at most so many frames."""
 LABEL = "SynthHDI"
@@ -141,7 +141,7 @@ def synthesize(
 
 @contextmanager
 def engine_warnings_logged() -> Generator[None, None, None]:
-    """Take MuJoCo's warnings into the log; it would write a file where the user happens to be.
+    """Redirect MuJoCo's warnings to the log; by default it writes a file in the working folder.
 
     What goes wrong for good is found by the engine's own checks.
     """
@@ -157,7 +157,7 @@ def engine_warnings_logged() -> Generator[None, None, None]:
 def _check(
     *, action: str, seed: int, cameras: int, frames: int, hold: Hold, images: Images
 ) -> None:
-    """Refuse what makes no sense before anything is computed or written."""
+    """Refuse invalid arguments before anything is computed or written."""
     if action not in ACTIONS:
         raise UsageError(f"There is no action {action!r}. Choose one of: {', '.join(ACTIONS)}.")
     if not 0 <= seed < 2**32:
@@ -179,7 +179,7 @@ def _check(
 
 
 def _describe(truth: PhysicalTruth, action: str, hands: Mapping[Side, TrueHand]) -> str:
-    """Tell in two sentences what is to be seen."""
+    """Describe the sequence in two sentences."""
     size = " x ".join(f"{100 * side:.0f}" for side in truth.body.size[:2])
     who = " and ".join(f"a {side} hand" for side in SIDES if side in hands)
     how = "friction" if truth.hold == "friction" else "attachment"

@@ -1,4 +1,4 @@
-"""What the adjoint of one frame says of everything that is the same in all its substeps."""
+"""Derivatives by everything that is constant over the substeps of a frame."""
 
 from typing import Any, NamedTuple
 
@@ -35,7 +35,7 @@ class FrameSums(NamedTuple):
 
     @classmethod
     def zeros(cls, model: SpringMassModel, device: Any, *, collides: bool = False) -> "FrameSums":
-        """Make room for a model's, with that of self-collision if nodes collide."""
+        """Allocate them for a model, those of self-collision only if nodes collide."""
         nodes, springs = model.node_count, len(model.spring_nodes)
         collided = nodes if collides else 0
         counts = (*[model.control_count] * 2, *[springs] * 2, *[nodes] * 3, *[collided] * 2)

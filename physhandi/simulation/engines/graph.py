@@ -12,7 +12,7 @@ from physhandi.simulation.topology import half_edges, split_rows
 
 
 class LaunchGraph:
-    """What a function launches, captured on first use and when told that arrays have moved."""
+    """The launches of a function as a graph, captured on first use and when arrays have moved."""
 
     def __init__(self, launches: Callable[[], None], device: Any) -> None:
         """Remember what to capture.
@@ -30,8 +30,8 @@ class LaunchGraph:
         """Run the launches.
 
         Args:
-            version: Of the arrays that they use; if it is another one than last time, the
-                launches are captured again.
+            version: Version of the arrays that they use; when it changes, the launches are
+                captured again.
         """
         if self.graph is None or version != self._version:
             with wp.ScopedCapture(device=self._device, force_module_load=True) as capture:
@@ -47,10 +47,10 @@ ROW_LENGTH = 8
 
 
 class SpringSums:
-    """How nodes sum over their springs: at once on a CPU, in two levels of short rows on a GPU.
+    """Sums over the springs of each node: directly on a CPU, in two levels of rows on a GPU.
 
-    A thread of a GPU waits for each value that it adds, so long sums are cut into rows that
-    many threads sum. The order of additions is fixed in both cases.
+    A GPU thread waits for each value that it adds, so long sums are split into rows that many
+    threads sum. The order of additions is fixed in both cases.
     """
 
     def __init__(self, model: SpringMassModel, device: Any) -> None:
@@ -58,7 +58,7 @@ class SpringSums:
         self.spring_nodes = wp.array(model.spring_nodes, dtype=wp.vec2i, device=device)
         """Both ends of each spring."""
         self.pull = wp.zeros(len(model.spring_nodes), dtype=wp.vec3, device=device)
-        """Room for the force of each spring."""
+        """Force of each spring [N]."""
         start, entry = half_edges(model.spring_nodes, model.node_count + model.control_count)
         self._half_edge = wp.array(entry, dtype=wp.int32, device=device)
         self._row_start: wp.array | None = None
@@ -69,15 +69,15 @@ class SpringSums:
         self._start = wp.array(start, dtype=wp.int32, device=device)
         self._entry = wp.array(entry, dtype=wp.int32, device=device)
         self.row_pull = self.scratch()
-        """Room for the rows of their sums."""
+        """Sums of the forces over rows [N]."""
 
     def scratch(self) -> wp.array:
-        """Make room for the rows of one sum."""
+        """Allocate the rows of one sum."""
         count = 0 if self._row_start is None else len(self._row_start) - 1
         return wp.zeros(count, dtype=wp.vec3, device=self._device)
 
     def of(self, value: wp.array, scratch: wp.array) -> tuple[wp.array, wp.array, wp.array]:
-        """Launch what must come first, and return what `spring_sum` reads: start, entry, value."""
+        """Sum rows if needed, and return the arguments of `spring_sum`: start, entry, value."""
         if self._row_start is None:
             return self._start, self._entry, value
         wp.launch(

@@ -14,23 +14,23 @@ from physhandi.simulation.simulator import Simulator
 
 
 def graph_tape_layout(nodes: int, substeps: int, *, collides: bool) -> TapeLayout:
-    """Say what is kept of a frame: positions, velocities, and velocities before each contact."""
+    """Shape the tape of a frame: positions, velocities, and velocities before each contact."""
     states, steps = ((substeps + 1, nodes), wp.vec3), ((substeps, nodes), wp.vec3)
     return (states, states, steps, steps) if collides else (states, states, steps)
 
 
 class GraphAdjoint:
-    """Simulates frames and carries a loss's derivatives from a frame's end to its start.
+    """Simulates frames and propagates a loss's derivatives from a frame's end to its start.
 
-    The attributes named after a value and `bar` hold the derivative of the loss by it. The
-    recorded launches work on one tape; what is kept of other frames is copied from and to it.
+    An attribute ``x_bar`` holds the derivative of the loss by ``x``. The captured launches work on
+    one tape; those of other frames are copied from and to it.
     """
 
     def __init__(self, simulator: Simulator) -> None:
-        """Make the tape.
+        """Allocate the tape.
 
         Args:
-            simulator: Whose frames; its controls, material and world are read, its state moved.
+            simulator: Its controls, material and world are read, its state is advanced.
         """
         self._simulator = simulator
         model, device = simulator.model, simulator.device
@@ -57,7 +57,7 @@ class GraphAdjoint:
         self._adjoint = LaunchGraph(self._launch_adjoint, device)
 
     def record(self, tape: Tape) -> None:
-        """Advance the simulator by one frame and keep its substeps in `tape`."""
+        """Advance the simulator by one frame and record its substeps in `tape`."""
         simulator = self._simulator
         state = simulator.position, simulator.velocity
         for rows, value in zip((self._position, self._velocity), state, strict=True):
@@ -70,9 +70,10 @@ class GraphAdjoint:
         self._copied = tape
 
     def backward(self, tape: Tape) -> None:
-        """Carry `position_bar` and `velocity_bar` from the end of the frame in `tape` to its start.
+        """Propagate `position_bar` and `velocity_bar` from the frame's end to its start.
 
-        Its controls and material must be those of the simulator; `sums` is what it gives.
+        The simulator must have the frame's controls and material. The derivatives by these are
+        written to `sums`.
         """
         if tape is not self._copied:
             for kept, own in zip(tape, self._tape, strict=True):
@@ -128,7 +129,7 @@ class GraphAdjoint:
             )
 
     def _launch_contacts(self, substep: int, collision: SelfCollision) -> None:
-        """Launch what `nodes_adjoint` does, with the collisions between ground and drag."""
+        """Launch the equivalent of `nodes_adjoint`, with collisions between ground and drag."""
         simulator = self._simulator
         state_bars = [self.position_bar, self.velocity_bar]
         candidates = [simulator.world, collision.start, collision.candidate]

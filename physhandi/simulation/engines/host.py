@@ -1,4 +1,4 @@
-"""What the fast engines need of a simulator."""
+"""The interface of a simulator that the engines use."""
 
 from typing import Any, Protocol
 
@@ -27,7 +27,7 @@ class EngineHost(Protocol):
 
     @property
     def controls(self) -> tuple[wp.array, wp.array]:
-        """Where the control nodes are at the start and the end of the frame."""
+        """Positions of the control nodes at the start and the end of the frame [m]."""
         ...
 
     def array(self, value: ndarray, dtype: Any) -> wp.array:

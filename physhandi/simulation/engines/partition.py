@@ -1,4 +1,4 @@
-"""How nodes are shared out to thread blocks that each own a compact part of the object."""
+"""Partitions of an object: compact blocks of nodes for CUDA, parts of springs for the CPU."""
 
 from dataclasses import dataclass
 
@@ -11,9 +11,9 @@ from physhandi.simulation.model import SpringMassModel
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Partition:
-    """Blocks of nodes, the nodes beyond each block's border, and every node's half-edges.
+    """Blocks of nodes, each block's halo, and every node's half-edges.
 
-    Nodes are numbered anew, block by block; control nodes follow as before.
+    Nodes are renumbered block by block; control nodes follow in their order.
     """
 
     own_start: Int32[ndarray, " block_1"]
@@ -21,15 +21,15 @@ class Partition:
     model_node: Int32[ndarray, " node"]
     """Number in the model of each node."""
     local_start: Int32[ndarray, " block_1"]
-    """Where each block's part of `local_node` begins."""
+    """Start of each block's part of `local_node`."""
     local_node: Int32[ndarray, " local"]
     """Nodes that a block needs: its own ones in order, then its halo."""
     entry_start: Int32[ndarray, " node_1"]
-    """Where each node's part of `entry` begins."""
+    """Start of each node's part of `entry`."""
     entry: Int32[ndarray, "half_edge 2"]
     """Half-edges: place of the other end in the block's part of `local_node`, and spring."""
     is_first: Int32[ndarray, " half_edge"]
-    """Whether this half-edge speaks for its spring: one of the two does."""
+    """Whether this half-edge writes the derivatives of its spring; one of the two does."""
 
     @property
     def block_count(self) -> int:
@@ -55,7 +55,7 @@ class Partition:
 def bisect_nodes(
     node: Float[ndarray, "node 3"], block_count: int
 ) -> tuple[Int[ndarray, " node"], Int[ndarray, " block_1"]]:
-    """Cut a point set again and again across its longest side into blocks of equal size.
+    """Bisect a point set recursively across its longest side into blocks of equal size.
 
     Args:
         node: Positions [m].
@@ -84,7 +84,7 @@ def bisect_nodes(
 
 
 def partition_model(model: SpringMassModel, block_count: int) -> Partition:
-    """Share a model's nodes out to blocks.
+    """Partition a model's nodes into blocks.
 
     Args:
         model: Nodes and springs; there must be a node.
@@ -133,7 +133,7 @@ def partition_model(model: SpringMassModel, block_count: int) -> Partition:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SpringParts:
-    """Parts of the object with whole springs, in groups for a processor's vector unit.
+    """Parts of the object with all their springs, in groups for a processor's vector unit.
 
     Places are the nodes part by part, then the control nodes that each part's springs pull at,
     then one empty place for each part, to which the springs that pad its lists are tied.
@@ -154,7 +154,7 @@ class SpringParts:
     spring: Int32[ndarray, " entry"]
     """Which spring of the model each is; -1 for padding."""
     spoken: Int32[ndarray, " entry"]
-    """The same, but -1 too where the other part speaks for a cut spring."""
+    """The same, but -1 also where the other part writes the derivatives of a cut spring."""
     ends: Int32[ndarray, "entry 2"]
     """Four times the place of each end."""
 
@@ -165,12 +165,12 @@ class SpringParts:
 
 
 def group_springs(model: SpringMassModel, part_count: int, group: int) -> SpringParts:
-    """Share out a model's nodes and springs to a few parts.
+    """Partition a model's nodes and springs into a few parts.
 
     Args:
         model: Nodes and springs; there must be a node.
-        part_count: Number of parts; no more than nodes are made.
-        group: How many springs are worked out at once; lists are padded to a multiple.
+        part_count: Number of parts, reduced to the number of nodes if larger.
+        group: Springs that are computed at once; lists are padded to a multiple.
     """
     count = model.node_count
     parts = min(part_count, count)
@@ -183,7 +183,7 @@ def group_springs(model: SpringMassModel, part_count: int, group: int) -> Spring
     home = part[ends[:, 0]]
     away = np.where(is_held, home, part[np.minimum(ends[:, 1], count - 1)])
 
-    # Each part has places of its own for the control nodes that it needs.
+    # Each part has its own places for the control nodes that it needs.
     width = len(number)
     held_keys, place = np.unique(home[is_held] * width + ends[is_held, 1], return_inverse=True)
     ends[is_held, 1] = count + place.reshape(-1)
@@ -194,7 +194,7 @@ def group_springs(model: SpringMassModel, part_count: int, group: int) -> Spring
     near = [springs[(home == index) & (away != index)] for index in range(parts)]
     far = [springs[(home != index) & (away == index)] for index in range(parts)]
     lists = [np.column_stack([ends[spring], spring, spring]) for spring in inner]
-    # Of a cut spring, a part's own node comes first, and only one part speaks for it.
+    # A part's own node is the first end of a cut spring; only one part writes its derivatives.
     lists += [
         np.vstack(
             [
@@ -227,7 +227,7 @@ def group_springs(model: SpringMassModel, part_count: int, group: int) -> Spring
 def _spread(pairs: Int[ndarray, "spring 2"]) -> Int[ndarray, " spring"]:
     """Order springs so that neighbours in the list seldom share a node.
 
-    A processor adds to a node only after the addition before; between, it has others to do.
+    Consecutive additions to one node depend on each other; spreading them keeps the processor busy.
     """
     order = np.lexsort((pairs[:, 1], pairs[:, 0]))
     first = pairs[order, 0]

@@ -1,8 +1,8 @@
-"""The substeps of a rollout, kept so that the way back need not simulate them again.
+"""Stores the substeps of a rollout for its backward pass, as far as memory allows.
 
-As many of the last frames are kept as memory allows. The others are simulated again one by one
-on the way back, from their start, in the place of a frame that is done with. The bits are the
-same either way, because the same kernels write them down.
+As many of the last frames are stored as fit. The backward pass simulates the others again one by
+one, each in the memory of a frame that is finished. The bits are the same either way, because the
+same kernels record both.
 """
 
 import math
@@ -23,14 +23,14 @@ _FILES = (
         "total_inactive_file",
     ),
 )
-"""Limit, use, statistics and the name of what could be dropped at once, of cgroups 2 and 1."""
+"""Files of limit, use and statistics, and the field of reclaimable memory, of cgroups 2 and 1."""
 
 
 def free_memory(device: Any) -> int:
-    """Return how much memory a Warp device has left [B], to this process's container if in one."""
+    """Return the free memory of a Warp device [B], within the limit of a container if any."""
     if device.is_cuda:
         return int(device.free_memory)
-    # A machine with a GPU can do without it.
+    # Needed on CPUs only.
     import psutil
 
     free = int(psutil.virtual_memory().available)
@@ -39,10 +39,10 @@ def free_memory(device: Any) -> int:
 
 
 def container_memory(folder: Path) -> int | None:
-    """Return how much memory a container has left [B]; none if it has no limit.
+    """Return the free memory of a container [B]; None without a limit.
 
     Args:
-        folder: Where its control groups are told of.
+        folder: Root of the control groups.
     """
     for limit, used, statistics, droppable in _FILES:
         try:
@@ -58,12 +58,12 @@ def container_memory(folder: Path) -> int | None:
 
 
 CUDA_SHARE, CPU_SHARE = 0.5, 0.25
-"""Part of a device's free memory that one trajectory may take."""
+"""Share of a device's free memory that one trajectory may use."""
 
 TapeLayout = tuple[tuple[tuple[int, ...], Any], ...]
-"""Shape of each array that keeps the substeps of one frame, and its type, a vector of floats."""
+"""Shape and type (a vector of floats) of each array of a tape."""
 Tape = tuple[wp.array, ...]
-"""These arrays."""
+"""Arrays with the substeps of one frame."""
 
 
 class Recorder(Protocol):
@@ -71,32 +71,32 @@ class Recorder(Protocol):
 
     @property
     def layout(self) -> TapeLayout:
-        """What it needs to keep of a frame."""
+        """Layout of the tape of a frame."""
         ...
 
     def record(self, tape: Tape) -> None:
-        """Advance the simulator by one frame and write its substeps down."""
+        """Advance the simulator by one frame and record its substeps."""
         ...
 
 
 def frame_bytes(layout: TapeLayout) -> int:
-    """Return how much memory the substeps of one frame take [B]."""
+    """Return the memory of the tape of one frame [B]."""
     return sum(math.prod(shape) * wp.types.type_size_in_bytes(dtype) for shape, dtype in layout)
 
 
 def stored_frames(layout: TapeLayout, frame_count: int, memory: int) -> int:
-    """Return of how many frames the substeps are kept: as many as fit, but one at least.
+    """Return the number of stored frames: as many as fit, but at least one.
 
     Args:
-        layout: What is kept of a frame.
+        layout: Layout of a tape.
         frame_count: Frames of the rollout, frame 0 not counted.
-        memory: That the trajectory may take [B].
+        memory: Memory that the trajectory may use [B].
     """
     return min(frame_count, max(1, memory // max(1, frame_bytes(layout))))
 
 
 def memory_budget(device: Any) -> int:
-    """Return how much memory a trajectory may take on a Warp device now [B]."""
+    """Return how much memory a trajectory may use on a Warp device now [B]."""
     device = wp.get_device(device)
     with _lock:
         layout, tapes = _spare.get(device.alias, ((), []))
@@ -110,14 +110,13 @@ class Trajectory:
     def __init__(
         self, recorder: Recorder, device: Any, frame_count: int, memory: int | None = None
     ) -> None:
-        """Decide how many frames to keep; the memory itself is taken when it is written to.
+        """Decide how many frames to store; memory is allocated at the first recording.
 
         Args:
-            recorder: Simulates frames and writes them down.
-            device: Warp device that this happens on.
+            recorder: Simulates and records frames.
+            device: Warp device of the tapes.
             frame_count: Frames of the rollout, frame 0 not counted.
-            memory: That may be taken [B]; if none, as `memory_budget` says. One frame's is
-                always taken.
+            memory: Memory that may be used [B], but always one frame's; None for `memory_budget`.
         """
         self._recorder = recorder
         self._device = device
@@ -128,15 +127,15 @@ class Trajectory:
         self._held: dict[int, int] = {}
 
     def keeps(self, frame: int) -> bool:
-        """Tell whether a frame is to be recorded on the way forward."""
+        """Whether a frame is to be recorded in the forward pass."""
         return frame > self._frame_count - self._count
 
     def holds(self, frame: int) -> bool:
-        """Tell whether a frame's substeps are there."""
+        """Whether a frame's substeps are stored."""
         return self._held.get(frame % self._count) == frame
 
     def record(self, frame: int) -> None:
-        """Advance the simulator by a frame and keep its substeps, in the place of a later one's."""
+        """Advance the simulator by a frame and store its substeps, replacing a later frame's."""
         if not self._tapes:
             self._tapes = _take(self._device, self._recorder.layout, self._count)
         place = frame % self._count
@@ -145,26 +144,26 @@ class Trajectory:
         self._held[place] = frame
 
     def tape(self, frame: int) -> Tape:
-        """Return the substeps of a frame that is held."""
+        """Return the substeps of a stored frame."""
         if not self.holds(frame):
             raise KeyError(f"frame {frame} is not held")
         return self._tapes[frame % self._count]
 
     def release(self) -> None:
-        """Let the next trajectory have the memory; this one goes on with one frame's."""
+        """Release the memory for the next trajectory; this one can continue with one frame's."""
         _give_back(self._device, self._recorder.layout, self._tapes)
         self._tapes, self._count = [], min(1, self._count)
         self._held.clear()
 
 
-# Writing to fresh memory can cost a CPU as much as simulating the frame, so what a trajectory no
-# longer needs is kept for the next.
+# Writing to fresh memory can cost a CPU as much as simulating the frame, so released tapes are
+# reused.
 _spare: dict[str, tuple[TapeLayout, list[Tape]]] = {}
 _lock = Lock()
 
 
 def _take(device: Any, layout: TapeLayout, count: int) -> list[Tape]:
-    """Take room for some frames from what was given back, the rest from the device."""
+    """Allocate tapes, released ones first."""
     with _lock:
         spare_layout, spare = _spare.pop(device.alias, (layout, []))
         tapes = spare[:count] if spare_layout == layout else []
@@ -185,7 +184,7 @@ def _room(device: Any, shape: tuple[int, ...], dtype: Any) -> wp.array:
 
 
 def _give_back(device: Any, layout: TapeLayout, tapes: list[Tape]) -> None:
-    """Keep the room of some frames for the next trajectory; forget that of another layout."""
+    """Keep released tapes for the next trajectory; drop those of another layout."""
     with _lock:
         spare_layout, spare = _spare.pop(device.alias, (layout, []))
         _spare[device.alias] = layout, (spare if spare_layout == layout else []) + tapes

@@ -19,13 +19,13 @@ from physhandi.progress import Progress
 SuiteName = Literal["tiny", "dev", "full"]
 Protocol = Literal["main", "single_view", "unseen", "robustness", "sensitivity"]
 Making = Mapping[str, Any]
-"""What the generator is told of one sequence."""
+"""Arguments of `synthesize` for one sequence."""
 RESERVED_SEED = 1000
 """Seeds from here on are reserved for verification."""
 BASELINES = ("static", "rigid_follow", "phystwin")
-"""Methods that every table carries."""
+"""Methods of every table."""
 ORACLES = ("oracle_hand", "oracle_parameters")
-"""Methods that are given what no real method can have."""
+"""Methods with input that no real method can have."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,9 +33,9 @@ class SuiteScene:
     """One scene of a suite; with a seed it becomes a sequence."""
 
     object_: str
-    """What is handled: cloth, towel, rope, plush or pouch."""
+    """Object: cloth, towel, rope, plush or pouch."""
     action: str
-    """What is done with it: lift, fold, stretch, squeeze, wipe or push."""
+    """Action: lift, fold, stretch, squeeze, wipe or push."""
 
     @property
     def hold(self) -> Literal["friction", "attachment"]:
@@ -49,12 +49,12 @@ class SuiteScene:
 
 @dataclass(frozen=True, kw_only=True)
 class Suite:
-    """A list of scenes, and how much effort every method may take."""
+    """A list of scenes, with the settings and methods of their evaluation."""
 
     name: SuiteName
-    """What it is called."""
+    """Name on the command line."""
     about: str
-    """What it is for, in one sentence."""
+    """Purpose, in one sentence."""
     scenes: tuple[SuiteScene, ...]
     """Scenes, in order."""
     seeds: tuple[int, ...]
@@ -66,7 +66,7 @@ class Suite:
     settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
     """Settings that all methods share: one node spacing, so that Chamfer distances compare."""
     recording: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    """What the generator is told of every sequence: preset, frames, images, resolution."""
+    """Arguments of `synthesize` for every sequence: preset, frames, images, resolution."""
 
 
 def _scenes(*pairs: str) -> tuple[SuiteScene, ...]:
@@ -170,19 +170,18 @@ def check_seeds(seeds: Many[int]) -> None:
 def make_recordings(
     suite: Suite, seeds: Many[int], folder: Path, make: Callable[[Mapping[Path, Making]], None]
 ) -> tuple[Sequence, ...]:
-    """Make the sequences of a suite; those that are there already are opened.
+    """Synthesize the sequences of a suite, or open those that exist.
 
     Args:
         suite: The suite.
         seeds: Seeds of every scene.
-        folder: Where the sequences lie.
-        make: Makes those that are missing: `make_one_by_one`, or several at a time by
-            `make_recording`.
+        folder: Folder of the sequences.
+        make: Synthesizes the missing ones: `make_one_by_one`, or in parallel by `make_recording`.
 
     Raises:
-        UsageError: If a seed makes no sense, or a sequence that is there was made otherwise; then
+        UsageError: If a seed is invalid, or an existing sequence was made with other settings; then
             nothing is made.
-        SequenceError: If a sequence that is there is damaged; delete its folder to make it anew.
+        SequenceError: If an existing sequence is damaged; delete its folder to make it again.
     """
     check_seeds(seeds)
     makings = {
@@ -198,24 +197,13 @@ def make_recordings(
 
 
 def make_one_by_one(makings: Mapping[Path, Making], progress: Progress) -> None:
-    """Make sequences of a suite, one after the other.
-
-    Args:
-        makings: What the generator is told of each, by its folder.
-        progress: Told about every frame.
-    """
+    """Synthesize sequences of a suite, given by folder, one after the other."""
     for target, making in makings.items():
         make_recording(making, target, progress)
 
 
 def make_recording(making: Making, target: Path, progress: Progress) -> None:
-    """Make one sequence of a suite.
-
-    Args:
-        making: Its object, and what else `synthesize` is told.
-        target: Its folder.
-        progress: Told about every frame.
-    """
+    """Synthesize one sequence of a suite in the folder `target`."""
     from physhandi.synthetic.synthesize import synthesize
 
     others = {name: value for name, value in making.items() if name != "object"}
@@ -228,7 +216,7 @@ def _making(suite: Suite, scene: SuiteScene, seed: int) -> dict[str, Any]:
 
 
 def _check_made(suite: Suite, recording: Sequence, making: Making) -> None:
-    """Refuse a sequence that is not the one that would be made.
+    """Refuse an existing sequence that differs from the one that would be made.
 
     Raises:
         UsageError: If it was made with other settings, or by something else.

@@ -1,8 +1,8 @@
-"""What a method is given in place of a whole recording: less, noisier, or the truth.
+"""Variants of a recording as inputs of methods: reduced, noisier, or with the truth.
 
-A variant is a sequence folder of its own, of the same name. It has nothing of what is kept for
-scoring, and nothing that tells how the recording was made, by which it could be made again with its
-truth. Methods run on it; scores are always taken against the recording itself.
+A variant is a sequence folder of its own, of the same name. It contains no data for scoring and no
+provenance from which the recording could be synthesized again with its truth. Methods run on it;
+scores are always taken against the recording itself.
 """
 
 import hashlib
@@ -31,28 +31,28 @@ TRACK_NOISE = 1.0
 DISTURBED_HAND = "noisy_hand"
 """The variant whose fitted hands are disturbed."""
 SCORING_ONLY = "validation_track.npy"
-"""True paths of points, of the future too, that no stage may fit."""
+"""True paths of points, also of future frames, that no stage may fit."""
 _GIVEN = ("views/", *(file for file in ARRAYS if file != SCORING_ONLY))
-"""Beginnings of the names of all that a method may be given."""
+"""Prefixes of the files that a method may read."""
 _MILLIMETRES = 1000.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class VariantChange:
-    """How a variant differs from its recording; everything else is copied."""
+    """The differences between a variant and its recording; everything else is copied."""
 
     meta: SequenceMeta
-    """Content of its ``sequence.yaml``; what tells how it was made is taken out of it."""
+    """Content of its ``sequence.yaml``, from which the provenance is removed."""
     arrays: Mapping[str, ndarray] = field(default_factory=dict[str, ndarray])
-    """Arrays that are other ones or new, by file."""
+    """Changed and additional arrays, by file."""
     images: Mapping[str, ndarray] = field(default_factory=dict[str, ndarray])
-    """Images that are other ones, by file."""
+    """Changed images, by file."""
     without: tuple[str, ...] = ()
-    """Beginnings of the names of files that are left out."""
+    """Prefixes of files that are left out."""
 
 
 def unchanged(recording: Sequence, _random: Generator) -> VariantChange:
-    """Give everything that a method may have."""
+    """Keep the whole recording."""
     return VariantChange(meta=recording.meta)
 
 
@@ -79,7 +79,7 @@ def true_hand(recording: Sequence, _random: Generator) -> VariantChange:
 
 
 def all_frames(recording: Sequence, _random: Generator) -> VariantChange:
-    """Give every frame to the fit, the held-out ones too."""
+    """Let the fit use every frame, also the held-out ones."""
     return VariantChange(meta=replace(recording.meta, reconstruction=recording.frame_count))
 
 
@@ -162,7 +162,7 @@ VARIANTS: dict[str, Callable[[Sequence, Generator], VariantChange]] = {
     "noisy_tracks": noisy_tracks,
     "noisy_hand": noisy_hand,
 }
-"""What a method can be given, by name."""
+"""Variants by name."""
 
 
 def make_variant(recording: Sequence, name: str, folder: Path) -> Sequence:
@@ -200,7 +200,7 @@ def make_variant(recording: Sequence, name: str, folder: Path) -> Sequence:
 
 
 def noise_seed(recording: Sequence, variant: str) -> int:
-    """Draw a seed from what a recording is: its name, and the seed that it was made with if any.
+    """Derive a seed from a recording's name and, if it is synthetic, its seed.
 
     Recordings made wrong by the same noise would not be independent.
     """
