@@ -1,4 +1,4 @@
-"""How many frames a second a population of candidates is simulated and judged at."""
+"""Benchmark of a batch: frames a second of simulating and scoring many candidates."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -84,13 +84,13 @@ def benchmark_batch(
     }
     times = time_in_turns(works, device, _ROUNDS)
     ours = times["ours"] / (frame_count * candidate_count)
-    found = simulator.rollout(scene.control)
+    rollout = simulator.rollout(scene.control)
     differences = []
     for index in (0, stiffest):
         baselines[index].rollout(scene.control)
         differences.append(
             describe_difference(
-                found.position[index, -1],
+                rollout.position[index, -1],
                 baselines[index].position.numpy(),
                 scene.model.object_node,
             )
@@ -102,7 +102,7 @@ def benchmark_batch(
         "observed_points": target.cloud.shape[1],
         "observed_tracks": target.track.shape[1],
         "median_springs": int(median(springs)),
-        "diverged": int(np.sum(found.diverged_frame >= 0)),
+        "diverged": int(np.sum(rollout.diverged_frame >= 0)),
         **describe_times(ours, times["baseline"] / frame_count),
         **{name: max(d[name] for d in differences) for name in differences[0]},
         **describe_traffic(widest, _COST, ours, device),
@@ -110,7 +110,7 @@ def benchmark_batch(
 
 
 def _target(scene: BenchmarkScene) -> MotionTarget:
-    """Make up observations of the usual number: points and tracks near where the nodes began."""
+    """Generate a typical number of observed points and tracks near the initial nodes."""
     node, frames = scene.model.object_node, len(scene.control)
     rng = np.random.default_rng(1)
     points, tracks = (rng.integers(0, len(node), count) for count in (_POINTS, _TRACKS))
@@ -128,7 +128,7 @@ def _target(scene: BenchmarkScene) -> MotionTarget:
 
 
 def _candidates(reference: SimulationParameters, count: int) -> list[SimulationParameters]:
-    """Vary every parameter that a search varies; the first candidate is the reference itself."""
+    """Vary every searched parameter; the first candidate is the reference itself."""
     rng = np.random.default_rng(0)
     return [
         reference,

@@ -1,4 +1,4 @@
-"""How long a simulated frame and its gradient take, beside PhysTwin's way, in one run."""
+"""Benchmark of a simulated frame with its gradient, beside PhysTwin's method in the same run."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""How long a simulated frame takes, beside a simulator built as PhysTwin's is, in one run."""
+"""Benchmark of a simulated frame, beside a simulator like PhysTwin's in the same run."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""How the time of a frame grows with nodes and springs."""
+"""Benchmark of the growth of a frame's time with nodes and springs."""
 
 import time
 from collections.abc import Iterable, Sequence

@@ -1,4 +1,4 @@
-"""What benchmarks simulate: made-up blocks of any size, and objects read from a file."""
+"""Scenes of the benchmarks: synthetic blocks of any size, and objects read from a file."""
 
 import math
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from physhandi.simulation.topology import build_model
 SPRINGS_AT_NODE = 18
 """Springs that end at a node of a made-up block on average; each ends at two nodes."""
 SUBSTEPS = 667
-"""Substeps of PhysTwin and of every figure that is compared with its."""
+"""Substeps of PhysTwin and of all benchmarks that compare with it."""
 _SPACING = 0.01
 _JITTER = 0.1
 _LIFT = 2e-3
@@ -26,14 +26,14 @@ _ARRAYS = ("position", "spring_nodes", "rest_length", "stiffness")
 
 @dataclass(frozen=True, kw_only=True)
 class BenchmarkScene:
-    """An object, what holds it and how that moves."""
+    """An object with its springs, parameters and control trajectory."""
 
     name: str
-    """What it is."""
+    """Name of the scene."""
     model: SpringMassModel
     """Springs and nodes; one damping for all springs, which the baseline needs."""
     parameters: SimulationParameters
-    """What to simulate with; no control velocity, which the baseline does not know."""
+    """Simulation parameters; without control velocity, which the baseline lacks."""
     control: Float32[ndarray, "frame control 3"]
     """Positions of the control nodes [m]."""
 
@@ -119,15 +119,15 @@ def recorded_object(
         virtual_connection_radius=0.04,
         virtual_max_neighbors=50,
     )
-    held = build_model(node, control, parameters.replace(max_neighbors=0))
-    count = held.virtual_spring_count
+    virtual = build_model(node, control, parameters.replace(max_neighbors=0))
+    count = virtual.virtual_spring_count
     floor = np.float32(parameters.rest_length_floor)
     soft = np.full(count, np.median(stiffness), dtype=np.float32)
     model = SpringMassModel(
         object_node=node,
-        initial_velocity=held.initial_velocity,
-        spring_nodes=np.concatenate([springs.astype(np.int32), held.spring_nodes]),
-        rest_length=np.concatenate([np.maximum(rest_length, floor), held.rest_length]),
+        initial_velocity=virtual.initial_velocity,
+        spring_nodes=np.concatenate([springs.astype(np.int32), virtual.spring_nodes]),
+        rest_length=np.concatenate([np.maximum(rest_length, floor), virtual.rest_length]),
         stiffness=np.concatenate([stiffness.astype(np.float32), soft]),
         damping=np.full(len(springs) + count, parameters.damping, dtype=np.float32),
         object_spring_count=len(springs),
@@ -145,7 +145,7 @@ def scene_of(
     frame_count: int,
     substeps_per_frame: int = SUBSTEPS,
 ) -> BenchmarkScene:
-    """Take the object of a file if there is one, else a made-up block."""
+    """Read the object of a file if one is given, else build a block."""
     if topology is None:
         return synthetic_block(
             node_count, frame_count=frame_count, substeps_per_frame=substeps_per_frame

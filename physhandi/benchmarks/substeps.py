@@ -1,4 +1,4 @@
-"""What fewer substeps cost: how far the motion is from that of the reference's 667."""
+"""Benchmark of fewer substeps: the difference of the motion from that with 667."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -1,4 +1,4 @@
-"""Time, memory traffic and the machine, as every benchmark tells them."""
+"""Timing, memory traffic and machine description for all benchmarks."""
 
 import os
 import time
@@ -63,7 +63,7 @@ def copy_bandwidth(device: str) -> float:
 
 
 def describe_machine(device: str) -> dict[str, Any]:
-    """Say on what is measured, and how busy the machine was in the minute before."""
+    """Describe device, versions and load of the machine."""
     environment = describe_environment(device, describe_device(device))
     return {
         "device": device,
@@ -75,7 +75,7 @@ def describe_machine(device: str) -> dict[str, Any]:
 
 
 def describe_scene(scene: BenchmarkScene, device: str) -> dict[str, Any]:
-    """Say what is measured and on what."""
+    """Describe scene and machine."""
     model = scene.model
     return {
         **describe_machine(device),
@@ -133,7 +133,7 @@ def describe_traffic(
 def describe_difference(
     ours: np.ndarray, baseline: np.ndarray, start: np.ndarray
 ) -> dict[str, float]:
-    """Say how far the two simulators end from each other, and how far the object moved [m]."""
+    """Compute the final difference between the simulators, and the object's motion [m]."""
     return {
         "max_abs_difference_m": float(np.max(np.abs(ours - baseline), initial=0.0)),
         "motion_m": float(np.max(np.abs(ours - start), initial=0.0)),

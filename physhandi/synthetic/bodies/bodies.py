@@ -1,4 +1,4 @@
-"""The soft bodies of SynthHDI: what they are made of and how they lie in frame 0.
+"""The soft bodies of SynthHDI: shape, material, and how they lie in frame 0.
 
 Everything lies on the ground ``z = 0`` about the origin, its longest side along x. Sizes and
 materials are drawn from ranges that were set once, before any method was tried on them.
@@ -20,7 +20,7 @@ from physhandi.synthetic.bodies.tubes import ROUND, tube_faces, tube_vertices
 BodyName = Literal["cloth", "towel", "rope", "plush", "pouch"]
 """Bodies that can be made."""
 Resolution = Literal["fine", "tiny"]
-"""How many nodes a body gets: 43 to 950 (``fine``) or 30 to 350 (``tiny``, for tests)."""
+"""Number of nodes of a body: 43 to 950 (``fine``) or 30 to 350 (``tiny``, for tests)."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -48,7 +48,7 @@ class Body:
     thickness: float
     """Thickness of a shell or diameter of a rod, which decides how it bends; 0 in a solid [m]."""
     radius: float
-    """Half the thickness at which others touch it, about nodes and elements [m]."""
+    """Contact radius around nodes and elements [m]."""
     mass: float
     """Mass [kg]."""
 
@@ -70,7 +70,7 @@ class Body:
         return np.arange(self.surface_node_count)
 
     def skin(self, position: Float[ndarray, "frame node 3"]) -> Float[ndarray, "frame vertex 3"]:
-        """Give the vertices to draw: a tube about a rod, otherwise the nodes of the surface.
+        """Compute the vertices to draw: a tube about a rod, otherwise the nodes of the surface.
 
         Args:
             position: Nodes in each frame [m]. A tube does not twist from one frame to the next.

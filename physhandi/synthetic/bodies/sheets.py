@@ -1,4 +1,4 @@
-"""What happens in a made-up sequence: the sheet, its springs, and the hand's motion."""
+"""A synthetic folded sheet: its nodes and springs, and the motion of the hand."""
 
 from dataclasses import dataclass, replace
 
@@ -91,7 +91,7 @@ def make_sheet(
 def uneven_material(
     model: SpringMassModel, random: Generator, *, spread: float = 0.35, patch: float = 0.05
 ) -> SpringMassModel:
-    """Make the object springs of a model unequally stiff, alike within patches.
+    """Vary the stiffness of a model's object springs smoothly over patches.
 
     Args:
         model: Model whose object springs are equally stiff.
@@ -161,7 +161,7 @@ def simulate_sheet(
     parameters: SimulationParameters,
     random: Generator,
 ) -> tuple[SpringMassModel, Float[ndarray, "frame node 3"]]:
-    """Let the hand's vertices move a sheet of uneven stiffness.
+    """Simulate a sheet of uneven stiffness moved by the hand's vertices.
 
     Returns:
         The model, and the positions of its nodes in every frame [m].

@@ -134,7 +134,7 @@ def _plush_blobs(length: float, random: Generator) -> Float[ndarray, "blob 6"]:
 def _outside(
     blobs: Float[ndarray, "blob 6"], point: Float[ndarray, "point 3"]
 ) -> Float[ndarray, " point"]:
-    """Tell about how far each point is outside of all ellipsoids [m]; less than 0 inside."""
+    """Estimate each point's distance to the ellipsoids [m]; negative inside."""
     scaled = (point[:, None] - blobs[:, :3]) / blobs[:, 3:]
     radius = np.linalg.norm(scaled, axis=-1)
     slope = np.linalg.norm(scaled / blobs[:, 3:], axis=-1)
@@ -142,7 +142,7 @@ def _outside(
 
 
 def _without_bare_edges(inside: Bool[ndarray, "x y z"]) -> Bool[ndarray, "x y z"]:
-    """Fill up where two cubes would only share an edge, so that the surface stays one skin."""
+    """Fill cubes where two others share only an edge, so that the surface is a manifold."""
     filled = inside.copy()
     while True:
         before = np.count_nonzero(filled)
@@ -177,7 +177,7 @@ def _tetrahedra(
 def _largest_piece(
     node: Float[ndarray, "node 3"], elements: Int[ndarray, "element 4"]
 ) -> tuple[Float[ndarray, "kept 3"], Int[ndarray, "kept_element 4"]]:
-    """Drop what does not hang together with the rest."""
+    """Keep the largest connected component."""
     row, column = elements[:, [0, 0, 0]].ravel(), elements[:, 1:].ravel()
     graph = coo_array((np.ones(len(row)), (row, column)), shape=(len(node), len(node)))
     label = connected_components(graph, directed=False)[1]
@@ -209,7 +209,7 @@ def _fit_surface(
     blobs: Float[ndarray, "blob 6"],
     spacing: float,
 ) -> Float[ndarray, "node 3"]:
-    """Move the steps of the grid onto the smooth surface, as far as no tetrahedron collapses."""
+    """Project surface nodes onto the smooth surface, as far as no tetrahedron collapses."""
     node = node.copy()
     least = _LEAST_VOLUME * spacing**3
     step = 1e-4 * spacing

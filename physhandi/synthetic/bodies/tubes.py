@@ -52,7 +52,7 @@ def tube_vertices(
 
 
 def _untwisted(tangent: Float[ndarray, "node 3"]) -> Float[ndarray, "node 3"]:
-    """Carry one normal along a line."""
+    """Transport one normal along a line."""
     normal = np.empty_like(tangent)
     least = np.eye(3)[np.argmin(np.abs(tangent[0]))]
     normal[0] = _across(least, tangent[0])
@@ -64,6 +64,6 @@ def _untwisted(tangent: Float[ndarray, "node 3"]) -> Float[ndarray, "node 3"]:
 def _across(
     vector: Float[ndarray, "*batch 3"], tangent: Float[ndarray, "*batch 3"]
 ) -> Float[ndarray, "*batch 3"]:
-    """Take the part of a vector that is across a unit tangent, at length 1."""
+    """Normalise the component of a vector that is perpendicular to a unit tangent."""
     across = vector - (vector * tangent).sum(axis=-1, keepdims=True) * tangent
     return across / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-12)

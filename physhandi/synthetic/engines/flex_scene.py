@@ -1,4 +1,4 @@
-"""A body, the ground and hands of capsules, as MuJoCo reads them.
+"""Describes a body, the ground and hands of capsules in MuJoCo's format.
 
 Each bone is a free body that is welded to a target without mass. A hand of targets alone moves as
 prescribed whatever it touches, and never holds anything by friction: it has no velocity that the
@@ -29,7 +29,7 @@ _MANY_NODES = 400
 
 @dataclass(frozen=True, kw_only=True)
 class FlexParameters:
-    """What the engine assumes about time, hands and touch."""
+    """Parameters of time steps, hands and contact."""
 
     substeps_per_frame: int = 20
     """Steps in one frame of 1/30 s."""
@@ -40,7 +40,7 @@ class FlexParameters:
     self_friction: float = 0.4
     """Friction of the body with itself."""
     bone_mass: float = 0.15
-    """Mass of each bone of a hand; how firmly it keeps its way [kg]."""
+    """Mass of each bone of a hand; heavier bones follow their path more firmly [kg]."""
     weld_time: float = 0.02
     """Time in which a bone returns to its prescribed way [s]. With its mass it makes a fingertip
     give way by 1 mm for about 0.75 N; a stiff one would crush what lies on the ground."""

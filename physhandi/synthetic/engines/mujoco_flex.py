@@ -43,7 +43,7 @@ def simulate_truth(
     progress: Progress | None = None,
     parameters: FlexParameters | None = None,
 ) -> PhysicalTruth:
-    """Let hands move a body.
+    """Simulate a body moved by hands.
 
     Args:
         body: What lies on the ground.
@@ -93,7 +93,7 @@ def simulate_truth(
 
 
 class _World:
-    """A MuJoCo model on its way through time."""
+    """A running MuJoCo simulation."""
 
     def __init__(
         self,
@@ -121,11 +121,11 @@ class _World:
         self._touched_frames = np.zeros(body.node_count, dtype=np.int64)
         self._touching_bone = np.zeros(body.node_count, dtype=np.int64)
         self.is_attached = np.zeros(body.node_count, dtype=bool)
-        """Whether a hand keeps hold of the node."""
+        """Whether the node is attached to a hand."""
 
     @property
     def node(self) -> Float[ndarray, "node 3"]:
-        """Where the nodes are now [m]."""
+        """Current positions of the nodes [m]."""
         return self._data.xpos[self._model.flex_vertbodyid]
 
     def frames(self, frame_count: int) -> Iterator[ndarray]:
@@ -142,7 +142,7 @@ class _World:
                 yield touched
 
     def bone_transforms(self, time: float) -> dict[Side, Float[ndarray, "bone 4 4"]]:
-        """Tell where each bone takes the points of the resting hand now.
+        """Compute the transforms from the resting hand to each bone's current pose.
 
         Args:
             time: Now [s]; bones without capsules are where the script has them at this time.
@@ -159,7 +159,7 @@ class _World:
         return transforms
 
     def attach_what_was_touched(self) -> None:
-        """Tie nodes of the surface that a bone has touched for some frames to it."""
+        """Attach surface nodes to a bone that has touched them for some frames."""
         ready = (self._touched_frames >= _FRAMES_TO_STICK) & ~self.is_attached
         for node in np.flatnonzero(ready[: self._body.surface_node_count]):
             bone = self._bone_body[self._touching_bone[node]]
@@ -192,7 +192,7 @@ class _World:
         return touched
 
     def _targets(self, time: float) -> tuple[Float[ndarray, "bone 3"], Rotation]:
-        """Say where the targets are, so that the bones are where they should be at a time.
+        """Compute targets that bring the bones to their prescribed poses at a time.
 
         A weld damps all motion and knows no speed of its target, so bones trail behind.
         """
@@ -208,7 +208,7 @@ class _World:
         return np.array(place), Rotation.from_matrix(np.array([m[:3, :3] for m in each]))
 
     def _move_targets(self, before: Any, after: Any, part: float) -> None:
-        """Move the targets some part of the way from one time to the next."""
+        """Interpolate the targets between two times."""
         if not self._bones:
             return
         self._data.mocap_pos[self._target] = (1 - part) * before[0] + part * after[0]
@@ -217,7 +217,7 @@ class _World:
         self._data.mocap_quat[self._target] = rotation.as_quat(scalar_first=True)
 
     def _put_hands(self, targets: tuple[Float[ndarray, "bone 3"], Rotation]) -> None:
-        """Put bones where their targets are."""
+        """Set the bones to their targets."""
         self._move_targets(targets, targets, 0.0)
         for bone, target in zip(self._bone_body, self._target, strict=True):
             start = self._model.jnt_qposadr[self._model.body_jntadr[bone]]
@@ -279,7 +279,7 @@ def _vary_stiffness(model: Any, body: Body) -> None:
 def _weights(
     corner: Float[ndarray, "point corner 3"], point: Float[ndarray, "point 3"]
 ) -> Float[ndarray, "point corner"]:
-    """Find how much each corner of an element counts at the point of it nearest to a point.
+    """Compute the barycentric weights of the element's point nearest to a given point.
 
     The weights of a point outside are cut at 0, which is near enough to tell which corners count.
     """

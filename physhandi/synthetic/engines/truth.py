@@ -1,4 +1,4 @@
-"""What a physics engine says has happened, and what it needs to know of a hand."""
+"""The result of a physics engine, and the interfaces of hands and scripts that it uses."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ Hold = Literal["friction", "attachment"]
 
 
 class CapsuleHand(Protocol):
-    """What an engine needs of a hand; `TrueHand` has it."""
+    """Interface of a hand; `TrueHand` implements it."""
 
     @property
     def capsules(self) -> Sequence[Capsule]:
@@ -31,7 +31,7 @@ class CapsuleHand(Protocol):
 
 
 class MovingHand(Protocol):
-    """What an engine needs of a motion; `HandScript` has it."""
+    """Interface of a motion; `HandScript` implements it."""
 
     @property
     def side(self) -> Side:
@@ -53,7 +53,7 @@ class PhysicalTruth:
     """A body and the hands that moved it, in every frame."""
 
     body: Body
-    """What was moved."""
+    """The body."""
     position: Float32[ndarray, "frame node 3"]
     """Nodes of the body in each frame [m]."""
     contact: Bool[ndarray, "frame node"]

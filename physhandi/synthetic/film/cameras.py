@@ -32,9 +32,9 @@ class Viewpoint:
     name: str
     """Name of the view."""
     camera: PinholeCamera
-    """Where it really is."""
+    """The true camera."""
     told: PinholeCamera
-    """What its calibration says."""
+    """The camera as its calibration states it."""
     delay: float
     """How much later than the first camera it takes its pictures [s]."""
 

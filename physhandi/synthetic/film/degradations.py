@@ -1,4 +1,4 @@
-"""What keeps a made-up recording from being perfect: one level each, 0 switches it off."""
+"""Errors of synthetic recordings: one level each, 0 switches it off."""
 
 import math
 from collections.abc import Mapping
@@ -22,7 +22,7 @@ _HAND_WANDERS = 0.3
 
 @dataclass(frozen=True, kw_only=True)
 class Degradations:
-    """Levels of all errors; a level of 0 means that there is none of this kind."""
+    """Levels of all errors; 0 switches one off."""
 
     depth_noise: float = 0.0
     """Standard deviation of the disparity [px]; 0.08 is a D455. Depth errs by
@@ -80,7 +80,7 @@ def depth_sensor(level: Degradations) -> DepthSensor:
 
 
 def miscalibrated(camera: PinholeCamera, level: Degradations, random: Generator) -> PinholeCamera:
-    """Give what calibration says of a camera: shifted and turned by the levels, any way."""
+    """Simulate the calibration of a camera: shifted and turned in random directions."""
     shift, axis = (_direction(random) for _ in range(2))
     pose = camera.T_world_camera.copy()
     turn = Rotation.from_rotvec(np.deg2rad(level.camera_turn) * axis).as_matrix()
@@ -179,8 +179,8 @@ def find_preset(name: str) -> Degradations:
         UsageError: If there is none of this name.
     """
     if name not in PRESETS:
-        known = ", ".join(PRESETS)
-        raise UsageError(f"There is no preset named {name!r}. Choose one of: {known}.")
+        names = ", ".join(PRESETS)
+        raise UsageError(f"There is no preset named {name!r}. Choose one of: {names}.")
     return PRESETS[name]
 
 
@@ -192,13 +192,13 @@ def changed(level: Degradations, changes: Mapping[str, float]) -> Degradations:
         changes: New levels by name.
 
     Raises:
-        UsageError: If there is no such degradation, or the level makes no sense.
+        UsageError: If there is no such degradation, or the level is out of bounds.
     """
-    known = [field.name for field in fields(Degradations)]
+    names = [field.name for field in fields(Degradations)]
     for name, value in changes.items():
-        if name not in known:
-            near = get_close_matches(name, known, 1)
-            hint = f"Did you mean {near[0]!r}?" if near else f"Choose one of: {', '.join(known)}."
+        if name not in names:
+            near = get_close_matches(name, names, 1)
+            hint = f"Did you mean {near[0]!r}?" if near else f"Choose one of: {', '.join(names)}."
             raise UsageError(f"There is no degradation named {name!r}. {hint}")
         largest = _LARGEST.get(name, _MOST_PIXELS)
         if not math.isfinite(value) or not 0 <= value <= largest:

@@ -1,4 +1,4 @@
-"""What the cameras of a made-up recording have before them: surfaces that move over time."""
+"""The scene of a synthetic recording: surfaces that move over time."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -43,7 +43,7 @@ class FilmedHand:
     keypoint: Float[ndarray, "frame 21 3"]
     """Keypoints in MediaPipe's order [m]."""
     shift: Float[ndarray, "frame 3"]
-    """How far from there it is filmed and found [m]."""
+    """Offset at which it is filmed and detected, an error of the recording [m]."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -69,23 +69,23 @@ class FilmedScene:
         return len(self.skin)
 
     def extent(self) -> Float[ndarray, "point 3"]:
-        """List points that say how much room everything takes over time [m]."""
+        """List points that span the space used over time [m]."""
         parts = [self.skin[::5, ::4], *(hand.keypoint[::5] for hand in self.hands)]
         return np.concatenate([part.reshape(-1, 3) for part in parts]).astype(np.float64)
 
     def skin_at(self, frame: float) -> Float[ndarray, "vertex 3"]:
-        """Give the surface of the body at a frame or between two [m]."""
+        """Interpolate the surface of the body at a frame or between two [m]."""
         return _between(self.skin, frame)
 
     def keypoints_at(self, frame: float) -> Float[ndarray, "hand 21 3"]:
-        """Give where the keypoints of all hands are found at a frame or between two [m]."""
-        found = [
+        """Interpolate the keypoints of all hands as detected, at a frame or between two [m]."""
+        keypoints = [
             _between(hand.keypoint, frame) + _between(hand.shift, frame) for hand in self.hands
         ]
-        return np.stack(found) if found else np.zeros((0, 21, 3))
+        return np.stack(keypoints) if keypoints else np.zeros((0, 21, 3))
 
     def scene_at(self, frame: float) -> Scene:
-        """Put together what is to be seen at a frame or between two."""
+        """Compose the visible surfaces at a frame or between two."""
         rest = self.skin[0]
         return compose(
             self.skin_at(frame),
@@ -148,7 +148,7 @@ def make_filmed_scene(
 def spread_points(
     vertex: Float[ndarray, "vertex 3"], faces: Int[ndarray, "face 3"], count: int, random: Generator
 ) -> SurfacePoints:
-    """Choose points all over a surface that are far from each other.
+    """Sample points all over a surface that are far from each other.
 
     Of many points drawn evenly over the area, the one farthest from all chosen so far is next.
 
@@ -173,12 +173,12 @@ def spread_points(
 
 
 def surface_area(vertex: Float[ndarray, "vertex 3"], faces: Int[ndarray, "face 3"]) -> float:
-    """Measure a surface [m²]."""
+    """Compute the area of a surface [m²]."""
     return float(triangle_areas(vertex, faces).sum())
 
 
 def _between(value: ndarray, frame: float) -> ndarray:
-    """Interpolate between the frames before and after; beyond the ends everything stands still."""
+    """Interpolate between the frames before and after; beyond the ends hold the last one."""
     frame = min(max(frame, 0.0), len(value) - 1.0)
     before = min(int(frame), max(len(value) - 2, 0))
     share = frame - before

@@ -1,4 +1,4 @@
-"""What all made-up recordings share: points on surfaces, what a picture shows of them, videos."""
+"""Tools of synthetic recordings: points on surfaces, their visibility in a picture, videos."""
 
 import errno
 import shutil
@@ -19,20 +19,20 @@ from physhandi.errors import SequenceError
 from physhandi.synthetic.film.rendering import Picture
 
 COVERED = 0.018
-"""A keypoint is hidden if something is nearer to the camera by more than this; it lies within the
-hand, under skin that does not count [m]."""
+"""A keypoint is hidden if the visible surface is nearer to the camera by more than this [m]; the
+keypoint itself lies inside the hand, below its skin."""
 _SAME_SURFACE = 0.004
 _LEAST_COSINE = 0.15
 
 
 @dataclass(frozen=True, eq=False)
 class SurfacePoints:
-    """Points that stick to a surface of triangles."""
+    """Points fixed on a surface of triangles."""
 
     corner: Int[ndarray, "point 3"]
     """Vertices of the triangle that each point lies on."""
     weight: Float[ndarray, "point 3"]
-    """How much each of these vertices counts."""
+    """Barycentric weights of these vertices."""
 
     def __len__(self) -> int:
         return len(self.corner)
@@ -42,13 +42,13 @@ class SurfacePoints:
         return SurfacePoints(self.corner[chosen], self.weight[chosen])
 
     def at(self, vertex: Float[ndarray, "*frame vertex 3"]) -> Float[ndarray, "*frame point 3"]:
-        """Find the points where the surface is now [m]."""
+        """Compute the points on the surface with these vertices [m]."""
         return np.einsum("tk,...tkd->...td", self.weight, vertex[..., self.corner, :])
 
     def face_camera(
         self, vertex: Float[ndarray, "*frame vertex 3"], camera: PinholeCamera
     ) -> Bool[ndarray, "*frame point"]:
-        """Tell whether a camera is on the outside of the triangle, and not at a grazing angle."""
+        """Mark points whose triangle faces the camera, and not at a grazing angle."""
         a, b, c = (vertex[..., self.corner[:, number], :] for number in range(3))
         normal = np.cross(b - a, c - a)
         normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
@@ -70,7 +70,7 @@ def sample_image(image: ndarray, pixel: Float[ndarray, "point 2"]) -> ndarray:
 def is_shown(
     camera: PinholeCamera, picture: Picture, point: Float[ndarray, "point 3"]
 ) -> Bool[ndarray, " point"]:
-    """Tell which points are the nearest thing that a picture shows at their place.
+    """Mark the points that a picture shows, which nothing nearer covers.
 
     Args:
         camera: What the picture was taken with.
@@ -84,7 +84,7 @@ def is_shown(
 def is_covered(
     camera: PinholeCamera, picture: Picture, keypoint: Float[ndarray, "keypoint 3"]
 ) -> Bool[ndarray, " keypoint"]:
-    """Tell which keypoints of hands are behind something else than their own skin.
+    """Mark the keypoints of hands that something other than their own skin covers.
 
     Args:
         camera: What the picture was taken with.
@@ -135,12 +135,12 @@ def save_video(
                 video.release()
         if video is None:
             return
-        found = _frame_count(path)
-        if found != count:  # OpenCV does not tell what the disk refused.
+        readable = _frame_count(path)
+        if readable != count:  # OpenCV does not tell what the disk refused.
             raise OSError(
                 errno.EIO,
-                f"The video holds {found} of {count} frames; the disk may be full. Free some space "
-                "on it, or choose another folder",
+                f"The video holds {readable} of {count} frames; the disk may be full. Free some "
+                "space on it, or choose another folder",
                 str(writer.folder / rel),
             )
         writer.copy(rel, path)
@@ -148,7 +148,7 @@ def save_video(
 
 @contextmanager
 def _folder_beside(writer: SequenceWriter) -> Generator[Path, None, None]:
-    """Make a folder on the sequence's own disk; if this process dies, the next writer sweeps it."""
+    """Make a folder on the sequence's disk; if this process dies, the next writer removes it."""
     folder = writer.folder.with_name(temporary_name(writer.folder.name))
     folder.mkdir()
     try:
@@ -162,7 +162,7 @@ def _opened(path: Path, size: tuple[int, int], frame_rate: float) -> cv2.VideoWr
 
 
 def _frame_count(path: Path) -> int:
-    """Count the frames that can be read; the header tells what was meant to be written."""
+    """Count the readable frames; the header states only the intended number."""
     if not path.is_file():
         return 0
     video = cv2.VideoCapture(str(path))

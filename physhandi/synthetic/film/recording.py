@@ -1,4 +1,7 @@
-"""A made-up recording: what cameras, detectors and trackers deliver of a stage, and the truth."""
+"""Records a scene: images, keypoints and tracks of all views with their errors, and the truth.
+
+`record` writes a sequence's files; a `Shot` is one camera with its detector and tracker.
+"""
 
 from collections.abc import Iterator, Sequence
 from typing import Literal
@@ -38,10 +41,80 @@ _BODY = 1
 _BIAS_PERIOD = 25.0
 _KEYPOINTS_LOST = 0.01
 _POOL = 3
+Images = Literal["all", "none"]
+"""Whether a recording has images, or only keypoints and markers."""
+FILMING = "filming"
+"""Name under which filming reports its progress."""
+KEPT_AROUND = 8
+"""Margin around body and hands outside of which depth is dropped, for small files [px]."""
+TRACK_COUNT = 300
+"""Most tracks of each view."""
+MARKER_SPACING = 0.011
+"""Distance between a view's tracked points if there are no images [m]."""
+MARKER_COUNTS = 150, 800
+"""Fewest and most points of a view in that case."""
+VALIDATION_COUNT = 200
+"""Most points whose true path is stored for scoring."""
+_CROP_MARGIN = 48
+_SHADOW_MARGIN = 16
+_COARSE = 0.5
+_EMPTY = np.zeros((0, 3))
+
+
+def record(
+    writer: SequenceWriter,
+    stage: FilmedScene,
+    views: Sequence[Viewpoint],
+    level: Degradations,
+    *,
+    seed: int,
+    images: Images,
+    progress: Progress,
+) -> None:
+    """Write all files of a recording but ``sequence.yaml``.
+
+    Args:
+        writer: Sequence that is being written.
+        stage: The scene.
+        views: Cameras.
+        level: Levels of all errors.
+        seed: Seed of all errors; those of one kind do not depend on the levels of others.
+        images: ``all`` writes color, depth, masks and pixel tracks; ``none`` leaves the images out
+            and writes the tracks lifted into the world as markers.
+        progress: Receives a report after every frame of every view; may cancel.
+
+    Raises:
+        CancelledError: If the user asked to stop.
+        OSError: If a file cannot be written.
+    """
+    lifted: list[ndarray] = []
+    for number, view in enumerate(views):
+        shot = Shot(stage, view, level, np.random.default_rng([seed, 30, number]))
+        folder = f"views/{view.name}"
+        counter = _Counter(progress, number * stage.frame_count, len(views) * stage.frame_count)
+        if images == "all":
+            colors = _film(writer, folder, shot, counter)
+            save_video(writer, f"{folder}/color.mp4", colors, stage.frame_rate)
+            reported, visible = shot.tracks()
+            writer.save_array(f"{folder}/track.npy", reported)
+            writer.save_array(f"{folder}/track_visible.npy", visible)
+        else:
+            lifted.append(_follow(shot, counter))
+        if stage.hands:
+            writer.save_array(f"{folder}/keypoint.npy", shot.keypoints())
+        else:
+            writer.make_folder(folder)
+    if lifted:
+        marker = np.concatenate(lifted, axis=1)
+        is_visible = np.asarray(np.isfinite(marker).all(axis=-1))
+        writer.save_array("marker.npy", marker.astype(np.float32))
+        writer.save_array("marker_motion_valid.npy", motion_validity(marker, is_visible))
+    _write_truth(writer, stage)
+    _write_validation(writer, stage, views, seed)
 
 
 class Shot:
-    """A camera in front of a stage; `look` at every frame in turn, then ask for what was found."""
+    """One camera's view of a scene: `look` at every frame in order, then read the detections."""
 
     def __init__(
         self, stage: FilmedScene, view: Viewpoint, level: Degradations, random: Generator
@@ -52,22 +125,22 @@ class Shot:
         self.random = random
         self.sensor = depth_sensor(level)
         self.surface = SurfacePoints(np.zeros((0, 3), dtype=np.int64), np.zeros((0, 3)))
-        """Points of the body that are followed."""
+        """Points of the body that are tracked."""
         self._bias = random.uniform(-0.7, 0.7), random.uniform(0, 2 * np.pi)
         self._is_covered: list[ndarray] = []
         self._is_seen: list[ndarray] = []
 
     def time(self, frame: int) -> float:
-        """Give the frame, and the part of one, at which the camera takes a picture."""
+        """Return the time at which the camera takes a picture, in frames."""
         return frame + self.view.delay * self.stage.frame_rate
 
     def offset(self, frame: int) -> float:
-        """Give the slow offset of depth as a part of its largest."""
+        """Return the slow offset of depth, from -1 to 1 of its largest value."""
         mean, phase = self._bias
         return mean + 0.3 * float(np.sin(phase + frame / _BIAS_PERIOD))
 
     def choose_tracks(self, camera: PinholeCamera, picture: Picture, count: int) -> None:
-        """Follow points that the first picture shows, spread over what it shows.
+        """Choose points to track, spread over the surface that the first picture shows.
 
         Args:
             camera: What the picture was taken with.
@@ -82,7 +155,7 @@ class Shot:
         self.surface = pool.pick(np.flatnonzero(shown)[:count])
 
     def look(self, frame: int, camera: PinholeCamera, picture: Picture) -> None:
-        """Note what a picture shows.
+        """Record which keypoints and points a picture shows.
 
         Args:
             frame: Number of the frame.
@@ -95,15 +168,15 @@ class Shot:
         for hand, joints in enumerate(keypoint):
             covered[hand] = is_covered(camera, picture, joints)
         self._is_covered.append(covered)
-        seen = is_shown(camera, picture, self.surface.at(skin))
-        self._is_seen.append(seen & self.surface.face_camera(skin, camera))
+        is_seen = is_shown(camera, picture, self.surface.at(skin))
+        self._is_seen.append(is_seen & self.surface.face_camera(skin, camera))
 
     def keypoints(self) -> Float[ndarray, "frame hand 21 3"]:
-        """Give what a detector finds of the hands: pixel x, pixel y and confidence."""
+        """Simulate the keypoint detector: pixel x, pixel y and confidence [px]."""
         camera, noise = self.view.camera, self.level.keypoint_noise
         joint = np.stack([self.stage.keypoints_at(time) for time in self._times()])
         pixel, is_hidden = camera.project(joint), np.stack(self._is_covered)
-        found = [
+        keypoints = [
             detect_keypoints(
                 pixel[:, hand],
                 is_hidden[:, hand],
@@ -114,10 +187,10 @@ class Shot:
             )
             for hand in range(joint.shape[1])
         ]
-        return np.stack(found, axis=1)
+        return np.stack(keypoints, axis=1)
 
     def tracks(self) -> tuple[Float[ndarray, "frame point 2"], Bool[ndarray, "frame point"]]:
-        """Give what a tracker finds of the points that are followed: pixels and visibility."""
+        """Simulate the tracker: pixels and visibility of the tracked points."""
         point = self._path()
         return track(
             self.view.camera.project(point),
@@ -152,80 +225,8 @@ class Shot:
         return [self.time(frame) for frame in range(self.stage.frame_count)]
 
 
-Images = Literal["all", "none"]
-"""Whether a recording has images, or only what was found in them."""
-FILMING = "filming"
-"""Name under which filming reports its progress."""
-KEPT_AROUND = 8
-"""Depth is kept this far around body and hands, to keep files small [px]."""
-TRACK_COUNT = 300
-"""Tracks of each view, at most."""
-MARKER_SPACING = 0.011
-"""Distance between the points that each view follows where there are no images [m]."""
-MARKER_COUNTS = 150, 800
-"""Fewest and most points that each view follows there."""
-VALIDATION_COUNT = 200
-"""Points whose true path is told for scoring, at most."""
-_CROP_MARGIN = 48
-_SHADOW_MARGIN = 16
-_COARSE = 0.5
-_EMPTY = np.zeros((0, 3))
-
-
-def record(
-    writer: SequenceWriter,
-    stage: FilmedScene,
-    views: Sequence[Viewpoint],
-    level: Degradations,
-    *,
-    seed: int,
-    images: Images,
-    progress: Progress,
-) -> None:
-    """Write everything of a recording but its description.
-
-    Args:
-        writer: Sequence that is being written.
-        stage: What happens.
-        views: Cameras.
-        level: How imperfect everything is.
-        seed: Decides all errors; those of one kind do not depend on the levels of others.
-        images: ``all`` writes color, depth, masks and pixel tracks; ``none`` leaves the images out
-            and writes the tracks lifted into the world as markers.
-        progress: Told after every frame of every view; may ask to stop.
-
-    Raises:
-        CancelledError: If the user asked to stop.
-        OSError: If the disk does not take it.
-    """
-    lifted: list[ndarray] = []
-    for number, view in enumerate(views):
-        shot = Shot(stage, view, level, np.random.default_rng([seed, 30, number]))
-        folder = f"views/{view.name}"
-        counter = _Counter(progress, number * stage.frame_count, len(views) * stage.frame_count)
-        if images == "all":
-            colors = _film(writer, folder, shot, counter)
-            save_video(writer, f"{folder}/color.mp4", colors, stage.frame_rate)
-            reported, visible = shot.tracks()
-            writer.save_array(f"{folder}/track.npy", reported)
-            writer.save_array(f"{folder}/track_visible.npy", visible)
-        else:
-            lifted.append(_follow(shot, counter))
-        if stage.hands:
-            writer.save_array(f"{folder}/keypoint.npy", shot.keypoints())
-        else:
-            writer.make_folder(folder)
-    if lifted:
-        marker = np.concatenate(lifted, axis=1)
-        is_visible = np.asarray(np.isfinite(marker).all(axis=-1))
-        writer.save_array("marker.npy", marker.astype(np.float32))
-        writer.save_array("marker_motion_valid.npy", motion_validity(marker, is_visible))
-    _write_truth(writer, stage)
-    _write_validation(writer, stage, views, seed)
-
-
 class _Counter:
-    """Tells how many frames of all views are done."""
+    """Reports the finished frames of all views."""
 
     def __init__(self, progress: Progress, before: int, total: int) -> None:
         self._progress, self._before, self._total = progress, before, total
@@ -240,7 +241,7 @@ class _Counter:
 def _film(
     writer: SequenceWriter, folder: str, shot: Shot, counter: _Counter
 ) -> Iterator[UInt8[ndarray, "row column 3"]]:
-    """Write depth and masks of a view frame by frame, and give its color images."""
+    """Write depth and masks of a view frame by frame, and yield its color images."""
     camera = shot.view.camera
     background = paint(camera, compose(_EMPTY, _EMPTY.astype(np.int64), _EMPTY[:, :2], []))
     around = np.ones((2 * KEPT_AROUND + 1,) * 2, dtype=np.uint8)
@@ -293,7 +294,7 @@ def _follow(shot: Shot, counter: _Counter) -> Float[ndarray, "frame point 3"]:
 
 
 def _write_truth(writer: SequenceWriter, stage: FilmedScene) -> None:
-    """Write what really happened to hands and body."""
+    """Write the true motion of hands and body, and the true contacts."""
     for hand in stage.hands:
         writer.save_array(f"truth/hand_{hand.side}_keypoint.npy", hand.keypoint.astype(np.float32))
         writer.save_array(f"truth/hand_{hand.side}_vertex.npy", hand.vertex.astype(np.float32))
@@ -306,7 +307,7 @@ def _write_truth(writer: SequenceWriter, stage: FilmedScene) -> None:
 def _write_validation(
     writer: SequenceWriter, stage: FilmedScene, views: Sequence[Viewpoint], seed: int
 ) -> None:
-    """Tell the true paths of points that a camera sees in frame 0."""
+    """Write the true paths of points that a camera sees in frame 0."""
     skin, scene = stage.skin_at(0.0), stage.scene_at(0.0)
     random = np.random.default_rng([seed, 31])
     surface = spread_points(skin, stage.faces, 2 * VALIDATION_COUNT, random)

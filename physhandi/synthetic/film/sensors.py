@@ -1,4 +1,4 @@
-"""What sensors and detectors make of a perfect picture: a model of an Intel RealSense D455.
+"""Error models of sensors and detectors, among them an Intel RealSense D455.
 
 Stereo errs in disparity, so the error of depth grows with the square of the distance; it is smooth
 over a few pixels, quantised, and depth fails beside edges and at grazing angles.
@@ -45,7 +45,7 @@ class DepthSensor:
     grazing_rate: float = 0.5
     """Part of the pixels lost on such a surface."""
     shadow: float = 1.0
-    """Width of the blind band beside near things, as a part of what the stereo pair causes."""
+    """Width of the blind band beside near objects, relative to that of the stereo pair."""
     even_noise: float = 0.0
     """Standard deviation of a further error of each pixel, alike at all distances [m]."""
     bias: float = 0.001
@@ -64,7 +64,7 @@ class DepthSensor:
         offset: float = 0.0,
         scale: float | None = None,
     ) -> UInt16[ndarray, "row column"]:
-        """Turn true depth into a depth image.
+        """Convert true depth to a measured depth image.
 
         Args:
             depth: True depth [m]; 0 where there is nothing.
@@ -105,7 +105,7 @@ class DepthSensor:
         return np.where(random.random(depth.shape) < self.hole_rate, np.nan, measured)
 
     def _read(self, depth: ndarray, noise: ndarray, offset: float) -> ndarray:
-        """Err in disparity by normal noise of unit variance, and quantise; gives depth [mm]."""
+        """Add normal noise of unit variance to the disparity, and quantise; returns depth [mm]."""
         reach = self.focal_length * self.baseline
         disparity = reach / np.maximum(np.where(depth > 0, depth + offset * self.bias, 1.0), 0.05)
         disparity += self.disparity_noise * noise
@@ -114,7 +114,7 @@ class DepthSensor:
         return 1000.0 * reach / np.maximum(disparity, 1e-3)
 
     def _fly(self, depth: ndarray, random: Generator) -> Float[ndarray, "row column"]:
-        """Mix fore- and background in some of the pixels beside depth edges."""
+        """Mix foreground and background in some of the pixels beside depth edges."""
         kernel = np.ones((2 * self.edge_reach + 1,) * 2, dtype=np.uint8)
         near, far = cv2.erode(depth, kernel), cv2.dilate(depth, kernel)
         is_edge = (far - near > self.edge_step) & (near > 0)
@@ -123,7 +123,7 @@ class DepthSensor:
         return np.where(is_edge, near + blend * (far - near), depth)
 
     def _shadow(self, depth: ndarray, scale: float) -> Bool[ndarray, "row column"]:
-        """Find background that the left imager sees but the right one does not."""
+        """Mark the background that the left imager sees but the right one does not."""
         disparity = np.where(depth > 0, self.focal_length * self.baseline, 0.0)
         disparity = disparity / np.maximum(depth, 0.05) * (scale * self.shadow)
         hidden = np.zeros(depth.shape, dtype=bool)
@@ -149,7 +149,7 @@ def segment(
     error: float = 0.7,
     largest: float = 1.4,
 ) -> UInt8[ndarray, "row column"]:
-    """Shift the outlines of a label image here and there.
+    """Shift the outlines of a label image by smooth noise.
 
     Args:
         label: True labels.
@@ -226,7 +226,7 @@ def detect_keypoints(
     hidden_factor: float = 2.0,
     loss_rate: float = 0.01,
 ) -> Float[ndarray, "frame keypoint 3"]:
-    """Report keypoints as a detector would: less exact and less sure where they are hidden.
+    """Simulate a keypoint detector: less accurate and less confident where keypoints are hidden.
 
     Args:
         pixel: True image positions [px].
@@ -241,10 +241,10 @@ def detect_keypoints(
         Pixel x, pixel y and confidence; NaN outside of the image and where nothing was found.
     """
     spread = error * np.where(is_hidden, hidden_factor, 1.0)[..., None]
-    found = pixel + spread * random.standard_normal(pixel.shape)
+    detected = pixel + spread * random.standard_normal(pixel.shape)
     low, high = np.where(is_hidden, 0.35, 0.85), np.where(is_hidden, 0.6, 0.98)
     confidence = low + (high - low) * random.random(is_hidden.shape)
-    keypoint = np.concatenate([found, confidence[..., None]], axis=-1)
-    outside = ((found < 0) | (found > np.array(size) - 1)).any(axis=-1)
+    keypoint = np.concatenate([detected, confidence[..., None]], axis=-1)
+    outside = ((detected < 0) | (detected > np.array(size) - 1)).any(axis=-1)
     keypoint[outside | (random.random(is_hidden.shape) < loss_rate)] = np.nan
     return keypoint.astype(np.float32)

@@ -1,4 +1,4 @@
-"""Six things that hands do with soft objects: where they grasp, which way they move, how long."""
+"""The six actions of hands on soft objects: grasp, path and duration of each."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -16,14 +16,14 @@ from physhandi.synthetic.hands.true_hand import TrueHand, load_true_hand
 
 ActionName = Literal["lift", "fold", "stretch", "squeeze", "wipe", "push"]
 ACTIONS: tuple[ActionName, ...] = ("lift", "fold", "stretch", "squeeze", "wipe", "push")
-"""What hands can do."""
+"""Names of the actions."""
 _UP = np.array([0.0, 0.0, 1.0])
 # How far hands pull each body beyond its length: as far as friction holds it.
 _STRETCH = {"cloth": 0.02, "towel": 0.05, "rope": -0.01, "plush": 0.08, "pouch": 0.05}
 # Shortest recording in which hands go the whole way, so that they are as slow in shorter ones [s].
 _WHOLE_WAY = 3.0
 DURATION = 3.0
-"""How long an action is recorded if nothing else is asked for [s]."""
+"""Default duration of an action [s]."""
 
 
 def script_action(
@@ -63,7 +63,7 @@ def script_action(
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """What an action is asked for."""
+    """Inputs of an action."""
 
     body: Graspable
     random: Generator
@@ -73,7 +73,7 @@ class _Task:
 
     @property
     def extent(self) -> float:
-        """Share of the whole way that there is time for; hands move no faster in short ones."""
+        """Share of the path that fits the duration; hands move no faster in short recordings."""
         return min(self.duration / _WHOLE_WAY, 1.0)
 
     def handler(self, side: Side | None = None) -> Handler:

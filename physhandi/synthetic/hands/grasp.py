@@ -1,4 +1,4 @@
-"""Poses of the true hand whose fingertips are where a grasp needs them."""
+"""Inverse kinematics of the true hand: poses that bring the fingertips to given targets."""
 
 from collections.abc import Mapping
 
@@ -92,7 +92,7 @@ def reach(
     along: Float[ndarray, " 3"] | None = None,
     floor: float = -np.inf,
 ) -> TrueHandPose:
-    """Bend and place a hand so that the middles of its fingertips are in given places.
+    """Find the pose of a hand whose fingertips' centres are at given targets.
 
     The middle of a fingertip is the end of its capsule's line, one radius under the skin.
 
@@ -131,7 +131,7 @@ def reach(
     ends = np.array([tip.end for tip in tips.values()])[..., None]
     lines = np.array([(tip.end - tip.start) for tip in tips.values()])
     lines = (lines / np.linalg.norm(lines, axis=1, keepdims=True))[..., None]
-    wanted = np.array(list(targets.values()))
+    goal = np.array(list(targets.values()))
     pads = np.array([finger <= MIDDLE for finger in tips])
 
     heel = hand.rest_keypoint[:2]
@@ -141,7 +141,7 @@ def reach(
         height = heel @ transform[0, 2, :3] + transform[0, 2, 3]
         low = np.maximum(floor + _HEEL - height, 0.0)
         transform = transform[bones]
-        misses = (transform[:, :3, :3] @ ends)[..., 0] + transform[:, :3, 3] - wanted
+        misses = (transform[:, :3, :3] @ ends)[..., 0] + transform[:, :3, 3] - goal
         if along is None:
             return misses, low, np.zeros((0, 3))
         return misses, low, (transform[pads, :3, :3] @ lines[pads])[..., 0] - along
@@ -153,8 +153,8 @@ def reach(
         return np.concatenate([off, slants.ravel() / _SLANT, stray])
 
     first = np.clip(guess, low, high)
-    found = least_squares(cost, first, bounds=(low, high), ftol=1e-4, xtol=1e-4, max_nfev=60)
-    error = np.linalg.norm(residuals(found.x)[0], axis=1)[pads]
+    solution = least_squares(cost, first, bounds=(low, high), ftol=1e-4, xtol=1e-4, max_nfev=60)
+    error = np.linalg.norm(residuals(solution.x)[0], axis=1)[pads]
     worst = int(error.argmax())
     if error[worst] > _TIP_ERROR:
         finger = FINGER_NAMES[[finger for finger in tips if finger <= MIDDLE][worst]]
@@ -162,14 +162,14 @@ def reach(
             f"The {hand.side} hand cannot reach: its {finger} finger stays "
             f"{error[worst] * 1000:.0f} mm short. Choose a smaller object or another seed."
         )
-    return pose_of(found.x)
+    return pose_of(solution.x)
 
 
 def _first_place(
-    hand: TrueHand, targets: Mapping[int, ndarray], held: Rotation, joints: ndarray
+    hand: TrueHand, targets: Mapping[int, ndarray], palm: Rotation, joints: ndarray
 ) -> Float[ndarray, " 3"]:
-    """Put the wrist so that the fingertips are where they should be on average."""
-    pose = TrueHandPose(orientation=held.as_rotvec(), position=np.zeros(3), bend=bend_of(joints))
+    """Place the wrist so that the fingertips' mean error is zero."""
+    pose = TrueHandPose(orientation=palm.as_rotvec(), position=np.zeros(3), bend=bend_of(joints))
     transform = hand.bone_transforms(pose)
     missing = []
     for finger, target in targets.items():

@@ -1,4 +1,4 @@
-"""Where a hand takes hold of an object that lies on the ground, and how it gets there."""
+"""Grasps of an object that lies on the ground, and the hand's path to them."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -43,7 +43,7 @@ _POINT_PITCH = 0.75
 
 
 class Graspable(Protocol):
-    """What hands must know of an object."""
+    """Interface of an object that hands can grasp."""
 
     @property
     def name(self) -> str:
@@ -75,7 +75,7 @@ class Grasp:
     place: Place
     """Where the object is grasped, and which way the hand faces."""
     approach: Sequence[HandMove]
-    """How the hand gets there before the recording starts, from far away to the last pose."""
+    """Path of the hand before the recording starts, from far away to the last pose."""
 
     @property
     def forward(self) -> Float[ndarray, " 3"]:
@@ -89,7 +89,7 @@ class Grasp:
 
 
 class Handler:
-    """One hand that is about to do something with one object."""
+    """Plans one hand's grasps and motions on one object."""
 
     def __init__(self, hand: TrueHand, body: Graspable, random: Generator) -> None:
         """Remember who does what.
@@ -214,11 +214,11 @@ class Handler:
             grasp: Where and how to take hold.
             moves: Start, end [s] and way of each move after that.
         """
-        held = grasp.poses[-1]
+        last_pose = grasp.poses[-1]
         chain = list(grasp.approach)
         for start, end, carry in moves:
             phases = np.linspace(0.0, 1.0, _POSES_PER_MOVE)
-            poses = [turned(held, grasp.place.point, *carry(float(p))) for p in phases]
+            poses = [turned(last_pose, grasp.place.point, *carry(float(p))) for p in phases]
             chain.append(HandMove(start, end, poses))
         return HandScript(self._hand.side, chain, Tremor(self._random))
 
@@ -250,7 +250,7 @@ class Handler:
         return HandScript(self._hand.side, chain, Tremor(self._random))
 
     def distance_to_middle(self, grasp: Grasp) -> float:
-        """How far the grasp is from the object's middle along the way the hand faces [m]."""
+        """Distance from the grasp to the object's middle along the hand's direction [m]."""
         return abs(float((self._body.node.mean(axis=0) - grasp.place.point) @ grasp.place.inwards))
 
     def _close(self, place: Place, gaps: Float[ndarray, " step"]) -> list[TrueHandPose]:

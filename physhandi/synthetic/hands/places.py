@@ -29,13 +29,13 @@ class Lying(Protocol):
 
     @property
     def radius(self) -> float:
-        """Distance at which others touch it, about its nodes [m]."""
+        """Contact radius around its nodes [m]."""
         ...
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Place:
-    """Where to take hold of an object."""
+    """A place at which a hand can grasp an object."""
 
     point: Float[ndarray, " 3"]
     """Middle between thumb and fingers; its height is that of the object [m]."""
@@ -44,7 +44,7 @@ class Place:
     inwards: Float[ndarray, " 3"]
     """Horizontal direction from there to the object's middle."""
     width: float | None = None
-    """How wide the object is between thumb and fingers; None if they rake it together [m]."""
+    """Width of the object between thumb and fingers; None if they rake it together [m]."""
     thickness: float = 0.0
     """How thick it is between bottom and top; 0 where that does not matter [m]."""
     depth: float = 0.0
@@ -78,7 +78,7 @@ def narrow_places(body: Lying, random: Generator, *, end: float = 0.0) -> list[P
     middle = body.node.mean(axis=0)
     if np.ptp(body.node[:, 2]) < 0.002 and np.ptp(body.node[:, 1]) > 2 * _WIDEST:
         return []
-    found = []
+    narrow = []
     count = min(_CANDIDATES, len(body.node))
     for node in body.node[random.choice(len(body.node), count, replace=False)]:
         if end and end * (node[1] - middle[1]) < 0.6 * np.abs(body.node[:, 1] - middle[1]).max():
@@ -88,12 +88,12 @@ def narrow_places(body: Lying, random: Generator, *, end: float = 0.0) -> list[P
         places = [_across(body, node, forward, middle) for forward in lines]
         fitting = [place for place in places if place is not None]
         if fitting:
-            found.append(min(fitting, key=lambda place: place.width or 0.0))
-    return found
+            narrow.append(min(fitting, key=lambda place: place.width or 0.0))
+    return narrow
 
 
 def rim_place(body: Lying, random: Generator, *, end: float = 0.0) -> Place:
-    """Choose a place near the rim, to be taken between a thumb below and fingers above.
+    """Choose a place near the rim, for a pinch with the thumb below and fingers above.
 
     Args:
         body: The object.

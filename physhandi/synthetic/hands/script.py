@@ -1,4 +1,4 @@
-"""What a scripted hand does: smooth moves between key poses, under a tremor that never stops."""
+"""Motion of a scripted hand: smooth moves between key poses, with a permanent tremor."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from physhandi.data.sequence_meta import Side
 from physhandi.synthetic.hands.true_hand import BONE_COUNT, TrueHandPose
 
 TREMOR_FREQUENCY = 6.0
-"""Middle of the band in which a hand trembles [Hz]."""
+"""Centre frequency of the tremor [Hz]."""
 _TREMOR_BAND = 1.5
 _TREMOR_WAVES = 5
 _TREMOR_POSITION = 0.0003
@@ -52,7 +52,7 @@ class Tremor:
         self._amplitude = level * amplitude
 
     def shake(self, pose: TrueHandPose, time: float) -> TrueHandPose:
-        """Add to a pose what the hand trembles by at one time [s]."""
+        """Add the tremor at one time [s] to a pose."""
         wave = np.cos(2 * np.pi * self._frequency * time + self._phase).sum(axis=0)
         shift = self._amplitude * np.sqrt(2 / _TREMOR_WAVES) * wave
         turn = Rotation.from_rotvec(shift[3:6]) * Rotation.from_rotvec(pose.orientation)
@@ -109,7 +109,7 @@ class HandScript:
         self._tremor = tremor
 
     def at(self, time: float) -> TrueHandPose:
-        """Compute where the hand is at a time [s]."""
+        """Compute the hand's pose at a time [s]."""
         number = max(sum(move.start <= time for move in self._moves) - 1, 0)
         move = self._moves[number]
         phase = float(minimum_jerk(np.array([time]), move.start, move.end)[0])

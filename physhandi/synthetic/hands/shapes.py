@@ -1,4 +1,4 @@
-"""The shapes that a hand takes about a place: a pinch, a claw, and what follows from them."""
+"""Poses of a hand at a place: pinch and claw, and rigid motions of poses."""
 
 import numpy as np
 from jaxtyping import Float
@@ -104,6 +104,6 @@ def turned(
 
 
 def _thumb_side(hand: TrueHand, place: Place) -> Float[ndarray, " 3"]:
-    """Tell the horizontal direction from the little finger to the index finger."""
+    """Compute the horizontal direction from the little finger to the index finger."""
     side = 1.0 if hand.side == "right" else -1.0
     return side * np.cross(_UP, place.forward)

@@ -21,7 +21,7 @@ ASSET = Path(__file__).parents[1] / "assets" / "true_hand.npz"
 BONE_COUNT = 16
 """The wrist with the palm, then three bones of each finger from thumb to little finger."""
 BONE_PARENT = (-1, *(0 if bone % 3 == 1 else bone - 1 for bone in range(1, BONE_COUNT)))
-"""Bone that each bone hangs on; bone 0 hangs on nothing."""
+"""Parent of each bone; bone 0 has none."""
 FINGERTIPS = (4, 8, 12, 16, 20)
 """Keypoints at the ends of the fingers, from thumb to little finger."""
 
@@ -37,7 +37,7 @@ _SOFT_RANGE = (0.001, 0.002)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrueHandPose:
-    """Where a hand is and how its fingers are bent."""
+    """Position, orientation and finger angles of a hand."""
 
     orientation: Float[ndarray, " 3"]
     """Rotation vector that turns the rest frame into the world [rad]."""
@@ -63,7 +63,7 @@ class PosedHand:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Capsule:
-    """A part of the hand as solids touch it: all points within a radius of a line."""
+    """A capsule of the hand's contact shape: all points within a radius of a line."""
 
     bone: int
     """Bone that carries it."""
@@ -138,7 +138,7 @@ class TrueHand:
         return tuple(capsules)
 
     def bone_transforms(self, pose: TrueHandPose) -> Float[ndarray, "bone 4 4"]:
-        """Compute where each bone takes the points of the resting hand."""
+        """Compute the transforms from the resting hand to each bone's pose."""
         turn = np.asarray(pose.bend, dtype=np.float64)
         if turn.shape != (BONE_COUNT, 3) or turn[0].any():
             raise ValueError("The bend of a hand has 16 rows of 3, and bone 0 stays zero.")
@@ -158,11 +158,11 @@ class TrueHand:
         return transform
 
     def pose(self, pose: TrueHandPose) -> PosedHand:
-        """Put surface and keypoints where a pose has them."""
+        """Compute surface and keypoints of a pose."""
         return self.carry(self.bone_transforms(pose))
 
     def carry(self, transform: Float[ndarray, "bone 4 4"]) -> PosedHand:
-        """Put surface and keypoints where the bones take them.
+        """Compute surface and keypoints from the transforms of the bones.
 
         Args:
             transform: Takes points of the resting hand with each bone into the world; bones need
@@ -218,7 +218,7 @@ def load_true_hand(side: Side, *, seed: int | None = None) -> TrueHand:
 
 
 def soft_tissue_offset(hand: TrueHand, seed: int) -> Float[ndarray, "vertex 3"]:
-    """Thicken a hand by 1 to 2 mm, unevenly, as muscle and fat do that no hand model knows.
+    """Thicken a hand by 1 to 2 mm, unevenly, like soft tissue outside of any hand model.
 
     Args:
         hand: Bare hand.
@@ -240,7 +240,7 @@ def soft_tissue_offset(hand: TrueHand, seed: int) -> Float[ndarray, "vertex 3"]:
 
 
 def _fit_capsule(bone: int, start: ndarray, end: ndarray, around: ndarray) -> Capsule:
-    """Give a line the middle distance of the surface that lies beside it as radius."""
+    """Fit a capsule's radius: the median distance of the surface around its line."""
     line = end - start
     share = (around - start) @ line / (line @ line)
     beside = (share > 0.1) & (share < 0.9)
