@@ -107,8 +107,8 @@ class SearchVariable(Settings, frozen=True, kw_only=True):
             interval = f"The interval reaches from {self.low:g} to {self.high:g}"
             raise SettingsError({"": f"{interval}: the low end must be lower."})
         if self.scale == "log" and self.low <= 0:
-            told = f"The interval begins at {self.low:g}; on a log scale it must begin above 0."
-            raise SettingsError({"": told})
+            problem = f"The interval begins at {self.low:g}; on a log scale it must begin above 0."
+            raise SettingsError({"": problem})
 
     def to_unit(self, value: float) -> float:
         """Map a value to [0, 1]; values outside the interval land on its ends."""
@@ -576,19 +576,19 @@ def apply_overrides(base: PipelineConfig, overrides: Mapping[str, Any]) -> Pipel
     Raises:
         SettingsError: If settings are unknown or out of bounds, or do not go together; names all.
     """
-    known = {setting.path: setting for setting in all_settings()}
+    settings = {setting.path: setting for setting in all_settings()}
     values = base.to_dict()
     problems: dict[str, str] = {}
     for path, value in overrides.items():
         parent, _, name = path.rpartition(".")
-        if parent in known and known[parent].kind == "interval" and name in _INTERVAL_FIELDS:
-            problem = _override_end(values, known[parent], name, value)
-        elif path not in known:
-            problem = _unknown(path, known)
-        elif known[path].kind == "interval":
-            problem = _override_interval(values, known[path], value)
-        elif wanted := _plain_fields()[path].problem_of(value):
-            problem = f"{path} is {shown(value)}; expected {wanted}."
+        if parent in settings and settings[parent].kind == "interval" and name in _INTERVAL_FIELDS:
+            problem = _override_end(values, settings[parent], name, value)
+        elif path not in settings:
+            problem = _unknown(path, settings)
+        elif settings[path].kind == "interval":
+            problem = _override_interval(values, settings[path], value)
+        elif expected := _plain_fields()[path].problem_of(value):
+            problem = f"{path} is {shown(value)}; expected {expected}."
         else:
             problem = ""
             _place(values, path, value)
@@ -597,9 +597,9 @@ def apply_overrides(base: PipelineConfig, overrides: Mapping[str, Any]) -> Pipel
     if problems:
         raise SettingsError(problems)
     config = PipelineConfig.from_dict(values)
-    for name, told in _clashes(config).items():
+    for name, clash in _clashes(config).items():
         start = f"simulation.{name}"
-        problems[start if start in overrides else f"{INTERVALS}.{name}"] = told
+        problems[start if start in overrides else f"{INTERVALS}.{name}"] = clash
     if problems:
         raise SettingsError(problems)
     return config
@@ -671,10 +671,10 @@ def _place(values: dict[str, Any], path: str, value: Any) -> None:
     values[name] = value
 
 
-def _unknown(path: str, known: Mapping[str, Setting]) -> str:
+def _unknown(path: str, settings: Mapping[str, Setting]) -> str:
     if path in FROM_SEQUENCE:
         return f"{path} is what the sequence says; it cannot be set."
-    return no_such("setting", path, known)
+    return no_such("setting", path, settings)
 
 
 def _interval_problem(setting: Setting, value: Any) -> str:
@@ -684,11 +684,11 @@ def _interval_problem(setting: Setting, value: Any) -> str:
     parameter, scale = PARAMETERS[setting.name], interval["scale"]
     ends = (interval["low"], interval["high"])
     if any(end is None or parameter.problem_of(parameter.converted(end)) for end in ends):
-        told = " to ".join(map(shown, ends))
-        return f"{setting.path} reaches from {told}; expected numbers {parameter.range}."
+        ends_text = " to ".join(map(shown, ends))
+        return f"{setting.path} reaches from {ends_text}; expected numbers {parameter.range}."
     if scale not in setting.choices:
-        wanted = " or ".join(setting.choices)
-        return f"{setting.path} has the scale {shown(scale)}; expected {wanted}."
+        expected = " or ".join(setting.choices)
+        return f"{setting.path} has the scale {shown(scale)}; expected {expected}."
     problems = problems_in(SearchVariable, interval, setting.path)
     return next(iter(problems.values()), "")
 

@@ -598,19 +598,19 @@ def depth_target(sequence: Sequence, side: HandSide, point_count: int) -> DepthT
         point, camera = np.zeros((0, 3)), np.zeros((0, 3))
         for view in views:
             is_hand = view.mask(frame) == HAND_LABEL[side]
-            seen = surface_points(view, view.depth(frame), is_hand)
-            point = np.concatenate([point, seen])
-            camera = np.concatenate([camera, view.camera.T_world_camera[:3, 3] - seen])
+            measured = surface_points(view, view.depth(frame), is_hand)
+            point = np.concatenate([point, measured])
+            camera = np.concatenate([camera, view.camera.T_world_camera[:3, 3] - measured])
         chosen = np.linspace(0, len(point) - 1, min(point_count, len(point))).round().astype(int)
         frames.append((point[chosen], camera[chosen]))
     if not any(len(point) for point, _ in frames):
         return None
     shape = (len(frames), point_count, 3)
     point, ray, weight = np.zeros(shape), np.zeros(shape), np.zeros(shape[:2])
-    for frame, (seen, camera) in enumerate(frames):
-        count = len(seen)
+    for frame, (measured, camera) in enumerate(frames):
+        count = len(measured)
         if count:
-            point[frame, :count] = seen
+            point[frame, :count] = measured
             ray[frame, :count] = camera / np.linalg.norm(camera, axis=1, keepdims=True)
             weight[frame, :count] = 1 / count
     return DepthTarget(

@@ -141,7 +141,7 @@ def _ranked_neighbors(node: ndarray, radius: float, most: int) -> _Ranked:
     if most < 1 or len(node) < 2:
         return np.zeros((0, 2), dtype=np.int64), np.zeros(0), np.zeros(0, dtype=np.int64)
     count = min(most + 1, len(node))
-    distance, neighbor = (np.asarray(found) for found in KDTree(node).query(node, k=count))
+    distance, neighbor = (np.asarray(columns) for columns in KDTree(node).query(node, k=count))
     own = np.arange(len(node))[:, None]
     is_other = neighbor != own
     place = np.cumsum(is_other, axis=1) - 1
@@ -161,7 +161,8 @@ def _ranked_holds(control: ndarray, node: ndarray, radius: float, most: int) -> 
         return np.zeros((0, 2), dtype=np.int64), np.zeros(0), np.zeros(0, dtype=np.int64)
     count = min(most, len(node))
     distance, neighbor = (
-        np.reshape(found, (len(control), count)) for found in KDTree(node).query(control, k=count)
+        np.reshape(columns, (len(control), count))
+        for columns in KDTree(node).query(control, k=count)
     )
     is_spring = distance < radius
     control_index = np.broadcast_to(np.arange(len(control))[:, None], neighbor.shape)[is_spring]

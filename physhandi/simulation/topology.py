@@ -40,7 +40,9 @@ def object_springs(
     if max_neighbors < 1 or node_count < 2:
         return _no_springs()
     neighbor_count = min(max_neighbors + 1, node_count)
-    distance, neighbor = (np.asarray(found) for found in KDTree(node).query(node, k=neighbor_count))
+    distance, neighbor = (
+        np.asarray(columns) for columns in KDTree(node).query(node, k=neighbor_count)
+    )
     own = np.arange(node_count)[:, None]
     is_other = neighbor != own
     # Of duplicated positions the node itself may rank behind its twins, or fall out.
@@ -75,7 +77,8 @@ def virtual_springs(
         return _no_springs()
     count = min(max_neighbors, len(node))
     distance, neighbor = (
-        np.reshape(found, (len(control), count)) for found in KDTree(node).query(control, k=count)
+        np.reshape(columns, (len(control), count))
+        for columns in KDTree(node).query(control, k=count)
     )
     is_kept = distance < radius
     control_index = np.broadcast_to(np.arange(len(control))[:, None], neighbor.shape)[is_kept]

@@ -81,7 +81,7 @@ def generator_version() -> str:
     return f"{code_hash(Path(__file__).parent, _PARTS)}-mujoco-{engine}"
 
 
-def told_version(recording: Sequence) -> str:
+def recorded_version(recording: Sequence) -> str:
     """Return the version of the generator that made a recording; empty if unknown."""
     return str(recording.provenance.get("generator") or "")
 
@@ -90,7 +90,7 @@ def outdated(recording: Sequence) -> str:
     """Explain that another generator made a synthetic recording; empty if this one did."""
     if "synthesize" not in recording.provenance:
         return ""
-    recorded, present = told_version(recording), generator_version()
+    recorded, present = recorded_version(recording), generator_version()
     if recorded == present or (present.endswith("-none") and recorded.startswith(present[:12])):
         return ""
     by = f"another version of the generator ({recorded})" if recorded else "an unknown generator"

@@ -125,7 +125,7 @@ def synthesize(
             frame_count=frames,
             ground_height=0.0,
             hands=tuple(hand.side for hand in stage.hands),
-            views=tuple(ViewMeta(name=view.name, camera=view.told) for view in views),
+            views=tuple(ViewMeta(name=view.name, camera=view.calibrated) for view in views),
             reconstruction=round(0.7 * frames),
             provenance={
                 "origin": "simulated by MuJoCo",

@@ -224,9 +224,9 @@ def _add_skinned_hand(
         "mode": TRIANGLES,
     }
     mesh = document.add_mesh(name, [primitive])
-    held = document.add_skin(name, bones, skin["T_bone_hand"])
-    # A skinned mesh hangs nowhere: its bones alone place it.
-    document.add_node(name, None, mesh=mesh, skin=held)
+    skin_number = document.add_skin(name, bones, skin["T_bone_hand"])
+    # A skinned mesh has no parent: only its bones place it.
+    document.add_node(name, None, mesh=mesh, skin=skin_number)
 
 
 def _add_moving_surface(

@@ -33,7 +33,7 @@ class Viewpoint:
     """Name of the view."""
     camera: PinholeCamera
     """The true camera."""
-    told: PinholeCamera
+    calibrated: PinholeCamera
     """The camera as its calibration states it."""
     delay: float
     """How much later than the first camera it takes its pictures [s]."""
@@ -70,7 +70,7 @@ def make_viewpoints(
         Viewpoint(
             name=f"camera{number}",
             camera=camera,
-            told=miscalibrated(camera, level, errors),
+            calibrated=miscalibrated(camera, level, errors),
             delay=float(late[number]),
         )
         for number, camera in enumerate(cameras)

@@ -214,7 +214,7 @@ class Shot:
                 for frame, row in enumerate(true_depth)
             ]
         )
-        lifted = self.view.told.unproject(reported.astype(np.float64), depth)
+        lifted = self.view.calibrated.unproject(reported.astype(np.float64), depth)
         lifted[~visible] = np.nan
         return lifted
 

@@ -84,8 +84,8 @@ class DepthSensor:
         lost |= self._shadow(depth, depth.shape[1] / IMAGER_WIDTH if scale is None else scale)
         if self.even_noise > 0:
             measured = measured + 1000.0 * self.even_noise * random.standard_normal(depth.shape)
-        kept = there & ~lost
-        return np.where(kept, np.clip(np.round(measured), 0, 65535), 0).astype(np.uint16)
+        is_measured = there & ~lost
+        return np.where(is_measured, np.clip(np.round(measured), 0, 65535), 0).astype(np.uint16)
 
     def measure_points(
         self, depth: Float[ndarray, " point"], random: Generator, *, offset: float = 0.0

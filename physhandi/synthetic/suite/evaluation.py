@@ -23,7 +23,7 @@ from physhandi.synthetic.code_version import (
     SCORES,
     code_version,
     outdated,
-    told_version,
+    recorded_version,
 )
 from physhandi.synthetic.suite.cells import FAILURES, Bench, Outcome
 from physhandi.synthetic.suite.folder import SuiteFolder, contact_kind, figures_of
@@ -268,7 +268,7 @@ def _about(order: Order, methods: Many[Method]) -> dict[str, Any]:
     environment = _environment(order)
     settings = [named_fields(r.provenance.get("synthesize")) or {} for r in order.recordings]
     seeds = sorted({one["seed"] for one in settings if isinstance(one.get("seed"), int)})
-    versions = [told_version(recording) for recording in order.recordings]
+    versions = [recorded_version(recording) for recording in order.recordings]
     return {
         "title": order.title,
         "command": order.command,
@@ -363,4 +363,4 @@ def _body(recording: Sequence) -> tuple[tuple[Any, ...] | None, Any]:
     if settings is None:
         return None, None
     body = tuple(settings.get(name) for name in ("object", "seed", "resolution"))
-    return (*body, told_version(recording)), settings.get("action")
+    return (*body, recorded_version(recording)), settings.get("action")

@@ -303,12 +303,12 @@ def correct(
     with run.begin_attempt() as attempt:
         for rel, path in artefacts(base.out):
             _copy(path, attempt.out / rel)
-        seen = {n: base.array(files.observation(n)) for n in ("point", "is_visible")}
+        observed = {n: base.array(files.observation(n)) for n in ("point", "is_visible")}
         name = files.observation("node_of_track")
         try:
             rollout = last_residual_baseline(
                 base.array(files.rollout),
-                **seen,
+                **observed,
                 first_future=len(recording.reconstruction_frames),
                 node_of_track=base.array(name) if base.has(name) else None,
             )

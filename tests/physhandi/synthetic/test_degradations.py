@@ -79,7 +79,7 @@ def test_a_wrong_calibration_is_off_by_the_levels():
     views = make_viewpoints(BOX, 3, Degradations(), 0)
     level = Degradations(camera_shift=0.002, camera_turn=0.2)
     for view in views:
-        assert np.array_equal(view.camera.T_world_camera, view.told.T_world_camera)
+        assert np.array_equal(view.camera.T_world_camera, view.calibrated.T_world_camera)
         told = miscalibrated(view.camera, level, rng()).T_world_camera
         true = view.camera.T_world_camera
         assert np.linalg.norm(told[:3, 3] - true[:3, 3]) == pytest.approx(0.002)

@@ -40,7 +40,8 @@ def write(
     views = make_viewpoints(stage.extent(), 2, level, seed)
     if images == "all":
         views = tuple(
-            replace(v, camera=resized(v.camera, 0.375), told=resized(v.told, 0.375)) for v in views
+            replace(v, camera=resized(v.camera, 0.375), calibrated=resized(v.calibrated, 0.375))
+            for v in views
         )
     if delay:
         views = tuple(replace(view, delay=delay) for view in views)
@@ -56,7 +57,7 @@ def describe(name: str, hands: tuple, views: tuple[Viewpoint, ...]) -> SequenceM
         frame_count=FRAMES,
         ground_height=0.0,
         hands=tuple(hand.side for hand in hands),
-        views=tuple(ViewMeta(name=view.name, camera=view.told) for view in views),
+        views=tuple(ViewMeta(name=view.name, camera=view.calibrated) for view in views),
     )
 
 
