@@ -54,11 +54,11 @@ class ObjectProblem:
     cloud: Float[Tensor, "frame point 3"]
     """Observed object points, padded [m]."""
     is_observed: Bool[Tensor, "frame point"]
-    """Which of the padded points are real."""
+    """False on padding."""
     track: Float[Tensor, "frame track 3"]
     """Observed tracks of the frames to fit [m]."""
     is_valid: Bool[Tensor, "frame track"]
-    """Where a track can be trusted."""
+    """Whether a track's motion is valid in a frame."""
     carrier: Int[Tensor, "track carrier"]
     """The nodes that carry each track."""
     carrier_weight: Float[Tensor, "track carrier"]

@@ -134,7 +134,7 @@ SHAPE_NAMES = (
     "finger_thickness",
     "thumb_set",
 )
-"""What each shape coefficient scales."""
+"""Length that each shape coefficient scales."""
 SHAPE_RATE = (0.05, 0.06, 0.06, 0.06, 0.06, 0.06, 0.06, 0.06, 0.08, 0.12)
 """A coefficient b multiplies its length by ``exp(rate * b)``; -3 to 3 is the sensible range."""
 

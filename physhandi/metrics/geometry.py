@@ -121,7 +121,7 @@ def marker_error(
 def nearest_node(
     point: Float[ndarray, "track 3"], node: Float[ndarray, "node 3"]
 ) -> Int[ndarray, " track"]:
-    """Give the node nearest to each point."""
+    """Find the node nearest to each point."""
     if len(point) == 0:
         return np.zeros(0, dtype=np.int64)
     tree: Any = KDTree(node)

@@ -191,7 +191,7 @@ def vertex_errors(
 def held_where_missing(
     motion: Float[ndarray, "frame point 3"],
 ) -> tuple[Float[ndarray, "frame point 3"] | None, int]:
-    """Let a hand stand still where its fit is not finite, as the static baseline does.
+    """Hold the last finite pose of a hand where its fit is not finite.
 
     Returns:
         The motion, each missing frame filled with the last finite one before it (at the start, with

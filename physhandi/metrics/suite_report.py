@@ -125,7 +125,7 @@ class SuiteRow:
 
 @dataclass(frozen=True, kw_only=True)
 class Difference:
-    """How much a method's figures differ from another one's on the cases that both have."""
+    """Difference between two methods on the cases that both have."""
 
     method: str
     """Name of the method."""

@@ -194,7 +194,7 @@ def _lift_tracks(
 
 
 def _join(paths: list[list[ndarray]], frame_count: int) -> Float[ndarray, "frame track 3"]:
-    """Put the tracks of all views side by side, without those that frame 0 does not show."""
+    """Concatenate the tracks of all views, without those that frame 0 does not show."""
     parts = [np.stack(path) for path in paths if path]
     point = np.concatenate([np.zeros((frame_count, 0, 3)), *parts], axis=1)
     return point[:, np.isfinite(point[0]).all(axis=-1)]

@@ -211,7 +211,7 @@ def _close_gaps(seen: Bool[ndarray, "row column"], spacing: float) -> Bool[ndarr
 def _in_hull(
     grid: Float[ndarray, "cell 2"], seen: Float[ndarray, "point 2"], spacing: float
 ) -> Bool[ndarray, " cell"]:
-    """Tell which cells lie in the convex hull of the seen ones."""
+    """Mark the cells in the convex hull of the seen ones."""
     corner = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]) * 0.5 * spacing
     outline = (seen[:, None] + corner).reshape(-1, 2)
     hull = outline[ConvexHull(outline).vertices]

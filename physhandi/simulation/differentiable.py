@@ -179,7 +179,7 @@ class _DifferentiableSimulator:
 
     @contextmanager
     def stream(self) -> Iterator[None]:
-        """Let PyTorch work on Warp's stream, ordered before and after with its own."""
+        """Run PyTorch on Warp's stream, synchronised with its own before and after."""
         if not self.simulator.device.is_cuda:
             yield
             return

@@ -36,7 +36,7 @@ class MasterTopology:
     rank: Int32[ndarray, " spring"]
     """Place among the neighbors of the end that proposes the spring first."""
     object_spring_count: int
-    """How many of the springs join two object nodes."""
+    """Number of leading springs that join two object nodes; the others are virtual."""
 
     @classmethod
     def of(

@@ -30,7 +30,7 @@ class SpringMassModel:
     damping: Float32[ndarray, " spring"]
     """Dashpot along the spring [N·s/m]."""
     object_spring_count: int
-    """How many of the springs join two object nodes; they come first."""
+    """Number of leading springs that join two object nodes; the others are virtual."""
     control_count: int
     """Number of control nodes."""
 

@@ -42,7 +42,7 @@ class SelfCollision:
         self._grid = wp.HashGrid(_GRID, _GRID, _GRID, device=self._device)
         self._counts = self._zeros(self._count + 1, wp.int32)
         self.start = self._zeros(self._count + 1, wp.int32)
-        """Where each node's candidates start, and the end of the last."""
+        """Start of each node's candidates, and the end of the last."""
         self.candidate = self._zeros(FIRST_CAPACITY * self._count, wp.int32)
         """Candidates of all nodes; those of a node are in ascending order."""
         self.position = self._zeros(self._count, wp.vec3)

@@ -132,7 +132,7 @@ class _Patch:
 
 
 def _lies_beside(found: list[ndarray], side: Float[ndarray, " 3"]) -> bool:
-    """Tell whether a triangle does not cover another one at their common edge."""
+    """Whether two triangles lie on different sides of their common edge."""
     return all(float(other @ side) < _OVERLAP for other in found)
 
 
@@ -176,7 +176,7 @@ def _oriented(faces: Int[ndarray, "face 3"]) -> Int[ndarray, "face 3"]:
 
 
 def _runs(corners: list[int], a: int, b: int) -> bool:
-    """Tell whether a triangle runs from corner a to corner b."""
+    """Whether corner b follows corner a in a triangle."""
     return corners[(corners.index(a) + 1) % 3] == b
 
 

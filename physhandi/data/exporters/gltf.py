@@ -126,7 +126,7 @@ class GltfDocument:
         )
 
     def animate(self, node: int, path: str, value: Float[ndarray, "row ..."]) -> None:
-        """Let a node's translation, rotation or weights follow one row (or one run) a frame."""
+        """Animate a node's translation, rotation or weights by one row (or one run) a frame."""
         output = self.add_array(value.astype(np.float32))
         self._samplers.append({"input": self._time, "output": output, "interpolation": "LINEAR"})
         target = {"node": node, "path": path}
@@ -139,7 +139,7 @@ class GltfDocument:
         return {"targets": targets} if targets else {}
 
     def animate_morph(self, node: int) -> None:
-        """Give each frame's target weight one in its frame and zero in all others."""
+        """Make weights that select each frame's target in its frame alone."""
         if self._frame_count > 1:
             weight = np.eye(self._frame_count, dtype=np.float32)[:, 1:]
             self.animate(node, "weights", weight.reshape(-1))

@@ -138,7 +138,7 @@ def _check_meaning(path: Path, arrays: dict[str, ndarray]) -> None:
 
 
 def _shrinks_along_x(arrays: dict[str, Float[ndarray, "..."]]) -> bool:
-    """Tell whether the first shape direction, a hand's size, acts against itself along x."""
+    """Whether the first shape direction, a hand's size, shrinks along x what grows along y, z."""
     vertex = arrays["v_template"] - arrays["v_template"].mean(axis=0)
     change = arrays["shapedirs"][:, :, 0]
     change = change - change.mean(axis=0)

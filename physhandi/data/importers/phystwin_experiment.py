@@ -59,7 +59,7 @@ class Checkpoint:
     stiffness: Float[ndarray, " spring"]
     """``spring_Y`` of each spring, in the order in which PhysTwin found the springs [N]."""
     object_spring_count: int
-    """How many of them join two object nodes; they come first."""
+    """Number of leading springs that join two object nodes."""
     contact: Contact
     """Collision coefficients."""
     epoch: int

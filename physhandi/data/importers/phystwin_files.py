@@ -42,7 +42,7 @@ class CaseMotion:
     node: Float[ndarray, "node 3"]
     """Object nodes at frame 0: tracked points, then surface points, then interior points [m]."""
     surface_node_count: int
-    """How many of the nodes are tracked points or surface points."""
+    """Number of leading nodes that are tracked points or surface points."""
     control: Float[ndarray, "frame control 3"]
     """Controller points [m]."""
 
@@ -98,7 +98,7 @@ class CaseImages:
         return self._existing(f"cotracker/{self.camera}.npz")
 
     def frame(self, folder: Path, frame: int, suffix: str) -> Path:
-        """Give the file of a frame.
+        """Return the file of a frame.
 
         Raises:
             ImportFailedError: If it is not there.

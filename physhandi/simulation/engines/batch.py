@@ -407,7 +407,7 @@ class Population:
 
 
 def _number(parameters: SimulationParameters, name: str, substeps: int) -> float:
-    """Give one of the kernel's numbers of a candidate."""
+    """Look up one of the kernel's parameters of a candidate."""
     duration = 1.0 / parameters.simulated_frame_rate
     height = parameters.ground_height
     scale = parameters.stiffness_scale

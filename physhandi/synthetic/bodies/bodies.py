@@ -28,7 +28,7 @@ class Body:
     """A soft body in its unloaded shape, which is also how it is laid down."""
 
     name: BodyName
-    """What it is."""
+    """Kind of body."""
     node: Float[ndarray, "node 3"]
     """Nodes in the world frame [m]; the first `surface_node_count` of them are on the surface."""
     elements: Int[ndarray, "element corner"]

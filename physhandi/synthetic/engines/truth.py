@@ -44,7 +44,7 @@ class MovingHand(Protocol):
         ...
 
     def at(self, time: float, /) -> TrueHandPose:
-        """Give the pose at any time [s]."""
+        """Compute the pose at a time [s]."""
         ...
 
 
@@ -59,7 +59,7 @@ class PhysicalTruth:
     contact: Bool[ndarray, "frame node"]
     """Whether a hand touches or holds the node."""
     hold: Hold
-    """How the hands hold."""
+    """Kind of hold."""
     hands: Mapping[Side, Float[ndarray, "frame bone 4 4"]]
     """Where each bone takes the points of the resting hand in each frame. Bones give way to what
     they touch, so this is not quite what the script asked for."""

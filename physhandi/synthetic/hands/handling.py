@@ -47,7 +47,7 @@ class Graspable(Protocol):
 
     @property
     def name(self) -> str:
-        """What kind of object it is."""
+        """Kind of object."""
         ...
 
     @property
@@ -73,7 +73,7 @@ class Grasp:
     poses: Sequence[TrueHandPose]
     """Poses from the one that first touches the object to the one that holds it."""
     place: Place
-    """Where the object is grasped, and which way the hand faces."""
+    """Place of the grasp and direction of the hand."""
     approach: Sequence[HandMove]
     """Path of the hand before the recording starts, from far away to the last pose."""
 

@@ -58,7 +58,7 @@ class PosedHand:
     keypoint: Float[ndarray, "21 3"]
     """Keypoints in MediaPipe's order [m]."""
     bone_transform: Float[ndarray, "bone 4 4"]
-    """Takes points of the resting hand with each bone into the world."""
+    """Transforms from the resting hand to the world by each bone."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

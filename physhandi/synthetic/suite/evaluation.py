@@ -51,7 +51,7 @@ class Order:
     methods: tuple[str, ...]
     """Names of methods."""
     protocols: tuple[Protocol, ...] = ("main",)
-    """Which protocols are run."""
+    """Protocols to run."""
     settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
     """Settings that all methods share."""
     device: str = "cpu"

@@ -52,18 +52,18 @@ _OPENING, _CLOSING = "[{(", "]})"
 
 @dataclass(frozen=True, kw_only=True)
 class Method:
-    """How the object's motion is predicted."""
+    """A way to predict the object's motion."""
 
     name: str
-    """What it is called in tables."""
+    """Name in tables."""
     about: str
-    """What it does, in one sentence."""
+    """Description in one sentence."""
     profile: str = "default"
     """Settings of the hands and, if there is no rule, of the object."""
     rule: Literal["static", "rigid_follow"] | None = None
-    """What moves the object in place of a fit."""
+    """Rule that moves the object; None for a fit."""
     gets: Given = "recording"
-    """What it is given: an oracle gets what no real method can have."""
+    """Input: an oracle gets data that no real method can have."""
     overrides: Mapping[str, Any] = field(default_factory=dict[str, Any])
     """Settings that differ from the profile's."""
     is_corrected: bool = False
@@ -159,7 +159,7 @@ def _split(settings: str) -> list[str]:
 
 
 def method_settings(method: Method, common: Mapping[str, Any]) -> dict[str, Any]:
-    """Give all settings of a method, in plain data.
+    """Return all settings of a method as plain data.
 
     Args:
         method: The method; its own settings win.
@@ -193,7 +193,7 @@ def execute(
     device: str = "cpu",
     progress: Progress,
 ) -> RunFolder:
-    """Let a method fill a run folder; a finished one is left as it is, another one goes on.
+    """Run a method in a run folder; a finished run is reused, an unfinished one is resumed.
 
     Args:
         method: The method, not corrected.

@@ -1,4 +1,4 @@
-"""What the suites hold: scenes, seeds, effort and methods.
+"""The suites: scenes, seeds, settings and methods.
 
 Difficulty is set here and in the scenes, once, before any method is tuned. Seeds from
 `RESERVED_SEED` on are kept for verification; nothing may be tuned on them.
@@ -39,7 +39,7 @@ class SuiteScene:
 
     @property
     def hold(self) -> Literal["friction", "attachment"]:
-        """How hands hold it: by friction, but by attachment where two of them pull."""
+        """Hold of the hands: friction, or attachment where two of them pull."""
         return "attachment" if self.action == "stretch" else "friction"
 
     def name(self, seed: int) -> str:

@@ -57,7 +57,7 @@ def unchanged(recording: Sequence, _random: Generator) -> VariantChange:
 
 
 def true_hand(recording: Sequence, _random: Generator) -> VariantChange:
-    """Give the vertices of the true hands as point controllers, and no hand to fit.
+    """Replace the hands by point controllers at the vertices of the true hands.
 
     Raises:
         MissingInputError: If the recording does not tell its true hands.
@@ -84,7 +84,7 @@ def all_frames(recording: Sequence, _random: Generator) -> VariantChange:
 
 
 def one_view(recording: Sequence, _random: Generator) -> VariantChange:
-    """Give the first camera alone.
+    """Keep the first camera alone.
 
     Raises:
         MissingInputError: If the object is observed by markers, which no single camera sees, or
@@ -143,7 +143,7 @@ def noisy_tracks(recording: Sequence, random: Generator) -> VariantChange:
 
 
 def noisy_hand(recording: Sequence, random: Generator) -> VariantChange:
-    """Give everything; the hands are disturbed after they were fitted.
+    """Keep the whole recording; the hands are disturbed after their fit.
 
     Raises:
         MissingInputError: If there is no hand to fit.
