@@ -211,12 +211,10 @@ def _simple(
     is_one = kind == "ply" and frame is not None
     try:
         name = f"{run_id}_{frame:05d}.ply" if is_one else f"{run_id}.{SUFFIXES.get(kind, kind)}"
-        name = f"{run_id}_ply" if kind == "ply" and not is_one else name
+        name = f"{run_id}_ply.zip" if kind == "ply" and not is_one else name
         path = export_run(
             run, kind, folder / name, sequence=sequence, frame=frame if is_one else None
         )
-        if path.is_dir():
-            path = Path(shutil.make_archive(str(path), "zip", path))
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise

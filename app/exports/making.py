@@ -2,8 +2,6 @@
 
 import json
 import os
-import shutil
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,7 +13,7 @@ from app.exports.offscreen import Offscreen
 from app.exports.painter import paint_scene, visible_from
 from app.exports.primitives import parts_of
 from app.exports.recording import record_scene
-from app.exports.request import SUFFIXES, FileRequest
+from app.exports.request import FileRequest
 from app.viewer.color.legend import draw_legend
 from app.viewer.content.content import Content, open_run, open_sequence
 from app.viewer.content.session_state import Pose, SessionState
@@ -111,7 +109,7 @@ def make(order: FileRequest, out: Path, report: Report = lambda _done, _of: None
         content_ = picture.content if order.format == "png" else bundle(snapshot, picture)
         write_bytes(out, content_)
     else:
-        _write_motion(order, snapshot, out)
+        export_scene(scene_data(snapshot), order.format, out, overwrite=True)
 
 
 class _Places:
@@ -179,18 +177,6 @@ def _picture(order: FileRequest, snapshot: Snapshot, state: SessionState) -> Scr
     if not is_written:
         raise UsageError("The picture could not be encoded; choose a smaller size.")
     return Screenshot(content=content.tobytes(), pose=pose, width=order.width, height=order.height)
-
-
-def _write_motion(order: FileRequest, snapshot: Snapshot, out: Path) -> None:
-    scene = scene_data(snapshot)
-    name = (
-        "frames" if order.format == "ply" else f"motion.{SUFFIXES.get(order.format, order.format)}"
-    )
-    with tempfile.TemporaryDirectory(dir=out.parent, prefix=".export-") as folder:
-        written = export_scene(scene, order.format, Path(folder) / name)
-        if written.is_dir():
-            written = Path(shutil.make_archive(str(written), "zip", written))
-        written.replace(out)
 
 
 _NICENESS = 5

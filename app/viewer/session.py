@@ -170,7 +170,7 @@ class Session(SceneServer):
     def _build(self) -> None:
         server, guard = self._server, self._guard
         set_theme(server, dark=False)
-        add_legend(server, self._content)
+        self._legend = add_legend(server, self._content)
         if len(self._names) > 1:
             now = self._content.sequence_name
             choice = server.gui.add_dropdown("Sequence", self._names, initial_value=now)
@@ -189,6 +189,7 @@ class Session(SceneServer):
             server,
             guard,
             self._playback.redraw,
+            color_instead=self._comparison.next_tint,
             reset_view=self._reset_view,
             snapshot=lambda event: export.save("PNG", event.client),
         )
@@ -283,12 +284,11 @@ class Session(SceneServer):
             rollout, rollout_frame = self._rollout_at(frame)
             self._view.draw(frame, rollout, rollout_frame, is_playing=is_playing)
             self._timeline.show(is_playing=is_playing)
+            is_hidden = self._comparison.is_on and rollout is not None
+            if self._legend.visible == is_hidden:
+                self._legend.visible = not is_hidden
             self._inspection.show(
-                rollout,
-                frame,
-                rollout_frame,
-                is_playing=is_playing,
-                is_hidden=self._comparison.is_on and rollout is not None,
+                rollout, frame, rollout_frame, is_playing=is_playing, is_hidden=is_hidden
             )
             if self._object is not None:
                 self._object.show(frame, is_playing=is_playing)

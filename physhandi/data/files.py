@@ -1,5 +1,6 @@
 """Writing files so that a reader sees the old content or the new, never half of it."""
 
+import io
 import json
 import math
 import os
@@ -7,6 +8,7 @@ import secrets
 import shutil
 import socket
 import tokenize
+import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path, PurePath
 from typing import Any, BinaryIO, cast
@@ -18,6 +20,8 @@ from safetensors import numpy as safetensors_numpy
 
 _MAGIC = b"\x93NUMPY"
 _ODD = (tokenize.TokenError, SyntaxError, TypeError, KeyError, OverflowError, MemoryError)
+_FIRST_TIME = (1980, 1, 1, 0, 0, 0)
+"""The earliest time that a ZIP archive can tell."""
 _HOST = socket.gethostname().replace("-", "_").replace(".", "_")[:32] or "host"
 
 
@@ -96,6 +100,18 @@ def write_atomically(
 def write_bytes(path: Path, content: bytes) -> None:
     """Replace a file's content."""
     write_atomically(path, lambda stream: stream.write(content))
+
+
+def zip_bytes(files: Iterable[tuple[str, bytes]]) -> bytes:
+    """Pack files, by their names, as a ZIP archive; the same files give the same bytes."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in files:
+            entry = zipfile.ZipInfo(name, _FIRST_TIME)
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            entry.external_attr = 0o644 << 16
+            archive.writestr(entry, content)
+    return stream.getvalue()
 
 
 def write_array(path: Path, array: np.ndarray) -> None:

@@ -37,15 +37,25 @@ class Paints(Protocol):
 class ColorPanel:
     """A choice, a legend and a range that follows the sequence or is held."""
 
-    def __init__(self, server: viser.ViserServer, guard: Guard, redraw: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        guard: Guard,
+        redraw: Callable[[], None],
+        *,
+        color_instead: Callable[[int], bool],
+    ) -> None:
         """Add the panel, hidden until there is something to color.
 
         Args:
             server: Where to.
             guard: Wraps the callbacks.
             redraw: Draws the current frame again.
+            color_instead: Gives what is shown instead of the scene its next colors, or those
+                before; False if it is the scene.
         """
         self._redraw = redraw
+        self._color_instead = color_instead
         self._layers = Layers()
         self._painter: Paints | None = None
         self._is_metric = True
@@ -79,7 +89,7 @@ class ColorPanel:
         before = self._layers
         self._layers, self._painter = layers, painter
         self._is_metric = content.is_metric
-        self._folder.visible = bool(painter.offered)
+        self._folder.visible = self.is_there
         self._choice.options = ("plain", *painter.offered)
         layers.color = before.color if before.color in self._choice.options else "plain"
         layers.color_range = before.color_range if layers.color == before.color else None
@@ -88,7 +98,7 @@ class ColorPanel:
     @property
     def is_there(self) -> bool:
         """Whether there is something to color."""
-        return bool(self._folder.visible)
+        return self._painter is not None and bool(self._painter.offered)
 
     def restore(self) -> None:
         """Show what the layers say now."""
@@ -105,15 +115,20 @@ class ColorPanel:
 
     def next(self, step: int) -> None:
         """Color by the next quantity of the list, or by one before."""
+        if self._color_instead(step):
+            return
         options = list(self._choice.options)
         with self._turn:  # Two quick presses are heard in threads of their own.
-            if self._folder.visible:
+            if self.is_there:
                 at = options.index(self._layers.color)
                 self.choose(options[(at + step) % len(options)])
 
     def show(self, *, is_playing: bool, is_hidden: bool) -> None:
-        """Follow what was painted last, or say nothing while something else is shown."""
+        """Follow what was painted last, or hide while something else is shown."""
         painter = self._painter
+        is_shown = self.is_there and not is_hidden
+        if self._folder.visible != is_shown:
+            self._folder.visible = is_shown
         legend = painter.legend if painter is not None and not is_hidden else None
         written = "" if legend is None else legend_html(legend, highest=not is_playing)
         if is_playing and self._legend_head(written) == self._legend_head(self._written):

@@ -261,6 +261,14 @@ class LiveComparison:
         with self._lock:
             return self._view is not None and self._view.reset_view(client)
 
+    def next_tint(self, step: int) -> bool:
+        """Give both sides their next colors, or those before; False outside of a comparison."""
+        with self._lock:
+            view = self._view
+        if view is not None:
+            view.panel.next_tint(step)
+        return view is not None
+
     def _enter(self, compared: Compared, kept: ObjectRollout | None) -> None:
         content, framing = self._content, self._framing
         if content is None or framing is None or content.fitted is None:
@@ -286,7 +294,6 @@ class LiveComparison:
                 cameras=self._cameras,
                 look=look,
                 redraw=self._redraw,
-                has_keys=False,
             )
         self._described = ()
         self._stop_button.visible = compared == "kept"

@@ -47,7 +47,6 @@ class ComparePanel:
         curve: DifferenceCurve,
         *,
         change: Callable[[], None],
-        has_keys: bool,
     ) -> None:
         """Add the panel.
 
@@ -57,7 +56,6 @@ class ComparePanel:
             look: What the switches change.
             curve: The difference.
             change: Called when the look has changed.
-            has_keys: Whether C changes the colors; elsewhere it has another meaning.
         """
         self._look = look
         self._curve = curve
@@ -76,12 +74,11 @@ class ComparePanel:
             self._mode = gui.add_dropdown(
                 "Show", tuple(MODES.values()), initial_value=MODES[look.mode], hint="M: the next"
             )
-            hint = "Beside each other, both can have the colors of the paper's figure"
             self._tint = gui.add_dropdown(
                 "Colors of A and B",
                 tuple(TINTS.values()),
                 initial_value=TINTS[look.tint],
-                hint=f"C: the next. {hint}" if has_keys else hint,
+                hint="C: the next. Beside each other, both can have those of the paper's figure",
             )
             self._fade = gui.add_slider(
                 "A ↔ B", 0.0, 1.0, 0.01, look.fade, hint="Left: A alone, right: B alone"
@@ -101,8 +98,6 @@ class ComparePanel:
         self._swap.on_click(guard(lambda _: self.swap()))
         self._commands = bind(server, guard, "swap", lambda _, __: self.swap())
         self._commands += bind(server, guard, "compare_mode", lambda _, __: self.next_mode())
-        if has_keys:
-            self._commands += bind(server, guard, "color", lambda _, __: self.next_tint())
         self._dress()
 
     def remove(self) -> None:
@@ -164,10 +159,10 @@ class ComparePanel:
         self._mode.value = MODES[mode]
         self._choose()
 
-    def next_tint(self) -> None:
-        """Go to the next meaning of the colors."""
+    def next_tint(self, step: int) -> None:
+        """Go to the next meaning of the colors, or to one before."""
         tints = list(TINTS)
-        self._tint.value = TINTS[tints[(tints.index(self._look.tint) + 1) % len(tints)]]
+        self._tint.value = TINTS[tints[(tints.index(self._look.tint) + step) % len(tints)]]
         self._choose()
 
     def _choose(self) -> None:

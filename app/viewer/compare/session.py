@@ -154,11 +154,12 @@ class CompareSession(SceneServer):
             cameras=self._cameras,
             look=Look(mode=self._ask.mode, tint=self._ask.color),
             redraw=self._playback.redraw,
-            has_keys=True,
         )
         self._layers_panel = LayersPanel(server, shown, guard, self._playback.redraw)
         self._layers_panel.replace(shown, self._layers, framing)
         export = ExportPanel(server, guard, self.snapshot)
+        bind(server, guard, "color", lambda _, __: self._view.panel.next_tint(1))
+        bind(server, guard, "color_back", lambda _, __: self._view.panel.next_tint(-1))
         bind(server, guard, "reset", lambda event, _: self._reset_view(event))
         bind(server, guard, "snapshot", lambda event, _: export.save("PNG", event.client))
         names = {side: plain(c.title) for side, c in zip(SIDES, pair.contents, strict=True)}

@@ -32,7 +32,6 @@ class CompareView:
         cameras: ComparisonCameras,
         look: Look,
         redraw: Callable[[], None],
-        has_keys: bool,
     ) -> None:
         """Add the panel where the caller stands.
 
@@ -45,7 +44,6 @@ class CompareView:
             cameras: Where the clients' cameras stood before.
             look: How it begins.
             redraw: Draws the current frame again.
-            has_keys: Whether C changes the colors; in a live scene it has another meaning.
         """
         self.look = look
         self.drawing = CompareDrawing(server, content, framing, rollouts, look)
@@ -56,7 +54,7 @@ class CompareView:
         self._panel: ComparePanel | None = None
         self.curve = DifferenceCurve(self._measured)
         self.panel = self._panel = ComparePanel(
-            server, guard, look, self.curve, change=self._change, has_keys=has_keys
+            server, guard, look, self.curve, change=self._change
         )
 
     def draw(self, tick: int, sides: Sides, layers: Layers, *, is_playing: bool) -> None:

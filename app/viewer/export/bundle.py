@@ -1,10 +1,7 @@
 """Everything that a picture of a scene shows, in one ZIP archive that explains itself."""
 
-import csv
-import io
 import json
 import logging
-import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -17,7 +14,8 @@ from app.viewer.content.content import Content
 from app.viewer.content.session_state import Pose
 from app.viewer.export.snapshot import Snapshot, snapshot_ply
 from physhandi import __version__
-from physhandi.data.files import plain, without_non_finite
+from physhandi.data.exporters.table import csv_bytes, npz_bytes, rounded
+from physhandi.data.files import plain, without_non_finite, zip_bytes
 from physhandi.errors import MissingInputError
 from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.forces import spring_strains
@@ -31,7 +29,6 @@ _SPRINGS = (
     *("strain", "stiffness_N", "damping_Ns_per_m"),
 )
 _FORCES = ("side", "spring", "node", "control", "force_x_N", "force_y_N", "force_z_N")
-_ALWAYS_THE_SAME = (1980, 1, 1, 0, 0, 0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -79,14 +76,8 @@ def bundle(snapshot: Snapshot, picture: Screenshot) -> bytes:
     if snapshot.link:
         files["permalink.txt"] = f"{snapshot.link}\n".encode()
     files["README.txt"] = _readme(snapshot, files).encode()
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name in sorted(files, key=lambda name: (name != "README.txt", name)):
-            about = zipfile.ZipInfo(name, _ALWAYS_THE_SAME)
-            about.compress_type = zipfile.ZIP_DEFLATED
-            about.external_attr = 0o644 << 16
-            archive.writestr(about, files[name])
-    return stream.getvalue()
+    names = sorted(files, key=lambda name: (name != "README.txt", name))
+    return zip_bytes((name, files[name]) for name in names)
 
 
 def _sides(snapshot: Snapshot) -> dict[str, tuple[ObjectRollout, int]]:
@@ -105,11 +96,11 @@ def _tables(sides: dict[str, tuple[ObjectRollout, int]]) -> dict[str, bytes]:
         model, first = rollout.model, rollout.model.object_spring_count
         position, control = np.asarray(rollout.position[frame]), np.asarray(rollout.control[frame])
         for node, (place, force) in enumerate(zip(position, rollout.forces(frame), strict=True)):
-            nodes.append([side, node, *_texts(place), *_texts(force)])
+            nodes.append([side, node, *rounded(place), *rounded(force)])
         ends = np.sort(model.spring_nodes, axis=1)
         held = np.bincount(ends[first:, 1] - model.node_count, minlength=len(control))
         for number, place in enumerate(control):
-            controls.append([side, number, *_texts(place), int(held[number])])
+            controls.append([side, number, *rounded(place), int(held[number])])
         strain = spring_strains(model, position, control)
         for number, (node, other) in enumerate(ends.tolist()):
             is_virtual = number >= first
@@ -118,16 +109,16 @@ def _tables(sides: dict[str, tuple[ObjectRollout, int]]) -> dict[str, bytes]:
             about = [(1 + strain[number]) * rest, rest, strain[number], stiffness]
             kind = "virtual" if is_virtual else "object"
             end = other - model.node_count if is_virtual else other
-            texts = _texts([*about, float(model.damping[number])])
+            texts = rounded([*about, float(model.damping[number])])
             springs.append([side, number, kind, node, end, *texts])
         for number, force in enumerate(rollout.spring_forces(frame), first):
             node, other = ends[number].tolist()
-            forces.append([side, number, node, other - model.node_count, *_texts(force)])
+            forces.append([side, number, node, other - model.node_count, *rounded(force)])
     return {
-        "nodes.csv": _csv(_NODES, nodes),
-        "controls.csv": _csv(_CONTROLS, controls),
-        "springs.csv": _csv(_SPRINGS, springs),
-        "forces.csv": _csv(_FORCES, forces),
+        "nodes.csv": csv_bytes(_NODES, nodes),
+        "controls.csv": csv_bytes(_CONTROLS, controls),
+        "springs.csv": csv_bytes(_SPRINGS, springs),
+        "forces.csv": csv_bytes(_FORCES, forces),
     }
 
 
@@ -147,9 +138,7 @@ def _arrays(sides: dict[str, tuple[ObjectRollout, int]], snapshot: Snapshot) -> 
         arrays[f"hand_{hand.side}_vertex"] = np.asarray(vertex)
         if hand.face is not None:
             arrays[f"hand_{hand.side}_face"] = np.asarray(hand.face)
-    stream = io.BytesIO()
-    np.savez_compressed(stream, allow_pickle=False, **arrays)
-    return stream.getvalue()
+    return npz_bytes(arrays)
 
 
 def _parameters(sides: dict[str, tuple[ObjectRollout, int]]) -> bytes:
@@ -272,17 +261,5 @@ _ABOUT = (
 )
 
 
-def _csv(columns: tuple[str, ...], rows: list[list[Any]]) -> bytes:
-    stream = io.StringIO()
-    table = csv.writer(stream, lineterminator="\n")
-    table.writerow(columns)
-    table.writerows(rows)
-    return stream.getvalue().encode()
-
-
 def _json(content: Any) -> bytes:
     return (json.dumps(without_non_finite(plain(content)), indent=1) + "\n").encode()
-
-
-def _texts(values: Any) -> list[str]:
-    return [f"{float(value):.9g}" for value in values]

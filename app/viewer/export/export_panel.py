@@ -12,8 +12,6 @@ from app.viewer.content.session_state import Pose
 from app.viewer.export.bundle import Screenshot, bundle
 from app.viewer.export.snapshot import (
     Snapshot,
-    comparison_csv,
-    comparison_npz,
     snapshot_csv,
     snapshot_gltf,
     snapshot_npz,
@@ -31,6 +29,7 @@ _FRAME = ("PNG", "PLY", "ZIP")
 _MOTION = ("GLB", "PLYs", "NPZ")
 _TABLES = ("CSV", "YAML")
 _OF_COMPARISON = ("PNG", "NPZ", "CSV", "ZIP")
+"""Files that show both sides of a comparison."""
 _RENDER_SECONDS = 20.0
 _RENDER_SECONDS_PER_PIXEL = 5e-6
 _WINDOW, _OWN = "as this window", "own size"
@@ -101,7 +100,7 @@ class ExportPanel:
         """Send a file to a client, as the button of that name does."""
         snapshot = self._snapshot()
         stem = re.sub(r"[^A-Za-z0-9_-]+", "_", snapshot.content.title)[:60] or "physhandi"
-        compared, suffix = snapshot.compared, {"PLYs": "ply.zip"}.get(kind, kind.lower())
+        suffix = {"PLYs": "ply.zip"}.get(kind, kind.lower())
         is_of_frame = kind in _FRAME
         if kind in {"PNG", "ZIP"}:
             size = self._picture_size()
@@ -109,12 +108,10 @@ class ExportPanel:
             if kind == "ZIP":
                 picture = Screenshot.of(content, Pose.of(client.camera))
                 content = bundle(snapshot, picture)
-        elif compared is not None and kind in _COMPARISON_WRITERS:
-            content = _COMPARISON_WRITERS[kind](compared)
-            is_of_frame = kind == "CSV"
         else:
             content = _MAKERS[kind](snapshot)
-        stem = stem if compared is None or kind not in _OF_COMPARISON else f"{stem}_figure"
+        if snapshot.compared is not None and kind in _OF_COMPARISON:
+            stem, is_of_frame = f"{stem}_figure", kind != "NPZ"
         name = f"{stem}_{snapshot.frame:05d}" if is_of_frame else stem
         client.send_file_download(f"{name}.{suffix}", content, save_immediately=True)
         notify(client, "Saved", f"{name}.{suffix}, {len(content) / 1e3:.0f} kB", color="blue")
@@ -128,7 +125,6 @@ _MAKERS: dict[str, Callable[[Snapshot], bytes]] = {
     "CSV": snapshot_csv,
     "YAML": snapshot_yaml,
 }
-_COMPARISON_WRITERS = {"NPZ": comparison_npz, "CSV": comparison_csv}
 
 
 def write_png(

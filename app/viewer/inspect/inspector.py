@@ -289,6 +289,7 @@ class Inspection:
         guard: Guard,
         redraw: Callable[[], None],
         *,
+        color_instead: Callable[[int], bool],
         reset_view: Callable[[Any], None],
         snapshot: Callable[[Any], None],
     ) -> None:
@@ -298,10 +299,11 @@ class Inspection:
             server: Where to.
             guard: Wraps the callbacks.
             redraw: Draws the current frame again.
+            color_instead: See `ColorPanel`.
             reset_view: Puts the camera of the client of an event back.
             snapshot: Saves a picture for the client of an event.
         """
-        self.colors = ColorPanel(server, guard, redraw)
+        self.colors = ColorPanel(server, guard, redraw, color_instead=color_instead)
         self.inspector = Inspector(server, guard, redraw)
         self._redraw = redraw
         bind(server, guard, "reset", lambda event, _: reset_view(event))

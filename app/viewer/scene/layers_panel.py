@@ -27,7 +27,7 @@ def set_theme(server: viser.ViserServer, *, dark: bool) -> None:
     )
 
 
-def add_legend(server: viser.ViserServer, content: Content) -> None:
+def add_legend(server: viser.ViserServer, content: Content) -> viser.GuiHtmlHandle:
     """Add the legend of the parts that a content has."""
     entries: list[tuple[tuple[int, int, int], str]] = []
     if content.hands or content.skeletons:
@@ -44,7 +44,7 @@ def add_legend(server: viser.ViserServer, content: Content) -> None:
         entries.append((GREEN, "markers" if is_marked else "observed"))
     if content.views:
         entries.append((GREY, "cameras"))
-    server.gui.add_html(swatches_html(entries, is_list=False))
+    return server.gui.add_html(swatches_html(entries, is_list=False))
 
 
 _OVERVIEW = "Overview"

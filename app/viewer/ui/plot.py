@@ -14,6 +14,8 @@ _AXIS = "rgb(120,130,145)"
 _GRID = "rgba(120,130,145,0.2)"
 _MARGIN = 0.05
 """Room above and below the curves, as a part of their range."""
+_PADDING = (8, 12, 0, 0)
+"""Room for the uppermost and the last number of the axes: top, right, bottom, left [px]."""
 _LONGEST_LABEL = 16
 """Characters that fit along the axis; of a longer label only the unit is written."""
 
@@ -81,6 +83,7 @@ class FramePlot:
             axes=self._axes(),
             legend=uplot.Legend(show=False),
             height=height,
+            padding=_PADDING,
             order=order,
         )
 

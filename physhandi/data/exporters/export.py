@@ -1,14 +1,14 @@
 """Exports runs and simulated motion to all formats, atomically."""
 
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 from jaxtyping import Int
 from numpy import ndarray
 
-from physhandi.data.exporters.gltf import write_gltf
-from physhandi.data.exporters.mesh import write_frame, write_frames
+from physhandi.data.exporters.gltf import scene_to_gltf
+from physhandi.data.exporters.mesh import frame_files
 from physhandi.data.exporters.scene_data import SceneData, read_scene
 from physhandi.data.exporters.table import (
     write_npz,
@@ -16,7 +16,7 @@ from physhandi.data.exporters.table import (
     write_tables,
     write_trajectories,
 )
-from physhandi.data.files import temporary_name
+from physhandi.data.files import temporary_name, write_bytes, zip_bytes
 from physhandi.data.run import RunFolder
 from physhandi.errors import UsageError
 
@@ -42,7 +42,8 @@ def export_run(
             ``csv`` (a file: trajectories; a folder: also parameters and metrics) or ``yaml``
             (settings, parameters, losses and metrics of the whole run), or ``gltf`` (one ``.glb``
             file: skinned hands, object nodes and springs, moving).
-        out_path: File to write. Without the format's suffix, PLY and CSV make a folder.
+        out_path: File to write; all frames as PLY go to a ``.zip``. Without the format's suffix,
+            PLY and CSV make a folder.
         sequence: Which sequence; None takes the first.
         frame: Only this frame (PLY); None takes all, which needs a folder.
         overwrite: Whether to replace an export that is there.
@@ -60,7 +61,7 @@ def export_run(
         raise UsageError(f"'{format}' is not a format; choose one of {', '.join(FORMATS)}.")
     if frame is not None and format != "ply":
         raise UsageError(f"A single frame can be exported as ply only, not as {format}.")
-    is_folder = format in {"ply", "csv"} and out.suffix != f".{format}"
+    is_folder = (format == "csv" and out.suffix != ".csv") or _is_folder_of_frames(format, out)
     _check_target(out, format, is_folder=is_folder, overwrite=overwrite)
     if format == "yaml":
         return _publish(out, lambda path: write_summary(path, run), is_folder=False)
@@ -83,7 +84,7 @@ def export_scene(
     Args:
         scene: The motion.
         format: ``ply``, ``npz``, ``csv`` (trajectories) or ``gltf``; see `export_run`.
-        out_path: File to write, or a folder for all frames as PLY.
+        out_path: File to write; all frames as PLY go to a ``.zip`` or a folder.
         frame: Only this frame (PLY).
         overwrite: Whether to replace an export that is there.
 
@@ -97,7 +98,7 @@ def export_scene(
     if format not in SCENE_FORMATS:
         formats = ", ".join(SCENE_FORMATS)
         raise UsageError(f"'{format}' is not a format of motion; choose one of {formats}.")
-    is_folder = format == "ply" and out.suffix != ".ply"
+    is_folder = _is_folder_of_frames(format, out)
     _check_target(out, format, is_folder=is_folder, overwrite=overwrite)
     return _write_scene(scene, format, out, frame, is_folder=is_folder)
 
@@ -112,7 +113,7 @@ def _write_scene(
 ) -> Path:
     whole: dict[str, Callable[[Path], None]] = {
         "npz": lambda path: write_npz(path, scene),
-        "gltf": lambda path: write_gltf(path, scene),
+        "gltf": lambda path: write_bytes(path, scene_to_gltf(scene)),
         "csv": lambda path: write_trajectories(path, scene),
     }
     if format in whole:
@@ -121,16 +122,26 @@ def _write_scene(
         raise UsageError(
             f"Sequence '{scene.sequence}' has frames 0 to {scene.frame_count - 1}, not {frame}."
         )
-    if frame is not None:
-        name = f"frame_{frame:05d}.ply"
-        return _publish(
-            out,
-            lambda path: write_frame(path / name if is_folder else path, scene, frame),
-            is_folder=is_folder,
+    if out.suffix == ".ply" and frame is None:
+        raise UsageError(
+            f"{out} is one file; name a folder or a .zip for all frames, or choose one frame."
         )
-    if not is_folder:
-        raise UsageError(f"{out} is one file; name a folder for all frames, or choose one frame.")
-    return _publish(out, lambda path: write_frames(path, scene), is_folder=True)
+    files = frame_files(scene, None if frame is None else [frame])
+    if is_folder:
+        return _publish(out, lambda path: _write_files(path, files), is_folder=True)
+    if out.suffix == ".zip":
+        return _publish(out, lambda path: write_bytes(path, zip_bytes(files)), is_folder=False)
+    ((_, content),) = files
+    return _publish(out, lambda path: write_bytes(path, content), is_folder=False)
+
+
+def _write_files(folder: Path, files: Iterable[tuple[str, bytes]]) -> None:
+    for name, content in files:
+        write_bytes(folder / name, content)
+
+
+def _is_folder_of_frames(format: str, out: Path) -> bool:  # noqa: A002
+    return format == "ply" and out.suffix not in {".ply", ".zip"}
 
 
 def _check_target(out: Path, suffix: str, *, is_folder: bool, overwrite: bool) -> None:

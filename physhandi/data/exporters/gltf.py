@@ -9,7 +9,6 @@ do. three.js holds every weight in a shader constant, of which WebGL 2 promises 
 import json
 import struct
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,6 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from physhandi.data.exporters.scene_data import HandSurface, SceneData
-from physhandi.data.files import write_bytes
 
 POINTS, LINES, TRIANGLES = 0, 1, 4
 """How a primitive's vertices are joined."""
@@ -173,14 +171,10 @@ class GltfDocument:
 _OBJECT, _SPRING, _HAND = (0.045, 0.156, 0.716), (0.35, 0.45, 0.75), (0.753, 0.457, 0.328)
 
 
-def write_gltf(path: Path, scene: SceneData) -> None:
-    """Write hands, object nodes and object springs of all frames to a ``.glb`` file.
+def scene_to_gltf(scene: SceneData) -> bytes:
+    """Describe hands, object nodes and object springs of all frames as binary glTF (``.glb``).
 
     A hand without a skin (in runs of version 0.1) becomes a mesh with a morph target a frame.
-
-    Args:
-        path: File to write.
-        scene: The motion.
     """
     extras = {"sequence": scene.sequence, "run": scene.run, "length_unit": scene.length_unit}
     document = GltfDocument(scene.frame_rate, scene.frame_count, extras)
@@ -191,7 +185,7 @@ def write_gltf(path: Path, scene: SceneData) -> None:
             _add_moving_surface(document, side, hand, scene.frame_count)
     if scene.rollout.shape[1]:
         _add_object(document, scene)
-    write_bytes(path, document.to_bytes())
+    return document.to_bytes()
 
 
 def _add_skinned_hand(

@@ -1,13 +1,12 @@
 """Frames as binary PLY: object nodes, hand meshes, and virtual springs as edges."""
 
-from pathlib import Path
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from physhandi.data.exporters.scene_data import SceneData
-from physhandi.data.files import write_bytes
 
 _OBJECT, _CONTROL, _HAND = (
     np.array(color, np.uint8) for color in ((60, 110, 220), (210, 60, 50), (225, 180, 155))
@@ -91,12 +90,9 @@ def ply_bytes(
     return text.encode() + vertices.tobytes() + faces.tobytes() + edge.astype("<i4").tobytes()
 
 
-def write_frame(path: Path, scene: SceneData, frame: int) -> None:
-    """Write one frame to a PLY file."""
-    write_bytes(path, frame_to_ply(scene, frame))
-
-
-def write_frames(folder: Path, scene: SceneData) -> None:
-    """Write every frame to ``frame_00000.ply`` and so on."""
-    for frame in range(scene.frame_count):
-        write_frame(folder / f"frame_{frame:05d}.ply", scene, frame)
+def frame_files(
+    scene: SceneData, frames: Iterable[int] | None = None
+) -> Iterator[tuple[str, bytes]]:
+    """Describe frames, or else all of them, as files: ``frame_00000.ply`` and so on."""
+    for frame in range(scene.frame_count) if frames is None else frames:
+        yield f"frame_{frame:05d}.ply", frame_to_ply(scene, frame)

@@ -79,12 +79,24 @@ def write_summary(path: Path, run: RunFolder) -> None:
 
 
 def write_csv(path: Path, columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
-    """Write a CSV file that is safe to open in a spreadsheet; see `safe_cell`."""
+    """Write a CSV file; see `csv_bytes`."""
+    write_bytes(path, csv_bytes(columns, rows))
+
+
+def csv_bytes(columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> bytes:
+    """Encode a table as CSV that is safe to open in a spreadsheet; see `safe_cell`."""
     buffer = io.StringIO(newline="")
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow([safe_cell(column) for column in columns])
     writer.writerows([safe_cell(cell) for cell in row] for row in rows)
-    write_bytes(path, buffer.getvalue().encode())
+    return buffer.getvalue().encode()
+
+
+def npz_bytes(arrays: Mapping[str, Any]) -> bytes:
+    """Encode arrays by their names as a compressed NPZ archive without pickles."""
+    stream = io.BytesIO()
+    np.savez_compressed(stream, allow_pickle=False, **arrays)
+    return stream.getvalue()
 
 
 def safe_cell(value: Any) -> Any:
@@ -113,9 +125,9 @@ def _trajectory_rows(scene: SceneData) -> Iterator[tuple[Any, ...]]:
         for kind, position in kinds:
             for index, (x, y, z) in enumerate(position[frame].tolist()):
                 row = scene.sequence, frame, time, kind, index
-                yield *row, _short(x), _short(y), _short(z)
+                yield *row, *rounded((x, y, z))
 
 
-def _short(value: float) -> float:
-    """Keep nine digits: they bring every 32-bit number back exactly."""
-    return float(f"{value:.9g}")
+def rounded(values: Iterable[Any]) -> list[float]:
+    """Keep nine digits of numbers, which bring every 32-bit number back exactly."""
+    return [float(f"{value:.9g}") for value in values]

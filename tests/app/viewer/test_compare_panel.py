@@ -12,6 +12,22 @@ from app.viewer.compare.panel import ComparePanel
 from app.viewer.ui.guard import Guard
 
 
+class WatchedLock:
+    """The panel's lock, which tells that a thread waits for it."""
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+        self.is_awaited = threading.Event()
+
+    def __enter__(self) -> None:
+        if not self._lock.acquire(blocking=False):
+            self.is_awaited.set()
+            self._lock.acquire()
+
+    def __exit__(self, *_: object) -> None:
+        self._lock.release()
+
+
 class MeasuredMeanwhile(DifferenceCurve):
     """A difference that gets known while the clock's thread writes that it is not."""
 
@@ -19,7 +35,7 @@ class MeasuredMeanwhile(DifferenceCurve):
         super().__init__(lambda: None)
         self.is_measured = False
         self.was_asked = threading.Event()
-        self.has_written = threading.Event()
+        self.has_gone_on = threading.Event()
 
     @property
     def way(self) -> Way | None:
@@ -37,7 +53,7 @@ class MeasuredMeanwhile(DifferenceCurve):
             return FrameDifference(mean=0.04, strong=0.055, largest=0.055)
         self.is_measured = True
         self.was_asked.set()
-        self.has_written.wait(0.3)
+        assert self.has_gone_on.wait(10.0)
         return None
 
 
@@ -46,16 +62,17 @@ def test_what_was_measured_is_not_overwritten_by_what_was_known_before(
 ) -> None:
     curve = MeasuredMeanwhile()
     curve.is_measured = True
-    panel = ComparePanel(
-        server, Guard(server), Look(tint="difference"), curve, change=lambda: None, has_keys=False
-    )
+    panel = ComparePanel(server, Guard(server), Look(tint="difference"), curve, change=lambda: None)
     panel.name({"a": "one", "b": "two"}, (), unit="m", tick_count=12)
     curve.is_measured = False
+    # Whoever measured either waits until the clock has written, or writes before it.
+    panel._lock = lock = WatchedLock()  # type: ignore[assignment]
+    lock.is_awaited = curve.has_gone_on
 
     def measure() -> None:
         assert curve.was_asked.wait(10.0)
         panel.follow()
-        curve.has_written.set()
+        curve.has_gone_on.set()
 
     measuring = threading.Thread(target=measure)
     measuring.start()
@@ -70,7 +87,7 @@ def test_a_panel_tells_whether_its_color_scale_changed(server: viser.ViserServer
     look = Look(tint="difference")
     curve = MeasuredMeanwhile()
     curve.is_measured = True
-    panel = ComparePanel(server, Guard(server), look, curve, change=lambda: None, has_keys=False)
+    panel = ComparePanel(server, Guard(server), look, curve, change=lambda: None)
     assert look.scale == 0.0
     assert panel.follow()
     assert abs(look.scale - 0.1) < 1e-12
@@ -80,7 +97,7 @@ def test_a_panel_tells_whether_its_color_scale_changed(server: viser.ViserServer
 def test_the_plot_marks_the_frame_at_which_the_clock_stops(server: viser.ViserServer) -> None:
     curve = MeasuredMeanwhile()
     curve.is_measured = True
-    panel = ComparePanel(server, Guard(server), Look(), curve, change=lambda: None, has_keys=False)
+    panel = ComparePanel(server, Guard(server), Look(), curve, change=lambda: None)
     panel.name({"a": "one", "b": "two"}, (), unit="m", tick_count=12)
     for tick in (4, 5, 6, 7):
         panel.show(tick, is_playing=True)

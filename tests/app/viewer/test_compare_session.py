@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from viewer_client import ViewerClient
-from viewer_world import FRAMES, PARAMETERS, FakeSettings, FolderCatalog, make_run
+from viewer_world import FRAMES, PARAMETERS, FakeSettings, FolderCatalog, hear_all, make_run
 
 from app.comparison import CompareAsk
 from app.viewer.compare.pair import open_pair
 from app.viewer.compare.sides import ComparedSide, compared_rollouts
-from app.viewer.export.snapshot import comparison_npz
+from app.viewer.export.snapshot import snapshot_npz
 from app.viewer.sessions import Sessions
 from physhandi.errors import MissingInputError, PhysHandiError, UsageError
 from physhandi.run import Run
@@ -298,9 +298,7 @@ def test_the_numbers_of_both_sides_can_be_saved(sessions: Sessions) -> None:
         client.until(lambda: client.find("Motion") != "")
         session = sessions.get(sessions.list()[0].id)
         assert session is not None
-        compared = session.snapshot().compared
-        assert compared is not None
-        with np.load(io.BytesIO(comparison_npz(compared))) as data:
+        with np.load(io.BytesIO(snapshot_npz(session.snapshot()))) as data:
             moved = data["b_position"] - data["a_position"]
         np.testing.assert_allclose(moved[3], np.tile(3 * OFFSET, (moved.shape[1], 1)), atol=1e-6)
 
@@ -338,5 +336,5 @@ def test_a_camera_that_was_not_moved_by_a_user_keeps_both_sides_in_its_picture(
         client.tell_camera(image_width=900)
         # The sides follow the camera, so that it was heard, and it stays where the user put it.
         client.until(lambda: stand_along(client, (0.0, 1.0, 0.0)))
-        client.listen(0.6)
+        hear_all(session._server, client)
         assert list(client.camera["position"]) == moved

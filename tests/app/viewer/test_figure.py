@@ -13,7 +13,7 @@ from app.viewer.compare.camera import Eye, picture_of_both
 from app.viewer.compare.drawing import ARROWS, CompareDrawing, Look, legend_force
 from app.viewer.compare.sides import ComparedSide
 from app.viewer.content.layers import Layers
-from app.viewer.export.snapshot import comparison_csv, comparison_npz
+from app.viewer.export.snapshot import Snapshot, snapshot_csv, snapshot_npz
 from app.viewer.scene.framing import frame_content
 from app.viewer.sessions import Sessions
 from physhandi.fitted_object import FittedObject
@@ -191,8 +191,14 @@ def test_the_live_process_holds_the_object_in_phystwins_way(run) -> None:
 def test_the_downloads_hold_positions_springs_and_forces_of_both_sides(run) -> None:
     content = content_of({}, run.array("sequences/lift/control.npy"))
     ours, rival = replace_rollout(content.fitted, run), rolled_out(run)
-    sides = {"ours": (ours, FRAME), "phystwin": (rival, FRAME)}
-    with np.load(io.BytesIO(comparison_npz(sides))) as saved:
+    snapshot = Snapshot(
+        content=content,
+        frame=FRAME,
+        rollout=ours,
+        rollout_frame=FRAME,
+        compared={"ours": (ours, FRAME), "phystwin": (rival, FRAME)},
+    )
+    with np.load(io.BytesIO(snapshot_npz(snapshot))) as saved:
         for name, take in (("ours", ours), ("phystwin", rival)):
             np.testing.assert_array_equal(saved[f"{name}_position"], take.position)
             np.testing.assert_array_equal(saved[f"{name}_control"], take.control)
@@ -200,7 +206,7 @@ def test_the_downloads_hold_positions_springs_and_forces_of_both_sides(run) -> N
             np.testing.assert_array_equal(saved[f"{name}_force"][FRAME], take.forces(FRAME))
             assert saved[f"{name}_frame"] == FRAME
         forces = {name: saved[f"{name}_force"][FRAME] for name in SIDES}
-    rows = list(csv.DictReader(io.StringIO(comparison_csv(sides).decode())))
+    rows = list(csv.DictReader(io.StringIO(snapshot_csv(snapshot).decode())))
     for name, take in (("ours", ours), ("phystwin", rival)):
         own = [row for row in rows if row["side"] == name]
         kinds = [row["kind"] for row in own]

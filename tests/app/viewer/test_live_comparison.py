@@ -124,7 +124,11 @@ def test_the_figure_and_what_was_kept_take_turns(sessions: Sessions) -> None:
         # The figure is a comparison like any other: its difference is measured and colored.
         client.until(lambda: f"PhysTwin-style: simulated {FRAMES}/{FRAMES}" in said(client))
         client.until(lambda: re.search(r"mean [\d.]+ mm", said(client)))
-        client.set("Colors of A and B", "of their difference")
+        # The keys of the colors are those of what is shown.
+        client.until(lambda: client.gui[client.find("Colors")]["visible"] is False)
+        press(client, "C")
+        client.until(lambda: client.value("Colors of A and B") == "of A and B")
+        press(client, "C")
         client.until(lambda: "≥" in said(client))
         client.set("Keep as A", "the fit")
         client.until(lambda: client.find("Compare with PhysTwin") != "")

@@ -1,6 +1,7 @@
 """Exports, read back by programs that know nothing of the exporter."""
 
 import csv
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -115,6 +116,18 @@ def test_all_frames_go_to_a_folder(tmp_path: Path) -> None:
     np.testing.assert_allclose(mesh.vertices[0], run.array("sequences/lift/rollout.npy")[1, 0])
     one = export_run(run, "ply", tmp_path / "one", frame=1)
     assert (one / names[1]).read_bytes() == (folder / names[1]).read_bytes()
+
+
+def test_all_frames_go_to_one_archive_that_is_the_same_every_time(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "fit")
+    folder = export_run(run, "ply", tmp_path / "frames")
+    packed = export_run(run, "ply", tmp_path / "frames.zip")
+    with zipfile.ZipFile(packed) as archive:
+        assert archive.testzip() is None
+        files = {name: archive.read(name) for name in archive.namelist()}
+    assert files == {path.name: path.read_bytes() for path in folder.iterdir()}
+    again = export_run(run, "ply", tmp_path / "again.zip")
+    assert again.read_bytes() == packed.read_bytes()
 
 
 def test_npz_can_be_read_without_pickle(tmp_path: Path) -> None:
