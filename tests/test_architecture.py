@@ -25,13 +25,8 @@ READABLE = 20
 ANYWHERE = {"logger", "main"}
 """Public names that mean the same in every module."""
 AMBIGUOUS = """
-AUTOMATIC Action CARRIERS COLUMNS CURVES Catalog Cell Change Curve FIELDS FINGERTIPS FLAT FOLDER
-FORMAT FORMATS FRAME_RATE HandPose Id Kind Link METHODS MOST MOST_FRAMES Motion Move
-PARTS Part Path Picture Raster Row SAFETY SIDES SMALLEST SPRINGS_AT_NODE STAGE Scene Sequence
-Setting Theme Window acceleration_loss evaluate evaluate_hands evaluate_suite export
-frame_errors is_higher_better measure open_run paint place_controls plain rasterize
-read_checkpoint read_json read_split reconstruct serve settings_of simulate summarize tape_layout
-triangle_areas unit_of vertex_normals work
+Catalog FORMATS Motion PARTS Part Raster Setting open_run plain rasterize reconstruct simulate
+triangle_areas vertex_normals
 """
 """Names that still have more than one meaning; the list only shrinks."""
 

@@ -19,6 +19,8 @@ _SIZE_LIMIT = 4_000_000
 _MOST_FRAMES = 1_000_000
 
 Side = Literal["right", "left"]
+SIDES: tuple[Side, Side] = ("right", "left")
+"""Hands in the order in which sequences list them."""
 
 
 @dataclass(frozen=True, kw_only=True)

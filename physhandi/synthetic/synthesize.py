@@ -13,7 +13,7 @@ from typing import cast, get_args
 import numpy as np
 
 from physhandi.data.sequence import Sequence, ViewMeta
-from physhandi.data.sequence_meta import SequenceMeta, Side
+from physhandi.data.sequence_meta import SIDES, SequenceMeta, Side
 from physhandi.data.sequence_writer import SequenceWriter
 from physhandi.errors import UsageError
 from physhandi.progress import NullProgress, Progress
@@ -23,7 +23,7 @@ from physhandi.synthetic.engines.mujoco_flex import simulate_truth
 from physhandi.synthetic.engines.truth import FRAME_RATE, CapsuleHand, Hold, PhysicalTruth
 from physhandi.synthetic.film.cameras import MOST_CAMERAS, make_viewpoints
 from physhandi.synthetic.film.degradations import changed, find_preset
-from physhandi.synthetic.film.filmed_scene import SIDES, make_filmed_scene
+from physhandi.synthetic.film.filmed_scene import make_filmed_scene
 from physhandi.synthetic.film.recording import Images, record
 from physhandi.synthetic.hands.actions import ACTIONS, script_action
 from physhandi.synthetic.hands.true_hand import TrueHand, load_true_hand

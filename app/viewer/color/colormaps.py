@@ -34,7 +34,7 @@ _TO_LINEAR = np.array(
 )
 
 
-def paint(
+def paint_values(
     value: Float[ndarray, "*item"],
     limits: tuple[float, float],
     scale: Scale = "sequential",

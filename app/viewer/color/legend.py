@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
-from app.viewer.color.colormaps import UNKNOWN, levels, paint, table
+from app.viewer.color.colormaps import UNKNOWN, levels, paint_values, table
 from app.viewer.color.quantities import Quantity
 
 TICKS = 5
@@ -42,7 +42,9 @@ class ColorScale:
     def paint(self, value: Float[ndarray, "*item"]) -> UInt8[ndarray, "*item 3"]:
         """Give values their colors; NaN gets `UNKNOWN`."""
         quantity = self.quantity
-        return paint(value, self.limits, quantity.scale, is_logarithmic=quantity.is_logarithmic)
+        return paint_values(
+            value, self.limits, quantity.scale, is_logarithmic=quantity.is_logarithmic
+        )
 
     @property
     def ramp(self) -> UInt8[ndarray, "step 3"]:

@@ -16,7 +16,7 @@ from app.viewer.color.difference import Way, rollout_difference
 from app.viewer.color.legend import ColorScale
 from app.viewer.color.quantities import QUANTITIES, Values, from_nodes, in_length_unit
 from app.viewer.compare.camera import Box, Eye
-from app.viewer.compare.sides import SIDES, ComparedSide, Sides
+from app.viewer.compare.sides import SIDE_KEYS, ComparedSide, Sides
 from app.viewer.content.content import Content
 from app.viewer.content.layers import GREEN, SKIN, YELLOW, Layers
 from app.viewer.scene.framing import Framing
@@ -162,13 +162,13 @@ class CompareDrawing:
         self._nodes = ClippedNodes(server)
         self._drawings = {
             key: ObjectDrawing(self._nodes, framing, root=f"{_ROOT}/{key}", style=STYLES[key])
-            for key in SIDES
+            for key in SIDE_KEYS
         }
         self._figure_drawings = {
             key: ObjectDrawing(
                 self._nodes, framing, root=f"{_ROOT}/{key}/figure", style=FIGURE_STYLE
             )
-            for key in SIDES
+            for key in SIDE_KEYS
         }
         self._extents = _measure(content, framing, rollouts)
         self._eye = Eye(right=np.array([1.0, 0.0, 0.0]), up=np.array([0.0, 0.0, 1.0]))

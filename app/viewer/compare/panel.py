@@ -18,15 +18,15 @@ from app.viewer.compare.drawing import (
     Look,
     difference_scale,
 )
-from app.viewer.compare.sides import SIDES
+from app.viewer.compare.sides import SIDE_KEYS
 from app.viewer.ui.guard import Guard, plain
 from app.viewer.ui.keyboard import bind
-from app.viewer.ui.plot import Curve, FramePlot, rounded_up
+from app.viewer.ui.plot import FramePlot, PlotCurve, rounded_up
 
 _STYLE = "font-size:0.8em;line-height:1.5;padding:0 0.6em"
 _MEAN, _LARGEST = "rgb(132,94,194)", "rgb(200,70,120)"
 _NOW = "rgba(120,130,145,0.9)"
-_CURVES = (Curve(label="mean", color=_MEAN), Curve(label="max", color=_LARGEST))
+_CURVES = (PlotCurve(label="mean", color=_MEAN), PlotCurve(label="max", color=_LARGEST))
 _COMPARED = {
     "nodes": "Each node of A from the same node of B.",
     "surface": "Each node from the other's surface: A and B are made of different nodes.",
@@ -60,7 +60,7 @@ class ComparePanel:
         self._look = look
         self._curve = curve
         self._change = change
-        self._names = dict.fromkeys(SIDES, "")
+        self._names = dict.fromkeys(SIDE_KEYS, "")
         self._notes: tuple[str, ...] = ()
         self._length_unit, self._unit, self._factor = "m", "mm", 1e3
         self._tick = 0
@@ -182,8 +182,8 @@ class ComparePanel:
 
     def _write(self) -> None:
         """Write the legend and the difference of the tick on the screen."""
-        styles = dict.fromkeys(SIDES, FIGURE_STYLE) if self._look.is_figure else STYLES
-        names = [(styles[name].node, f"{name.upper()} {self._names[name]}") for name in SIDES]
+        styles = dict.fromkeys(SIDE_KEYS, FIGURE_STYLE) if self._look.is_figure else STYLES
+        names = [(styles[name].node, f"{name.upper()} {self._names[name]}") for name in SIDE_KEYS]
         if self._look.is_swapped:
             names.reverse()
         written = swatches_html(names, is_list=True)

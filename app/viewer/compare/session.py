@@ -13,7 +13,7 @@ from app.viewer.clock.timeline_panel import TimelinePanel
 from app.viewer.compare.camera import ComparisonCameras
 from app.viewer.compare.drawing import Look
 from app.viewer.compare.pair import open_pair, pairing_of
-from app.viewer.compare.sides import SIDES, ComparedSide, Sides, compared_rollouts
+from app.viewer.compare.sides import SIDE_KEYS, ComparedSide, Sides, compared_rollouts
 from app.viewer.compare.view import CompareView
 from app.viewer.content.content import Catalog, Content
 from app.viewer.content.layers import Layers, default_layers
@@ -162,7 +162,7 @@ class CompareSession(SceneServer):
         bind(server, guard, "color_back", lambda _, __: self._view.panel.next_tint(-1))
         bind(server, guard, "reset", lambda event, _: self._reset_view(event))
         bind(server, guard, "snapshot", lambda event, _: export.save("PNG", event.client))
-        names = {side: plain(c.title) for side, c in zip(SIDES, pair.contents, strict=True)}
+        names = {side: plain(c.title) for side, c in zip(SIDE_KEYS, pair.contents, strict=True)}
         unit = pair.contents[0].length_unit
         self._view.panel.name(names, pair.notes, unit=unit, tick_count=pair.clock.tick_count)
         self._view.follow(pairing_of(pair))
@@ -206,7 +206,7 @@ class CompareSession(SceneServer):
 
     def _sides(self, tick: int) -> Sides:
         frames = self._pair.clock.frames(tick)
-        parts = zip(SIDES, self._pair.contents, frames, strict=True)
+        parts = zip(SIDE_KEYS, self._pair.contents, frames, strict=True)
         return {key: _side(key, content, frame) for key, content, frame in parts}
 
 

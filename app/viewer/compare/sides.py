@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from app.viewer.content.content import Content
 from physhandi.object_rollout import ObjectRollout
 
-SIDES = ("a", "b")
+SIDE_KEYS = ("a", "b")
 """Keys of the sides; A is on the left unless they are swapped."""
 
 

@@ -20,7 +20,7 @@ from app.viewer.scene.nodes import SceneNodes
 from app.viewer.scene.scene import SceneDrawing
 from app.viewer.ui.guard import Guard
 from app.viewer.ui.keyboard import bind
-from app.viewer.ui.plot import Curve, FramePlot
+from app.viewer.ui.plot import FramePlot, PlotCurve
 from physhandi.object_rollout import ObjectRollout
 
 MARK = (233, 30, 180)
@@ -247,7 +247,7 @@ class Inspector:
             with self._folder:
                 self._plot = FramePlot(
                     self._server.gui,
-                    (Curve(label=kind, color=_LINE),),
+                    (PlotCurve(label=kind, color=_LINE),),
                     frame_count=content.frame_count,
                     unit=unit,
                     quantity=kind,

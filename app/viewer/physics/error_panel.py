@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from app.viewer.content.content import Content
 from app.viewer.ui.guard import plain
-from app.viewer.ui.plot import Curve, FramePlot
+from app.viewer.ui.plot import FramePlot, PlotCurve
 from physhandi.data.files import named_fields
 from physhandi.data.layout import SequenceFiles
 from physhandi.object_rollout import ObjectRollout
@@ -90,10 +90,10 @@ class ErrorPanel:
         self._folder = server.gui.add_folder("Error per frame")
         with self._folder:
             self._text = server.gui.add_html("")
-            fit = [Curve(label="fit", color=_FIT)] if np.isfinite(self._track).any() else []
+            fit = [PlotCurve(label="fit", color=_FIT)] if np.isfinite(self._track).any() else []
             self._plot = FramePlot(
                 server.gui,
-                [*fit, Curve(label="re-simulated", color=_AGAIN)],
+                [*fit, PlotCurve(label="re-simulated", color=_AGAIN)],
                 frame_count=count,
                 unit=self._unit,
             )

@@ -21,7 +21,7 @@ _LONGEST_LABEL = 16
 
 
 @dataclass(frozen=True, kw_only=True)
-class Curve:
+class PlotCurve:
     """One line of a plot."""
 
     label: str
@@ -39,7 +39,7 @@ class FramePlot:
     def __init__(
         self,
         gui: viser.GuiApi,
-        curves: Listing[Curve],
+        curves: Listing[PlotCurve],
         *,
         frame_count: int,
         unit: str,

@@ -9,10 +9,8 @@ from numpy import ndarray
 
 from physhandi.data.layout import SequenceFiles
 from physhandi.data.run import RunFolder
+from physhandi.data.sequence_meta import SIDES
 from physhandi.errors import RunError, UsageError
-
-SIDES = ("right", "left")
-"""Names of the hands."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from numpy.random import Generator
 
-from physhandi.data.sequence_meta import Side
+from physhandi.data.sequence_meta import SIDES, Side
 from physhandi.synthetic.engines.truth import PhysicalTruth
 from physhandi.synthetic.film.degradations import Degradations, hand_shift
 from physhandi.synthetic.film.filming import SurfacePoints
@@ -18,8 +18,6 @@ from physhandi.synthetic.hands.true_hand import TrueHand, soft_tissue_offset
 
 MASK_VALUE: dict[Side, int] = {"right": 2, "left": 3}
 """Mask value of each hand."""
-SIDES: tuple[Side, Side] = ("right", "left")
-"""Hands in the order in which sequences list them."""
 _DYES = {
     "cloth": Dye(),
     "towel": Dye(top=(0.66, 0.30, 0.26), back=(0.78, 0.50, 0.45)),

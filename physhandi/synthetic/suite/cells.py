@@ -19,13 +19,13 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from physhandi.data.environment import processor_name
-from physhandi.data.exporters.scene_data import SIDES
 from physhandi.data.files import write_array, write_json
 from physhandi.data.layout import SequenceFiles
 from physhandi.data.lease import locked_file
 from physhandi.data.run import RunFolder
 from physhandi.data.run_folder import EXIT, artefacts, read_json, read_mapping
 from physhandi.data.sequence import Sequence
+from physhandi.data.sequence_meta import SIDES
 from physhandi.data.truth import read_truth
 from physhandi.devices import describe_device
 from physhandi.errors import (

@@ -11,7 +11,7 @@ from spring_world import content_of, two_springs
 from viewer_world import FolderCatalog
 
 from app.viewer.color.coloring import Painter
-from app.viewer.color.colormaps import UNKNOWN, levels, paint, table
+from app.viewer.color.colormaps import UNKNOWN, levels, paint_values, table
 from app.viewer.color.quantities import QUANTITIES, measure
 from app.viewer.content.content import open_run
 from app.viewer.content.layers import COLORINGS, Layers
@@ -137,12 +137,14 @@ def test_the_range_grows_with_a_rollout_that_is_being_computed():
 
 def test_colors_are_viridis_and_the_ends_are_reached():
     ramp = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)
-    painted = paint(np.array([-5.0, 0.0, 0.5, 1.0, 9.0, np.nan]), (0.0, 1.0))
+    painted = paint_values(np.array([-5.0, 0.0, 0.5, 1.0, 9.0, np.nan]), (0.0, 1.0))
     np.testing.assert_array_equal(painted[0], painted[1])
     np.testing.assert_array_equal(painted[3], painted[4])
     np.testing.assert_array_equal(painted[5], UNKNOWN)
     assert np.abs(ramp[130, 0, ::-1].astype(int) - painted[2]).max() < 5
-    blue, middle, red = paint(np.array([-2.0, 0.0, 2.0]), (-2.0, 2.0), "diverging").astype(int)
+    blue, middle, red = paint_values(np.array([-2.0, 0.0, 2.0]), (-2.0, 2.0), "diverging").astype(
+        int
+    )
     assert blue[2] > blue[0] + 80
     assert red[0] > red[2] + 80
     assert np.ptp(middle) < 4
