@@ -9,12 +9,13 @@ import viser
 
 from app.viewer.clock.playback import TURN, Playback
 from app.viewer.clock.timeline_panel import TimelinePanel
+from app.viewer.color.color_panel import ColorPanel
 from app.viewer.compare.live import LiveComparison
 from app.viewer.content.content import Catalog, Content, open_run, open_sequence
 from app.viewer.content.session_state import Kind, Pose, SessionState
 from app.viewer.export.export_panel import ExportPanel
 from app.viewer.export.snapshot import Snapshot
-from app.viewer.inspect.inspector import Inspection
+from app.viewer.inspect.inspector import Inspector
 from app.viewer.live.client import SimulationClient
 from app.viewer.physics.keep_panel import UserStorage
 from app.viewer.physics.object_session import FrameStrip, ObjectSession
@@ -23,6 +24,7 @@ from app.viewer.scene.framing import frame_content
 from app.viewer.scene.layers_panel import LayersPanel, add_legend, set_theme
 from app.viewer.scene.scene import SceneDrawing
 from app.viewer.scene.scene_server import SceneServer
+from app.viewer.ui.keyboard import bind
 from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.parameters import parameter_changes
 
@@ -118,7 +120,7 @@ class Session(SceneServer):
         """Features that it has; see `SessionInfo`."""
         features = {
             "object": self._content.fitted is not None,
-            "colors": self._inspection.colors.is_there,
+            "colors": self._colors.is_there,
             "figure": self._comparison.offers_figure,
         }
         return tuple(name for name, is_there in features.items() if is_there)
@@ -185,17 +187,15 @@ class Session(SceneServer):
             newest=self._newest,
             redraw=self._playback.redraw,
         )
-        self._inspection = Inspection(
-            server,
-            guard,
-            self._playback.redraw,
-            color_instead=self._comparison.next_tint,
-            reset_view=self._reset_view,
-            snapshot=lambda event: export.save("PNG", event.client),
+        self._colors = ColorPanel(
+            server, guard, self._playback.redraw, color_instead=self._comparison.next_tint
         )
+        self._inspector = Inspector(server, guard, self._playback.redraw)
         self._physics_place = server.gui.add_folder(None)
         self._layers = LayersPanel(server, self._content, guard, self._playback.redraw)
         export = self._export = ExportPanel(server, guard, self.snapshot)
+        bind(server, guard, "reset", lambda event, _: self._reset_view(event))
+        bind(server, guard, "snapshot", lambda event, _: export.save("PNG", event.client))
         self._fill()
         server.on_client_connect(guard(self._welcome))
         server.on_client_disconnect(guard(self._part))
@@ -207,7 +207,9 @@ class Session(SceneServer):
         scene = SceneDrawing(self._server, content, framing)
         self._view = ViewSwitch(scene, self._comparison)
         self._layers.replace(content, scene.layers, framing, has_surface=scene.may_have_surface)
-        self._inspection.replace(content, scene, framing)
+        painter = scene.painter if content.fitted is not None else scene.hand_painter
+        self._colors.replace(content, scene.layers, painter)
+        self._inspector.replace(content, scene, framing)
         run = self._catalog.run(self._target) if self.kind == "run" else None
         self._export.offer(content)
         self._comparison.offer(content, framing, run.folder if run is not None else None)
@@ -233,7 +235,7 @@ class Session(SceneServer):
         self._timeline.restore(state.speed, does_loop=state.does_loop)
         if state.layers is not None:
             self._layers.restore(state.layers, state.theme, prefers_dark=state.prefers_dark)
-            self._inspection.colors.restore()
+            self._colors.restore()
         if self._object is not None and state.parameters:
             self._object.panel.restore(state.parameters, is_automatic=state.automatic_substeps)
         if state.pose is not None:
@@ -287,7 +289,8 @@ class Session(SceneServer):
             is_hidden = self._comparison.is_on and rollout is not None
             if self._legend.visible == is_hidden:
                 self._legend.visible = not is_hidden
-            self._inspection.show(
+            self._colors.show(is_playing=is_playing, is_hidden=is_hidden)
+            self._inspector.show(
                 rollout, frame, rollout_frame, is_playing=is_playing, is_hidden=is_hidden
             )
             if self._object is not None:

@@ -3,35 +3,18 @@
 import math
 import threading
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import viser
 
-from app.viewer.color.legend import Legend, legend_html
-from app.viewer.color.quantities import Quantity
+from app.viewer.color.coloring import Painter
+from app.viewer.color.hand_coloring import HandPainter
+from app.viewer.color.legend import legend_html
 from app.viewer.content.content import Content
 from app.viewer.content.layers import Coloring, Layers
 from app.viewer.ui.followed import FollowedChoice
 from app.viewer.ui.guard import Guard
 from app.viewer.ui.keyboard import bind
-
-
-class Paints(Protocol):
-    """Paints an object, or the hands where there is no object."""
-
-    @property
-    def legend(self) -> Legend | None:
-        """Legend of the colors painted last; None if they are plain."""
-        ...
-
-    @property
-    def offered(self) -> tuple[Coloring, ...]:
-        """Colorings to choose from, besides ``plain``."""
-        ...
-
-    def quantity(self, coloring: Coloring, /) -> Quantity:
-        """Describe one of the offered colorings."""
-        ...
 
 
 class ColorPanel:
@@ -57,7 +40,7 @@ class ColorPanel:
         self._redraw = redraw
         self._color_instead = color_instead
         self._layers = Layers()
-        self._painter: Paints | None = None
+        self._painter: Painter | HandPainter | None = None
         self._is_metric = True
         self._written = ""
         self._turn = threading.Lock()
@@ -84,7 +67,7 @@ class ColorPanel:
         bind(server, guard, "color_back", lambda _, __: self.next(-1))
         self._show_range_fields()
 
-    def replace(self, content: Content, layers: Layers, painter: Paints) -> None:
+    def replace(self, content: Content, layers: Layers, painter: Painter | HandPainter) -> None:
         """Offer the colorings of a content."""
         before = self._layers
         self._layers, self._painter = layers, painter

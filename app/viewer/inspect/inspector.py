@@ -11,7 +11,6 @@ import viser
 from jaxtyping import Float
 from numpy import ndarray
 
-from app.viewer.color.color_panel import ColorPanel
 from app.viewer.content.content import Content
 from app.viewer.inspect.picking import Pick, Ray, Target, pick
 from app.viewer.inspect.readings import HISTORIES, HistoryQuantity, Readings, Rows, follow, unit_of
@@ -77,6 +76,7 @@ class Inspector:
             self._clear = gui.add_button("Clear", color="gray", hint="Esc", visible=False)
         self._kind.on_update(guard.by_user(lambda _: self._choose_history()))
         self._clear.on_click(guard(lambda _: self.clear()))
+        bind(server, guard, "clear", lambda _, __: self.clear())
         server.scene.on_click()(guard(lambda event: self._click(event, prefers_hand=False)))
         server.scene.on_click(modifier="shift")(
             guard(lambda event: self._click(event, prefers_hand=True))
@@ -278,59 +278,3 @@ def _table(title: str, rows: Rows) -> str:
         f'<b><span style="color:{color}">●</span> {html.escape(title)}</b>'
         f"<table>{lines}</table></div>"
     )
-
-
-class Inspection:
-    """The panels of colors and of what was clicked, and the keys that belong to them."""
-
-    def __init__(
-        self,
-        server: viser.ViserServer,
-        guard: Guard,
-        redraw: Callable[[], None],
-        *,
-        color_instead: Callable[[int], bool],
-        reset_view: Callable[[Any], None],
-        snapshot: Callable[[Any], None],
-    ) -> None:
-        """Add the panels where the caller stands.
-
-        Args:
-            server: Where to.
-            guard: Wraps the callbacks.
-            redraw: Draws the current frame again.
-            color_instead: See `ColorPanel`.
-            reset_view: Puts the camera of the client of an event back.
-            snapshot: Saves a picture for the client of an event.
-        """
-        self.colors = ColorPanel(server, guard, redraw, color_instead=color_instead)
-        self.inspector = Inspector(server, guard, redraw)
-        self._redraw = redraw
-        bind(server, guard, "reset", lambda event, _: reset_view(event))
-        bind(server, guard, "snapshot", lambda event, _: snapshot(event))
-        bind(server, guard, "clear", lambda _, __: self._clear())
-
-    def replace(self, content: Content, scene: SceneDrawing, framing: Framing) -> None:
-        """Get ready for another content."""
-        painter = scene.painter if content.fitted is not None else scene.hand_painter
-        self.colors.replace(content, scene.layers, painter)
-        self.inspector.replace(content, scene, framing)
-
-    def show(
-        self,
-        rollout: ObjectRollout | None,
-        frame: int,
-        rollout_frame: int,
-        *,
-        is_playing: bool,
-        is_hidden: bool,
-    ) -> None:
-        """Follow the clock; see `Inspector.show`."""
-        self.colors.show(is_playing=is_playing, is_hidden=is_hidden)
-        self.inspector.show(
-            rollout, frame, rollout_frame, is_playing=is_playing, is_hidden=is_hidden
-        )
-
-    def _clear(self) -> None:
-        self.inspector.clear()
-        self._redraw()

@@ -155,7 +155,7 @@ def test_typed_ends_of_the_colors_are_not_replaced_before_they_are_heard(
 ) -> None:
     with watched(sessions) as (session, client):
         rest_at(client, 7)
-        colors = session._inspection.colors
+        colors = session._colors
         colors.choose("speed")
         client.until(lambda: colors._range.handle.value != (0.0, 1.0))
         painter = colors._painter
