@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -65,17 +66,24 @@ def catalog(tmp_path_factory: pytest.TempPathFactory) -> FolderCatalog:
     return FolderCatalog(root)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def sessions(catalog: FolderCatalog) -> Iterator[Sessions]:
     sessions = Sessions(FakeSettings(), catalog)
     yield sessions
     sessions.shutdown()
 
 
-def watch(sessions: Sessions, query: str) -> ViewerClient:
-    session = sessions.get(sessions.open("comparison", query, "me"))
+@contextmanager
+def watch(sessions: Sessions, query: str) -> Iterator[ViewerClient]:
+    """Look at a comparison, which is closed afterwards."""
+    session_id = sessions.open("comparison", query, "me")
+    session = sessions.get(session_id)
     assert session is not None
-    return ViewerClient(f"ws://127.0.0.1:{session.port}")
+    try:
+        with ViewerClient(f"ws://127.0.0.1:{session.port}") as client:
+            yield client
+    finally:
+        sessions.close(session_id)
 
 
 def said(client: ViewerClient) -> str:
@@ -266,11 +274,13 @@ def test_a_copy_and_a_closed_session_know_the_pair(sessions: Sessions) -> None:
     first = sessions.open("comparison", "a=sheet&b=moved&mode=overlay&f=7", "me")
     session = sessions.get(first)
     assert session is not None
-    copied = sessions.get(sessions.copy(session))
+    copied_id = sessions.copy(session)
+    copied = sessions.get(copied_id)
     assert copied is not None
     assert copied.target == session.target == "a=sheet&b=moved&mode=overlay&f=7"
     assert sessions.find(first, "somebody else") is None
     sessions.close(first, "Enough.")
+    sessions.close(copied_id)
     closed = sessions.closed_session(first, "me")
     assert closed is not None
     assert (closed.kind, closed.target) == ("comparison", session.target)

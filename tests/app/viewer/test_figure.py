@@ -1,20 +1,32 @@
 import csv
 import io
 import itertools
+from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy import ndarray
 from viewer_client import ViewerClient
-from viewer_world import FRAMES, PARAMETERS, content_of, hear_all, rest_at, sheet
+from viewer_world import (
+    FRAMES,
+    PARAMETERS,
+    FakeSettings,
+    FolderCatalog,
+    content_of,
+    hear_all,
+    sheet,
+)
 
+from app.exports.permalink import state_from_query
 from app.viewer.compare.camera import Eye, picture_of_both
 from app.viewer.compare.drawing import ARROWS, CompareDrawing, Look, legend_force
 from app.viewer.compare.sides import ComparedSide
 from app.viewer.content.layers import Layers
 from app.viewer.export.snapshot import Snapshot, snapshot_csv, snapshot_npz
 from app.viewer.scene.framing import frame_content
+from app.viewer.session import Session
 from app.viewer.sessions import Sessions
 from physhandi.fitted_object import FittedObject
 from physhandi.object_rollout import ObjectRollout
@@ -29,15 +41,27 @@ TURNED = (0.5**0.5, 0.0, 0.0, 0.5**0.5)
 """A camera whose right hand is the world's y axis."""
 
 
-def watch(sessions: Sessions) -> ViewerClient:
-    session = sessions.get(sessions.open("run", "sheet", "me"))
-    assert session is not None
-    return ViewerClient(f"ws://127.0.0.1:{session.port}")
+@pytest.fixture(scope="module")
+def session(root: Path) -> Iterator[Session]:
+    """A run that rests at a frame, and in which PhysTwin's side is simulated once."""
+    sessions = Sessions(FakeSettings(), FolderCatalog(root))
+    at_rest = state_from_query({"f": str(FRAME)})
+    session = sessions.get(sessions.open("run", "sheet", "me", state=at_rest))
+    assert isinstance(session, Session)
+    yield session
+    sessions.shutdown()
+
+
+@pytest.fixture
+def client(session: Session) -> Iterator[ViewerClient]:
+    """A browser with the figure; the scene comes back after it."""
+    with ViewerClient(f"ws://127.0.0.1:{session.port}") as client:
+        enter(client)
+        yield client
+    session._comparison.stop()
 
 
 def enter(client: ViewerClient) -> None:
-    client.until(lambda: "object springs" in client.texts())
-    rest_at(client, FRAME)
     client.set("Compare with PhysTwin", True)
     done = f"PhysTwin-style: simulated {FRAMES}/{FRAMES} frames"
     client.until(lambda: done in said(client) and "/compare/b/figure/forces" in client.nodes)
@@ -94,52 +118,51 @@ def rolled_out(run: Run) -> ObjectRollout:
     )
 
 
-def test_both_sides_are_shown_in_one_scale_and_the_scene_comes_back(sessions, run) -> None:
-    with watch(sessions) as client:
-        enter(client)
-        session = sessions.get(sessions.list()[0].id)
-        session._playback.redraw()
-        rival = session._comparison._phystwin.newest
-        ours = run.array("sequences/lift/rollout.npy")[FRAME]
-        for side, expected in (("a", ours), ("b", rival.position[FRAME])):
-            name = f"/compare/{side}/figure/object/nodes"
-            client.until(
-                lambda name=name, expected=expected: np.array_equal(
-                    client.array(name, "batched_positions"), expected
-                )
+def test_both_sides_are_shown_in_one_scale_and_the_scene_comes_back(
+    client: ViewerClient, session: Session, run: Run
+) -> None:
+    session._playback.redraw()
+    rival = session._comparison._phystwin.newest
+    ours = run.array("sequences/lift/rollout.npy")[FRAME]
+    for side, expected in (("a", ours), ("b", rival.position[FRAME])):
+        name = f"/compare/{side}/figure/object/nodes"
+        client.until(
+            lambda name=name, expected=expected: np.array_equal(
+                client.array(name, "batched_positions"), expected
             )
-        assert np.abs(rival.position[FRAME] - ours).max() > 1e-3
-        client.until(lambda: text_of(client, "title_a") == "ours")
-        detail = f"δ 40 mm · d_max 50 · {recount(run, 0.04, 50)} virtual springs"
-        client.until(lambda: text_of(client, "detail_b") == detail)
-        other = f"δ 20 mm · d_max 3 · {recount(run, 0.02, 3)} virtual springs"
-        client.until(lambda: text_of(client, "detail_a") == other)
-        client.until(lambda: "both sides use them" in said(client))
-        strengths = {
-            side: np.sort(np.linalg.norm(take.forces(FRAME), axis=1))[::-1]
-            for side, take in (("a", session._content.fitted), ("b", rival))
-        }
+        )
+    assert np.abs(rival.position[FRAME] - ours).max() > 1e-3
+    client.until(lambda: text_of(client, "title_a") == "ours")
+    detail = f"δ 40 mm · d_max 50 · {recount(run, 0.04, 50)} virtual springs"
+    client.until(lambda: text_of(client, "detail_b") == detail)
+    other = f"δ 20 mm · d_max 3 · {recount(run, 0.02, 3)} virtual springs"
+    client.until(lambda: text_of(client, "detail_a") == other)
+    client.until(lambda: "both sides use them" in said(client))
+    strengths = {
+        side: np.sort(np.linalg.norm(take.forces(FRAME), axis=1))[::-1]
+        for side, take in (("a", session._content.fitted), ("b", rival))
+    }
 
-        def is_to_scale() -> bool:
-            """Whether one length means one force on both sides, and in the legend."""
-            units = [lengths_of(client, "/compare/legend/force") / shown_force(client)]
-            for side, strength in strengths.items():
-                length = lengths_of(client, f"/compare/{side}/figure/forces")
-                if len(length) <= 10:
-                    return False
-                units.append(length / strength[: len(length)])
-            unit = np.concatenate(units)
-            return len(units[0]) == 1 and np.allclose(unit, unit[0], rtol=1e-3, atol=0)
+    def is_to_scale() -> bool:
+        """Whether one length means one force on both sides, and in the legend."""
+        units = [lengths_of(client, "/compare/legend/force") / shown_force(client)]
+        for side, strength in strengths.items():
+            length = lengths_of(client, f"/compare/{side}/figure/forces")
+            if len(length) <= 10:
+                return False
+            units.append(length / strength[: len(length)])
+        unit = np.concatenate(units)
+        return len(units[0]) == 1 and np.allclose(unit, unit[0], rtol=1e-3, atol=0)
 
-        client.until(is_to_scale)
-        client.until(lambda: client.visible.get("/object/nodes") is False)
-        client.tell_camera()
-        client.set("Back to the scene", True)
-        client.until(lambda: client.visible["/object/nodes"] and client.camera["fov"] > 0.5)
-        client.until(lambda: client.camera["look_at"] == pytest.approx([0, 0, 0]))
-        client.until(lambda: client.camera["position"] == pytest.approx([1, 1, 1]))
-        assert session._comparison._view is None
-        assert client.camera["fov"] == pytest.approx(0.8)
+    client.until(is_to_scale)
+    client.until(lambda: client.visible.get("/object/nodes") is False)
+    client.tell_camera()
+    client.set("Back to the scene", True)
+    client.until(lambda: client.visible["/object/nodes"] and client.camera["fov"] > 0.5)
+    client.until(lambda: client.camera["look_at"] == pytest.approx([0, 0, 0]))
+    client.until(lambda: client.camera["position"] == pytest.approx([1, 1, 1]))
+    assert session._comparison._view is None
+    assert client.camera["fov"] == pytest.approx(0.8)
 
 
 def recount(run: Run, radius: float, most: int) -> int:
@@ -149,23 +172,21 @@ def recount(run: Run, radius: float, most: int) -> int:
     return int(np.minimum((distance < radius).sum(axis=1), most).sum())
 
 
-def test_the_halves_stay_left_and_right_as_the_camera_turns(sessions) -> None:
-    with watch(sessions) as client:
-        enter(client)
-        # The camera looks along z with the world's x to its right.
-        client.tell_camera(wxyz=(1.0, 0.0, 0.0, 0.0))
-        client.until(lambda: place_of(client, "b")[0] > 0.05)
-        client.until(lambda: np.allclose(place_of(client, "b")[1:], 0, atol=1e-6))
-        right = place_of(client, "b")
-        client.until(lambda: np.allclose(place_of(client, "a"), -right, atol=1e-6))
-        client.tell_camera(wxyz=TURNED)
-        client.until(lambda: place_of(client, "b")[1] > 0.05)
-        x, _, z = place_of(client, "b")
-        assert (x, z) == pytest.approx((0, 0), abs=1e-6)
-        up = Eye.of(np.array(TURNED)).up
-        client.until(
-            lambda: (place_of(client, "title_a") - place_of(client, "legend/text_0")) @ up > 0.05
-        )
+def test_the_halves_stay_left_and_right_as_the_camera_turns(client: ViewerClient) -> None:
+    # The camera looks along z with the world's x to its right.
+    client.tell_camera(wxyz=(1.0, 0.0, 0.0, 0.0))
+    client.until(lambda: place_of(client, "b")[0] > 0.05)
+    client.until(lambda: np.allclose(place_of(client, "b")[1:], 0, atol=1e-6))
+    right = place_of(client, "b")
+    client.until(lambda: np.allclose(place_of(client, "a"), -right, atol=1e-6))
+    client.tell_camera(wxyz=TURNED)
+    client.until(lambda: place_of(client, "b")[1] > 0.05)
+    x, _, z = place_of(client, "b")
+    assert (x, z) == pytest.approx((0, 0), abs=1e-6)
+    up = Eye.of(np.array(TURNED)).up
+    client.until(
+        lambda: (place_of(client, "title_a") - place_of(client, "legend/text_0")) @ up > 0.05
+    )
 
 
 def test_the_live_process_holds_the_object_in_phystwins_way(run) -> None:

@@ -1,21 +1,41 @@
 """One rollout is kept while the sliders move the other, as a client without a browser sees it."""
 
 import re
+from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
+import pytest
 from viewer_client import ViewerClient
-from viewer_world import FRAMES, rest_at
+from viewer_world import FRAMES, FakeSettings, FolderCatalog
 
+from app.exports.permalink import state_from_query
 from app.viewer.sessions import Sessions
 from physhandi.run import Run
 
 FRAME = 15
 
 
-def watch(sessions: Sessions) -> ViewerClient:
-    session = sessions.get(sessions.open("run", "sheet", "me"))
+@pytest.fixture(scope="module")
+def sessions(root: Path) -> Iterator[Sessions]:
+    sessions = Sessions(FakeSettings(), FolderCatalog(root))
+    yield sessions
+    sessions.shutdown()
+
+
+@pytest.fixture
+def client(sessions: Sessions) -> Iterator[ViewerClient]:
+    """A browser with a run that rests at a frame and is simulated to its end."""
+    at_rest = state_from_query({"f": str(FRAME)})
+    session_id = sessions.open("run", "sheet", "me", state=at_rest)
+    session = sessions.get(session_id)
     assert session is not None
-    return ViewerClient(f"ws://127.0.0.1:{session.port}")
+    try:
+        with ViewerClient(f"ws://127.0.0.1:{session.port}") as client:
+            client.until(lambda: is_ready(client) and client.find("Keep as A") != "")
+            yield client
+    finally:
+        sessions.close(session_id)
 
 
 def said(client: ViewerClient) -> str:
@@ -55,81 +75,73 @@ def mean_difference(client: ViewerClient) -> float:
     return 1e3 * float(np.sqrt((offset**2).sum(axis=1)).mean())
 
 
-def test_the_fit_is_kept_while_sliders_move_the_other(sessions: Sessions, run: Run) -> None:
+def test_the_fit_is_kept_while_sliders_move_the_other(client: ViewerClient, run: Run) -> None:
     fitted = run.array("sequences/lift/rollout.npy")
-    with watch(sessions) as client:
-        client.until(lambda: is_ready(client) and client.find("Keep as A") != "")
-        rest_at(client, FRAME)
-        client.set("Keep as A", "the fit")
-        client.until(lambda: "/compare/b/object/compared" in client.nodes)
-        client.until(lambda: "mean 0 mm" in said(client) and "equal parameters" in said(client))
-        client.until(lambda: client.visible.get("/object/nodes") is False)
-        client.set("stiffness 10^", -1.5)
-        client.until(lambda: "From A to B: stiffness" in said(client))
-        client.until(lambda: is_done(client) and mean_difference(client) > 0.1)
-        # The panel may tell of it later than the scene.
-        client.until(lambda: f"mean {mean_difference(client):.3g} mm" in said(client))
-        client.until(lambda: is_fitted(client, "a", fitted))
-        told = f"mean {mean_difference(client):.3g} mm"
-        # What is kept next is the rollout of now, from which the fit differs as much.
-        client.set("Keep as A", "this rollout")
-        client.until(lambda: "mean 0 mm" in said(client))
-        client.set("History", "Reset")
-        client.until(lambda: told in said(client))
-        client.until(lambda: is_fitted(client, "b", fitted))
-        client.set("Stop comparing", True)
-        client.until(lambda: client.visible["/object/nodes"] is True)
-        client.until(lambda: client.find("Colors of A and B") == "")
+    client.set("Keep as A", "the fit")
+    client.until(lambda: "/compare/b/object/compared" in client.nodes)
+    client.until(lambda: "mean 0 mm" in said(client) and "equal parameters" in said(client))
+    client.until(lambda: client.visible.get("/object/nodes") is False)
+    client.set("stiffness 10^", -1.5)
+    client.until(lambda: "From A to B: stiffness" in said(client))
+    client.until(lambda: is_done(client) and mean_difference(client) > 0.1)
+    # The panel may tell of it later than the scene.
+    client.until(lambda: f"mean {mean_difference(client):.3g} mm" in said(client))
+    client.until(lambda: is_fitted(client, "a", fitted))
+    told = f"mean {mean_difference(client):.3g} mm"
+    # What is kept next is the rollout of now, from which the fit differs as much.
+    client.set("Keep as A", "this rollout")
+    client.until(lambda: "mean 0 mm" in said(client))
+    client.set("History", "Reset")
+    client.until(lambda: told in said(client))
+    client.until(lambda: is_fitted(client, "b", fitted))
+    client.set("Stop comparing", True)
+    client.until(lambda: client.visible["/object/nodes"] is True)
+    client.until(lambda: client.find("Colors of A and B") == "")
 
 
 def test_a_key_compares_with_what_was_kept_last_or_with_the_fit(
-    sessions: Sessions, run: Run
+    client: ViewerClient, run: Run
 ) -> None:
     fitted = run.array("sequences/lift/rollout.npy")
-    with watch(sessions) as client:
-        client.until(lambda: is_ready(client) and client.find("Keep as A") != "")
-        rest_at(client, FRAME)
-        # Nothing was changed: both are the fit, and the panel says what to do.
-        press(client, "V")
-        client.until(lambda: "Move a slider to change B" in said(client))
-        client.set("stiffness 10^", -1.5)
-        client.until(lambda: is_done(client) and mean_difference(client) > 0.1)
-        client.until(lambda: is_fitted(client, "a", fitted))
-        changed = nodes(client, "b").copy()
-        client.set("Keep as A", "this rollout")
-        client.until(lambda: "mean 0 mm" in said(client))
-        press(client, "V")
-        client.until(lambda: client.visible.get("/object/nodes") is True)
-        # What was kept is on the screen itself, so that the fit tells more.
-        press(client, "V")
-        client.until(lambda: client.find("Colors of A and B") != "")
-        client.until(lambda: is_fitted(client, "a", fitted))
-        press(client, "V")
-        client.until(lambda: client.find("Colors of A and B") == "")
-        client.set("History", "Reset")
-        press(client, "V")
-        client.until(lambda: client.find("Colors of A and B") != "")
-        client.until(lambda: is_fitted(client, "b", fitted))
-        client.until(lambda: np.allclose(nodes(client, "a"), changed, atol=1e-6))
+    # Nothing was changed: both are the fit, and the panel says what to do.
+    press(client, "V")
+    client.until(lambda: "Move a slider to change B" in said(client))
+    client.set("stiffness 10^", -1.5)
+    client.until(lambda: is_done(client) and mean_difference(client) > 0.1)
+    client.until(lambda: is_fitted(client, "a", fitted))
+    changed = nodes(client, "b").copy()
+    client.set("Keep as A", "this rollout")
+    client.until(lambda: "mean 0 mm" in said(client))
+    press(client, "V")
+    client.until(lambda: client.visible.get("/object/nodes") is True)
+    # What was kept is on the screen itself, so that the fit tells more.
+    press(client, "V")
+    client.until(lambda: client.find("Colors of A and B") != "")
+    client.until(lambda: is_fitted(client, "a", fitted))
+    press(client, "V")
+    client.until(lambda: client.find("Colors of A and B") == "")
+    client.set("History", "Reset")
+    press(client, "V")
+    client.until(lambda: client.find("Colors of A and B") != "")
+    client.until(lambda: is_fitted(client, "b", fitted))
+    client.until(lambda: np.allclose(nodes(client, "a"), changed, atol=1e-6))
 
 
-def test_the_figure_and_what_was_kept_take_turns(sessions: Sessions) -> None:
-    with watch(sessions) as client:
-        client.until(lambda: is_ready(client) and client.find("Keep as A") != "")
-        client.set("Keep as A", "the fit")
-        client.until(lambda: "A kept: the fit" in said(client))
-        client.set("Compare with PhysTwin", True)
-        client.until(lambda: client.find("Back to the scene") != "")
-        client.until(lambda: "A ours: δ 20 mm" in said(client))
-        # The figure is a comparison like any other: its difference is measured and colored.
-        client.until(lambda: f"PhysTwin-style: simulated {FRAMES}/{FRAMES}" in said(client))
-        client.until(lambda: re.search(r"mean [\d.]+ mm", said(client)))
-        # The keys of the colors are those of what is shown.
-        client.until(lambda: client.gui[client.find("Colors")]["visible"] is False)
-        press(client, "C")
-        client.until(lambda: client.value("Colors of A and B") == "of A and B")
-        press(client, "C")
-        client.until(lambda: "≥" in said(client))
-        client.set("Keep as A", "the fit")
-        client.until(lambda: client.find("Compare with PhysTwin") != "")
-        client.until(lambda: "A kept: the fit" in said(client))
+def test_the_figure_and_what_was_kept_take_turns(client: ViewerClient) -> None:
+    client.set("Keep as A", "the fit")
+    client.until(lambda: "A kept: the fit" in said(client))
+    client.set("Compare with PhysTwin", True)
+    client.until(lambda: client.find("Back to the scene") != "")
+    client.until(lambda: "A ours: δ 20 mm" in said(client))
+    # The figure is a comparison like any other: its difference is measured and colored.
+    client.until(lambda: f"PhysTwin-style: simulated {FRAMES}/{FRAMES}" in said(client))
+    client.until(lambda: re.search(r"mean [\d.]+ mm", said(client)))
+    # The keys of the colors are those of what is shown.
+    client.until(lambda: client.gui[client.find("Colors")]["visible"] is False)
+    press(client, "C")
+    client.until(lambda: client.value("Colors of A and B") == "of A and B")
+    press(client, "C")
+    client.until(lambda: "≥" in said(client))
+    client.set("Keep as A", "the fit")
+    client.until(lambda: client.find("Compare with PhysTwin") != "")
+    client.until(lambda: "A kept: the fit" in said(client))
