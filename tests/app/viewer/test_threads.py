@@ -165,6 +165,7 @@ def test_typed_ends_of_the_colors_are_not_replaced_before_they_are_heard(
         colors._range.handle._impl.value = (0.25, 0.75)
         grown = SimpleNamespace(
             legend=replace(painter.legend, scale=replace(painter.legend.scale, limits=(0.0, 40.0))),
+            offered=painter.offered,
             quantity=painter.quantity,
         )
         monkeypatch.setattr(colors, "_painter", grown)
