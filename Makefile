@@ -34,7 +34,7 @@ fmt: install
 
 test: install browser
 	rm -f .coverage .coverage.*
-	$(BIN)/python -m pytest -n 2 --dist loadfile --cov --cov-report=term
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --cov --cov-report=term
 
 # Live scenes, jobs and pages while their threads are held up at random.
 races: install

@@ -18,6 +18,14 @@ def pytest_configure(config):
     sys.dont_write_bytecode = False
 
 
+def pytest_collection_modifyitems(items):
+    """Begin with the files that take longest, so that no worker has one of them left at the end."""
+    slow = {
+        item.path for item in items if {"e2e", "slow"} & {mark.name for mark in item.iter_markers()}
+    }
+    items.sort(key=lambda item: item.path not in slow)
+
+
 DEVICES = ["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)]
 
 
