@@ -223,6 +223,7 @@ def parse_yaml(text: str) -> Any:
         raise ValueError(f"a value is not what its tag says ({error})") from error
 
 
+_yaml: Any = yaml
 _FastLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 """PyYAML's reader in C, ten times as fast as that in Python, where PyYAML was built with it."""
 
@@ -233,7 +234,7 @@ _DEEPEST = 100
 
 def _check_depth(text: str) -> None:
     depth = 0
-    for event in yaml.parse(text, Loader=_FastLoader):
+    for event in _yaml.parse(text, Loader=_FastLoader):
         depth += isinstance(event, yaml.CollectionStartEvent)
         depth -= isinstance(event, yaml.CollectionEndEvent)
         if depth > _DEEPEST:
@@ -254,4 +255,4 @@ class _Loader(_FastLoader):
                     None, None, f"field '{key.value}' is there twice; keep one", key.start_mark
                 )
             seen.add(key.value)
-        return super().construct_mapping(node, deep=deep)
+        return _FastLoader.construct_mapping(self, node, deep=deep)
