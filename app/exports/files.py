@@ -16,9 +16,8 @@ from starlette.exceptions import HTTPException
 from app.exports.cache import FileCache
 from app.exports.links import CLOSED, address, read_query
 from app.exports.making import store_take
-from app.exports.painter import LARGEST
 from app.exports.permalink import state_from_query, state_to_query
-from app.exports.request import SMALLEST, SUFFIXES, FileRequest
+from app.exports.request import LARGEST, SMALLEST, SUFFIXES, FileRequest
 from app.exports.schema import MEDIA_TYPES, RunFormat, errors, files
 from app.ids import ItemId
 from app.jobs.catalog import Catalog

@@ -10,10 +10,9 @@ import cv2
 import numpy as np
 
 from app.exports.offscreen import Offscreen
-from app.exports.painter import paint_scene, visible_from
-from app.exports.primitives import parts_of
 from app.exports.recording import record_scene
 from app.exports.request import FileRequest
+from app.exports.scene_picture import draw_scene
 from app.viewer.color.legend import draw_legend
 from app.viewer.content.content import Content, open_run, open_sequence
 from app.viewer.content.session_state import Pose, SessionState
@@ -169,8 +168,8 @@ def _picture(order: FileRequest, snapshot: Snapshot, state: SessionState) -> Scr
     with Offscreen(snapshot.content, snapshot.rollout, state) as scene:
         scene.draw(snapshot.frame, is_playing=False)
         pose: Pose = scene.pose
-        parts = visible_from(parts_of(scene.server), pose)
-        image = paint_scene(parts, pose, order.width, order.height, is_dark=scene.is_dark)
+        size = (order.width, order.height)
+        image = draw_scene(scene.server, pose, *size, is_dark=scene.is_dark)
         if scene.legend is not None:
             image = draw_legend(image, scene.legend, is_dark=scene.is_dark)
     is_written, content = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))

@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Literal, get_args
 
-from app.exports.painter import LARGEST
 from app.exports.permalink import state_from_query
 from app.viewer.content.session_state import SessionState
 from physhandi.errors import UsageError
@@ -14,8 +13,8 @@ Format = Literal["png", "viser", "html", "zip", "ply", "gltf", "npz", "csv"]
 FORMATS: tuple[Format, ...] = get_args(Format)
 SUFFIXES: dict[str, str] = {"gltf": "glb", "ply": "zip"}
 """How the files of formats end, if not like the format."""
-SMALLEST = 16
-"""Shortest side of a picture [px]."""
+SMALLEST, LARGEST = 16, 4_096
+"""Shortest and longest side of a picture [px]."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -32,6 +32,7 @@ from physhandi.hand.motion import HandMotion, control_trajectory
 from physhandi.perception.lifting import observe_object
 from physhandi.perception.shape import object_nodes_from_observation
 from physhandi.progress import Progress
+from physhandi.triangles import vertex_normals
 
 LEAST_CLOUD = 10
 """Object points that frame 0 must show for the object to be located."""
@@ -212,11 +213,7 @@ def visible_vertices(
 
     Occlusion by the object or by other fingers is not considered.
     """
-    corner = vertex[faces]
-    face_normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    normal = np.zeros_like(vertex)
-    for k in range(3):
-        np.add.at(normal, faces[:, k], face_normal)
+    normal = vertex_normals(vertex, faces)
     is_visible = np.zeros(len(vertex), bool)
     for view in views:
         eye = view.camera.T_world_camera[:3, 3]

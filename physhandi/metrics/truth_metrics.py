@@ -15,7 +15,7 @@ from scipy.spatial import KDTree  # pyright: ignore[reportMissingTypeStubs]  # i
 from physhandi.data.truth import Truth
 from physhandi.errors import SequenceError
 from physhandi.metrics.geometry import chamfer_one_way
-from physhandi.triangles import triangle_distance
+from physhandi.triangles import triangle_areas, triangle_distance
 
 SAMPLE_COUNT = 2000
 """Samples of the true surface."""
@@ -76,8 +76,7 @@ def true_surface(truth: Truth, count: int = SAMPLE_COUNT) -> TrueSurface | None:
             f"truth/object_face.npy: triangle {wrong} joins the points {face[wrong].tolist()}, but "
             f"truth/object_point.npy has {point.shape[1]}. Repair one of them, or remove both."
         )
-    a, b, c = (point[0][face[:, corner]].astype(np.float64) for corner in range(3))
-    until = np.cumsum(np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    until = np.cumsum(triangle_areas(point[0], face))
     if until[-1] <= 0.0:
         return None
     random = np.random.default_rng(_SEED)

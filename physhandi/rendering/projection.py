@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from itertools import product
 from typing import Any, TypeVar
 
 import numpy as np
@@ -67,6 +68,12 @@ class Projection:
     """Of each of these layers."""
     texel: UInt8[ndarray, "texel 3"]
     """Pixels of all images."""
+    light: Float[ndarray, " 3"]
+    """Direction from which the light comes, in the camera's axes."""
+    samples: int
+    """Rows and columns of samples in a pixel."""
+    window: tuple[int, int, int, int]
+    """First column and row that shapes may reach, and the ones after the last; at least a pixel."""
 
 
 def project(
@@ -110,13 +117,17 @@ def project(
         else:
             solid.append(_surface(view, number, shape, light))
     ends = np.cumsum([len(part.element) for part in [*solid, *sheer]])
+    triangles, all_balls = _joined([*solid, *sheer]), _joined(balls)
     return Projection(
         K=view.K,
-        triangles=_joined([*solid, *sheer]),
-        balls=_joined(balls),
+        triangles=triangles,
+        balls=all_balls,
         layer_end=ends[len(solid) - 1 :].tolist(),
         opacity=opacity,
         texel=np.concatenate(texel),
+        light=np.zeros(3) if light is None else light @ camera.T_world_camera[:3, :3],
+        samples=samples,
+        window=_window(view, triangles, all_balls),
     )
 
 
@@ -139,6 +150,27 @@ class _View:
     def corners(self, point: Float[ndarray, "*batch 3"]) -> Float[ndarray, "*batch 3"]:
         """Give sample x times depth, sample y times depth, and depth of points in the world."""
         return self.camera.to_camera(np.asarray(point, np.float64)) @ self.K.T
+
+
+def _window(
+    view: _View, triangles: ProjectedTriangles, balls: ProjectedBalls
+) -> tuple[int, int, int, int]:
+    """Find the part of the picture that shapes may reach [px]."""
+    size = np.array([view.camera.width, view.camera.height])
+    corner = triangles.corner.reshape(-1, 3)
+    # The corners of a box around each ball, but for those too near to be seen.
+    seen = balls.center[:, 2] - balls.radius > view.near
+    steps = np.array(list(product([-1.0, 1.0], repeat=3)))
+    box = balls.center[seen, None] + balls.radius[seen, None, None] * steps
+    point = np.concatenate([corner, (box @ view.K.T).reshape(-1, 3)])
+    if not len(point):
+        return 0, 0, 1, 1
+    if not (point[:, 2] >= view.near).all():
+        return 0, 0, *size.tolist()
+    pixel = point[:, :2] / point[:, 2:] / view.samples
+    low = np.clip(np.floor(pixel.min(axis=0)) - 1, 0, size - 1).astype(int)
+    high = np.clip(np.ceil(pixel.max(axis=0)) + 2, low + 1, size).astype(int)
+    return *low.tolist(), *high.tolist()
 
 
 def _rows(

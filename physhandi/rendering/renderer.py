@@ -15,6 +15,7 @@ from physhandi.devices import start_warp
 from physhandi.rendering.kernels import (
     NOTHING,
     Grid,
+    Shapes,
     color_pixels,
     cover_balls,
     cover_triangles,
@@ -27,12 +28,15 @@ NEAR = 1e-3
 """What is nearer to the camera is not seen, unless a caller says otherwise."""
 FROM_ABOVE = np.array([0.0, 0.0, 1.0])
 """Light straight from above."""
-_STRIP = 2**21
+_STRIP = 2**19
 """Samples that are held at once."""
 _BAND = 32
 """Rows of samples that a thread of a graphics card takes; a processor takes all."""
 _GRID: Any = Grid
+_SHAPES: Any = Shapes
 _BYTE: Any = wp.uint8
+_KEY: Any = wp.int64
+_COLOR: Any = wp.vec4ub
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,27 +80,32 @@ def rasterize(
         ValueError: If the camera has distortion.
     """
     projection = project(camera, shapes, near=near)
-    scene = _DeviceScene(projection, near, camera.width, device)
-    size = (camera.height, camera.width)
-    key = scene.cover(0, camera.height)
+    left, top, right, bottom = projection.window
+    size = (bottom - top, right - left)
+    scene = _DeviceScene(projection, near, device, size)
     depth = wp.zeros(size, dtype=wp.float64, device=scene.device)
     number = wp.full(size, -1, dtype=wp.int32, device=scene.device)
     weight = wp.zeros(size, dtype=wp.vec3d, device=scene.device)
     wp.launch(
         describe_samples,
         size,
-        [scene.corner, scene.center, scene.radius, scene.grid(0, camera.height), key[0]],
+        [scene.shapes, scene.grid(top, bottom), scene.cover(top, bottom)[0]],
         [depth, number, weight],
         device=scene.device,
     )
+    raster = Raster(
+        depth=np.zeros((camera.height, camera.width)),
+        shape=np.full((camera.height, camera.width), -1, np.int32),
+        element=np.full((camera.height, camera.width), -1, np.int32),
+        weight=np.zeros((camera.height, camera.width, 3)),
+    )
     triangles, balls = projection.triangles, projection.balls
     seen: ndarray = number.numpy()
-    return Raster(
-        depth=depth.numpy(),
-        shape=np.concatenate([triangles.shape, balls.shape, [-1]])[seen],
-        element=np.concatenate([triangles.element, balls.element, [-1]])[seen],
-        weight=weight.numpy(),
-    )
+    place = np.s_[top:bottom, left:right]
+    raster.depth[place], raster.weight[place] = depth.numpy(), weight.numpy()
+    raster.shape[place] = np.concatenate([triangles.shape, balls.shape, [-1]])[seen]
+    raster.element[place] = np.concatenate([triangles.element, balls.element, [-1]])[seen]
+    return raster
 
 
 def render(
@@ -128,86 +137,101 @@ def render(
     """
     towards = light / np.linalg.norm(light)
     projection = project(camera, shapes, near=near, samples=samples, light=towards)
-    scene = _DeviceScene(projection, near, samples * camera.width, device)
-    ground = (0.0, 0.0, 0.0, 0.0) if background is None else (*background, 1.0)
+    ground = (0, 0, 0, 0) if background is None else (*background, 255)
     image = np.empty((camera.height, camera.width, 4), np.uint8)
-    step = max(_STRIP // (len(projection.opacity) * scene.width * samples), 1)
-    for top in range(0, camera.height, step):
-        end = min(top + step, camera.height)
-        part = wp.empty((end - top, camera.width, 4), dtype=_BYTE, device=scene.device)
+    image[:] = ground
+    left, top, right, bottom = projection.window
+    row_size = max(len(projection.opacity) * samples * samples * (right - left), 1)
+    step = max(_STRIP // row_size, 1)
+    size = (samples * min(step, bottom - top), samples * (right - left))
+    scene = _DeviceScene(projection, near, device, size)
+    for first in range(top, bottom, step):
+        end = min(first + step, bottom)
+        part = wp.empty((end - first, right - left, 4), dtype=_BYTE, device=scene.device)
+        rows = (samples * first, samples * end)
         wp.launch(
             color_pixels,
             part.shape[:2],
             [
-                *(scene.corner, scene.color, scene.image, scene.texel),
-                *(scene.center, scene.radius, scene.ball_color, scene.ball_shading),
-                wp.vec3d(*(towards @ camera.T_world_camera[:3, :3])),
-                scene.grid(samples * top, samples * end),
-                scene.cover(samples * top, samples * end),
-                *(scene.opacity, samples, wp.vec4(*ground)),
+                *(scene.shapes, scene.grid(*rows), scene.cover(*rows)),
+                *(scene.opacity, samples, _COLOR(*ground)),
             ],
             [part],
             device=scene.device,
         )
-        image[top:end] = part.numpy()
+        image[first:end, left:right] = part.numpy()
     return image
 
 
 class _DeviceScene:
     """A projection on a device."""
 
-    def __init__(self, projection: Projection, near: float, width: int, device: str) -> None:
+    def __init__(
+        self, projection: Projection, near: float, device: str, size: tuple[int, int]
+    ) -> None:
+        """Place a projection on a device.
+
+        Args:
+            projection: What there is.
+            near: Least depth that is seen.
+            device: Warp device.
+            size: Rows that are covered at once, and columns of samples in the window.
+        """
         start_warp()
         self.device: Any = wp.get_device(device)
-        self.width = width
-        self._K, self._near = projection.K, near
         self._layers = list(pairwise([0, *projection.layer_end]))
+        self._key = wp.empty((len(self._layers), *size), dtype=_KEY, device=self.device)
+        self._grid = _GRID()
+        self._grid.K = wp.mat33d(*projection.K.ravel())
+        self._grid.inverse = wp.mat33d(*np.linalg.inv(projection.K).ravel())
+        self._grid.near = near
+        self._grid.left = projection.window[0] * projection.samples
+        self._grid.right = projection.window[2] * projection.samples
         triangles, balls = projection.triangles, projection.balls
-        self.corner = self._array(triangles.corner, wp.vec3d)
-        self.color = self._array(triangles.color, wp.vec3)
-        self.image = self._array(triangles.image, wp.vec3i)
-        self.texel = self._array(projection.texel, wp.vec3ub)
         self.opacity = self._array(np.array(projection.opacity), wp.float32)
-        self.center = self._array(balls.center, wp.vec3d)
-        self.radius = self._array(balls.radius, wp.float64)
-        self.ball_color = self._array(balls.color, wp.vec3)
-        self.ball_shading = self._array(balls.shading, wp.float32)
+        self.shapes = _SHAPES()
+        self.shapes.corner = self._array(triangles.corner, wp.vec3d)
+        self.shapes.corner_color = self._array(triangles.color, wp.vec3)
+        self.shapes.image = self._array(triangles.image, wp.vec3i)
+        self.shapes.texel = self._array(projection.texel, wp.vec3ub)
+        self.shapes.center = self._array(balls.center, wp.vec3d)
+        self.shapes.radius = self._array(balls.radius, wp.float64)
+        self.shapes.ball_color = self._array(balls.color, wp.vec3)
+        self.shapes.ball_shading = self._array(balls.shading, wp.float32)
+        self.shapes.light = wp.vec3d(*projection.light)
 
-    def grid(self, first: int, end: int) -> Any:
-        """Describe rows of samples."""
-        grid = _GRID()
-        grid.K, grid.inverse = (
-            wp.mat33d(*self._K.ravel()),
-            wp.mat33d(*np.linalg.inv(self._K).ravel()),
-        )
-        grid.near, grid.width, grid.first, grid.end = self._near, self.width, first, end
-        return grid
+    def grid(self, top: int, bottom: int) -> Any:
+        """Describe rows of samples in the window."""
+        self._grid.top, self._grid.bottom = top, bottom
+        return self._grid
 
-    def cover(self, first: int, end: int) -> Any:
-        """Find the nearest shape of every layer at every sample of some rows."""
-        size = (len(self._layers), end - first, self.width)
-        key = wp.full(size, wp.int64(NOTHING), dtype=wp.int64, device=self.device)
-        band = _BAND if self.device.is_cuda else end - first
-        bands = -(-(end - first) // band)
-        grid = self.grid(first, end)
-        for layer, (start, stop) in enumerate(self._layers):
-            if stop > start:
+    def cover(self, top: int, bottom: int) -> Any:
+        """Find the nearest shape of every layer at every sample of some rows.
+
+        The array is used again for the next rows.
+        """
+        self._key.fill_(wp.int64(NOTHING))
+        band = _BAND if self.device.is_cuda else bottom - top
+        band_count = -(-(bottom - top) // band)
+        grid, shapes = self.grid(top, bottom), self.shapes
+        for layer, (first, end) in enumerate(self._layers):
+            if end > first:
                 wp.launch(
                     cover_triangles,
-                    (stop - start, bands),
-                    [self.corner[start:stop], start, grid, band],
-                    [key[layer]],
+                    (end - first, band_count),
+                    [shapes.corner[first:end], first, grid, band],
+                    [self._key[layer]],
                     device=self.device,
                 )
-        if len(self.center):
+        if len(shapes.center):
             wp.launch(
                 cover_balls,
-                (len(self.center), bands),
-                [self.center, self.radius, len(self.corner), grid, band],
-                [key[0]],
+                (len(shapes.center), band_count),
+                [shapes.center, shapes.radius, len(shapes.corner), grid, band],
+                [self._key[0]],
                 device=self.device,
             )
-        return key
+        return self._key
 
     def _array(self, value: ndarray, dtype: Any) -> Any:
         return wp.array(np.ascontiguousarray(value), dtype=dtype, device=self.device)

@@ -132,3 +132,11 @@ def arrows(
         color=np.repeat(color, count, axis=0),
         shading=shading,
     )
+
+
+def facets(
+    vertex: Float[ndarray, "vertex 3"], faces: Int[ndarray, "face 3"]
+) -> tuple[Float[ndarray, "corner 3"], Int[ndarray, "face 3"]]:
+    """Give every triangle corners of its own, for sharp edges between them."""
+    corner = vertex[faces].reshape(-1, 3)
+    return corner, np.arange(len(corner)).reshape(-1, 3)

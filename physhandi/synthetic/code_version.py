@@ -65,7 +65,10 @@ def code_hash(folder: Path, parts: tuple[str, ...]) -> str:
     return digest.hexdigest()[:12]
 
 
-_PARTS = ("assets", "bodies", "engines", "film", "hands", "synthesize.py")
+_PARTS = (
+    *(f"synthetic/{part}" for part in ("assets", "bodies", "engines", "film", "hands")),
+    *("synthetic/synthesize.py", "rendering", "triangles.py"),
+)
 
 
 @lru_cache(maxsize=1)
@@ -78,7 +81,7 @@ def generator_version() -> str:
         engine = version("mujoco")
     except PackageNotFoundError:
         engine = "none"
-    return f"{code_hash(Path(__file__).parent, _PARTS)}-mujoco-{engine}"
+    return f"{code_hash(Path(physhandi.__file__).parent, _PARTS)}-mujoco-{engine}"
 
 
 def recorded_version(recording: Sequence) -> str:

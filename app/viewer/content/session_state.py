@@ -10,6 +10,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from app.viewer.content.layers import Layers, Theme
+from physhandi.data.camera import PinholeCamera
 from physhandi.simulation.parameters import SimulationParameters
 
 Kind = Literal["run", "sequence", "comparison"]
@@ -67,6 +68,18 @@ class Pose:
         """Read where the cameras of new clients are put."""
         up = np.array([0.0, 0.0, 1.0]) if camera.up is None else camera.up
         return cls(position=camera.position, look_at=camera.look_at, up=up, fov=camera.fov)
+
+    def camera(self, width: int, height: int) -> PinholeCamera:
+        """Give the camera that takes a picture of so many columns and rows."""
+        ahead = self.look_at - self.position
+        ahead = ahead / np.linalg.norm(ahead)
+        right = np.cross(ahead, self.up)
+        right = right / np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3] = np.stack([right, np.cross(ahead, right), ahead, self.position], axis=1)
+        focal = 0.5 * height / float(np.tan(self.fov / 2))
+        K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
+        return PinholeCamera(K=K, T_world_camera=pose, width=width, height=height)
 
     def give_first(self, camera: viser.InitialCameraConfig) -> None:
         """Put the cameras of new clients here."""

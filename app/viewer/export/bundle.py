@@ -158,14 +158,7 @@ def _views(snapshot: Snapshot) -> Iterator[tuple[str, bytes]]:
 
 def _camera(picture: Screenshot, snapshot: Snapshot) -> dict[str, Any]:
     pose = picture.pose
-    ahead = pose.look_at - pose.position
-    ahead = ahead / np.linalg.norm(ahead)
-    right = np.cross(ahead, pose.up)
-    right = right / np.linalg.norm(right)
-    T_world_camera = np.eye(4)
-    T_world_camera[:3] = np.stack([right, np.cross(ahead, right), ahead, pose.position], axis=1)
-    focal = 0.5 * picture.height / float(np.tan(pose.fov / 2))
-    middle = ((picture.width - 1) / 2, (picture.height - 1) / 2)
+    camera = pose.camera(picture.width, picture.height)
     own = {
         "width": picture.width,
         "height": picture.height,
@@ -173,8 +166,8 @@ def _camera(picture: Screenshot, snapshot: Snapshot) -> dict[str, Any]:
         "look_at": pose.look_at,
         "up": pose.up,
         "vertical_field_of_view_deg": float(np.degrees(pose.fov)),
-        "K": [[focal, 0.0, middle[0]], [0.0, focal, middle[1]], [0.0, 0.0, 1.0]],
-        "T_world_camera": T_world_camera,
+        "K": camera.K,
+        "T_world_camera": camera.T_world_camera,
     }
     recorded = {
         view.name: {

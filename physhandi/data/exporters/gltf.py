@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from physhandi.data.exporters.scene_data import HandSurface, SceneData
+from physhandi.triangles import vertex_normals
 
 POINTS, LINES, TRIANGLES = 0, 1, 4
 """How a primitive's vertices are joined."""
@@ -256,12 +257,6 @@ def _add_object(document: GltfDocument, scene: SceneData) -> None:
 
 
 def _normals(vertex: ndarray, faces: ndarray) -> ndarray:
-    """Compute unit normals of vertices, the area-weighted mean of their triangles'."""
-    corner = vertex[faces].astype(np.float64)
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    total = np.zeros(vertex.shape)
-    for index in range(3):
-        np.add.at(total, faces[:, index], normal)
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    # A vertex without a triangle has no normal; glTF wants some unit vector.
-    return np.where(length > 0, total / np.maximum(length, 1e-30), [0, 0, 1.0]).astype(np.float32)
+    """Give unit normals of vertices; one without a triangle has none, but glTF wants some."""
+    normal = vertex_normals(vertex, faces)
+    return np.where(normal.any(axis=1, keepdims=True), normal, [0, 0, 1.0]).astype(np.float32)

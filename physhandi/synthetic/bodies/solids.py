@@ -10,7 +10,7 @@ from numpy.random import Generator
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from physhandi.synthetic.film.rasterizer import triangle_areas
+from physhandi.triangles import triangle_areas
 
 _TETRAHEDRON_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 _LEAST_VOLUME = 0.25

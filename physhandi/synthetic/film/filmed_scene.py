@@ -12,9 +12,9 @@ from physhandi.data.sequence_meta import SIDES, Side
 from physhandi.synthetic.engines.truth import PhysicalTruth
 from physhandi.synthetic.film.degradations import Degradations, hand_shift
 from physhandi.synthetic.film.filming import SurfacePoints
-from physhandi.synthetic.film.rasterizer import triangle_areas
 from physhandi.synthetic.film.rendering import Dye, Scene, compose, light_camera
 from physhandi.synthetic.hands.true_hand import TrueHand, soft_tissue_offset
+from physhandi.triangles import triangle_areas
 
 MASK_VALUE: dict[Side, int] = {"right": 2, "left": 3}
 """Mask value of each hand."""

@@ -8,7 +8,9 @@ from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from physhandi.data.camera import PinholeCamera
-from physhandi.synthetic.film.rasterizer import Raster, rasterize, vertex_normals
+from physhandi.rendering.renderer import Raster, rasterize
+from physhandi.rendering.shapes import Surface
+from physhandi.triangles import vertex_normals
 
 _LIGHT = np.array([0.30, -0.28, 0.91]) / np.linalg.norm([0.30, -0.28, 0.91])
 _LIGHT_DISTANCE = 2.5
@@ -62,12 +64,17 @@ class Scene:
     light: PinholeCamera = field(default_factory=light_camera)
     """What the light sees; see `light_camera`."""
 
+    @property
+    def surface(self) -> Surface:
+        """Everything, to be drawn."""
+        return Surface(vertex=self.vertex, faces=self.faces)
+
     def labels(self, raster: Raster) -> UInt8[ndarray, "row column"]:
         """Name what each pixel shows as masks do: 0 the table, 1 the body, 2 and 3 the hands."""
         if not len(self.faces):
-            return np.zeros(raster.face.shape, dtype=np.uint8)
-        label = self.face_label[np.maximum(raster.face, 0)]
-        return np.where(raster.face < 0, 0, label).astype(np.uint8)
+            return np.zeros(raster.element.shape, dtype=np.uint8)
+        label = self.face_label[np.maximum(raster.element, 0)]
+        return np.where(raster.element < 0, 0, label).astype(np.uint8)
 
 
 @dataclass(frozen=True)
@@ -120,7 +127,7 @@ def compose(
 
 def photograph(camera: PinholeCamera, scene: Scene) -> Picture:
     """Render depth, labels and viewing angles of a scene."""
-    raster = rasterize(camera, scene.vertex, scene.faces)
+    raster = rasterize(camera, [scene.surface])
     point, sight = _points(camera, raster)
     normal = _normals(scene, raster)
     return Picture(
@@ -141,7 +148,7 @@ def paint(
         samples: Each pixel is averaged over this many rows and columns.
     """
     fine = resized(camera, samples)
-    raster = rasterize(fine, scene.vertex, scene.faces)
+    raster = rasterize(fine, [scene.surface])
     point, sight = _points(fine, raster)
     normal = _normals(scene, raster)
     facing = np.einsum("rcd,rcd->rc", normal, sight)
@@ -164,15 +171,15 @@ def _points(camera: PinholeCamera, raster: Raster) -> tuple[ndarray, ndarray]:
     ray = far - eye
     with np.errstate(divide="ignore"):
         table = np.where(ray[..., 2] < -1e-6, -eye[2] / ray[..., 2], np.nan)
-    depth = np.where(raster.face >= 0, raster.depth, table)
+    depth = np.where(raster.element >= 0, raster.depth, table)
     return eye + ray * depth[..., None], ray / np.linalg.norm(ray, axis=-1, keepdims=True)
 
 
 def _normals(scene: Scene, raster: Raster) -> Float[ndarray, "row column 3"]:
     if not len(scene.faces):
-        return np.broadcast_to([0.0, 0.0, 1.0], (*raster.face.shape, 3))
+        return np.broadcast_to([0.0, 0.0, 1.0], (*raster.element.shape, 3))
     normal = raster.interpolate(scene.faces, vertex_normals(scene.vertex, scene.faces))
-    normal[raster.face < 0] = [0.0, 0.0, 1.0]
+    normal[raster.element < 0] = [0.0, 0.0, 1.0]
     return normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
 
 
@@ -199,7 +206,7 @@ def _lit(scene: Scene, point: Float[ndarray, "row column 3"]) -> Float[ndarray, 
     """Tell how much of the light reaches each point past body and hands."""
     light = scene.light
     last = (light.width - 1, light.height - 1)
-    reach = rasterize(light, scene.vertex, scene.faces).depth
+    reach = rasterize(light, [scene.surface]).depth
     reach = np.where(reach > 0, reach, np.inf)
     where = np.nan_to_num(point)
     # Far away the table is behind the light; nothing casts a shadow there.

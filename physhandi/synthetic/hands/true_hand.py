@@ -15,7 +15,7 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from physhandi.data.sequence_meta import Side
-from physhandi.synthetic.film.rasterizer import vertex_normals
+from physhandi.triangles import vertex_normals
 
 ASSET = Path(__file__).parents[1] / "assets" / "true_hand.npz"
 BONE_COUNT = 16

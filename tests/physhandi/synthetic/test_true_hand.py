@@ -7,7 +7,6 @@ from scipy.spatial.transform import Rotation
 
 from physhandi.data.sequence_meta import Side
 from physhandi.hand.loading import load_hand_model
-from physhandi.synthetic.film.rasterizer import vertex_normals
 from physhandi.synthetic.hands.true_hand import (
     ASSET,
     BONE_COUNT,
@@ -17,6 +16,7 @@ from physhandi.synthetic.hands.true_hand import (
     load_true_hand,
     soft_tissue_offset,
 )
+from physhandi.triangles import vertex_normals
 
 
 def pose(**changed: np.ndarray) -> TrueHandPose:
