@@ -1,5 +1,7 @@
 """What pixel centres see, against rays in closed form and against every triangle in turn."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import warp as wp
@@ -13,6 +15,12 @@ from physhandi.rendering.shapes import Balls, Image, Segments, Surface
 
 FACE = np.array([[0, 1, 2]])
 QUAD = np.array([[0, 1, 2], [0, 2, 3]])
+
+
+@pytest.fixture(autouse=True)
+def drawn_on_every_device(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run each test on each device of this machine."""
+    monkeypatch.setitem(globals(), "rasterize", partial(rasterize, device=device))
 
 
 def turned_camera() -> PinholeCamera:
@@ -251,8 +259,8 @@ def test_the_same_shapes_give_the_same_bits() -> None:
 
 @pytest.mark.gpu
 def test_a_graphics_card_sees_what_a_processor_sees() -> None:
-    if not wp.is_cuda_available():
-        pytest.skip("needs a CUDA device")
+    if not (wp.is_cuda_available() and wp.is_cpu_available()):
+        pytest.skip("needs a CUDA device, and a Warp that compiles for the processor")
     view, shapes = crowd()
     ours, theirs = rasterize(view, shapes), rasterize(view, shapes, device="cuda:0")
     assert same(theirs, rasterize(view, shapes, device="cuda:0"))

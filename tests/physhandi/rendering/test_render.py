@@ -1,5 +1,7 @@
 """Antialiased pictures: coverage, colors, light, what is sheer, and lines of a width."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import warp as wp
@@ -14,6 +16,13 @@ from physhandi.rendering.shapes import Balls, Image, Segments, Shape, Surface, a
 QUAD = np.array([[0, 1, 2], [0, 2, 3]])
 RED, BLUE, GRAY = (np.array([color]) for color in ([200.0, 0, 0], [0, 0, 200.0], [100.0] * 3))
 FOCAL = 100.0
+
+
+@pytest.fixture(autouse=True)
+def drawn_on_every_device(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run each test on each device of this machine."""
+    monkeypatch.setitem(globals(), "rasterize", partial(rasterize, device=device))
+    monkeypatch.setitem(globals(), "render", partial(render, device=device))
 
 
 def camera(width: int = 80, height: int = 60) -> PinholeCamera:
@@ -239,8 +248,8 @@ def test_pictures_are_the_same_every_time() -> None:
 
 @pytest.mark.gpu
 def test_a_graphics_card_draws_what_a_processor_draws() -> None:
-    if not wp.is_cuda_available():
-        pytest.skip("needs a CUDA device")
+    if not (wp.is_cuda_available() and wp.is_cpu_available()):
+        pytest.skip("needs a CUDA device, and a Warp that compiles for the processor")
     view, shapes = crowd()
     ours, theirs = render(view, shapes), render(view, shapes, device="cuda:0")
     np.testing.assert_array_equal(theirs, render(view, shapes, device="cuda:0"))
