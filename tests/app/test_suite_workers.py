@@ -4,13 +4,15 @@ import json
 import os
 import signal
 import threading
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
 import psutil
 import pytest
-from suite_world import METHODS, order_of, table, write_told
+from suite_world import order_of, table, write_told
+from waiting import LIMIT_S
 
 from app.cli import suite_workers
 from app.cli.suite_workers import SuiteWorkers, order_from_json, order_to_json
@@ -19,10 +21,14 @@ from physhandi.data.sequence import Sequence
 from physhandi.errors import CancelledError, RunError, UsageError
 from physhandi.progress import NullProgress, Progress
 from physhandi.run import Run
+from physhandi.synthetic.suite import cells
 from physhandi.synthetic.suite.evaluation import Order, evaluate_suite, filler, list_tasks
 from physhandi.synthetic.suite.methods import parse_method
 
 pytestmark = pytest.mark.timeout(900)
+METHODS = ("static", "quick", "quick+last_residual")
+CELLS = 10
+"""Three methods and two recordings; two of the methods once more where nothing was fitted."""
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +39,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> tuple[Sequence, ...]
 
 @pytest.fixture(scope="module")
 def order(recordings: tuple[Sequence, ...]) -> Order:
-    return order_of(recordings, at_once=2)
+    return order_of(recordings, at_once=2, methods=METHODS)
 
 
 def children() -> list[psutil.Process]:
@@ -78,7 +84,7 @@ def test_two_processes_give_the_table_of_one_and_fill_each_cell_once(
         found = evaluate_suite(order, out, progress, fill=workers.fill(order, out))
         shares = [process.cpu_affinity() for process in children()]
         assert sorted(shares) == suite_workers._shares(2)
-    assert (found["cells"], found["failed"], found["skipped"]) == (14, 0, [])
+    assert (found["cells"], found["failed"], found["skipped"]) == (CELLS, 0, [])
     assert children() == []
     one, two = table(tmp_path / "one"), table(out)
     assert list(one) == list(two)
@@ -90,7 +96,7 @@ def test_two_processes_give_the_table_of_one_and_fill_each_cell_once(
     names = [sorted(p.name for p in (tmp_path / n / "cells").iterdir()) for n in ("one", "two")]
     assert names[0] == names[1]
     assert {Run.open(out / "cells" / name).attempt for name in names[1]} == {1}
-    assert progress.told[-1][:3] == ("suite", 14, 14)
+    assert progress.told[-1][:3] == ("suite", CELLS, CELLS)
     assert any("quick, low" in message for *_, message in progress.told)
     assert "shared by 2 cells at a time" in (out / "report.md").read_text()
 
@@ -108,18 +114,29 @@ def test_whatever_is_made_of_other_cells_comes_last(recordings: tuple[Sequence, 
     assert [t.protocol for t in placed] == ["main"] * 6 + ["unseen"] * 4
 
 
-def test_a_cell_that_another_process_fills_is_waited_for(tmp_path: Path, order: Order) -> None:
+def test_a_cell_that_another_process_fills_is_waited_for(
+    tmp_path: Path, order: Order, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    is_asked_for = threading.Event()
+
+    @contextmanager
+    def asked_for(path: Path) -> Iterator[None]:
+        is_asked_for.set()
+        with locked_file(path):
+            yield
+
     (tmp_path / "locks").mkdir()
     fill = filler(replace(order, methods=("static",)), tmp_path, NullProgress())
     fill(0)
     (name,) = (path.name for path in (tmp_path / "cells").iterdir())
     again = filler(replace(order, methods=("static",)), tmp_path, NullProgress())
     waiting = threading.Thread(target=lambda: again(0))
+    monkeypatch.setattr(cells, "locked_file", asked_for)
     with locked_file(tmp_path / "locks" / name):
         waiting.start()
-        waiting.join(0.5)
+        assert is_asked_for.wait(LIMIT_S)
         assert waiting.is_alive()
-    waiting.join(300)
+    waiting.join(LIMIT_S)
     assert not waiting.is_alive()
     assert Run.open(tmp_path / "cells" / name).attempt == 1
 
@@ -139,9 +156,8 @@ def test_a_process_that_is_killed_is_told_and_the_command_goes_on(
     with pytest.raises(RunError, match=told), SuiteWorkers(2, Killer()) as workers:
         evaluate_suite(order, out, fill=workers.fill(order, out))
     assert children() == []
-    with SuiteWorkers(2, NullProgress()) as workers:
-        found = evaluate_suite(order, out, fill=workers.fill(order, out))
-    assert (found["cells"], found["failed"]) == (14, 0)
+    found = evaluate_suite(order, out)
+    assert (found["cells"], found["failed"]) == (CELLS, 0)
 
 
 def test_a_wish_to_stop_ends_all_processes_and_keeps_what_is_finished(
@@ -151,20 +167,20 @@ def test_a_wish_to_stop_ends_all_processes_and_keeps_what_is_finished(
     with pytest.raises(CancelledError), SuiteWorkers(2, progress) as workers:
         evaluate_suite(order, tmp_path, progress, fill=workers.fill(order, tmp_path))
     assert children() == []
-    cells = json.loads((tmp_path / "cells.json").read_text())
-    assert {cell["method"] for cell in cells["cells"]} >= {"static"}
-    assert 0 < cells["about"]["missing"] < 14
+    stored = json.loads((tmp_path / "cells.json").read_text())
+    assert {cell["method"] for cell in stored["cells"]} >= {"static"}
+    assert 0 < stored["about"]["missing"] < CELLS
 
 
 def test_what_a_process_finds_wrong_is_told_in_its_words(tmp_path: Path, order: Order) -> None:
     wrong = replace(order, methods=("quick@object_.search.population=1",))
     told = r"population is 1; expected a whole number from 2"
-    with pytest.raises(UsageError, match=told), SuiteWorkers(2, NullProgress()) as workers:
-        evaluate_suite(wrong, tmp_path, fill=workers.fill(wrong, tmp_path))
-    making = {"object": "brick", "action": "lift", "seed": 0}
-    told = "no object named 'brick'"
-    with pytest.raises(UsageError, match=told), SuiteWorkers(2, NullProgress()) as workers:
-        workers.make({tmp_path / "brick": making})
+    with SuiteWorkers(2, NullProgress()) as workers:
+        with pytest.raises(UsageError, match=told):
+            evaluate_suite(wrong, tmp_path, fill=workers.fill(wrong, tmp_path))
+        making = {"object": "brick", "action": "lift", "seed": 0}
+        with pytest.raises(UsageError, match="no object named 'brick'"):
+            workers.make({tmp_path / "brick": making})
     assert not (tmp_path / "brick").exists()
 
 
