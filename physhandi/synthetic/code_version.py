@@ -13,7 +13,7 @@ from physhandi.data.sequence import Sequence
 INPUTS = ("synthetic/suite/variants.py", "data/sequence_writer.py", "data/truth.py")
 """Code that makes the inputs of methods."""
 PREDICTIONS = (
-    *("pipeline.py", "fitted_object.py", "object_rollout.py", "settings.py"),
+    *("pipeline.py", "fitted_object.py", "object_rollout.py", "settings.py", "triangles.py"),
     *("data", "hand", "perception", "simulation", "fitting"),
     *("metrics/baselines.py", "metrics/alignment.py", "metrics/geometry.py"),
     *("synthetic/suite/methods.py", "synthetic/suite/cells.py"),

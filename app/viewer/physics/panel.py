@@ -39,7 +39,7 @@ class SliderSet:
         gui: viser.GuiApi,
         guard: Guard,
         history: History,
-        move: Callable[[Knob | Switch, Any], None],
+        move: Callable[[Knob | Switch, FollowedChoice], None],
     ) -> None:
         """Prepare; `add` makes the controls where the caller stands.
 
@@ -53,7 +53,7 @@ class SliderSet:
         self._guard = guard
         self._history = history
         self._move = move
-        self._controls: list[tuple[Knob | Switch, Any]] = []
+        self._controls: list[tuple[Knob | Switch, FollowedChoice]] = []
 
     @property
     def knobs(self) -> tuple[Knob | Switch, ...]:
@@ -63,23 +63,22 @@ class SliderSet:
     def add(self, *knobs: Knob | Switch) -> None:
         """Add a control for each of some parameters."""
         for knob in knobs:
-            control = self._make(knob)
-            control.on_update(
+            control = FollowedChoice(self._make(knob), self._guard)
+            control.handle.on_update(
                 self._guard.by_user(lambda _, knob=knob, control=control: self._move(knob, control))
             )
             self._controls.append((knob, control))
 
     def show(self) -> None:
-        """Move the controls to the parameters in force."""
+        """Move the controls to the parameters in force, but none that a user is moving."""
         for knob, control in self._controls:
-            value = knob.to_slider(self._history.current)
-            if control.value != value:
-                control.value = value
+            control.show(knob.to_slider(self._history.current))
 
     def mark(self) -> None:
         """Put a dot before the name of whatever is not as fitted."""
         start, now = self._history.start, self._history.current
-        for knob, control in self._controls:
+        for knob, followed in self._controls:
+            control = followed.handle
             label = f"{_CHANGED}{knob.label}" if knob.differs(start, now) else knob.label
             if control.label != label:
                 control.label = label
@@ -364,10 +363,10 @@ class PhysicsPanel:
             for command in bind(server, guard, action, lambda _, __, act=act: act())
         ]
 
-    def _move(self, knob: Knob | Switch, control: Any) -> None:
+    def _move(self, knob: Knob | Switch, control: FollowedChoice) -> None:
         with self._lock:
             before = self.history.setting
-            setting = self.history.set(knob.field, knob.from_slider(control.value))
+            setting = self.history.set(knob.field, knob.from_slider(control.read()))
             if setting != before:
                 self._simulate(setting)
 

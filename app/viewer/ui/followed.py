@@ -1,4 +1,4 @@
-"""A control that program and user both set, in which no choice of a user is overwritten."""
+"""A control that program and user both set: a list, a field or a slider; the user prevails."""
 
 import threading
 from typing import Any
@@ -7,7 +7,7 @@ from app.viewer.ui.guard import Guard
 
 
 class FollowedChoice:
-    """A list or a field that both the program and a user set.
+    """A list, a field or a slider that both the program and a user set.
 
     Viser stores a user's choice on its event loop before it calls anybody, so a value that was not
     the last one written or read here is a user's that is about to be heard. The program writes on

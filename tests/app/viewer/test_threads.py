@@ -207,13 +207,14 @@ def test_what_is_moved_last_is_asked_for_last(sessions: Sessions) -> None:
         panel._rollouts = rollouts  # pyright: ignore[reportAttributeAccessIssue]
         controls = {knob.field: (knob, control) for knob, control in panel._sliders._controls}
         knob, control = controls["drag"]
-        control._impl.value = 7.0
+        control.handle._impl.value = 7.0
         first = beside(lambda: panel._move(knob, control))
         assert rollouts.has_begun.wait(PATIENCE)
-        control._impl.value = 9.0
+        control.handle._impl.value = 9.0
+        # Whichever comes first: what shows the parameters in force leaves what a user moved.
         others = [
-            beside(lambda: panel._move(knob, control)),
             beside(lambda: panel._set_substeps(77, False)),
+            beside(lambda: panel._move(knob, control)),
         ]
         rollouts.may_end.set()
         for thread in (first, *others):
@@ -221,6 +222,8 @@ def test_what_is_moved_last_is_asked_for_last(sessions: Sessions) -> None:
         now = panel.history.current
         assert (now.drag, now.substeps_per_frame) == (9.0, 77)
         assert rollouts.asked[-1] == now
+        write_all(session)
+        assert control.handle.value == 9.0
 
 
 def test_a_camera_is_not_aimed_at_a_figure_that_is_being_left(
