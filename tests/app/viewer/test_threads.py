@@ -238,13 +238,15 @@ def test_a_camera_is_not_aimed_at_a_figure_that_is_being_left(
         monkeypatch.setattr(comparison._view, "_aim", lambda client, _: aimed.append(client))
         monkeypatch.setattr(comparison._cameras, "has_lost", lambda _: True)
         comparison.turn(viewer)
-        assert aimed == [viewer]
+        # The browser's own answers to being aimed may be among them.
+        assert viewer in aimed
         with comparison._lock:
+            aimed.clear()
             late = beside(lambda: comparison.turn(viewer))
             late.join(SHORT)
             comparison._leave()
         late.join(PATIENCE)
-        assert aimed == [viewer]
+        assert aimed == []
 
 
 def test_a_camera_that_is_heard_late_brings_no_comparison_back(sessions: Sessions) -> None:
