@@ -28,13 +28,16 @@ class FollowedChoice:
         self._guard = guard
         self._lock = threading.Lock()
         self._last: Any = handle.value
+        self._read_count = 0
 
     def show(self, value: Any) -> None:
-        """Set the control, unless a choice of a user waits for its callback."""
+        """Set the control, unless a user's choice waits for its callback or was read meanwhile."""
+        read_count = self._read_count
 
         def write() -> None:
             with self._lock:
-                if self.handle.value == self._last != value:
+                is_latest = read_count == self._read_count
+                if is_latest and self.handle.value == self._last != value:
                     self._last = value
                     self.handle.value = value
 
@@ -56,5 +59,6 @@ class FollowedChoice:
     def read(self) -> Any:
         """Read the control, whoever has set it."""
         with self._lock:
+            self._read_count += 1
             self._last = self.handle.value
             return self._last
