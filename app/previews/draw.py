@@ -20,8 +20,8 @@ _MARKER = np.array([63.0, 174.0, 92.0])
 _SPRING = np.array([[112.0, 160.0, 208.0]])
 _LIGHT = np.array([-0.35, -0.65, -0.67])
 """Where the light comes from, in the camera's axes."""
-_SHADING = 0.65
-_FADING = 0.35
+_SKIN_SHADING, _POINT_SHADING = 0.9, 0.5
+_FADING = 0.3
 """How much darker the farthest points are than the nearest."""
 _SKIN_RADIUS = 1.0
 _SAMPLED_POINTS = 4_000
@@ -87,7 +87,7 @@ def _shapes(camera: PinholeCamera, motion: Motion, frame: int) -> list[Shape]:
             shapes.append(_balls(camera, vertex, _SKIN, _SKIN_RADIUS))
         else:
             color = _SKIN[None]
-            shapes.append(Surface(vertex=vertex, faces=faces, color=color, shading=_SHADING))
+            shapes.append(Surface(vertex=vertex, faces=faces, color=color, shading=_SKIN_SHADING))
     radius = _radius(motion)
     for track, color in (
         (motion.node, _NODE),
@@ -125,5 +125,5 @@ def _balls(
         center=point,
         radius=depth * (radius / float(camera.K[0, 0])),
         color=shade[:, None] * color,
-        shading=_SHADING,
+        shading=_POINT_SHADING,
     )
