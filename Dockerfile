@@ -1,7 +1,7 @@
 # Runs the demo: docker build -t physhandi . && docker run --rm -p 127.0.0.1:8080:8080 physhandi
 FROM python:3.11-slim-bookworm
 RUN apt-get update \
- && apt-get install -y --no-install-recommends make libgl1 libegl1 libusb-1.0-0 libgomp1 \
+ && apt-get install -y --no-install-recommends make libgl1 libegl1 libgomp1 \
  && rm -rf /var/lib/apt/lists/*
 WORKDIR /opt/physhandi
 COPY pyproject.toml constraints.txt Makefile README.md LICENSE ./

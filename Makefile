@@ -50,12 +50,12 @@ test-gpu: install
 bench: install
 	$(BIN)/physhandi benchmark rollout --json
 
-# The browser tests drive Debian's chromium; open3d, where it is used, needs libusb and libGL.
+# The browser tests drive Debian's chromium.
 browser:
 	@command -v chromium >/dev/null || { \
 	  if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
 	    apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends \
-	      chromium libegl-mesa0 libgl1-mesa-dri libgl1 libegl1 libusb-1.0-0 >/dev/null; \
+	      chromium libegl-mesa0 libgl1-mesa-dri libgl1 libegl1 >/dev/null; \
 	  else echo "The browser tests need chromium: install it with your package manager." >&2; exit 1; fi; }
 
 clean:

@@ -193,7 +193,7 @@ def test_an_empty_server_tells_how_to_begin(tmp_path: Path) -> None:
 
 
 def test_a_server_starts_without_what_only_fits_need() -> None:
-    heavy = ["torch", "open3d", "ai_edge_litert", "mujoco", "matplotlib"]
+    heavy = ["torch", "ai_edge_litert", "mujoco", "matplotlib"]
     code = f"import sys; sys.modules.update(dict.fromkeys({heavy!r})); import app.cli, app.server"
     root = Path(__file__).parents[2]
     done = subprocess.run(

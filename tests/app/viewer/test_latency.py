@@ -67,7 +67,7 @@ def test_a_run_that_is_gone_fails_by_name(run: Run, monkeypatch: pytest.MonkeyPa
 
 
 def test_it_needs_no_package_of_the_server() -> None:
-    missing = ["fastapi", "open3d", "pydantic", "torch", "trimesh", "tyro", "uvicorn", "viser"]
+    missing = ["fastapi", "pydantic", "torch", "tyro", "uvicorn", "viser"]
     code = (
         f"import sys; sys.modules.update(dict.fromkeys({missing!r}))\n"
         "import app.benchmarks.latency, app.viewer.live.worker, app.viewer.live.worker\n"

@@ -1,7 +1,6 @@
 """Each distance against a case that was computed by hand, and against plain double loops."""
 
 import numpy as np
-import open3d as o3d
 import pytest
 from scipy.spatial.distance import cdist
 
@@ -50,22 +49,11 @@ def test_chamfer_agrees_with_a_full_distance_matrix(norm, order) -> None:
     rng = np.random.default_rng(7)
     observed, nodes = rng.normal(size=(70, 3)), rng.normal(size=(40, 3))
     matrix = cdist(observed, nodes, order)
-    assert chamfer_one_way(observed, nodes, norm) == pytest.approx(matrix.min(axis=1).mean())
+    there, back = (matrix.min(axis=axis).mean() for axis in (1, 0))
+    assert chamfer_one_way(observed, nodes, norm) == pytest.approx(there)
+    if norm == "l2":
+        assert chamfer_symmetric(observed, nodes) == pytest.approx((there + back) / 2)
     assert matrix.min(axis=1).mean() != pytest.approx(matrix.min(axis=0).mean(), rel=0.01)
-
-
-def test_chamfer_agrees_with_open3d() -> None:
-    rng = np.random.default_rng(8)
-    first, second = (
-        o3d.geometry.PointCloud(o3d.utility.Vector3dVector(rng.normal(size=(n, 3))))
-        for n in (60, 35)
-    )
-    there = np.asarray(first.compute_point_cloud_distance(second)).mean()
-    back = np.asarray(second.compute_point_cloud_distance(first)).mean()
-    points = np.asarray(first.points), np.asarray(second.points)
-    assert chamfer_one_way(*points) == pytest.approx(there)
-    assert chamfer_symmetric(*points) == pytest.approx((there + back) / 2)
-    assert abs(there - back) > 0.02
 
 
 def test_empty_sets() -> None:
