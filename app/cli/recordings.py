@@ -61,6 +61,8 @@ def synthesize(
     frames: int = 90,
     hold: Literal["friction", "attachment"] = "friction",
     images: Literal["all", "none"] = "all",
+    image_size: Literal["full", "half", "quarter"] = "full",
+    held_out_view: bool = False,
     resolution: Literal["fine", "tiny"] = "fine",
     overwrite: bool = False,
 ) -> None:
@@ -80,6 +82,8 @@ def synthesize(
         hold: Hands hold by friction alone, or what they have touched for 0.1 s sticks to them.
         images: none writes lifted tracks instead of color, depth and masks: small, and made in
             seconds.
+        image_size: Pictures 848, 424 or 212 px wide; detectors' errors stay as large in the world.
+        held_out_view: One more camera films without errors into `truth/`, for scoring alone.
         resolution: How many nodes the simulated body has.
         overwrite: Replace a sequence that is there.
     """
@@ -97,6 +101,8 @@ def synthesize(
             frames=frames,
             hold=hold,
             images=images,
+            image_size=image_size,
+            held_out_view=held_out_view,
             resolution=resolution,
             overwrite=overwrite,
             progress=progress,

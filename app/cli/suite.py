@@ -24,7 +24,8 @@ _OF_SUITE = arg(help_behavior_hint="(default: the suite's)")
 def evaluate_suite(
     *,
     suite: Annotated[
-        Literal["tiny", "dev", "full"] | None, arg(help_behavior_hint="(default: tiny)")
+        Literal["tiny", "dev", "dev_rgbd", "full"] | None,
+        arg(help_behavior_hint="(default: tiny)"),
     ] = None,
     methods: Annotated[tuple[str, ...], _OF_SUITE] = (),
     seeds: Annotated[tuple[int, ...], _OF_SUITE] = (),

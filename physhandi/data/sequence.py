@@ -22,6 +22,7 @@ from physhandi.data.length_unit import (
 from physhandi.data.sequence_meta import FILE, SequenceMeta, Side, read_meta
 from physhandi.data.sequence_meta import ViewMeta as ViewMeta
 from physhandi.data.truth import TRUTH_FOLDER as TRUTH
+from physhandi.data.truth import read_held_out_views
 from physhandi.data.view import View
 from physhandi.errors import SequenceError
 
@@ -76,6 +77,8 @@ def check_layout(folder: Path, meta: SequenceMeta, views: tuple[View, ...]) -> N
         if has_track[0] != has_track[1]:
             _fail(meta.name, f"views/{view.name}", "needs both track.npy and track_visible.npy")
         view.check_presence()
+    for view in read_held_out_views(folder, meta.name, meta.frame_count):
+        view.check_presence()
     _check_markers(folder, meta, axes)
 
 
@@ -101,7 +104,7 @@ def check_values(
     _check_motion(folder, name)
     if meta.metric:
         _check_unit(folder, meta)
-    for view in views:
+    for view in (*views, *read_held_out_views(folder, name, meta.frame_count)):
         for file in VIEW_ARRAYS:
             _check_finite(folder, view.folder / file, name)
         _check_tracks(view, name)
@@ -366,6 +369,11 @@ class Sequence:
     def future_frames(self) -> range:
         """Frames that are held out for scoring the prediction."""
         return range(self.meta.reconstruction_count, self.frame_count)
+
+    @cached_property
+    def held_out_views(self) -> tuple[View, ...]:
+        """Views for scoring only, from ``truth/views/``; no stage of a fit reads them."""
+        return read_held_out_views(self.folder, self.name, self.frame_count)
 
     @cached_property
     def control(self) -> Float[ndarray, "frame control 3"] | None:

@@ -6,6 +6,7 @@ from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from types import TracebackType
+from typing import Any
 
 import cv2
 import numpy as np
@@ -94,6 +95,10 @@ class SequenceWriter:
             raise SequenceError(f"Sequence '{self.folder.name}': {rel} could not be written.")
         with _naming(path):
             path.write_bytes(code.tobytes())
+
+    def save_yaml(self, rel: str, value: Any) -> None:
+        """Store plain data, for example as ``truth/views/a/camera.yaml``."""
+        write_yaml(self._path(rel), value)
 
     def copy(self, rel: str, path: Path | str) -> None:
         """Take over a file as it is, for example a video."""

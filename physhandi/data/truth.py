@@ -1,6 +1,8 @@
 """What really happened in a recording, for scoring only: the optional folder ``truth/``.
 
 No stage of a fit reads it. Simulated recordings can have it, and recordings of a better sensor.
+Views that are held out lie in it too, with a ``camera.yaml`` each, so that what copies a recording
+without its truth cannot give them away.
 """
 
 from collections.abc import Mapping
@@ -11,11 +13,18 @@ from typing import Any
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from physhandi.data.files import read_array
+from physhandi.data.camera import PinholeCamera
+from physhandi.data.files import named_fields, parse_yaml, read_array
 from physhandi.data.sequence_meta import Side
+from physhandi.data.view import View
+from physhandi.errors import SequenceError
 
 TRUTH_FOLDER = "truth"
 """Folder of a sequence that holds the truth."""
+HELD_OUT_FOLDER = f"{TRUTH_FOLDER}/views"
+"""Folder of a sequence that holds the views that are held out."""
+HELD_OUT_CAMERA = "camera.yaml"
+"""File of such a view that holds its calibration, in the fields that ``sequence.yaml`` has."""
 _SIDES: tuple[Side, Side] = ("right", "left")
 
 
@@ -60,3 +69,29 @@ def read_truth(folder: Path) -> Truth:
         object_point=read("object_point.npy"),
         object_face=read("object_face.npy"),
     )
+
+
+def read_held_out_views(folder: Path, name: str, frame_count: int) -> tuple[View, ...]:
+    """Open the views of a sequence that are held out for scoring, by name.
+
+    Args:
+        folder: Folder of the sequence.
+        name: Name of the sequence, for errors.
+        frame_count: Number of its frames.
+
+    Raises:
+        SequenceError: If a view has no calibration, or an invalid one.
+    """
+    views: list[View] = []
+    for path in sorted((folder / HELD_OUT_FOLDER).glob("*/")):
+        file = path / HELD_OUT_CAMERA
+        where = f"Sequence '{name}': {file.relative_to(folder).as_posix()}"
+        try:
+            fields = named_fields(parse_yaml(file.read_text(encoding="utf-8"))) or {}
+            camera = PinholeCamera.from_dict(fields)
+        except FileNotFoundError:
+            raise SequenceError(f"{where} is missing. Add it, or remove the view.") from None
+        except (ValueError, OSError) as error:
+            raise SequenceError(f"{where} is not the calibration of a camera: {error}.") from error
+        views.append(View(path, name, camera, frame_count))
+    return tuple(views)

@@ -21,7 +21,13 @@ from physhandi.synthetic.bodies.bodies import BodyName, Resolution, make_body
 from physhandi.synthetic.code_version import generator_version
 from physhandi.synthetic.engines.mujoco_flex import simulate_truth
 from physhandi.synthetic.engines.truth import FRAME_RATE, CapsuleHand, Hold, PhysicalTruth
-from physhandi.synthetic.film.cameras import MOST_CAMERAS, make_viewpoints
+from physhandi.synthetic.film.cameras import (
+    MOST_CAMERAS,
+    ImageSize,
+    make_held_out_viewpoint,
+    make_viewpoints,
+    with_image_size,
+)
 from physhandi.synthetic.film.degradations import changed, find_preset
 from physhandi.synthetic.film.filmed_scene import make_filmed_scene
 from physhandi.synthetic.film.recording import Images, record
@@ -49,6 +55,8 @@ def synthesize(
     frames: int = FRAMES,
     hold: Hold = "friction",
     images: Images = "all",
+    image_size: ImageSize = "full",
+    held_out_view: bool = False,
     resolution: Resolution = "fine",
     changes: Mapping[str, float] | None = None,
     overwrite: bool = False,
@@ -70,6 +78,10 @@ def synthesize(
         frames: Number of frames, 30 a second.
         hold: Whether hands hold by friction, or what they have touched for 0.1 s sticks to them.
         images: ``none`` leaves color, depth and masks out; see `record`.
+        image_size: ``half`` and ``quarter`` store smaller pictures of the same cameras. Levels in
+            pixels stay those of the full picture, as if detectors had seen that.
+        held_out_view: Whether one more camera, halfway between the first two, films without errors
+            for scoring alone (`Sequence.held_out_views`). The others stay as they are.
         resolution: How many nodes the body gets; ``tiny`` is for tests.
         changes: Levels that differ from the preset's, by name.
         overwrite: Whether to replace a sequence that is there.
@@ -87,7 +99,10 @@ def synthesize(
     """
     progress = progress or NullProgress()
     level = changed(find_preset(preset), changes or {})
-    _check(action=action, seed=seed, cameras=cameras, frames=frames, hold=hold, images=images)
+    _check(action=action, seed=seed, cameras=cameras, frames=frames)
+    _check_choice("hold", hold, get_args(Hold))
+    _check_choice("images", images, get_args(Images))
+    _check_choice("image_size", image_size, get_args(ImageSize))
     name = cast("BodyName", object_)  # An unknown one is refused by `make_body`.
     body = make_body(name, np.random.default_rng([seed, 0]), resolution=resolution)
     with SequenceWriter(out, overwrite=overwrite) as writer:
@@ -103,8 +118,20 @@ def synthesize(
         place = [seed, 2, get_args(BodyName).index(name), ACTIONS.index(action)]
         own = int(np.random.default_rng(place).integers(2**32))
         stage = make_filmed_scene(truth, hands, level, own)
-        views = make_viewpoints(stage.extent(), cameras, level, own)
-        record(writer, stage, views, level, seed=own, images=images, progress=progress)
+        extent = stage.extent()
+        given = make_viewpoints(extent, cameras, level, own)
+        views = tuple(with_image_size(view, image_size) for view in given)
+        held_out = (make_held_out_viewpoint(extent, cameras, own),) if held_out_view else ()
+        record(
+            writer,
+            stage,
+            views,
+            level,
+            seed=own,
+            images=images,
+            held_out=[with_image_size(view, image_size) for view in held_out],
+            progress=progress,
+        )
         settings = {
             "object": object_,
             "action": action,
@@ -114,6 +141,8 @@ def synthesize(
             "frames": frames,
             "hold": hold,
             "images": images,
+            "image_size": image_size,
+            "held_out_view": held_out_view,
             "resolution": resolution,
             "changes": dict(changes or {}),
         }
@@ -154,9 +183,7 @@ def engine_warnings_logged() -> Generator[None, None, None]:
         mujoco.set_mju_user_warning(before)
 
 
-def _check(
-    *, action: str, seed: int, cameras: int, frames: int, hold: Hold, images: Images
-) -> None:
+def _check(*, action: str, seed: int, cameras: int, frames: int) -> None:
     """Refuse invalid arguments before anything is computed or written."""
     if action not in ACTIONS:
         raise UsageError(f"There is no action {action!r}. Choose one of: {', '.join(ACTIONS)}.")
@@ -166,16 +193,15 @@ def _check(
         raise UsageError(f"cameras is {cameras}; expected 1 to {MOST_CAMERAS}.")
     if not LEAST_FRAMES <= frames <= MOST_SYNTHETIC_FRAMES:
         raise UsageError(f"frames is {frames}; expected {LEAST_FRAMES} to {MOST_SYNTHETIC_FRAMES}.")
-    for name, value, choices in (
-        ("hold", hold, get_args(Hold)),
-        ("images", images, get_args(Images)),
-    ):
-        if value not in choices:
-            raise UsageError(f"{name} is {value!r}; expected one of: {', '.join(choices)}.")
     if find_spec("mujoco") is None:
         raise UsageError(
             "Making sequences needs MuJoCo, which is not installed: pip install 'physhandi[synth]'."
         )
+
+
+def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise UsageError(f"{name} is {value!r}; expected one of: {', '.join(choices)}.")
 
 
 def _describe(truth: PhysicalTruth, action: str, hands: Mapping[Side, TrueHand]) -> str:

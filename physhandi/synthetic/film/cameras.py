@@ -1,6 +1,7 @@
 """Cameras around a table: where they stand, and cut-outs of their pictures."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -10,12 +11,16 @@ from numpy.random import Generator
 from physhandi.data.camera import PinholeCamera
 from physhandi.errors import UsageError
 from physhandi.synthetic.film.degradations import Degradations, delays, miscalibrated
-from physhandi.synthetic.film.rendering import look_at
+from physhandi.synthetic.film.rendering import look_at, resized
 
 SIZE = (848, 480)
 """Width and height of a D455's depth image [px]."""
 FOCAL_LENGTH = 447.0
 """Its focal length [px]."""
+ImageSize = Literal["full", "half", "quarter"]
+"""How wide stored pictures are: 848, 424 or 212 px."""
+HELD_OUT = "held_out"
+"""Name of the view that is held out."""
 MOST_CAMERAS = 4
 """A recording has at most this many cameras."""
 NEAREST_CAMERA, FARTHEST_CAMERA = 0.6, 1.0
@@ -23,6 +28,7 @@ NEAREST_CAMERA, FARTHEST_CAMERA = 0.6, 1.0
 _ELEVATION = (30.0, 55.0)
 _MARGIN = 12
 _STEP = 0.02
+_FACTOR: dict[ImageSize, float] = {"full": 1.0, "half": 0.5, "quarter": 0.25}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -58,12 +64,8 @@ def make_viewpoints(
     """
     if not 1 <= count <= MOST_CAMERAS:
         raise UsageError(f"cameras is {count}; expected 1 to {MOST_CAMERAS}.")
-    random = np.random.default_rng([seed, 10])
-    center = (point.min(axis=0) + point.max(axis=0)) / 2
-    first = random.uniform(0, 2 * np.pi)
-    cameras = [
-        _place(point, center, first + 2 * np.pi * number / count, random) for number in range(count)
-    ]
+    random, first = _around(seed)
+    cameras = [_place(point, first + 2 * np.pi * number / count, random) for number in range(count)]
     errors = np.random.default_rng([seed, 11])
     late = delays(count, level, errors)
     return tuple(
@@ -77,12 +79,37 @@ def make_viewpoints(
     )
 
 
-def _place(
-    point: Float[ndarray, "point 3"],
-    center: Float[ndarray, " 3"],
-    azimuth: float,
-    random: Generator,
-) -> PinholeCamera:
+def make_held_out_viewpoint(point: Float[ndarray, "point 3"], count: int, seed: int) -> Viewpoint:
+    """Place a camera halfway between the first two of `make_viewpoints`, which stay as they are.
+
+    Its calibration is exact and its clock that of the truth, since it is for scoring alone.
+
+    Args:
+        point: Everything that shall be seen, of all frames [m].
+        count: Number of the other cameras; beside a single one it stands opposite.
+        seed: Seed of the other cameras.
+    """
+    azimuth = _around(seed)[1] + np.pi / count
+    camera = _place(point, azimuth, np.random.default_rng([seed, 12]))
+    return Viewpoint(name=HELD_OUT, camera=camera, calibrated=camera, delay=0.0)
+
+
+def with_image_size(view: Viewpoint, size: ImageSize) -> Viewpoint:
+    """Let a camera store its pictures in another size."""
+    factor = _FACTOR[size]
+    return replace(
+        view, camera=resized(view.camera, factor), calibrated=resized(view.calibrated, factor)
+    )
+
+
+def _around(seed: int) -> tuple[Generator, float]:
+    """Draw the direction in which the first camera stands, and return where the drawing goes on."""
+    random = np.random.default_rng([seed, 10])
+    return random, float(random.uniform(0, 2 * np.pi))
+
+
+def _place(point: Float[ndarray, "point 3"], azimuth: float, random: Generator) -> PinholeCamera:
+    center = (point.min(axis=0) + point.max(axis=0)) / 2
     azimuth += np.deg2rad(random.uniform(-15, 15))
     elevation = np.deg2rad(random.uniform(*_ELEVATION))
     distance = random.uniform(NEAREST_CAMERA, FARTHEST_CAMERA)

@@ -43,6 +43,10 @@ class FilmedHand:
     shift: Float[ndarray, "frame 3"]
     """Offset at which it is filmed and detected, an error of the recording [m]."""
 
+    def in_place(self) -> "FilmedHand":
+        """Return the hand where it really is."""
+        return replace(self, shift=np.zeros_like(self.shift))
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FilmedScene:

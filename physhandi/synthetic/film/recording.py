@@ -4,6 +4,7 @@
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Literal
 
 import cv2
@@ -14,9 +15,10 @@ from numpy.random import Generator
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence_writer import SequenceWriter
+from physhandi.data.truth import HELD_OUT_CAMERA, HELD_OUT_FOLDER
 from physhandi.perception.tracks import motion_validity
 from physhandi.progress import Progress
-from physhandi.synthetic.film.cameras import Viewpoint, window_around
+from physhandi.synthetic.film.cameras import SIZE, Viewpoint, window_around
 from physhandi.synthetic.film.degradations import Degradations, depth_sensor
 from physhandi.synthetic.film.filmed_scene import FilmedScene, spread_points, surface_area
 from physhandi.synthetic.film.filming import (
@@ -69,6 +71,7 @@ def record(
     *,
     seed: int,
     images: Images,
+    held_out: Sequence[Viewpoint] = (),
     progress: Progress,
 ) -> None:
     """Write all files of a recording but ``sequence.yaml``.
@@ -81,6 +84,7 @@ def record(
         seed: Seed of all errors; those of one kind do not depend on the levels of others.
         images: ``all`` writes color, depth, masks and pixel tracks; ``none`` leaves the images out
             and writes the tracks lifted into the world as markers.
+        held_out: Cameras whose color, depth and masks, without any error, are for scoring alone.
         progress: Receives a report after every frame of every view; may cancel.
 
     Raises:
@@ -91,7 +95,7 @@ def record(
     for number, view in enumerate(views):
         shot = Shot(stage, view, level, np.random.default_rng([seed, 30, number]))
         folder = f"views/{view.name}"
-        counter = _Counter(progress, number * stage.frame_count, len(views) * stage.frame_count)
+        counter = _Counter(progress, stage.frame_count, number, len(views) + len(held_out))
         if images == "all":
             colors = _film(writer, folder, shot, counter)
             save_video(writer, f"{folder}/color.mp4", colors, stage.frame_rate)
@@ -109,6 +113,14 @@ def record(
         is_visible = np.asarray(np.isfinite(marker).all(axis=-1))
         writer.save_array("marker.npy", marker.astype(np.float32))
         writer.save_array("marker_motion_valid.npy", motion_validity(marker, is_visible))
+    exact = replace(stage, hands=tuple(hand.in_place() for hand in stage.hands))
+    for number, view in enumerate(held_out, len(views)):
+        folder = f"{HELD_OUT_FOLDER}/{view.name}"
+        shot = Shot(exact, view, Degradations(), np.random.default_rng([seed, 30, number]))
+        counter = _Counter(progress, stage.frame_count, number, len(views) + len(held_out))
+        colors = _film(writer, folder, shot, counter)
+        save_video(writer, f"{folder}/color.mp4", colors, stage.frame_rate)
+        writer.save_yaml(f"{folder}/{HELD_OUT_CAMERA}", view.camera.to_dict())
     _write_truth(writer, stage)
     _write_validation(writer, stage, views, seed)
 
@@ -124,6 +136,8 @@ class Shot:
         self.level = level
         self.random = random
         self.sensor = depth_sensor(level)
+        self.scale = view.camera.width / SIZE[0]
+        """Pixels of this picture in one of the width that levels in pixels are about."""
         self.surface = SurfacePoints(np.zeros((0, 3), dtype=np.int64), np.zeros((0, 3)))
         """Points of the body that are tracked."""
         self._bias = random.uniform(-0.7, 0.7), random.uniform(0, 2 * np.pi)
@@ -173,7 +187,7 @@ class Shot:
 
     def keypoints(self) -> Float[ndarray, "frame hand 21 3"]:
         """Simulate the keypoint detector: pixel x, pixel y and confidence [px]."""
-        camera, noise = self.view.camera, self.level.keypoint_noise
+        camera, noise = self.view.camera, self.scale * self.level.keypoint_noise
         joint = np.stack([self.stage.keypoints_at(time) for time in self._times()])
         pixel, is_hidden = camera.project(joint), np.stack(self._is_covered)
         keypoints = [
@@ -196,8 +210,8 @@ class Shot:
             self.view.camera.project(point),
             np.stack(self._is_seen),
             self.random,
-            error=self.level.track_noise,
-            wander=self.level.track_drift,
+            error=self.scale * self.level.track_noise,
+            wander=self.scale * self.level.track_drift,
             dropout_rate=self.level.track_loss,
         )
 
@@ -228,8 +242,9 @@ class Shot:
 class _Counter:
     """Reports the finished frames of all views."""
 
-    def __init__(self, progress: Progress, before: int, total: int) -> None:
-        self._progress, self._before, self._total = progress, before, total
+    def __init__(self, progress: Progress, frame_count: int, number: int, count: int) -> None:
+        self._progress = progress
+        self._before, self._total = number * frame_count, count * frame_count
 
     def check(self) -> None:
         self._progress.check_cancelled()
@@ -254,9 +269,9 @@ def _film(
             shot.choose_tracks(window.camera, picture, TRACK_COUNT)
         shot.look(frame, window.camera, picture)
         depth = shot.sensor.measure(
-            picture.depth, picture.cosine, shot.random, offset=shot.offset(frame), scale=1.0
+            picture.depth, picture.cosine, shot.random, offset=shot.offset(frame), scale=shot.scale
         )
-        limit = shot.level.mask_error
+        limit = shot.scale * shot.level.mask_error
         mask = segment(picture.label, shot.random, error=limit / 2, largest=limit)
         depth[cv2.dilate((mask > 0).astype(np.uint8), around) == 0] = 0
         for kind, part in (("depth", depth), ("mask", mask)):

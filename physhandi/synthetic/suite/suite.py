@@ -16,7 +16,7 @@ from physhandi.data.sequence import Sequence
 from physhandi.errors import UsageError
 from physhandi.progress import Progress
 
-SuiteName = Literal["tiny", "dev", "full"]
+SuiteName = Literal["tiny", "dev", "dev_rgbd", "full"]
 Protocol = Literal["main", "single_view", "unseen", "robustness", "sensitivity"]
 Making = Mapping[str, Any]
 """Arguments of `synthesize` for one sequence."""
@@ -74,6 +74,11 @@ def _scenes(*pairs: str) -> tuple[SuiteScene, ...]:
     return tuple(SuiteScene(object_=object_, action=action) for object_, action in split)
 
 
+_DEV_SCENES = _scenes(
+    "cloth lift", "cloth fold", "rope lift", "rope push", "plush squeeze", "pouch lift"
+)
+_DEV_SETTINGS = {"node_spacing": 0.011, "object_.first_order.iterations": 80}
+
 SUITES: dict[str, Suite] = {
     suite.name: suite
     for suite in (
@@ -99,9 +104,7 @@ SUITES: dict[str, Suite] = {
             name="dev",
             about="Six sequences without images, and 80 first-order steps in every fit so that all "
             "methods take a quarter of an hour on a fast GPU: for daily work on methods.",
-            scenes=_scenes(
-                "cloth lift", "cloth fold", "rope lift", "rope push", "plush squeeze", "pouch lift"
-            ),
+            scenes=_DEV_SCENES,
             seeds=(0,),
             methods=(
                 *BASELINES,
@@ -110,8 +113,28 @@ SUITES: dict[str, Suite] = {
                 *ORACLES,
             ),
             protocols=("main", "unseen"),
-            settings={"node_spacing": 0.011, "object_.first_order.iterations": 80},
+            settings=_DEV_SETTINGS,
             recording={"preset": "default", "images": "none", "frames": 60},
+        ),
+        Suite(
+            name="dev_rgbd",
+            about="The motions and cameras of `dev`, with color and depth of 424 x 240 px in three "
+            "views, and a fourth view that is held out.",
+            scenes=_DEV_SCENES,
+            seeds=(0,),
+            methods=(
+                *BASELINES,
+                "phystwin+last_residual",
+                *("ours", "ours+last_residual", "ours@refinement.iterations=0"),
+            ),
+            protocols=("main", "single_view"),
+            settings=_DEV_SETTINGS,
+            recording={
+                "preset": "default",
+                "frames": 60,
+                "image_size": "half",
+                "held_out_view": True,
+            },
         ),
         Suite(
             name="full",

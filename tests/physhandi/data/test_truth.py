@@ -1,13 +1,16 @@
 """The optional truth of a sequence: read as written, and checked like everything else."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+import physhandi
+from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import SequenceMeta
-from physhandi.data.sequence_writer import write_sequence
+from physhandi.data.sequence_writer import SequenceWriter, write_sequence
 from physhandi.data.truth import read_truth
 from physhandi.errors import SequenceError
 
@@ -44,6 +47,70 @@ def test_most_sequences_have_none(tmp_path: Path) -> None:
     assert not truth.hand_vertex
     assert truth.contact is truth.contact_point is None
     assert truth.object_point is truth.object_face is None
+
+
+def held_out_files() -> dict[str, np.ndarray]:
+    """Depth and masks of a view that is held out, 6 px wide and 4 px high."""
+    depth, mask = np.full((4, 6), 700, np.uint16), np.ones((4, 6), np.uint8)
+    folder = "truth/views/side"
+    return {
+        f"{folder}/{kind}/{frame:05d}.png": image
+        for kind, image in (("depth", depth), ("mask", mask))
+        for frame in range(3)
+    }
+
+
+def write_held_out(folder: Path, camera: dict[str, Any] | None) -> Sequence:
+    with SequenceWriter(folder) as writer:
+        for rel, image in held_out_files().items():
+            writer.save_image(rel, image)
+        if camera is not None:
+            writer.save_yaml("truth/views/side/camera.yaml", camera)
+        return writer.finish(META)
+
+
+CAMERA = PinholeCamera(
+    K=np.array([[5.0, 0, 2.5], [0, 5.0, 1.5], [0, 0, 1]]),
+    T_world_camera=np.eye(4),
+    width=6,
+    height=4,
+)
+
+
+def test_a_held_out_view_is_read_with_its_camera_and_is_no_view_of_the_sequence(
+    tmp_path: Path,
+) -> None:
+    sequence = write_held_out(tmp_path / "s", CAMERA.to_dict())
+    assert sequence.views == ()
+    assert sequence.missing("views", "depth", "mask") == ["views", "depth", "mask"]
+    (view,) = sequence.held_out_views
+    assert view.name == "side"
+    assert view.camera.to_dict() == CAMERA.to_dict()
+    np.testing.assert_allclose(view.depth(2), 0.7, atol=1e-6)
+    assert (view.mask(0) == 1).all()
+
+
+@pytest.mark.parametrize(
+    ("camera", "told"),
+    [
+        (None, r"truth/views/side/camera\.yaml is missing"),
+        ({"width": 6}, r"truth/views/side/camera\.yaml is not the calibration of a camera"),
+        ({**CAMERA.to_dict(), "width": 7}, "view 'side': mask of frame 0 is 6x4 px"),
+    ],
+)
+def test_a_wrong_held_out_view_is_refused(tmp_path: Path, camera: Any, told: str) -> None:
+    with pytest.raises(SequenceError, match=told):
+        write_held_out(tmp_path / "s", camera)
+
+
+def test_no_stage_of_a_fit_can_name_what_is_held_out() -> None:
+    library = Path(physhandi.__file__).parent
+    stages = [library / "pipeline.py", library / "fitted_object.py", library / "object_rollout.py"]
+    for part in ("fitting", "perception", "hand", "simulation"):
+        stages += sorted((library / part).rglob("*.py"))
+    assert len(stages) > 40
+    for path in stages:
+        assert "held_out_views" not in path.read_text(), path
 
 
 @pytest.mark.parametrize(

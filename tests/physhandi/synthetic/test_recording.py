@@ -15,7 +15,12 @@ from physhandi.data.sequence_writer import SequenceWriter
 from physhandi.data.truth import read_truth
 from physhandi.perception.lifting import hand_points, observe_object
 from physhandi.progress import NullProgress
-from physhandi.synthetic.film.cameras import Viewpoint, make_viewpoints
+from physhandi.synthetic.film.cameras import (
+    Viewpoint,
+    make_held_out_viewpoint,
+    make_viewpoints,
+    with_image_size,
+)
 from physhandi.synthetic.film.degradations import PRESETS, Degradations
 from physhandi.synthetic.film.filmed_scene import make_filmed_scene, spread_points, surface_area
 from physhandi.synthetic.film.recording import record
@@ -33,11 +38,13 @@ def write(
     sides: tuple[str, ...] = ("right",),
     seed: int = 1,
     delay: float = 0.0,
+    held_out: bool = False,
 ) -> Sequence:
     """Record a lifted sheet with two cameras, in small images if there are any."""
     truth = lifted_sheet(FRAMES, sides)
     stage = make_filmed_scene(truth, bare_hands(truth), level, seed)
     views = make_viewpoints(stage.extent(), 2, level, seed)
+    beside = [make_held_out_viewpoint(stage.extent(), 2, seed)] if held_out else []
     if images == "all":
         views = tuple(
             replace(v, camera=resized(v.camera, 0.375), calibrated=resized(v.calibrated, 0.375))
@@ -46,7 +53,16 @@ def write(
     if delay:
         views = tuple(replace(view, delay=delay) for view in views)
     with SequenceWriter(folder) as writer:
-        record(writer, stage, views, level, seed=seed, images=images, progress=NullProgress())
+        record(
+            writer,
+            stage,
+            views,
+            level,
+            seed=seed,
+            images=images,
+            held_out=[with_image_size(view, "half") for view in beside],
+            progress=NullProgress(),
+        )
         return writer.finish(describe(folder.name, stage.hands, views))
 
 
@@ -137,6 +153,62 @@ def test_without_images_the_lifted_tracks_are_markers(imageless):
         assert np.abs(off).max() < 0.0005
     assert observation.is_motion_valid[1:].mean() > 0.5
     assert imageless.views[0].keypoint.shape == (FRAMES, 1, 21, 3)
+
+
+def test_a_held_out_view_shows_without_errors_what_the_others_show_with_them(tmp_path):
+    level = replace(PRESETS["hard"], hand_error=0.03)
+    sequence = write(tmp_path / "held", level, held_out=True)
+    assert [view.name for view in sequence.views] == ["camera0", "camera1"]
+    (view,) = sequence.held_out_views
+    assert (view.camera.width, view.camera.height) == (424, 240)
+    known = read_truth(sequence.folder)
+    for frame in (0, 3):
+        mask, depth = view.mask(frame), view.depth(frame)
+        row, column = np.nonzero((mask == 1) & (depth > 0))
+        point = view.camera.unproject(
+            np.stack([column, row], axis=1).astype(np.float64), depth[row, column]
+        )
+        assert len(point) > 300
+        # Depth is whole millimetres.
+        assert np.abs(distance_to_sheet(lifted_sheet(FRAMES), frame, point)).max() < 0.0008
+        row, column = np.nonzero((mask == 2) & (depth > 0))
+        point = view.camera.unproject(
+            np.stack([column, row], axis=1).astype(np.float64), depth[row, column]
+        )
+        assert len(point) > 100
+        # The others find the hand 30 mm beside where it is.
+        near = cKDTree(known.hand_vertex["right"][frame]).query(point)[0]
+        assert np.percentile(near, 95) < 0.008
+    color, mask = view.color(2).astype(float), view.mask(2)
+    cloth, table = (np.median(color[mask == label], axis=0) for label in (1, 0))
+    assert cloth[2] - cloth[0] > table[2] - table[0] + 30
+    # The others are what they are without it.
+    without = write(tmp_path / "without", level)
+    for one, other in zip(sequence.views, without.views, strict=True):
+        assert one.camera.to_dict() == other.camera.to_dict()
+        np.testing.assert_array_equal(one.keypoint, other.keypoint)
+    np.testing.assert_array_equal(sequence.marker, without.marker)
+    np.testing.assert_array_equal(observe_object(sequence).point, observe_object(without).point)
+
+
+def test_smaller_pictures_have_the_same_errors_in_the_world(tmp_path):
+    truth = lifted_sheet(FRAMES)
+    level = Degradations(keypoint_noise=3.0)
+    stage = make_filmed_scene(truth, bare_hands(truth), level, 1)
+    (full,) = make_viewpoints(stage.extent(), 1, level, 1)
+    known = np.stack([hand.keypoint for hand in stage.hands], axis=1)
+    spread = []
+    for size in ("full", "half", "quarter"):
+        view = with_image_size(full, size)
+        with SequenceWriter(tmp_path / size) as writer:
+            record(writer, stage, [view], level, seed=1, images="none", progress=NullProgress())
+            made = writer.finish(describe(size, stage.hands, (view,)))
+        seen = made.views[0].keypoint
+        off = (seen[..., :2] - view.camera.project(known))[np.isfinite(seen[..., 0])]
+        spread.append(off.std() / view.camera.width)
+    # 3 px of 848 where a keypoint is seen, 6 where it is hidden.
+    assert 3 / 848 < spread[0] < 6 / 848
+    np.testing.assert_allclose(spread[1:], spread[0], rtol=0.15)
 
 
 def test_noise_and_a_wrong_calibration_are_in_the_markers(tmp_path):

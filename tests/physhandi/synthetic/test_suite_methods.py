@@ -86,6 +86,8 @@ def test_the_full_suite_has_five_objects_of_four_actions() -> None:
     assert len({scene.action for scene in scenes}) == 6
     assert sum(scene.hold == "friction" for scene in scenes) >= 10
     assert len(find_suite("dev").scenes) == 6
+    assert find_suite("dev_rgbd").scenes == find_suite("dev").scenes
+    assert find_suite("dev_rgbd").recording["held_out_view"]
     assert len(find_suite("tiny").scenes) <= 2
     assert len(find_suite("tiny").methods) >= 4
 

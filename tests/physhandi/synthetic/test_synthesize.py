@@ -84,6 +84,7 @@ def test_actions_share_a_seed_s_body_but_not_its_cameras(rope, tmp_path):
         ({"changes": {"fog": 1.0}}, "no degradation named 'fog'"),
         ({"hold": "glue"}, "hold is 'glue'; expected one of: friction, attachment"),
         ({"images": "some"}, "images is 'some'; expected one of: all, none"),
+        ({"image_size": "tiny"}, "image_size is 'tiny'; expected one of: full, half, quarter"),
         ({"resolution": "coarse"}, "no resolution named 'coarse'"),
     ],
 )
@@ -160,14 +161,16 @@ def test_the_command_writes_a_sequence(tmp_path: Path, capsys: pytest.CaptureFix
     fixed = ("--object", "rope", "--action", "push", "--seed", "4", "--preset", "clean")
     quick = ("--frames", "3", "--images", "none", "--resolution", "tiny", "--cameras", "1")
     change = ("--change", "depth_noise=0.05", "track_noise=0.5")
-    assert call(*fixed, *quick, *change, "--out", str(out)) == 0
+    aside = ("--image-size", "quarter", "--held-out-view")
+    assert call(*fixed, *quick, *change, *aside, "--out", str(out)) == 0
     assert str(out) in capsys.readouterr().out
     sequence = Sequence.load(out)
     assert sequence.provenance["synthesize"]["changes"] == {
         "depth_noise": 0.05,
         "track_noise": 0.5,
     }
-    assert len(sequence.views) == 1
+    assert [view.camera.width for view in sequence.views] == [212]
+    assert [view.camera.width for view in sequence.held_out_views] == [212]
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pytest
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence import Sequence, ViewMeta
 from physhandi.data.sequence_meta import SequenceMeta
-from physhandi.data.sequence_writer import write_sequence
+from physhandi.data.sequence_writer import SequenceWriter, write_sequence
 from physhandi.errors import MissingInputError
 from physhandi.synthetic.suite import variants
 from physhandi.synthetic.suite.variants import VARIANTS, make_variant, noise_seed
@@ -48,6 +48,8 @@ def recording(tmp_path: Path) -> Sequence:
     rise = np.arange(FRAMES, dtype=np.float32)[:, None, None] / 100
     arrays["truth/hand_right_vertex.npy"] = np.ones((FRAMES, 7, 3), np.float32) * 0.1 + rise
     arrays["validation_track.npy"] = np.zeros((FRAMES, 2, 3), np.float32)
+    for frame in range(FRAMES):
+        images[f"truth/views/held_out/mask/{frame:05d}.png"] = mask
     meta = SequenceMeta(
         name="scene",
         frame_rate=30.0,
@@ -58,7 +60,13 @@ def recording(tmp_path: Path) -> Sequence:
         views=views,
         provenance={"synthesize": {"seed": 4711}, "degradations": {"depth_noise": 0.5}},
     )
-    return write_sequence(tmp_path / "scene", meta, arrays, images=images)
+    with SequenceWriter(tmp_path / "scene") as writer:
+        for rel, array in arrays.items():
+            writer.save_array(rel, array)
+        for rel, image in images.items():
+            writer.save_image(rel, image)
+        writer.save_yaml("truth/views/held_out/camera.yaml", camera(0.2).to_dict())
+        return writer.finish(meta)
 
 
 def files(sequence: Sequence) -> dict[str, bytes]:
@@ -71,6 +79,8 @@ def test_nothing_but_truth_and_origin_is_kept_back(recording: Sequence, tmp_path
     made = make_variant(recording, "recording", tmp_path / "inputs")
     given = files(made)
     kept_back = {"truth/hand_right_vertex.npy", "validation_track.npy"}
+    kept_back |= {f"truth/views/held_out/mask/{frame:05d}.png" for frame in range(FRAMES)}
+    kept_back.add("truth/views/held_out/camera.yaml")
     assert set(whole) - set(given) == kept_back
     assert [name for name in given if given[name] != whole[name]] == ["sequence.yaml"]
     assert made.meta.to_dict() == {
@@ -88,8 +98,11 @@ def test_no_variant_tells_the_future_or_how_it_was_made(
 ) -> None:
     (recording.folder / "notes").mkdir()
     (recording.folder / "notes/validation.npy").write_bytes(b"the same under another name")
-    given = files(make_variant(recording, name, tmp_path / "inputs"))
+    made = make_variant(recording, name, tmp_path / "inputs")
+    given = files(made)
     assert not [file for file in given if "truth" in file or "validation" in file]
+    assert not [file for file in given if "held_out" in file]
+    assert (len(recording.held_out_views), len(made.held_out_views)) == (1, 0)
     for told in (b"4711", b"synthesize", b"degradations", b"21 x 33"):
         assert told in files(recording)["sequence.yaml"]
         assert told not in given["sequence.yaml"]
