@@ -32,9 +32,10 @@ fmt: install
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+# Three processes keep two cores busy, since the one with the browser mostly waits.
 test: install browser
 	rm -f .coverage .coverage.*
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --cov --cov-report=term
+	$(BIN)/python -m pytest -n 3 --dist loadgroup --no-loadscope-reorder --cov --cov-report=term
 
 # Live scenes, jobs and pages while their threads are held up at random.
 races: install

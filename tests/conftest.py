@@ -18,12 +18,25 @@ def pytest_configure(config):
     sys.dont_write_bytecode = False
 
 
-def pytest_collection_modifyitems(items):
-    """Begin with the files that take longest, so that no worker has one of them left at the end."""
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config, items):
+    """Give processes whole files, those that take longest first, and all browsers to one process.
+
+    Tests with a browser mostly wait, and two browsers without a graphics card hold each other up:
+    beside one of them the other processes compute.
+    """
+    browsers = config.rootpath / "tests" / "e2e"
     slow = {
         item.path for item in items if {"e2e", "slow"} & {mark.name for mark in item.iter_markers()}
     }
-    items.sort(key=lambda item: item.path not in slow)
+    items.sort(key=lambda item: (item.path.parent != browsers, item.path not in slow))
+    for item in items:
+        group = (
+            "browser"
+            if item.path.parent == browsers
+            else str(item.path.relative_to(config.rootpath))
+        )
+        item.add_marker(pytest.mark.xdist_group(group))
 
 
 DEVICES = ["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)]
