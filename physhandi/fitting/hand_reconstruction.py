@@ -654,7 +654,7 @@ def vertex_normals_torch(
     vertex: Float[Tensor, "frame vertex 3"], faces: Tensor
 ) -> Float[Tensor, "frame vertex 3"]:
     """Compute unit normals of vertices, the area-weighted mean of their triangles'."""
-    a, b, c = (vertex[:, faces[:, corner]] for corner in range(3))
+    a, b, c = (vertex.index_select(1, faces[:, corner]) for corner in range(3))
     normal = torch.cross(b - a, c - a, dim=-1)
     total = torch.zeros_like(vertex)
     for corner in range(3):

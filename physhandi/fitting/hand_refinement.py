@@ -37,6 +37,8 @@ BETA_1 = 0.9
 """Decay of Adam's first moment."""
 FLAT_GRADIENT = 1e-12
 """Adam's ε: change of the loss by one step below which the step shrinks [m²]."""
+WEAK_FRAME = 1e-3
+"""Share of the steepest frame's gradient below which a frame's step shrinks with its gradient."""
 REFINEMENT_STAGE = "hand_refinement"
 STEEPEST = 50.0
 """Gradients steeper than this many times that of an object tied rigidly to the hand count as
@@ -374,6 +376,12 @@ class OffsetDescent:
     the object turn as far as those that hold it. With a shared second moment a frame moves along
     its gradient, scaled by the expected size of each kind of correction, by one step in all.
     `by_parameter` selects plain Adam, as the paper uses it.
+
+    A step of fixed size makes much of a gradient that is nothing but rounding: a hand that does
+    not touch the object in a frame has one 1e-7 times that of a frame in which it does. Gradients
+    are therefore summed in a fixed order, so that the same input gives the same bits, and below
+    `WEAK_FRAME` of the steepest frame a step shrinks with its gradient: rounding then moves a
+    frame by less than a ten-thousandth of a step.
     """
 
     def __init__(
@@ -415,6 +423,8 @@ class OffsetDescent:
                 self.second[name].lerp_(squared[name], 1 - self.beta_2)
                 mean = self.first[name] / (1 - BETA_1**self.count)
                 size = (self.second[name] / (1 - self.beta_2**self.count)).sqrt()
+                if not self.by_parameter:
+                    size = size.clamp(min=WEAK_FRAME * float(size.max()))
                 offset.sub_(share * self.rates[name] * mean / (size + FLAT_GRADIENT))
 
 
@@ -423,7 +433,9 @@ def control_nodes(
 ) -> Float[Tensor, "frame control 3"]:
     """Join the vertices of all hands, in order, and select the control nodes (None for all)."""
     joined = torch.cat(list(vertices), dim=1)
-    return joined if chosen is None else joined[:, torch.from_numpy(chosen.astype(np.int64))]
+    if chosen is None:
+        return joined
+    return joined.index_select(1, torch.from_numpy(chosen.astype(np.int64)))
 
 
 def _carry(

@@ -75,8 +75,10 @@ class ObjectProblem:
 
     def predict_tracks(self, node: Float[Tensor, "frame node 3"]) -> Float[Tensor, "frame track 3"]:
         """Carry the tracked surface points along with the nodes."""
-        carried = (node[:, self.carrier] * self.carrier_weight[..., None]).sum(dim=2)
-        return carried + self.track_offset
+        # Unlike that of indexing, which adds in parallel, the gradient of index_select on a CPU is
+        # a sum in the order of the tracks: the same bits every time.
+        carrier = node.index_select(1, self.carrier.flatten()).unflatten(1, self.carrier.shape)
+        return (carrier * self.carrier_weight[..., None]).sum(dim=2) + self.track_offset
 
     def frame_losses(
         self,

@@ -118,7 +118,7 @@ def test_together_a_frame_takes_one_step_along_its_gradient() -> None:
     hand = offsets()
     gradients(hand, 5)
     for value in hand.value.values():
-        value.grad[1] *= 1e-6
+        value.grad[1] *= 0.01
         value.grad[2] = 0.0
     slope = {name: RATES[name] * value.grad.double() for name, value in hand.value.items()}
     OffsetDescent(hand, RATES, 0.99, by_parameter=False).step(0.5)
@@ -129,6 +129,20 @@ def test_together_a_frame_takes_one_step_along_its_gradient() -> None:
         assert float(step.norm()) == pytest.approx(0.5, rel=1e-4)
         assert float(step @ along / (step.norm() * along.norm())) == pytest.approx(-1.0, abs=1e-5)
     assert all(not value[2].any() for value in in_steps.values())
+
+
+def test_a_frame_whose_gradient_is_only_rounding_hardly_moves() -> None:
+    hand = offsets()
+    gradients(hand, 5)
+    for value in hand.value.values():
+        value.grad[1] *= 1e-7
+    OffsetDescent(hand, RATES, 0.99, by_parameter=False).step(1.0)
+    in_steps = torch.cat([(v / RATES[name]).flatten(1) for name, v in hand.value.items()], 1)
+    size = in_steps.detach().norm(dim=1)
+    assert float(size[0]) == pytest.approx(1.0, rel=0.7)
+    steepest = float(size.max())
+    assert steepest == pytest.approx(1.0, rel=1e-4)
+    assert 1e-6 < float(size[1]) < 1e-3
 
 
 def test_no_gradient_is_no_step() -> None:

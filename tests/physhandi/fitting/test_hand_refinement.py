@@ -22,6 +22,7 @@ from physhandi.fitting.hand_refinement import (
 )
 from physhandi.hand.motion import HandMotion, control_trajectory
 from physhandi.progress import NullProgress, Progress
+from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
 
 FREE = RefinementConfig(
@@ -92,8 +93,10 @@ def oracle_loss(
         damping=model.damping.astype(float),
         control=control,
         drag=parameters.drag,
-        ground=None,
-        gravity=0.0,
+        restitution=parameters.restitution,
+        friction=parameters.friction,
+        ground=parameters.ground_height,
+        gravity=parameters.gravity,
         substeps=parameters.substeps_per_frame,
     )
     node = simulate(scene)[0]
@@ -145,11 +148,22 @@ def with_targets(problem: RefinementProblem, frames: int) -> RefinementProblem:
     return replace(problem, targets=targets)
 
 
-@pytest.mark.parametrize("every", [1, 3], ids=["all vertices", "a third of them"])
-def test_the_gradient_agrees_with_central_differences_in_float64(every: int) -> None:
+FALLING = SOFT.replace(gravity=9.81, ground_height=0.06)
+"""The same rig with weight, above a ground that some of its nodes hit and slide on."""
+
+
+@pytest.mark.parametrize(
+    ("every", "parameters"),
+    [(1, SOFT), (3, SOFT), (3, FALLING)],
+    ids=["all vertices", "a third of them", "on the ground"],
+)
+def test_the_gradient_agrees_with_central_differences_in_float64(
+    every: int, parameters: SimulationParameters
+) -> None:
     truth = two_hands(frames=5)
     seen = tuple(disturbed(motion, seed) for seed, motion in enumerate(truth))
-    problem = with_targets(held_patch(truth, seen, fitted=4, every=every), 4)
+    posed_patch = held_patch(truth, seen, fitted=4, every=every, parameters=parameters)
+    problem = with_targets(posed_patch, 4)
     config = FREE.replace(prior_weight=0.3, smoothness_weight=0.7, keypoint_weight=1e-7)
     random = np.random.default_rng(3)
     refinement = Refinement(problem, config, "cpu")
