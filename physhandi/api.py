@@ -157,11 +157,21 @@ def prepare_run(
         name = name or path.resolve().name
         return Run.create(path, name=name, kind=kind, sequences=paths, config=settings)
     run = Run.open(path)
-    if run.kind != kind or run.config != settings or list(run.sequences) != paths:
+    if run.kind != kind or run.config != _known_to(run, settings) or list(run.sequences) != paths:
         raise UsageError(
             f"{path} already holds another run. Choose another folder, or delete that one first."
         )
     return run
+
+
+def _known_to(run: Run, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Drop settings that there were not yet when a run was made; it goes on as it began."""
+    from physhandi.fitting.config import without_newer
+
+    known = dict(settings)
+    if "profile" in settings and "profile" in run.config:
+        known["profile"] = without_newer(settings["profile"], run.config["profile"])
+    return known
 
 
 def _execute(

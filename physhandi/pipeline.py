@@ -52,6 +52,7 @@ from physhandi.fitting.placement import (
     refine_sequence,
     store_refined,
 )
+from physhandi.fitting.rest_state import resting_clearance
 from physhandi.fitting.spring_optimisation import optimise_springs
 from physhandi.metrics.report import measure_run, score_run
 from physhandi.object_rollout import ObjectRollout
@@ -342,20 +343,26 @@ def _problems(
     sequences: Many[Sequence], config: PipelineConfig, attempt: Attempt
 ) -> list[ObjectProblem]:
     rest_node = artefacts.load_array(attempt.out / REST_NODE_FILE)
+    clearance = None
     problems = []
     for sequence in sequences:
         files = SequenceFiles(sequence.name)
+        object_node = artefacts.load_array(attempt.out / files.object_node)
+        if clearance is None and config.object_.rests_where_seen:
+            # It is the object's, which the first sequence defines.
+            clearance = resting_clearance(object_node, sequence.ground_height)
         problems.append(
             build_problem(
                 name=sequence.name,
                 observation=artefacts.load_observation(attempt.out, sequence.name),
-                object_node=artefacts.load_array(attempt.out / files.object_node),
+                object_node=object_node,
                 rest_node=rest_node,
                 control=artefacts.load_control(attempt.out, sequence.name),
                 frame_count=len(sequence.reconstruction_frames),
                 frame_rate=sequence.frame_rate,
                 ground_height=sequence.ground_height,
                 gravity=sequence.gravity,
+                clearance=clearance,
                 surface_count=sequence.surface_node_count,
                 chamfer_points=config.object_.chamfer_points,
                 cloud_points=config.object_.cloud_points,

@@ -217,6 +217,9 @@ class ObjectFitConfig(Settings, frozen=True, kw_only=True):
     """What the Chamfer term compares with: the fused cloud, or the tracks that are visible."""
     cloud_points: Annotated[int, Meta(ge=1, le=100_000)] | None = 300
     """Most points of a frame that enter the Chamfer term; none for all."""
+    rests_where_seen: bool = False
+    """Whether nodes that lie on the ground at frame 0 stay as high above it as they were seen,
+    instead of falling by the object's thickness."""
     starts_at_rest: bool = False
     """Take the object to rest at frame 0 instead of estimating its velocity (PhysTwin)."""
     automatic_substeps: bool = False
@@ -555,6 +558,20 @@ def values_of(config: PipelineConfig) -> dict[str, Any]:
         return value
 
     return {setting.path: at(setting.path) for setting in all_settings()}
+
+
+def without_newer(config: Mapping[str, Any], stored: Mapping[str, Any]) -> dict[str, Any]:
+    """Drop the settings of a configuration that a stored one was made without, in plain data."""
+
+    def inside(kind: type[Settings], own: Mapping[str, Any], then: Mapping[str, Any]) -> Any:
+        groups = {e.name: e.inner for e in fields_of(kind) if e.kind == "settings"}
+        return {
+            name: inside(group, value, then[name]) if (group := groups.get(name)) else value
+            for name, value in own.items()
+            if name in then
+        }
+
+    return inside(PipelineConfig, config, stored)
 
 
 def overrides_of(config: PipelineConfig, base: PipelineConfig) -> dict[str, Any]:

@@ -51,6 +51,8 @@ class ObjectProblem:
     """Acceleration along -z [m/s²]."""
     initial_velocity: Float[ndarray, "node 3"]
     """Velocity of the object nodes at frame 0 [m/s]."""
+    clearance: Float[ndarray, " node"]
+    """Height above the ground at which each object node touches it [m]."""
     cloud: Float[Tensor, "frame point 3"]
     """Observed object points, padded [m]."""
     is_observed: Bool[Tensor, "frame point"]
@@ -127,6 +129,7 @@ def build_problem(
     frame_rate: float,
     ground_height: float | None,
     gravity: float,
+    clearance: Float[ndarray, " node"] | None = None,
     surface_count: int | None = None,
     chamfer_points: Literal["cloud", "tracks"] = "cloud",
     cloud_points: int | None = 300,
@@ -144,6 +147,7 @@ def build_problem(
         frame_rate: Frames a second [Hz].
         ground_height: Height of the ground; None without ground [m].
         gravity: Acceleration along -z [m/s²].
+        clearance: Height above the ground at which each object node touches it [m]; 0 if left out.
         surface_count: Number of leading nodes that lie on the surface; None if unknown.
         chamfer_points: Whether the Chamfer term compares with the fused cloud or with the visible
             tracks.
@@ -193,6 +197,9 @@ def build_problem(
         ground_height=ground_height,
         gravity=gravity,
         initial_velocity=velocity,
+        clearance=np.asarray(
+            np.zeros(len(velocity)) if clearance is None else clearance, np.float32
+        ),
         cloud=cloud,
         is_observed=is_observed,
         track=torch.from_numpy(np.asarray(observation.point[:frame_count, track], np.float32)),
@@ -369,7 +376,7 @@ def build_problem_model(
         problem_parameters(parameters, problem),
         rest_node=problem.rest_node,
     )
-    return replace(model, initial_velocity=problem.initial_velocity)
+    return replace(model, initial_velocity=problem.initial_velocity, clearance=problem.clearance)
 
 
 def simulate_problem(

@@ -191,6 +191,7 @@ class CandidateEvaluator:
                 candidates,
                 rest_node=problem.rest_node,
                 initial_velocity=problem.initial_velocity,
+                clearance=problem.clearance,
             )
             for problem in self._problems
         ]

@@ -27,6 +27,8 @@ class MasterTopology:
     """Positions of the object nodes at frame 0 [m]."""
     initial_velocity: Float32[ndarray, "node 3"]
     """Velocities of the object nodes at frame 0 [m/s]."""
+    clearance: Float32[ndarray, " node"]
+    """Height above the ground at which each object node touches it [m]."""
     control_count: int
     """Number of control nodes."""
     spring_nodes: Int32[ndarray, "spring 2"]
@@ -44,8 +46,10 @@ class MasterTopology:
         object_node: Float[ndarray, "node 3"],
         control_0: Float[ndarray, "control 3"],
         parameters: Many[SimulationParameters],
+        *,
         rest_node: Float[ndarray, "node 3"] | None = None,
         initial_velocity: Float[ndarray, "node 3"] | None = None,
+        clearance: Float[ndarray, " node"] | None = None,
     ) -> "MasterTopology":
         """Find the springs of all candidates at once.
 
@@ -55,6 +59,8 @@ class MasterTopology:
             parameters: The candidates.
             rest_node: The object's rest shape [m], if it differs from frame 0.
             initial_velocity: Of the object nodes at frame 0 [m/s]; at rest if left out.
+            clearance: Height above the ground at which each object node touches it [m]; 0 if left
+                out.
         """
         node = np.asarray(object_node, dtype=np.float64)
         rest = node if rest_node is None else np.asarray(rest_node, dtype=np.float64)
@@ -75,6 +81,9 @@ class MasterTopology:
             object_node=node.astype(np.float32),
             initial_velocity=np.asarray(
                 still if initial_velocity is None else initial_velocity, np.float32
+            ),
+            clearance=np.asarray(
+                np.zeros(len(node)) if clearance is None else clearance, np.float32
             ),
             control_count=len(control),
             spring_nodes=np.concatenate([springs, virtual]).astype(np.int32),
@@ -124,6 +133,7 @@ class MasterTopology:
         return SpringMassModel(
             object_node=self.object_node,
             initial_velocity=self.initial_velocity,
+            clearance=self.clearance,
             spring_nodes=self.spring_nodes[exists],
             rest_length=self.rest_length(parameters)[exists],
             stiffness=stiffness[exists].astype(np.float32),

@@ -1,7 +1,7 @@
 """The model that is simulated: nodes and the springs that join them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -33,8 +33,12 @@ class SpringMassModel:
     """Number of leading springs that join two object nodes; the others are virtual."""
     control_count: int
     """Number of control nodes."""
+    clearance: Float32[ndarray, " #node"] = field(default_factory=lambda: np.zeros(1, np.float32))
+    """Height above the ground at which each object node touches it [m]; one for all, or each."""
 
     def __post_init__(self) -> None:
+        if self.clearance.shape == (1,):
+            object.__setattr__(self, "clearance", np.repeat(self.clearance, self.node_count))
         spring_count = len(self.spring_nodes)
         for name in ("rest_length", "stiffness", "damping"):
             value = getattr(self, name)
@@ -52,6 +56,11 @@ class SpringMassModel:
                     f"{name} has shape {value.shape} or values that are not finite; "
                     f"expected ({self.node_count}, 3)."
                 )
+        if self.clearance.shape != (self.node_count,) or not np.all(np.isfinite(self.clearance)):
+            raise ValueError(
+                f"clearance has shape {self.clearance.shape} or values that are not finite; "
+                f"expected {self.node_count} finite values, one an object node."
+            )
         if not 0 <= self.object_spring_count <= spring_count:
             raise ValueError(
                 f"object_spring_count is {self.object_spring_count}, "
@@ -94,16 +103,18 @@ class SpringMassModel:
     def from_tensors(cls, tensors: Mapping[str, ndarray]) -> "SpringMassModel":
         """Rebuild a model from the arrays of `to_tensors`.
 
+        Models that were stored before nodes had a clearance have none.
+
         Raises:
             ValueError: If an array is missing, unknown or inconsistent.
         """
         names = {field.name for field in fields(cls)}
-        if set(tensors) != names:
+        if set(tensors) | {"clearance"} != names:
             raise ValueError(
                 f"A spring-mass model needs the arrays {', '.join(sorted(names))}; "
                 f"got {', '.join(sorted(tensors))}."
             )
-        values: dict[str, Any] = {name: np.asarray(tensors[name]) for name in names}
+        values: dict[str, Any] = {name: np.asarray(tensors[name]) for name in tensors}
         for name in ("object_spring_count", "control_count"):
             values[name] = int(values[name][0])
         return cls(**values)

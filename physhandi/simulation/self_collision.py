@@ -28,14 +28,18 @@ class SelfCollision:
     `object_node`, its shape at frame 0, wherever a rollout starts.
     """
 
-    def __init__(self, rest: Float32[ndarray, "node 3"], world: wp.array) -> None:
+    def __init__(
+        self, rest: Float32[ndarray, "node 3"], clearance: wp.array, world: wp.array
+    ) -> None:
         """Make room for a model's nodes.
 
         Args:
             rest: Object nodes at rest [m].
+            clearance: Height above the ground at which each node touches it [m].
             world: The simulator's `World`, whose device is used.
         """
         self._world = world
+        self._clearance = clearance
         self._device = world.device
         self._count = len(rest)
         self._rest = self._array(rest, wp.vec3)
@@ -120,10 +124,11 @@ class SelfCollision:
     ) -> None:
         """Launch the collisions and the motion after them; see `collide_nodes`."""
         velocity = self._free_velocity if free_velocity is None else free_velocity
+        ground = [self._world, self._clearance]
         wp.launch(
             collide_nodes,
             dim=self._count,
-            inputs=[substep, self._world, self.start, self.candidate, position, velocity],
+            inputs=[substep, *ground, self.start, self.candidate, position, velocity],
             outputs=outputs,
             device=self._device,
         )

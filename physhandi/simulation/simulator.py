@@ -64,6 +64,7 @@ class Simulator:
         self.rest_length = self.array(model.rest_length, wp.float32)
         self.stiffness = self.array(model.stiffness, wp.float32)
         self.damping = self.array(model.damping, wp.float32)
+        self.clearance = self.array(model.clearance, wp.float32)
         self.world = wp.zeros(1, dtype=_WORLD, device=self.device)
         self.position = self.array(model.object_node, wp.vec3)
         self.velocity = self.array(model.initial_velocity, wp.vec3)
@@ -251,7 +252,7 @@ class Simulator:
         if not self.parameters.self_collision:
             return None
         if self._collision is None:
-            self._collision = SelfCollision(self.model.object_node, self.world)
+            self._collision = SelfCollision(self.model.object_node, self.clearance, self.world)
         return self._collision
 
     def find_candidates(self, position: wp.array) -> int:
@@ -311,7 +312,7 @@ class Simulator:
         wp.launch(
             integrate_nodes,
             dim=self.model.node_count,
-            inputs=[substep, self.world, start, entry, *before, value],
+            inputs=[substep, self.world, self.clearance, start, entry, *before, value],
             outputs=[tape, *after, self.first_divergence],
             device=self.device,
         )

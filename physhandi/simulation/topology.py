@@ -161,7 +161,7 @@ def retopologize(
         rest_node: The object's rest shape [m]; the nodes of frame 0 if left out.
 
     Returns:
-        The new model, with the initial velocity of the old one.
+        The new model, with the initial velocity and the clearance of the old one.
     """
     built = build_model(model.object_node, control_0, parameters, rest_node)
     key = _spring_keys(built.spring_nodes, model.node_count)
@@ -174,7 +174,11 @@ def retopologize(
     stiffness[index] *= _ratio(model.stiffness[fitted_index], global_stiffness)
     damping[index] *= _ratio(model.damping[fitted_index], np.full(len(index), fitted.damping))
     return replace(
-        built, stiffness=stiffness, damping=damping, initial_velocity=model.initial_velocity
+        built,
+        stiffness=stiffness,
+        damping=damping,
+        initial_velocity=model.initial_velocity,
+        clearance=model.clearance,
     )
 
 

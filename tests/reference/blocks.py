@@ -22,8 +22,11 @@ PARAMETERS = SimulationParameters(
 )
 
 
-def thrown_block(side, frames=4):
-    """Throw a block of jittered nodes at the ground while its top is held."""
+def thrown_block(side, frames=4, clearance=0.0):
+    """Throw a block of jittered nodes at the ground while its top is held.
+
+    Two thirds of the nodes touch it at a clearance and at twice that, the lowest one at 0.
+    """
     rng = np.random.default_rng(side)
     axis = 0.01 * np.arange(side)
     node = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -32,7 +35,12 @@ def thrown_block(side, frames=4):
     model = build_model(node.astype(np.float32), control.astype(np.float32), PARAMETERS)
     velocity = rng.normal(0, 0.05, node.shape) + np.array([0.1, 0, -0.3])
     path = control + np.linspace(0, 1, frames)[:, None, None] * np.array([0.01, -0.004, 0.003])
-    return replace(model, initial_velocity=velocity.astype(np.float32)), path.astype(np.float32)
+    model = replace(
+        model,
+        initial_velocity=velocity.astype(np.float32),
+        clearance=np.float32(clearance * (node[:, 2].argsort().argsort() % 3)),
+    )
+    return model, path.astype(np.float32)
 
 
 def recorded(model, device, parameters=PARAMETERS):
@@ -56,6 +64,7 @@ def as_scene(model, control, parameters=PARAMETERS):
         restitution=parameters.restitution,
         friction=parameters.friction,
         ground=parameters.ground_height,
+        clearance=model.clearance.astype(float),
         gravity=parameters.gravity,
         frame_rate=parameters.frame_rate,
         substeps=parameters.substeps_per_frame,

@@ -136,7 +136,8 @@ def crossing_scene(**changes):
 
 def in_float32(scene):
     """Round every array to float32, but keep float64."""
-    arrays = ("node", "velocity", "rest", "stiffness", "damping", "control")
+    arrays = ["node", "velocity", "rest", "stiffness", "damping", "control"]
+    arrays += [] if scene.clearance is None else ["clearance"]
     return replace(
         scene, **{name: np.float32(getattr(scene, name)).astype(float) for name in arrays}
     )
@@ -170,5 +171,6 @@ def as_model(scene):
         damping=scene.damping.astype(np.float32),
         object_spring_count=int(is_object.sum()),
         control_count=scene.control.shape[1],
+        clearance=np.float32([0.0] if scene.clearance is None else scene.clearance),
     )
     return model, parameters

@@ -18,6 +18,7 @@ class Scene:
     restitution: float = 0.5
     friction: float = 0.3
     ground: float | None = 0.0
+    clearance: np.ndarray | None = None  # height above the ground at which each node touches it
     gravity: float = 9.81
     frame_rate: float = 30.0
     substeps: int = 667
@@ -43,9 +44,9 @@ def spring_force(scene, x, v):
     return -incidence.T @ (tension[:, None] * unit)
 
 
-def move_on_ground(scene, x, v, dt):
-    """Move one node that may hit the plane: fly to the impact, bounce, fly on."""
-    gap = np.inf if scene.ground is None else x[2] - scene.ground
+def move_on_ground(scene, x, v, dt, plane):
+    """Move one node that may hit its plane: fly to the impact, bounce, fly on."""
+    gap = x[2] - plane
     if not (gap + v[2] * dt < 0.0 and v[2] < -1e-4):
         return x + dt * v, v
     e, mu = np.clip(scene.restitution, 0, 1), np.clip(scene.friction, 0, 2)
@@ -99,6 +100,9 @@ def simulate(scene, counts=None):
     dt = 1.0 / (scene.frame_rate * scene.substeps)
     x, v = scene.node.astype(float), scene.velocity.astype(float)
     weight = np.array([0.0, 0.0, -scene.gravity])
+    plane = np.full(len(x), -np.inf if scene.ground is None else scene.ground)
+    if scene.clearance is not None:
+        plane += scene.clearance
     states = [(x, v)]
     for start, end in zip(scene.control[:-1], scene.control[1:], strict=True):
         rate = (end - start) * scene.frame_rate * scene.moves
@@ -111,7 +115,9 @@ def simulate(scene, counts=None):
                 free, count = collisions(scene, may, x, free)
                 if counts is not None:
                     counts.append(count)
-            moved = [move_on_ground(scene, a, b, dt) for a, b in zip(x, free, strict=True)]
+            moved = [
+                move_on_ground(scene, *node, dt, p) for *node, p in zip(x, free, plane, strict=True)
+            ]
             x, v = np.array([m[0] for m in moved]), np.array([m[1] for m in moved])
         states.append((x, v))
     return np.array([s[0] for s in states]), np.array([s[1] for s in states])

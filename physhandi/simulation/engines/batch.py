@@ -234,6 +234,7 @@ class Population:
         self._model_node = bisect_nodes(master.object_node, blocks)[0]
         rest_length = master.rest_length(parameters[0])
         self._inputs = [
+            self._array(master.clearance[self._model_node], wp.float32),
             self._array(table.swapaxes(0, 1).ravel(), wp.float32),
             self._array(group_reach.T.astype(np.float32), wp.float32),
             *self._entries(master, rest_length, group_reach[:, 0], group_limit),

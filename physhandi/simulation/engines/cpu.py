@@ -251,7 +251,8 @@ class CpuEngine:
         if loop is None:
             loop = self._loops[tape is None] = self.substep_loop(
                 advance_parts,
-                [simulator.world, self.parts, *simulator.material, *simulator.controls, *before],
+                [simulator.world, simulator.clearance, self.parts, *simulator.material],
+                [*simulator.controls, *before],
                 [self.material, self.state, self._force, self.no_tape, *after, self._first],
             )
         state, free_tape = (self.state, self.no_tape) if tape is None else tape
@@ -319,7 +320,8 @@ class CpuAdjoint:
             setattr(self._bars, name, engine.zeros(shape, dtype))
         self._adjoint = engine.substep_loop(
             parts_adjoint,
-            [simulator.world, engine.parts, *simulator.material, engine.material],
+            [simulator.world, simulator.clearance, engine.parts, *simulator.material],
+            [engine.material],
             [engine.state, engine.no_tape, self._bars, self.position_bar, self.velocity_bar],
             [*self.sums.material, self.sums.drag, *self.sums.ground],
         )

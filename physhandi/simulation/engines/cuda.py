@@ -193,7 +193,7 @@ class LargeFrames:
             device=simulator.device,
         )
         inputs: list[Any] = [self._chunk_count, simulator.parameters.substeps_per_frame, tag]
-        inputs += [simulator.world, *blocks, self._start, self._packed]
+        inputs += [simulator.world, simulator.clearance, *blocks, self._start, self._packed]
         wp.launch(
             large_frame_kernel(layout.lanes, layout.kept, layout.threads, layout.locals),
             dim=self._block_count * layout.threads,
@@ -298,7 +298,7 @@ class CudaEngine:
         self._launch(
             frame_kernel(self.layout.lanes, self.layout.kept),
             [self.layout.threads, substeps, self.next_tags(substeps + 1), simulator.world],
-            [*self._map, *simulator.material],
+            [simulator.clearance, *self._map, *simulator.material],
             [*simulator.controls, *before],
             [
                 self._relay,
@@ -324,7 +324,7 @@ class CudaEngine:
         self._launch(
             adjoint_kernel(self.layout.lanes, self.layout.kept),
             [self.layout.threads, substeps, self.next_tags(substeps), simulator.world],
-            [*self._map, is_first, simulator.model.object_spring_count],
+            [simulator.clearance, *self._map, is_first, simulator.model.object_spring_count],
             [*simulator.material, *simulator.controls, tape],
             [*state_bars, self._relay, *bars],
         )

@@ -97,6 +97,7 @@ class GraphAdjoint:
     def _launch_adjoint(self) -> None:
         simulator, model = self._simulator, self._simulator.model
         collision = simulator.collision
+        ground = [simulator.world, simulator.clearance]
         state_bars = [self.position_bar, self.velocity_bar]
         for substep in reversed(range(len(self._free_velocity))):
             state = self._position[substep], self._velocity[substep]
@@ -105,7 +106,7 @@ class GraphAdjoint:
                 wp.launch(
                     nodes_adjoint,
                     dim=model.node_count,
-                    inputs=[simulator.world, state[0], self._free_velocity[substep]],
+                    inputs=[*ground, state[0], self._free_velocity[substep]],
                     outputs=[*state_bars, self.sums.drag, *self.sums.ground, self._force_bar],
                     device=simulator.device,
                 )
@@ -132,19 +133,20 @@ class GraphAdjoint:
         """Launch the equivalent of `nodes_adjoint`, with collisions between ground and drag."""
         simulator = self._simulator
         state_bars = [self.position_bar, self.velocity_bar]
-        candidates = [simulator.world, collision.start, collision.candidate]
-        inputs = [*candidates, self._position[substep], self._free_velocity[substep]]
+        inputs = [collision.start, collision.candidate]
+        inputs += [self._position[substep], self._free_velocity[substep]]
+        ground = [simulator.world, simulator.clearance]
         wp.launch(
             ground_adjoint,
             dim=simulator.model.node_count,
-            inputs=[*inputs, self._contact_velocity[substep]],
+            inputs=[*ground, *inputs, self._contact_velocity[substep]],
             outputs=[*state_bars, *self.sums.ground, self._gain_bar],
             device=simulator.device,
         )
         wp.launch(
             collisions_adjoint,
             dim=simulator.model.node_count,
-            inputs=[*inputs, self._gain_bar],
+            inputs=[simulator.world, *inputs, self._gain_bar],
             outputs=[*state_bars, self.sums.drag, *self.sums.collision, self._force_bar],
             device=simulator.device,
         )

@@ -16,6 +16,7 @@ class EngineHost(Protocol):
     parameters: SimulationParameters
     device: Any
     world: wp.array
+    clearance: wp.array
     first_divergence: wp.array
     position: wp.array
     velocity: wp.array

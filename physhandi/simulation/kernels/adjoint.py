@@ -24,16 +24,18 @@ class ContactAdjoint:
 
 
 @wp.func
-def node_adjoint(world: World, position: wp.vec3, velocity: wp.vec3, after: Motion):
+def node_adjoint(
+    world: World, clearance: float, position: wp.vec3, velocity: wp.vec3, after: Motion
+):
     """Carry adjoints (`after`) back through `contacts.advance`.
 
-    With impact time τ = -z/v_z and kept sliding s = 1 + μ (1 + e) v_z / |v_t|:
-    v' = (s v_t, -e v_z) and x' = x + v τ + v' (dt - τ).
+    With height z above where it touches, impact time τ = -z/v_z and kept sliding
+    s = 1 + μ (1 + e) v_z / |v_t|: v' = (s v_t, -e v_z) and x' = x + v τ + v' (dt - τ).
     """
     before = ContactAdjoint()
     before.motion.position = after.position
     before.motion.velocity = after.velocity + world.dt * after.position
-    if not touches_ground(world, position, velocity):
+    if not touches_ground(world, clearance, position, velocity):
         return before
     restitution = wp.clamp(world.restitution, 0.0, 1.0)
     friction = wp.clamp(world.friction, 0.0, 2.0)
@@ -43,7 +45,7 @@ def node_adjoint(world: World, position: wp.vec3, velocity: wp.vec3, after: Moti
     grip = (1.0 + restitution) * velocity[2] / speed
     keep = wp.max(0.0, 1.0 + friction * grip)
     bounced = keep * sliding - wp.vec3(0.0, 0.0, restitution * velocity[2])
-    impact = -(position[2] - world.ground_height) / velocity[2]
+    impact = -(position[2] - world.ground_height - clearance) / velocity[2]
 
     bounced_bar = after.velocity + (world.dt - impact) * after.position
     impact_bar = wp.dot(velocity - bounced, after.position)
@@ -77,6 +79,7 @@ def before_drag(world: World, free_bar: wp.vec3):
 def nodes_adjoint(
     # Model:
     world: wp.array[World],
+    clearance: wp.array[float],
     # State in:
     position: wp.array[wp.vec3],
     free_velocity: wp.array[wp.vec3],
@@ -94,7 +97,7 @@ def nodes_adjoint(
     after = Motion()
     after.position = position_bar_out[node]
     after.velocity = velocity_bar_out[node]
-    before = node_adjoint(world[0], position[node], free_velocity[node], after)
+    before = node_adjoint(world[0], clearance[node], position[node], free_velocity[node], after)
     free_bar = before.motion.velocity
     old_bar = before_drag(world[0], free_bar)
     position_bar_out[node] = before.motion.position

@@ -184,6 +184,7 @@ def make_batch_kernel(count: int, parts: int) -> wp.Kernel:
         groups: int,
         fraction: float,
         # Model:
+        clearance: wp.array[float],
         number: wp.array[float],
         reach: wp.array2d[float],
         entry_start: wp.array[int],
@@ -284,6 +285,7 @@ def make_batch_kernel(count: int, parts: int) -> wp.Kernel:
             force = add_parts(part, lane, force)
             if part > 0:
                 return
+        touching = clearance[node]
         for i in range(wp.static(count)):
             here = World()
             here.dt = dt[i]
@@ -296,7 +298,7 @@ def make_batch_kernel(count: int, parts: int) -> wp.Kernel:
             here.speed_limit = speed_limit[i]
             total = wp.vec3(force[0, i], force[1, i], force[2, i])
             free = free_velocity(here, wp.vec3(v[0, i], v[1, i], v[2, i]), total)
-            motion = advance(here, wp.vec3(x[0, i], x[1, i], x[2, i]), free)
+            motion = advance(here, touching, wp.vec3(x[0, i], x[1, i], x[2, i]), free)
             for k in range(3):
                 x[k, i] = motion.position[k]
                 v[k, i] = motion.velocity[k]

@@ -1,4 +1,8 @@
-"""The ground plane: restitution, Coulomb friction and the time of impact."""
+"""The ground plane: restitution, Coulomb friction and the time of impact.
+
+A node touches the ground at a height of its own, its clearance: it may be a point of the upper side
+of what lies there.
+"""
 
 import warp as wp
 
@@ -21,27 +25,27 @@ class Motion:
 
 
 @wp.func
-def touches_ground(world: World, position: wp.vec3, velocity: wp.vec3):
+def touches_ground(world: World, clearance: float, position: wp.vec3, velocity: wp.vec3):
     """Return whether a node is about to go through the ground in this substep."""
-    height = position[2] - world.ground_height
+    height = position[2] - world.ground_height - clearance
     is_approaching = velocity[2] < -APPROACH_SPEED
     return world.has_ground == 1 and is_approaching and height + velocity[2] * world.dt < 0.0
 
 
 @wp.func
-def advance(world: World, position: wp.vec3, velocity: wp.vec3):
+def advance(world: World, clearance: float, position: wp.vec3, velocity: wp.vec3):
     """Move a node through one substep, bouncing and sliding on the ground."""
     motion = Motion()
     motion.velocity = velocity
     motion.position = position + velocity * world.dt
-    if touches_ground(world, position, velocity):
+    if touches_ground(world, clearance, position, velocity):
         restitution = wp.clamp(world.restitution, 0.0, 1.0)
         friction = wp.clamp(world.friction, 0.0, 2.0)
         speed = wp.max(wp.length(wp.vec2(velocity[0], velocity[1])), SLIDING_SPEED)
         keep = wp.max(0.0, 1.0 + friction * (1.0 + restitution) * velocity[2] / speed)
         bounced = wp.vec3(keep * velocity[0], keep * velocity[1], -restitution * velocity[2])
         # Negative if the node is already below: it returns to the plane along its velocity.
-        impact = -(position[2] - world.ground_height) / velocity[2]
+        impact = -(position[2] - world.ground_height - clearance) / velocity[2]
         motion.velocity = bounced
         motion.position = position + velocity * impact + bounced * (world.dt - impact)
     return motion

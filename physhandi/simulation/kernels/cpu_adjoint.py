@@ -65,6 +65,7 @@ def part_nodes_adjoint(
     part: int,
     substep: int,
     world: World,
+    clearance: wp.array[float],
     parts: Parts,
     state: wp.array2d[Record],
     free_tape: wp.array2d[wp.vec4],
@@ -78,7 +79,8 @@ def part_nodes_adjoint(
         after.velocity = record_velocity(record)
         taped = free_tape[substep, own]
         free = wp.vec3(taped[0], taped[1], taped[2])
-        before = node_adjoint(world, record_position(state[substep, own]), free, after)
+        touching = clearance[parts.node[own]]
+        before = node_adjoint(world, touching, record_position(state[substep, own]), free, after)
         free_bar = before.motion.velocity
         old_bar = before_drag(world, free_bar)
         bars.state[own] = as_record(before.motion.position, old_bar)
@@ -130,6 +132,7 @@ def parts_adjoint(
     meeting_out: wp.array[int],
     # Model:
     world: wp.array[World],
+    clearance: wp.array[float],
     parts: Parts,
     rest_length: wp.array[float],
     stiffness: wp.array[float],
@@ -170,7 +173,7 @@ def parts_adjoint(
         substep = substeps - 1 - step
         fraction = float(substep + 1) / float(substeps)
         for part in range(part_first, part_last):
-            part_nodes_adjoint(part, substep, here, parts, state, free_tape, bars_out)
+            part_nodes_adjoint(part, substep, here, clearance, parts, state, free_tape, bars_out)
         waited = meet(meeting_out, step - first + 1, threads, waited, give_way)
         for part in range(part_first, part_last):
             inner_springs_adjoint(part, substep, parts, material_out, state, bars_out)

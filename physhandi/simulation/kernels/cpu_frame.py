@@ -93,6 +93,7 @@ def move_nodes(
     row: int,
     next_row: int,
     world: World,
+    clearance: wp.array[float],
     parts: Parts,
     state: wp.array2d[Record],
     force: wp.array[wp.vec4],
@@ -106,7 +107,8 @@ def move_nodes(
         f = force[node]
         force[node] = wp.vec4(0.0, 0.0, 0.0, 0.0)
         free = free_velocity(world, record_velocity(before), wp.vec3(f[0], f[1], f[2]))
-        motion = advance(world, record_position(before), free)
+        touching = clearance[parts.node[node]]
+        motion = advance(world, touching, record_position(before), free)
         state[next_row, node] = as_record(motion.position, motion.velocity)
         if free_tape.shape[0] > 0:
             free_tape[substep, node] = wp.vec4(free[0], free[1], free[2], 0.0)
@@ -125,6 +127,7 @@ def advance_parts(
     meeting_out: wp.array[int],
     # Model:
     world: wp.array[World],
+    clearance: wp.array[float],
     parts: Parts,
     rest_length: wp.array[float],
     stiffness: wp.array[float],
@@ -190,6 +193,7 @@ def advance_parts(
                 row,
                 next_row,
                 here,
+                clearance,
                 parts,
                 state_out,
                 force_out,

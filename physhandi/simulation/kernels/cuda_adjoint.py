@@ -112,6 +112,7 @@ def make_adjoint_kernel(lanes: int, kept: int) -> wp.Kernel:
         tag: int,
         # Model:
         world: wp.array[World],
+        clearance: wp.array[float],
         own_start: wp.array[int],
         local_start: wp.array[int],
         local_node: wp.array[int],
@@ -171,6 +172,7 @@ def make_adjoint_kernel(lanes: int, kept: int) -> wp.Kernel:
         # The row's first lane carries its node's adjoints from substep to substep.
         own_node = wp.min(first + row, first + own - 1)
         is_owner = lane == 0 and row < own
+        touching = clearance[model_node[own_node]]
         after = Motion()
         if is_owner:
             after.position = position_bar_out[model_node[own_node]]
@@ -194,7 +196,7 @@ def make_adjoint_kernel(lanes: int, kept: int) -> wp.Kernel:
             fraction = float(substep + 1) / float(substeps)
             if is_owner:
                 free = xyz(own_free)
-                before = node_adjoint(here, xyz(own_position), free, after)
+                before = node_adjoint(here, touching, xyz(own_position), free, after)
                 free_bar = before.motion.velocity
                 after.position = before.motion.position
                 after.velocity = before_drag(here, free_bar)

@@ -85,6 +85,7 @@ def make_frame_kernel(lanes: int, kept: int) -> wp.Kernel:
         tag: int,
         # Model:
         world: wp.array[World],
+        clearance: wp.array[float],
         own_start: wp.array[int],
         local_start: wp.array[int],
         local_node: wp.array[int],
@@ -120,6 +121,7 @@ def make_frame_kernel(lanes: int, kept: int) -> wp.Kernel:
         locals_first = local_start[block]
         halo = local_start[block + 1] - locals_first - own
 
+        first_clearance = clearance[model_node[first + wp.min(row, own - 1)]]
         entry_first, entry_last = entries_of(row, own, first, entry_start)
         index, _, rest, hooke, dashpot = load_half_edges(
             entry_first,
@@ -197,8 +199,11 @@ def make_frame_kernel(lanes: int, kept: int) -> wp.Kernel:
                 force = lane_sum(force, wp.static(lanes))
                 if lane == 0 and i < own:
                     free = free_velocity(here, v, force)
-                    motion = advance(here, x, free)
                     node = first + i
+                    touching = first_clearance
+                    if from_row > 0:
+                        touching = clearance[model_node[node]]
+                    motion = advance(here, touching, x, free)
                     relay = 2 * ((1 - parity) * count + node)
                     publish(relay_out, relay, motion.position, tag + substep + 1)
                     publish(relay_out, relay + 1, motion.velocity, tag + substep + 1)

@@ -72,6 +72,7 @@ def make_large_frame_kernel(lanes: int, kept: int, threads: int, locals_: int) -
         tag: int,
         # Model:
         world: wp.array[World],
+        clearance: wp.array[float],
         own_start: wp.array[int],
         local_start: wp.array[int],
         local_node: wp.array[int],
@@ -177,8 +178,9 @@ def make_large_frame_kernel(lanes: int, kept: int, threads: int, locals_: int) -
                 if lane == 0 and i < own:
                     # Read late: its registers are better used for springs until here.
                     here = world[0]
-                    motion = advance(here, x, free_velocity(here, v, force))
                     node = first + i
+                    touching = clearance[model_node[node]]
+                    motion = advance(here, touching, x, free_velocity(here, v, force))
                     relay = 2 * ((1 - parity) * count + node)
                     publish(relay_out, relay, motion.position, tag + substep + 1)
                     publish(relay_out, relay + 1, motion.velocity, tag + substep + 1)

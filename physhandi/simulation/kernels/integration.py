@@ -61,6 +61,7 @@ def integrate_nodes(
     substep: int,
     # Model:
     world: wp.array[World],
+    clearance: wp.array[float],
     entry_start: wp.array[int],
     entry: wp.array[int],
     # State in:
@@ -81,7 +82,7 @@ def integrate_nodes(
     node = wp.tid()
     force = spring_sum(node, entry_start, entry, pull)
     free = free_velocity(world[0], velocity[node], force)
-    motion = advance(world[0], position[node], free)
+    motion = advance(world[0], clearance[node], position[node], free)
     position_out[node] = motion.position
     velocity_out[node] = motion.velocity
     if free_velocity_out.shape[0] > 0:

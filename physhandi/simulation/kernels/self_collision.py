@@ -106,6 +106,7 @@ def collide_nodes(
     substep: int,
     # Model:
     world: wp.array[World],
+    clearance: wp.array[float],
     start: wp.array[int],
     candidate: wp.array[int],
     # State in:
@@ -125,7 +126,7 @@ def collide_nodes(
     """
     node = wp.tid()
     collided = collided_velocity(node, world[0], start, candidate, position, velocity)
-    motion = advance(world[0], position[node], collided)
+    motion = advance(world[0], clearance[node], position[node], collided)
     position_out[node] = motion.position
     velocity_out[node] = motion.velocity
     if contact_velocity_out.shape[0] > 0:

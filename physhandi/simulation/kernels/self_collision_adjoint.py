@@ -72,6 +72,7 @@ def bounce_adjoint(world: World, offset: wp.vec3, rate: wp.vec3, gain_bar: wp.ve
 def ground_adjoint(
     # Model:
     world: wp.array[World],
+    clearance: wp.array[float],
     start: wp.array[int],
     candidate: wp.array[int],
     # State in:
@@ -94,7 +95,8 @@ def ground_adjoint(
     after = Motion()
     after.position = position_bar_out[node]
     after.velocity = velocity_bar_out[node]
-    before = node_adjoint(world[0], position[node], contact_velocity[node], after)
+    touching, velocity = clearance[node], contact_velocity[node]
+    before = node_adjoint(world[0], touching, position[node], velocity, after)
     position_bar_out[node] = before.motion.position
     velocity_bar_out[node] = before.motion.velocity
     restitution_bar_out[node] += before.restitution

@@ -14,6 +14,7 @@ from physhandi.fitting.config import (
     load_profile,
     overrides_of,
     values_of,
+    without_newer,
 )
 
 QUICK = load_profile("quick")
@@ -163,3 +164,17 @@ def test_whatever_lies_on_the_bounds_is_taken_by_the_settings_classes() -> None:
                 continue
             value = int(end) if setting.kind == "whole" else end
             assert values_of(apply_overrides(QUICK, {setting.path: value}))[setting.path] == value
+
+
+def test_settings_that_a_stored_configuration_lacks_are_dropped_and_only_these() -> None:
+    asked = QUICK.to_dict()
+    stored = QUICK.replace(node_spacing=0.02).to_dict()
+    del stored["object_"]["rests_where_seen"], stored["refinement"]
+    del stored["object_"]["search"]["variables"]["drag"]
+    known = without_newer(asked, stored)
+    assert leaves(asked) - leaves(known) == {
+        path for path in leaves(asked) if path.startswith("refinement")
+    } | {"object_.rests_where_seen"}
+    # A searched parameter is a choice, not a setting that there was not yet.
+    assert known["object_"]["search"] == asked["object_"]["search"]
+    assert known["node_spacing"] == QUICK.node_spacing != stored["node_spacing"]

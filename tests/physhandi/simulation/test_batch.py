@@ -50,8 +50,20 @@ def scene(side=5, seed=1):
     return node, (control + path).astype(np.float32), velocity.astype(np.float32)
 
 
+def clearance_of(node):
+    """Let two thirds of the nodes touch the ground at 0.8 and 1.6 mm above it."""
+    return (8e-4 * (np.arange(len(node)) % 3)).astype(np.float32)
+
+
+def master_of(node, control, drawn, velocity):
+    return MasterTopology.of(
+        node, control[0], drawn, initial_velocity=velocity, clearance=clearance_of(node)
+    )
+
+
 def alone(parameters, node, control, velocity, device):
-    model = replace(build_model(node, control[0], parameters), initial_velocity=velocity)
+    model = build_model(node, control[0], parameters)
+    model = replace(model, initial_velocity=velocity, clearance=clearance_of(node))
     return Simulator(model, parameters, device=device).rollout(control).position
 
 
@@ -74,7 +86,7 @@ def test_a_candidate_has_the_springs_that_it_would_find_itself():
 def test_each_candidate_moves_as_if_it_were_alone(device, count):
     node, control, velocity = scene()
     drawn = candidates(count)
-    master = MasterTopology.of(node, control[0], drawn, initial_velocity=velocity)
+    master = master_of(node, control, drawn, velocity)
     batch = BatchSimulator(master, drawn, device=device).rollout(control)
     assert batch.position.shape == (count, 4, len(node), 3)
     assert np.all(batch.diverged_frame == -1)
@@ -92,7 +104,7 @@ def test_sizes_that_fit_shared_memory_in_different_ways(side):
     _needs_cuda()
     node, control, velocity = scene(side)
     drawn = [p.replace(connection_radius=0.03, max_neighbors=60) for p in candidates(3)]
-    master = MasterTopology.of(node, control[0], drawn, initial_velocity=velocity)
+    master = master_of(node, control, drawn, velocity)
     batch = BatchSimulator(master, drawn, device="cuda:0").rollout(control)
     for candidate, parameters in enumerate(drawn):
         wanted = alone(parameters, node, control, velocity, "cuda:0")
@@ -109,7 +121,7 @@ def test_a_node_with_more_neighbors_than_fit_is_simulated_too():
         BASE.replace(connection_radius=0.2, max_neighbors=499, stiffness=s, damping=0.05)
         for s in (0.05, 0.2)
     ]
-    master = MasterTopology.of(node, still[0], drawn)
+    master = master_of(node, still, drawn, np.zeros_like(node))
     batch = BatchSimulator(master, drawn, device="cuda:0").rollout(still)
     wanted = alone(drawn[1], node, still, np.zeros_like(node), "cuda:0")
     assert np.abs(wanted[-1] - wanted[0]).max() > 1e-3
@@ -121,7 +133,7 @@ def test_a_thousand_candidates_at_once():
     _needs_cuda()
     node, control, velocity = scene(3)
     drawn = candidates(1000)
-    master = MasterTopology.of(node, control[0], drawn, initial_velocity=velocity)
+    master = master_of(node, control, drawn, velocity)
     simulator = BatchSimulator(master, drawn, device="cuda:0")
     batch = simulator.rollout(control)
     for candidate in (0, 499, 999):
@@ -135,7 +147,7 @@ def test_a_candidate_that_diverges_does_not_harm_the_others(device):
     node, control, velocity = scene()
     drawn = candidates(5)
     drawn[2] = drawn[2].replace(stiffness=1e7, connection_radius=0.02, max_neighbors=19)
-    master = MasterTopology.of(node, control[0], drawn, initial_velocity=velocity)
+    master = master_of(node, control, drawn, velocity)
     batch = BatchSimulator(master, drawn, device=device).rollout(control)
     assert batch.diverged_frame[2] >= 1
     assert np.all(np.delete(batch.diverged_frame, 2) == -1)

@@ -25,7 +25,7 @@ def needs_cuda():
 @pytest.mark.parametrize("side", [2, 5, 10, 15])
 def test_blocks_move_as_the_recorded_kernels_do(side):
     needs_cuda()
-    model, control = thrown_block(side)
+    model, control = thrown_block(side, clearance=8e-4)
     simulator = Simulator(model, PARAMETERS, device="cuda:0")
     assert simulator.engine is not None
     fast = simulator.rollout(control)
@@ -40,7 +40,7 @@ def test_blocks_move_as_the_recorded_kernels_do(side):
 @pytest.mark.parametrize("side", [2, 5, 10])
 def test_gradients_are_those_of_the_recorded_adjoint(side, monkeypatch):
     needs_cuda()
-    model, control = thrown_block(side, frames=3)
+    model, control = thrown_block(side, frames=3, clearance=8e-4)
     fast = block_gradients(model, control, PARAMETERS, "cuda:0")
     monkeypatch.setattr(CudaAdjoint, "of", lambda *_: None)
     # Other parameters, so that another simulator is made; the difference is far below rounding.

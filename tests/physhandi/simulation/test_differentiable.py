@@ -22,6 +22,7 @@ SCENES = {
     "no control velocity": {"moves": False},
     "slippery": {"friction": 0.05, "restitution": 0.9, "ground": 0.003},
     "no ground": {"ground": None},
+    "clearance": {"clearance": np.linspace(-0.001, 0.006, 8)},
 }
 
 

@@ -117,10 +117,20 @@ def test_a_model_survives_safetensors():
     assert (again.node_count, again.control_count, again.virtual_spring_count) == (8, 4, 5)
 
 
+def test_a_model_stored_before_nodes_had_a_clearance_has_none():
+    model, _ = as_model(cube_scene(clearance=np.full(8, 0.01)))
+    tensors = model.to_tensors()
+    assert np.array_equal(SpringMassModel.from_tensors(tensors).clearance, model.clearance)
+    del tensors["clearance"]
+    old = SpringMassModel.from_tensors(tensors)
+    np.testing.assert_array_equal(old.clearance, np.zeros(8, np.float32))
+    assert old.clearance.dtype == np.float32
+
+
 def test_a_model_without_one_of_its_arrays_is_refused():
     tensors = as_model(cube_scene())[0].to_tensors()
     del tensors["damping"]
-    with pytest.raises(ValueError, match="needs the arrays control_count, damping"):
+    with pytest.raises(ValueError, match="needs the arrays clearance, control_count"):
         SpringMassModel.from_tensors(tensors)
 
 
@@ -129,6 +139,7 @@ def test_a_model_without_one_of_its_arrays_is_refused():
     [
         (lambda m: {"rest_length": m.rest_length * 0}, "rest_length must be positive"),
         (lambda m: {"stiffness": m.stiffness * np.float32(np.nan)}, "stiffness has shape"),
+        (lambda m: {"clearance": m.clearance + np.float32(np.inf)}, r"clearance has shape \(8,\)"),
         (lambda m: {"object_node": m.object_node * np.float32(np.inf)}, "object_node has shape"),
         (lambda m: {"spring_nodes": m.spring_nodes + np.int32(4)}, r"a node outside 0…11"),
         (lambda m: {"spring_nodes": m.spring_nodes * np.int32(0)}, "joins a node to itself"),

@@ -20,6 +20,7 @@ SCENES = {
     "dull": ({"self_restitution": 0.2}, 13),
     "smooth": ({"self_friction": 0.05}, 11),
     "all pairs": ({"distance": 0.03, "blocks_rest": True}, 1472),
+    "clearance": ({"clearance": np.linspace(0.0, 0.008, 18)}, 22),
 }
 
 

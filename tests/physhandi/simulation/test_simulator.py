@@ -33,6 +33,7 @@ def pair(stretch=0.1, stiffness=50.0, damping=0.0, **changes):
         {"ground": None},
         {"ground": 0.003, "restitution": 0.9, "friction": 0.0},
         {"ground": 0.002, "restitution": 0.0, "friction": 2.0},
+        {"clearance": np.linspace(-0.001, 0.006, 8)},
         {"drag": 0.0, "gravity": -3.0},
         {"drag": 40.0, "frame_rate": 60.0, "substeps": 33},
     ],
@@ -50,7 +51,13 @@ def test_rollouts_agree_with_the_oracle(device, changes):
 def test_the_oracle_scene_touches_the_ground_and_its_switches_matter():
     position, _ = simulate(cube_scene())
     assert position[..., 2].min() < 1e-4
-    for change in ({"moves": False}, {"ground": None}, {"friction": 0.0}, {"restitution": 0.9}):
+    for change in (
+        {"moves": False},
+        {"ground": None},
+        {"friction": 0.0},
+        {"restitution": 0.9},
+        {"clearance": np.linspace(-0.001, 0.006, 8)},
+    ):
         assert np.abs(simulate(cube_scene(**change))[0] - position).max() > 1e-4, change
 
 
@@ -126,6 +133,44 @@ def test_friction_takes_its_share_of_sliding_at_the_impact(device):
     velocity = run(scene, device).velocity[1]
     np.testing.assert_allclose(velocity[0], [0.0, 2.4, 0.5], atol=1e-6)
     np.testing.assert_allclose(velocity[1], [0.0, 0.0, 0.5], atol=1e-6)
+
+
+def test_nodes_fall_onto_their_clearances(device):
+    # The ground is at 10 mm, so that they come to lie at 10, 15 and 40 mm.
+    scene = bare_scene(
+        [[0.0, 0.0, 0.06], [0.1, 0.0, 0.06], [0.2, 0.0, 0.06]], frames=8, gravity=9.81,
+        substeps=200, ground=0.01, clearance=np.array([0.0, 0.005, 0.03]), restitution=0.0,
+    )  # fmt: skip
+    position = run(scene, device).position[:, :, 2]
+    fall = 0.06 - 9.81 / 2.0 * (np.arange(8) / 30.0) ** 2
+    landed = fall[:, None] < [0.01, 0.015, 0.04]
+    assert landed.any(axis=0).all()
+    assert not landed[1].any()
+    expected = np.where(landed, [0.01, 0.015, 0.04], fall[:, None])
+    np.testing.assert_allclose(position, expected, atol=1e-4)
+    np.testing.assert_allclose(position[-1], [0.01, 0.015, 0.04], atol=1e-6)
+
+
+def test_a_node_slides_at_its_clearance_until_friction_stops_it(device):
+    # Each substep's impact takes μ (1 + e) g dt of its speed: it stops after v² / (2 μ (1 + e) g).
+    scene = bare_scene(
+        [[0.0, 0.0, 0.025]], velocity=[[0.3, 0.4, 0.0]], frames=8, gravity=9.81,
+        ground=0.005, clearance=np.array([0.02]), restitution=0.0, friction=0.4,
+    )  # fmt: skip
+    position = run(scene, device).position[:, 0]
+    time = np.minimum(np.arange(8) / 30.0, 0.5 / (0.4 * 9.81))
+    way = 0.5 * time - 0.4 * 9.81 / 2.0 * time**2
+    assert way[-1] == pytest.approx(0.5**2 / (2.0 * 0.4 * 9.81))
+    np.testing.assert_allclose(position[:, :2], way[:, None] * [0.6, 0.8], atol=1e-4)
+    np.testing.assert_allclose(position[:, 2], 0.025, atol=1e-6)
+
+
+def test_a_clearance_of_all_nodes_is_a_higher_ground(device):
+    scene = cube_scene(ground=0.003)
+    wanted = run(scene, device)
+    lifted = run(replace(scene, ground=-0.001, clearance=np.full(8, 0.004)), device)
+    assert wanted.position[..., 2].min() < 0.0031
+    np.testing.assert_allclose(lifted.position, wanted.position, atol=2e-7)
 
 
 def test_a_control_node_drags_its_object_node_through_spring_and_dashpot(device):

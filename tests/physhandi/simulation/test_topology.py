@@ -142,6 +142,7 @@ def test_a_new_topology_keeps_what_was_fitted_as_a_ratio():
     model = replace(
         built, stiffness=built.stiffness * factor, damping=built.damping / factor,
         initial_velocity=np.full((30, 3), 0.1, dtype=np.float32),
+        clearance=np.linspace(0.0, 0.01, 30, dtype=np.float32),
     )  # fmt: skip
     changed = fitted.replace(connection_radius=0.12, max_neighbors=7, stiffness=300.0, damping=5.0)
     new = retopologize(model, changed, control, fitted=fitted)
@@ -155,6 +156,7 @@ def test_a_new_topology_keeps_what_was_fitted_as_a_ratio():
     np.testing.assert_allclose(new.stiffness, ratio * np.where(is_object, 300.0, 50.0), rtol=1e-6)
     np.testing.assert_allclose(new.damping, 5.0 / ratio, rtol=1e-6)
     np.testing.assert_array_equal(new.initial_velocity, model.initial_velocity)
+    np.testing.assert_array_equal(new.clearance, model.clearance)
     same = retopologize(model, fitted, control, fitted=fitted)
     np.testing.assert_array_equal(same.spring_nodes, model.spring_nodes)
     np.testing.assert_allclose(same.stiffness, model.stiffness, rtol=1e-6)
