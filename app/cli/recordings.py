@@ -59,6 +59,8 @@ def synthesize(
     change: tuple[str, ...] = (),
     cameras: int = 3,
     frames: int = 90,
+    set_out: float = -1.5,
+    release: float | None = None,
     hold: Literal["friction", "attachment"] = "friction",
     images: Literal["all", "none"] = "all",
     image_size: Literal["full", "half", "quarter"] = "full",
@@ -79,6 +81,8 @@ def synthesize(
             them).
         cameras: Number of cameras, 1 to 4.
         frames: Number of frames, 30 a second.
+        set_out: When hands set out for it [s]; they hold it 1.5 s later, by default in frame 0.
+        release: When hands begin to let go [s], which takes 0.8 s; none is never.
         hold: Hands hold by friction alone, or what they have touched for 0.1 s sticks to them.
         images: none writes lifted tracks instead of color, depth and masks: small, and made in
             seconds.
@@ -99,6 +103,8 @@ def synthesize(
             changes=dict(_level(text) for text in change),
             cameras=cameras,
             frames=frames,
+            set_out=set_out,
+            release=release,
             hold=hold,
             images=images,
             image_size=image_size,

@@ -32,6 +32,7 @@ from physhandi.synthetic.film.degradations import changed, find_preset
 from physhandi.synthetic.film.filmed_scene import make_filmed_scene
 from physhandi.synthetic.film.recording import Images, record
 from physhandi.synthetic.hands.actions import ACTIONS, script_action
+from physhandi.synthetic.hands.handling import SET_OUT
 from physhandi.synthetic.hands.true_hand import TrueHand, load_true_hand
 
 _LOG = logging.getLogger(__name__)
@@ -53,6 +54,8 @@ def synthesize(
     preset: str = "default",
     cameras: int = 3,
     frames: int = FRAMES,
+    set_out: float = SET_OUT,
+    release: float | None = None,
     hold: Hold = "friction",
     images: Images = "all",
     image_size: ImageSize = "full",
@@ -76,6 +79,9 @@ def synthesize(
         preset: Levels of all degradations: clean, default, hard or paper.
         cameras: Number of cameras, 1 to 4.
         frames: Number of frames, 30 a second.
+        set_out: When hands set out for the body, which takes them 1.5 s to hold [s]; by default
+            they have it in frame 0.
+        release: When hands begin to let go [s]; None: never.
         hold: Whether hands hold by friction, or what they have touched for 0.1 s sticks to them.
         images: ``none`` leaves color, depth and masks out; see `record`.
         image_size: ``half`` and ``quarter`` store smaller pictures of the same cameras. Levels in
@@ -107,7 +113,14 @@ def synthesize(
     body = make_body(name, np.random.default_rng([seed, 0]), resolution=resolution)
     with SequenceWriter(out, overwrite=overwrite) as writer:
         script_random = np.random.default_rng([seed, 1, ACTIONS.index(action)])
-        scripts = script_action(action, body, script_random, duration=(frames - 1) / FRAME_RATE)
+        scripts = script_action(
+            action,
+            body,
+            script_random,
+            duration=(frames - 1) / FRAME_RATE,
+            set_out=set_out,
+            release=release,
+        )
         hands: dict[Side, TrueHand] = {one.side: load_true_hand(one.side) for one in scripts}
         capsules = cast("Mapping[Side, CapsuleHand]", hands)
         with engine_warnings_logged():
@@ -139,6 +152,8 @@ def synthesize(
             "preset": preset,
             "cameras": cameras,
             "frames": frames,
+            "set_out": set_out,
+            "release": release,
             "hold": hold,
             "images": images,
             "image_size": image_size,

@@ -40,7 +40,7 @@ class MovingHand(Protocol):
 
     @property
     def begin(self) -> float:
-        """When the hand starts to move [s]; 0 is frame 0, so this is not positive."""
+        """When the hand starts to move [s]; 0 (frame 0) if that is within the recording."""
         ...
 
     def at(self, time: float, /) -> TrueHandPose:

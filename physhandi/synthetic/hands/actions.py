@@ -10,7 +10,7 @@ from numpy.random import Generator
 
 from physhandi.data.sequence_meta import Side
 from physhandi.errors import UsageError
-from physhandi.synthetic.hands.handling import Graspable, Handler
+from physhandi.synthetic.hands.handling import SET_OUT, Graspable, Handler
 from physhandi.synthetic.hands.script import HandScript
 from physhandi.synthetic.hands.true_hand import TrueHand, load_true_hand
 
@@ -22,6 +22,8 @@ _UP = np.array([0.0, 0.0, 1.0])
 _STRETCH = {"cloth": 0.02, "towel": 0.05, "rope": -0.01, "plush": 0.08, "pouch": 0.05}
 # Shortest recording in which hands go the whole way, so that they are as slow in shorter ones [s].
 _WHOLE_WAY = 3.0
+# Shortest time in which an action can be told as one [s].
+_LEAST = 0.3
 DURATION = 3.0
 """Default duration of an action [s]."""
 
@@ -32,19 +34,25 @@ def script_action(
     random: Generator,
     *,
     duration: float = DURATION,
+    set_out: float = SET_OUT,
+    release: float | None = None,
     side: Side = "right",
     hands: Mapping[Side, TrueHand] | None = None,
 ) -> tuple[HandScript, ...]:
     """Write the script of one action on one object.
 
-    Every script reaches for the object before time 0 (see `HandScript.begin`), touches it at time
-    0 and goes on to move until `duration`, so that its last part cannot be guessed from rest.
+    A script reaches for the object before time 0 (see `HandScript.begin`), touches it at time 0 and
+    goes on to move until `duration`, so that its last part cannot be guessed from rest; or hands
+    arrive later, or let go before.
 
     Args:
         action: One of `ACTIONS`.
         body: The object as it lies on the ground.
         random: Decides where it is grasped, which way and how far it is moved, and the tremor.
         duration: Length of the recording [s].
+        set_out: When hands set out for the object, which they touch no sooner than that [s]. They
+            take 1.5 s to hold it; by default the recording begins then and holds the action alone.
+        release: When hands begin to let go, which takes 0.8 s with going away [s]. None: never.
         side: Hand that does one-handed actions; stretching takes both.
         hands: The hands that will do it, so that their soft tissue is counted; None for bare ones.
 
@@ -52,13 +60,24 @@ def script_action(
         One script, or the right hand's and the left hand's.
 
     Raises:
-        UsageError: There is no such action.
+        UsageError: There is no such action, or no time for it.
         SequenceError: The object is too large for the hand.
     """
     if action not in _WRITERS:
         raise UsageError(f"There is no action {action!r}. Choose one of {', '.join(ACTIONS)}.")
     hands = hands or {side: load_true_hand(side) for side in ("right", "left")}
-    return _WRITERS[action](_Task(body, random, duration, side, hands))
+    delay = set_out - SET_OUT
+    until = duration if release is None else release
+    is_timed = delay != 0.0 or release is not None
+    if is_timed and (delay < 0.0 or until > duration or until - delay < _LEAST):
+        raise UsageError(
+            f"Hands that set out at {set_out:g} s have hold of the object at {delay:.2f} s. "
+            f"Until {until:.2f} s of {duration:.2f} s, {until - delay:.2f} s are left for the "
+            f"action, and it needs {_LEAST:g} s. Choose an earlier set_out from {SET_OUT:g} s on, "
+            "a later release within the recording, or more frames."
+        )
+    task = _Task(body, random, until - delay, side, hands, lets_go=release is not None)
+    return tuple(script.later(delay) for script in _WRITERS[action](task))
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +89,7 @@ class _Task:
     duration: float
     side: Side
     hands: Mapping[Side, TrueHand]
+    lets_go: bool
 
     @property
     def extent(self) -> float:
@@ -77,7 +97,8 @@ class _Task:
         return min(self.duration / _WHOLE_WAY, 1.0)
 
     def handler(self, side: Side | None = None) -> Handler:
-        return Handler(self.hands[side or self.side], self.body, self.random)
+        hand = self.hands[side or self.side]
+        return Handler(hand, self.body, self.random, lets_go=self.lets_go)
 
 
 def _lift(task: _Task) -> tuple[HandScript, ...]:

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 from numpy.random import Generator
+from scipy.spatial.transform import Rotation
 
 from physhandi.errors import SequenceError
 from physhandi.synthetic.hands.grasp import (
@@ -34,8 +35,12 @@ Carry = Callable[[float], tuple[Float[ndarray, " 3"], Float[ndarray, " 3"]]]
 """Where a grasp has gone after a share of a move: shift [m] and rotation vector [rad]."""
 
 _UP = np.array([0.0, 0.0, 1.0])
-# Times of reaching, touching, closing and being ready, before the recording starts [s].
-_BEGIN, _TOUCH, _CLOSED, _READY = -1.5, -1.1, -0.6, -0.15
+SET_OUT = -1.5
+"""When a hand sets out for the object, before the recording starts, if it is not late [s]."""
+# Times of touching, closing and being ready, before the recording starts [s].
+_TOUCH, _CLOSED, _READY = -1.1, -0.6, -0.15
+# How long a hand opens, and how long it then moves away [s].
+_OPENING, _LEAVING = 0.4, 0.4
 _HOVER, _ASIDE = 0.06, 0.08
 _CLEARANCE = 0.004
 _POSES_PER_MOVE = 9
@@ -76,6 +81,8 @@ class Grasp:
     """Place of the grasp and direction of the hand."""
     approach: Sequence[HandMove]
     """Path of the hand before the recording starts, from far away to the last pose."""
+    retreat: Sequence[TrueHandPose]
+    """Way out, from a pose that holds the object where it was grasped to one that is far away."""
 
     @property
     def forward(self) -> Float[ndarray, " 3"]:
@@ -91,17 +98,21 @@ class Grasp:
 class Handler:
     """Plans one hand's grasps and motions on one object."""
 
-    def __init__(self, hand: TrueHand, body: Graspable, random: Generator) -> None:
+    def __init__(
+        self, hand: TrueHand, body: Graspable, random: Generator, *, lets_go: bool = False
+    ) -> None:
         """Remember who does what.
 
         Args:
             hand: The hand.
             body: The object as it lies on the ground.
             random: Decides places, directions and the tremor.
+            lets_go: Whether the hand opens and goes away after the last move of a script.
         """
         self._hand = hand
         self._body = body
         self._random = random
+        self._lets_go = lets_go
 
     def take(self, *, end: float = 0.0) -> Grasp:
         """Take hold of the object so that it can be carried.
@@ -127,10 +138,11 @@ class Handler:
             place=raised_place,
             poses=(moved(closed, raised),),
             approach=(
-                HandMove(_BEGIN, _TOUCH, (outside, lower[0])),
+                HandMove(SET_OUT, _TOUCH, (outside, lower[0])),
                 HandMove(_TOUCH, _CLOSED, lower),
                 HandMove(_CLOSED, _READY, (closed, moved(closed, raised))),
             ),
+            retreat=[*lower[::-1], outside],
         )
 
     def _take_limb(self, end: float) -> Grasp:
@@ -144,8 +156,7 @@ class Handler:
         place = places[self._random.integers(max(len(places) // 6, 1))]
         place = replace(place, closed_gap=0.5 * (place.width or 0.0))
         gaps = np.linspace((place.width or 0.0) + 0.012, place.closed_gap, 5)
-        poses = self._close(place, gaps)
-        return Grasp(poses=poses, place=place, approach=_from_above(poses[0], poses))
+        return _grasp_from_above(place, self._close(place, gaps))
 
     def embrace(self) -> Grasp:
         """Close all fingers around a part of the object, or around a handful of it."""
@@ -157,8 +168,7 @@ class Handler:
         else:
             place = handful_place(self._body, self._random)
             gaps = np.linspace(place.open_gap, place.closed_gap, 7)
-        poses = self._close(place, gaps)
-        return Grasp(poses=poses, place=place, approach=_from_above(poses[0], poses))
+        return _grasp_from_above(place, self._close(place, gaps))
 
     def lay_flat(self) -> Grasp:
         """Press the flat hand on the middle of the object."""
@@ -177,8 +187,7 @@ class Handler:
         press = 0.010 if is_soft else 0.003
         shift = np.array([*(place.point - center)[:2], top - press - low])
         above = moved(pose, shift + (press + 0.004) * _UP)
-        poses = (above, moved(pose, shift))
-        return Grasp(poses=poses, place=place, approach=_from_above(above, poses))
+        return _grasp_from_above(place, (above, moved(pose, shift)))
 
     def point_at(self) -> Grasp:
         """Put the index finger beside the object, or on it where it is flat."""
@@ -204,8 +213,7 @@ class Handler:
         orientation = orientation_towards(forward, pitch=_POINT_PITCH)
         touch = reach(self._hand, {INDEX: target}, orientation=orientation, joints=POINTING)
         back = 0.01 * _UP if is_flat else -0.01 * forward
-        poses = (moved(touch, back), touch)
-        return Grasp(poses=poses, place=place, approach=_from_above(poses[0], poses))
+        return _grasp_from_above(place, (moved(touch, back), touch))
 
     def script(self, grasp: Grasp, moves: Sequence[tuple[float, float, Carry]]) -> HandScript:
         """Reach for the object, close the hand, and carry what it holds.
@@ -220,7 +228,7 @@ class Handler:
             phases = np.linspace(0.0, 1.0, _POSES_PER_MOVE)
             poses = [turned(last_pose, grasp.place.point, *carry(float(p))) for p in phases]
             chain.append(HandMove(start, end, poses))
-        return HandScript(self._hand.side, chain, Tremor(self._random))
+        return self._finished(grasp, chain)
 
     def squeeze_script(
         self,
@@ -247,7 +255,13 @@ class Handler:
             shares = np.linspace(first, last, len(leg))
             drifting = [moved(p, share * drift) for p, share in zip(leg, shares, strict=True)]
             chain.append(HandMove(times[number], times[number + 1], drifting))
-        return HandScript(self._hand.side, chain, Tremor(self._random))
+        return self._finished(grasp, chain)
+
+    def _finished(self, grasp: Grasp, moves: Sequence[HandMove]) -> HandScript:
+        """Let the hand tremble, and let go in the end if it shall."""
+        last = moves[-1]
+        leaving = _let_go(grasp.retreat, last.poses[-1], last.end) if self._lets_go else ()
+        return HandScript(self._hand.side, [*moves, *leaving], Tremor(self._random))
 
     def distance_to_middle(self, grasp: Grasp) -> float:
         """Distance from the grasp to the object's middle along the hand's direction [m]."""
@@ -261,9 +275,41 @@ class Handler:
         return poses
 
 
+def _grasp_from_above(place: Place, poses: Sequence[TrueHandPose]) -> Grasp:
+    """Come from above, close the hand, and go back the same way."""
+    approach = _from_above(poses[0], poses)
+    retreat = [*reversed(poses), moved(poses[0], _HOVER * _UP)]
+    return Grasp(poses=poses, place=place, approach=approach, retreat=retreat)
+
+
 def _from_above(first: TrueHandPose, closing: Sequence[TrueHandPose]) -> list[HandMove]:
     """Come down to where a hand touches first, then close it."""
     return [
-        HandMove(_BEGIN, _TOUCH, (moved(first, _HOVER * _UP), first)),
+        HandMove(SET_OUT, _TOUCH, (moved(first, _HOVER * _UP), first)),
         HandMove(_TOUCH, _READY, closing),
     ]
+
+
+def _let_go(
+    retreat: Sequence[TrueHandPose], held: TrueHandPose, start: float
+) -> tuple[HandMove, HandMove]:
+    """Open a hand that holds something and take it away, the way it came.
+
+    Args:
+        retreat: Way out of the grasp where the object was taken.
+        held: Pose of the hand that has carried it elsewhere; its way out is that of the grasp,
+            moved and turned as far as the wrist has been.
+        start: When it begins to open [s].
+    """
+    before = Rotation.from_rotvec(retreat[0].orientation)
+    turn = Rotation.from_rotvec(held.orientation) * before.inv()
+    way = [held] + [
+        TrueHandPose(
+            orientation=(turn * Rotation.from_rotvec(pose.orientation)).as_rotvec(),
+            position=held.position + turn.apply(pose.position - retreat[0].position),
+            bend=pose.bend,
+        )
+        for pose in retreat[1:]
+    ]
+    opened = start + _OPENING
+    return HandMove(start, opened, way[:-1]), HandMove(opened, opened + _LEAVING, way[-2:])

@@ -1,7 +1,7 @@
 """Motion of a scripted hand: smooth moves between key poses, with a permanent tremor."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -79,8 +79,8 @@ class HandScript:
     """The motion of one hand as a function of time.
 
     A recording starts at time 0. What happens from `begin` up to then (reaching for the object and
-    closing the fingers) belongs to the simulation but is not recorded. Before `begin` and after
-    `end` the hand stays where it is and only trembles.
+    closing the fingers, unless the hand is late) belongs to the simulation but is not recorded.
+    Before the first move and after `end` the hand stays where it is and only trembles.
     """
 
     def __init__(self, side: Side, moves: Sequence[HandMove], tremor: Tremor) -> None:
@@ -100,13 +100,18 @@ class HandScript:
             raise ValueError("The moves of a hand script overlap.")
         self.side: Side = side
         """Which hand moves."""
-        self.begin = moves[0].start
-        """When the hand starts to move [s]; 0 or less."""
+        self.begin = min(moves[0].start, 0.0)
+        """When the hand starts to move [s]; 0 if that is within the recording."""
         self.end = moves[-1].end
         """When it has arrived [s]."""
         self._moves = tuple(moves)
         self._paths = tuple(_Path(move.poses) for move in moves)
         self._tremor = tremor
+
+    def later(self, delay: float) -> "HandScript":
+        """Do the same so much later [s]; until then the hand waits where it begins."""
+        moves = [replace(m, start=m.start + delay, end=m.end + delay) for m in self._moves]
+        return HandScript(self.side, moves, self._tremor)
 
     def at(self, time: float) -> TrueHandPose:
         """Compute the hand's pose at a time [s]."""

@@ -3,12 +3,14 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from physhandi.data.sequence_meta import Side
 from physhandi.errors import UsageError
 from physhandi.synthetic.bodies.bodies import Body, make_body
 from physhandi.synthetic.hands.actions import ACTIONS, script_action
 from physhandi.synthetic.hands.grasp import INDEX, THUMB, fingertip
+from physhandi.synthetic.hands.handling import SET_OUT
 from physhandi.synthetic.hands.script import HandScript
 from physhandi.synthetic.hands.true_hand import TrueHand, load_true_hand
 
@@ -179,6 +181,79 @@ def test_a_left_hand_and_a_shorter_recording_can_be_asked_for():
     assert (short.side, short.end) == ("left", 0.5)
     rise = [grip(one, one.end)[2] - grip(one, 0.0)[2] for one in (short, long)]
     assert rise[0] == pytest.approx(rise[1] / 4, abs=0.002)
+
+
+def timed(
+    name: str, action: str, duration: float, set_out: float, release: float | None = None
+) -> HandScript:
+    (one,) = script_action(
+        action,
+        body(name),
+        np.random.default_rng(3),
+        duration=duration,
+        set_out=set_out,
+        release=release,
+        hands=HANDS,
+    )
+    return one
+
+
+@pytest.mark.parametrize(
+    ("name", "action"),
+    [("rope", "push"), ("cloth", "wipe"), ("towel", "lift"), ("plush", "squeeze")],
+)
+def test_a_late_hand_touches_nothing_before_it_sets_out_and_then_does_the_same(name, action):
+    late, lying = timed(name, action, 3.0, 0.0), body(name)
+    assert late.begin == 0.0
+    assert late.end == pytest.approx(3.0)
+    assert min(gap(late, t, lying.node, lying.radius) for t in (-0.5, 0.0)) > 0.0005
+    assert min(gap(late, t, lying.node, lying.radius) for t in (0.9, 1.4)) < 0.002
+    # It holds the object after 1.5 s, and does what it would in a recording that begins then.
+    soon = timed(name, action, 1.5, SET_OUT)
+    for time in (-1.5, -1.0, 0.0, 0.7, 1.5):
+        # Only their tremor differs.
+        np.testing.assert_allclose(
+            late.at(time + 1.5).position, soon.at(time).position, atol=0.003, rtol=0
+        )
+        np.testing.assert_allclose(late.at(time + 1.5).bend, soon.at(time).bend, atol=0.04, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("name", "action"),
+    [
+        ("rope", "lift"),
+        ("cloth", "fold"),
+        ("plush", "squeeze"),
+        ("pouch", "push"),
+        ("towel", "wipe"),
+    ],
+)
+def test_a_hand_that_lets_go_does_the_same_until_then_and_goes_away(name, action):
+    one, plain = timed(name, action, 3.0, SET_OUT, 1.0), timed(name, action, 1.0, SET_OUT)
+    for time in (-1.0, 0.0, 0.6, 1.0):
+        np.testing.assert_array_equal(one.at(time).position, plain.at(time).position)
+        np.testing.assert_array_equal(one.at(time).bend, plain.at(time).bend)
+    assert one.end == pytest.approx(1.8)
+    times = np.arange(1.0, 1.9, 1 / 30)
+    places = np.array([grip(one, float(time)) for time in times])
+    assert np.linalg.norm(np.diff(places, axis=0), axis=1).max() * 30 < 1.0
+    # It is as far from where it let go as it was from the object before it came.
+    away = np.linalg.norm(one.at(1.8).position - one.at(1.0).position)
+    came = np.linalg.norm(plain.at(-1.5).position - plain.at(-0.6).position)
+    assert away > 0.8 * came > 0.03
+    turn = [Rotation.from_rotvec(one.at(time).orientation) for time in (1.0, 1.8)]
+    grasped = [Rotation.from_rotvec(one.at(time).orientation) for time in (-0.15, -1.5)]
+    # The way out is that of the way in, turned as the wrist has been.
+    difference = (turn[1] * turn[0].inv()).magnitude() - (grasped[1] * grasped[0].inv()).magnitude()
+    assert abs(difference) < 0.03
+
+
+@pytest.mark.parametrize(
+    ("set_out", "release"), [(-1.6, None), (-1.5, 2.1), (0.3, 2.2), (0.3, None), (-1.5, 0.2)]
+)
+def test_a_time_that_leaves_nothing_for_an_action_is_refused(set_out, release):
+    with pytest.raises(UsageError, match=r"Hands that set out at .* s have hold"):
+        timed("rope", "push", 2.0, set_out, release)
 
 
 def test_an_unknown_action_is_refused_by_name():

@@ -83,6 +83,7 @@ def test_actions_share_a_seed_s_body_but_not_its_cameras(rope, tmp_path):
         ({"preset": "foggy"}, "no preset named 'foggy'"),
         ({"changes": {"fog": 1.0}}, "no degradation named 'fog'"),
         ({"hold": "glue"}, "hold is 'glue'; expected one of: friction, attachment"),
+        ({"frames": 30, "set_out": 0.5}, "have hold of the object at 2.00 s"),
         ({"images": "some"}, "images is 'some'; expected one of: all, none"),
         ({"image_size": "tiny"}, "image_size is 'tiny'; expected one of: full, half, quarter"),
         ({"resolution": "coarse"}, "no resolution named 'coarse'"),
@@ -179,6 +180,10 @@ def test_the_command_writes_a_sequence(tmp_path: Path, capsys: pytest.CaptureFix
         (("--object", "anvil", "--action", "lift"), "no object named 'anvil'"),
         (("--object", "rope", "--action", "push", "--cameras", "0"), "cameras is 0"),
         (("--object", "rope", "--action", "push", "--change", "holes"), "write it like"),
+        (
+            ("--object", "rope", "--action", "push", "--set-out", "-0.2", "--frames", "30"),
+            "have hold of the object at 1.30 s",
+        ),
     ],
 )
 def test_the_command_refuses_in_one_line(
