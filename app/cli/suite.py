@@ -24,11 +24,14 @@ _OF_SUITE = arg(help_behavior_hint="(default: the suite's)")
 def evaluate_suite(
     *,
     suite: Annotated[
-        Literal["tiny", "dev", "dev_rgbd", "full"] | None,
+        Literal["tiny", "dev", "dev_rgbd", "dev_contact", "full"] | None,
         arg(help_behavior_hint="(default: tiny)"),
     ] = None,
     methods: Annotated[tuple[str, ...], _OF_SUITE] = (),
     seeds: Annotated[tuple[int, ...], _OF_SUITE] = (),
+    search_seeds: Annotated[
+        tuple[int, ...], arg(help_behavior_hint="(default: the profiles' own)")
+    ] = (),
     protocols: Annotated[
         tuple[Literal["main", "single_view", "unseen", "robustness", "sensitivity"], ...], _OF_SUITE
     ] = (),
@@ -47,8 +50,10 @@ def evaluate_suite(
         suite: Which suite; sequences that are not there yet are made. With `--sequences`, whose
             effort methods may take: without it their profiles' own.
         methods: Methods: static, rigid_follow, phystwin, paper, ours, quick, oracle_hand,
-            oracle_parameters, each also as NAME+last_residual or NAME@SETTING=VALUE.
+            oracle_parameters, true_motion, each also as NAME+last_residual or NAME@SETTING=VALUE.
         seeds: Seeds of every scene. From 1000 on they are reserved for verification.
+        search_seeds: Repeat every fit with these seeds of its search, and give means over them with
+            their spread; a search is also luck.
         protocols: main is reconstruction and future prediction.
         sequences: Folders or names of sequences to evaluate in place of the suite's scenes.
         out: Folder to fill, and to go on with; none takes one of its own in `suites/` of the data
@@ -63,7 +68,7 @@ def evaluate_suite(
     from physhandi.synthetic.suite.evaluation import Order
     from physhandi.synthetic.suite.evaluation import evaluate_suite as compare
     from physhandi.synthetic.suite.folder import check_folder
-    from physhandi.synthetic.suite.methods import method_settings, parse_method
+    from physhandi.synthetic.suite.methods import method_settings, parse_method, searched_from
     from physhandi.synthetic.suite.suite import (
         NAMED_SETTINGS,
         check_seeds,
@@ -73,14 +78,20 @@ def evaluate_suite(
     )
 
     start = time.monotonic()
-    given = {"methods": methods, "seeds": seeds, "protocols": protocols}
+    given = {
+        "methods": methods,
+        "seeds": seeds,
+        "search-seeds": search_seeds,
+        "protocols": protocols,
+    }
     chosen = find_suite(suite or "tiny")
     if sequences and seeds:
         raise UsageError("--seeds belongs to a suite's scenes; leave it out with --sequences.")
     settings = chosen.settings if suite or not sequences else NAMED_SETTINGS
     methods = methods or chosen.methods
     for method in methods:  # Tells a wrong one before a sequence is made, which takes long.
-        method_settings(parse_method(method), settings)
+        for one in searched_from(parse_method(method), search_seeds):
+            method_settings(one, settings)
     seeds = seeds or chosen.seeds
     check_seeds(seeds)
     device = pick_device(device)
@@ -108,6 +119,7 @@ def evaluate_suite(
             methods=methods,
             protocols=protocols or chosen.protocols,
             settings=settings,
+            search_seeds=search_seeds,
             device=device,
             command=_command(suite, given, sequences, jobs, device),
             at_once=jobs,

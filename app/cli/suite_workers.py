@@ -38,7 +38,7 @@ def order_from_json(about: dict[str, Any]) -> Order:
     """
     read = dict(about)
     read["recordings"] = tuple(Sequence.load(Path(folder)) for folder in about["recordings"])
-    read |= {name: tuple(about[name]) for name in ("methods", "protocols")}
+    read |= {name: tuple(about[name]) for name in ("methods", "protocols", "search_seeds")}
     return Order(**read)
 
 

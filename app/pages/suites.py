@@ -1,6 +1,7 @@
 """The pages of suites: methods compared on many sequences, and every cell to look into."""
 
 import re
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -58,6 +59,7 @@ class About(BaseModel):
     cases: list[str]
     methods: dict[str, str]
     oracles: list[str] = []
+    seed_of: dict[str, str] = {}
     skipped: list[str]
     notes: list[str] = []
     missing: int = 0
@@ -106,7 +108,7 @@ def add_suites(router: APIRouter, folder: Path, pages: Pages) -> None:
             "suite.html",
             suite=name,
             about=about,
-            tables=_tables(_rows(path), about.oracles),
+            tables=_tables(_rows(path, about.seed_of), about.oracles),
             matrix=_matrix(cells, about.oracles, query),
             choices=_choices(cells),
             query=query,
@@ -186,10 +188,12 @@ def _read(path: Path) -> StoredCells:
         ) from None
 
 
-def _rows(path: Path) -> list[SuiteRow]:
+def _rows(path: Path, hidden: Collection[str]) -> list[SuiteRow]:
+    """Read the table of a suite without the methods that it shows as means over seeds."""
     file = path / "table.csv"
     try:
-        return read_rows(file.read_text(encoding="utf-8"))
+        rows = read_rows(file.read_text(encoding="utf-8"))
+        return [row for row in rows if row.method not in hidden]
     except (OSError, ValueError) as error:
         raise RunError(f"{file} is not readable: {error}. Evaluate the suite again.") from error
 

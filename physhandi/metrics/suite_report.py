@@ -5,8 +5,9 @@
 
 import csv
 import io
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 from xml.sax.saxutils import escape
 
@@ -16,6 +17,8 @@ from numpy import ndarray
 
 SUITE_COLUMNS = ("method", "split", "metric", "mean", "low", "high", "n")
 """Columns of ``table.csv``."""
+SEED_COLUMNS = (*SUITE_COLUMNS, "spread")
+"""Its columns if there are means over several seeds of a search."""
 PAIRED_COLUMNS = (
     *("method", "against", "split", "metric"),
     *("difference", "low", "high", "better", "n"),
@@ -34,6 +37,7 @@ _LATEX = (
     ("δ", "$\\delta$"),
     ("×", "$\\times$"),  # noqa: RUF001
     ("↑", "$\\uparrow$"),
+    ("±", "$\\pm$"),
     ("–", "--"),  # noqa: RUF001
 )
 _COLORS = ("#4269d0", "#efb118", "#ff725c", "#6cc5b0", "#3ca951", "#ff8ab7", "#a463f2", "#97bbf5")
@@ -73,6 +77,7 @@ _OTHER = {
 }
 _SPLITS = {"reconstruction": "rec.", "future": "fut."}
 _COMPARED = ("chamfer_dynamic_l1", "chamfer_phystwin", "track_error_phystwin", "track_error")
+_FLOORED = ("chamfer_dynamic_l1", "chamfer_phystwin")
 _CURVE = "track_error"
 _NOTE = """\
 Figures are means over sequences of the mean over frames of the mean over points; brackets hold the
@@ -80,7 +85,9 @@ Figures are means over sequences of the mean over frames of the mean over points
 is given and not scored. `rec.` are the frames that were fitted, `fut.` those that were held out. A
 method without output scores as the static object, which touches nothing. The best figure of a
 column is bold, and so is every one that prints the same; oracles do not count, and no figure is
-bold where methods have different numbers of sequences, which `n` then tells. CD_dyn and CD_full are
+bold where methods have different numbers of sequences, which `n` then tells. `±` is the standard
+deviation over several seeds of the search, over which the figures of a sequence are then means.
+CD_dyn and CD_full are
 one-way and in the L1 norm, as PhysTwin computes them; `sym.` is the symmetric mean of Euclidean
 distances. All data is synthetic: these figures do not compare with those published on other data.
 docs/evaluation.md explains the methods and protocols, docs/metrics.md every metric.
@@ -121,6 +128,8 @@ class SuiteRow:
     """Upper end of the interval."""
     n: int
     """Number of cases."""
+    spread: float | None = None
+    """Standard deviation of the mean over the seeds of a search; None if there are not several."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,20 +176,25 @@ def write_report(
     about: Mapping[str, Any],
     rows: Sequence[SuiteRow],
     differences: Sequence[Difference],
+    above: Sequence[Difference],
     cells: Sequence[Mapping[str, Any]],
 ) -> dict[str, str]:
     """Write a suite's results as text, tables and charts.
 
     Args:
         about: Description of the suite: ``title command methods oracles cases protocols settings
-            seeds is_verification presets generators notes skipped missing environment``.
+            seeds is_verification presets generators notes skipped missing environment``, and as
+            ``seed_of`` the method of which others are one seed.
         rows: Means over sequences.
         differences: Paired comparisons with one method.
+        above: The same with the true motion; empty if that is not among the methods.
         cells: One entry a cell: ``method case run error figures curves seconds`` and more.
 
     Returns:
         Content by file name: ``report.md``, ``tables.tex``, ``per_sequence.csv`` and charts.
     """
+    hidden = about.get("seed_of", {})
+    rows = [row for row in rows if row.method not in hidden]
     tables = tables_of(rows)
     charts = _charts(rows, cells)
     oracles = about["oracles"]
@@ -189,7 +203,9 @@ def write_report(
     for title, columns in tables.items():
         parts += [f"## {title}{mark}", "", markdown_table(rows, columns, oracles)]
     if differences:
-        parts += [f"## Compared with {differences[0].against}", "", _compared(differences)]
+        parts += [f"## Compared with {differences[0].against}", "", _compared(differences, hidden)]
+    if above:
+        parts += ["## Above the floor", "", _above_the_floor(above, hidden)]
     if charts:
         parts += ["## Charts", "", *(f"![{file}]({file})" for file in charts), ""]
     parts += ["## Every sequence", "", _every_sequence(cells)]
@@ -205,6 +221,50 @@ def write_report(
         "per_sequence.csv": _per_sequence(cells),
         **charts,
     }
+
+
+def with_seed_means(scores: Iterable[Score], seed_of: Mapping[str, str]) -> list[Score]:
+    """Add to methods that differ in the seed of their search the mean over these, case by case.
+
+    A case counts if every seed has a figure of it. Means stand before the first of their seeds.
+
+    Args:
+        scores: Figures of all methods.
+        seed_of: The method of which each is one seed.
+    """
+    given = list(scores)
+    values: dict[tuple[str, str, str, str], dict[str, float]] = {}
+    for score in given:
+        if score.method in seed_of and np.isfinite(score.value):
+            values.setdefault(_place(score, seed_of), {})[score.method] = score.value
+    counts = Counter(seed_of.values())
+    means: list[Score] = []
+    for score in given:
+        if score.method in seed_of:
+            place = _place(score, seed_of)
+            of_seeds = values.pop(place, {})
+            if len(of_seeds) == counts[place[0]]:
+                mean = sum(of_seeds.values()) / len(of_seeds)
+                means.append(replace(score, method=place[0], value=mean))
+        means.append(score)
+    return means
+
+
+def _place(score: Score, seed_of: Mapping[str, str]) -> tuple[str, str, str, str]:
+    return seed_of[score.method], score.case, score.split, score.metric
+
+
+def _spreads(
+    grouped: Mapping[tuple[str, str, str], Mapping[str, float]], seed_of: Mapping[str, str]
+) -> dict[tuple[str, str, str], float]:
+    """Compute the deviation over seeds of the mean over those cases that all of them have."""
+    means: dict[tuple[str, str, str], list[float]] = {}
+    for (method, split, metric), cases in grouped.items():
+        shared = grouped.get((seed_of.get(method, ""), split, metric))
+        if shared:
+            mean = sum(cases[case] for case in shared) / len(shared)
+            means.setdefault((seed_of[method], split, metric), []).append(mean)
+    return {key: float(np.std(m, ddof=1)) for key, m in means.items() if len(m) > 1}
 
 
 def _intro(about: Mapping[str, Any]) -> str:
@@ -283,16 +343,34 @@ def _columns(
     ]
 
 
-def _compared(differences: Sequence[Difference]) -> str:
+def _compared(differences: Sequence[Difference], hidden: Collection[str]) -> str:
     against = differences[0].against
+    intro = f"Method less `{against}` on the same sequences [mm]; below zero is better."
+    return _difference_table(intro, differences, _COMPARED, hidden)
+
+
+def _above_the_floor(above: Sequence[Difference], hidden: Collection[str]) -> str:
+    intro = (
+        f"Method less `{above[0].against}` on the same sequences [mm]: the true motion, carried by "
+        "the same nodes, has Chamfer distances too, which no fit can avoid."
+    )
+    return _difference_table(intro, above, _FLOORED, hidden)
+
+
+def _difference_table(
+    intro: str,
+    differences: Sequence[Difference],
+    metrics: Collection[str],
+    hidden: Collection[str],
+) -> str:
     lines = [
-        f"Method less `{against}` on the same sequences [mm]; below zero is better.",
+        intro,
         "",
         "| method | split | metric | difference | better in |",
         "| --- | --- | --- | ---: | ---: |",
     ]
     for entry in differences:
-        if entry.metric in _COMPARED and entry.split in _SPLITS:
+        if entry.metric in metrics and entry.split in _SPLITS and entry.method not in hidden:
             low, mean, high = (
                 f"{_MM * value:+.2f}" for value in (entry.low, entry.difference, entry.high)
             )
@@ -406,10 +484,17 @@ def _charts(rows: Sequence[SuiteRow], cells: Sequence[Mapping[str, Any]]) -> dic
     return charts
 
 
-def summarise(scores: Iterable[Score]) -> list[SuiteRow]:
-    """Average every metric of every method and split over its cases, in the order they come."""
+def summarise(scores: Iterable[Score], seed_of: Mapping[str, str] | None = None) -> list[SuiteRow]:
+    """Average every metric of every method and split over its cases, in the order they come.
+
+    Args:
+        scores: Figures, with the means over seeds (`with_seed_means`) if there are any.
+        seed_of: The method of which each is one seed; that one's rows then tell their spread.
+    """
     rows: list[SuiteRow] = []
-    for (method, split, metric), cases in _grouped(scores).items():
+    grouped = _grouped(scores)
+    spreads = _spreads(grouped, seed_of or {})
+    for (method, split, metric), cases in grouped.items():
         value = np.array([cases[case] for case in sorted(cases)])
         low, high = interval(value)
         rows.append(
@@ -421,6 +506,7 @@ def summarise(scores: Iterable[Score]) -> list[SuiteRow]:
                 low=low,
                 high=high,
                 n=len(value),
+                spread=spreads.get((method, split, metric)),
             )
         )
     return rows
@@ -514,13 +600,13 @@ def read_rows(text: str) -> list[SuiteRow]:
         ValueError: If the columns are others, or a number is not one.
     """
     table = list(csv.reader(io.StringIO(text)))
-    if not table or tuple(table[0]) != SUITE_COLUMNS:
+    if not table or tuple(table[0]) not in (SUITE_COLUMNS, SEED_COLUMNS):
         raise ValueError(f"the columns must be {', '.join(SUITE_COLUMNS)}")
     rows: list[SuiteRow] = []
     for line, cells in enumerate(table[1:], 2):
-        if len(cells) != len(SUITE_COLUMNS):
-            raise ValueError(f"line {line} has {len(cells)} cells instead of {len(SUITE_COLUMNS)}")
-        method, split, metric, mean, low, high, n = cells
+        if len(cells) != len(table[0]):
+            raise ValueError(f"line {line} has {len(cells)} cells instead of {len(table[0])}")
+        method, split, metric, mean, low, high, n, *spread = cells
         rows.append(
             SuiteRow(
                 method=method,
@@ -530,6 +616,7 @@ def read_rows(text: str) -> list[SuiteRow]:
                 low=float(low),
                 high=float(high),
                 n=int(n),
+                spread=float(spread[0]) if any(spread) else None,
             )
         )
     return rows
@@ -607,6 +694,9 @@ def _column(
         low, mean, high = (_printed(value, column) for value in (row.low, row.mean, row.high))
         is_best = mean == winner and row.method not in unranked
         parts = [best.format(mean) if is_best else mean]
+        parts += (
+            [f"± {row.spread * column.factor:.{column.digits}f}"] if row.spread is not None else []
+        )
         parts += [f"[{low}, {high}]"] if row.n > 1 else []
         parts += [f"(n = {row.n})"] if is_uneven else []
         texts.append(" ".join(parts))

@@ -1,4 +1,4 @@
-"""Distances between a simulated object and its true surface.
+"""Distances between a simulated object and its true surface, and how nodes would truly move.
 
 They are measured in the world of the truth and so include the errors of calibration and
 synchronisation that observations and fit have in common.
@@ -117,6 +117,47 @@ def truth_curves(
         "chamfer_truth_to_nodes": there,
         "chamfer_nodes_to_truth": back,
     }
+
+
+def true_motion(
+    node: Float[ndarray, "node 3"], surface: TrueSurface
+) -> Float[ndarray, "frame node 3"]:
+    """Carry nodes by the true motion [m]: what remains of their errors no fit can avoid.
+
+    Each node is fixed to the triangle that is nearest to it in frame 0: its place along the plane
+    stretches with two edges of the triangle, its distance from the plane turns with the normal. A
+    rigid motion is followed exactly.
+
+    Args:
+        node: Nodes in frame 0, of whatever spacing [m].
+        surface: The true surface, which has a triangle with an area.
+    """
+    start = surface.point[0].astype(np.float64)
+    face = surface.face[triangle_areas(start, surface.face) > 0.0]
+    corner, place = start[face], node.astype(np.float64)
+    count = min(CANDIDATES, len(face))
+    tree: Any = KDTree(corner.mean(axis=1))
+    near = np.reshape(tree.query(place, k=count)[1], (len(place), count))
+    nearest = triangle_distance(place[:, None], corner[near]).argmin(axis=1)
+    mine = face[near[np.arange(len(place)), nearest]]
+    origin, frame = _frames(start[mine])
+    own = np.linalg.solve(frame, (place - origin)[..., None])
+    moved = np.empty((len(surface.point), *place.shape))
+    for number, point in enumerate(surface.point):
+        origin, frame = _frames(point[mine].astype(np.float64))
+        moved[number] = origin + (frame @ own)[..., 0]
+    return moved
+
+
+def _frames(
+    corner: Float[ndarray, "node 3 3"],
+) -> tuple[Float[ndarray, "node 3"], Float[ndarray, "node 3 3"]]:
+    """Return the first corner of each triangle, and as columns two edges and the unit normal."""
+    origin = corner[:, 0]
+    first, second = corner[:, 1] - origin, corner[:, 2] - origin
+    normal = np.cross(first, second)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    return origin, np.stack([first, second, normal], axis=2)
 
 
 def surface_distance(

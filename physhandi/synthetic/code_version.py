@@ -16,6 +16,7 @@ PREDICTIONS = (
     *("pipeline.py", "fitted_object.py", "object_rollout.py", "settings.py", "triangles.py"),
     *("data", "hand", "perception", "simulation", "fitting"),
     *("metrics/baselines.py", "metrics/alignment.py", "metrics/geometry.py"),
+    "metrics/truth_metrics.py",
     *("synthetic/suite/methods.py", "synthetic/suite/cells.py"),
     *INPUTS[:1],
 )

@@ -38,6 +38,7 @@ from physhandi.errors import (
 )
 from physhandi.metrics.photometric import photometric_curves
 from physhandi.metrics.report import measure_run
+from physhandi.metrics.truth_metrics import true_surface
 from physhandi.progress import Progress
 from physhandi.synthetic.code_version import PREDICTIONS, SCORES, code_version
 from physhandi.synthetic.suite.methods import (
@@ -153,6 +154,11 @@ class Bench:
 
     def lacks(self, method: Method, recording: Sequence, variant: str = "recording") -> str:
         """Explain what a recording lacks for a variant of it; empty if nothing."""
+        if method.gets == "truth" and true_surface(read_truth(recording.folder)) is None:
+            return (
+                f"Sequence '{recording.name}' has no truth/object_point.npy with "
+                "truth/object_face.npy, so its true motion is not known."
+            )
         try:
             self._make_variant(recording, _given(method, variant))
         except MissingInputError as error:
@@ -257,6 +263,7 @@ class Bench:
             base = self._run(method.base, recording, variant)
             return correct(base, inputs, folder, title=title, method=method)
         still, hands, noise = self._still(method), None, None
+        truth = true_surface(read_truth(recording.folder)) if method.gets == "truth" else None
         if method.name != still.name:
             hands = self._run(still, recording, variant)
         elif variant == DISTURBED_HAND:
@@ -271,6 +278,7 @@ class Bench:
                 common=self.common,
                 hands=hands,
                 noise=noise,
+                truth=truth,
                 device=self.device,
                 progress=self.progress,
             )
@@ -356,7 +364,9 @@ def _raise_again(folder: Path, *, also: type[PhysHandiError] | None = None) -> N
 
 
 def _given(method: Method, variant: str) -> str:
-    return method.gets if variant == "recording" else variant
+    """Name the input of a method; the truth is given beside the recording, not in it."""
+    own = "recording" if method.gets == "truth" else method.gets
+    return own if variant == "recording" else variant
 
 
 def _as_one_split(recording: Sequence) -> Sequence:

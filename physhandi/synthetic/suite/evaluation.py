@@ -27,7 +27,13 @@ from physhandi.synthetic.code_version import (
 )
 from physhandi.synthetic.suite.cells import FAILURES, Bench, Outcome
 from physhandi.synthetic.suite.folder import SuiteFolder, contact_kind, figures_of
-from physhandi.synthetic.suite.methods import METHODS, Method, method_settings, parse_method
+from physhandi.synthetic.suite.methods import (
+    METHODS,
+    Method,
+    method_settings,
+    parse_method,
+    searched_from,
+)
 from physhandi.synthetic.suite.suite import RESERVED_SEED, Protocol
 
 SENSITIVITY = ((0.001, 3), (0.002, 3), (0.02, 3), (0.04, 3), (0.002, 1), (0.002, 10), (0.002, 50))
@@ -54,6 +60,8 @@ class Order:
     """Protocols to run."""
     settings: Mapping[str, Any] = field(default_factory=dict[str, Any])
     """Settings that all methods share."""
+    search_seeds: tuple[int, ...] = ()
+    """Seeds of the search with which every fit is repeated; none takes the profiles' own."""
     device: str = "cpu"
     """Warp device."""
     command: str = ""
@@ -247,7 +255,8 @@ class _Work:
 
 def _read(order: Order) -> tuple[Order, tuple[Method, ...], list[Task]]:
     """Check an order, remove duplicates, and return it with its methods and tasks."""
-    methods = tuple(parse_method(name) for name in dict.fromkeys(order.methods))
+    named = [parse_method(name) for name in dict.fromkeys(order.methods)]
+    methods = tuple(one for method in named for one in searched_from(method, order.search_seeds))
     order = replace(order, protocols=tuple(dict.fromkeys(order.protocols)))
     _check(order, methods)
     return order, methods, list(list_tasks(order, methods))
@@ -273,7 +282,8 @@ def _about(order: Order, methods: Many[Method]) -> dict[str, Any]:
         "title": order.title,
         "command": order.command,
         "methods": {method.name: method.about for method in methods},
-        "oracles": [method.name for method in methods if method.gets != "recording"],
+        "oracles": _oracles(methods),
+        "seed_of": {method.name: method.seed_of for method in methods if method.seed_of},
         "cases": [recording.name for recording in order.recordings],
         "protocols": list(order.protocols),
         "settings": dict(order.settings),
@@ -291,6 +301,13 @@ def _about(order: Order, methods: Many[Method]) -> dict[str, Any]:
             "sequences": {r.name: r.fingerprint() for r in order.recordings},
         },
     }
+
+
+def _oracles(methods: Many[Method]) -> list[str]:
+    """Name the methods that are given what no real one can have, and the means over their seeds."""
+    oracles = [method for method in methods if method.gets != "recording"]
+    seeded = [method.seed_of for method in oracles if method.seed_of]
+    return list(dict.fromkeys([*(method.name for method in oracles), *seeded]))
 
 
 def _environment(order: Order) -> dict[str, Any]:

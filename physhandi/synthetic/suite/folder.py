@@ -22,13 +22,17 @@ from physhandi.metrics.contact import THRESHOLDS, ContactLabels, contact_scores,
 from physhandi.metrics.report import CONTACT_METRICS, METRICS
 from physhandi.metrics.suite_report import (
     PAIRED_COLUMNS,
+    SEED_COLUMNS,
+    SUITE_COLUMNS,
     Score,
     compare,
     summarise,
     to_csv,
+    with_seed_means,
     write_report,
 )
 from physhandi.synthetic.suite.cells import Outcome
+from physhandi.synthetic.suite.suite import FLOOR
 
 DENSE_ACTIONS = ("squeeze", "wipe")
 """Synthetic actions in which the whole hand is on the body; others use fingertips."""
@@ -57,8 +61,8 @@ class SuiteFolder:
 
         Args:
             out: The folder.
-            about: Description of the order: ``title methods oracles cases protocols made_from`` and
-                more.
+            about: Description of the order: ``title methods seed_of oracles cases protocols
+                made_from`` and more.
 
         Raises:
             UsageError: If the folder holds the table of another order.
@@ -78,6 +82,7 @@ class SuiteFolder:
             self._earlier = _with_curves(out, before["cells"])
             self._skipped = list(earlier["skipped"])
             self.about["methods"] = {**earlier["methods"], **about["methods"]}
+            self.about["seed_of"] = {**earlier.get("seed_of", {}), **about["seed_of"]}
             self.about["oracles"] = list(dict.fromkeys([*earlier["oracles"], *about["oracles"]]))
             self.about["protocols"] = list(
                 dict.fromkeys([*earlier["protocols"], *about["protocols"]])
@@ -110,14 +115,18 @@ class SuiteFolder:
             "missing": missing,
             "environment": dict(environment),
         }
-        scores = list(scores_of(cells))
-        rows = summarise(scores)
-        methods = list(about["methods"])
+        about["seed_of"] = {n: base for n, base in self.about["seed_of"].items() if n in shown}
+        scores = with_seed_means(scores_of(cells), about["seed_of"])
+        rows = summarise(scores, about["seed_of"])
+        methods = list(dict.fromkeys(about["seed_of"].get(n, n) for n in about["methods"]))
         against = "phystwin" if "phystwin" in methods else (methods or [""])[0]
         differences = compare(scores, against)
-        files = write_report(about, rows, differences, cells)
+        above = compare(scores, FLOOR) if against != FLOOR else []
+        files = write_report(about, rows, differences, above, cells)
         about["charts"] = [Path(file).name for file in files if file.startswith("charts/")]
-        files |= {"table.csv": to_csv(rows), "paired.csv": to_csv(differences, PAIRED_COLUMNS)}
+        columns = SEED_COLUMNS if about["seed_of"] else SUITE_COLUMNS
+        paired = to_csv([*differences, *above], PAIRED_COLUMNS)
+        files |= {"table.csv": to_csv(rows, columns), "paired.csv": paired}
         for file, content in files.items():
             (self.out / file).parent.mkdir(parents=True, exist_ok=True)
             write_bytes(self.out / file, content.encode())

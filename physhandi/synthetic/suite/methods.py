@@ -7,6 +7,7 @@ settings are those of a profile.
 import re
 import shutil
 from collections.abc import Mapping
+from collections.abc import Sequence as Many
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -34,6 +35,7 @@ from physhandi.metrics.baselines import (
     static_baseline,
 )
 from physhandi.metrics.report import measure_run
+from physhandi.metrics.truth_metrics import TrueSurface, true_motion
 from physhandi.progress import Progress
 
 HAND_NOISE = 0.010
@@ -41,7 +43,9 @@ HAND_NOISE = 0.010
 _PLACE, _TURN, _POSE = 0.01, 0.1, 0.1
 _HALVINGS = 30
 _MOST = 8.0
-Given = Literal["recording", "true_hand", "all_frames"]
+Given = Literal["recording", "true_hand", "all_frames", "truth"]
+SEARCH_SEED = "object_.search.seed"
+"""Setting that decides the candidates of a search."""
 CORRECTION = "last_residual"
 """Ends the name of a method whose predicted frames are shifted by its last residual."""
 _NAME = re.compile(
@@ -60,7 +64,7 @@ class Method:
     """Description in one sentence."""
     profile: str = "default"
     """Settings of the hands and, if there is no rule, of the object."""
-    rule: Literal["static", "rigid_follow"] | None = None
+    rule: Literal["static", "rigid_follow", "true_motion"] | None = None
     """Rule that moves the object; None for a fit."""
     gets: Given = "recording"
     """Input: an oracle gets data that no real method can have."""
@@ -68,6 +72,8 @@ class Method:
     """Settings that differ from the profile's."""
     is_corrected: bool = False
     """Whether the last residual is added to the predicted frames."""
+    seed_of: str = ""
+    """The method that this is one of several seeds of; empty if there are not several."""
 
     @property
     def base(self) -> "Method":
@@ -104,6 +110,13 @@ METHODS = {
             gets="all_frames",
             about="The default profile, fitted to the future frames too: one optimisation in "
             "hindsight; other parameters might do better still.",
+        ),
+        Method(
+            name="true_motion",
+            rule="true_motion",
+            gets="truth",
+            about="The object of frame 0, carried by the true motion: the floor of every error at "
+            "this node spacing.",
         ),
     )
 }
@@ -144,6 +157,21 @@ def parse_method(text: str) -> Method:
     method = replace(start, name=text, about=about, overrides=overrides, is_corrected=is_corrected)
     method_settings(method, {})
     return method
+
+
+def searched_from(method: Method, seeds: Many[int]) -> tuple[Method, ...]:
+    """Repeat a fit with other seeds of its search; a rule, or a fit that names one, stays alone.
+
+    Raises:
+        UsageError: If a seed cannot be one.
+    """
+    if method.rule is not None or SEARCH_SEED in method.overrides or not seeds:
+        return (method,)
+    correction = f"+{CORRECTION}" if method.is_corrected else ""
+    base = method.base.name
+    mark = "," if "@" in base else "@"
+    names = [f"{base}{mark}{SEARCH_SEED}={seed}{correction}" for seed in dict.fromkeys(seeds)]
+    return tuple(replace(parse_method(name), seed_of=method.name) for name in names)
 
 
 def _split(settings: str) -> list[str]:
@@ -190,6 +218,7 @@ def execute(
     common: Mapping[str, Any],
     hands: RunFolder | None = None,
     noise: HandNoise | None = None,
+    truth: TrueSurface | None = None,
     device: str = "cpu",
     progress: Progress,
 ) -> RunFolder:
@@ -204,6 +233,7 @@ def execute(
         hands: A finished run on the same recording, whose stages are taken over as far as the
             settings that they depend on are the same.
         noise: Makes the hands that are taken over wrong, and nothing but hands is taken over.
+        truth: The true surface, for a rule that follows it.
         device: Warp device.
         progress: Told about every iteration.
 
@@ -225,7 +255,7 @@ def execute(
         if method.rule is None:
             pipeline.reconstruct([recording], config, attempt, watched, device=device)
         else:
-            rule = partial(_moved, rule=method.rule)
+            rule = partial(_moved, rule=method.rule, truth=truth)
             pipeline.predict(recording, config, rule, attempt, watched)
         attempt.publish()
     return RunFolder.open(folder)
@@ -407,7 +437,13 @@ def take_disturbed_hands(source: RunFolder, attempt: Attempt, name: str, noise: 
     attempt.finish_stage(pipeline.HANDS, stage["summary"])
 
 
-def _moved(node: np.ndarray, control: np.ndarray, *, rule: str) -> np.ndarray:
+def _moved(
+    node: np.ndarray, control: np.ndarray, *, rule: str, truth: TrueSurface | None
+) -> np.ndarray:
+    if rule == "true_motion":
+        if truth is None:
+            raise MissingInputError("There is no true surface that nodes could follow.")
+        return true_motion(node, truth)
     if rule == "static":
         return static_baseline(node, len(control))
     return rigid_follow_baseline(node, control)

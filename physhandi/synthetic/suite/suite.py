@@ -15,8 +15,9 @@ from physhandi.data.files import named_fields
 from physhandi.data.sequence import Sequence
 from physhandi.errors import UsageError
 from physhandi.progress import Progress
+from physhandi.synthetic.hands.handling import SET_OUT
 
-SuiteName = Literal["tiny", "dev", "dev_rgbd", "full"]
+SuiteName = Literal["tiny", "dev", "dev_rgbd", "dev_contact", "full"]
 Protocol = Literal["main", "single_view", "unseen", "robustness", "sensitivity"]
 Making = Mapping[str, Any]
 """Arguments of `synthesize` for one sequence."""
@@ -24,7 +25,9 @@ RESERVED_SEED = 1000
 """Seeds from here on are reserved for verification."""
 BASELINES = ("static", "rigid_follow", "phystwin")
 """Methods of every table."""
-ORACLES = ("oracle_hand", "oracle_parameters")
+FLOOR = "true_motion"
+"""The method whose errors are those of the nodes' places alone."""
+ORACLES = ("oracle_hand", "oracle_parameters", FLOOR)
 """Methods with input that no real method can have."""
 
 
@@ -36,6 +39,10 @@ class SuiteScene:
     """Object: cloth, towel, rope, plush or pouch."""
     action: str
     """Action: lift, fold, stretch, squeeze, wipe or push."""
+    set_out: float = SET_OUT
+    """When the hands set out for the object [s]; by default they hold it in frame 0."""
+    release: float | None = None
+    """When they begin to let go [s]; None: never."""
 
     @property
     def hold(self) -> Literal["friction", "attachment"]:
@@ -44,7 +51,10 @@ class SuiteScene:
 
     def name(self, seed: int) -> str:
         """Name the sequence of a seed."""
-        return f"{self.object_}_{self.action}_{seed}"
+        parts = [self.object_, self.action]
+        parts += ["late"] if self.set_out > SET_OUT else []
+        parts += ["released"] if self.release is not None else []
+        return "_".join([*parts, str(seed)])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,7 +97,7 @@ SUITES: dict[str, Suite] = {
             about="One small sequence and little effort: shows that everything works.",
             scenes=_scenes("cloth lift"),
             seeds=(0,),
-            methods=("static", "rigid_follow", "phystwin", "quick", "quick+last_residual"),
+            methods=("static", "rigid_follow", "phystwin", "quick", "quick+last_residual", FLOOR),
             settings={
                 "node_spacing": 0.022,
                 "simulation.connection_radius": 0.03,
@@ -126,6 +136,7 @@ SUITES: dict[str, Suite] = {
                 *BASELINES,
                 "phystwin+last_residual",
                 *("ours", "ours+last_residual", "ours@refinement.iterations=0"),
+                FLOOR,
             ),
             protocols=("main", "single_view"),
             settings=_DEV_SETTINGS,
@@ -135,6 +146,26 @@ SUITES: dict[str, Suite] = {
                 "image_size": "half",
                 "held_out_view": True,
             },
+        ),
+        Suite(
+            name="dev_contact",
+            about="What `dev` lacks: flat hands that wipe, a hand that arrives late, and one that "
+            "lets go; four sequences without images.",
+            scenes=(
+                SuiteScene(object_="towel", action="wipe"),
+                SuiteScene(object_="cloth", action="wipe", set_out=-0.2),
+                SuiteScene(object_="rope", action="push", set_out=-0.2),
+                SuiteScene(object_="pouch", action="lift", release=1.2),
+            ),
+            seeds=(0,),
+            methods=(
+                *BASELINES,
+                "phystwin+last_residual",
+                *("ours", "ours+last_residual"),
+                *ORACLES,
+            ),
+            settings=_DEV_SETTINGS,
+            recording={"preset": "default", "images": "none", "frames": 90},
         ),
         Suite(
             name="full",
@@ -235,7 +266,8 @@ def make_recording(making: Making, target: Path, progress: Progress) -> None:
 
 def _making(suite: Suite, scene: SuiteScene, seed: int) -> dict[str, Any]:
     scripted = {"object": scene.object_, "action": scene.action, "seed": seed, "hold": scene.hold}
-    return scripted | dict(suite.recording)
+    timed = {"set_out": scene.set_out, "release": scene.release}
+    return scripted | timed | dict(suite.recording)
 
 
 def _check_made(suite: Suite, recording: Sequence, making: Making) -> None:

@@ -1,6 +1,7 @@
 """Tables as people read them."""
 
 import re
+from dataclasses import replace
 
 from physhandi.metrics.suite_report import (
     Column,
@@ -40,6 +41,14 @@ def test_lines_hold_figures_in_the_units_of_their_column() -> None:
         ["static", "20.00 [10.00, 40.00]", "0.500 [0.250, 1.000]"],
         ["last_residual", "<10.00> [5.00, 20.00]", "<0.750> [0.375, 1.500]"],
     ]
+
+
+def test_a_spread_over_seeds_stands_beside_the_mean() -> None:
+    rows = [replace(row("a", "track_error", 0.01), spread=0.0015), row("b", "track_error", 0.02)]
+    lines = laid_out(rows, SHOWN[:1], "<{}>")
+    assert lines[1][1] == "<10.00> ± 1.50 [5.00, 20.00]"
+    assert lines[2][1] == "20.00 [10.00, 40.00]"
+    assert "$\\pm$ 1.50" in latex_table(rows, SHOWN[:1])
 
 
 def test_a_mean_without_the_hard_cases_is_not_best_and_tells_its_number() -> None:

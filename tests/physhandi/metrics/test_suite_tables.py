@@ -10,6 +10,7 @@ from scipy.stats import bootstrap
 
 from physhandi.metrics.suite_report import (
     PAIRED_COLUMNS,
+    SEED_COLUMNS,
     SUITE_COLUMNS,
     Score,
     compare,
@@ -18,6 +19,7 @@ from physhandi.metrics.suite_report import (
     resampled_means,
     summarise,
     to_csv,
+    with_seed_means,
 )
 
 
@@ -82,6 +84,44 @@ def test_the_table_has_the_agreed_columns_and_is_read_back() -> None:
     (again,) = read_rows(text)
     assert (again.n, again.metric) == (2, "track_error")
     assert again.low == pytest.approx(rows[0].low, rel=1e-6)
+    assert again.spread is None
+
+
+def test_seeds_of_a_search_become_a_mean_with_its_spread() -> None:
+    figures = {"x": (1.0, 2.0, 6.0), "y": (10.0, 20.0, 30.0)}
+    scores = [score("static", "x", 9.0)]
+    scores += [
+        score(f"ours@seed={seed}", case, value)
+        for case, values in figures.items()
+        for seed, value in enumerate(values)
+    ]
+    scores.append(score("ours@seed=0", "z", 5.0))  # One seed alone has it.
+    seed_of = {f"ours@seed={seed}": "ours" for seed in range(3)}
+    means = with_seed_means(scores, seed_of)
+    assert [one for one in means if one.method != "ours"] == scores
+    rows = {row.method: row for row in summarise(means, seed_of)}
+    assert list(rows) == ["static", "ours", *seed_of]
+    ours = rows["ours"]
+    assert (ours.mean, ours.low, ours.high, ours.n) == (11.5, 3.0, 20.0, 2)
+    # Means over the sequences are 5.5, 11 and 18.
+    assert ours.spread == pytest.approx(np.std([5.5, 11.0, 18.0], ddof=1))
+    assert rows["static"].spread is rows["ours@seed=1"].spread is None
+    text = to_csv(list(rows.values()), SEED_COLUMNS)
+    assert text.splitlines()[0].endswith(",n,spread")
+    again = {row.method: row for row in read_rows(text)}
+    assert again["ours"].spread == pytest.approx(ours.spread, rel=1e-6)
+    assert again["static"] == rows["static"]
+    against = {one.method: one.difference for one in compare(means, "ours")}
+    assert against["ours@seed=2"] == pytest.approx(18.0 - 11.5)
+
+
+def test_one_seed_alone_has_no_spread() -> None:
+    seed_of = {"ours@seed=7": "ours"}
+    means = with_seed_means([score("ours@seed=7", "x", 2.0)], seed_of)
+    assert [(r.method, r.mean, r.spread) for r in summarise(means, seed_of)] == [
+        ("ours", 2.0, None),
+        ("ours@seed=7", 2.0, None),
+    ]
 
 
 @pytest.mark.parametrize(
@@ -91,6 +131,8 @@ def test_the_table_has_the_agreed_columns_and_is_read_back() -> None:
         ("method,mean\n", "columns"),
         (",".join(SUITE_COLUMNS) + "\na,b,c,1,2\n", "line 2 has 5"),
         (",".join(SUITE_COLUMNS) + "\na,b,c,one,2,3,4\n", "one"),
+        (",".join(SEED_COLUMNS) + "\na,b,c,1,2,3,4\n", "line 2 has 7 cells instead of 8"),
+        (",".join(SEED_COLUMNS) + "\na,b,c,1,2,3,4,some\n", "some"),
     ],
 )
 def test_a_damaged_table_is_refused(text: str, told: str) -> None:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy import ndarray
 from scipy.spatial.distance import cdist
+from scipy.spatial.transform import Rotation
 
 from physhandi.data.truth import Truth
 from physhandi.errors import SequenceError
@@ -11,6 +12,7 @@ from physhandi.metrics.truth_metrics import (
     SAMPLE_COUNT,
     TrueSurface,
     surface_distance,
+    true_motion,
     true_surface,
     truth_curves,
 )
@@ -162,3 +164,51 @@ def test_without_a_surface_there_is_nothing_to_measure() -> None:
     assert prepared(0 * point, TWO) is None
     with pytest.raises(SequenceError, match=r"object_face\.npy: triangle 1 joins .*\[0, 2, 4\]"):
         prepared(point, np.array([[0, 1, 2], [0, 2, 4]]))
+
+
+def bent(point: np.ndarray, curvature: float, height: float = 0.0) -> np.ndarray:
+    """Wind a plane about a cylinder, in closed form; `height` is above the plane."""
+    if curvature == 0.0:
+        return np.column_stack([point[:, 0], point[:, 1], height + 0.0 * point[:, 0]])
+    angle, radius = point[:, 0] * curvature, 1.0 / curvature - height
+    return np.column_stack(
+        [radius * np.sin(angle), point[:, 1], 1.0 / curvature - radius * np.cos(angle)]
+    )
+
+
+def test_nodes_that_the_truth_carries_move_rigidly_with_it_to_the_last_digit() -> None:
+    point, face = waving()
+    turn = Rotation.from_rotvec([0.3, -0.9, 0.5]).as_matrix()
+    up = np.array([0.0, 0.0, 1.0])
+    frames = np.stack([point[0], point[0] @ turn.T + [0.1, 0.2, -0.3], point[0] + up])
+    # On the sheet, above it and beyond its rim.
+    node = np.array([[0.01, 0.02, 0.03], [-0.1, 0.14, 0.0], [0.17, 0.1, 0.05], [0.0, -0.2, 0.0]])
+    moved = true_motion(node, surface_of(frames, face))
+    assert moved.dtype == np.float64
+    np.testing.assert_allclose(moved[0], node, atol=1e-14)
+    np.testing.assert_allclose(moved[1], node @ turn.T + [0.1, 0.2, -0.3], atol=1e-13)
+    np.testing.assert_allclose(moved[2], node + up, atol=1e-13)
+
+
+def test_nodes_that_the_truth_carries_are_wound_about_a_cylinder_with_it() -> None:
+    flat, face = waving(60)
+    flat = flat[0] * [1.0, 1.0, 0.0]
+    curvature = np.array([0.0, 2.0, 5.0])
+    surface = surface_of(np.stack([bent(flat, c) for c in curvature]), face)
+    node = np.random.default_rng(1).uniform(-0.14, 0.14, (50, 3)) * [1.0, 1.0, 0.0]
+    for height in (0.0, 0.004):
+        moved = true_motion(node + height * np.array([0.0, 0.0, 1.0]), surface)
+        for frame, c in enumerate(curvature):
+            # Triangles of 5 mm lie at most 5 mm²/8 times the curvature beside the cylinder, and
+            # their normals turn in steps of 5 mm times it.
+            expected = bent(node, c, height)
+            np.testing.assert_allclose(moved[frame], expected, atol=2e-5 + 0.006 * c * height)
+        assert np.abs(moved[2] - moved[0]).max() > 0.03
+
+
+def test_a_flat_triangle_carries_no_node() -> None:
+    point = np.concatenate([SQUARE, [[0.2, 0.0, 0.0]]])
+    face = np.concatenate([TWO, [[4, 4, 4]]])
+    frames = np.stack([point, point + np.array([0.0, 0.0, 0.5])])
+    moved = true_motion(np.array([[0.2, 0.0, 0.1]]), surface_of(frames, face))
+    np.testing.assert_allclose(moved[:, 0], [[0.2, 0.0, 0.1], [0.2, 0.0, 0.6]], atol=1e-15)

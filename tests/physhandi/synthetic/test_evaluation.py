@@ -1,6 +1,8 @@
 """A suite of two small sheets: what is computed once, what stands in, and what is written."""
 
+import csv
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,10 @@ from physhandi.synthetic.suite.cells import Bench
 from physhandi.synthetic.suite.evaluation import evaluate_suite, list_tasks
 from physhandi.synthetic.suite.folder import contact_kind
 from physhandi.synthetic.suite.methods import parse_method
+
+CORNER = (np.arange(4)[:, None] * 5 + np.arange(4)).reshape(-1, 1)
+GRID_FACES = np.concatenate([CORNER + np.array(offset) for offset in ((0, 1, 5), (1, 6, 5))])
+"""Triangles of the sheet's five by five nodes."""
 
 
 @pytest.fixture(scope="module")
@@ -163,6 +169,83 @@ def test_what_a_recording_cannot_give_is_not_asked_for(
     assert found["cells"] == 1
     assert len(found["skipped"]) == 2
     assert "true hand" in found["skipped"][0]
+
+
+def test_the_true_motion_is_the_floor_that_methods_are_told_above(
+    tmp_path: Path, recordings: tuple[Sequence, ...]
+) -> None:
+    low, high = recordings
+    folder = shutil.copytree(low.folder, tmp_path / low.name)
+    marker = np.load(folder / "marker.npy")
+    np.save(folder / "truth/object_point.npy", marker)
+    np.save(folder / "truth/object_face.npy", GRID_FACES)
+    order = order_of(
+        (Sequence.load(folder), high),
+        methods=("static", "quick", "true_motion"),
+        protocols=("main",),
+    )
+    found = evaluate_suite(order, tmp_path / "out")
+    assert found["cells"] == 5
+    (skipped,) = found["skipped"]
+    assert "true_motion, high" in skipped
+    assert "truth/object_point.npy" in skipped
+    rows = table(tmp_path / "out")
+    for split in ("reconstruction", "future"):
+        # Nodes are markers, so they are where the truth carries them.
+        assert float(rows["true_motion", split, "marker_error"]["mean"]) < 1e-6
+        assert float(rows["static", split, "marker_error"]["mean"]) > 0.01
+    report = (tmp_path / "out/report.md").read_text()
+    assert "Method less `true_motion`" in report.partition("## Above the floor")[2]
+    about = json.loads((tmp_path / "out/cells.json").read_text())["about"]
+    assert about["oracles"] == ["true_motion"]
+    with (tmp_path / "out/paired.csv").open() as stream:
+        pairs = [row for row in csv.DictReader(stream) if row["against"] == "true_motion"]
+    (gap,) = [
+        row
+        for row in pairs
+        if (row["method"], row["split"], row["metric"]) == ("static", "future", "marker_error")
+    ]
+    still = np.linalg.norm(marker[FITTED:] - marker[0], axis=2).mean()
+    assert float(gap["difference"]) == pytest.approx(still, rel=1e-5)
+    assert gap["n"] == "1"
+    assert not list((tmp_path / "out/inputs").rglob("truth"))
+
+
+def test_fits_with_several_seeds_of_the_search_are_told_as_a_mean(
+    tmp_path: Path, recordings: tuple[Sequence, ...]
+) -> None:
+    order = order_of(
+        recordings[:1],
+        methods=("static", "quick", "quick+last_residual"),
+        protocols=("main",),
+        search_seeds=(1, 2),
+        # A bad start, which every candidate beats in its own way.
+        settings=SETTINGS | {"simulation.virtual_stiffness": 50.0, "object_.search.population": 4},
+    )
+    assert evaluate_suite(order, tmp_path)["cells"] == 5
+    rows = table(tmp_path)
+    for name in ("quick{}", "quick{}+last_residual"):
+        seeds = [
+            float(
+                rows[name.format(f"@object_.search.seed={seed}"), "future", "track_error"]["mean"]
+            )
+            for seed in (1, 2)
+        ]
+        assert seeds[0] != seeds[1]
+        mean = rows[name.format(""), "future", "track_error"]
+        assert float(mean["mean"]) == pytest.approx(np.mean(seeds), rel=1e-6)
+        assert float(mean["spread"]) == pytest.approx(abs(seeds[0] - seeds[1]) / 2**0.5, rel=1e-5)
+    assert rows["static", "future", "track_error"]["spread"] == ""
+    report = (tmp_path / "report.md").read_text()
+    tables = report.partition("## Reconstruction")[2].partition("## Charts")[0]
+    assert "| quick | " in tables
+    assert " ± " in tables
+    assert "search.seed" not in tables
+    assert "quick@object_.search.seed=2" in report.partition("## Every sequence")[2]
+    # An order without seeds adds to the table and leaves the means in it.
+    evaluate_suite(replace(order, methods=("rigid_follow",), search_seeds=()), tmp_path)
+    place = ("quick", "future", "track_error")
+    assert table(tmp_path)[place] == rows[place]
 
 
 def test_starts_and_disturbances_have_splits_of_their_own(

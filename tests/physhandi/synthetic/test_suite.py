@@ -131,7 +131,26 @@ def test_the_version_changes_with_any_source_or_asset_of_the_generator(tmp_path:
         code_hash(tmp_path, ("none.py",))
 
 
-@pytest.mark.parametrize(("name", "most"), [("tiny", 441), ("dev", 1000)])
+def test_scenes_of_contact_are_told_apart_by_name_and_made_with_their_times(
+    tmp_path: Path, made: list[str]
+) -> None:
+    suite = SUITES["dev_contact"]
+    recordings = make(tmp_path / "s", suite)
+    assert made == [
+        "towel_wipe_0",
+        "cloth_wipe_late_0",
+        "rope_push_late_0",
+        "pouch_lift_released_0",
+    ]
+    told = [one.provenance["synthesize"] for one in recordings]
+    assert [one["set_out"] for one in told] == [-1.5, -0.2, -0.2, -1.5]
+    assert [one["release"] for one in told] == [None, None, None, 1.2]
+    later = replace(suite, scenes=(replace(suite.scenes[1], set_out=0.3),))
+    with pytest.raises(UsageError, match=r"cloth_wipe_late_0 was made with set_out -0\.2 in place"):
+        make(tmp_path / "s", later)
+
+
+@pytest.mark.parametrize(("name", "most"), [("tiny", 441), ("dev", 1000), ("dev_contact", 1000)])
 def test_bodies_of_small_suites_have_few_nodes(name: str, most: int) -> None:
     suite = SUITES[name]
     for object_ in {scene.object_ for scene in suite.scenes}:

@@ -3,7 +3,13 @@
 import pytest
 
 from physhandi.errors import UsageError
-from physhandi.synthetic.suite.methods import METHODS, method_settings, parse_method, shared_stages
+from physhandi.synthetic.suite.methods import (
+    METHODS,
+    method_settings,
+    parse_method,
+    searched_from,
+    shared_stages,
+)
 from physhandi.synthetic.suite.suite import SUITES, check_seeds, find_suite
 
 
@@ -39,6 +45,25 @@ def test_a_wrong_name_is_refused(name: str, told: str) -> None:
         parse_method(name)
 
 
+def test_a_fit_is_repeated_for_every_seed_of_its_search_and_a_rule_is_not() -> None:
+    found = searched_from(parse_method("quick@node_spacing=0.03+last_residual"), (1, 2, 1))
+    assert [method.name for method in found] == [
+        f"quick@node_spacing=0.03,object_.search.seed={seed}+last_residual" for seed in (1, 2)
+    ]
+    assert {method.seed_of for method in found} == {"quick@node_spacing=0.03+last_residual"}
+    for method, seed in zip(found, (1, 2), strict=True):
+        assert method.is_corrected
+        assert method_settings(method, {})["object_"]["search"]["seed"] == seed
+        assert method.base.name.endswith(f"seed={seed}")
+    (plain,) = searched_from(parse_method("ours"), (5,))
+    assert (plain.name, plain.seed_of) == ("ours@object_.search.seed=5", "ours")
+    for alone in ("static", "true_motion", "ours@object_.search.seed=9"):
+        assert searched_from(parse_method(alone), (1, 2)) == (parse_method(alone),)
+    assert searched_from(parse_method("ours"), ()) == (parse_method("ours"),)
+    with pytest.raises(UsageError, match="seed is 0"):
+        searched_from(parse_method("ours"), (0,))
+
+
 def test_a_value_may_hold_commas_and_signs() -> None:
     radius = "object_.search.variables.connection_radius"
     interval = "{low: 0.01, high: 0.05, scale: log}"
@@ -72,7 +97,7 @@ def test_stages_are_shared_as_far_as_settings_agree() -> None:
 @pytest.mark.parametrize("suite", SUITES.values(), ids=list(SUITES))
 def test_every_suite_holds_methods_that_exist_and_reserved_seeds_are_not_in_it(suite) -> None:
     assert all(method_settings(parse_method(name), suite.settings) for name in suite.methods)
-    assert {"static", "phystwin"} <= set(suite.methods)
+    assert {"static", "phystwin", "true_motion"} <= set(suite.methods)
     assert len(set(suite.scenes)) == len(suite.scenes)
     assert max(suite.seeds) < 1000
     assert "node_spacing" in suite.settings
