@@ -23,6 +23,7 @@ from torch import Tensor
 from physhandi.data.camera import PinholeCamera, triangulate
 from physhandi.data.sequence import Sequence
 from physhandi.errors import FitError, MissingInputError
+from physhandi.fitting.adam import Adam
 from physhandi.fitting.config import HandFitConfig
 from physhandi.hand.loading import load_hand_model
 from physhandi.hand.model import HandModel, HandSide
@@ -315,21 +316,19 @@ class HandProblem:
             "translation": 0.1,
             "log_scale": 0.1,
         }
-        groups = [
-            {"params": [value.requires_grad_()], "lr": rate * share[name]}
-            for name, value in self.parameters.items()
-            if not (self.metric and name == "log_scale")
-        ]
-        optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
-        schedule = torch.optim.lr_scheduler.LambdaLR(
-            optimizer, lambda i: 0.05 + 0.475 * (1 + math.cos(math.pi * i / iterations))
+        optimizer = Adam(
+            [
+                (value.requires_grad_(), rate * share[name])
+                for name, value in self.parameters.items()
+                if not (self.metric and name == "log_scale")
+            ],
+            betas=(0.9, 0.99),
         )
         for iteration in range(iterations):
             optimizer.zero_grad()
             loss = loss_at(iteration)
             loss.backward()
-            optimizer.step()
-            schedule.step()
+            optimizer.step(0.05 + 0.475 * (1 + math.cos(math.pi * iteration / iterations)))
             step(first + iteration + 1, loss)
 
     def _motion(self) -> HandMotion:

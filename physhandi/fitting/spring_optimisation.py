@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from physhandi.errors import FitError, SimulationDivergedError
+from physhandi.fitting.adam import Adam
 from physhandi.fitting.config import FirstOrderConfig, ObjectFitConfig
 from physhandi.fitting.object_problem import (
     SUBSTEP_SAFETY,
@@ -315,8 +316,9 @@ class SpringDescent:
         self._config = config
         self._device = device
         settings = config.first_order
-        self._optimizer = torch.optim.Adam(
-            material.tensors(), lr=settings.learning_rate, betas=(0.9, settings.beta_2)
+        self._optimizer = Adam(
+            [(tensor, settings.learning_rate) for tensor in material.tensors()],
+            betas=(0.9, settings.beta_2),
         )
         self._reach: dict[str, int] = {}
 
