@@ -159,13 +159,14 @@ class FittedObject:
             automatic_substeps: Whether to choose as few substeps as are stable and fine enough.
 
         Returns:
-            A rollout of which no frame is ready; see `fill`.
+            A rollout of which no frame is ready; see `fill`. It restarts where the fitted one
+            does: in the same observed state, with rest lengths that keep its own strain.
         """
         self._choose_controls(controls)
         model = self._model(parameters)
         if automatic_substeps:
             parameters = with_stable_substeps(parameters, model, self._control[0])
-        rollout = ObjectRollout.empty(model, parameters, self._control)
+        rollout = ObjectRollout.empty(model, parameters, self._control, self.fitted.restart)
         rollout.scene = self.fitted.scene
         return rollout
 
@@ -206,7 +207,8 @@ class FittedObject:
 
         Args:
             sequence: A recording of the same object; its hands are reconstructed and the object is
-                laid into its first frame. Left out, it is the one that the object was fitted in.
+                laid into its first frame. Left out, it is the one that the object was fitted in,
+                where predicted frames start from the observed state if those of the run do.
             device: Warp device, such as ``"cuda:0"``.
             progress: True shows a bar, a callable is given stage, iteration, total, loss and
                 message.
@@ -291,7 +293,9 @@ class FittedObject:
         """Simulate the fitted springs so that PyTorch can differentiate the motion.
 
         What is left out has its fitted value, so that ``rollout(log_stiffness=log(x))`` moves as
-        ``simulate(stiffness=x)`` does.
+        ``simulate(stiffness=x)`` does, but it does not restart: all frames follow from the initial
+        state. To predict, give `initial_position`, `initial_velocity` and the control nodes from
+        ``fitted.restart.frame`` on to a `FittedObject` of ``fitted.model_in(frame)`` after it.
 
         Args:
             log_stiffness: Natural logarithm of the stiffness [log N]. One number is that of
@@ -406,7 +410,7 @@ class FittedObject:
 
 
 def _filled(rollout: ObjectRollout, simulator: Simulator) -> Iterator[Frame]:
-    for frame, position, velocity in simulator.frames(rollout.control):
+    for frame, position, velocity in simulator.frames(rollout.control, rollout.restart):
         rollout.position[frame] = position
         if rollout.velocity is not None:
             rollout.velocity[frame] = velocity

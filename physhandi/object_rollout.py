@@ -1,7 +1,7 @@
 """One rollout of the object: the fitted one, or one that is being simulated now."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,7 @@ from physhandi.simulation.forces import (
 )
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
+from physhandi.simulation.restart import Restart
 
 _FORMATS = {".glb": "gltf", ".npz": "npz", ".csv": "csv", ".ply": "ply", "": "ply"}
 
@@ -31,7 +32,7 @@ class ObjectRollout:
     """Object motion under one set of parameters; frames become ready one after the other."""
 
     model: SpringMassModel
-    """Topology and material."""
+    """Topology and material; see `model_in` for the frames after a restart."""
     parameters: SimulationParameters
     """What the object was simulated with."""
     control: Float[ndarray, "frame control 3"]
@@ -44,8 +45,11 @@ class ObjectRollout:
     """Number of frames that have been simulated."""
     error: str | None = None
     """Why the simulation ended early, if it did."""
+    restart: Restart | None = None
+    """State from which the frames after `restart.frame` start, in place of the rollout's own."""
     scene: Callable[[], SceneData] | None = None
     """Reads the hands and names that `export` writes beside the motion, if they are known."""
+    _continued: SpringMassModel | None = field(default=None, init=False, repr=False)
 
     @classmethod
     def empty(
@@ -53,6 +57,7 @@ class ObjectRollout:
         model: SpringMassModel,
         parameters: SimulationParameters,
         control: Float[ndarray, "frame control 3"],
+        restart: Restart | None = None,
     ) -> "ObjectRollout":
         """Make room for a rollout of which no frame is ready."""
         shape = (len(control), model.node_count, 3)
@@ -62,6 +67,7 @@ class ObjectRollout:
             control=control,
             position=np.zeros(shape, np.float32),
             velocity=np.zeros(shape, np.float32),
+            restart=restart,
         )
 
     @property
@@ -74,36 +80,67 @@ class ObjectRollout:
         """Whether every frame is ready."""
         return self.ready >= self.frame_count
 
+    def model_in(self, frame: int) -> SpringMassModel:
+        """Get the springs that pull in a frame: after a restart their rest lengths are others."""
+        restart = self.restart
+        if restart is None or frame <= restart.frame:
+            return self.model
+        if self._continued is None:
+            own, control = self.position[restart.frame], self.control[restart.frame]
+            self._continued = restart.continued(
+                self.model, self.parameters, np.asarray(own), np.asarray(control)
+            )
+        return self._continued
+
+    def restart_arrays(self) -> dict[str, ndarray]:
+        """Give what an export needs to tell springs after a restart from those before it.
+
+        Returns:
+            ``restart_frame``, the last frame before it; ``restart_position`` and
+            ``restart_velocity`` of the object nodes, from which the next frame starts [m, m/s];
+            ``restart_rest_length`` of every spring from then on [m]. Nothing if no frame that is
+            ready comes after a restart.
+        """
+        if self.restart is None or self.restart.frame >= self.ready:
+            return {}
+        state = {f"restart_{name}": array for name, array in self.restart.to_tensors().items()}
+        model = self.model_in(self.restart.frame + 1)
+        return state | {"restart_rest_length": model.rest_length}
+
     def forces(self, frame: int) -> Float[ndarray, "node 3"]:
         """Compute the sum of the virtual springs' forces on each object node [N]."""
-        return virtual_forces(self.model, self.parameters, *self.state(frame))
+        return virtual_forces(self.model_in(frame), self.parameters, *self.state(frame))
 
     def spring_forces(self, frame: int) -> Float[ndarray, "virtual 3"]:
         """Compute the force of each virtual spring on its object node [N]."""
-        return virtual_spring_forces(self.model, self.parameters, *self.state(frame))
+        return virtual_spring_forces(self.model_in(frame), self.parameters, *self.state(frame))
 
     def strains(self, frame: int) -> Float[ndarray, " spring"]:
         """Measure how much longer each spring is than at rest, as a part of its rest length."""
         position, control = self.position[frame], self.control[frame]
-        return spring_strains(self.model, np.asarray(position), np.asarray(control))
+        return spring_strains(self.model_in(frame), np.asarray(position), np.asarray(control))
 
     def tensions(self, frame: int) -> Float[ndarray, " spring"]:
         """Compute how hard each spring pulls its ends together [N]."""
-        return spring_tensions(self.model, self.parameters, *self.state(frame))
+        return spring_tensions(self.model_in(frame), self.parameters, *self.state(frame))
 
     def state(self, frame: int) -> tuple[ndarray, ndarray, ndarray, ndarray]:
         """Collect positions and velocities of object nodes, then of control nodes [m, m/s]."""
-        rate = self.parameters.frame_rate
-        if self.velocity is not None:
-            velocity = self.velocity[frame]
-        else:
-            velocity = _difference(self.position, frame, rate)
+        given = self.velocity
+        velocity = self._mean_velocity(frame) if given is None else given[frame]
         return (
             np.asarray(self.position[frame]),
             np.asarray(velocity),
             np.asarray(self.control[frame]),
-            _difference(self.control, frame, rate),
+            _difference(self.control, frame, self.parameters.frame_rate),
         )
+
+    def _mean_velocity(self, frame: int) -> Float[ndarray, "node 3"]:
+        """Velocity of the nodes during the frame's substeps, from their positions [m/s]."""
+        restart, rate = self.restart, self.parameters.frame_rate
+        if restart is None or frame != restart.frame + 1:
+            return _difference(self.position, frame, rate)
+        return _difference(np.stack([restart.position, self.position[frame]]), 1, rate)
 
     def export(
         self, path: Path | str, *, frame: int | None = None, overwrite: bool = False
@@ -141,7 +178,7 @@ class ObjectRollout:
             "control": np.asarray(self.control[:count]),
             "spring_nodes": self.model.spring_nodes,
             "object_spring_count": self.model.object_spring_count,
-            "model": self.model.to_tensors(),
+            "model": self.model.to_tensors() | self.restart_arrays(),
         }
         if self.scene is None:
             rate = self.parameters.frame_rate
@@ -189,12 +226,18 @@ def load_fitted(run: RunFolder, sequence_name: str) -> ObjectRollout | None:
         )
     with reading(run.out / files.model):
         model = SpringMassModel.from_tensors(run.tensors(files.model))
+    restart = None
+    if run.has(files.restart):
+        with reading(run.out / files.restart):
+            restart = Restart.from_tensors(run.tensors(files.restart))
+            restart.check_nodes(model.node_count)
     return ObjectRollout(
         model=model,
         parameters=parameters,
         control=run.array(files.control)[: len(position)],
         position=position,
         ready=len(position),
+        restart=restart,
     )
 
 

@@ -21,7 +21,6 @@ from physhandi.data.layout import (
     METRICS_FILE,
     PARAMETERS_FILE,
     REST_NODE_FILE,
-    SHAPE_FILE,
     SequenceFiles,
 )
 from physhandi.data.run import RunFolder
@@ -55,6 +54,7 @@ from physhandi.fitting.placement import (
 )
 from physhandi.fitting.rest_state import resting_clearance
 from physhandi.fitting.spring_optimisation import optimise_springs
+from physhandi.fitting.state_estimate import observed_state
 from physhandi.metrics.report import measure_run, score_run
 from physhandi.object_rollout import ObjectRollout
 from physhandi.perception.lifting import observe_object
@@ -111,7 +111,7 @@ def reconstruct(
         _stage_search(problems, config, attempt, progress, device)
         _stage_springs(problems, config, attempt, progress, device)
         _stage_refinement(sequences, problems, config, attempt, progress, device=device)
-    return _stage_evaluation(sequences, attempt, progress, device, has_object=has_object)
+    return _stage_evaluation(sequences, config, attempt, progress, device, has_object=has_object)
 
 
 def predict(
@@ -207,8 +207,6 @@ def _stage_simulation(
         progress.report(SIMULATION, 0, count, message=f"{substeps} substeps a frame")
     rest_node = artefacts.load_rest_node(source.out)
     artefacts.save_object(attempt, parameters, rollouts[0].model, rest_node)
-    if source.has(SHAPE_FILE):
-        attempt.save_yaml(SHAPE_FILE, source.yaml(SHAPE_FILE))
     for object_, rollout in zip(objects, rollouts, strict=True):
         rollout.parameters = rollout.parameters.replace(substeps_per_frame=substeps)
         artefacts.save_model(attempt, object_.sequence, rollout.model)
@@ -231,6 +229,8 @@ def _object_in(
         object_ = FittedObject.of(source, name)
         if source.has(files.attachment):
             attempt.save_array(files.attachment, artefacts.load_attachment(source.out, name))
+        if object_.fitted.restart is not None:
+            attempt.save_tensors(files.restart, object_.fitted.restart.to_tensors())
     else:
         object_ = FittedObject.of(source).placed_in(sequence, progress)
         placed = object_.placement
@@ -246,6 +246,45 @@ def _object_in(
     return object_
 
 
+def _store_restart(attempt: Attempt, sequence: Sequence, device: str) -> None:
+    """Estimate the object's state in the last fitted frame, from which prediction starts."""
+    fitted = _stored_object(attempt, sequence)
+    try:
+        restart = observed_state(
+            fitted.model,
+            fitted.parameters,
+            fitted.fitted.control,
+            artefacts.load_observation(attempt.out, sequence.name),
+            sequence.reconstruction_frames[-1],
+            device=device,
+        )
+    except MissingInputError as error:
+        raise MissingInputError(f"Sequence '{sequence.name}': {error}") from error
+    attempt.save_tensors(SequenceFiles(sequence.name).restart, restart.to_tensors())
+
+
+def predict_again(
+    attempt: Attempt, sequence: Sequence, progress: Progress, *, device: str = "cpu"
+) -> None:
+    """Give a run that does not restart a restart, simulate it anew and measure it.
+
+    Args:
+        attempt: Holds what the run has stored.
+        sequence: Recording that the run was fitted to.
+        progress: Told about every frame.
+        device: Warp device.
+
+    Raises:
+        MissingInputError: If no track is seen in the last frame that was fitted.
+        RunError: If the run holds no fitted object.
+        SimulationDivergedError: If the motion runs away.
+    """
+    _store_restart(attempt, sequence, device)
+    fitted = _stored_object(attempt, sequence)
+    _store_rollout(attempt, fitted, fitted.begin(fitted.parameters), device, progress)
+    attempt.save_json(METRICS_FILE, {sequence.name: _measure(sequence, attempt)})
+
+
 def _stored_object(attempt: Attempt, sequence: Sequence) -> FittedObject:
     """Read the object that earlier stages stored, in the world of a sequence."""
     parameters = artefacts.load_parameters(attempt.out).in_world(
@@ -255,7 +294,8 @@ def _stored_object(attempt: Attempt, sequence: Sequence) -> FittedObject:
     )
     model = artefacts.load_model(attempt.out, sequence.name)
     control = artefacts.load_control(attempt.out, sequence.name)
-    empty = ObjectRollout.empty(model, parameters, control)
+    restart = artefacts.load_restart(attempt.out, sequence.name)
+    empty = ObjectRollout.empty(model, parameters, control, restart)
     return FittedObject(empty, sequence=sequence.name)
 
 
@@ -325,10 +365,9 @@ def _stage_observation(
     if attempt.stage_done(OBSERVATION):
         return
     template = None
-    found = ""
     for number, sequence in enumerate(sequences):
         observation = observe_object(sequence, progress)
-        node, rest_node, shape = object_nodes_of(sequence, observation, config, template)
+        node, rest_node = object_nodes_of(sequence, observation, config.node_spacing, template)
         template = (node, rest_node) if template is None else template
         control = control_trajectory_of(
             sequence, artefacts.load_motions(attempt.out, sequence.name), config
@@ -339,11 +378,8 @@ def _stage_observation(
         attempt.save_array(files.control, control.astype(np.float32))
         if number == 0:
             attempt.save_array(REST_NODE_FILE, rest_node.astype(np.float32))
-        if shape is not None:
-            attempt.save_yaml(SHAPE_FILE, shape.to_dict())
-            found = str(shape)
-        progress.report(OBSERVATION, number + 1, len(sequences), message=found)
-    _finish(attempt, OBSERVATION, [], [], [], note=found)
+        progress.report(OBSERVATION, number + 1, len(sequences))
+    _finish(attempt, OBSERVATION, [], [], [])
 
 
 def _problems(
@@ -446,6 +482,7 @@ def _stage_refinement(
 
 def _stage_evaluation(
     sequences: Many[Sequence],
+    config: PipelineConfig,
     attempt: Attempt,
     progress: Progress,
     device: str,
@@ -459,6 +496,12 @@ def _stage_evaluation(
     for number, sequence in enumerate(sequences):
         artefacts.save_hand_vertices(attempt, sequence.name)
         if has_object:
+            if config.prediction.restarts and sequence.future_frames:
+                try:
+                    _store_restart(attempt, sequence, device)
+                except MissingInputError as error:
+                    told = f"Predicted without a restart. {error}"
+                    progress.report(EVALUATION, number, len(sequences), message=told)
             fitted = _stored_object(attempt, sequence)
             _store_rollout(attempt, fitted, fitted.begin(fitted.parameters), device, progress)
         metrics[sequence.name] = _measure(sequence, attempt)

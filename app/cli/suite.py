@@ -50,7 +50,8 @@ def evaluate_suite(
         suite: Which suite; sequences that are not there yet are made. With `--sequences`, whose
             effort methods may take: without it their profiles' own.
         methods: Methods: static, rigid_follow, phystwin, paper, ours, quick, oracle_hand,
-            oracle_parameters, true_motion, each also as NAME+last_residual or NAME@SETTING=VALUE.
+            oracle_parameters, true_motion, each also as NAME+last_residual, NAME+restart or
+            NAME@SETTING=VALUE.
         seeds: Seeds of every scene. From 1000 on they are reserved for verification.
         search_seeds: Repeat every fit with these seeds of its search, and give means over them with
             their spread; a search is also luck.

@@ -268,7 +268,7 @@ def _in_order(tasks: Many[Task]) -> list[int]:
     def place(number: int) -> tuple[bool, bool, int, int]:
         task = tasks[number]
         rank = protocols.index(task.protocol), methods.index(task.method.name)
-        return (task.fitted is not None, task.method.is_corrected, *rank)
+        return (task.fitted is not None, task.method.correction is not None, *rank)
 
     return sorted(range(len(tasks)), key=place)
 

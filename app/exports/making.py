@@ -28,8 +28,9 @@ from physhandi.object_rollout import ObjectRollout
 from physhandi.run import Run
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
+from physhandi.simulation.restart import Restart
 
-_ARRAYS, _PARAMETERS, _MODEL = "take.npz", "parameters.json", "model_"
+_ARRAYS, _PARAMETERS, _MODEL, _RESTART = "take.npz", "parameters.json", "model_", "restart_"
 
 
 def store_take(folder: Path, take: ObjectRollout) -> None:
@@ -47,6 +48,8 @@ def store_take(folder: Path, take: ObjectRollout) -> None:
     if take.velocity is not None:
         arrays["velocity"] = np.asarray(take.velocity[:count])
     arrays |= {_MODEL + name: array for name, array in take.model.to_tensors().items()}
+    if take.restart is not None:
+        arrays |= {_RESTART + name: array for name, array in take.restart.to_tensors().items()}
     write_atomically(
         folder / _ARRAYS,
         lambda stream: np.savez(stream, allow_pickle=False, **arrays),
@@ -59,7 +62,10 @@ def load_take(folder: Path) -> ObjectRollout:
     """Read what `store_take` kept."""
     with np.load(folder / _ARRAYS, allow_pickle=False) as stored:
         arrays = dict(stored)
-    model = {n.removeprefix(_MODEL): a for n, a in arrays.items() if n.startswith(_MODEL)}
+    model, restart = (
+        {name.removeprefix(part): a for name, a in arrays.items() if name.startswith(part)}
+        for part in (_MODEL, _RESTART)
+    )
     parameters = json.loads((folder / _PARAMETERS).read_text())
     return ObjectRollout(
         model=SpringMassModel.from_tensors(model),
@@ -68,6 +74,7 @@ def load_take(folder: Path) -> ObjectRollout:
         position=arrays["position"],
         velocity=arrays.get("velocity"),
         ready=len(arrays["position"]),
+        restart=Restart.from_tensors(restart) if restart else None,
     )
 
 

@@ -139,6 +139,6 @@ def _rounded(
     content = replace(content, hands=hands, control=control)
     if take is None:
         return content, None
-    known = {field.name: getattr(take, field.name) for field in fields(take)}
+    known = {field.name: getattr(take, field.name) for field in fields(take) if field.init}
     known |= {"position": rounded(take.position), "control": rounded(take.control)}
     return content, _RoundedTake(**known, exact=take)

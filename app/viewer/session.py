@@ -8,6 +8,7 @@ from typing import Any
 import viser
 
 from app.viewer.clock.playback import TURN, Playback
+from app.viewer.clock.restart_mark import RestartMark
 from app.viewer.clock.timeline_panel import TimelinePanel
 from app.viewer.color.color_panel import ColorPanel
 from app.viewer.compare.live import LiveComparison
@@ -178,7 +179,8 @@ class Session(SceneServer):
             choice = server.gui.add_dropdown("Sequence", self._names, initial_value=now)
             choice.on_update(guard.by_user(lambda _: self._switch(choice)))
         self._timeline = TimelinePanel(server, self._playback, guard)
-        self._strip = FrameStrip(server, self._timeline.behind_slider)
+        self._restart = RestartMark(server, self._timeline.behind_slider)
+        self._strip = FrameStrip(server, self._timeline.behind_slider + 0.1)
         self._comparison = LiveComparison(
             server,
             guard,
@@ -210,6 +212,7 @@ class Session(SceneServer):
         painter = scene.painter if content.fitted is not None else scene.hand_painter
         self._colors.replace(content, scene.layers, painter)
         self._inspector.replace(content, scene, framing)
+        self._restart.replace(content)
         run = self._catalog.run(self._target) if self.kind == "run" else None
         self._export.offer(content)
         self._comparison.offer(content, framing, run.folder if run is not None else None)

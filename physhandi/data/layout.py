@@ -10,8 +10,6 @@ PARAMETERS_FILE = "object/parameters.yaml"
 """Global parameters of the object."""
 MATERIAL_FILE = "object/material.safetensors"
 """The object by itself: rest shape, springs, stiffness and damping."""
-SHAPE_FILE = "object/shape.yaml"
-"""Kind of object that was found, and what was removed from the cloud that its nodes come from."""
 REST_NODE_FILE = "object/rest_node.npy"
 """The object's rest shape, before its springs are fitted."""
 
@@ -47,6 +45,11 @@ class SequenceFiles:
     def attachment(self) -> str:
         """Where the control nodes were when the virtual springs were laid, if they have moved."""
         return f"{self.folder}/attachment.npy"
+
+    @property
+    def restart(self) -> str:
+        """The observed state from which the predicted frames were simulated, if they were."""
+        return f"{self.folder}/restart.safetensors"
 
     @property
     def object_node(self) -> str:

@@ -25,6 +25,7 @@ from physhandi.perception.lifting import hand_points
 from physhandi.progress import Progress
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
+from physhandi.simulation.restart import Restart
 
 STORED_CLOUD = 500
 """Most points of one frame's cloud that a run stores, evenly picked, unless they are markers."""
@@ -250,6 +251,19 @@ def load_model(out: Path, name: str) -> SpringMassModel:
     path = out / SequenceFiles(name).model
     with reading(path):
         return SpringMassModel.from_tensors(load_file(path))
+
+
+def load_restart(out: Path, name: str) -> Restart | None:
+    """Read the state from which the predicted frames of a sequence start; None for the rollout's.
+
+    Raises:
+        RunError: If the file is damaged.
+    """
+    path = out / SequenceFiles(name).restart
+    if not path.is_file():
+        return None
+    with reading(path):
+        return Restart.from_tensors(load_file(path))
 
 
 def save_hand_observation(

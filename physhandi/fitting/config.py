@@ -268,6 +268,15 @@ class RefinementConfig(Settings, frozen=True, kw_only=True):
         }
 
 
+class PredictionConfig(Settings, frozen=True, kw_only=True):
+    """How the frames after the fitted ones are simulated."""
+
+    restarts: bool = False
+    """Whether they start from the observed state of the last fitted frame, with all strain kept,
+    instead of the rollout's own state. Off where a run's settings say nothing of it, as those of
+    older runs, which do not restart."""
+
+
 class PipelineConfig(Settings, frozen=True, kw_only=True):
     """Settings of all stages."""
 
@@ -277,8 +286,6 @@ class PipelineConfig(Settings, frozen=True, kw_only=True):
     """What the profile is for, in one line."""
     node_spacing: Annotated[float, Meta(ge=0.001, le=0.5)] = 0.01
     """Distance between object nodes sampled from what was seen [m]."""
-    most_nodes: Annotated[int, Meta(ge=1, le=1_000_000)] | None = None
-    """Most object nodes that may be sampled from what was seen; none for any number."""
     control_nodes: Literal["all", "visible"] = "all"
     """Which hand vertices become control nodes: all, or a few that a camera sees at frame 0."""
     control_count: Annotated[int, Meta(ge=1, le=10_000)] = 30
@@ -289,6 +296,8 @@ class PipelineConfig(Settings, frozen=True, kw_only=True):
     """Stage 2."""
     refinement: RefinementConfig = field(default_factory=RefinementConfig)
     """Stage 3."""
+    prediction: PredictionConfig = field(default_factory=PredictionConfig)
+    """The frames after the fitted ones."""
     simulation: SimulationParameters = field(default_factory=SimulationParameters)
     """Values that the search starts from, and all that are not searched."""
 
@@ -444,6 +453,7 @@ GROUPS = {
     INTERVALS: "Stage 2: searched intervals",
     "object_.first_order": "Stage 2: springs one by one",
     "refinement": "Stage 3: hands again",
+    "prediction": "Predicted frames",
 }
 """Settings that belong together, by the path that they share."""
 FROM_SEQUENCE = ("simulation.frame_rate", "simulation.ground_height")

@@ -35,6 +35,8 @@ def last_residual_baseline(
     is_visible: Bool[ndarray, "frame track"],
     first_future: int,
     node_of_track: Int[ndarray, " track"] | None = None,
+    *,
+    continued_from: Float[ndarray, "node 3"] | None = None,
 ) -> Float[ndarray, "frame node 3"]:
     """Shift the predicted frames of a rollout by its residual in the last observed frame [m].
 
@@ -44,10 +46,12 @@ def last_residual_baseline(
         is_visible: Whether a track is visible.
         first_future: First frame that was held out; only frames before it are read.
         node_of_track: Node that each track observes; None lets the nodes around it carry it.
+        continued_from: State of the last observed frame from which the predicted ones were
+            simulated, if it is not the rollout's own: their residual is this state's [m].
 
     Returns:
         The rollout as it is up to `first_future`; from there on every node is shifted by the
-        residual of the eight tracks nearest to it in frame 0, weighted by inverse distance.
+        `last_residual`.
 
     Raises:
         ValueError: If there is no frame before `first_future`, or the last one shows no track
@@ -56,23 +60,55 @@ def last_residual_baseline(
     if not 0 < first_future <= len(rollout):
         raise ValueError(f"first_future is {first_future} of {len(rollout)} frames")
     last = first_future - 1
-    is_usable = is_visible[last] if node_of_track is not None else is_visible[last] & is_visible[0]
+    now = rollout[last] if continued_from is None else continued_from
+    corrected = rollout.astype(np.float64)
+    corrected[first_future:] += last_residual(
+        rollout[0], now, point, is_visible, last, node_of_track
+    )
+    return corrected
+
+
+def last_residual(  # noqa: PLR0917  (the object at two times, then what was seen of it)
+    start: Float[ndarray, "node 3"],
+    now: Float[ndarray, "node 3"],
+    point: Float[ndarray, "frame track 3"],
+    is_visible: Bool[ndarray, "frame track"],
+    frame: int,
+    node_of_track: Int[ndarray, " track"] | None = None,
+) -> Float[ndarray, "node 3"]:
+    """Interpolate over the nodes what a frame's tracks are away from where the nodes put them [m].
+
+    Args:
+        start: Nodes in frame 0 [m].
+        now: Nodes in the frame [m].
+        point: Observed tracks [m].
+        is_visible: Whether a track is visible.
+        frame: The frame.
+        node_of_track: Node that each track observes; None lets the nodes around it carry it.
+
+    Returns:
+        For each node the mean residual of the eight tracks nearest to it in frame 0, weighted by
+        inverse distance.
+
+    Raises:
+        ValueError: If the frame shows no track whose place on the object is known.
+    """
+    is_usable = is_visible[frame]
+    if node_of_track is None:
+        is_usable = is_usable & is_visible[0]
     if not is_usable.any():
-        raise ValueError(f"frame {last} shows no track that frame 0 places on the object")
-    start = rollout[0].astype(np.float64)
+        raise ValueError(f"frame {frame} shows no track that frame 0 places on the object")
+    start, now = start.astype(np.float64), now.astype(np.float64)
     if node_of_track is not None:
         anchor = start[node_of_track[is_usable]]
-        predicted = rollout[last, node_of_track[is_usable]].astype(np.float64)
+        predicted = now[node_of_track[is_usable]]
     else:
         anchor = point[0, is_usable].astype(np.float64)
-        predicted = carried_points(anchor, rollout[[0, last]].astype(np.float64))[1]
-    residual = point[last, is_usable] - predicted
+        predicted = carried_points(anchor, np.stack([start, now]))[1]
+    residual = point[frame, is_usable] - predicted
     tree: Any = KDTree(anchor)
     count = min(CARRIERS, len(anchor))
     distance, near = tree.query(start, k=count)
     weight = 1.0 / (np.reshape(distance, (-1, count)) + 1e-6)
     weight /= weight.sum(axis=1, keepdims=True)
-    shift = np.einsum("nc,nci->ni", weight, residual[np.reshape(near, (-1, count))])
-    corrected = rollout.astype(np.float64)
-    corrected[first_future:] += shift
-    return corrected
+    return np.einsum("nc,nci->ni", weight, residual[np.reshape(near, (-1, count))])

@@ -20,6 +20,7 @@ from physhandi.simulation.kernels.springs import pull_springs
 from physhandi.simulation.kernels.world import World
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
+from physhandi.simulation.restart import Restart
 from physhandi.simulation.self_collision import SelfCollision
 from physhandi.simulation.stability import explain_divergence
 
@@ -149,12 +150,29 @@ class Simulator:
         position: Float[ndarray, "node 3"] | None = None,
         velocity: Float[ndarray, "node 3"] | None = None,
     ) -> None:
-        """Go back to the initial state, or to a given one."""
+        """Go back to the initial state, or to a given one, and to the model's rest lengths."""
         position = self.model.object_node if position is None else position
         velocity = self.model.initial_velocity if velocity is None else velocity
         self.position.assign(np.asarray(position, dtype=np.float32))
         self.velocity.assign(np.asarray(velocity, dtype=np.float32))
+        self.rest_length.assign(self.model.rest_length)
         self.first_divergence.fill_(_NO_DIVERGENCE)
+
+    def continue_from(self, restart: Restart, control: Float[ndarray, "control 3"]) -> None:
+        """Replace the state by another one, in which every spring is strained as it is now.
+
+        Args:
+            restart: The state; its frame is the one that has been reached.
+            control: Where the control nodes are [m].
+
+        Raises:
+            ValueError: If it is a state of another number of nodes.
+        """
+        restart.check_nodes(self.model.node_count)
+        own = self.position.numpy()
+        model = restart.continued(self.model, self.parameters, own, control)
+        self.reset(restart.position, restart.velocity)
+        self.rest_length.assign(model.rest_length)
 
     def step_frame(
         self,
@@ -179,34 +197,43 @@ class Simulator:
         self.check_divergence(frame)
 
     def frames(
-        self, control: Float[ndarray, "frame control 3"]
+        self, control: Float[ndarray, "frame control 3"], restart: Restart | None = None
     ) -> Iterator[tuple[int, Float32[ndarray, "node 3"], Float32[ndarray, "node 3"]]]:
         """Simulate frame by frame from the initial state.
 
         Args:
             control: Positions of the control nodes in every frame [m]; its length decides how
                 many frames there are, also when there are no control nodes.
+            restart: State from which the frames after its own are simulated; see `continue_from`.
+                Without one they follow from the initial state, as those up to it always do.
 
         Yields:
             Frame, positions [m] and velocities [m/s]; frame 0 is the initial state.
 
         Raises:
             SimulationDivergedError: If a node is not finite or faster than `SPEED_LIMIT`.
+            ValueError: If the control nodes or the restart do not fit the model.
         """
         control = self.checked_control(control)
+        if restart is not None:
+            restart.check_nodes(self.model.node_count)
         self.reset()
         for frame in range(len(control)):
             if frame > 0:
                 self.step_frame(frame, control[frame - 1], control[frame])
             yield frame, self.position.numpy().copy(), self.velocity.numpy().copy()
+            if restart is not None and frame == restart.frame:
+                self.continue_from(restart, control[frame])
 
-    def rollout(self, control: Float[ndarray, "frame control 3"]) -> Rollout:
+    def rollout(
+        self, control: Float[ndarray, "frame control 3"], restart: Restart | None = None
+    ) -> Rollout:
         """Simulate all frames of a control trajectory; see `frames`."""
         control = self.checked_control(control)
         shape = (len(control), self.model.node_count, 3)
         position = np.empty(shape, dtype=np.float32)
         velocity = np.empty(shape, dtype=np.float32)
-        for frame, frame_position, frame_velocity in self.frames(control):
+        for frame, frame_position, frame_velocity in self.frames(control, restart):
             position[frame] = frame_position
             velocity[frame] = frame_velocity
         return Rollout(position, velocity)
@@ -323,7 +350,10 @@ class Simulator:
         if first == _NO_DIVERGENCE:
             return
         substep, node = divmod(first, self.model.node_count)
-        model = replace(self.model, stiffness=self.stiffness.numpy(), damping=self.damping.numpy())
+        material = {
+            name: getattr(self, name).numpy() for name in ("rest_length", "stiffness", "damping")
+        }
+        model = replace(self.model, **material)
         raise SimulationDivergedError(
             f"Simulation diverged at frame {frame}, substep {substep}: node {node} is not finite "
             f"or faster than {SPEED_LIMIT:g} m/s. "

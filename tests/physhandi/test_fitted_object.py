@@ -3,11 +3,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from safetensors.numpy import save_file
 from viewer_world import PARAMETERS, make_run
 
+from physhandi.data.layout import SequenceFiles
+from physhandi.errors import RunError
 from physhandi.fitted_object import FittedObject
 from physhandi.object_rollout import load_fitted
 from physhandi.run import Run
+from physhandi.simulation.forces import spring_strains
+from physhandi.simulation.restart import SHORTEST_SHARE, Restart
+from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.topology import retopologize
 
 
@@ -63,3 +69,96 @@ def test_the_world_is_that_of_the_sequence(tmp_path: Path) -> None:
         assert take is not None
         found = take.parameters
         assert (found.frame_rate, found.ground_height, found.gravity) == world
+
+
+AT = 14
+
+
+@pytest.fixture(scope="module")
+def restarted(tmp_path_factory) -> Run:
+    """A run whose object is seen 7 mm beside and below its rollout at the last fitted frame."""
+    run = make_run(tmp_path_factory.mktemp("restarted") / "sheet")
+    state = run.array("sequences/lift/rollout.npy")[AT].copy()
+    noise = np.random.default_rng(8).normal(0.0, 0.0003, state.shape)
+    state += (np.array([0.004, 0.003, -0.005]) + noise).astype(np.float32)
+    still = np.zeros_like(state)
+    restart = Restart(frame=AT, position=state, velocity=still)
+    save_file(restart.to_tensors(), run.out / SequenceFiles("lift").restart)
+    return run
+
+
+@pytest.mark.parametrize("change", [{}, {"stiffness": 90.0}, {"connection_radius": 0.04}])
+def test_every_simulation_of_the_sequence_restarts_with_the_strain_it_had(
+    run, restarted, change
+) -> None:
+    plain = FittedObject.of(run, "lift").simulate(**change)
+    rollout = FittedObject.of(restarted, "lift").simulate(**change)
+    assert rollout.restart is not None
+    seen, control = rollout.restart.position, rollout.control[AT]
+    np.testing.assert_array_equal(rollout.position[: AT + 1], plain.position[: AT + 1])
+    assert rollout.frame_distance(plain, AT + 1) > 0.003
+    later = rollout.model_in(AT + 1)
+    assert rollout.model_in(AT) is rollout.model
+    one_frame = Simulator(later, rollout.parameters)
+    one_frame.reset(seen, rollout.restart.velocity)
+    one_frame.step_frame(AT + 1, control, rollout.control[AT + 1])
+    np.testing.assert_array_equal(rollout.position[AT + 1], one_frame.position.numpy())
+    assert np.abs(later.rest_length / rollout.model.rest_length - 1).max() > 0.01
+    # Other springs leave the object far from where it was seen, and a few would become too short.
+    is_kept = later.rest_length > (SHORTEST_SHARE + 1e-3) * rollout.model.rest_length
+    assert is_kept.mean() > (0.9 if "connection_radius" in change else 0.999)
+    strains = spring_strains(later, seen, control)
+    np.testing.assert_allclose(strains[is_kept], rollout.strains(AT)[is_kept], atol=2e-6)
+    expected = spring_strains(later, rollout.position[AT + 1], rollout.control[AT + 1])
+    np.testing.assert_array_equal(rollout.strains(AT + 1), expected)
+    assert np.abs(plain.tensions(AT + 1) - rollout.tensions(AT + 1)).max() > 1e-3
+
+
+def test_some_of_the_controls_restart_too(restarted) -> None:
+    fitted = FittedObject.of(restarted, "lift")
+    rollout = fitted.begin(PARAMETERS, controls=[3, 17, 4])
+    for _ in fitted.fill(rollout):
+        pass
+    assert rollout.restart is not None
+    assert rollout.control.shape[1] == 3
+    strains = spring_strains(
+        rollout.model_in(AT + 1), rollout.restart.position, rollout.control[AT]
+    )
+    np.testing.assert_allclose(strains, rollout.strains(AT), atol=2e-6)
+
+
+def test_the_jump_at_a_restart_is_no_velocity(restarted) -> None:
+    stored = FittedObject.of(restarted, "lift").fitted
+    assert stored.restart is not None
+    rate = PARAMETERS.frame_rate
+    step = stored.position[AT + 1] - stored.restart.position
+    np.testing.assert_allclose(stored.state(AT + 1)[1], rate * step, rtol=1e-5, atol=1e-6)
+    step = stored.position[AT + 2] - stored.position[AT + 1]
+    np.testing.assert_allclose(stored.state(AT + 2)[1], rate * step, rtol=1e-5, atol=1e-6)
+
+
+def test_what_is_exported_tells_the_springs_after_a_restart(restarted, tmp_path: Path) -> None:
+    rollout = FittedObject.of(restarted, "lift").simulate()
+    with np.load(rollout.export(tmp_path / "motion.npz")) as arrays:
+        assert arrays["restart_frame"].tolist() == [AT]
+        np.testing.assert_array_equal(arrays["restart_position"], rollout.restart.position)
+        later = rollout.model_in(AT + 1).rest_length
+        np.testing.assert_array_equal(arrays["restart_rest_length"], later)
+    rollout.ready = AT
+    assert rollout.restart_arrays() == {}
+
+
+def test_only_the_sequence_that_was_observed_restarts(run, restarted) -> None:
+    assert FittedObject.of(restarted, "drag").fitted.restart is None
+    old = FittedObject.of(run, "lift")
+    assert old.begin(PARAMETERS).restart is None
+    assert old.fitted.model_in(19) is old.model
+
+
+def test_a_damaged_restart_is_named(restarted, tmp_path: Path) -> None:
+    run = make_run(tmp_path / "sheet")
+    tensors = FittedObject.of(restarted, "lift").fitted.restart.to_tensors()
+    shorter = {name: array[:5] for name, array in tensors.items()}
+    save_file(shorter, run.out / SequenceFiles("lift").restart)
+    with pytest.raises(RunError, match=r"restart\.safetensors.*position has 5 nodes"):
+        FittedObject.of(run, "lift")

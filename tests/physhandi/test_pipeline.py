@@ -17,6 +17,7 @@ from physhandi.fitting.artefacts import load_model, load_parameters
 from physhandi.fitting.config import PipelineConfig
 from physhandi.progress import Progress
 from physhandi.run import Run
+from physhandi.simulation.simulator import Simulator
 
 
 def small_config() -> PipelineConfig:
@@ -61,22 +62,6 @@ def test_every_stage_tells_its_loss_and_lowers_it(fitted: Run) -> None:
         assert len(losses[stage]["curve"]) > 2
 
 
-def test_the_kind_of_object_is_stored_with_the_run_and_told(
-    tmp_path: Path, fitted: Run, recordings: Path
-) -> None:
-    shape = fitted.yaml("object/shape.yaml")
-    assert (shape["shape"], shape["is_given"], shape["node_count"]) == ("sheet", False, len(NODE))
-    assert shape["node_spacing"] == pytest.approx(0.05)
-    assert (shape["removed"], shape["warnings"]) == ([], [])
-    told = fitted.json("losses.json")[pipeline.OBSERVATION]["note"]
-    assert told.startswith("sheet (")
-    assert told.endswith("25 nodes")
-    said = [event["message"] for event in read_events(fitted.folder)[0]]
-    assert told in said
-    again = simulate(tmp_path / "copy", fitted, recordings / "low")
-    assert again.yaml("object/shape.yaml") == shape
-
-
 def test_point_controllers_are_not_refined(fitted: Run) -> None:
     assert fitted.json("losses.json")[pipeline.REFINEMENT] == {"curve": []}
     for folder in fitted.sequences:
@@ -98,6 +83,38 @@ def test_the_fit_beats_standing_still(fitted: Run) -> None:
         static = np.linalg.norm(marker[:1] - marker, axis=2)[future].mean()
         assert error < 0.4 * static
         assert static > 0.03
+
+
+def test_prediction_starts_where_the_last_fitted_frame_was_seen(
+    fitted: Run, recordings: Path, tmp_path: Path
+) -> None:
+    last = FITTED - 1
+    for name in ("low", "high"):
+        object_ = fitted.object_in(name)
+        restart = object_.fitted.restart
+        marker = np.load(recordings / name / "marker.npy")
+        assert restart is not None
+        assert restart.frame == last
+        # Every node has a marker, which outweighs those around it by far.
+        np.testing.assert_allclose(restart.position, marker[last], atol=2e-5)
+        rollout = fitted.array(f"sequences/{name}/rollout.npy")
+        assert np.abs(rollout[last] - marker[last]).max() > 1e-4
+        model, parameters = object_.model, object_.parameters
+        motion = Simulator(model, parameters).rollout(object_.fitted.control, restart)
+        np.testing.assert_array_equal(rollout, motion.position)
+        plain = Simulator(model, parameters).rollout(object_.fitted.control).position
+        gap, plain_gap = (
+            np.linalg.norm(nodes - marker, axis=2)[FITTED:].mean() for nodes in (rollout, plain)
+        )
+        assert gap < 0.95 * plain_gap
+        # One changed parameter, simulated as a run of its own, keeps the observed state.
+        again = simulate(
+            tmp_path / name, fitted, recordings / name, substeps_per_frame=70
+        ).object_in(name)
+        assert again.fitted.restart is not None
+        np.testing.assert_array_equal(again.fitted.restart.position, restart.position)
+        moved = object_.simulate(substeps_per_frame=70)
+        np.testing.assert_array_equal(again.fitted.position, moved.position)
 
 
 def test_both_sequences_share_one_object(fitted: Run) -> None:

@@ -410,7 +410,10 @@ class LiveComparison:
         self._baseline = PhysTwinBaseline.of(content, fitted)
         controls = tuple(int(control) for control in self._baseline.controls)
         empty = ObjectRollout.empty(
-            fitted.model, self._baseline.parameters, np.asarray(fitted.control[:, list(controls)])
+            fitted.model,
+            self._baseline.parameters,
+            np.asarray(fitted.control[:, list(controls)]),
+            fitted.restart,
         )
         self._phystwin = LiveRollouts(
             self._mailbox,

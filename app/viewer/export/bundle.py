@@ -93,7 +93,7 @@ def _tables(sides: dict[str, tuple[ObjectRollout, int]]) -> dict[str, bytes]:
     springs: list[list[Any]] = []
     forces: list[list[Any]] = []
     for side, (rollout, frame) in sides.items():
-        model, first = rollout.model, rollout.model.object_spring_count
+        model, first = rollout.model_in(frame), rollout.model.object_spring_count
         position, control = np.asarray(rollout.position[frame]), np.asarray(rollout.control[frame])
         for node, (place, force) in enumerate(zip(position, rollout.forces(frame), strict=True)):
             nodes.append([side, node, *rounded(place), *rounded(force)])
@@ -132,7 +132,8 @@ def _arrays(sides: dict[str, tuple[ObjectRollout, int]], snapshot: Snapshot) -> 
             f"{prefix}force": rollout.forces(frame),
             f"{prefix}virtual_spring_force": rollout.spring_forces(frame),
         }
-        arrays |= {f"{prefix}{name}": array for name, array in rollout.model.to_tensors().items()}
+        model = rollout.model_in(frame).to_tensors()
+        arrays |= {f"{prefix}{name}": array for name, array in model.items()}
     for hand in snapshot.content.hands:
         vertex = hand.vertex[min(snapshot.frame, len(hand.vertex) - 1)]
         arrays[f"hand_{hand.side}_vertex"] = np.asarray(vertex)

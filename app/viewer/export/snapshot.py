@@ -123,7 +123,8 @@ def snapshot_npz(snapshot: Snapshot) -> bytes:
     Of a comparison all frames of both sides, as in ``ours_…`` and ``phystwin_…`` or ``a_…`` and
     ``b_…``: ``position`` "frame node 3" and ``control`` "frame control 3" [m], ``spring_nodes``,
     ``rest_length`` [m], ``stiffness`` [N], ``object_spring_count``, ``force`` "frame node 3" [N],
-    the sum over virtual springs on each object node, and ``frame``, the frame on the screen.
+    the sum over virtual springs on each object node, and ``frame``, the frame on the screen; of a
+    rollout that restarts also what `ObjectRollout.restart_arrays` gives.
     """
     content = snapshot.content
     arrays: dict[str, Any] = {}
@@ -168,7 +169,7 @@ def snapshot_yaml(snapshot: Snapshot) -> bytes:
 
 
 def _motion_arrays(rollout: ObjectRollout) -> dict[str, Any]:
-    return {
+    return rollout.restart_arrays() | {
         "position": rollout.position[: rollout.ready],
         "control": rollout.control[: rollout.ready],
         "spring_nodes": rollout.model.spring_nodes,
@@ -190,7 +191,7 @@ def _side_rows(name: str, rollout: ObjectRollout, frame: int) -> Iterator[list[A
         yield [name, frame, "node", node, "", *rounded([*place, *force]), "", ""]
     first = rollout.model.object_spring_count
     springs = np.sort(rollout.model.spring_nodes[first:], axis=1)
-    rest = rollout.model.rest_length[first:]
+    rest = rollout.model_in(frame).rest_length[first:]
     for ends, force, length in zip(springs, rollout.spring_forces(frame), rest, strict=True):
         node, holder = int(ends[0]), int(ends[1]) - rollout.model.node_count
         stretched = np.linalg.norm(control[holder] - position[node])

@@ -126,6 +126,14 @@ def _of_control(control: int, kind: HistoryQuantity, part: ObjectRollout, frame:
     return float(np.linalg.norm(value))
 
 
+def _restart_rows(rollout: ObjectRollout, frame: int) -> "Rows":
+    """Say from where a predicted frame was simulated, if that is not the rollout's own state."""
+    restart = rollout.restart
+    if restart is None or frame <= restart.frame:
+        return []
+    return [("predicted from", f"the observed state at frame {restart.frame}")]
+
+
 _NAMED = 6
 Rows = list[tuple[str, str]]
 
@@ -224,7 +232,10 @@ class Readings:
             where = [("position", self._vector(place[0], self._units))] if len(place) else []
             return where + self._recorded_rows(pick, frame)
         if pick.kind == "spring":
-            return self._spring_rows(pick.index, rollout, rollout_frame)
+            return [
+                *self._spring_rows(pick.index, rollout, rollout_frame),
+                *_restart_rows(rollout, rollout_frame),
+            ]
         rows = [("position", self._vector(place[0], self._unit))]
         node_velocity, control_velocity = (rollout.state(rollout_frame)[i] for i in (1, 3))
         velocity = (node_velocity if pick.kind == "node" else control_velocity)[pick.index]
@@ -243,6 +254,7 @@ class Readings:
             )
             rows += self._node_rows(pick.index, rollout, rollout_frame, int((joined < own).sum()))
             rows.append(("held by", self._partners(rollout, rollout_frame, held, is_control=True)))
+            rows += _restart_rows(rollout, rollout_frame)
         else:
             rows.append(("force on the object", self._vector(force, "N", size=True)))
             rows.append(("holds", self._partners(rollout, rollout_frame, held, is_control=False)))
@@ -274,7 +286,7 @@ class Readings:
         return rows
 
     def _spring_rows(self, spring: int, rollout: ObjectRollout, frame: int) -> Rows:
-        model = rollout.model
+        model = rollout.model_in(frame)
         point = np.concatenate([rollout.position[frame], rollout.control[frame]])
         a, b = (int(end) for end in model.spring_nodes[spring])
         length = float(np.linalg.norm(point[b] - point[a]))

@@ -498,7 +498,8 @@ class LiveRollouts:
             parameters = self._wanted.parameters.replace(
                 substeps_per_frame=message["substeps_per_frame"]
             )
-            self._incoming = ObjectRollout.empty(model, parameters, self.fitted.control)
+            fitted = self.fitted
+            self._incoming = ObjectRollout.empty(model, parameters, fitted.control, fitted.restart)
             self._durations = []
         elif message.kind == "frame" and self._incoming is not None:
             frame = int(message["frame"])

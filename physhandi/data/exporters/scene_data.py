@@ -106,6 +106,9 @@ def read_scene(
     model: dict[str, ndarray] = {}
     if run.has(files.model):
         model = run.tensors(files.model)
+    if run.has(files.restart):
+        state = run.tensors(files.restart)
+        model |= {f"restart_{name}": array for name, array in state.items()}
     return SceneData(
         sequence=name,
         frame_rate=float(meta["frame_rate"]),

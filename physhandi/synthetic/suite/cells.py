@@ -259,9 +259,16 @@ class Bench:
         _raise_again(folder)
         inputs = self._make_variant(recording, variant)
         title = f"{method.name} on {recording.name}"
-        if method.is_corrected:
-            base = self._run(method.base, recording, variant)
-            return correct(base, inputs, folder, title=title, method=method)
+        if method.correction is not None:
+            return correct(
+                self._run(method.base, recording, variant),
+                inputs,
+                folder,
+                title=title,
+                method=method,
+                device=self.device,
+                progress=self.progress,
+            )
         still, hands, noise = self._still(method), None, None
         truth = true_surface(read_truth(recording.folder)) if method.gets == "truth" else None
         if method.name != still.name:
@@ -319,7 +326,7 @@ class Bench:
             return {}
         seconds = {s["name"]: float(s.get("seconds", 0.0)) for s in run.stages()}
         base = method.base
-        if method.is_corrected:
+        if method.correction is not None:
             before = self._seconds(base, recording, variant, self._run(base, recording, variant))
             return {**before, **seconds} if before else {}
         still = self._still(base)
@@ -339,7 +346,7 @@ class Bench:
         return self._settings[key]
 
     def _folder(self, method: Method, recording: Sequence, variant: str) -> Path:
-        about = [variant, method.rule, method.is_corrected, self._settings_of(method)]
+        about = [variant, method.rule, method.correction, self._settings_of(method)]
         return self._cell(recording.name, method.name, about, recording)
 
     def _cell(self, case: str, method: str, about: Any, recording: Sequence) -> Path:

@@ -127,9 +127,7 @@ def evaluate_suite(
     before = ""
 
     def write() -> dict[str, Any]:
-        missing = len(tasks) - finished
-        recordings = () if missing else order.recordings
-        return folder.write(_environment(order), work.skipped, missing, recordings)
+        return folder.write(_environment(order), work.skipped, len(tasks) - finished)
 
     try:
         for number in range(len(tasks)) if fill is None else fill(tasks):
@@ -342,7 +340,7 @@ def _asked(protocol: Protocol, order: Order, method: Method, recording: Sequence
     elif protocol == "robustness" and is_plain:
         for variant in ROBUSTNESS:
             yield replace(task, variant=variant, split=variant)
-    elif protocol == "unseen" and not method.is_corrected:
+    elif protocol == "unseen" and method.correction is None:
         yield replace(task, fitted=_other_of_same_object(recording, order.recordings))
     elif protocol == "sensitivity" and is_plain and recording is order.recordings[0]:
         starts = () if method.rule else SENSITIVITY

@@ -1,7 +1,7 @@
 """Methods of a suite: every baseline and every profile as a run of the pipeline.
 
-A method is written ``BASE[@SETTING=VALUE,…][+last_residual]``: `METHODS` has the bases, and the
-settings are those of a profile.
+A method is written ``BASE[@SETTING=VALUE,…][+CORRECTION]``: `METHODS` has the bases, `CORRECTIONS`
+what can be done to their predicted frames, and the settings are those of a profile.
 """
 
 import re
@@ -46,8 +46,11 @@ _MOST = 8.0
 Given = Literal["recording", "true_hand", "all_frames", "truth"]
 SEARCH_SEED = "object_.search.seed"
 """Setting that decides the candidates of a search."""
-CORRECTION = "last_residual"
-"""Ends the name of a method whose predicted frames are shifted by its last residual."""
+CORRECTIONS: dict[str, str] = {
+    "last_residual": "The last residual is added.",
+    "restart": "Prediction starts from the observed state.",
+}
+"""What can be done to the predicted frames of a method; ends its name."""
 _NAME = re.compile(
     r"(?P<base>[^@+]*)(@(?P<settings>.*?))?(\+(?P<correction>[A-Za-z]\w*))?", re.DOTALL
 )
@@ -70,16 +73,16 @@ class Method:
     """Input: an oracle gets data that no real method can have."""
     overrides: Mapping[str, Any] = field(default_factory=dict[str, Any])
     """Settings that differ from the profile's."""
-    is_corrected: bool = False
-    """Whether the last residual is added to the predicted frames."""
+    correction: str | None = None
+    """What is done to the predicted frames, one of `CORRECTIONS`; None leaves them."""
     seed_of: str = ""
     """The method that this is one of several seeds of; empty if there are not several."""
 
     @property
     def base(self) -> "Method":
         """The same without the correction."""
-        name = self.name.removesuffix(f"+{CORRECTION}")
-        return replace(self, name=name, is_corrected=False)
+        name = self.name.removesuffix(f"+{self.correction}")
+        return replace(self, name=name, correction=None)
 
 
 METHODS = {
@@ -136,8 +139,9 @@ def parse_method(text: str) -> Method:
     )
     if base not in METHODS:
         raise UsageError(f"There is no method '{base}'. Choose from: {', '.join(METHODS)}.")
-    if correction not in (None, CORRECTION):
-        raise UsageError(f"Method '{text}' ends in '+{correction}'; only '+{CORRECTION}' exists.")
+    if correction is not None and correction not in CORRECTIONS:
+        known = " and ".join(f"'+{name}'" for name in CORRECTIONS)
+        raise UsageError(f"Method '{text}' ends in '+{correction}'; only {known} exist.")
     overrides: dict[str, Any] = {}
     for part in () if settings is None else _split(settings):
         path, equals, value = part.partition("=")
@@ -147,15 +151,12 @@ def parse_method(text: str) -> Method:
             overrides[path] = yaml.safe_load(value)
         except yaml.YAMLError:
             raise UsageError(f"Method '{text}': '{value}' is not a value of YAML.") from None
-    start, is_corrected = METHODS[base], correction is not None
-    if is_corrected and start.gets == "all_frames":
-        raise UsageError(
-            f"Method '{text}' has no predicted frames, since '{base}' is fitted to all of them: "
-            f"leave '+{CORRECTION}' out."
-        )
-    about = f"{start.about} The last residual is added." if is_corrected else start.about
-    method = replace(start, name=text, about=about, overrides=overrides, is_corrected=is_corrected)
-    method_settings(method, {})
+    start = METHODS[base]
+    about = start.about if correction is None else f"{start.about} {CORRECTIONS[correction]}"
+    method = replace(start, name=text, about=about, overrides=overrides, correction=correction)
+    settings_of_it = method_settings(method, {})
+    if why := _why_not_corrected(method, base, settings_of_it):
+        raise UsageError(f"Method '{text}' {why}: leave '+{correction}' out.")
     return method
 
 
@@ -167,11 +168,25 @@ def searched_from(method: Method, seeds: Many[int]) -> tuple[Method, ...]:
     """
     if method.rule is not None or SEARCH_SEED in method.overrides or not seeds:
         return (method,)
-    correction = f"+{CORRECTION}" if method.is_corrected else ""
+    correction = "" if method.correction is None else f"+{method.correction}"
     base = method.base.name
     mark = "," if "@" in base else "@"
     names = [f"{base}{mark}{SEARCH_SEED}={seed}{correction}" for seed in dict.fromkeys(seeds)]
     return tuple(replace(parse_method(name), seed_of=method.name) for name in names)
+
+
+def _why_not_corrected(method: Method, base: str, settings: Mapping[str, Any]) -> str:
+    """Say why a method's correction makes no sense; empty if it does, or if there is none."""
+    if method.correction is None:
+        return ""
+    if method.gets == "all_frames":
+        return f"has no predicted frames, since '{base}' is fitted to all of them"
+    if method.correction == "restart":
+        if method.rule is not None:
+            return f"has nothing to simulate again, since '{base}' is a rule"
+        if settings["prediction"]["restarts"]:
+            return "restarts by its own settings (prediction.restarts)"
+    return ""
 
 
 def _split(settings: str) -> list[str]:
@@ -318,39 +333,70 @@ def disturbed(motion: HandMotion, error: float, *, seed: tuple[int, ...]) -> Han
 
 
 def correct(
-    base: RunFolder, recording: Sequence, folder: Path, *, title: str, method: Method
+    base: RunFolder,
+    recording: Sequence,
+    folder: Path,
+    *,
+    title: str,
+    method: Method,
+    device: str = "cpu",
+    progress: Progress,
 ) -> RunFolder:
-    """Copy a finished run with its last residual added to the predicted frames.
+    """Copy a finished run and correct its predicted frames.
+
+    With ``restart`` the run's own object is simulated again, from the observed state on. With
+    ``last_residual`` the residual of the state from which the run predicted is added: of a run
+    that restarts that is the observed state, with next to nothing to add.
+
+    Args:
+        base: The run.
+        recording: What it was given.
+        folder: Folder of the copy.
+        title: What the copy is called.
+        method: The corrected method.
+        device: Warp device.
+        progress: Told about every frame.
 
     Raises:
         MissingInputError: If no track is seen in the last frame that was fitted.
+        SimulationDivergedError: If the motion runs away.
     """
     config = {**base.config, "method": method.name, "source": str(base.folder.resolve())}
     run = open_suite_run(folder, title, recording, config)
     if run.is_published:
         return run
-    files = SequenceFiles(recording.name)
     with run.begin_attempt() as attempt:
         for rel, path in artefacts(base.out):
             _copy(path, attempt.out / rel)
-        observed = {n: base.array(files.observation(n)) for n in ("point", "is_visible")}
-        name = files.observation("node_of_track")
-        try:
-            rollout = last_residual_baseline(
-                base.array(files.rollout),
-                **observed,
-                first_future=len(recording.reconstruction_frames),
-                node_of_track=base.array(name) if base.has(name) else None,
-            )
-        except ValueError as error:
-            raise MissingInputError(f"Sequence '{recording.name}': {error}.") from error
-        attempt.save_array(files.rollout, rollout.astype(np.float32))
-        scores, frames = measure_run(attempt.out, recording)
-        attempt.save_json(files.frame_errors, frames)
-        attempt.save_json(METRICS_FILE, {recording.name: scores})
-        attempt.finish_stage(CORRECTION)
+        if method.correction == "restart":
+            pipeline.predict_again(attempt, recording, progress, device=device)
+        else:
+            _add_last_residual(attempt, base, recording)
+        attempt.finish_stage(str(method.correction))
         attempt.publish()
     return RunFolder.open(folder)
+
+
+def _add_last_residual(attempt: Attempt, base: RunFolder, recording: Sequence) -> None:
+    """Shift the predicted frames of a run, and measure it."""
+    files = SequenceFiles(recording.name)
+    observed = {n: base.array(files.observation(n)) for n in ("point", "is_visible")}
+    name = files.observation("node_of_track")
+    state = base.tensors(files.restart)["position"] if base.has(files.restart) else None
+    try:
+        rollout = last_residual_baseline(
+            base.array(files.rollout),
+            **observed,
+            first_future=len(recording.reconstruction_frames),
+            node_of_track=base.array(name) if base.has(name) else None,
+            continued_from=state,
+        )
+    except ValueError as error:
+        raise MissingInputError(f"Sequence '{recording.name}': {error}.") from error
+    attempt.save_array(files.rollout, rollout.astype(np.float32))
+    scores, frames = measure_run(attempt.out, recording)
+    attempt.save_json(files.frame_errors, frames)
+    attempt.save_json(METRICS_FILE, {recording.name: scores})
 
 
 def simulate_in(

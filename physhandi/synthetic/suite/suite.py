@@ -118,7 +118,7 @@ SUITES: dict[str, Suite] = {
             seeds=(0,),
             methods=(
                 *BASELINES,
-                "phystwin+last_residual",
+                *("phystwin+last_residual", "phystwin+restart"),
                 *("ours", "ours+last_residual"),
                 *ORACLES,
             ),
@@ -134,7 +134,7 @@ SUITES: dict[str, Suite] = {
             seeds=(0,),
             methods=(
                 *BASELINES,
-                "phystwin+last_residual",
+                *("phystwin+last_residual", "phystwin+restart"),
                 *("ours", "ours+last_residual", "ours@refinement.iterations=0"),
                 FLOOR,
             ),
@@ -160,7 +160,7 @@ SUITES: dict[str, Suite] = {
             seeds=(0,),
             methods=(
                 *BASELINES,
-                "phystwin+last_residual",
+                *("phystwin+last_residual", "phystwin+restart"),
                 *("ours", "ours+last_residual"),
                 *ORACLES,
             ),
@@ -180,7 +180,7 @@ SUITES: dict[str, Suite] = {
             seeds=(0, 1, 2, 3, 4),
             methods=(
                 *BASELINES,
-                "phystwin+last_residual",
+                *("phystwin+last_residual", "phystwin+restart"),
                 *("paper", "ours", "ours+last_residual"),
                 *("ours@refinement.iterations=0", *ORACLES),
             ),

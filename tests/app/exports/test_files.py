@@ -65,7 +65,10 @@ def test_a_changed_parameter_is_simulated_before_it_is_written(
 ) -> None:
     fitted = FittedObject.of(run, "sheet")
     parameters = fitted.parameters.replace(drag=9.0)
-    expected = Simulator(fitted.model, parameters).rollout(fitted.fitted.control).position
+    restart = fitted.fitted.restart
+    assert restart is not None
+    motion = Simulator(fitted.model, parameters).rollout(fitted.fitted.control, restart)
+    expected = motion.position
     assert np.abs(expected - rollout(run)).max() > 1e-3
     with np.load(io.BytesIO(fetch(world, "npz&drag=9"))) as arrays:
         np.testing.assert_allclose(arrays["rollout"], expected, atol=1e-6)

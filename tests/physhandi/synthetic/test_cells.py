@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from sheet_sequence import FITTED, NODE, write_sheet
+from suite_world import SETTINGS
 
 import physhandi
 from physhandi import pipeline
@@ -202,6 +203,25 @@ def test_scores_are_taken_against_what_the_method_was_not_given(tmp_path: Path) 
     given = list((tmp_path / "suite/inputs").rglob("*"))
     assert [file for file in given if file.name == "marker.npy"]
     assert not [file for file in given if file.name == "validation_track.npy"]
+
+
+def test_a_restart_and_a_last_residual_of_the_fit_itself(tmp_path: Path) -> None:
+    recording = write_sheet(tmp_path / "sheet")
+    bench = Bench(tmp_path / "out", common=SETTINGS, device="cpu", progress=NullProgress())
+    off = "quick@prediction.restarts=false"
+    names = ("quick", off, f"{off}+restart", f"{off}+last_residual", "quick+last_residual")
+    rollout = {}
+    for name in names:
+        run = Run.open(tmp_path / "out/cells" / bench.outcome(parse_method(name), recording).run)
+        rollout[name] = run.array("sequences/sheet/rollout.npy")
+    np.testing.assert_array_equal(rollout[f"{off}+restart"], rollout["quick"])
+    for name in names[1:]:
+        np.testing.assert_array_equal(rollout[name][:FITTED], rollout["quick"][:FITTED])
+    # What is added to a rollout that restarts is what the observed state still misses.
+    added = [rollout[f"{n}+last_residual"] - rollout[n] for n in (off, "quick")]
+    assert np.abs(added[0][FITTED:]).max() > 1e-3
+    assert np.abs(added[1][FITTED:]).max() < 1e-4
+    assert np.abs(rollout["quick"][FITTED:] - rollout[off][FITTED:]).max() > 1e-3
 
 
 def test_a_cell_that_was_stopped_has_no_times(tmp_path: Path) -> None:

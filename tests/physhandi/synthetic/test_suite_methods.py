@@ -15,7 +15,7 @@ from physhandi.synthetic.suite.suite import SUITES, check_seeds, find_suite
 
 def test_a_name_says_base_settings_and_correction() -> None:
     method = parse_method("quick@node_spacing=0.03,object_.search.generations=2+last_residual")
-    assert (method.profile, method.rule, method.is_corrected) == ("quick", None, True)
+    assert (method.profile, method.rule, method.correction) == ("quick", None, "last_residual")
     assert method.base.name == "quick@node_spacing=0.03,object_.search.generations=2"
     settings = method_settings(method, {"node_spacing": 0.5, "refinement.iterations": 3})
     assert settings["node_spacing"] == 0.03
@@ -37,6 +37,9 @@ def test_a_name_says_base_settings_and_correction() -> None:
         ("quick@node_spacing=1,b", "'b' is not SETTING=VALUE"),
         ("quick+5", r"no method 'quick\+5'"),
         ("oracle_parameters+last_residual", "has no predicted frames"),
+        ("quick+restart", "restarts by its own settings"),
+        ("static+restart", "'static' is a rule"),
+        ("oracle_parameters@prediction.restarts=false+restart", "has no predicted frames"),
         ("oracle_parameters@node_spacing=0.02+last_residual", "has no predicted frames"),
     ],
 )
@@ -52,7 +55,7 @@ def test_a_fit_is_repeated_for_every_seed_of_its_search_and_a_rule_is_not() -> N
     ]
     assert {method.seed_of for method in found} == {"quick@node_spacing=0.03+last_residual"}
     for method, seed in zip(found, (1, 2), strict=True):
-        assert method.is_corrected
+        assert method.correction == "last_residual"
         assert method_settings(method, {})["object_"]["search"]["seed"] == seed
         assert method.base.name.endswith(f"seed={seed}")
     (plain,) = searched_from(parse_method("ours"), (5,))
@@ -69,13 +72,22 @@ def test_a_value_may_hold_commas_and_signs() -> None:
     interval = "{low: 0.01, high: 0.05, scale: log}"
     name = f"quick@{radius}={interval},simulation.stiffness=1.0e+4+last_residual"
     method = parse_method(name)
-    assert method.is_corrected
+    assert method.correction == "last_residual"
     assert method.base.name == name.removesuffix("+last_residual")
     assert method.overrides == {
         radius: {"low": 0.01, "high": 0.05, "scale": "log"},
         "simulation.stiffness": 1e4,
     }
-    assert not parse_method("quick@simulation.stiffness=1.0e+4").is_corrected
+    assert parse_method("quick@simulation.stiffness=1.0e+4").correction is None
+
+
+def test_a_fit_that_does_not_restart_can_be_restarted() -> None:
+    for name in ("phystwin+restart", "paper+restart", "quick@prediction.restarts=false+restart"):
+        method = parse_method(name)
+        assert method.correction == "restart"
+        assert not method_settings(method.base, {})["prediction"]["restarts"]
+        assert "starts from the observed state" in method.about
+    assert method_settings(METHODS["ours"], {})["prediction"]["restarts"]
 
 
 def test_hindsight_is_not_told_as_a_bound() -> None:

@@ -1,0 +1,106 @@
+"""A rollout that continues from another state than its own, with every spring's strain kept.
+
+Moved nodes alone would not stay: springs would pull them back to the shape that the old rest
+lengths describe. With the rest length r of a spring of length L scaled to ``r' = r L' / L``, where
+L' is its length in the new state, its strain ``L' / r' - 1`` and with it its tension are what they
+were.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Float32
+from numpy import ndarray
+
+from physhandi.simulation.forces import spring_strains
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
+from physhandi.simulation.stability import SAFETY
+
+SHORTEST_SHARE = 1.0 / SAFETY**2
+"""Least share of its rest length that a spring keeps: shorter ones are stiffer [N/m], and this is
+what the margin of automatic substeps leaves room for."""
+COINCIDENT = 1e-6
+"""Nodes nearer to each other than this have no strain that could be kept [m]."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Restart:
+    """The state from which a rollout continues after a frame."""
+
+    frame: int
+    """The last frame that is the rollout's own; the next one starts from the state below."""
+    position: Float32[ndarray, "node 3"]
+    """Object nodes in that frame [m]."""
+    velocity: Float32[ndarray, "node 3"]
+    """Their velocities [m/s]."""
+
+    def __post_init__(self) -> None:
+        if self.frame < 0:
+            raise ValueError(f"frame is {self.frame}; expected 0 or later.")
+        for name in ("position", "velocity"):
+            value = getattr(self, name)
+            if value.ndim != 2 or value.shape[1:] != (3,) or len(value) != len(self.position):
+                raise ValueError(f"{name} has shape {value.shape}; expected (node, 3).")
+            wrong = np.argwhere(~np.isfinite(value))
+            if len(wrong):
+                raise ValueError(f"{name} is not finite at node {wrong[0][0]}.")
+
+    def check_nodes(self, count: int) -> None:
+        """Raise `ValueError` unless it is a state of so many nodes."""
+        if len(self.position) != count:
+            has = len(self.position)
+            raise ValueError(f"position has {has} nodes, but the object has {count}.")
+
+    def continued(
+        self,
+        model: SpringMassModel,
+        parameters: SimulationParameters,
+        position: Float[ndarray, "node 3"],
+        control: Float[ndarray, "control 3"],
+    ) -> SpringMassModel:
+        """Give the springs with which the frames after the restart are simulated.
+
+        A spring keeps its strain, unless its rest length would fall below its floor or below
+        `SHORTEST_SHARE` of what it was. One whose ends coincide in the rollout has no strain to
+        keep: its rest length stays.
+
+        Args:
+            model: The springs until then; virtual ones are changed as the object's own.
+            parameters: For the floors of the rest lengths.
+            position: The rollout's own nodes in the frame of the restart [m].
+            control: Control nodes in that frame [m].
+        """
+        rest = model.rest_length.astype(np.float64)
+        before = rest * (1.0 + spring_strains(model, position, control))
+        after = rest * (1.0 + spring_strains(model, self.position, control))
+        scale = np.divide(after, before, out=np.ones_like(rest), where=before > COINCIDENT)
+        floor = np.full_like(rest, parameters.virtual_rest_length_floor)
+        floor[: model.object_spring_count] = parameters.rest_length_floor
+        shortest = np.maximum(SHORTEST_SHARE * rest, np.minimum(rest, floor))
+        scaled = np.maximum(scale * rest, shortest)
+        return replace(model, rest_length=scaled.astype(np.float32))
+
+    def to_tensors(self) -> dict[str, ndarray]:
+        """Return every field as an array, ready for safetensors."""
+        frame = np.array([self.frame], dtype=np.int32)
+        return {"frame": frame, "position": self.position, "velocity": self.velocity}
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, ndarray]) -> "Restart":
+        """Rebuild it from the arrays of `to_tensors`.
+
+        Raises:
+            ValueError: If an array is missing, unknown or inconsistent.
+        """
+        if set(tensors) != {"frame", "position", "velocity"}:
+            raise ValueError(
+                "A restart needs the arrays frame, position, velocity; "
+                f"got {', '.join(sorted(tensors))}."
+            )
+        frame = np.asarray(tensors["frame"]).reshape(-1)
+        if len(frame) != 1:
+            raise ValueError(f"frame has {len(frame)} values; expected one.")
+        state = {name: np.asarray(tensors[name], np.float32) for name in ("position", "velocity")}
+        return cls(frame=int(frame[0]), **state)

@@ -1,0 +1,80 @@
+"""The state in the last observed frame, worked out node by node in float64."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from reference.scenes import as_model, cube_scene
+from reference.spring_mass import simulate
+
+from physhandi.data.observation import ObjectObservation
+from physhandi.errors import MissingInputError
+from physhandi.fitting.state_estimate import observed_state
+
+LAST = 2
+SCENE = cube_scene()
+
+
+def observed(shift: np.ndarray, **changes) -> ObjectObservation:
+    """The nodes of the oracle, moved by `shift` in the last frame and nonsense after it."""
+    point = simulate(SCENE)[0].astype(np.float32)
+    point[LAST] += shift.astype(np.float32)
+    point[LAST + 1 :] += 7.0
+    seen = np.ones(point.shape[:2], bool)
+    fields = {"is_visible": seen, "is_motion_valid": seen, "node_of_track": np.arange(8)}
+    return ObjectObservation(**({"point": point} | fields | changes))
+
+
+def estimate(observation: ObjectObservation, frame: int = LAST):
+    model, parameters = as_model(SCENE)
+    return observed_state(model, parameters, SCENE.control, observation, frame)
+
+
+def test_a_node_that_is_seen_is_where_it_is_seen_and_moves_as_simulated() -> None:
+    shift = np.random.default_rng(1).normal(0, 0.004, (8, 3))
+    shift[:, 2] = np.abs(shift[:, 2])
+    position, velocity = simulate(SCENE)
+    found = estimate(observed(shift))
+    assert found.frame == LAST
+    np.testing.assert_allclose(found.position, position[LAST] + shift, atol=2e-6)
+    np.testing.assert_allclose(found.velocity, velocity[LAST], atol=5e-6)
+    # The frame before shows no residual.
+    np.testing.assert_allclose(
+        estimate(observed(shift), LAST - 1).position, position[LAST - 1], atol=2e-6
+    )
+    assert np.abs(position[LAST] - position[LAST - 1]).max() > 1e-3
+
+
+def test_a_node_that_is_not_seen_takes_the_mean_of_the_tracks_around_it() -> None:
+    shift = np.random.default_rng(2).uniform(0.001, 0.006, (8, 3))
+    seen = np.ones((4, 8), bool)
+    seen[LAST, [2, 5]] = False
+    found = estimate(observed(shift, is_visible=seen))
+    position = simulate(SCENE)[0]
+    for node in (2, 5):
+        total, weights = np.zeros(3), 0.0
+        for track in (0, 1, 3, 4, 6, 7):
+            weight = 1.0 / (np.linalg.norm(SCENE.node[node] - SCENE.node[track]) + 1e-6)
+            total += weight * shift[track]
+            weights += weight
+        np.testing.assert_allclose(
+            found.position[node], position[LAST, node] + total / weights, atol=2e-6
+        )
+
+
+def test_no_node_ends_below_the_ground() -> None:
+    found = estimate(observed(np.full((8, 3), -1.0)))
+    assert found.position[:, 2].tolist() == [0.0] * 8
+    assert found.position[:, 0].max() < -0.5
+    model, parameters = as_model(SCENE)
+    held = replace(model, clearance=np.linspace(0.0, 0.003, 8, dtype=np.float32))
+    seen = observed(np.full((8, 3), -1.0))
+    found = observed_state(held, parameters, SCENE.control, seen, LAST)
+    np.testing.assert_allclose(found.position[:, 2], held.clearance, rtol=1e-6)
+
+
+def test_without_a_track_there_is_no_state() -> None:
+    seen = np.ones((4, 8), bool)
+    seen[LAST] = False
+    with pytest.raises(MissingInputError, match="frame 2 shows no track"):
+        estimate(observed(np.zeros((8, 3)), is_visible=seen))

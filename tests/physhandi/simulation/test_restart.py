@@ -1,0 +1,183 @@
+"""A rollout that continues from another state: against the oracle, closed forms and bits."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from reference.scenes import as_model, cube_scene
+from reference.spring_mass import Scene, simulate
+
+from physhandi.simulation.forces import spring_strains
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
+from physhandi.simulation.restart import Restart
+from physhandi.simulation.simulator import Simulator
+
+AT = 2
+GRAVITY, STIFFNESS = 9.81, 50.0
+HANGING = 1.0 + GRAVITY / STIFFNESS
+"""Length at which a spring of 1 m that holds 1 kg is at rest [m]."""
+
+
+def another_state(scene: Scene, frame: int = AT) -> Restart:
+    rng = np.random.default_rng(5)
+    node = simulate(scene)[0][frame] + rng.normal(0, 0.003, scene.node.shape)
+    node[:, 2] = np.maximum(node[:, 2], 0.001)
+    velocity = rng.normal(0, 0.1, node.shape)
+    state = {"position": node.astype(np.float32), "velocity": velocity.astype(np.float32)}
+    return Restart(frame=frame, **state)
+
+
+def continued_oracle(scene: Scene, restart: Restart, frame: int = AT) -> np.ndarray:
+    """Simulate the frames after a restart in float64, with rest lengths scaled by their ratio."""
+    own = simulate(scene)[0][frame]
+    first, second = scene.springs.T
+    lengths = []
+    for node in (own, restart.position.astype(float)):
+        point = np.vstack([node, scene.control[frame]])
+        lengths.append(np.sqrt(((point[second] - point[first]) ** 2).sum(axis=1)))
+    later = replace(
+        scene,
+        node=restart.position.astype(float),
+        velocity=restart.velocity.astype(float),
+        rest=scene.rest * lengths[1] / lengths[0],
+        control=scene.control[frame:],
+        rest_shape=scene.node,
+    )
+    return simulate(later)[0]
+
+
+@pytest.mark.parametrize("distance", [None, 0.002], ids=["engine", "self_collision"])
+def test_frames_after_a_restart_agree_with_the_oracle(device: str, distance: float | None) -> None:
+    scene = cube_scene(distance=distance)
+    restart = another_state(scene)
+    rollout = Simulator(*as_model(scene), device=device).rollout(scene.control, restart)
+    before, after = simulate(scene)[0], continued_oracle(scene, restart)
+    np.testing.assert_allclose(rollout.position[: AT + 1], before[: AT + 1], atol=2e-7)
+    np.testing.assert_allclose(rollout.position[AT + 1 :], after[1:], atol=1e-6)
+    # One frame too early or too late would be seen, and so would rest lengths that are not scaled.
+    unscaled = replace(scene, rest=scene.rest * 0.99)
+    for wrong in (before[AT + 1 :], continued_oracle(unscaled, restart)[1:]):
+        assert np.abs(rollout.position[AT + 1 :] - wrong).max() > 1e-4
+    early = continued_oracle(scene, restart, AT - 1)
+    assert np.abs(rollout.position[AT + 1] - early[1]).max() > 1e-4
+
+
+def test_every_strain_is_kept() -> None:
+    scene = cube_scene()
+    model, parameters = as_model(scene)
+    restart, own = another_state(scene), simulate(scene)[0][AT]
+    control = scene.control[AT]
+    later = restart.continued(model, parameters, own, control)
+    expected = spring_strains(model, own, control)
+    assert np.abs(expected).max() > 0.05
+    np.testing.assert_allclose(
+        spring_strains(later, restart.position, control), expected, rtol=1e-6, atol=1e-6
+    )
+    assert np.abs(spring_strains(model, restart.position, control) - expected).max() > 0.05
+    for name in ("stiffness", "damping", "spring_nodes"):
+        assert getattr(later, name) is getattr(model, name)
+
+
+def hanging() -> tuple[SpringMassModel, SimulationParameters, np.ndarray]:
+    """1 kg that hangs at rest below a control node, and controls for six frames."""
+    model = SpringMassModel(
+        object_node=np.array([[0.0, 0.0, -HANGING]], np.float32),
+        initial_velocity=np.zeros((1, 3), np.float32),
+        spring_nodes=np.array([[0, 1]], np.int32),
+        rest_length=np.ones(1, np.float32),
+        stiffness=np.full(1, STIFFNESS, np.float32),
+        damping=np.zeros(1, np.float32),
+        object_spring_count=0,
+        control_count=1,
+    )
+    parameters = SimulationParameters(
+        drag=0.0,
+        gravity=GRAVITY,
+        ground_height=None,
+        uses_sequence_ground=False,
+        frame_rate=1000.0,
+        substeps_per_frame=1,
+    )
+    return model, parameters, np.zeros((6, 1, 3), np.float32)
+
+
+def test_a_spring_under_tension_restarts_without_a_kick(device: str) -> None:
+    model, parameters, control = hanging()
+    lower = model.object_node - np.float32([0.0, 0.0, 0.1])
+    restart = Restart(frame=AT, position=lower, velocity=np.zeros((1, 3), np.float32))
+    simulator = Simulator(model, parameters, device)
+    rollout = simulator.rollout(control, restart)
+    assert np.abs(rollout.position[: AT + 1] - model.object_node).max() < 1e-6
+    assert np.abs(rollout.position[AT + 1 :] - lower).max() < 1e-6
+    # With the old rest length 0.1 m more pull by 50 N/m · 0.1 m: 5 m/s² for a millisecond.
+    simulator.reset(lower)
+    simulator.step_frame(1, control[0], control[1])
+    assert simulator.velocity.numpy()[0] == pytest.approx([0.0, 0.0, 5e-3], rel=1e-3, abs=1e-9)
+
+
+def test_what_follows_a_restart_is_the_same_bits_and_leaves_nothing_behind(device: str) -> None:
+    scene = cube_scene()
+    restart = another_state(scene)
+    simulator = Simulator(*as_model(scene), device=device)
+    plain = simulator.rollout(scene.control)
+    first, second = (simulator.rollout(scene.control, restart) for _ in range(2))
+    again = simulator.rollout(scene.control)
+    for name in ("position", "velocity"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+        np.testing.assert_array_equal(getattr(again, name), getattr(plain, name))
+        np.testing.assert_array_equal(
+            getattr(first, name)[: AT + 1], getattr(plain, name)[: AT + 1]
+        )
+    assert np.abs(first.position[-1] - plain.position[-1]).max() > 1e-3
+    shorter = simulator.rollout(scene.control[:AT], restart)
+    np.testing.assert_array_equal(shorter.position, plain.position[:AT])
+
+
+def test_rest_lengths_stay_above_their_bounds_and_coincident_nodes_keep_theirs() -> None:
+    node = np.array([[0, 0, 0], [1, 0, 0], [1, 0, 0], [3, 0, 0]], np.float32)
+    model = SpringMassModel(
+        object_node=node,
+        initial_velocity=np.zeros_like(node),
+        spring_nodes=np.array([[0, 1], [1, 2], [2, 3], [3, 4]], np.int32),
+        rest_length=np.array([1.0, 0.4, 0.5, 0.25], np.float32),
+        stiffness=np.ones(4, np.float32),
+        damping=np.ones(4, np.float32),
+        object_spring_count=3,
+        control_count=1,
+    )
+    parameters = SimulationParameters(rest_length_floor=0.1, virtual_rest_length_floor=0.2)
+    control = np.array([[4.0, 0, 0]], np.float32)
+    # The first and the last spring vanish, the second has no length, the third doubles.
+    moved = np.array([[0, 0, 0], [0, 0, 0], [0, 0, 0], [4, 0, 0]], np.float32)
+    restart = Restart(frame=0, position=moved, velocity=np.zeros_like(moved))
+    later = restart.continued(model, parameters, node, control)
+    # A spring of 64 % of the length is 1.25² times as stiff, which automatic substeps allow for.
+    np.testing.assert_allclose(later.rest_length, [0.64, 0.4, 1.0, 0.2], rtol=1e-6)
+    bare = parameters.replace(rest_length_floor=0.0, virtual_rest_length_floor=0.0)
+    later = restart.continued(model, bare, node, control)
+    np.testing.assert_allclose(later.rest_length, [0.64, 0.4, 1.0, 0.16], rtol=1e-6)
+
+
+def test_a_restart_that_does_not_fit_is_refused() -> None:
+    still = np.zeros((8, 3), np.float32)
+    simulator = Simulator(*as_model(cube_scene()))
+    with pytest.raises(ValueError, match="position has 7 nodes, but the object has 8"):
+        next(
+            simulator.frames(
+                cube_scene().control, Restart(frame=1, position=still[1:], velocity=still[1:])
+            )
+        )
+    wrong = still.copy()
+    wrong[3, 1] = np.nan
+    with pytest.raises(ValueError, match="velocity is not finite at node 3"):
+        Restart(frame=1, position=still, velocity=wrong)
+    with pytest.raises(ValueError, match="frame is -1"):
+        Restart(frame=-1, position=still, velocity=still)
+    with pytest.raises(ValueError, match=r"velocity has shape \(7, 3\)"):
+        Restart(frame=1, position=still, velocity=still[1:])
+    kept = Restart(frame=3, position=still + 1, velocity=still + 2)
+    again = Restart.from_tensors(kept.to_tensors())
+    assert (again.frame, again.position[0, 0], again.velocity[0, 0]) == (3, 1.0, 2.0)
+    with pytest.raises(ValueError, match="got frame, position"):
+        Restart.from_tensors({"frame": np.zeros(1, np.int32), "position": still})
