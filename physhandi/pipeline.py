@@ -21,6 +21,7 @@ from physhandi.data.layout import (
     METRICS_FILE,
     PARAMETERS_FILE,
     REST_NODE_FILE,
+    SHAPE_FILE,
     SequenceFiles,
 )
 from physhandi.data.run import RunFolder
@@ -207,6 +208,8 @@ def _stage_simulation(
         progress.report(SIMULATION, 0, count, message=f"{substeps} substeps a frame")
     rest_node = artefacts.load_rest_node(source.out)
     artefacts.save_object(attempt, parameters, rollouts[0].model, rest_node)
+    if source.has(SHAPE_FILE):
+        attempt.save_yaml(SHAPE_FILE, source.yaml(SHAPE_FILE))
     for object_, rollout in zip(objects, rollouts, strict=True):
         rollout.parameters = rollout.parameters.replace(substeps_per_frame=substeps)
         artefacts.save_model(attempt, object_.sequence, rollout.model)
@@ -365,9 +368,10 @@ def _stage_observation(
     if attempt.stage_done(OBSERVATION):
         return
     template = None
+    found = ""
     for number, sequence in enumerate(sequences):
         observation = observe_object(sequence, progress)
-        node, rest_node = object_nodes_of(sequence, observation, config.node_spacing, template)
+        node, rest_node, shape = object_nodes_of(sequence, observation, config, template)
         template = (node, rest_node) if template is None else template
         control = control_trajectory_of(
             sequence, artefacts.load_motions(attempt.out, sequence.name), config
@@ -378,8 +382,11 @@ def _stage_observation(
         attempt.save_array(files.control, control.astype(np.float32))
         if number == 0:
             attempt.save_array(REST_NODE_FILE, rest_node.astype(np.float32))
-        progress.report(OBSERVATION, number + 1, len(sequences))
-    _finish(attempt, OBSERVATION, [], [], [])
+        if shape is not None:
+            attempt.save_yaml(SHAPE_FILE, shape.to_dict())
+            found = str(shape)
+        progress.report(OBSERVATION, number + 1, len(sequences), message=found)
+    _finish(attempt, OBSERVATION, [], [], [], note=found)
 
 
 def _problems(

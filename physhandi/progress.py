@@ -109,7 +109,7 @@ class PrintedProgress(Progress):
         if self._stream.isatty():
             self._draw(stage, iteration, total, text)
         else:
-            self._write(stage, iteration, total, text)
+            self._write(stage, iteration, total, text, message)
 
     def finish(self) -> None:
         """End the bar, if there is one, so that what follows stands on a line of its own."""
@@ -136,9 +136,10 @@ class PrintedProgress(Progress):
             self._task = self._bar.add_task(stage, total=total, text=text)
         self._bar.update(self._task, completed=iteration, total=total, text=text)
 
-    def _write(self, stage: str, iteration: int, total: int, text: str) -> None:
+    def _write(self, stage: str, iteration: int, total: int, text: str, message: str) -> None:
         quarter = _QUARTERS * iteration // max(1, total)
-        if (stage, quarter) == (self._stage, self._quarter):
+        is_told = (stage, quarter) == (self._stage, self._quarter)
+        if is_told and not (message and iteration >= total):
             return
         self._stage, self._quarter = stage, quarter
         self._stream.write(f"{stage} {iteration}/{total}  {text}".rstrip() + "\n")

@@ -44,6 +44,7 @@ def check(
             "object": f"lacks {', '.join([*object_parts, *mover])}"
             if object_parts or mover
             else "can be reconstructed",
+            "shape": sequence.shape or "is found by the fit",
         }
     show(reports, as_json=as_json)
     return 1 if any("error" in report for report in reports.values()) else 0

@@ -24,10 +24,16 @@ from physhandi.metrics.suite_report import (
 
 _NAME = r"^[A-Za-z0-9_-]{1,64}$"
 Name = Annotated[str, Field(pattern=_NAME)]
-Chart = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,80}\.svg$")]
+Chart = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,80}\.(svg|png)$")]
 File = Literal["table.csv", "paired.csv", "per_sequence.csv", "report.md", "tables.tex"]
 _BEST = "\0"
-_TYPES = {".csv": "text/csv", ".md": "text/markdown", ".tex": "text/plain", ".svg": "image/svg+xml"}
+_TYPES = {
+    ".csv": "text/csv",
+    ".md": "text/markdown",
+    ".tex": "text/plain",
+    ".svg": "image/svg+xml",
+    ".png": "image/png",
+}
 _SMALL = 64 * 2**20
 
 

@@ -10,6 +10,8 @@ PARAMETERS_FILE = "object/parameters.yaml"
 """Global parameters of the object."""
 MATERIAL_FILE = "object/material.safetensors"
 """The object by itself: rest shape, springs, stiffness and damping."""
+SHAPE_FILE = "object/shape.yaml"
+"""Kind of object that was found, and what was removed from the cloud that its nodes come from."""
 REST_NODE_FILE = "object/rest_node.npy"
 """The object's rest shape, before its springs are fitted."""
 

@@ -19,7 +19,7 @@ from physhandi.data.length_unit import (
     doubt_keypoints,
     doubt_position,
 )
-from physhandi.data.sequence_meta import FILE, SequenceMeta, Side, read_meta
+from physhandi.data.sequence_meta import FILE, SequenceMeta, ShapeClass, Side, read_meta
 from physhandi.data.sequence_meta import ViewMeta as ViewMeta
 from physhandi.data.truth import TRUTH_FOLDER as TRUTH
 from physhandi.data.truth import read_held_out_views
@@ -356,6 +356,11 @@ class Sequence:
         return self.meta.surface_node_count
 
     @property
+    def shape(self) -> ShapeClass | None:
+        """Kind of object; None if that is to be found from what the first frame shows."""
+        return self.meta.shape
+
+    @property
     def provenance(self) -> Mapping[str, Any]:
         """Where the recording comes from."""
         return self.meta.provenance
@@ -446,7 +451,7 @@ class Sequence:
         """Compute a SHA-256 over what was recorded, whatever the sequence is called.
 
         It covers what `fingerprint` covers, but of ``sequence.yaml`` only what describes the
-        recording: not name, description, label, provenance and split.
+        recording: not name, description, label, provenance, split and shape.
         """
         return self._content_fingerprint
 
@@ -457,8 +462,8 @@ class Sequence:
     @cached_property
     def _content_fingerprint(self) -> str:
         fields = self.meta.to_dict()
-        for name in ("name", "description", "label", "provenance", "split"):
-            del fields[name]
+        for name in ("name", "description", "label", "provenance", "split", "shape"):
+            fields.pop(name, None)
         text = json.dumps(fields, sort_keys=True) + self._digest(leaves_out=frozenset({FILE}))
         return hashlib.sha256(text.encode()).hexdigest()
 

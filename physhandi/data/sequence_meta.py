@@ -6,7 +6,7 @@ import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal, cast, get_args
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.files import named_fields, parse_yaml
@@ -21,6 +21,8 @@ _MOST_FRAMES = 1_000_000
 Side = Literal["right", "left"]
 SIDES: tuple[Side, Side] = ("right", "left")
 """Hands in the order in which sequences list them."""
+ShapeClass = Literal["sheet", "solid", "shell", "rope"]
+"""Kinds of object: a layer, a filled body, a hollow one, or a long thin one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,6 +69,8 @@ class SequenceMeta:
     """Where the recording comes from: origin, licence, importer and its settings."""
     label: str = ""
     """Free label of the user."""
+    shape: ShapeClass | None = None
+    """Kind of object; None if that is to be found from what the first frame shows."""
 
     @property
     def reconstruction_count(self) -> int:
@@ -94,6 +98,7 @@ class SequenceMeta:
             "split": {"reconstruction": self.reconstruction_count},
             "views": [{"name": v.name, "camera": v.camera.to_dict()} for v in self.views],
             "provenance": dict(self.provenance),
+            **({} if self.shape is None else {"shape": self.shape}),
         }
 
 
@@ -152,6 +157,7 @@ def parse_meta(content: Any, where: str) -> SequenceMeta:
         surface_node_count=fields.optional_whole("surface_node_count", least=0),
         provenance=fields.take("provenance", dict, {}),
         label=fields.take("label", str, ""),
+        shape=cast("ShapeClass | None", fields.optional_choice("shape", get_args(ShapeClass))),
     )
     fields.finish()
     return meta
@@ -252,6 +258,12 @@ class _Fields:
 
     def optional_number(self, name: str) -> float | None:
         return self.number(name) if self._left.get(name) is not None else self._left.pop(name, None)
+
+    def optional_choice(self, name: str, choices: tuple[str, ...]) -> str | None:
+        value = self._left.pop(name, None)
+        if value is not None and value not in choices:
+            self.fail(name, value, f"one of {', '.join(choices)}")
+        return value
 
     def name(self, name: str) -> str:
         value = self.take(name, str)

@@ -286,6 +286,8 @@ class PipelineConfig(Settings, frozen=True, kw_only=True):
     """What the profile is for, in one line."""
     node_spacing: Annotated[float, Meta(ge=0.001, le=0.5)] = 0.01
     """Distance between object nodes sampled from what was seen [m]."""
+    most_nodes: Annotated[int, Meta(ge=1, le=1_000_000)] | None = None
+    """Most object nodes that may be sampled from what was seen; none for any number."""
     control_nodes: Literal["all", "visible"] = "all"
     """Which hand vertices become control nodes: all, or a few that a camera sees at frame 0."""
     control_count: Annotated[int, Meta(ge=1, le=10_000)] = 30

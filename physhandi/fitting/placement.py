@@ -30,7 +30,7 @@ from physhandi.hand.loading import load_hand_model
 from physhandi.hand.model import HandModel
 from physhandi.hand.motion import HandMotion, control_trajectory
 from physhandi.perception.lifting import observe_object
-from physhandi.perception.shape import object_nodes_from_observation
+from physhandi.perception.shape import ObjectShape, shape_of_nodes, shape_of_observation
 from physhandi.progress import Progress
 from physhandi.triangles import vertex_normals
 
@@ -78,7 +78,7 @@ def place_object(
     config = PipelineConfig.from_dict(run.config["profile"])
     hands = reconstruct_hands(sequence, config.hand, progress) if sequence.hands else None
     observation = observe_object(sequence, progress)
-    node, _ = object_nodes_of(sequence, observation, config.node_spacing, template)
+    node, _, _ = object_nodes_of(sequence, observation, config, template)
     velocity = np.zeros_like(node)
     if not config.object_.starts_at_rest:
         velocity = initial_velocity(observation, node, sequence.frame_rate)
@@ -95,19 +95,21 @@ def place_object(
 def object_nodes_of(
     sequence: Sequence,
     observation: ObjectObservation,
-    spacing: float,
+    config: PipelineConfig,
     template: tuple[ndarray, ndarray] | None,
-) -> tuple[Float[ndarray, "node 3"], Float[ndarray, "node 3"]]:
-    """Find the object nodes at frame 0 and their rest shape [m].
+) -> tuple[Float[ndarray, "node 3"], Float[ndarray, "node 3"], ObjectShape | None]:
+    """Find the object nodes at frame 0, their rest shape [m], and the kind of object.
 
     Args:
         sequence: Recording in which the object is placed.
         observation: Observation of the object in it.
-        spacing: Distance between nodes if they are sampled from the observation [m].
-        template: Nodes and rest shape in the first sequence, if the object is known already.
+        config: How far apart, and how many, nodes are that are sampled from the observation.
+        template: Nodes and rest shape in the first sequence, if the object is known already; then
+            its kind is not looked for again.
 
     Raises:
-        FitError: If the sequence has another number of object nodes than the template.
+        FitError: If the sequence has another number of object nodes than the template, or the
+            object would get too many.
         MissingInputError: If frame 0 shows too little of the object.
     """
     if sequence.object_node is not None:
@@ -118,10 +120,14 @@ def object_nodes_of(
                 f"Sequence '{sequence.name}' has {len(node)} object nodes (object_node.npy), but "
                 f"the object has {len(template[0])}: it is another object, or refined differently."
             )
-        return node, rest if template is None else template[1]
+        if template is not None:
+            return node, template[1], None
+        return node, rest, shape_of_nodes(node, sequence)
     if template is None:
-        node = object_nodes_from_observation(observation, spacing, sequence)
-        return node, node
+        shape = shape_of_observation(
+            observation, config.node_spacing, sequence, most_nodes=config.most_nodes
+        )
+        return shape.node, shape.node, shape
     cloud = observation.cloud[0] if observation.cloud else observation.point[0]
     cloud = cloud[np.isfinite(cloud).all(axis=1)]
     if len(cloud) < LEAST_CLOUD:
@@ -129,7 +135,7 @@ def object_nodes_of(
             f"Sequence '{sequence.name}' shows only {len(cloud)} object points in frame 0; at "
             f"least {LEAST_CLOUD} are needed to find the object. Check its depth and masks."
         )
-    return lay_object(template[0], cloud), template[1]
+    return lay_object(template[0], cloud), template[1], None
 
 
 def lay_object(

@@ -208,6 +208,8 @@ def write_report(
         parts += ["## Above the floor", "", _above_the_floor(above, hidden)]
     if charts:
         parts += ["## Charts", "", *(f"![{file}]({file})" for file in charts), ""]
+    if pictures := about.get("pictures"):
+        parts += ["## Pictures", "", *(f"![{name}](charts/{name})" for name in pictures), ""]
     parts += ["## Every sequence", "", _every_sequence(cells)]
     parts += ["## Missing output", "", _missing(about, cells)]
     parts += ["## Computed with", "", _environment(about)]

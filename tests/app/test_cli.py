@@ -374,7 +374,17 @@ def test_sequences_are_checked_file_by_file(terminal: Terminal) -> None:
     assert terminal("check", "sheet", "towel_fold", "--json") == 0
     reports = json.loads(terminal.out)
     assert reports["sheet"]["hands"] == "not in it"
+    assert reports["sheet"]["shape"] == "is found by the fit"
     assert reports["towel_fold"]["hands"] == reports["towel_fold"]["object"]
+    meta = terminal.data_dir / "sequences" / "sheet" / "sequence.yaml"
+    described = meta.read_text()
+    meta.write_text(f"{described}shape: rope\n")
+    assert terminal("check", "sheet", "--json") == 0
+    assert json.loads(terminal.out)["sheet"]["shape"] == "rope"
+    meta.write_text(f"{described}shape: ropes\n")
+    assert terminal("check", "sheet") == 1
+    assert "sequence.yaml: shape is 'ropes'; expected one of sheet, solid, shell" in terminal.out
+    meta.write_text(described)
     marker = terminal.data_dir / "sequences" / "sheet" / "marker.npy"
     marker.write_bytes(marker.read_bytes()[:-8])
     assert terminal("check", "sheet", "towel_fold") == 1

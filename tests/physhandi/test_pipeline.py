@@ -62,6 +62,22 @@ def test_every_stage_tells_its_loss_and_lowers_it(fitted: Run) -> None:
         assert len(losses[stage]["curve"]) > 2
 
 
+def test_the_kind_of_object_is_stored_with_the_run_and_told(
+    tmp_path: Path, fitted: Run, recordings: Path
+) -> None:
+    shape = fitted.yaml("object/shape.yaml")
+    assert (shape["shape"], shape["is_given"], shape["node_count"]) == ("sheet", False, len(NODE))
+    assert shape["node_spacing"] == pytest.approx(0.05)
+    assert (shape["removed"], shape["warnings"]) == ([], [])
+    told = fitted.json("losses.json")[pipeline.OBSERVATION]["note"]
+    assert told.startswith("sheet (")
+    assert told.endswith("25 nodes")
+    said = [event["message"] for event in read_events(fitted.folder)[0]]
+    assert told in said
+    again = simulate(tmp_path / "copy", fitted, recordings / "low")
+    assert again.yaml("object/shape.yaml") == shape
+
+
 def test_point_controllers_are_not_refined(fitted: Run) -> None:
     assert fitted.json("losses.json")[pipeline.REFINEMENT] == {"curve": []}
     for folder in fitted.sequences:

@@ -273,11 +273,13 @@ def test_progress_is_a_line_a_quarter_where_there_is_no_terminal() -> None:
     progress = PrintedProgress(stream)
     for iteration in range(101):
         progress.report("search", iteration, 100, loss=0.5)
-    progress.report("springs", 4, 4, message="done")
+    progress.report("springs", 4, 4)
+    progress.report("springs", 1, 1, message="done")
     progress.finish()
     assert stream.getvalue().splitlines() == [
         *(f"search {iteration}/100  loss 0.5" for iteration in (0, 25, 50, 75, 100)),
-        "springs 4/4  done",
+        "springs 4/4",
+        "springs 1/1  done",
     ]
 
 

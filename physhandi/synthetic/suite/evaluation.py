@@ -127,7 +127,9 @@ def evaluate_suite(
     before = ""
 
     def write() -> dict[str, Any]:
-        return folder.write(_environment(order), work.skipped, len(tasks) - finished)
+        missing = len(tasks) - finished
+        recordings = () if missing else order.recordings
+        return folder.write(_environment(order), work.skipped, missing, recordings)
 
     try:
         for number in range(len(tasks)) if fill is None else fill(tasks):

@@ -32,6 +32,7 @@ from physhandi.metrics.suite_report import (
     write_report,
 )
 from physhandi.synthetic.suite.cells import Outcome
+from physhandi.synthetic.suite.pictures import write_motion_pictures
 from physhandi.synthetic.suite.suite import FLOOR
 
 DENSE_ACTIONS = ("squeeze", "wipe")
@@ -94,14 +95,19 @@ class SuiteFolder:
             )
 
     def write(
-        self, environment: Mapping[str, Any], skipped: Many[str], missing: int
+        self,
+        environment: Mapping[str, Any],
+        skipped: Many[str],
+        missing: int,
+        recordings: Many[Sequence] = (),
     ) -> dict[str, Any]:
-        """Write cells, tables, report and charts of the finished cells.
+        """Write cells, tables, report, charts and pictures of the finished cells.
 
         Args:
             environment: Machine and library versions.
             skipped: Reasons for skipped cells.
             missing: Number of unfinished cells of the order.
+            recordings: Sequences of which pictures are drawn.
 
         Returns:
             ``out``, ``table`` and ``report``: paths.
@@ -122,8 +128,10 @@ class SuiteFolder:
         against = "phystwin" if "phystwin" in methods else (methods or [""])[0]
         differences = compare(scores, against)
         above = compare(scores, FLOOR) if against != FLOOR else []
+        about["pictures"] = list(write_motion_pictures(self.out / "charts", recordings, cells))
         files = write_report(about, rows, differences, above, cells)
         about["charts"] = [Path(file).name for file in files if file.startswith("charts/")]
+        about["charts"] += about["pictures"]
         columns = SEED_COLUMNS if about["seed_of"] else SUITE_COLUMNS
         paired = to_csv([*differences, *above], PAIRED_COLUMNS)
         files |= {"table.csv": to_csv(rows, columns), "paired.csv": paired}

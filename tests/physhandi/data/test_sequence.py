@@ -189,6 +189,8 @@ def test_fingerprint_follows_content_and_not_place(tmp_path: Path, folder: Path)
         ({"views": [{"name": "front", "camera": {"K": 3}}]}, "camera of view 'front': field"),
         ({"controlled_markers": [5]}, "controlled_markers 5, but marker.npy has 2"),
         ({"controlled_markers": [-1]}, "controlled_markers is -1"),
+        ({"shape": "blob"}, r"'lift': sequence\.yaml: shape is 'blob'; expected one of sheet, sol"),
+        ({"shape": ["rope"]}, "shape is .'rope'.; expected one of"),
     ],
 )
 def test_wrong_fields_are_named(folder: Path, fields: dict[str, object], message: str) -> None:
@@ -269,6 +271,18 @@ def test_trusted_motions_need_both_positions(folder: Path) -> None:
     edit(folder, controlled_markers=[])
     with pytest.raises(SequenceError, match=r"there is no marker\.npy"):
         Sequence.load(folder).validate()
+
+
+def test_a_given_shape_is_read_and_is_no_other_recording(folder: Path) -> None:
+    before = Sequence.load(folder)
+    assert before.shape is None
+    assert "shape" not in before.meta.to_dict()
+    edit(folder, shape="rope")
+    named = Sequence.load(folder)
+    assert (named.shape, named.meta.to_dict()["shape"]) == ("rope", "rope")
+    assert named.content_fingerprint() == before.content_fingerprint()
+    edit(folder, shape=None)
+    assert Sequence.load(folder).shape is None
 
 
 def test_surface_nodes_are_among_the_object_nodes(folder: Path) -> None:

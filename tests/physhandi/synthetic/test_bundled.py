@@ -12,7 +12,7 @@ from physhandi.data.sequence import Sequence
 from physhandi.data.truth import read_truth
 from physhandi.errors import CancelledError, SequenceError
 from physhandi.perception.lifting import hand_points, observe_object
-from physhandi.perception.shape import object_nodes_from_observation
+from physhandi.perception.shape import shape_of_observation
 from physhandi.progress import Progress
 from physhandi.simulation.parameters import PARAMETERS
 from physhandi.simulation.topology import virtual_springs
@@ -136,7 +136,7 @@ def test_the_bundled_sequence_is_small_valid_and_complete(bundled):
 def test_the_fit_can_touch_the_bundled_towel_where_the_hand_hides_it(bundled):
     truth = make_truth(recipe=Recipe(frame_count=2))
     observation = observe_object(bundled)
-    node = object_nodes_from_observation(observation, 0.012, bundled)
+    node = shape_of_observation(observation, 0.012, bundled).node
     assert 180 <= len(node) <= 225
     held = truth.sheet.node[cKDTree(truth.control[0]).query(truth.sheet.node)[0] < 0.008]
     assert len(held) > 20

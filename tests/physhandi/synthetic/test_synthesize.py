@@ -11,7 +11,7 @@ from physhandi.data.sequence import Sequence
 from physhandi.data.truth import read_truth
 from physhandi.errors import CancelledError, SequenceError, UsageError
 from physhandi.perception.lifting import observe_object
-from physhandi.perception.shape import object_nodes_from_observation
+from physhandi.perception.shape import shape_of_observation
 from physhandi.progress import Progress
 from physhandi.synthetic import synthesize as generator
 from physhandi.synthetic.synthesize import synthesize
@@ -44,7 +44,7 @@ def test_what_is_seen_is_near_what_happened(rope):
         near = cKDTree(known.object_point[frame]).query(observation.cloud[frame])[0]
         # Default errors: 1 mm and 0.1° of calibration, 10 ms, 1 mm of depth; the skin is coarse.
         assert 0.0005 < np.median(near) < 0.012
-    node = object_nodes_from_observation(observation, 0.012, rope)
+    node = shape_of_observation(observation, 0.012, rope).node
     assert 30 < len(node) < 400
 
 

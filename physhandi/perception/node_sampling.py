@@ -1,0 +1,268 @@
+"""Samples nodes over an object's cloud: along a flat sheet, along any surface, or through a solid.
+
+* A *flat sheet* gets a grid in its own plane, lifted to its height.
+* Any other *surface* (a sheet that hangs, bends or is folded, a shell, a rope) gets nodes evenly
+  along itself. They lie among the points that were seen, because losses compare with those: nodes
+  on the centre line of a rope would start half its thickness away.
+* A *solid* gets a voxel grid, filled from its top down to the ground, or to its lowest seen point.
+
+Gaps in a surface are closed where the hand may hide it: where no view sees past the object, or,
+without masks, where they are no wider than `MAX_GAP`. Limits: overhangs of a solid are filled, and
+what no view sees beside its outline is not invented.
+"""
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+from scipy.interpolate import griddata
+from scipy.ndimage import binary_closing, binary_fill_holes
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull, Delaunay, KDTree, QhullError
+
+from physhandi.perception.object_points import WIDEST_GAP
+from physhandi.perception.shape_class import (
+    STANDING_HEIGHT,
+    HiddenTest,
+    links,
+    poisson_disk_points,
+    rim_points,
+    spread_out,
+)
+
+MAX_GAP = 0.04
+"""Widest gap in a surface that is closed without knowing whether a hand hides it [m]."""
+_LEAST_FILL = 0.25
+"""Points of an occupied cell, as a share of the median over cells."""
+_SMOOTHED = 13
+"""Points over which a sheet's height is smoothed."""
+_FLAT_THICKNESS = 1.5
+"""Largest relief of a flat sheet, in distances between nodes."""
+_PACKING = 0.8
+"""Least distance of nodes on a surface, in distances between nodes: then each is about one such
+distance away from those around it."""
+_LARGEST_LEAN = 0.6
+"""Sine of the largest angle between a surface and the way across a gap in it."""
+_TOUCHING = 1.6
+"""Distance up to which nodes on a surface are beside each other, in distances between nodes."""
+
+
+def is_flat(cloud: Float[ndarray, "point 3"], spacing: float) -> bool:
+    """Whether a cloud is wide and lies in a plane, its outermost points left out."""
+    local = cloud - cloud.mean(axis=0)
+    axes = np.linalg.svd(local, full_matrices=False)[2]
+    if len(axes) < 3:
+        return False
+    low, high = np.percentile(local @ axes.T, [2, 98], axis=0)
+    _, width, thickness = high - low
+    return bool(thickness < _FLAT_THICKNESS * spacing and thickness < max(0.02, width))
+
+
+def flat_sheet_nodes(
+    cloud: Float[ndarray, "point 3"], spacing: float, is_hidden: HiddenTest | None
+) -> Float[ndarray, "node 3"]:
+    """Sample a grid in the plane of a sheet and lift it to the sheet's height.
+
+    Args:
+        cloud: Points on the sheet [m].
+        spacing: Edge of the grid's cells [m].
+        is_hidden: Where the sheet may continue unseen. Without it only gaps up to `MAX_GAP` and
+            holes enclosed on all sides are filled.
+    """
+    center = cloud.mean(axis=0)
+    normal = np.linalg.svd(cloud - center, full_matrices=False)[2][2]
+    basis = _sheet_basis(cloud - center, normal)
+    local = (cloud - center) @ basis.T
+    low, high = np.percentile(local[:, :2], [0.5, 99.5], axis=0)
+    shape = np.maximum(np.round((high - low) / spacing).astype(np.int64), 1)
+    start = (low + high) / 2 - shape * spacing / 2
+    cell = np.floor((local[:, :2] - start) / spacing).astype(np.int64)
+    cell = np.clip(cell, 0, shape - 1)
+    count = np.zeros(tuple(shape), dtype=np.int64)
+    np.add.at(count, (cell[:, 0], cell[:, 1]), 1)
+    is_seen = count >= max(1.0, _LEAST_FILL * float(np.median(count[count > 0])))
+    grid = start + (np.indices(tuple(shape)).reshape(2, -1).T + 0.5) * spacing
+    height = _heights(local, grid)
+    position = center + np.concatenate([grid, height[:, None]], axis=1) @ basis
+    filled = is_seen.ravel()
+    if is_hidden is None:
+        filled = filled | _close_gaps(is_seen, spacing).ravel()
+    else:
+        filled = filled | (_in_hull(grid, grid[filled], spacing) & is_hidden(position))
+    return position[filled]
+
+
+def _sheet_basis(
+    local: Float[ndarray, "point 3"], normal: Float[ndarray, " 3"]
+) -> Float[ndarray, "3 3"]:
+    """Choose axes along the sheet's sides: rows are length, width and the upward normal."""
+    normal = normal if normal[np.argmax(np.abs(normal))] > 0 else -normal
+    helper = np.eye(3)[np.argmin(np.abs(normal))]
+    first = np.cross(helper, normal)
+    first /= np.linalg.norm(first)
+    second = np.cross(normal, first)
+    flat = np.stack([local @ first, local @ second], axis=1)
+    corners = cv2.boxPoints(cv2.minAreaRect((flat * 1000).astype(np.float32)))
+    sides = np.diff(corners[:3], axis=0)
+    long = sides[int(np.argmax(np.linalg.norm(sides, axis=1)))].astype(np.float64)
+    long /= max(float(np.linalg.norm(long)), 1e-12)
+    long = long if long[np.argmax(np.abs(long))] > 0 else -long
+    length = long[0] * first + long[1] * second
+    return np.stack([length, np.cross(normal, length), normal])
+
+
+def _heights(local: Float[ndarray, "point 3"], grid: Float[ndarray, "cell 2"]) -> ndarray:
+    """Interpolate the sheet's height over its plane, and continue it level beyond the cloud.
+
+    Each point first takes the median height of those around it: beside a hand, masks let some of
+    the hand's points through.
+    """
+    around = KDTree(local[:, :2]).query(local[:, :2], k=min(_SMOOTHED, len(local)))[1]
+    smooth = np.median(local[around.reshape(len(local), -1), 2], axis=1)
+    nearest = griddata(local[:, :2], smooth, grid, method="nearest")
+    try:
+        height = griddata(local[:, :2], smooth, grid, method="linear")
+    except QhullError:
+        return nearest
+    return np.where(np.isfinite(height), height, nearest)
+
+
+def _close_gaps(seen: Bool[ndarray, "row column"], spacing: float) -> Bool[ndarray, "row column"]:
+    """Fill enclosed holes, and gaps up to `MAX_GAP` along the grid's two directions."""
+    reach = max(int(MAX_GAP / spacing), 1) + 1
+    padded = np.pad(seen, reach)
+    for structure in (np.ones((reach, 1)), np.ones((1, reach))):
+        padded = padded | np.asarray(binary_closing(padded, structure.astype(bool)), dtype=bool)
+    return np.asarray(binary_fill_holes(padded), dtype=bool)[reach:-reach, reach:-reach]
+
+
+def _in_hull(
+    grid: Float[ndarray, "cell 2"], seen: Float[ndarray, "point 2"], spacing: float
+) -> Bool[ndarray, " cell"]:
+    """Mark the cells in the convex hull of the seen ones."""
+    corner = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]) * 0.5 * spacing
+    outline = (seen[:, None] + corner).reshape(-1, 2)
+    hull = outline[ConvexHull(outline).vertices]
+    return Delaunay(hull).find_simplex(grid) >= 0
+
+
+def surface_nodes(
+    cloud: Float[ndarray, "point 3"], spacing: float, is_hidden: HiddenTest | None
+) -> Float[ndarray, "node 3"]:
+    """Sample nodes evenly along a sheet or shell of any shape, and close the gaps in it.
+
+    Args:
+        cloud: Points on the surface [m].
+        spacing: Distance between neighbouring nodes [m].
+        is_hidden: Where the surface may continue unseen.
+    """
+    node = poisson_disk_points(cloud, _PACKING * spacing)
+    is_rim, normal = rim_points(node, _TOUCHING * spacing)
+    edge = np.flatnonzero(is_rim)
+    if len(edge) < 2:
+        return node
+    widest = MAX_GAP if is_hidden is None else WIDEST_GAP
+    pair, across, length = _gaps(node, edge, spacing, widest)
+    # What lies off the surface at either end is another layer of it.
+    run = across / length[:, None]
+    lean = np.abs((normal[pair] * run[:, None]).sum(axis=2)).max(axis=1)
+    pair, across, length = (part[lean < _LARGEST_LEAN] for part in (pair, across, length))
+    bridges, owner = _bridges(node, pair, across, length, spacing)
+    is_open = np.ones(len(pair), dtype=bool)
+    beside = KDTree(node).query(bridges)[0] < _PACKING * spacing
+    np.logical_and.at(is_open, owner, ~beside)
+    if is_hidden is not None and len(bridges):
+        np.logical_and.at(is_open, owner, is_hidden(bridges))
+    order = np.lexsort((owner, length[owner]))
+    order = order[is_open[owner[order]]]
+    if len(order) == 0:
+        return node
+    added = spread_out(bridges[order], _PACKING * spacing)
+    return np.concatenate([node, added])
+
+
+def rope_nodes(
+    cloud: Float[ndarray, "point 3"], spacing: float, is_hidden: HiddenTest | None
+) -> Float[ndarray, "node 3"]:
+    """Sample nodes evenly along the seen side of a rope, and join its pieces straight.
+
+    Args:
+        cloud: Points on the rope [m].
+        spacing: Distance between neighbouring nodes [m].
+        is_hidden: Where the rope may continue unseen.
+    """
+    node = poisson_disk_points(cloud, _PACKING * spacing)
+    piece = connected_components(links(node, _TOUCHING * spacing), directed=False)[1]
+    pair, across, length = _gaps(node, np.arange(len(node)), spacing, WIDEST_GAP)
+    bridges, owner = _bridges(node, pair, across, length, spacing)
+    is_open = np.ones(len(pair), dtype=bool)
+    if is_hidden is not None and len(bridges):
+        np.logical_and.at(is_open, owner, is_hidden(bridges))
+    added = [node]
+    for index in np.flatnonzero(is_open)[np.argsort(length[is_open], kind="stable")]:
+        first, second = piece[pair[index]]
+        if first != second:
+            piece[piece == second] = first
+            added.append(bridges[owner == index])
+    return np.concatenate(added)
+
+
+def _gaps(
+    node: Float[ndarray, "node 3"], edge: Int[ndarray, " edge"], spacing: float, widest: float
+) -> tuple[Int[ndarray, "gap 2"], Float[ndarray, "gap 3"], Float[ndarray, " gap"]]:
+    """Find the pairs of nodes with a gap between them: who they are, the way across, its length."""
+    pair = edge[KDTree(node[edge]).query_pairs(widest, output_type="ndarray")]
+    across = node[pair[:, 1]] - node[pair[:, 0]]
+    length = np.linalg.norm(across, axis=1)
+    is_gap = length > _TOUCHING * spacing
+    return pair[is_gap], across[is_gap], length[is_gap]
+
+
+def _bridges(
+    node: Float[ndarray, "node 3"],
+    pair: Int[ndarray, "gap 2"],
+    across: Float[ndarray, "gap 3"],
+    length: Float[ndarray, " gap"],
+    spacing: float,
+) -> tuple[Float[ndarray, "bridge 3"], Int[ndarray, " bridge"]]:
+    """Lay evenly spaced points across gaps, and tell the gap of each."""
+    count = np.ceil(length / spacing).astype(np.int64) - 1
+    owner = np.repeat(np.arange(len(pair)), count)
+    number = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count) + 1
+    share = number / (count[owner] + 1.0)
+    return node[pair[owner, 0]] + share[:, None] * across[owner], owner
+
+
+def solid_nodes(
+    cloud: Float[ndarray, "point 3"], spacing: float, ground_height: float | None
+) -> Float[ndarray, "node 3"]:
+    """Sample the surface on a voxel grid and fill every column below its top.
+
+    Args:
+        cloud: Points on the surface [m].
+        spacing: Edge of a voxel [m].
+        ground_height: Height below which there is nothing [m].
+    """
+    low = cloud.min(axis=0)
+    stands = ground_height is not None and low[2] - ground_height < STANDING_HEIGHT
+    floor = ground_height if stands and ground_height is not None else low[2]
+    origin = np.array([low[0], low[1], floor])
+    voxel = np.floor((cloud - origin) / spacing).astype(np.int64)
+    key, owner, count = np.unique(voxel, axis=0, return_inverse=True, return_counts=True)
+    owner = owner.reshape(-1)
+    total = [np.bincount(owner, weights=cloud[:, axis]) for axis in range(3)]
+    surface = np.stack(total, axis=1) / count[:, None]
+    column, of_column = np.unique(key[:, :2], axis=0, return_inverse=True)
+    top = np.zeros(len(column), dtype=np.int64)
+    np.maximum.at(top, of_column.reshape(-1), key[:, 2])
+    inside = np.concatenate(
+        [
+            np.column_stack([np.repeat(place[None], level, axis=0), np.arange(level)])
+            for place, level in zip(column, top, strict=True)
+        ]
+    )
+    occupied = {tuple(place) for place in key.tolist()}
+    empty = np.array([place for place in inside.tolist() if tuple(place) not in occupied])
+    if len(empty) == 0:
+        return surface
+    return np.concatenate([surface, origin + (empty + 0.5) * spacing])
