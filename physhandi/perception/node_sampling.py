@@ -27,7 +27,6 @@ from physhandi.perception.shape_class import (
     links,
     poisson_disk_points,
     rim_points,
-    spread_out,
 )
 
 MAX_GAP = 0.04
@@ -43,6 +42,12 @@ _PACKING = 0.8
 distance away from those around it."""
 _LARGEST_LEAN = 0.6
 """Sine of the largest angle between a surface and the way across a gap in it."""
+_LEAST_APART = 0.6
+"""Distance below which a drawn filling is dropped beside another node, in the same."""
+_AROUND = 7
+"""Nodes about which a filling is drawn smooth, itself included."""
+_DRAWN = 20
+"""Times that it is."""
 _TOUCHING = 1.6
 """Distance up to which nodes on a surface are beside each other, in distances between nodes."""
 
@@ -161,15 +166,21 @@ def surface_nodes(
     edge = np.flatnonzero(is_rim)
     if len(edge) < 2:
         return node
+    tree = KDTree(node)
     widest = MAX_GAP if is_hidden is None else WIDEST_GAP
     pair, across, length = _gaps(node, edge, spacing, widest)
     # What lies off the surface at either end is another layer of it.
     run = across / length[:, None]
     lean = np.abs((normal[pair] * run[:, None]).sum(axis=2)).max(axis=1)
-    pair, across, length = (part[lean < _LARGEST_LEAN] for part in (pair, across, length))
+    # Most ways end right beside another node already, which saves laying the whole bridge.
+    step = np.minimum(spacing, 0.5 * length)[:, None] * run
+    is_open = lean < _LARGEST_LEAN
+    for start in (node[pair[:, 0]] + step, node[pair[:, 1]] - step):
+        is_open[is_open] = tree.query(start[is_open])[0] >= _PACKING * spacing
+    pair, across, length = (part[is_open] for part in (pair, across, length))
     bridges, owner = _bridges(node, pair, across, length, spacing)
     is_open = np.ones(len(pair), dtype=bool)
-    beside = KDTree(node).query(bridges)[0] < _PACKING * spacing
+    beside = tree.query(bridges)[0] < _PACKING * spacing
     np.logical_and.at(is_open, owner, ~beside)
     if is_hidden is not None and len(bridges):
         np.logical_and.at(is_open, owner, is_hidden(bridges))
@@ -177,8 +188,48 @@ def surface_nodes(
     order = order[is_open[owner[order]]]
     if len(order) == 0:
         return node
-    added = spread_out(bridges[order], _PACKING * spacing)
-    return np.concatenate([node, added])
+    ends = normal[pair[owner[order]]]
+    along = ends[:, 0] + ends[:, 1] * np.sign((ends[:, :1] * ends[:, 1:]).sum(axis=2))
+    along /= np.maximum(np.linalg.norm(along, axis=1), 1e-12)[:, None]
+    return np.concatenate([node, _filling(node, bridges[order], along, spacing)])
+
+
+def _filling(
+    node: Float[ndarray, "node 3"],
+    bridge: Float[ndarray, "bridge 3"],
+    normal: Float[ndarray, "bridge 3"],
+    spacing: float,
+) -> Float[ndarray, "filling 3"]:
+    """Choose one layer of the points that lie on bridges, and draw it smooth.
+
+    Bridges in different directions across a hole in a curved surface pass each other at a distance.
+
+    Args:
+        node: Nodes around the gaps [m].
+        bridge: Points on the bridges, the surest first [m].
+        normal: Direction of the surface's normal at each; zero if it is not known.
+        spacing: Distance between neighbouring nodes [m].
+    """
+    kept: list[int] = []
+    for index, (point, axis) in enumerate(zip(bridge, normal, strict=True)):
+        offset = bridge[kept] - point
+        beside = offset - np.outer(offset @ axis, axis)
+        is_near = (beside**2).sum(axis=1) < (_PACKING * spacing) ** 2
+        if not (is_near & ((offset**2).sum(axis=1) < MAX_GAP**2)).any():
+            kept.append(index)
+    filling, axis = bridge[kept].copy(), normal[kept]
+    count = min(_AROUND, len(node) + len(filling))
+    for _ in range(_DRAWN):
+        every = np.concatenate([node, filling])
+        near = KDTree(every).query(filling, k=count)[1]
+        pull = every[np.reshape(near, (len(filling), count))].mean(axis=1) - filling
+        filling += (pull * axis).sum(axis=1, keepdims=True) * axis
+    least = _LEAST_APART * spacing
+    filling = filling[KDTree(node).query(filling)[0] >= least]
+    is_kept = np.ones(len(filling), dtype=bool)
+    for first, second in sorted(KDTree(filling).query_pairs(least)):
+        is_kept[second] &= not is_kept[first]
+    return filling[is_kept]
 
 
 def rope_nodes(

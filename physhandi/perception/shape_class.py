@@ -95,7 +95,7 @@ def find_class(
     Returns:
         The same for the same points in any order.
     """
-    cell = cell_size(cloud, spacing)
+    cell = cell_size(cloud, 0.5 * spacing)
     patch = poisson_disk_points(cloud, cell)
     extent = np.sort(_extent(patch))[::-1]
     thick = max(_LEAST_LAYERS * spacing, _LEAST_SHARE_OF_WIDTH * float(extent[1]))
@@ -134,7 +134,13 @@ def poisson_disk_points(
         Points ordered by x, then y, then z; the same for the same cloud in any order.
     """
     cloud = cloud[np.lexsort(cloud.T[::-1])]
-    point = spread_out(cloud, distance)
+    is_left = np.ones(len(cloud), dtype=bool)
+    kept: list[int] = []
+    for index, around in enumerate(KDTree(cloud).query_ball_point(cloud, distance)):
+        if is_left[index]:
+            kept.append(index)
+            is_left[around] = False
+    point = cloud[kept]
     for _ in range(rounds):
         owner = KDTree(point).query(cloud)[1]
         count = np.bincount(owner, minlength=len(point))
@@ -142,18 +148,6 @@ def poisson_disk_points(
         mean = np.stack(total, axis=1) / np.maximum(count, 1)[:, None]
         point = np.where(count[:, None] > 0, mean, point)
     return point
-
-
-def spread_out(point: Float[ndarray, "point 3"], distance: float) -> Float[ndarray, "kept 3"]:
-    """Go through points in their order, and drop those that are too near to one that stays."""
-    near = KDTree(point).query_ball_point(point, distance)
-    is_left = np.ones(len(point), dtype=bool)
-    kept: list[int] = []
-    for index, around in enumerate(near):
-        if is_left[index]:
-            kept.append(index)
-            is_left[around] = False
-    return point[kept]
 
 
 def rim_points(
