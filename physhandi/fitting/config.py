@@ -220,6 +220,9 @@ class ObjectFitConfig(Settings, frozen=True, kw_only=True):
     rests_where_seen: bool = False
     """Whether nodes that lie on the ground at frame 0 stay as high above it as they were seen,
     instead of falling by the object's thickness."""
+    holds_still: bool = False
+    """Whether springs have rest lengths with which they carry the object at frame 0, against its
+    weight, instead of their lengths there, with which it sags."""
     starts_at_rest: bool = False
     """Take the object to rest at frame 0 instead of estimating its velocity (PhysTwin)."""
     automatic_substeps: bool = False

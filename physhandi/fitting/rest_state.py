@@ -1,14 +1,23 @@
-"""The object at rest in frame 0: how far above the ground its nodes touch it.
+"""The object at rest in frame 0: where its nodes touch the ground, and springs that hold it still.
 
 Nodes are points of the surface that cameras see, mostly the upper one. What lies on the ground
 keeps them above it by its thickness, and there they stay: each node that rests at frame 0 has the
-height at which it was seen as its *clearance*, the height at which it touches the ground.
+height at which it was seen as its *clearance*, the height at which it touches the ground. And what
+is seen at frame 0 is the object under its weight, so springs that were at rest there would sag.
 """
 
+from dataclasses import replace
+
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Int
 from numpy import ndarray
+from scipy.sparse import csc_array, csr_array, eye_array, hstack
+from scipy.sparse.linalg import splu
 from scipy.spatial import KDTree
+
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
+from physhandi.simulation.topology import MINIMUM_LENGTH, MINIMUM_VIRTUAL_REST_LENGTH
 
 NEAR_GROUND = 1.25
 """Height below which the lowest node of its column rests on the ground, in distances of nodes."""
@@ -20,6 +29,14 @@ NEIGHBORHOOD = 2.5
 """Radius in which an object is thick or thin, in distances of nodes."""
 THIN = 0.45
 """Largest standard deviation across a thin object's neighborhoods, in distances of nodes."""
+MOST_CHANGE = 0.2
+"""Most by which a rest length changes, as a part of it."""
+TOUCH = 1e-4
+"""A node that is no higher than this above where it touches the ground is pushed by it [m]."""
+MOST_ROUNDS = 8
+"""Rounds in which forces are put on their bounds."""
+SMALLEST_SHARE = 1e-9
+"""Of the largest term, what is added to each so that what nothing carries has no force."""
 
 
 def resting_clearance(
@@ -79,3 +96,125 @@ def _is_lowest(node: ndarray, spacing: float) -> ndarray:
     lowest = np.ones(len(node), dtype=bool)
     lowest[upper] = False
     return lowest
+
+
+def hold_still(
+    model: SpringMassModel,
+    control_0: Float[ndarray, "control 3"],
+    parameters: SimulationParameters,
+    *,
+    keeps_object: bool = False,
+) -> SpringMassModel:
+    """Change rest lengths so that the springs carry the object at frame 0, as it was seen.
+
+    Of the forces that balance the weight of every node, the ground's push at those that touch it
+    included, it takes those with the least change of strain. No rest length changes by more than
+    `MOST_CHANGE`, so that what springs cannot carry still sags; springs that are shorter than their
+    floor stay as they are.
+
+    Args:
+        model: Springs of which most are as long as at rest.
+        control_0: Control nodes at frame 0 [m].
+        parameters: Gravity, ground, floors of rest lengths and `stiffness_scale`.
+        keeps_object: Change the virtual springs only.
+    """
+    place = np.concatenate([model.object_node, control_0]).astype(np.float64)
+    offset = place[model.spring_nodes[:, 1]] - place[model.spring_nodes[:, 0]]
+    length = np.linalg.norm(offset, axis=1)
+    rest = model.rest_length.astype(np.float64)
+    stiffness = parameters.stiffness_scale * model.stiffness.astype(np.float64)
+    is_virtual = np.arange(len(rest)) >= model.object_spring_count
+    floor = np.where(
+        is_virtual,
+        max(parameters.virtual_rest_length_floor, MINIMUM_VIRTUAL_REST_LENGTH),
+        parameters.rest_length_floor,
+    )
+    acts = (stiffness > 0.0) & (length > np.maximum(floor, MINIMUM_LENGTH))
+    if not acts.any():
+        return model
+    tension = np.where(acts, stiffness * (length / rest - 1.0), 0.0)
+    shortest = np.maximum((1.0 - MOST_CHANGE) * rest, floor)
+    low = stiffness * (length / ((1.0 + MOST_CHANGE) * rest) - 1.0)
+    high = stiffness * (length / np.maximum(shortest, MINIMUM_VIRTUAL_REST_LENGTH) - 1.0)
+    may_change = acts & (is_virtual | (not keeps_object))
+
+    direction = offset / np.maximum(length, MINIMUM_LENGTH)[:, None]
+    touching = _touching(model, parameters)
+    pulls = _pulls(model, direction)
+    # The ground's push has no bound above and costs nothing.
+    ground = csr_array(
+        (np.ones(len(touching)), (3 * touching + 2, np.arange(len(touching)))),
+        shape=(3 * model.node_count, len(touching)),
+    )
+    weight = np.zeros((model.node_count, 3))
+    weight[:, 2] = parameters.gravity
+    force = _balance(
+        csr_array(hstack([pulls, ground])),
+        weight.ravel(),
+        start=np.concatenate([tension, np.zeros(len(touching))]),
+        low=np.concatenate([np.where(may_change, low, tension), np.zeros(len(touching))]),
+        high=np.concatenate([np.where(may_change, high, tension), np.full(len(touching), np.inf)]),
+        ease=np.concatenate([stiffness, np.full(len(touching), 100.0 * stiffness.max())]),
+    )[: len(rest)]
+    strain = np.divide(force, stiffness, out=np.zeros_like(force), where=acts)
+    held = np.where(may_change, length / (1.0 + strain), rest)
+    return replace(model, rest_length=held.astype(np.float32))
+
+
+def _touching(model: SpringMassModel, parameters: SimulationParameters) -> Int[ndarray, " resting"]:
+    """Find the nodes that the ground can push at."""
+    if parameters.ground_height is None:
+        return np.zeros(0, dtype=np.int64)
+    height = model.object_node[:, 2] - model.clearance - parameters.ground_height
+    return np.flatnonzero(height < TOUCH)
+
+
+def _pulls(model: SpringMassModel, direction: Float[ndarray, "spring 3"]) -> csr_array:
+    """Map tensions of springs to forces on the object nodes, three rows a node."""
+    count = len(direction)
+    spring = np.repeat(np.arange(count), 3)
+    rows, columns, values = [], [], []
+    for end, sign in ((0, 1.0), (1, -1.0)):
+        node = model.spring_nodes[:, end].astype(np.int64)
+        is_object = np.repeat(node < model.node_count, 3)
+        rows.append((3 * node[:, None] + np.arange(3)).ravel()[is_object])
+        columns.append(spring[is_object])
+        values.append(sign * direction.ravel()[is_object])
+    return csr_array(
+        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))),
+        shape=(3 * model.node_count, count),
+    )
+
+
+def _balance(
+    matrix: csr_array,
+    load: Float[ndarray, " row"],
+    *,
+    start: Float[ndarray, " column"],
+    low: Float[ndarray, " column"],
+    high: Float[ndarray, " column"],
+    ease: Float[ndarray, " column"],
+) -> Float[ndarray, " column"]:
+    """Find forces near `start` within bounds whose sums are a load, as nearly as can be.
+
+    A force's change costs the square of it over its `ease`. What would leave its bounds is put on
+    them, and the others are found anew.
+    """
+    force = np.clip(start, low, high)
+    is_free = low < high
+    for _ in range(MOST_ROUNDS):
+        missing = load - matrix @ force
+        free = matrix[:, is_free]
+        easier = free * (ease[is_free] / ease.max()) ** 2
+        normal = csc_array(easier @ free.T)
+        share = SMALLEST_SHARE * max(float(normal.diagonal().max()), 1.0)
+        solved = splu(csc_array(normal + share * eye_array(len(load)))).solve(missing)
+        force[is_free] += easier.T @ solved
+        is_out = (force < low) | (force > high)
+        force = np.clip(force, low, high)
+        if not is_out.any():
+            break
+        is_free &= ~is_out
+        if not is_free.any():
+            break
+    return force

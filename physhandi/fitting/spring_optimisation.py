@@ -27,6 +27,7 @@ from physhandi.fitting.object_problem import (
     settle_substeps,
 )
 from physhandi.fitting.preview import RolloutPreview
+from physhandi.fitting.rest_state import hold_still
 from physhandi.progress import Progress
 from physhandi.simulation import differentiable
 from physhandi.simulation.model import SpringMassModel
@@ -95,7 +96,7 @@ def optimise_springs(
     settings = config.first_order
     if settings.truncates_damping:
         parameters = _truncated(parameters)
-    models = {p.name: build_problem_model(p, parameters) for p in problems}
+    models = _starting_models(problems, parameters, config)
     # Springs may stiffen while they are fitted, so the limit is kept farther away.
     parameters = settle_substeps(
         list(models.values()), parameters, config, safety=SUBSTEP_SAFETY * SUBSTEP_SAFETY
@@ -153,6 +154,29 @@ def optimise_springs(
         curve=curve,
         stopped=stopped,
     )
+
+
+def _starting_models(
+    problems: Many[ObjectProblem], parameters: SimulationParameters, config: ObjectFitConfig
+) -> dict[str, SpringMassModel]:
+    """Build every sequence's springs; the object's own have the same rest lengths in all."""
+    models: dict[str, SpringMassModel] = {}
+    for problem in problems:
+        model = build_problem_model(problem, parameters)
+        if config.holds_still:
+            if models:
+                first = next(iter(models.values()))
+                own = first.rest_length[: first.object_spring_count]
+                virtual = model.rest_length[model.object_spring_count :]
+                model = replace(model, rest_length=np.concatenate([own, virtual]))
+            model = hold_still(
+                model,
+                problem.control[0],
+                problem_parameters(parameters, problem),
+                keeps_object=bool(models),
+            )
+        models[problem.name] = model
+    return models
 
 
 def _truncated(parameters: SimulationParameters) -> SimulationParameters:

@@ -15,6 +15,9 @@ MINIMUM_LENGTH = 1e-4
 MINIMUM_VIRTUAL_REST_LENGTH = 1e-6
 """Floor for control nodes on top of object nodes, against division by zero [m]."""
 
+SAME_LENGTH = 1e-5
+"""Rest lengths whose ratio differs from 1 by less than this are the same."""
+
 SpringList = tuple[Int32[ndarray, "spring 2"], Float[ndarray, " spring"]]
 
 
@@ -151,7 +154,8 @@ def retopologize(
     """Rebuild the springs for other radii or neighbor limits, keeping fitted values.
 
     A spring that both topologies have keeps the ratio of its stiffness and damping to the
-    global value under which it was fitted; a new spring gets the global value.
+    global value under which it was fitted; a new spring gets the global value. An object spring
+    that was given another rest length than its own in the rest shape keeps that ratio too.
 
     Args:
         model: The fitted model; not modified.
@@ -173,8 +177,12 @@ def retopologize(
     damping = built.damping.copy()
     stiffness[index] *= _ratio(model.stiffness[fitted_index], global_stiffness)
     damping[index] *= _ratio(model.damping[fitted_index], np.full(len(index), fitted.damping))
+    rest_length = built.rest_length.copy()
+    own = index[is_object]
+    rest_length[own] *= _rest_ratio(model, fitted, rest_node)[fitted_index[is_object]]
     return replace(
         built,
+        rest_length=rest_length,
         stiffness=stiffness,
         damping=damping,
         initial_velocity=model.initial_velocity,
@@ -224,6 +232,19 @@ def split_rows(
 
 def _no_springs() -> SpringList:
     return np.zeros((0, 2), dtype=np.int32), np.zeros(0)
+
+
+def _rest_ratio(
+    model: SpringMassModel, fitted: SimulationParameters, rest_node: ndarray | None
+) -> Float[ndarray, " own"]:
+    """Compare the object springs' rest lengths with those that they were laid with."""
+    rest = np.asarray(model.object_node if rest_node is None else rest_node, dtype=np.float64)
+    ends = model.spring_nodes[: model.object_spring_count]
+    length = np.linalg.norm(rest[ends[:, 1]] - rest[ends[:, 0]], axis=1)
+    laid = np.maximum(length, fitted.rest_length_floor)
+    ratio = model.rest_length[: len(ends)] / laid
+    # What only rounding changed keeps its bits.
+    return np.where(np.abs(ratio - 1.0) > SAME_LENGTH, ratio, 1.0).astype(np.float32)
 
 
 def _spring_keys(spring_nodes: ndarray, node_count: int) -> ndarray:
