@@ -87,9 +87,9 @@ method without output scores as the static object, which touches nothing. The be
 column is bold, and so is every one that prints the same; oracles do not count, and no figure is
 bold where methods have different numbers of sequences, which `n` then tells. `±` is the standard
 deviation over several seeds of the search, over which the figures of a sequence are then means.
-CD_dyn and CD_full are
-one-way and in the L1 norm, as PhysTwin computes them; `sym.` is the symmetric mean of Euclidean
-distances. All data is synthetic: these figures do not compare with those published on other data.
+CD_dyn and CD_full are one-way and in the L1 norm, as PhysTwin computes them; `sym.` is the
+symmetric mean of Euclidean distances. All data is synthetic: these figures do not compare with
+those published on other data.
 docs/evaluation.md explains the methods and protocols, docs/metrics.md every metric.
 """
 
@@ -270,7 +270,9 @@ def _spreads(
 
 
 def _intro(about: Mapping[str, Any]) -> str:
-    cases, methods = about["cases"], about["methods"]
+    cases, seed_of = about["cases"], about.get("seed_of", {})
+    # All seeds of a method are described alike.
+    methods = {seed_of.get(name, name): text for name, text in about["methods"].items()}
     lines = [f"{len(cases)} sequences: {', '.join(cases)}.", ""]
     lines += [f"* `{name}`: {text}" for name, text in methods.items()]
     if len(cases) == 1:

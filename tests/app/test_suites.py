@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import pytest
 from server_world import World
 
 from physhandi.data.sequence import Sequence
+from physhandi.metrics.suite_report import SEED_COLUMNS, read_rows, to_csv
 from physhandi.synthetic.suite.evaluation import Order, evaluate_suite
 
 METHODS = ("static", "rigid_follow", "quick@simulation.connection_radius=0.01")
@@ -57,6 +59,19 @@ def test_a_suite_shows_its_tables_and_every_cell(world: World, suite: Path) -> N
     assert f'<a href="/runs/{lost["run"]}/view">' not in page
     assert "Missing output" in page
     assert "connection_radius" in page.partition("Missing output")[2]
+
+
+def test_seeds_of_a_search_are_shown_as_their_mean(world: World, suite: Path) -> None:
+    rows = read_rows((suite / "table.csv").read_text())
+    mean = [replace(r, method="quick", spread=0.0011) for r in rows if r.method == METHODS[2]]
+    (suite / "table.csv").write_text(to_csv([*mean, *rows], SEED_COLUMNS))
+    content = json.loads((suite / "cells.json").read_text())
+    content["about"]["seed_of"] = {METHODS[2]: "quick"}
+    (suite / "cells.json").write_text(json.dumps(content))
+    tables = world.browser().get("/suites/small").text.partition("Every sequence")[0]
+    assert '<th scope="row">quick</th>' in tables
+    assert "± 1.10" in tables
+    assert f'<th scope="row">{METHODS[2]}</th>' not in tables
 
 
 def test_another_figure_is_chosen_by_the_address(world: World, suite: Path) -> None:

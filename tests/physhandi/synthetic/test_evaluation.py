@@ -241,6 +241,8 @@ def test_fits_with_several_seeds_of_the_search_are_told_as_a_mean(
     assert "| quick | " in tables
     assert " ± " in tables
     assert "search.seed" not in tables
+    assert report.count("* `quick`: ") == 1
+    assert "* `quick@" not in report
     assert "quick@object_.search.seed=2" in report.partition("## Every sequence")[2]
     # An order without seeds adds to the table and leaves the means in it.
     evaluate_suite(replace(order, methods=("rigid_follow",), search_seeds=()), tmp_path)
