@@ -119,19 +119,24 @@ def frame_0_colors(
 
 
 def photometric_curves(
-    views: Sequence[View], rollout: Float[ndarray, "frame node 3"]
+    views: Sequence[View],
+    rollout: Float[ndarray, "frame node 3"],
+    *,
+    scored: View | None = None,
 ) -> dict[str, Float[ndarray, " frame"]]:
-    """Measure every frame in the first view that has masks, as PhysTwin does.
+    """Measure every frame in one view.
 
     Args:
         views: Views of the recording; all that have color lend it to the nodes.
         rollout: Surface nodes, finite [m].
+        scored: The view, which may be one that is held out and lends no color; None takes the first
+            one that has masks, as PhysTwin does.
 
     Returns:
         ``iou``, and ``psnr`` [dB] if that view has color; nothing if no view has masks.
     """
-    view = next((view for view in views if view.has_mask), None)
-    if view is None or rollout.shape[1] < 2:
+    view = scored or next((view for view in views if view.has_mask), None)
+    if view is None or not view.has_mask or rollout.shape[1] < 2:
         return {}
     node = rollout.astype(np.float64)
     radius = DISC * resolution(node[0])

@@ -61,6 +61,10 @@ _PROPER = (
     ("track_error", "Track [mm]", _MM, 2),
     ("marker_error", "Markers [mm]", _MM, 2),
 )
+_HELD_OUT = (
+    ("iou_held_out", "IoU ↑", 1.0, 3),
+    ("psnr_held_out", "PSNR ↑", 1.0, 2),
+)
 _CONTACT = (
     ("contact_accuracy_5mm", "accuracy 5 mm ↑", 1.0, 3),
     ("contact_accuracy_10mm", "accuracy 10 mm ↑", 1.0, 3),
@@ -292,6 +296,7 @@ def tables_of(rows: Sequence[SuiteRow]) -> dict[str, list[Column]]:
     tables: dict[str, list[Column]] = {
         "Reconstruction and future prediction": _both(_PAPER),
         "The same by proper metrics": _both(_PROPER),
+        "In the view that is held out": _both(_HELD_OUT),
         "Contact": _both(_CONTACT),
     }
     for kind, title in (("dense", "Dense contact"), ("point", "Point contact")):

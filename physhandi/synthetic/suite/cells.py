@@ -438,10 +438,14 @@ def add_photometric(
     """Add IoU and PSNR to the other figures of the rollout.
 
     The run's own nodes are drawn in the colors that they have in frame 0. Missing frames show the
-    object of frame 0.
+    object of frame 0. Figures of the view that is held out, the first if there are several, end in
+    ``_held_out``.
     """
-    rollout = _complete(run or reference, recording)
-    measured = photometric_curves(recording.views, rollout[:, : recording.surface_node_count])
+    rollout = _complete(run or reference, recording)[:, : recording.surface_node_count]
+    measured = photometric_curves(recording.views, rollout)
+    for view in recording.held_out_views[:1]:
+        beside = photometric_curves(recording.views, rollout, scored=view)
+        measured |= {f"{metric}_held_out": curve for metric, curve in beside.items()}
     splits = {
         "reconstruction": recording.reconstruction_frames,
         "future": recording.future_frames,

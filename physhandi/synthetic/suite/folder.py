@@ -42,7 +42,7 @@ DENSE = 0.05
 contact points on average, over the frames in which it touches any."""
 _SPLITS = ("reconstruction", "future")
 _HANDS = {"chamfer_symmetric": "hand_chamfer", "mpjpe": "mpjpe", "surface_error": "hand_surface"}
-_SHADED = ("iou", "psnr")
+_SHADED = ("iou", "psnr", "iou_held_out", "psnr_held_out")
 _TOPOLOGY = ("rrd_object", "rrd_virtual")
 Figures = dict[str, dict[str, float]]
 """Figures by split and metric."""

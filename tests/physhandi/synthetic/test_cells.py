@@ -1,10 +1,12 @@
 """Cells: what they are scored on, when they are computed anew, and what is told of them."""
 
 import ast
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from sheet_sequence import FITTED, NODE, write_sheet
@@ -13,6 +15,7 @@ from suite_world import SETTINGS
 import physhandi
 from physhandi import pipeline
 from physhandi.data.camera import PinholeCamera
+from physhandi.data.files import write_yaml
 from physhandi.data.sequence import Sequence, ViewMeta
 from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import write_sequence
@@ -75,6 +78,32 @@ def run_with(folder: Path, recording: Sequence, rollout: np.ndarray) -> Run:
         attempt.save_array("sequences/square/rollout.npy", rollout)
         attempt.publish()
     return run
+
+
+def test_the_view_that_is_held_out_is_scored_too_and_lends_no_color(
+    seen: Sequence, tmp_path: Path
+) -> None:
+    # The same camera 10 cm, thus 20 px, to the left, which takes everything for blue.
+    aside = seen.folder / "truth/views/aside"
+    shutil.copytree(seen.folder / "views/a", aside)
+    fields = seen.views[0].camera.to_dict()
+    fields["T_world_camera"][0][3] -= 0.1
+    write_yaml(aside / "camera.yaml", fields)
+    for path in [*aside.glob("mask/*.png"), *aside.glob("color/*.png")]:
+        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        assert image is not None
+        shifted = np.roll(image, 20, axis=1)
+        cv2.imwrite(str(path), shifted[..., ::-1] if image.ndim == 3 else shifted)
+    moved = np.arange(FRAMES)[:, None, None] * np.array([0.05, 0, 0]) + square(0.02)
+    run = run_with(tmp_path / "run", seen, moved.astype(np.float32))
+    report: dict[str, Any] = {"reconstruction": {"rollout": {}}, "future": {"rollout": {}}}
+    curves: dict[str, Any] = {}
+    add_photometric(report, curves, run, run, Sequence.load(seen.folder))
+    assert curves["iou_held_out"][:2] == pytest.approx(curves["iou"][:2], abs=0.02)
+    assert min(curves["iou_held_out"][:2]) > 0.88
+    # Nodes are as red as the other views show them.
+    assert curves["psnr_held_out"][1] < curves["psnr"][1] - 3.0
+    assert report["reconstruction"]["rollout"]["iou_held_out"] == curves["iou_held_out"][1]
 
 
 @pytest.mark.parametrize("spacing", [0.02, 0.01])
