@@ -400,7 +400,10 @@ def _problems(
         object_node = artefacts.load_array(attempt.out / files.object_node)
         if clearance is None and config.object_.rests_where_seen:
             # It is the object's, which the first sequence defines.
-            clearance = resting_clearance(object_node, sequence.ground_height)
+            kind, thickness = artefacts.load_shape(attempt.out)
+            clearance = resting_clearance(
+                object_node, sequence.ground_height, kind, thickness=thickness
+            )
         problems.append(
             build_problem(
                 name=sequence.name,

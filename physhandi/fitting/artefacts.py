@@ -4,6 +4,7 @@ Paths are relative to the output folder of one attempt; docs/formats.md lists th
 """
 
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -12,11 +13,12 @@ from safetensors.numpy import load_file
 
 from physhandi.data.attempt import Attempt
 from physhandi.data.files import named_fields, parse_yaml, read_array
-from physhandi.data.layout import MATERIAL_FILE, PARAMETERS_FILE, SequenceFiles
+from physhandi.data.layout import MATERIAL_FILE, PARAMETERS_FILE, SHAPE_FILE, SequenceFiles
 from physhandi.data.observation import ObjectObservation
 from physhandi.data.run import RunFolder
 from physhandi.data.run_folder import reading
 from physhandi.data.sequence import Sequence
+from physhandi.data.sequence_meta import ShapeClass
 from physhandi.errors import RunError
 from physhandi.hand.loading import load_hand_model
 from physhandi.hand.motion import HandMotion
@@ -231,6 +233,18 @@ def load_parameters(out: Path) -> SimulationParameters:
         if content is None:
             raise ValueError("it must hold named fields")
         return SimulationParameters.from_dict(content)
+
+
+def load_shape(out: Path) -> tuple[ShapeClass, float]:
+    """Read the kind of a run's object and its local thickness [m]."""
+    path = out / SHAPE_FILE
+    with reading(path):
+        content = named_fields(parse_yaml(path.read_text(encoding="utf-8"))) or {}
+        kind = next((kind for kind in get_args(ShapeClass) if kind == content.get("shape")), None)
+        thickness = content.get("thickness")
+        if kind is None or not isinstance(thickness, int | float):
+            raise ValueError("it must name a shape and its thickness")
+        return kind, float(thickness)
 
 
 def load_rest_node(out: Path) -> Float[ndarray, "node 3"]:

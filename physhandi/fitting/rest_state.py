@@ -15,6 +15,7 @@ from scipy.sparse import csc_array, csr_array, eye_array, hstack
 from scipy.sparse.linalg import splu
 from scipy.spatial import KDTree
 
+from physhandi.data.sequence_meta import ShapeClass
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.topology import MINIMUM_LENGTH, MINIMUM_VIRTUAL_REST_LENGTH
@@ -25,10 +26,6 @@ COLUMN_RADIUS = 0.75
 """Horizontal distance of nodes that stand one above the other, in distances of nodes."""
 COLUMN_STEP = 0.25
 """Least difference of their heights, in distances of nodes."""
-NEIGHBORHOOD = 2.5
-"""Radius in which an object is thick or thin, in distances of nodes."""
-THIN = 0.45
-"""Largest standard deviation across a thin object's neighborhoods, in distances of nodes."""
 MOST_CHANGE = 0.2
 """Most by which a rest length changes, as a part of it."""
 TOUCH = 1e-4
@@ -40,17 +37,23 @@ SMALLEST_SHARE = 1e-9
 
 
 def resting_clearance(
-    node: Float[ndarray, "node 3"], ground_height: float | None
+    node: Float[ndarray, "node 3"],
+    ground_height: float | None,
+    kind: ShapeClass,
+    *,
+    thickness: float = 0.0,
 ) -> Float32[ndarray, " node"]:
     """Find the height above the ground at which each node touches it [m].
 
     A node rests if it is near the ground and the lowest of its column; its clearance is its own
-    height. Other nodes of a thin object, a sheet or a rope, come to lie as high as those that rest
-    (the median of them); others of a thick object touch the ground themselves.
+    height. Other nodes of a sheet or a rope come to lie as high as those that rest (the median of
+    them); others of a solid or a shell touch the ground themselves.
 
     Args:
         node: Object nodes at frame 0 [m].
         ground_height: Height of the ground; None without ground [m].
+        kind: Kind of object.
+        thickness: Of a rope [m]; others lie within about a node's distance of the ground.
 
     Returns:
         Clearances; all 0 where nothing rests on the ground.
@@ -61,10 +64,11 @@ def resting_clearance(
     point = np.asarray(node, dtype=np.float64)
     spacing = node_distance(point)
     height = np.maximum(point[:, 2] - ground_height, 0.0)
-    is_resting = (height < NEAR_GROUND * spacing) & _is_lowest(point, spacing)
+    reach = NEAR_GROUND * max(spacing, thickness if kind == "rope" else 0.0)
+    is_resting = (height < reach) & _is_lowest(point, spacing)
     if not is_resting.any():
         return clearance
-    if is_thin(point, spacing):
+    if kind in {"sheet", "rope"}:
         clearance[:] = np.median(height[is_resting])
     clearance[is_resting] = height[is_resting]
     return clearance
@@ -73,18 +77,6 @@ def resting_clearance(
 def node_distance(node: Float[ndarray, "node 3"]) -> float:
     """Return the median distance from a node to the one nearest to it [m]."""
     return float(np.median(KDTree(node).query(node, k=2)[0][:, 1]))
-
-
-def is_thin(node: Float[ndarray, "node 3"], spacing: float) -> bool:
-    """Whether most nodes have their neighbors in one layer, flat or bent, or in a line.
-
-    Args:
-        node: Object nodes [m].
-        spacing: Distance between neighboring nodes [m].
-    """
-    near = KDTree(node).query_ball_point(node, NEIGHBORHOOD * spacing)
-    across = [np.linalg.eigvalsh(np.cov(node[others].T, ddof=0))[0] for others in near]
-    return bool(np.sqrt(max(float(np.median(across)), 0.0)) < THIN * spacing)
 
 
 def _is_lowest(node: ndarray, spacing: float) -> ndarray:

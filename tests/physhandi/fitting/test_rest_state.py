@@ -41,7 +41,7 @@ def block(layers=4):
 
 def test_a_sheet_keeps_each_node_as_high_as_it_was_seen():
     node = sheet()
-    clearance = resting_clearance(node, GROUND)
+    clearance = resting_clearance(node, GROUND, "sheet")
     assert clearance.dtype == np.float32
     assert 0.0039 < clearance.min() < 0.0045
     assert 0.0055 < clearance.max() < 0.0061
@@ -51,7 +51,7 @@ def test_a_sheet_keeps_each_node_as_high_as_it_was_seen():
 def test_lifted_nodes_of_a_sheet_come_to_lie_as_high_as_the_others():
     node = sheet(rise=1.5)
     height = node[:, 2] - GROUND
-    clearance = resting_clearance(node, GROUND)
+    clearance = resting_clearance(node, GROUND, "sheet")
     lifted = height > 0.015
     assert 8 <= lifted.sum() < 40
     resting = np.isclose(clearance, height, atol=1e-7)
@@ -62,14 +62,24 @@ def test_lifted_nodes_of_a_sheet_come_to_lie_as_high_as_the_others():
 def test_a_rope_is_thin_too():
     x = 0.01 * np.arange(40)
     height = 0.008 + np.where(x > 0.3, 0.6 * (x - 0.3), 0.0)
-    clearance = resting_clearance(np.column_stack([x, 0.2 * x, GROUND + height]), GROUND)
+    clearance = resting_clearance(np.column_stack([x, 0.2 * x, GROUND + height]), GROUND, "rope")
     np.testing.assert_allclose(clearance, 0.008, atol=1e-3)
     assert height.max() > 0.06
 
 
-def test_only_the_lowest_nodes_of_a_solid_have_a_clearance():
+def test_a_thick_rope_rests_although_its_nodes_are_far_above_the_ground():
+    x = 0.01 * np.arange(40)
+    node = np.column_stack([x, 0.2 * x, np.full(40, GROUND + 0.02)])
+    assert not resting_clearance(node, GROUND, "rope").any()
+    found = resting_clearance(node, GROUND, "rope", thickness=0.022)
+    np.testing.assert_allclose(found, 0.02, atol=1e-6)
+    assert not resting_clearance(node, GROUND, "sheet", thickness=0.022).any()
+
+
+@pytest.mark.parametrize("kind", ["solid", "shell"])
+def test_only_the_lowest_nodes_of_a_solid_have_a_clearance(kind):
     node = block()
-    clearance = resting_clearance(node, GROUND)
+    clearance = resting_clearance(node, GROUND, kind)
     is_lowest = node[:, 2] < GROUND + 0.01
     np.testing.assert_allclose(clearance[is_lowest], 0.005, atol=1e-6)
     assert is_lowest.sum() == 36
@@ -78,14 +88,14 @@ def test_only_the_lowest_nodes_of_a_solid_have_a_clearance():
 
 @pytest.mark.parametrize("ground", [None, GROUND - 0.1])
 def test_what_does_not_lie_on_the_ground_has_no_clearance(ground):
-    for node in (sheet(), block()):
-        np.testing.assert_array_equal(resting_clearance(node, ground), np.zeros(len(node)))
+    for node, kind in ((sheet(), "sheet"), (block(), "solid")):
+        np.testing.assert_array_equal(resting_clearance(node, ground, kind), np.zeros(len(node)))
 
 
 def test_nodes_below_the_ground_do_not_sink():
     node = sheet() - np.float32([0.0, 0.0, 0.005])
     assert node[:, 2].min() < GROUND
-    clearance = resting_clearance(node, GROUND)
+    clearance = resting_clearance(node, GROUND, "sheet")
     assert clearance.min() == 0.0
     np.testing.assert_allclose(clearance, np.maximum(node[:, 2] - GROUND, 0.0), atol=1e-6)
 
@@ -95,7 +105,7 @@ def test_a_sheet_that_nobody_touches_does_not_move(device):
     model = build_model(node, np.zeros((0, 3)), PARAMETERS)
     still = np.zeros((61, 0, 3), np.float32)
     fallen = Simulator(model, PARAMETERS, device=device).rollout(still).position
-    model = replace(model, clearance=resting_clearance(node, GROUND))
+    model = replace(model, clearance=resting_clearance(node, GROUND, "sheet"))
     kept = Simulator(model, PARAMETERS, device=device).rollout(still).position
     assert np.linalg.norm(fallen - node, axis=2).max() > 0.004
     assert np.linalg.norm(kept - node, axis=2).max() < 1e-4
@@ -104,7 +114,7 @@ def test_a_sheet_that_nobody_touches_does_not_move(device):
 def test_other_parameters_and_other_controls_keep_the_clearance():
     node = sheet()
     control = np.repeat(node[None, :4] + np.float32([0.0, 0.0, 0.004]), 3, axis=0)
-    clearance = resting_clearance(node, GROUND)
+    clearance = resting_clearance(node, GROUND, "sheet")
     model = replace(build_model(node, control[0], PARAMETERS), clearance=clearance)
     fitted = FittedObject(ObjectRollout.empty(model, PARAMETERS, control))
     for changes, chosen in (
@@ -130,9 +140,9 @@ def moved(model, parameters, control=None, frames=60):
     return np.linalg.norm(position - model.object_node, axis=2).max(axis=0)
 
 
-def laid(node, parameters, control=None):
+def laid(node, parameters, control=None, kind="solid"):
     model = build_model(node, nobody() if control is None else control, parameters)
-    return replace(model, clearance=resting_clearance(node, parameters.ground_height))
+    return replace(model, clearance=resting_clearance(node, parameters.ground_height, kind))
 
 
 def test_springs_of_a_hanging_chain_carry_what_hangs_on_them():
@@ -186,7 +196,7 @@ def test_the_bundled_towel_does_not_move_before_it_is_touched():
     run = Path(__file__).parents[3] / "sequences/runs/towel_fold_quick"
     node = FittedObject.of(run).model.object_node
     parameters = PARAMETERS.replace(connection_radius=0.03, ground_height=0.0)
-    held = hold_still(laid(node, parameters), nobody(), parameters)
+    held = hold_still(laid(node, parameters, kind="sheet"), nobody(), parameters)
     assert held.clearance.min() > 0.0
     assert moved(held, parameters).max() < 5e-4
 
