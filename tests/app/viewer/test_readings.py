@@ -13,6 +13,7 @@ from app.viewer.color.legend import ColorScale, Legend, legend_html, number
 from app.viewer.color.quantities import QUANTITIES
 from app.viewer.inspect.picking import Pick
 from app.viewer.inspect.readings import HISTORIES, Readings, follow, unit_of
+from physhandi.simulation.restart import Restart
 
 
 @pytest.fixture
@@ -60,6 +61,30 @@ def test_a_spring_tells_its_length_and_pull(world):
     assert rows["joins"] == "control node 0 and node 0"
     assert rows["pull"] == "80 N"
     np.testing.assert_allclose(readings.place(virtual, take, 2, 2), [[0, 0, 1], [0, 0, 0]])
+
+
+def test_a_spring_after_a_restart_is_read_with_its_new_rest_length():
+    take = two_springs()
+    state = take.position[1].copy()
+    state[1, 0] += 0.11  # The spring of 1.1 m becomes 1.21 m long, 1.1 m of it at rest.
+    restart = Restart(frame=1, position=state, velocity=np.zeros_like(state))
+    take = replace(take, restart=restart)
+    readings = Readings(content_of(take), Painter(content_of(take)))
+    own = Pick(kind="spring", index=0)
+    before, after = (dict(readings.rows(own, take, frame, frame)) for frame in (1, 2))
+    assert before["length"] == "1100 mm, at rest 1000 mm"
+    assert "predicted from" not in before
+    assert after["length"] == "1200 mm, at rest 1100 mm"
+    assert after["strain"] == "9.09 %"
+    # 2 · 10 · 0.0909; it gets 0.01 m shorter in the frame, 30 times a second.
+    assert after["pull"] == "1.22 N"
+    assert after["predicted from"] == "the observed state at frame 1"
+    node = dict(readings.rows(Pick(kind="node", index=1), take, 2, 2))
+    assert node["velocity"].startswith("0.3 m/s")
+    assert node["predicted from"] == "the observed state at frame 1"
+    assert readings.exists(own, take)
+    curve = follow(own, "strain", take, content_of(take), Painter(content_of(take)))
+    np.testing.assert_allclose(curve, [0.0, 0.1, 1.2 / 1.1 - 1, 1.3 / 1.1 - 1], atol=1e-6)
 
 
 def test_a_control_node_tells_what_it_holds(world):
