@@ -173,11 +173,14 @@ def shape_of_nodes(node: Float[ndarray, "node 3"], sequence: Sequence) -> Object
     near = KDTree(place).query(place, k=min(2, len(place)))[0].reshape(len(place), -1)[:, -1]
     spacing = max(float(np.median(near)), _LEAST_SPACING)
     found = find_class(place, spacing, ground_height=sequence.ground_height)
+    kind, reason = found.kind, found.reason
+    if (sequence.surface_node_count or len(node)) < len(node):
+        kind, reason = "solid", "it has nodes that are not on its surface"
     return ObjectShape(
-        kind=sequence.shape or found.kind,
+        kind=sequence.shape or kind,
         is_given=sequence.shape is not None,
         thickness=found.thickness,
-        reason=found.reason,
+        reason=reason,
         spacing=spacing,
         point_count=len(node),
         removed=(),

@@ -60,6 +60,10 @@ _ROUND = 0.35
 """Thickness of wider ropes, in widths."""
 _SHORT_RIM = 0.7
 """Rim of a shell, in circumferences of a disc of the same area."""
+_LEAST_NEIGHBORS = 3
+"""Neighbors from which a point has a tangent plane."""
+_FREE_ANGLE = 2 * np.pi / 3
+"""Directions that the neighbors of a point on the rim leave free [rad]."""
 _FACING_SHARE = 0.5
 """Part of a shell's points that face another layer."""
 
@@ -156,7 +160,7 @@ def rim_points(
     """Find the points at the rim of a surface.
 
     A point is on the rim if its neighbors leave a third of the directions in its tangent plane
-    free.
+    free, or if there are too few to tell.
 
     Args:
         point: Points spread evenly over the surface [m].
@@ -166,19 +170,31 @@ def rim_points(
         Whether each point is on the rim, and the normal of each, of either sign; zero where
         too few points are near.
     """
-    is_rim = np.ones(len(point), dtype=bool)
-    normal = np.zeros((len(point), 3))
-    for index, near in enumerate(KDTree(point).query_ball_point(point, reach)):
-        around = point[near] - point[index]
-        if len(near) < 4:
-            continue
-        axes = np.linalg.svd(point[near] - point[near].mean(axis=0), full_matrices=False)[2]
-        normal[index] = axes[2]
-        flat = around[np.linalg.norm(around, axis=1) > 1e-9] @ axes[:2].T
-        angle = np.sort(np.arctan2(flat[:, 1], flat[:, 0]))
-        gap = np.diff(angle, append=angle[0] + 2 * np.pi)
-        is_rim[index] = gap.max() > 2 * np.pi / 3
-    return is_rim, normal
+    pair = KDTree(point).query_pairs(reach, output_type="ndarray")
+    pair = np.concatenate([pair, pair[:, ::-1]])
+    pair = pair[np.linalg.norm(point[pair[:, 1]] - point[pair[:, 0]], axis=1) > 1e-9]
+    own, away = pair[:, 0], point[pair[:, 1]] - point[pair[:, 0]]
+    count = np.bincount(own, minlength=len(point))
+    scatter = np.empty((len(point), 3, 3))
+    total = np.stack([np.bincount(own, away[:, axis], len(point)) for axis in range(3)], axis=1)
+    for row, column in np.ndindex(3, 3):
+        product = away[:, row] * away[:, column]
+        scatter[:, row, column] = np.bincount(own, product, len(point))
+    # The point itself belongs to its neighborhood, at no distance.
+    scatter -= total[:, :, None] * total[:, None, :] / (count + 1.0)[:, None, None]
+    axes = np.linalg.eigh(scatter)[1]
+    angle = np.arctan2((away * axes[own, :, 1]).sum(axis=1), (away * axes[own, :, 2]).sum(axis=1))
+    order = np.lexsort((angle, own))
+    own, angle = own[order], angle[order]
+    gap = np.diff(angle, append=0.0)
+    is_last = np.append(own[1:] != own[:-1], True) if len(own) else np.zeros(0, dtype=bool)
+    first = np.cumsum(count) - count
+    gap[is_last] = angle[first[own[is_last]]] + 2 * np.pi - angle[is_last]
+    widest = np.zeros(len(point))
+    np.maximum.at(widest, own, gap)
+    is_sure = count >= _LEAST_NEIGHBORS
+    normal = np.where(is_sure[:, None], axes[:, :, 0], 0.0)
+    return ~is_sure | (widest > _FREE_ANGLE), normal
 
 
 def links(point: Float[ndarray, "point 3"], reach: float) -> coo_array:
@@ -329,15 +345,16 @@ def _surface_of(
 ) -> FoundClass:
     """Tell a shell from a sheet by what a surface faces and by the length of its rim."""
     is_rim, normal = rim_points(patch, 2.0 * cell)
-    tree = KDTree(cloud)
-    spread: list[float] = []
-    gap: list[float] = []
-    for point, direction in zip(patch, normal, strict=True):
-        beside = _along(patch - point, direction, cell)
-        facing = beside[beside > thick]
-        gap += [float(facing.min())] if len(facing) else []
-        own = cloud[tree.query_ball_point(point, cell)] - point
-        spread.append(float(np.ptp(np.percentile(own @ direction, [5, 95]))))
+    gap = [
+        float(facing.min())
+        for point, direction in zip(patch, normal, strict=True)
+        if len(facing := _beside(patch - point, direction, cell, thick))
+    ]
+    near = KDTree(cloud).query_ball_point(patch, cell)
+    spread = [
+        _spread((cloud[around] - point) @ direction)
+        for point, direction, around in zip(patch, normal, near, strict=True)
+    ]
     # A patch covers a hexagon about as wide as its points are apart.
     area = np.sqrt(3) / 2 * cell**2 * len(patch)
     rim = float(is_rim.sum()) * cell / (2.0 * np.sqrt(np.pi * area))
@@ -348,10 +365,18 @@ def _surface_of(
     return FoundClass(kind="sheet", thickness=float(np.median(spread)), reason=told)
 
 
-def _along(
-    offset: Float[ndarray, "point 3"], direction: Float[ndarray, " 3"], radius: float
+def _beside(
+    offset: Float[ndarray, "point 3"], direction: Float[ndarray, " 3"], radius: float, least: float
 ) -> Float[ndarray, " beside"]:
-    """Measure how far along a line the points within `radius` of it are [m]."""
-    along = offset @ direction
-    aside = (offset**2).sum(axis=1) - along**2
-    return np.abs(along[aside < radius**2])
+    """Measure how far along a line the points within `radius` of it are, the near ones left out."""
+    along = np.abs(offset @ direction)
+    is_far = along > least
+    along, offset = along[is_far], offset[is_far]
+    return along[(offset**2).sum(axis=1) - along**2 < radius**2]
+
+
+def _spread(value: Float[ndarray, " point"]) -> float:
+    """Measure how far apart values are, without the lowest and highest twentieth."""
+    ordered = np.sort(value)
+    end = round(0.05 * (len(ordered) - 1))
+    return float(ordered[len(ordered) - 1 - end] - ordered[end])

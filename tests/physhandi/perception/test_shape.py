@@ -297,6 +297,8 @@ def test_given_nodes_have_a_class_too(plate):
     line = np.stack([along, 0.1 * np.sin(9 * along), 0.3 + 0 * along], axis=1)
     assert shape_of_nodes(line.astype(np.float32), plate).kind == "rope"
     assert shape_of_nodes(made.flat(0.3, 0.2, step=0.01).astype(np.float32), plate).kind == "sheet"
+    filled = Sequence(plate.folder, replace(plate.meta, surface_node_count=40))
+    assert shape_of_nodes(line.astype(np.float32), filled).kind == "solid"
     for count in (1, 2, 3):
         assert len(shape_of_nodes(line[:count].astype(np.float32), plate).node) == count
 
@@ -312,6 +314,20 @@ def test_too_many_nodes_are_refused_with_a_spacing_that_fits(plate):
     fits = float(words.partition("A node_spacing of ")[2].partition(" m fits")[0])
     assert 0.004 < fits <= 0.012
     assert len(shape_of_observation(observation, fits, plate, most_nodes=300).node) <= 300
+
+
+@pytest.mark.parametrize("kind", [None, "sheet", "solid", "shell", "rope"])
+def test_scanty_clouds_get_nodes_too(kind):
+    random = np.random.default_rng(0)
+    line = np.outer(np.arange(30), [0.0, 0.0, 0.01])
+    few = [np.zeros((1, 3)), np.zeros((5, 3)), random.normal(size=(2, 3)), line, line[:3, ::-1]]
+    for cloud in [*few, random.uniform(size=(40, 3)) * 0.2]:
+        for ground in (None, 0.0):
+            shape = object_shape(
+                cloud, 0.02, ground_height=ground, is_hidden=lambda p: p[:, 0] > 0, kind=kind
+            )
+            assert len(shape.node) >= 1
+            assert np.isfinite(shape.node).all()
 
 
 def test_an_empty_cloud_is_refused():
