@@ -21,6 +21,7 @@ from physhandi.data.layout import (
     METRICS_FILE,
     PARAMETERS_FILE,
     REST_NODE_FILE,
+    SEARCH_FILE,
     SHAPE_FILE,
     SequenceFiles,
 )
@@ -437,7 +438,10 @@ def _stage_search(
         return
     result = search_object(problems(), config.simulation, config.object_, progress, device=device)
     attempt.save_yaml(PARAMETERS_FILE, result.parameters.to_dict())
-    _finish(attempt, SEARCH, [result.loss_before], [result.loss_after], result.curve)
+    searched = {name: variable.to_dict() for name, variable in result.intervals.items()}
+    attempt.save_yaml(SEARCH_FILE, {"intervals": searched, "widened": list(result.widened)})
+    losses = [result.loss_before], [result.loss_after]
+    _finish(attempt, SEARCH, *losses, result.curve, note=result.note)
 
 
 def _stage_springs(

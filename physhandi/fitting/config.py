@@ -142,6 +142,16 @@ class SearchConfig(Settings, frozen=True, kw_only=True):
     of the evolution alone."""
     seed: Annotated[int, Meta(ge=1, le=2**31 - 1)] = 42
     """Seed of the random numbers."""
+    reference_spacing: Annotated[float, Meta(ge=1e-4, le=1e3)] | None = None
+    """Mean distance of neighboring nodes for which the intervals are meant [m]; for another object
+    radii, stiffness and damping are scaled (`search_bounds.scale_factors`). None takes them as they
+    are."""
+    reference_length: Annotated[float, Meta(ge=1e-3, le=1e4)] | None = None
+    """Length of the object for which the intervals are meant [m]; with it, and the reference
+    spacing, stiffness and damping go with the weight that a strand carries. None leaves them."""
+    widening_generations: Count = 0
+    """Generations that follow, once, with wider intervals where a parameter ended at a bound; 0 for
+    none."""
     variables: dict[str, SearchVariable] = field(default_factory=dict[str, SearchVariable])
     """Interval of each searched parameter, by its name in the simulation parameters."""
     tied: dict[str, str] = field(default_factory=dict[str, str])

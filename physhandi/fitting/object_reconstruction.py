@@ -24,6 +24,7 @@ from physhandi.fitting.object_problem import (
 )
 from physhandi.fitting.preview import RolloutPreview
 from physhandi.fitting.search import SEARCH_STAGE, SearchResult, search_parameters
+from physhandi.fitting.search_bounds import fit_intervals, measure_object
 from physhandi.progress import Progress
 from physhandi.simulation.engines.batch import BatchSimulator, MotionTarget
 from physhandi.simulation.master_topology import MasterTopology
@@ -52,10 +53,13 @@ def search_object(
     Raises:
         FitError: If no spring can form, or every candidate diverges.
     """
+    search = config.search
+    if search.generations:
+        search, start = fit_intervals(search, start, measure_object(problems))
     for problem in problems:
-        check_problem(problem, start, config.search)
+        check_problem(problem, start, search)
     evaluate = CandidateEvaluator(problems, config, progress, device=device)
-    return search_parameters(evaluate, start, config.search, progress)
+    return search_parameters(evaluate, start, search, progress)
 
 
 def check_problem(

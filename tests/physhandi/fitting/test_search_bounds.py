@@ -1,0 +1,209 @@
+"""Intervals follow the size of the object, and give way where the search ends at their bound."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from physhandi.data.observation import ObjectObservation
+from physhandi.fitting.config import SearchConfig, SearchVariable, load_profile
+from physhandi.fitting.object_problem import ObjectProblem, build_problem
+from physhandi.fitting.search import Evaluate, search_parameters
+from physhandi.fitting.search_bounds import (
+    bounds_met,
+    fit_intervals,
+    measure_object,
+    object_length,
+    widened,
+)
+from physhandi.progress import NullProgress
+from physhandi.simulation.parameters import SimulationParameters
+
+STIFFNESS = SearchVariable(low=1e2, high=1e4, scale="log")
+DRAG = SearchVariable(low=0.0, high=10.0)
+
+
+def rope(count: int, spacing: float, *, is_bow: bool = False) -> np.ndarray:
+    """Nodes along a line, or along three quarters of a circle of the same length [m]."""
+    way = spacing * np.arange(count)
+    if not is_bow:
+        return np.stack([way, 0 * way, 0 * way], axis=1)
+    radius = way[-1] / (1.5 * np.pi)
+    return radius * np.stack([np.cos(way / radius), np.sin(way / radius), 0 * way], axis=1)
+
+
+def held(node: np.ndarray, control: np.ndarray, gravity: float = 9.81) -> ObjectProblem:
+    motion = np.repeat(node[None].astype(np.float32), 3, axis=0)
+    seen = np.ones(motion.shape[:2], bool)
+    return build_problem(
+        name="rope",
+        observation=ObjectObservation(point=motion, is_visible=seen, is_motion_valid=seen),
+        object_node=node,
+        rest_node=node,
+        control=np.repeat(control[None].astype(np.float32), 3, axis=0),
+        frame_count=3,
+        frame_rate=30.0,
+        ground_height=None,
+        gravity=gravity,
+    )
+
+
+@pytest.mark.parametrize("is_bow", [False, True])
+def test_a_rope_is_as_long_in_a_bow_as_when_it_is_straight(is_bow: bool) -> None:
+    node = rope(61, 0.01, is_bow=is_bow)
+    assert object_length(node, 0.01) == pytest.approx(0.6, rel=0.01)
+    shuffled = np.random.default_rng(0).permutation(node)
+    assert object_length(shuffled, 0.01) == pytest.approx(0.6, rel=0.01)
+
+
+def test_of_an_object_in_pieces_the_largest_counts() -> None:
+    node = np.concatenate([rope(10, 0.01) + np.array([0, 5, 0]), rope(31, 0.01)])
+    assert object_length(node, 0.01) == pytest.approx(0.3)
+
+
+def test_an_object_is_measured_with_its_grip() -> None:
+    node = rope(61, 0.01)
+    size = measure_object([held(node, np.array([[0.0, 0.0, 0.03], [0.0, 0.025, 0.02]]))])
+    assert size.spacing == pytest.approx(0.015, rel=0.03)  # of four neighbors: 1 1 2 2
+    assert size.length == pytest.approx(0.6, rel=0.01)
+    assert size.gap == pytest.approx(0.03)
+    assert size.grip == pytest.approx(np.hypot(0.025, 0.01))
+    far = measure_object([held(node, np.array([[0.0, 0.0, 0.03], [0.6, 0.0, 0.03]]))])
+    assert far.grip == pytest.approx(4 * far.spacing)
+    dense = measure_object([held(node, rope(300, 0.002) + np.array([0.0, 0.001, 0.0]))])
+    assert dense.grip == dense.spacing
+
+
+def test_intervals_go_with_the_object() -> None:
+    """The same rope three times as large, in moon gravity, against the closed form."""
+    control = np.array([[0.0, 0.0, 0.008], [0.0, 0.02, 0.0]])
+    small = measure_object([held(rope(61, 0.01), control)])
+    variables = load_profile("default").object_.search.variables
+    config = SearchConfig(
+        reference_spacing=small.spacing, reference_length=small.length, variables=variables
+    )
+    start = SimulationParameters(connection_radius=0.02, stiffness=3e4, drag=3.0)
+    same, unchanged = fit_intervals(config, start, small)
+    for name, variable in variables.items():
+        if name != "virtual_connection_radius":
+            assert same.variables[name].low == pytest.approx(variable.low)
+            assert same.variables[name].high == pytest.approx(variable.high)
+    assert unchanged == start
+    large = measure_object([held(3 * rope(61, 0.01), 3 * control, gravity=1.62)])
+    scaled, begin = fit_intervals(config, start, large)
+    lunar = 1.62 / 9.81
+    for name, factor in {
+        "connection_radius": 3.0,
+        "stiffness": lunar,
+        "virtual_stiffness": lunar,
+        "damping": math.sqrt(lunar * 3) / 3,
+        "drag": 1.0,
+        "max_neighbors": 1.0,
+    }.items():
+        for end in ("low", "high"):
+            expected = factor * getattr(variables[name], end)
+            assert getattr(scaled.variables[name], end) == pytest.approx(expected), name
+    # 20 mm is below the interval that begins at 30 mm, 3e4 N beyond the one that ends at 1.65e4.
+    assert begin.connection_radius == pytest.approx(0.06)
+    assert begin.stiffness == pytest.approx(3e4 * lunar)
+    assert begin.drag == start.drag
+
+
+def test_virtual_springs_are_looked_for_as_far_as_the_controls_are() -> None:
+    node = rope(61, 0.01)
+    config = SearchConfig(
+        reference_spacing=0.015,
+        variables={"virtual_connection_radius": SearchVariable(low=4e-3, high=1.6e-2, scale="log")},
+    )
+    beside = measure_object([held(node, rope(61, 0.01) + np.array([0.0, 0.05, 0.0]))])
+    interval = fit_intervals(config, SimulationParameters(), beside)[0].variables
+    high = interval["virtual_connection_radius"].high
+    assert high == pytest.approx(2 * 0.05 + beside.spacing / 2)
+    away = measure_object([held(node, rope(61, 0.01) + np.array([0.0, 1.0, 0.0]))])
+    interval = fit_intervals(config, SimulationParameters(), away)[0].variables
+    assert interval["virtual_connection_radius"].high == pytest.approx(8 * away.spacing)
+    sparse = measure_object([held(node, rope(3, 0.04) + np.array([0.0, 0.001, 0.0]))])
+    interval = fit_intervals(config, SimulationParameters(), sparse)[0].variables
+    assert interval["virtual_connection_radius"].high == pytest.approx(
+        0.016 / 0.015 * sparse.grip, rel=1e-6
+    )
+    assert sparse.grip > 0.04
+
+
+def test_without_a_reference_nothing_is_scaled() -> None:
+    size = measure_object([held(rope(61, 0.03), np.zeros((1, 3)))])
+    for name in ("phystwin", "paper"):
+        profile = load_profile(name)
+        search = profile.object_.search
+        assert fit_intervals(search, profile.simulation, size) == (search, profile.simulation)
+        assert search.widening_generations == 0
+
+
+def test_a_bound_is_met_where_the_parameter_could_go_on() -> None:
+    intervals = {
+        "stiffness": STIFFNESS,
+        "drag": DRAG,
+        "friction": SearchVariable(low=0.0, high=2.0),
+        "max_neighbors": SearchVariable(low=3, high=80, scale="integer"),
+        "virtual_max_neighbors": SearchVariable(low=1, high=80, scale="integer"),
+    }
+    inside = SimulationParameters(
+        stiffness=1e3, drag=5.0, friction=1.0, max_neighbors=20, virtual_max_neighbors=6
+    )
+    assert bounds_met(inside, intervals) == {}
+    # 1.09e2 is 1.9 % of the way from 1e2 to 1e4 on a log scale, 1.11e2 is 2.3 %.
+    assert bounds_met(inside.replace(stiffness=109.0), intervals) == {"stiffness": 1e2}
+    assert bounds_met(inside.replace(stiffness=111.0), intervals) == {}
+    assert bounds_met(inside.replace(stiffness=9.9e3), intervals) == {"stiffness": 1e4}
+    assert bounds_met(inside.replace(drag=0.0), intervals) == {}
+    assert bounds_met(inside.replace(drag=9.9), intervals) == {"drag": 10.0}
+    assert bounds_met(inside.replace(friction=2.0), intervals) == {}
+    assert bounds_met(inside.replace(max_neighbors=79), intervals) == {"max_neighbors": 80}
+    assert bounds_met(inside.replace(max_neighbors=3), intervals) == {"max_neighbors": 3}
+    assert bounds_met(inside.replace(virtual_max_neighbors=1), intervals) == {}
+
+
+def test_intervals_are_lengthened_by_half_and_not_beyond_the_parameter() -> None:
+    intervals = {"stiffness": STIFFNESS, "drag": SearchVariable(low=4.0, high=10.0)}
+    high = widened(intervals, {"stiffness": 1e4, "drag": 10.0})
+    assert (high["stiffness"].low, high["stiffness"].high) == pytest.approx((1e2, 1e5))
+    assert (high["drag"].low, high["drag"].high) == pytest.approx((4.0, 13.0))
+    low = widened(intervals, {"stiffness": 1e2})
+    assert (low["stiffness"].low, low["stiffness"].high) == pytest.approx((1e1, 1e4))
+    assert low["drag"] == intervals["drag"]
+    near_zero = {"drag": SearchVariable(low=1.0, high=9.0)}
+    assert widened(near_zero, {"drag": 1.0})["drag"].low == 0.0
+
+
+def valley(best: float) -> Callable[[SimulationParameters], float]:
+    return lambda parameters: math.log(parameters.stiffness / best) ** 2
+
+
+def each(evaluate: Callable[[SimulationParameters], float]) -> Evaluate:
+    return lambda candidates: [(candidate, evaluate(candidate)) for candidate in candidates]
+
+
+def test_a_search_that_ends_at_a_bound_goes_on_beyond_it() -> None:
+    config = SearchConfig(
+        generations=12, population=8, variables={"stiffness": STIFFNESS, "drag": DRAG}
+    )
+    start = SimulationParameters(stiffness=1e3)
+    stopped = search_parameters(each(valley(5e4)), start, config, NullProgress())
+    assert stopped.parameters.stiffness == pytest.approx(1e4, rel=0.1)
+    assert stopped.widened == ()
+    assert stopped.note == ""
+    config = config.replace(widening_generations=8)
+    result = search_parameters(each(valley(5e4)), start, config, NullProgress())
+    assert result.widened == ("stiffness",)
+    assert result.intervals["stiffness"].high == pytest.approx(1e5)
+    assert result.intervals["drag"] == DRAG
+    assert result.parameters.stiffness == pytest.approx(5e4, rel=0.2)
+    assert result.loss_after < 0.1 * stopped.loss_after
+    assert len(result.curve) == 1 + 12 + 8
+    assert "stiffness to 100 to 1e+05 N" in result.note
+    inside = search_parameters(each(valley(1e3)), start, config, NullProgress())
+    assert inside.widened == ()
+    assert len(inside.curve) == 1 + 12
+    assert replace(inside, curve=[]).intervals == config.variables
