@@ -45,6 +45,7 @@ from physhandi.fitting.config import (
     load_profile,
 )
 from physhandi.fitting.config import STAGES as STAGES
+from physhandi.fitting.fit_warnings import with_warnings
 from physhandi.fitting.hand_reconstruction import reconstruct_hands
 from physhandi.fitting.object_problem import ObjectProblem, build_problem
 from physhandi.fitting.object_reconstruction import search_object
@@ -323,7 +324,8 @@ def evaluate(run: RunFolder, sequences: Many[Sequence]) -> dict[str, Any]:
         points = None
         if not run.has(SequenceFiles(sequence.name).observation("hand_point")):
             points = artefacts.lifted_hand_points(sequence)
-        scores[sequence.name] = score_run(run.out, sequence, hand_points=points)
+        measured = score_run(run.out, sequence, hand_points=points)
+        scores[sequence.name] = with_warnings(run.out, sequence, measured)
     return scores
 
 
@@ -529,7 +531,7 @@ def _measure(sequence: Sequence, attempt: Attempt) -> dict[str, Any]:
     """Score one sequence, and store the error of every frame for charts."""
     scores, frames = measure_run(attempt.out, sequence)
     attempt.save_json(SequenceFiles(sequence.name).frame_errors, frames)
-    return scores
+    return with_warnings(attempt.out, sequence, scores)
 
 
 def _finish(

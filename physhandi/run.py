@@ -1,13 +1,31 @@
 """A run as scripts, the command line and the viewer hold it: its measures and its object."""
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, cast
 
+from physhandi.data.files import named_fields
 from physhandi.data.layout import METRICS_FILE
 from physhandi.data.run import RunFolder
 
 if TYPE_CHECKING:
     from physhandi.fitted_object import FittedObject
     from physhandi.viewer_process import ViewerProcess
+
+
+def warnings_in(metrics: Mapping[str, Any]) -> list[dict[str, str]]:
+    """Collect the warnings of all sequences from what ``metrics.json`` holds.
+
+    Returns:
+        For each ``sequence code message``.
+    """
+    found: list[dict[str, str]] = []
+    for name, scores in metrics.items():
+        listed = (named_fields(scores) or {}).get("warnings")
+        for warning in cast("list[Any]", listed) if isinstance(listed, list) else []:
+            fields = named_fields(warning) or {}
+            texts = {key: str(fields.get(key, "")) for key in ("code", "message")}
+            found.append({"sequence": name, **texts})
+    return found
 
 
 class Run(RunFolder):
@@ -21,6 +39,18 @@ class Run(RunFolder):
             RunError: If the run has not been measured yet.
         """
         return self.json(METRICS_FILE)
+
+    @property
+    def warnings(self) -> list[dict[str, str]]:
+        """What there is to doubt about the fit: ``sequence code message`` each (docs/metrics.md).
+
+        Empty if there is nothing, if the run has not been measured yet, or if a version measured it
+        that looked for no doubts.
+
+        Raises:
+            RunError: If what it holds is damaged.
+        """
+        return warnings_in(self.metrics) if self.has(METRICS_FILE) else []
 
     @property
     def object(self) -> "FittedObject":

@@ -40,6 +40,13 @@ def lines(result: Mapping[str, Any], indent: int = 0) -> Iterator[str]:
                 yield from below
         elif isinstance(value, list | tuple):
             yield f"{start}{key}:"
-            yield from (f"{start}  {item}" for item in cast("list[object]", value))
+            yield from (f"{start}  {_item(item)}" for item in cast("list[object]", value))
         else:
             yield f"{start}{key}: {f'{value:.6g}' if isinstance(value, float) else value}"
+
+
+def _item(item: object) -> object:
+    """Write fields of a listed item behind each other."""
+    if not isinstance(item, Mapping):
+        return item
+    return ": ".join(str(value) for value in cast("Mapping[str, Any]", item).values())

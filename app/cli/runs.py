@@ -246,7 +246,7 @@ def _run_at(
 
 
 def _execute(run: Run, device: str) -> dict[str, Any]:
-    """Fill a run; gives its folder, the losses of its stages and its metrics."""
+    """Fill a run; gives its folder, the losses of its stages, its metrics and last its warnings."""
     from physhandi import pipeline
 
     with watched(True) as progress:
@@ -260,5 +260,11 @@ def _execute(run: Run, device: str) -> dict[str, Any]:
             if "before" in value
         }
     if finished.has(METRICS_FILE):
-        result["metrics"] = finished.json(METRICS_FILE)
+        result["metrics"] = {
+            name: {key: value for key, value in scores.items() if key != "warnings"}
+            for name, scores in finished.metrics.items()
+        }
+        result["warnings"] = [
+            f"{w['sequence']}: {w['message']} ({w['code']})" for w in finished.warnings
+        ] or None
     return result

@@ -9,6 +9,7 @@ METHOD_TEXTS = {
     "rollout": "The fitted object, simulated from frame 0 on with the motion of the hand.",
     "static": "Baseline: the object stays as it is in frame 0.",
     "rigid_follow": "Baseline: the object of frame 0 moves rigidly with the control nodes.",
+    "last_residual": "Baseline: the rollout, shifted by what it missed in the last fitted frame.",
 }
 """Explanations of the columns of a comparison."""
 _HIGHER = {"accuracy", "iou", "precision", "recall", "f1", "psnr", "ssim"}
@@ -64,7 +65,7 @@ def tabulate(scores: Any) -> dict[str, Any]:
     for name, part in fields.items():
         inside = named_fields(part)
         if inside is None:
-            if name != "unit":
+            if name not in {"unit", "warnings"}:
                 notes.append((words(name), _fact(name, part)))
             continue
         columns = {

@@ -29,6 +29,7 @@ from app.viewer.sessions import Sessions
 from physhandi.data.sequence import Sequence
 from physhandi.errors import UsageError
 from physhandi.fitting.config import named_profile, profile_names
+from physhandi.run import warnings_in
 
 _THUMBNAIL_WIDTH = 640
 
@@ -156,6 +157,7 @@ def run_values(item: RunItem, described: dict[str, Any], catalog: Catalog) -> di
     return {
         "run": described,
         "order": order_of(item, catalog),
+        "warnings": warnings_in(results.get("metrics", {})),
         "metrics": {name: tabulate(v) for name, v in results.get("metrics", {}).items()},
         "parameters": parameter_rows(item.run, final) if item.run else [],
         "environment": results.get("environment", {}),

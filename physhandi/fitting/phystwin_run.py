@@ -28,6 +28,7 @@ from physhandi.devices import describe_device
 from physhandi.errors import ImportFailedError
 from physhandi.fitting import artefacts
 from physhandi.fitting.config import load_profile
+from physhandi.fitting.fit_warnings import with_warnings
 from physhandi.metrics.report import measure_run
 from physhandi.perception.lifting import observe_object
 from physhandi.progress import NullProgress, Progress
@@ -228,6 +229,7 @@ def _finish(
         comparison = compare_rollouts(rollout, expected)
     attempt.save_json(REPORT, {**report, "inference": comparison or None})
     metrics, errors = measure_run(attempt.out, sequence)
+    metrics = with_warnings(attempt.out, sequence, metrics)
     attempt.save_json(METRICS_FILE, {sequence.name: metrics})
     attempt.save_json(files.frame_errors, errors)
     attempt.finish_stage(_STAGE, {"curve": [], **comparison})

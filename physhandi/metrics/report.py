@@ -19,7 +19,11 @@ from physhandi.data.sequence import Sequence
 from physhandi.data.truth import read_truth
 from physhandi.errors import RunError
 from physhandi.metrics.alignment import carried_points
-from physhandi.metrics.baselines import rigid_follow_baseline, static_baseline
+from physhandi.metrics.baselines import (
+    last_residual_baseline,
+    rigid_follow_baseline,
+    static_baseline,
+)
 from physhandi.metrics.contact import (
     THRESHOLDS,
     ContactLabels,
@@ -161,6 +165,10 @@ def measure_run(
             motions = {"rollout": motions["rollout"]}
         curves = {name: error_curves(nodes, reference) for name, nodes in motions.items()}
         report |= _tabulated(motions, curves, substituted, reference, splits)
+        if with_baselines and "future" in report:
+            report["future"] |= _last_residual(
+                motions["rollout"], reference, sequence.future_frames
+            )
         frames |= {name: _plain(of_method) for name, of_method in curves.items()}
         topology = read_topology(out, reference.object_node)
         if topology is not None:
@@ -185,7 +193,8 @@ def score_run(
 
     Returns:
         The table of `score_rollout` if the sequence has an object, with ``topology`` if one was
-        fitted; and ``hands`` with each hand's figures if there is anything to compare it with.
+        fitted and the track errors of ``last_residual`` in the ``future``; and ``hands`` with each
+        hand's figures if there is anything to compare it with.
 
     Raises:
         RunError: If a file of the run is damaged.
@@ -298,6 +307,31 @@ def _tabulated(
     if detail:
         report["contact"] = detail
     return report
+
+
+def _last_residual(
+    rollout: Float[ndarray, "frame node 3"], reference: ScoringReference, future_frames: range
+) -> dict[str, Any]:
+    """Measure the tracks of a prediction that is shifted by the last fitted frame's residual.
+
+    Returns:
+        The measures under ``last_residual``; nothing where no track tells a residual.
+    """
+    if reference.point is None or reference.is_visible is None:
+        return {}
+    try:
+        shifted = last_residual_baseline(
+            rollout,
+            reference.point.astype(np.float64),
+            reference.is_visible,
+            future_frames.start,
+            reference.node_of_track,
+        )
+    except ValueError:
+        return {}
+    curves = _track_curves(shifted, reference)
+    scored = list(future_frames)
+    return {"last_residual": {name: _mean(curve[scored]) for name, curve in curves.items()}}
 
 
 def _predicted(

@@ -119,9 +119,11 @@ def test_unknown_ids_are_not_found(world: QueueWorld) -> None:
 def test_a_page_shows_results_with_units_and_its_parts_alone(world: QueueWorld) -> None:
     run_id = world.launch("script")
     scores = {"rollout": {"track_error": 0.0125}, "static": {"track_error": 0.5}}
+    doubts = [{"code": "loose_nodes", "message": "3 of <12> nodes"}]
+    measured = {"unit": "m", "future": scores, "warnings": doubts}
     world.tell(
         run_id,
-        ["save", "metrics.json", {"sheet": {"unit": "m", "future": scores}}],
+        ["save", "metrics.json", {"sheet": measured}],
         ["save", "object/parameters.yaml", {"drag": 4.5, "friction": 0.3}],
         ["save", "environment.json", {"device": "cuda:7", "device_name": "A <b>card</b>"}],
         ["publish"],
@@ -131,6 +133,9 @@ def test_a_page_shows_results_with_units_and_its_parts_alone(world: QueueWorld) 
     parts = world.client.get(f"/runs/{run_id}/parts").text
     for page in (whole, parts):
         assert 'class="best">12.50' in page
+        assert "1 warning</h2>" in page
+        assert "<strong>Loose nodes:</strong> 3 of &lt;12&gt; nodes</li>" in page
+        assert page.count("of &lt;12&gt; nodes") == 1
         assert '<tr class="changed"><th scope="row"><span' in page
         assert "cuda:7 · A &lt;b&gt;card&lt;/b&gt;" in page
     assert "<html" in whole

@@ -2,6 +2,7 @@
 
 import threading
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -65,6 +66,7 @@ class ErrorPanel:
         content: Content,
         fitted: ObjectRollout,
         track_error: Float[ndarray, " frame"] | None,
+        warnings: Sequence[str] = (),
     ) -> None:
         """Add the panel.
 
@@ -73,6 +75,7 @@ class ErrorPanel:
             content: What is shown.
             fitted: The fitted rollout.
             track_error: Its error against the tracks [m]; None if it was not measured.
+            warnings: Codes of what there is to doubt about the fit.
         """
         self._lock = threading.Lock()
         self._fitted = fitted
@@ -89,6 +92,11 @@ class ErrorPanel:
         self._is_late = False
         self._folder = server.gui.add_folder("Error per frame")
         with self._folder:
+            if warnings:
+                told = ", ".join(plain(code.replace("_", " ")) for code in dict.fromkeys(warnings))
+                server.gui.add_html(
+                    f'<div style="{_STYLE}"><b>Warnings</b> of the fit: {told} (see its page)</div>'
+                )
             self._text = server.gui.add_html("")
             fit = [PlotCurve(label="fit", color=_FIT)] if np.isfinite(self._track).any() else []
             self._plot = FramePlot(

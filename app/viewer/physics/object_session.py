@@ -69,7 +69,8 @@ class ObjectSession:
         self.panel = PhysicsPanel(server, guard, content, self._rollouts, run=run, storage=storage)
         """The sliders."""
         error = load_track_error(run, content.sequence_name, fitted.frame_count)
-        self._errors = ErrorPanel(server, content, fitted, error)
+        doubts = [w["code"] for w in run.warnings if w["sequence"] == content.sequence_name]
+        self._errors = ErrorPanel(server, content, fitted, error, doubts)
         self._is_shown = True
         self._show_readout(at_once=True)
 

@@ -179,3 +179,17 @@ def test_a_slider_that_is_not_as_fitted_has_a_dot(sessions) -> None:
         assert sum(label.startswith("● ") for label in labels()) == 1
         client.set("History", "Undo")
         client.until(lambda: "drag [1/s]" in labels())
+
+
+def test_warnings_of_the_fit_are_told_without_what_html_could_mean(server_client, content) -> None:
+    server, client = server_client
+    codes = ["loose_nodes", "worse_than_static", "loose_nodes", "<b>x"]
+    panel = ErrorPanel(server, content, content.fitted, None, codes)
+
+    def told() -> str:
+        texts = (str(p.get("content", "")) for p in client.gui.values())
+        return next((text for text in texts if "Warnings" in text), "")
+
+    client.until(lambda: "of the fit: loose nodes, worse than static," in told())
+    assert "<b>x" not in told()
+    panel.remove()

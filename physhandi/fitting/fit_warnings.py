@@ -1,0 +1,222 @@
+"""What a fit knows of its own weaknesses: warnings for people, with a code for programs.
+
+`fit_warnings` looks at what a run has stored of a sequence and at its measures. The measures of
+predicted frames compare with what the recording shows there, so these warnings are results as well:
+nothing that is fitted may depend on them.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
+from physhandi.data.files import named_fields
+from physhandi.data.layout import SEARCH_FILE, SequenceFiles
+from physhandi.data.run_folder import read_yaml
+from physhandi.data.sequence import Sequence
+from physhandi.fitting import artefacts
+from physhandi.fitting.config import INTERVALS, SearchVariable
+from physhandi.fitting.search_bounds import bounds_met, describe
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import PARAMETERS
+
+Code = Literal[
+    "at_bound",
+    "worse_than_static",
+    "worse_than_rigid_follow",
+    "worse_than_last_residual",
+    "hand_holds_nothing",
+    "controls_hold_nothing",
+    "loose_nodes",
+    "few_observations",
+]
+MARGIN = 1.02
+"""Ratio of two errors from which the larger one is called worse."""
+FEW_POINTS = 10
+"""Points of the object below which a frame shows too little of it."""
+FEW_FRAMES = 0.2
+"""Share of the fitted frames that may show too little."""
+_RIVALS: dict[str, tuple[Code, str]] = {
+    "static": ("worse_than_static", "an object that stays as it is in frame 0"),
+    "rigid_follow": (
+        "worse_than_rigid_follow",
+        "an object that moves rigidly with the controls",
+    ),
+    "last_residual": (
+        "worse_than_last_residual",
+        "the same prediction shifted by what it missed in the last fitted frame",
+    ),
+}
+_SPLITS = {"reconstruction": "fitted", "future": "predicted"}
+_ADVICE = {
+    "reconstruction": "Look at the worst frames in the viewer; a longer search, or a profile with "
+    "more nodes, may help.",
+    "future": "The fitted parameters explain what was seen, but do not predict: fit more frames or "
+    "several recordings of the object.",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitWarning:
+    """One doubt about a fit."""
+
+    code: Code
+    """Which kind of doubt."""
+    message: str
+    """What was found, and what to do about it."""
+
+
+def with_warnings(out: Path, sequence: Sequence, scores: Mapping[str, Any]) -> dict[str, Any]:
+    """Add what there is to doubt to the measures of a sequence, if an object was fitted in it.
+
+    Args:
+        out: Output folder of the run.
+        sequence: The sequence.
+        scores: Its measures (`metrics.report.score_run`).
+
+    Returns:
+        The measures, with ``warnings``: ``code message`` each.
+
+    Raises:
+        RunError: If a file of the run is damaged.
+    """
+    if not (out / SequenceFiles(sequence.name).model).is_file():
+        return dict(scores)
+    found = fit_warnings(out, sequence, scores)
+    return {**scores, "warnings": [asdict(warning) for warning in found]}
+
+
+def fit_warnings(out: Path, sequence: Sequence, scores: Mapping[str, Any]) -> list[FitWarning]:
+    """Collect the doubts about a fitted object in one of its sequences.
+
+    Args:
+        out: Output folder of the run. What it does not hold, such as the intervals of the search
+            in runs of earlier versions, is not judged.
+        sequence: The sequence.
+        scores: Its measures (`metrics.report.score_run`).
+
+    Raises:
+        RunError: If a file of the run is damaged.
+    """
+    files = SequenceFiles(sequence.name)
+    found = [*_at_bounds(out), *_worse_than_baselines(scores)]
+    model = artefacts.load_model(out, sequence.name)
+    found += [*_empty_hands(out, sequence, model), *_loose_nodes(model)]
+    if (out / files.observation("point")).is_file():
+        found += _few_observations(out, sequence)
+    return found
+
+
+def _at_bounds(out: Path) -> Iterator[FitWarning]:
+    if not (out / SEARCH_FILE).is_file():
+        return
+    searched = (
+        named_fields((named_fields(read_yaml(out / SEARCH_FILE)) or {}).get("intervals")) or {}
+    )
+    intervals = {name: SearchVariable.from_dict(value) for name, value in searched.items()}
+    parameters = artefacts.load_parameters(out)
+    for name, end in bounds_met(parameters, intervals).items():
+        side = "high" if end == intervals[name].high else "low"
+        unit = PARAMETERS[name].unit
+        yield FitWarning(
+            code="at_bound",
+            message=f"{name} ended at {getattr(parameters, name):.4g}{f' {unit}' if unit else ''}, "
+            f"the {side} end of the interval in which it was searched "
+            f"({describe(name, intervals[name])}): a better value may lie beyond. Widen "
+            f"{INTERVALS}.{name}.{side}, or raise object_.search.generations.",
+        )
+
+
+def _worse_than_baselines(scores: Mapping[str, Any]) -> Iterator[FitWarning]:
+    for split, frames in _SPLITS.items():
+        part = named_fields(scores.get(split)) or {}
+        own = named_fields(part.get("rollout")) or {}
+        for rival, (code, about) in _RIVALS.items():
+            other = named_fields(part.get(rival)) or {}
+            measure = next(
+                (name for name in ("track_error", "chamfer_l2") if own.get(name) is not None), None
+            )
+            theirs = None if measure is None else other.get(measure)
+            if measure is None or theirs is None or own[measure] <= MARGIN * theirs:
+                continue
+            yield FitWarning(
+                code=code,
+                message=f"In the {frames} frames the {measure.replace('_', ' ')} is "
+                f"{1e3 * own[measure]:.1f} mm, but that of {about} is {1e3 * theirs:.1f} mm. "
+                f"{_ADVICE[split]}",
+            )
+
+
+def _empty_hands(out: Path, sequence: Sequence, model: SpringMassModel) -> Iterator[FitWarning]:
+    """Find hands, or point controllers, without a virtual spring."""
+    attached = artefacts.load_attachment(out, sequence.name)
+    if not len(attached):
+        return
+    remedy = "raise virtual_connection_radius if it should touch the object at frame 0"
+    ends = model.spring_nodes[model.object_spring_count :].max(axis=1, initial=0)
+    holding = np.unique(ends[ends >= model.node_count]) - model.node_count
+    surfaces = {
+        side: artefacts.load_array(path)[0]
+        for side in sequence.hands
+        if (path := out / SequenceFiles(sequence.name).hand_vertex(side)).is_file()
+    }
+    if sequence.control is not None or not surfaces:
+        if not len(holding):
+            yield FitWarning(
+                code="controls_hold_nothing",
+                message=f"No virtual spring joins a control node to the object: {remedy}.",
+            )
+        return
+    # Control nodes are vertices of the hands, all or some; refinement moved them a little.
+    owner = np.repeat(np.arange(len(surfaces)), [len(surface) for surface in surfaces.values()])
+    tree = KDTree(np.concatenate(list(surfaces.values())))
+    held_by = set(owner[np.asarray(tree.query(attached[holding])[1])].tolist())
+    for number, side in enumerate(surfaces):
+        if number not in held_by:
+            yield FitWarning(
+                code="hand_holds_nothing",
+                message=f"The {side} hand holds nothing: no virtual spring joins it to the object, "
+                f"so it does not move it. Check where it is in the viewer; {remedy}.",
+            )
+
+
+def _loose_nodes(model: SpringMassModel) -> Iterator[FitWarning]:
+    """Find nodes that no chain of springs joins to the largest piece of the object."""
+    count = model.node_count
+    own = slice(0, model.object_spring_count)
+    ends = model.spring_nodes[own][model.stiffness[own] > 0.0]
+    joined = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    pieces, piece = connected_components(joined, directed=False)
+    if pieces < 2:
+        return
+    loose = count - int(np.bincount(piece).max())
+    yield FitWarning(
+        code="loose_nodes",
+        message=f"{loose} of {count} nodes, in {pieces - 1} piece{'s' if pieces > 2 else ''}, are "
+        "not joined to the rest of the object and move by themselves: raise connection_radius, "
+        "or check the masks of frame 0 for background beside the object.",
+    )
+
+
+def _few_observations(out: Path, sequence: Sequence) -> Iterator[FitWarning]:
+    observation = artefacts.load_observation(out, sequence.name)
+    frames = range(1, len(sequence.reconstruction_frames))
+    seen = [
+        max(
+            int(observation.is_visible[frame].sum()),
+            len(observation.cloud[frame]) if observation.cloud else 0,
+        )
+        for frame in frames
+    ]
+    poor = sum(count < min(FEW_POINTS, observation.point.shape[1] or FEW_POINTS) for count in seen)
+    if seen and poor > FEW_FRAMES * len(seen):
+        yield FitWarning(
+            code="few_observations",
+            message=f"{poor} of {len(seen)} fitted frames show fewer than {FEW_POINTS} points of "
+            "the object, so the fit rests on little. Check masks, depth and tracks there.",
+        )
