@@ -73,6 +73,9 @@ def sheet_config(*, generations: int, population: int, iterations: int) -> Pipel
         generations=generations,
         population=population,
         variables=variables,
+        reference_spacing=None,
+        reference_length=None,
+        widening_generations=0,
     )
     first_order = config.object_.first_order.replace(iterations=iterations)
     simulation = config.simulation.replace(connection_radius=0.08, virtual_connection_radius=0.02)

@@ -99,6 +99,8 @@ class SearchVariable(Settings, frozen=True, kw_only=True):
     """Upper end of the interval, in the parameter's unit."""
     scale: Literal["linear", "log", "integer"] = "linear"
     """How the interval is walked: ``linear``, ``log`` or ``integer``."""
+    is_scaled: bool = False
+    """Whether the interval is that of the reference object and is scaled to others."""
 
     def __post_init__(self) -> None:
         """Check the values, and that the interval is one."""
@@ -143,11 +145,11 @@ class SearchConfig(Settings, frozen=True, kw_only=True):
     seed: Annotated[int, Meta(ge=1, le=2**31 - 1)] = 42
     """Seed of the random numbers."""
     reference_spacing: Annotated[float, Meta(ge=1e-4, le=1e3)] | None = None
-    """Mean distance of neighboring nodes for which the intervals are meant [m]; for another object
-    radii, stiffness and damping are scaled (`search_bounds.scale_factors`). None takes them as they
-    are."""
+    """Mean distance of neighboring nodes for which scaled intervals are meant [m]; for another
+    object radii, stiffness and damping are scaled (`search_bounds.scale_factors`). None takes all
+    intervals as they are."""
     reference_length: Annotated[float, Meta(ge=1e-3, le=1e4)] | None = None
-    """Length of the object for which the intervals are meant [m]; with it, and the reference
+    """Length of the object for which scaled intervals are meant [m]; with it, and the reference
     spacing, stiffness and damping go with the weight that a strand carries. None leaves them."""
     widening_generations: Count = 0
     """Generations that follow, once, with wider intervals where a parameter ended at a bound; 0 for
@@ -493,7 +495,8 @@ class Setting:
     unit: str
     """What it is measured in; empty for a mere number."""
     kind: SettingKind
-    """``interval`` is ``{low, high, scale}`` of a searched parameter."""
+    """``interval`` is ``{low, high, scale}`` of a searched parameter, taken as it is unless it says
+    ``is_scaled``."""
     low: float | None = None
     """Lowest value; of an interval, of its lower end."""
     high: float | None = None
@@ -684,6 +687,7 @@ def _number_or_none(value: Any) -> Any:
 
 
 _INTERVAL_FIELDS = tuple(entry.name for entry in fields_of(SearchVariable))
+_NEEDED_FIELDS = ("low", "high", "scale")
 
 
 def _override_interval(values: dict[str, Any], setting: Setting, value: Any) -> str:
@@ -722,7 +726,8 @@ def _unknown(path: str, settings: Mapping[str, Setting]) -> str:
 
 
 def _interval_problem(setting: Setting, value: Any) -> str:
-    if not isinstance(value, Mapping) or set(value) != set(_INTERVAL_FIELDS):
+    given = set(cast("Mapping[str, Any]", value)) if isinstance(value, Mapping) else set[str]()
+    if not set(_NEEDED_FIELDS) <= given <= set(_INTERVAL_FIELDS):
         return f"{setting.path} is {shown(value)}; expected low, high and scale, or nothing."
     interval = cast("Mapping[str, Any]", value)
     parameter, scale = PARAMETERS[setting.name], interval["scale"]

@@ -149,7 +149,7 @@ def fit_intervals(
     intervals: dict[str, SearchVariable] = {}
     begin: dict[str, float] = {}
     for name, variable in config.variables.items():
-        if name not in factors:
+        if name not in factors or not variable.is_scaled:
             intervals[name] = variable
             continue
         low, high = (_allowed(name, factors[name] * end) for end in (variable.low, variable.high))

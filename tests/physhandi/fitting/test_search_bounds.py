@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from physhandi.data.observation import ObjectObservation
-from physhandi.fitting.config import SearchConfig, SearchVariable, load_profile
+from physhandi.fitting.config import (
+    INTERVALS,
+    SearchConfig,
+    SearchVariable,
+    apply_overrides,
+    load_profile,
+)
 from physhandi.fitting.object_problem import ObjectProblem, build_problem
 from physhandi.fitting.search import Evaluate, search_parameters
 from physhandi.fitting.search_bounds import (
@@ -115,7 +121,11 @@ def test_virtual_springs_are_looked_for_as_far_as_the_controls_are() -> None:
     node = rope(61, 0.01)
     config = SearchConfig(
         reference_spacing=0.015,
-        variables={"virtual_connection_radius": SearchVariable(low=4e-3, high=1.6e-2, scale="log")},
+        variables={
+            "virtual_connection_radius": SearchVariable(
+                low=4e-3, high=1.6e-2, scale="log", is_scaled=True
+            )
+        },
     )
     beside = measure_object([held(node, rope(61, 0.01) + np.array([0.0, 0.05, 0.0]))])
     interval = fit_intervals(config, SimulationParameters(), beside)[0].variables
@@ -130,6 +140,18 @@ def test_virtual_springs_are_looked_for_as_far_as_the_controls_are() -> None:
         0.016 / 0.015 * sparse.grip, rel=1e-6
     )
     assert sparse.grip > 0.04
+
+
+def test_an_interval_that_a_user_gives_is_taken_as_it_is() -> None:
+    base = load_profile("quick")
+    given = {"low": 0.02, "high": 0.04, "scale": "log"}
+    search = apply_overrides(base, {f"{INTERVALS}.connection_radius": given}).object_.search
+    size = measure_object([held(rope(61, 0.03), np.zeros((1, 3)))])
+    intervals = fit_intervals(search, base.simulation, size)[0].variables
+    assert intervals["connection_radius"].to_dict() == {**given, "is_scaled": False}
+    assert intervals["stiffness"].high > 1.5 * search.variables["stiffness"].high
+    one_end = apply_overrides(base, {f"{INTERVALS}.connection_radius.high": 0.06})
+    assert one_end.object_.search.variables["connection_radius"].is_scaled
 
 
 def test_without_a_reference_nothing_is_scaled() -> None:
