@@ -409,13 +409,23 @@ def _base_of(path: Path, base: Any, extended: tuple[Path, ...]) -> PipelineConfi
     return _profile_file(other, (*extended, path.resolve()))
 
 
+def _is_whole_interval(value: Mapping[str, Any]) -> bool:
+    """Tell whether an interval is given with both ends and its scale."""
+    return set(_NEEDED_FIELDS) <= set(value)
+
+
 def _merged(base: Mapping[str, Any], own: Mapping[str, Any], path: str = "") -> dict[str, Any]:
-    """Lay fields over those of a base; a searched variable that is empty goes."""
+    """Lay fields over those of a base; a searched variable that is empty goes.
+
+    A whole interval takes nothing over, not even that the base's is scaled.
+    """
     merged = dict(base)
     for name, value in own.items():
         before, place = merged.get(name), f"{path}.{name}" if path else name
         if value is None and path == INTERVALS:
             merged.pop(name, None)
+        elif path == INTERVALS and isinstance(value, Mapping) and _is_whole_interval(value):
+            merged[name] = dict(cast("Mapping[str, Any]", value))
         elif isinstance(before, dict) and isinstance(value, Mapping):
             merged[name] = _merged(
                 cast("dict[str, Any]", before), cast("Mapping[str, Any]", value), place
@@ -577,7 +587,7 @@ def _interval(parameter: Field) -> Setting:
 def values_of(config: PipelineConfig) -> dict[str, Any]:
     """Give the values of all settings by their paths, in plain data.
 
-    An interval is none where its parameter is not searched.
+    An interval is none where its parameter is not searched, and says ``is_scaled`` only if it is.
     """
     plain = config.to_dict()
 
@@ -587,18 +597,31 @@ def values_of(config: PipelineConfig) -> dict[str, Any]:
             value = value.get(name)
         return value
 
-    return {setting.path: at(setting.path) for setting in all_settings()}
+    values = {setting.path: at(setting.path) for setting in all_settings()}
+    for path, value in values.items():
+        if path.startswith(f"{INTERVALS}.") and value and not value["is_scaled"]:
+            values[path] = {name: value[name] for name in _NEEDED_FIELDS}
+    return values
 
 
 def without_newer(config: Mapping[str, Any], stored: Mapping[str, Any]) -> dict[str, Any]:
     """Drop the settings of a configuration that a stored one was made without, in plain data."""
 
     def inside(kind: type[Settings], own: Mapping[str, Any], then: Mapping[str, Any]) -> Any:
-        groups = {e.name: e.inner for e in fields_of(kind) if e.kind == "settings"}
+        entries = {entry.name: entry for entry in fields_of(kind)}
         return {
-            name: inside(group, value, then[name]) if (group := groups.get(name)) else value
+            name: within(entries[name], value, then[name])
             for name, value in own.items()
             if name in then
+        }
+
+    def within(entry: Field, own: Any, then: Any) -> Any:
+        if entry.inner is None:
+            return own
+        if entry.kind == "settings":
+            return inside(entry.inner, own, then)
+        return {
+            key: inside(entry.inner, v, then[key]) if key in then else v for key, v in own.items()
         }
 
     return inside(PipelineConfig, config, stored)
@@ -726,8 +749,8 @@ def _unknown(path: str, settings: Mapping[str, Setting]) -> str:
 
 
 def _interval_problem(setting: Setting, value: Any) -> str:
-    given = set(cast("Mapping[str, Any]", value)) if isinstance(value, Mapping) else set[str]()
-    if not set(_NEEDED_FIELDS) <= given <= set(_INTERVAL_FIELDS):
+    given = cast("Mapping[str, Any]", value) if isinstance(value, Mapping) else {}
+    if not _is_whole_interval(given) or not set(given) <= set(_INTERVAL_FIELDS):
         return f"{setting.path} is {shown(value)}; expected low, high and scale, or nothing."
     interval = cast("Mapping[str, Any]", value)
     parameter, scale = PARAMETERS[setting.name], interval["scale"]

@@ -16,12 +16,12 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from physhandi.data.files import named_fields
-from physhandi.data.layout import SEARCH_FILE, SequenceFiles
+from physhandi.data.layout import SEARCH_FILE, SHAPE_FILE, SequenceFiles
 from physhandi.data.run_folder import read_yaml
 from physhandi.data.sequence import Sequence
 from physhandi.fitting import artefacts
 from physhandi.fitting.config import INTERVALS, SearchVariable
-from physhandi.fitting.search_bounds import bounds_met, describe
+from physhandi.fitting.search_bounds import bounds_met, interval_text
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import PARAMETERS
 
@@ -34,6 +34,7 @@ Code = Literal[
     "controls_hold_nothing",
     "loose_nodes",
     "few_observations",
+    "object_points_removed",
 ]
 MARGIN = 1.02
 """Ratio of two errors from which the larger one is called worse."""
@@ -104,12 +105,20 @@ def fit_warnings(out: Path, sequence: Sequence, scores: Mapping[str, Any]) -> li
         RunError: If a file of the run is damaged.
     """
     files = SequenceFiles(sequence.name)
-    found = [*_at_bounds(out), *_worse_than_baselines(scores)]
+    found = [*_at_bounds(out), *_worse_than_baselines(scores), *_doubts_of_shape(out)]
     model = artefacts.load_model(out, sequence.name)
     found += [*_empty_hands(out, sequence, model), *_loose_nodes(model)]
     if (out / files.observation("point")).is_file():
         found += _few_observations(out, sequence)
     return found
+
+
+def _doubts_of_shape(out: Path) -> Iterator[FitWarning]:
+    """Repeat what was found when the object got its nodes."""
+    if not (out / SHAPE_FILE).is_file():
+        return
+    for warning in (named_fields(read_yaml(out / SHAPE_FILE)) or {}).get("warnings") or ():
+        yield FitWarning(code="object_points_removed", message=str(warning["message"]))
 
 
 def _at_bounds(out: Path) -> Iterator[FitWarning]:
@@ -127,7 +136,7 @@ def _at_bounds(out: Path) -> Iterator[FitWarning]:
             code="at_bound",
             message=f"{name} ended at {getattr(parameters, name):.4g}{f' {unit}' if unit else ''}, "
             f"the {side} end of the interval in which it was searched "
-            f"({describe(name, intervals[name])}): a better value may lie beyond. Widen "
+            f"({interval_text(name, intervals[name])}): a better value may lie beyond. Widen "
             f"{INTERVALS}.{name}.{side}, or raise object_.search.generations.",
         )
 

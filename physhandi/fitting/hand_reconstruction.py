@@ -6,9 +6,8 @@ keypoints and depth.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from collections.abc import Sequence as Many
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import cv2
@@ -25,6 +24,7 @@ from physhandi.data.sequence import Sequence
 from physhandi.errors import FitError, MissingInputError
 from physhandi.fitting.adam import Adam
 from physhandi.fitting.config import HandFitConfig
+from physhandi.fitting.one_thread import one_thread
 from physhandi.hand.loading import load_hand_model
 from physhandi.hand.model import HandModel, HandSide
 from physhandi.hand.motion import HandMotion
@@ -266,7 +266,7 @@ class HandProblem:
                 progress.report(HAND_STAGE, iteration, total, value, message)
                 self._show(value, progress)
 
-        with _one_thread():
+        with one_thread():
             self._descend(
                 config.iterations, config.learning_rate, lambda i: self.loss(widening(i)), step, 0
             )
@@ -344,17 +344,6 @@ class HandProblem:
             wrist_translation=translation.detach().numpy().copy(),
             scale=1.0 if self.metric else float(scale),
         )
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Run torch on one thread: on small tensors, threads cost more than they gain."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _parameters(guess: WristGuess, frame_count: int) -> dict[str, Tensor]:

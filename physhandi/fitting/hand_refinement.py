@@ -19,6 +19,7 @@ from physhandi.errors import SimulationDivergedError
 from physhandi.fitting.config import RefinementConfig as RefinementConfig
 from physhandi.fitting.hand_reconstruction import KeypointTarget, reprojection_loss
 from physhandi.fitting.object_problem import ObjectProblem, problem_parameters
+from physhandi.fitting.one_thread import one_thread
 from physhandi.fitting.preview import RolloutPreview
 from physhandi.hand.model import HandModel, HandPose
 from physhandi.hand.motion import HandMotion, control_trajectory
@@ -85,6 +86,7 @@ class RefinedHands:
     """Iteration and mean frame loss."""
 
 
+@one_thread()
 def refine_hands(
     problem: RefinementProblem,
     config: RefinementConfig,

@@ -5,6 +5,7 @@
 """
 
 from collections.abc import Sequence as Many
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
@@ -27,6 +28,7 @@ from physhandi.fitting.search import SEARCH_STAGE, SearchResult, search_paramete
 from physhandi.fitting.search_bounds import fit_intervals, measure_object
 from physhandi.progress import Progress
 from physhandi.simulation.engines.batch import BatchSimulator, MotionTarget
+from physhandi.simulation.engines.cpu import processor_count
 from physhandi.simulation.master_topology import MasterTopology
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
@@ -152,8 +154,8 @@ def _node_gap(node: ndarray) -> float:
 class CandidateEvaluator:
     """Computes the loss of candidate parameters over all sequences.
 
-    On CUDA each sequence simulates a generation as one batch; on a CPU, or with self-collision,
-    candidates are simulated one after the other.
+    On CUDA each sequence simulates a generation as one batch; on a CPU as many candidates at once
+    as there are processors, each in a thread of its own. With self-collision they take turns.
     """
 
     def __init__(
@@ -163,6 +165,7 @@ class CandidateEvaluator:
         progress: Progress,
         *,
         device: str = "cpu",
+        threads: int | None = None,
     ) -> None:
         """Prepare the observations of all sequences.
 
@@ -171,7 +174,10 @@ class CandidateEvaluator:
             config: Weights of the loss and bounds of the substeps.
             progress: Can cancel between two simulations; shows the best candidate.
             device: Warp device.
+            threads: Candidates at once on a CPU; None for as many as processors. The bits are the
+                same.
         """
+        self._threads = threads or processor_count()
         self._problems, self._config, self._progress = problems, config, progress
         self._device = device
         self._targets = [motion_target(problem, config) for problem in problems]
@@ -258,12 +264,31 @@ class CandidateEvaluator:
                 self._device,
                 acceleration_weight=self._config.acceleration_weight,
             )
-        for part in [batch] if is_batched and batch else [[index] for index in batch]:
+        if not batch:
+            return
+        control, target = problem.control[: problem.frame_count], self._targets[row]
+
+        def simulate(part: list[int], threads: int | None = None) -> None:
             self._progress.check_cancelled()
             parameters = [problem_parameters(candidates[index], problem) for index in part]
-            simulator = BatchSimulator(master, parameters, self._device)
-            control = problem.control[: problem.frame_count]
-            losses[part] = simulator.losses(control, self._targets[row]).loss
+            simulator = BatchSimulator(master, parameters, self._device, threads=threads)
+            losses[part] = simulator.losses(control, target).loss
+
+        if is_batched:
+            simulate(batch)
+            return
+        if len(batch) == 1 or self._threads == 1:
+            for index in batch:
+                simulate([index])
+            return
+        with ThreadPoolExecutor(self._threads, thread_name_prefix="physhandi-candidate") as pool:
+            jobs = [pool.submit(simulate, [index], 1) for index in batch]
+            try:
+                for job in jobs:
+                    job.result()
+            finally:
+                for job in jobs:
+                    job.cancel()
 
 
 def motion_target(problem: ObjectProblem, config: ObjectFitConfig) -> MotionTarget:

@@ -13,7 +13,7 @@ from numpy import ndarray
 
 from physhandi.errors import FitError
 from physhandi.fitting.config import SearchConfig, SearchVariable
-from physhandi.fitting.search_bounds import bounds_met, describe, widened
+from physhandi.fitting.search_bounds import bounds_met, interval_text, widened
 from physhandi.progress import Progress
 from physhandi.simulation.parameters import SimulationParameters
 
@@ -46,7 +46,7 @@ class SearchResult:
         """What the search did beyond its settings, in a sentence; empty if nothing."""
         if not self.widened:
             return ""
-        told = (f"{name} to {describe(name, self.intervals[name])}" for name in self.widened)
+        told = (f"{name} to {interval_text(name, self.intervals[name])}" for name in self.widened)
         return f"Ended at a bound and went on with wider intervals: {', '.join(told)}."
 
 

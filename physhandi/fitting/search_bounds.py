@@ -19,7 +19,6 @@ from scipy.spatial import KDTree
 
 from physhandi.fitting.config import SearchConfig, SearchVariable
 from physhandi.fitting.object_problem import ObjectProblem
-from physhandi.metrics.topology import resolution
 from physhandi.simulation.parameters import PARAMETERS, SimulationParameters
 
 NEAR_BOUND = 0.02
@@ -30,8 +29,8 @@ STANDARD_GRAVITY = 9.81
 """Gravity under which the profiles' intervals hold [m/s²]."""
 _PATH_REACH = 2.5
 """Node spacings that one step of a path along the object may span."""
-_COARSEST_GRIP = 4.0
-"""Most node spacings that the distance of two control nodes counts as."""
+_COARSEST_GRIP = 3.0
+"""Most node spacings that the distance of two control nodes counts as: they may be two hands."""
 _FARTHEST_GRIP = 8.0
 """Node spacings up to which the virtual radius follows control nodes that are away."""
 
@@ -41,13 +40,13 @@ class ObjectSize:
     """What the scale of an object's parameters follows from; lengths in the recording's unit."""
 
     spacing: float
-    """Mean distance of the nodes from their nearest neighbors, at rest."""
+    """Mean distance of the nodes from their two nearest neighbors, at rest."""
     length: float
     """Longest of the shortest ways along the object, from node to node."""
     gravity: float
     """Acceleration downwards."""
     grip: float
-    """Distance of the control nodes from each other, at least the node spacing."""
+    """The same of the control nodes at frame 0; at least the node spacing, and at most three."""
     gap: float
     """Distance between the object and the nearest control node, at frame 0."""
 
@@ -59,13 +58,9 @@ def measure_object(problems: Many[ObjectProblem]) -> ObjectSize:
         problems: One for each recording; all have the same rest shape.
     """
     node = problems[0].rest_node.astype(np.float64)
-    spacing = resolution(node) if len(node) > 1 else 0.0
+    spacing = neighbor_distance(node)
     held = [problem for problem in problems if problem.control.shape[1]]
-    grips = [
-        resolution(problem.control[0].astype(np.float64))
-        for problem in held
-        if problem.control.shape[1] > 1
-    ]
+    grips = [neighbor_distance(problem.control[0].astype(np.float64)) for problem in held]
     gaps = [KDTree(p.object_node).query(p.control[0])[0].min() for p in held]
     gravity = abs(problems[0].gravity)
     return ObjectSize(
@@ -75,6 +70,18 @@ def measure_object(problems: Many[ObjectProblem]) -> ObjectSize:
         grip=float(np.clip(max(grips, default=0.0), spacing, _COARSEST_GRIP * spacing)),
         gap=float(max(gaps, default=0.0)),
     )
+
+
+def neighbor_distance(node: Float[ndarray, "node 3"]) -> float:
+    """Average over nodes the mean distance to their two nearest neighbors; 0 for a single node [m].
+
+    Along a rope, in a sheet and in a block that is the distance of neighbors, unlike that of four.
+    """
+    count = min(3, len(node))
+    if count < 2:
+        return 0.0
+    distance = np.asarray(KDTree(node).query(node, k=count)[0])
+    return float(distance[:, 1:].mean())
 
 
 def object_length(node: Float[ndarray, "node 3"], spacing: float) -> float:
@@ -111,8 +118,7 @@ def scale_factors(size: ObjectSize, config: SearchConfig) -> dict[str, float]:
 
     All nodes weigh the same, so a strand of springs along an object of length L with nodes at a
     distance h carries L/h of them: the stiffness that bounds its strain goes with g L/h, and the
-    dashpot that is critical beside such a spring with √(g L)/h. Radii go with h, that of virtual
-    springs with the distance of the control nodes where these are farther apart.
+    dashpot that is critical beside such a spring with √(g L)/h. Radii go with h.
 
     Returns:
         A factor for each parameter that has one; nothing if the intervals are not to be scaled.
@@ -123,7 +129,7 @@ def scale_factors(size: ObjectSize, config: SearchConfig) -> dict[str, float]:
     finer = size.spacing / reference
     factors = {
         "connection_radius": finer,
-        "virtual_connection_radius": size.grip / reference,
+        "virtual_connection_radius": finer,
         "collision_distance": finer,
     }
     if config.reference_length is not None:
@@ -139,8 +145,9 @@ def fit_intervals(
     """Scale the intervals of a search to an object, as far as its settings ask for it.
 
     The virtual radius then reaches at least half a node spacing farther than twice to the nearest
-    control node, unless that is farther than hands that hold an object are. A start outside of its
-    scaled interval is scaled likewise, one inside stays.
+    control node, and one and a half times as far as control nodes are apart, unless that is farther
+    than hands that hold an object are. A start outside of its scaled interval is scaled likewise,
+    one inside stays.
 
     Returns:
         Settings whose intervals are those of this object, and where its search starts.
@@ -154,8 +161,9 @@ def fit_intervals(
             continue
         low, high = (_allowed(name, factors[name] * end) for end in (variable.low, variable.high))
         if name == "virtual_connection_radius":
-            reach = min(2.0 * size.gap + 0.5 * size.spacing, _FARTHEST_GRIP * size.spacing)
-            high = max(high, _allowed(name, reach))
+            reach = max(2.0 * size.gap + 0.5 * size.spacing, 1.5 * size.grip)
+            farthest = _FARTHEST_GRIP * size.spacing
+            high = max(high, _allowed(name, min(reach, farthest)))
         intervals[name] = variable.replace(low=low, high=high)
         value = float(getattr(start, name))
         if not low <= value <= high:
@@ -209,7 +217,7 @@ def widened(
     return result
 
 
-def describe(name: str, variable: SearchVariable) -> str:
+def interval_text(name: str, variable: SearchVariable) -> str:
     """Write an interval for people."""
     unit = PARAMETERS[name].unit
     return f"{variable.low:.4g} to {variable.high:.4g}{f' {unit}' if unit else ''}"

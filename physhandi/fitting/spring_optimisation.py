@@ -26,6 +26,7 @@ from physhandi.fitting.object_problem import (
     problem_parameters,
     settle_substeps,
 )
+from physhandi.fitting.one_thread import one_thread
 from physhandi.fitting.preview import RolloutPreview
 from physhandi.fitting.rest_state import hold_still
 from physhandi.progress import Progress
@@ -67,6 +68,7 @@ class FirstOrderResult:
     """Why the descent ended early; empty if all iterations were made."""
 
 
+@one_thread()
 def optimise_springs(
     problems: Many[ObjectProblem],
     parameters: SimulationParameters,

@@ -167,7 +167,10 @@ def measure_run(
         report |= _tabulated(motions, curves, substituted, reference, splits)
         if with_baselines and "future" in report:
             report["future"] |= _last_residual(
-                motions["rollout"], reference, sequence.future_frames
+                motions["rollout"],
+                reference,
+                sequence.future_frames,
+                _restart_position(out / files.restart),
             )
         frames |= {name: _plain(of_method) for name, of_method in curves.items()}
         topology = read_topology(out, reference.object_node)
@@ -310,9 +313,19 @@ def _tabulated(
 
 
 def _last_residual(
-    rollout: Float[ndarray, "frame node 3"], reference: ScoringReference, future_frames: range
+    rollout: Float[ndarray, "frame node 3"],
+    reference: ScoringReference,
+    future_frames: range,
+    continued_from: Float[ndarray, "node 3"] | None,
 ) -> dict[str, Any]:
     """Measure the tracks of a prediction that is shifted by the last fitted frame's residual.
+
+    Args:
+        rollout: Simulated nodes [m].
+        reference: Observations.
+        future_frames: Frames that were held out.
+        continued_from: State of the last fitted frame from which they were simulated, if it is not
+            the rollout's own [m].
 
     Returns:
         The measures under ``last_residual``; nothing where no track tells a residual.
@@ -326,12 +339,23 @@ def _last_residual(
             reference.is_visible,
             future_frames.start,
             reference.node_of_track,
+            continued_from=continued_from,
         )
     except ValueError:
         return {}
     curves = _track_curves(shifted, reference)
     scored = list(future_frames)
     return {"last_residual": {name: _mean(curve[scored]) for name, curve in curves.items()}}
+
+
+def _restart_position(path: Path) -> Float[ndarray, "node 3"] | None:
+    """Read the state from which a prediction began; None if it began from the rollout's own."""
+    if not path.is_file():
+        return None
+    try:
+        return read_tensors(path)["position"]
+    except Exception as error:  # safetensors has no common class of errors
+        raise RunError(f"{path} is not a readable state: {error}.") from error
 
 
 def _predicted(

@@ -16,6 +16,7 @@ from jaxtyping import Float, Float32, Int
 from numpy import ndarray
 
 from physhandi.errors import SimulationDivergedError, UsageError
+from physhandi.simulation.engines.cpu import CpuEngine
 from physhandi.simulation.engines.graph import LaunchGraph
 from physhandi.simulation.engines.partition import bisect_nodes
 from physhandi.simulation.kernels.batch import (
@@ -435,7 +436,12 @@ class BatchSimulator:
     """
 
     def __init__(
-        self, master: MasterTopology, parameters: Many[SimulationParameters], device: str = "cpu"
+        self,
+        master: MasterTopology,
+        parameters: Many[SimulationParameters],
+        device: str = "cpu",
+        *,
+        threads: int | None = None,
     ) -> None:
         """Copy candidates to a device.
 
@@ -443,6 +449,8 @@ class BatchSimulator:
             master: Springs of all candidates; see `MasterTopology.of`.
             parameters: The candidates, at least one.
             device: Warp device.
+            threads: Threads of a candidate on a CPU, 1 or 2; None for whichever is faster. The
+                bits are the same.
 
         Raises:
             UsageError: If there is no candidate, or candidates differ in what must be common:
@@ -459,6 +467,7 @@ class BatchSimulator:
         self.parameters = tuple(parameters)
         self.substeps = max(p.substeps_per_frame for p in parameters)
         self.device = wp.get_device(device)
+        self._threads = threads
         self._population: Population | None = None
 
     def rollout(self, control: Float[ndarray, "frame control 3"]) -> BatchRollout:
@@ -534,4 +543,7 @@ class BatchSimulator:
         self, parameters: SimulationParameters, control: Float32[ndarray, "frame control 3"]
     ) -> Iterator[tuple[int, ndarray, ndarray]]:
         model = self.master.model(parameters)
-        return Simulator(model, parameters, device=str(self.device)).frames(control)
+        simulator = Simulator(model, parameters, device=str(self.device))
+        if self._threads is not None and isinstance(simulator.engine, CpuEngine):
+            simulator.engine.threads = self._threads
+        return simulator.frames(control)

@@ -58,7 +58,7 @@ class Pace:
             processors: Processors available to this process; None asks the system.
             clock: Current time [s].
         """
-        self._choices = (1, 2) if (processors or _processor_count()) > 1 else (1,)
+        self._choices = (1, 2) if (processors or processor_count()) > 1 else (1,)
         self._clock = clock
         self._cost: dict[int, float] = {}
         self._pause = FIRST_PAUSE
@@ -192,7 +192,7 @@ def _give_way() -> int:
     return ctypes.cast(function, ctypes.c_void_p).value or 0
 
 
-def _processor_count() -> int:
+def processor_count() -> int:
     """Count the processors that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))

@@ -1,7 +1,9 @@
 """The judge of the search against simulating and comparing each candidate with torch."""
 
 import math
+import threading
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from physhandi.fitting.object_problem import (
 )
 from physhandi.fitting.object_reconstruction import CandidateEvaluator
 from physhandi.progress import NullProgress, Preview, Progress
+from physhandi.simulation.engines.batch import BatchSimulator
 from physhandi.simulation.parameters import SimulationParameters
 
 PARAMETERS = SimulationParameters(
@@ -183,7 +186,39 @@ def test_judging_stops_between_candidates() -> None:
             if self.asked == 3:
                 raise CancelledError
 
+    problems, progress = [sheet("slow", 0.05)], Impatient()
+    with pytest.raises(CancelledError):
+        CandidateEvaluator(problems, ObjectFitConfig(), progress, threads=1)(drawn(4))
+    assert progress.asked == 3
     progress = Impatient()
     with pytest.raises(CancelledError):
-        CandidateEvaluator([sheet("slow", 0.05)], ObjectFitConfig(), progress)(drawn(4))
-    assert progress.asked == 3
+        CandidateEvaluator(problems, ObjectFitConfig(), progress, threads=2)(drawn(4))
+
+
+def test_candidates_are_simulated_at_once_with_the_same_bits(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    problems, candidates = [sheet("a", 0.2), sheet("bc", 0.3)], drawn(6)
+    alone = CandidateEvaluator(problems, ObjectFitConfig(), NullProgress(), threads=1)(candidates)
+    assert len({loss for _, loss in alone}) == 6
+    # Nobody leaves before another one has come.
+    pairs = threading.Barrier(2, timeout=60)
+    losses = BatchSimulator.losses
+
+    def met(simulator: BatchSimulator, *arguments: Any) -> Any:
+        pairs.wait()
+        return losses(simulator, *arguments)
+
+    monkeypatch.setattr(BatchSimulator, "losses", met)
+    evaluate = CandidateEvaluator(problems, ObjectFitConfig(), NullProgress(), threads=2)
+    assert evaluate(candidates) == alone
+
+
+def test_a_candidate_that_fails_in_its_thread_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: Any) -> Any:
+        raise MemoryError("no room")
+
+    monkeypatch.setattr(BatchSimulator, "losses", broken)
+    evaluate = CandidateEvaluator([sheet("a", 0.2)], ObjectFitConfig(), NullProgress(), threads=2)
+    with pytest.raises(MemoryError, match="no room"):
+        evaluate(drawn(3))

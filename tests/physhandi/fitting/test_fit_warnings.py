@@ -192,6 +192,27 @@ def test_frames_that_show_little_are_counted(stored: Stored, sequence: Sequence)
     assert "few_observations" not in found(stored, sequence)
 
 
+def test_what_was_found_with_the_nodes_is_repeated(stored: Stored, sequence: Sequence) -> None:
+    stored.array("rollout", GRID + RISE)
+    doubt = {"code": "object_points_removed", "message": "70 of 90 points are a wall"}
+    stored.yaml("shape", {"shape": "sheet", "warnings": [doubt]})
+    assert found(stored, sequence) == {"object_points_removed": ["70 of 90 points are a wall"]}
+    stored.yaml("shape", {"shape": "sheet", "warnings": []})
+    assert found(stored, sequence) == {}
+
+
+def test_a_prediction_from_an_observed_state_has_the_residual_of_that_state(
+    stored: Stored, sequence: Sequence
+) -> None:
+    state = {"position": (GRID + RISE[FITTED - 1]).astype(np.float32)}
+    save_file(state, stored.folder / "restart.safetensors")
+    scores = score_run(stored.out, sequence)["future"]
+    assert scores["last_residual"]["track_error"] == pytest.approx(
+        scores["rollout"]["track_error"], rel=1e-3
+    )
+    assert "worse_than_last_residual" not in found(stored, sequence)
+
+
 def test_warnings_of_all_sequences_are_listed() -> None:
     doubt = {"code": "loose_nodes", "message": "3 of 12"}
     metrics = {"a": {"unit": "m"}, "b": {"warnings": [doubt]}, "c": {"warnings": []}}

@@ -7,6 +7,7 @@ import pytest
 
 from physhandi.errors import SettingsError, UsageError
 from physhandi.fitting.config import (
+    SearchVariable,
     apply_overrides,
     load_profile,
     named_profile,
@@ -41,10 +42,25 @@ def test_a_file_says_only_what_differs_from_its_base(write) -> None:
     assert (config.profile, config.description) == ("mine", "Softer cloth.")
     assert overrides_of(config, DEFAULT) == {
         "object_.search.generations": 5,
-        "object_.search.variables.stiffness": {"low": 300.0, "high": 1e6, "scale": "log"},
+        "object_.search.variables.stiffness": {
+            "low": 300.0,
+            "high": 1e6,
+            "scale": "log",
+            "is_scaled": True,
+        },
         "object_.search.variables.friction": None,
     }
     assert load_profile(str(path)) == config
+
+
+def test_an_interval_that_a_file_gives_as_a_whole_is_taken_as_it_is(write) -> None:
+    whole = "{low: 2e3, high: 1e4, scale: linear}"
+    config = load_profile(
+        write(f"base: quick\nobject_:\n  search:\n    variables:\n      stiffness: {whole}\n")
+    )
+    variables = config.object_.search.variables
+    assert variables["stiffness"] == SearchVariable(low=2e3, high=1e4, scale="linear")
+    assert variables["virtual_stiffness"].is_scaled
 
 
 def test_a_file_may_extend_another_file_but_not_itself(write) -> None:

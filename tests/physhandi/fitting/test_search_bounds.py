@@ -72,12 +72,12 @@ def test_of_an_object_in_pieces_the_largest_counts() -> None:
 def test_an_object_is_measured_with_its_grip() -> None:
     node = rope(61, 0.01)
     size = measure_object([held(node, np.array([[0.0, 0.0, 0.03], [0.0, 0.025, 0.02]]))])
-    assert size.spacing == pytest.approx(0.015, rel=0.03)  # of four neighbors: 1 1 2 2
+    assert size.spacing == pytest.approx(0.01 * 62 / 61)  # Those at the ends have 1 and 2.
     assert size.length == pytest.approx(0.6, rel=0.01)
     assert size.gap == pytest.approx(0.03)
     assert size.grip == pytest.approx(np.hypot(0.025, 0.01))
     far = measure_object([held(node, np.array([[0.0, 0.0, 0.03], [0.6, 0.0, 0.03]]))])
-    assert far.grip == pytest.approx(4 * far.spacing)
+    assert far.grip == pytest.approx(3 * far.spacing)
     dense = measure_object([held(node, rope(300, 0.002) + np.array([0.0, 0.001, 0.0]))])
     assert dense.grip == dense.spacing
 
@@ -120,26 +120,28 @@ def test_intervals_go_with_the_object() -> None:
 def test_virtual_springs_are_looked_for_as_far_as_the_controls_are() -> None:
     node = rope(61, 0.01)
     config = SearchConfig(
-        reference_spacing=0.015,
+        reference_spacing=0.01,
         variables={
             "virtual_connection_radius": SearchVariable(
                 low=4e-3, high=1.6e-2, scale="log", is_scaled=True
             )
         },
     )
-    beside = measure_object([held(node, rope(61, 0.01) + np.array([0.0, 0.05, 0.0]))])
-    interval = fit_intervals(config, SimulationParameters(), beside)[0].variables
-    high = interval["virtual_connection_radius"].high
-    assert high == pytest.approx(2 * 0.05 + beside.spacing / 2)
-    away = measure_object([held(node, rope(61, 0.01) + np.array([0.0, 1.0, 0.0]))])
-    interval = fit_intervals(config, SimulationParameters(), away)[0].variables
-    assert interval["virtual_connection_radius"].high == pytest.approx(8 * away.spacing)
-    sparse = measure_object([held(node, rope(3, 0.04) + np.array([0.0, 0.001, 0.0]))])
-    interval = fit_intervals(config, SimulationParameters(), sparse)[0].variables
-    assert interval["virtual_connection_radius"].high == pytest.approx(
-        0.016 / 0.015 * sparse.grip, rel=1e-6
-    )
-    assert sparse.grip > 0.04
+
+    def widest(control: np.ndarray) -> float:
+        size = measure_object([held(node, control)])
+        intervals = fit_intervals(config, SimulationParameters(), size)[0].variables
+        return intervals["virtual_connection_radius"].high
+
+    h = 0.01 * 62 / 61
+    beside = np.array([0.0, 1.0, 0.0])
+    dense = rope(301, 0.002)
+    assert widest(dense + 0.001 * beside) == pytest.approx(1.6 * h)
+    assert widest(dense + 0.02 * beside) == pytest.approx(2 * 0.02 + h / 2)
+    assert widest(dense + 0.5 * beside) == pytest.approx(8 * h)
+    # 20 mm apart, but for those at the ends.
+    assert widest(rope(31, 0.02) + 0.001 * beside) == pytest.approx(1.5 * 0.02 * 32 / 31)
+    assert widest(rope(2, 0.6) + 0.001 * beside) == pytest.approx(1.5 * 3 * h)
 
 
 def test_an_interval_that_a_user_gives_is_taken_as_it_is() -> None:
