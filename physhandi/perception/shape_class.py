@@ -359,7 +359,8 @@ def _surface_of(
     area = np.sqrt(3) / 2 * cell**2 * len(patch)
     rim = float(is_rim.sum()) * cell / (2.0 * np.sqrt(np.pi * area))
     share = len(gap) / max(len(patch), 1)
-    told = f"{100 * share:.0f} % of it face another side, rim {rim:.1f} times that of a disc"
+    layers = f"{100 * share:.0f} % of its points face another layer" if share else "in one layer"
+    told = f"{layers}, its rim is {rim:.1f} times as long as that of a disc"
     if share >= _FACING_SHARE and rim < _SHORT_RIM:
         return FoundClass(kind="shell", thickness=float(np.median(gap)), reason=told)
     return FoundClass(kind="sheet", thickness=float(np.median(spread)), reason=told)
