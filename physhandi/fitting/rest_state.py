@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Float32, Int
 from numpy import ndarray
-from scipy.sparse import csc_array, csr_array, eye_array, hstack
+from scipy.sparse import csc_array, csr_array, diags_array
 from scipy.sparse.linalg import splu
 from scipy.spatial import KDTree
 
@@ -26,14 +26,16 @@ COLUMN_RADIUS = 0.75
 """Horizontal distance of nodes that stand one above the other, in distances of nodes."""
 COLUMN_STEP = 0.25
 """Least difference of their heights, in distances of nodes."""
-MOST_CHANGE = 0.2
+MOST_CHANGE = 0.05
 """Most by which a rest length changes, as a part of it."""
 TOUCH = 1e-4
 """A node that is no higher than this above where it touches the ground is pushed by it [m]."""
+EASE_OF_GROUND = 1e3
+"""Ease of the ground's push, in terms of the stiffest springs."""
+SHARES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
+"""How dear uncarried load is: the first with which no rest length changes too much counts."""
 MOST_ROUNDS = 8
-"""Rounds in which forces are put on their bounds."""
-SMALLEST_SHARE = 1e-9
-"""Of the largest term, what is added to each so that what nothing carries has no force."""
+"""Rounds in which nodes that the ground would have to pull at are found to hang."""
 
 
 def resting_clearance(
@@ -101,8 +103,8 @@ def hold_still(
 
     Of the forces that balance the weight of every node, the ground's push at those that touch it
     included, it takes those with the least change of strain. No rest length changes by more than
-    `MOST_CHANGE`, so that what springs cannot carry still sags; springs that are shorter than their
-    floor stay as they are.
+    `MOST_CHANGE`: where that is not enough, as in a cloth that hangs in the air, less of the weight
+    is carried everywhere, and it sags. Springs that are shorter than their floor stay as they are.
 
     Args:
         model: Springs of which most are as long as at rest.
@@ -130,24 +132,19 @@ def hold_still(
     high = stiffness * (length / np.maximum(shortest, MINIMUM_VIRTUAL_REST_LENGTH) - 1.0)
     may_change = acts & (is_virtual | (not keeps_object))
 
+    ease = np.where(may_change, stiffness, 0.0)
+    if not ease.any():
+        return model
     direction = offset / np.maximum(length, MINIMUM_LENGTH)[:, None]
-    touching = _touching(model, parameters)
-    pulls = _pulls(model, direction)
-    # The ground's push has no bound above and costs nothing.
-    ground = csr_array(
-        (np.ones(len(touching)), (3 * touching + 2, np.arange(len(touching)))),
-        shape=(3 * model.node_count, len(touching)),
-    )
+    pulls, touching = _pulls(model, direction), _touching(model, parameters)
     weight = np.zeros((model.node_count, 3))
     weight[:, 2] = parameters.gravity
-    force = _balance(
-        csr_array(hstack([pulls, ground])),
-        weight.ravel(),
-        start=np.concatenate([tension, np.zeros(len(touching))]),
-        low=np.concatenate([np.where(may_change, low, tension), np.zeros(len(touching))]),
-        high=np.concatenate([np.where(may_change, high, tension), np.full(len(touching), np.inf)]),
-        ease=np.concatenate([stiffness, np.full(len(touching), 100.0 * stiffness.max())]),
-    )[: len(rest)]
+    for share in SHARES:
+        force = _balance((pulls, touching), weight.ravel(), tension, ease, share)
+        if np.all(~may_change | ((low <= force) & (force <= high))):
+            break
+    else:
+        return model
     strain = np.divide(force, stiffness, out=np.zeros_like(force), where=acts)
     held = np.where(may_change, length / (1.0 + strain), rest)
     return replace(model, rest_length=held.astype(np.float32))
@@ -179,34 +176,36 @@ def _pulls(model: SpringMassModel, direction: Float[ndarray, "spring 3"]) -> csr
 
 
 def _balance(
-    matrix: csr_array,
+    forces: tuple[csr_array, Int[ndarray, " resting"]],
     load: Float[ndarray, " row"],
-    *,
-    start: Float[ndarray, " column"],
-    low: Float[ndarray, " column"],
-    high: Float[ndarray, " column"],
-    ease: Float[ndarray, " column"],
-) -> Float[ndarray, " column"]:
-    """Find forces near `start` within bounds whose sums are a load, as nearly as can be.
+    start: Float[ndarray, " spring"],
+    ease: Float[ndarray, " spring"],
+    share: float,
+) -> Float[ndarray, " spring"]:
+    """Find tensions that, with the ground's push at some nodes, add up to a load.
 
-    A force's change costs the square of it over its `ease`. What would leave its bounds is put on
-    them, and the others are found anew.
+    What a tension changes costs the square of it over its `ease`, the ground's push next to
+    nothing; a `share` of the largest term says how dear it is to leave load uncarried.
     """
-    force = np.clip(start, low, high)
-    is_free = low < high
+    (pulls, touching), tension = forces, start.copy()
+    push = np.zeros(len(touching))
+    easier = csr_array(pulls * (ease / ease.max()) ** 2)
+    normal = csr_array(easier @ pulls.T)
+    largest = max(float(normal.diagonal().max()), np.finfo(np.float64).tiny)
+    pushes = np.ones(len(touching), dtype=bool)
     for _ in range(MOST_ROUNDS):
-        missing = load - matrix @ force
-        free = matrix[:, is_free]
-        easier = free * (ease[is_free] / ease.max()) ** 2
-        normal = csc_array(easier @ free.T)
-        share = SMALLEST_SHARE * max(float(normal.diagonal().max()), 1.0)
-        solved = splu(csc_array(normal + share * eye_array(len(load)))).solve(missing)
-        force[is_free] += easier.T @ solved
-        is_out = (force < low) | (force > high)
-        force = np.clip(force, low, high)
-        if not is_out.any():
+        given = np.full(len(load), share * largest)
+        given[3 * touching[pushes] + 2] += EASE_OF_GROUND * largest
+        missing = load - pulls @ tension
+        missing[3 * touching + 2] -= push
+        solved = splu(csc_array(normal + diags_array(given))).solve(missing)
+        tension += easier.T @ solved
+        push[pushes] += EASE_OF_GROUND * largest * solved[3 * touching[pushes] + 2]
+        # The ground does not pull: such nodes hang.
+        hangs = pushes & (push < 0.0)
+        if not hangs.any():
             break
-        is_free &= ~is_out
-        if not is_free.any():
-            break
-    return force
+        pushes &= ~hangs
+        tension = start.copy()
+        push[:] = 0.0
+    return tension

@@ -188,7 +188,7 @@ def test_a_block_that_nobody_touches_does_not_sink(stiffness):
     held = hold_still(model, nobody(), parameters)
     sunk = moved(model, parameters).max()
     assert sunk > 0.3 / stiffness
-    assert moved(held, parameters).max() < min(5e-5, 0.2 * sunk)
+    assert moved(held, parameters).max() < min(1e-4, 0.2 * sunk)
     np.testing.assert_array_equal(held.clearance, model.clearance)
 
 
@@ -205,17 +205,28 @@ def test_no_rest_length_changes_beyond_the_bounds_and_none_below_its_floor():
     node = np.float32([[0.0, 0.0, -0.01 * (i + 1)] for i in range(6)])
     control = np.float32([[0.0, 0.0, -0.0095]])
     parameters = PARAMETERS.replace(
-        ground_height=None, connection_radius=0.012, stiffness=30.0, virtual_stiffness=30.0,
+        ground_height=None, connection_radius=0.012, stiffness=400.0, virtual_stiffness=400.0,
         virtual_connection_radius=0.012, virtual_max_neighbors=2, virtual_rest_length_floor=0.001,
     )  # fmt: skip
     model = laid(node, parameters, control)
     held = hold_still(model, control, parameters)
     change = held.rest_length / model.rest_length
-    assert change.min() == pytest.approx(0.8, abs=1e-6)
-    assert change.max() <= 1.2 + 1e-6
+    assert 0.95 - 1e-6 <= change.min() < 0.999
+    assert change.max() <= 1.05 + 1e-6
     shorter = model.rest_length == np.float32(0.001)
     assert shorter.sum() == 1
     assert np.array_equal(held.rest_length[shorter], model.rest_length[shorter])
+
+
+def test_what_springs_cannot_carry_deforms_nothing_else():
+    # Nothing holds the end of the sheet that is in the air.
+    node = sheet(rise=1.5)
+    parameters = PARAMETERS.replace(stiffness=1000.0)
+    model = laid(node, parameters, kind="sheet")
+    held = hold_still(model, nobody(), parameters)
+    flat = node[:, 0] < 0.05
+    assert moved(held, parameters).max() > 0.01
+    assert moved(held, parameters)[flat].max() < 1e-3 + moved(model, parameters)[flat].max()
 
 
 def test_another_sequence_keeps_the_object_and_carries_it_by_its_grip_alone():
