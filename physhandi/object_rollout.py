@@ -81,7 +81,7 @@ class ObjectRollout:
         return self.ready >= self.frame_count
 
     def model_in(self, frame: int) -> SpringMassModel:
-        """Get the springs that pull in a frame: after a restart their rest lengths are others."""
+        """Get the model of a frame: after a restart rest lengths and clearances are others."""
         restart = self.restart
         if restart is None or frame <= restart.frame:
             return self.model
@@ -98,14 +98,17 @@ class ObjectRollout:
         Returns:
             ``restart_frame``, the last frame before it; ``restart_position`` and
             ``restart_velocity`` of the object nodes, from which the next frame starts [m, m/s];
-            ``restart_rest_length`` of every spring from then on [m]. Nothing if no frame that is
-            ready comes after a restart.
+            ``restart_rest_length`` of every spring and ``restart_clearance`` of every node from
+            then on [m]. Nothing if no frame that is ready comes after a restart.
         """
         if self.restart is None or self.restart.frame >= self.ready:
             return {}
         state = {f"restart_{name}": array for name, array in self.restart.to_tensors().items()}
         model = self.model_in(self.restart.frame + 1)
-        return state | {"restart_rest_length": model.rest_length}
+        return state | {
+            "restart_rest_length": model.rest_length,
+            "restart_clearance": model.clearance,
+        }
 
     def forces(self, frame: int) -> Float[ndarray, "node 3"]:
         """Compute the sum of the virtual springs' forces on each object node [N]."""

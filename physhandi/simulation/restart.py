@@ -1,9 +1,10 @@
-"""A rollout that continues from another state than its own, with every spring's strain kept.
+"""A rollout that continues from another state than its own, with strain and contact kept.
 
 Moved nodes alone would not stay: springs would pull them back to the shape that the old rest
 lengths describe. With the rest length r of a spring of length L scaled to ``r' = r L' / L``, where
 L' is its length in the new state, its strain ``L' / r' - 1`` and with it its tension are what they
-were.
+were. Nodes that lie on the ground would fall, or slide off while they do, if they are seen a little
+higher; they lie on it where they are seen.
 """
 
 from collections.abc import Mapping
@@ -21,6 +22,8 @@ from physhandi.simulation.stability import SAFETY
 SHORTEST_SHARE = 1.0 / SAFETY**2
 """Least share of its rest length that a spring keeps: shorter ones are stiffer [N/m], and this is
 what the margin of automatic substeps leaves room for."""
+TOUCHING = 3e-3
+"""Height above where it touches the ground up to which a node is taken to lie there [m]."""
 COINCIDENT = 1e-6
 """Nodes nearer to each other than this have no strain that could be kept [m]."""
 
@@ -60,15 +63,16 @@ class Restart:
         position: Float[ndarray, "node 3"],
         control: Float[ndarray, "control 3"],
     ) -> SpringMassModel:
-        """Give the springs with which the frames after the restart are simulated.
+        """Give the model with which the frames after the restart are simulated.
 
         A spring keeps its strain, unless its rest length would fall below its floor or below
         `SHORTEST_SHARE` of what it was. One whose ends coincide in the rollout has no strain to
-        keep: its rest length stays.
+        keep: its rest length stays. A node that lies on the ground in the rollout has its height in
+        the new state as its clearance from then on.
 
         Args:
             model: The springs until then; virtual ones are changed as the object's own.
-            parameters: For the floors of the rest lengths.
+            parameters: For the floors of the rest lengths, and the ground.
             position: The rollout's own nodes in the frame of the restart [m].
             control: Control nodes in that frame [m].
         """
@@ -80,7 +84,21 @@ class Restart:
         floor[: model.object_spring_count] = parameters.rest_length_floor
         shortest = np.maximum(SHORTEST_SHARE * rest, np.minimum(rest, floor))
         scaled = np.maximum(scale * rest, shortest)
-        return replace(model, rest_length=scaled.astype(np.float32))
+        clearance = self._clearance(model, parameters.ground_height, position)
+        return replace(model, rest_length=scaled.astype(np.float32), clearance=clearance)
+
+    def _clearance(
+        self,
+        model: SpringMassModel,
+        ground_height: float | None,
+        position: Float[ndarray, "node 3"],
+    ) -> Float32[ndarray, " node"]:
+        """Let nodes that lie on the ground lie on it where they are now [m]."""
+        if ground_height is None:
+            return model.clearance
+        touches = position[:, 2] - ground_height - model.clearance < TOUCHING
+        height = np.maximum(self.position[:, 2] - ground_height, 0.0)
+        return np.where(touches, height, model.clearance).astype(np.float32)
 
     def to_tensors(self) -> dict[str, ndarray]:
         """Return every field as an array, ready for safetensors."""

@@ -156,6 +156,7 @@ class Simulator:
         self.position.assign(np.asarray(position, dtype=np.float32))
         self.velocity.assign(np.asarray(velocity, dtype=np.float32))
         self.rest_length.assign(self.model.rest_length)
+        self.clearance.assign(self.model.clearance)
         self.first_divergence.fill_(_NO_DIVERGENCE)
 
     def continue_from(self, restart: Restart, control: Float[ndarray, "control 3"]) -> None:
@@ -173,6 +174,7 @@ class Simulator:
         model = restart.continued(self.model, self.parameters, own, control)
         self.reset(restart.position, restart.velocity)
         self.rest_length.assign(model.rest_length)
+        self.clearance.assign(model.clearance)
 
     def step_frame(
         self,

@@ -42,6 +42,7 @@ def continued_oracle(scene: Scene, restart: Restart, frame: int = AT) -> np.ndar
         velocity=restart.velocity.astype(float),
         rest=scene.rest * lengths[1] / lengths[0],
         control=scene.control[frame:],
+        clearance=np.where(own[:, 2] < 0.003, restart.position[:, 2].astype(float), 0.0),
         rest_shape=scene.node,
     )
     return simulate(later)[0]
@@ -157,6 +158,36 @@ def test_rest_lengths_stay_above_their_bounds_and_coincident_nodes_keep_theirs()
     bare = parameters.replace(rest_length_floor=0.0, virtual_rest_length_floor=0.0)
     later = restart.continued(model, bare, node, control)
     np.testing.assert_allclose(later.rest_length, [0.64, 0.4, 1.0, 0.16], rtol=1e-6)
+
+
+def test_what_lies_on_the_ground_lies_where_it_is_seen_and_what_does_not_falls(device: str) -> None:
+    node = np.array([[0, 0, 0.004], [0.1, 0, 0.0065], [0.2, 0, 0.02]], np.float32)
+    model = SpringMassModel(
+        object_node=node,
+        initial_velocity=np.zeros_like(node),
+        spring_nodes=np.zeros((0, 2), np.int32),
+        rest_length=np.zeros(0, np.float32),
+        stiffness=np.zeros(0, np.float32),
+        damping=np.zeros(0, np.float32),
+        object_spring_count=0,
+        control_count=0,
+        clearance=np.float32([0.004, 0.004, 0.004]),
+    )
+    parameters = SimulationParameters(restitution=0.0, frame_rate=30.0, ground_height=0.0)
+    seen = node + np.float32([0.0, 0.0, 0.005])
+    restart = Restart(frame=0, position=seen, velocity=np.zeros_like(node))
+    later = restart.continued(model, parameters, node, np.zeros((0, 3)))
+    np.testing.assert_allclose(later.clearance, [0.009, 0.0115, 0.004], rtol=1e-6)
+    simulator = Simulator(model, parameters, device)
+    control = np.zeros((9, 0, 3), np.float32)
+    height = simulator.rollout(control, restart).position[:, :, 2]
+    np.testing.assert_allclose(height[1:, :2], np.tile(seen[:2, 2], (8, 1)), atol=1e-4)
+    assert height[-1, 2] == pytest.approx(0.004, abs=1e-4)
+    np.testing.assert_allclose(simulator.rollout(control).position[-1, :, 2], 0.004, atol=1e-4)
+    without = restart.continued(
+        model, parameters.replace(ground_height=None), node, np.zeros((0, 3))
+    )
+    np.testing.assert_array_equal(without.clearance, model.clearance)
 
 
 def test_a_restart_that_does_not_fit_is_refused() -> None:
