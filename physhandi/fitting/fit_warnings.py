@@ -36,8 +36,8 @@ Code = Literal[
     "few_observations",
     "object_points_removed",
 ]
-MARGIN = 1.02
-"""Ratio of two errors from which the larger one is called worse."""
+MARGIN, LEAST_EXCESS = 0.1, 5e-4
+"""Part of a baseline's error, and length [m], by which a fit must exceed it to be called worse."""
 FEW_POINTS = 10
 """Points of the object below which a frame shows too little of it."""
 FEW_FRAMES = 0.2
@@ -151,7 +151,9 @@ def _worse_than_baselines(scores: Mapping[str, Any]) -> Iterator[FitWarning]:
                 (name for name in ("track_error", "chamfer_l2") if own.get(name) is not None), None
             )
             theirs = None if measure is None else other.get(measure)
-            if measure is None or theirs is None or own[measure] <= MARGIN * theirs:
+            if measure is None or theirs is None:
+                continue
+            if own[measure] - theirs <= max(MARGIN * theirs, LEAST_EXCESS):
                 continue
             yield FitWarning(
                 code=code,
