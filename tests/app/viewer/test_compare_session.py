@@ -41,7 +41,7 @@ def another_run(
         else:
             position = position[: FRAMES // 2, ::step]
             meta["frame_count"] = len(position)
-            for name in ("object_node", "initial_velocity"):
+            for name in ("object_node", "initial_velocity", "clearance"):
                 tensors[name] = tensors[name][::step]
             for name in ("rest_length", "stiffness", "damping"):
                 tensors[name] = tensors[name][:0]
