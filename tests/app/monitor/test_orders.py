@@ -137,7 +137,7 @@ def test_settings_are_listed_with_the_values_of_a_run_beside_its_profile(
     assert (own["parent"], own["profile"]) == (run_id, "quick")
     assert values["object_.search.generations"] == 12
     assert values["object_.search.variables.drag"] is None
-    assert {s["base"] for s in own["settings"] if s["path"].endswith("generations")} == {6}
+    assert {s["base"] for s in own["settings"] if s["path"].endswith(".generations")} == {6}
     other = world.client.get(f"/api/v1/settings?run={run_id}&profile=paper").json()
     assert all(s["value"] == s["base"] for s in other["settings"])
     assert world.client.get("/api/v1/settings?run=nobody").status_code == 404
