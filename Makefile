@@ -32,10 +32,10 @@ fmt: install
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# Three processes keep two cores busy, since the one with the browser mostly waits.
+# One of the two processes has all browsers: beside each other they hold each other up.
 test: install browser
 	rm -f .coverage .coverage.*
-	$(BIN)/python -m pytest -n 3 --dist loadgroup --no-loadscope-reorder --cov --cov-report=term
+	$(BIN)/python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder --cov --cov-report=term
 
 # Live scenes, jobs and pages while their threads are held up at random.
 races: install
