@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
-from scipy.spatial import KDTree
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.layout import SequenceFiles
@@ -17,6 +16,7 @@ from physhandi.data.run import RunFolder
 from physhandi.data.sequence import Sequence
 from physhandi.data.truth import read_truth
 from physhandi.errors import MissingInputError
+from physhandi.metrics.topology import resolution
 from physhandi.metrics.truth_metrics import true_motion, true_surface
 from physhandi.rendering.renderer import render
 from physhandi.rendering.shapes import Balls, Shape, Surface
@@ -75,7 +75,7 @@ def motion_picture(
     for name, run in runs.items():
         rollout = run.array(files.rollout)
         carried = true_motion(rollout[0], truth)
-        radius = 0.45 * _spacing(rollout[0])
+        radius = 0.45 * resolution(rollout[0].astype(np.float64))
         sides = [side for side in recording.hands if run.has(files.hand_vertex(side))]
         vertex = {side: run.array(files.hand_vertex(side)) for side in sides}
         face = {side: run.array(files.hand_face(side)) for side in sides}
@@ -182,10 +182,6 @@ def _scale(columns: int) -> ndarray:
 def _colors(error: Float[ndarray, " node"]) -> Float[ndarray, "node 3"]:
     level = np.clip(np.rint(255.0 * error / WORST), 0, 255).astype(np.uint8)
     return cv2.applyColorMap(level[:, None], cv2.COLORMAP_VIRIDIS)[:, 0, ::-1].astype(np.float64)
-
-
-def _spacing(node: Float[ndarray, "node 3"]) -> float:
-    return float(np.median(KDTree(node).query(node, k=2)[0][:, 1]))
 
 
 def _write(image: ndarray, text: str, place: tuple[int, int]) -> None:
