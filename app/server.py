@@ -225,9 +225,9 @@ def serve(
         port = int(listener.getsockname()[1])
         security = Security(settings, port=port)
         app = create_app(settings, security=security)
-        app.state.sessions.live.start()  # Warm before the first slider moves.
         scheduler: Scheduler = app.state.scheduler
-        scheduler.start()
+        scheduler.start()  # First: it refuses a data folder that another server works on.
+        app.state.sessions.live.start()  # Warm before the first slider moves.
         if queue_demo:
             scheduler.launch([DEMO_SEQUENCE], "quick", "Quick fit, running now")
         config = uvicorn.Config(

@@ -69,7 +69,8 @@ def receive(connection: socket.socket) -> Message | None:
         connection: Stream socket to the other process.
 
     Returns:
-        The message, or None when the other side has closed the connection.
+        The message, or None when the other side has closed the connection, also if it did so
+        without reading all that was sent to it.
 
     Raises:
         WireError: If the bytes are not a message.
@@ -113,7 +114,10 @@ def _read(connection: socket.socket, size: int) -> bytearray | None:
     view = memoryview(buffer)
     filled = 0
     while filled < size:
-        count = connection.recv_into(view[filled:])
+        try:
+            count = connection.recv_into(view[filled:])
+        except ConnectionResetError:  # Linux's word for "closed, and did not read everything".
+            return None
         if count == 0:
             return None
         filled += count

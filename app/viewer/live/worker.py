@@ -11,6 +11,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 
 import numpy as np
 import warp as wp
@@ -121,6 +122,10 @@ class SimulationWorker:
 
     def run(self) -> None:
         """Work until the parent closes the connection."""
+        with suppress(ConnectionError):  # It may do so while it is being written to.
+            self._serve()
+
+    def _serve(self) -> None:
         threading.Thread(target=self._read, name="live-requests", daemon=True).start()
         warm_up(self._device)
         send(self._connection, Message("ready", {"session": "", "request": 0}))
@@ -170,6 +175,8 @@ class SimulationWorker:
             )
         except PhysHandiError as error:
             send(self._connection, Message("failed", {**about, "error": str(error)}))
+        except ConnectionError:  # Nobody is left to be told.
+            raise
         except (ValueError, OSError, RuntimeError, MemoryError) as error:
             logger.exception("request %s failed", about)
             send(self._connection, Message("failed", {**about, "error": str(error)}))

@@ -63,3 +63,10 @@ def test_an_endless_header_is_refused_before_it_is_read(pair) -> None:
     ours.sendall(struct.pack("<I", 1 << 30))
     with pytest.raises(WireError, match="1073741824 bytes"):
         receive(theirs)
+
+
+def test_a_connection_closed_before_everything_was_read_is_the_end_too(pair) -> None:
+    ours, theirs = pair
+    send(theirs, Message("ready"))
+    ours.close()  # The kernel resets the other end.
+    assert receive(theirs) is None

@@ -2,7 +2,7 @@
 
 import socket
 
-from app.viewer.live.wire import PAUSE, RESUME, STEP, Message
+from app.viewer.live.wire import PAUSE, RESUME, STEP, Message, send
 from app.viewer.live.worker import Mailbox, PacedFrames, SimulationWorker
 
 
@@ -91,3 +91,12 @@ def test_a_pause_takes_back_the_steps_that_were_asked_for() -> None:
     for pace in (STEP, STEP, PAUSE):
         paced.set_pace(pace)
     assert not paced.may_advance
+
+
+def test_a_parent_that_closes_without_listening_ends_the_worker_without_a_word(caplog) -> None:
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        send(ours, simulate(1))
+        ours.close()
+        SimulationWorker(theirs, "cpu").run()
+    assert caplog.records == []
