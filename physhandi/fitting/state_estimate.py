@@ -15,7 +15,11 @@ from physhandi.metrics.baselines import last_residual
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.restart import Restart
-from physhandi.simulation.simulator import Simulator
+from physhandi.simulation.simulator import Rollout, Simulator
+
+VELOCITY_FRAMES = 5
+"""Last frames over which the velocity is averaged. Over two of them the noise of tracks would be
+more than four times as large; over ten, hands may have turned round."""
 
 
 def observed_state(
@@ -30,15 +34,16 @@ def observed_state(
     """Estimate position and velocity of the nodes in a frame.
 
     Each node is moved by the residual of the tracks around it (`metrics.baselines.last_residual`),
-    but not deeper than where it touches the ground. The velocity is the rollout's: it belongs to
-    the motion of the hands that goes on, and differences of noisy tracks would change little but
-    add their noise.
+    but not deeper than where it touches the ground. Its velocity is that of the line that fits best
+    to where it was seen, found in the same way, in the last `VELOCITY_FRAMES` frames: springs of a
+    rollout swing about the true motion, and their velocity is less sure than no velocity at all. It
+    is the rollout's if the frame before shows no track.
 
     Args:
         model: Fitted nodes and springs.
         parameters: Fitted parameters, in the world of the sequence.
         control: Control nodes in every frame [m].
-        observation: What was seen; only frame 0 and the frame itself are read.
+        observation: What was seen; only frame 0, the frame itself and those before it are read.
         frame: The frame.
         device: Warp device.
 
@@ -47,23 +52,49 @@ def observed_state(
         SimulationDivergedError: If the motion runs away before the frame.
     """
     motion = Simulator(model, parameters, device).rollout(control[: frame + 1])
-    own = motion.position[frame]
     try:
-        shift = last_residual(
-            motion.position[0],
-            own,
-            observation.point,
-            observation.is_visible,
-            frame,
-            observation.node_of_track,
-        )
+        position = _seen(motion, observation, frame)
     except ValueError as error:
         raise MissingInputError(f"{error}.") from error
-    position = own + shift
+    velocity = _seen_velocity(motion, observation, frame, parameters.simulated_frame_rate)
     if parameters.ground_height is not None:
         position[:, 2] = np.maximum(position[:, 2], parameters.ground_height + model.clearance)
     return Restart(
         frame=frame,
         position=position.astype(np.float32),
-        velocity=motion.velocity[frame].copy(),
+        velocity=velocity.astype(np.float32),
     )
+
+
+def _seen(motion: Rollout, observation: ObjectObservation, frame: int) -> Float[ndarray, "node 3"]:
+    """Move the nodes of a frame to where the tracks were seen [m]."""
+    own = motion.position[frame]
+    return own + last_residual(
+        motion.position[0],
+        own,
+        observation.point,
+        observation.is_visible,
+        frame,
+        observation.node_of_track,
+    )
+
+
+def _seen_velocity(
+    motion: Rollout, observation: ObjectObservation, last: int, frame_rate: float
+) -> Float[ndarray, "node 3"]:
+    """Fit a line to where each node was seen in the last frames; its slope [m/s]."""
+    first = last
+    while first > max(0, last + 1 - VELOCITY_FRAMES) and _shows_tracks(observation, first - 1):
+        first -= 1
+    if first == last:
+        return motion.velocity[last]
+    frames = np.arange(first, last + 1)
+    seen = np.stack([_seen(motion, observation, int(frame)) for frame in frames])
+    time = (frames - frames.mean()) / frame_rate
+    return np.tensordot(time, seen, axes=1) / (time**2).sum()
+
+
+def _shows_tracks(observation: ObjectObservation, frame: int) -> bool:
+    """Whether a frame shows a track whose place on the object is known."""
+    visible = observation.is_visible
+    return bool((visible[frame] & (visible[0] | (observation.node_of_track is not None))).any())

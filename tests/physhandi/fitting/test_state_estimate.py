@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from reference.scenes import as_model, cube_scene
+from reference.scenes import as_model, bare_scene, cube_scene
 from reference.spring_mass import simulate
 
 from physhandi.data.observation import ObjectObservation
@@ -30,14 +30,17 @@ def estimate(observation: ObjectObservation, frame: int = LAST):
     return observed_state(model, parameters, SCENE.control, observation, frame)
 
 
-def test_a_node_that_is_seen_is_where_it_is_seen_and_moves_as_simulated() -> None:
+def test_a_node_that_is_seen_is_where_it_is_seen_and_moves_as_it_did() -> None:
     shift = np.random.default_rng(1).normal(0, 0.004, (8, 3))
     shift[:, 2] = np.abs(shift[:, 2])
-    position, velocity = simulate(SCENE)
+    position = simulate(SCENE)[0]
     found = estimate(observed(shift))
     assert found.frame == LAST
     np.testing.assert_allclose(found.position, position[LAST] + shift, atol=2e-6)
-    np.testing.assert_allclose(found.velocity, velocity[LAST], atol=5e-6)
+    # The line that fits three points best is as steep as the one through the outer two.
+    mean = (position[LAST] + shift - position[0]) / 2.0 * SCENE.frame_rate
+    np.testing.assert_allclose(found.velocity, mean, atol=1e-4)
+    assert np.abs(mean).max() > 0.1
     # The frame before shows no residual.
     np.testing.assert_allclose(
         estimate(observed(shift), LAST - 1).position, position[LAST - 1], atol=2e-6
@@ -60,6 +63,30 @@ def test_a_node_that_is_not_seen_takes_the_mean_of_the_tracks_around_it() -> Non
         np.testing.assert_allclose(
             found.position[node], position[LAST, node] + total / weights, atol=2e-6
         )
+
+
+def test_the_velocity_is_that_of_five_frames_whatever_the_rollout_does() -> None:
+    random = np.random.default_rng(3)
+    node = random.uniform(0.1, 0.2, (4, 3))
+    point = (node + random.normal(0, 0.01, (9, 4, 3))).astype(np.float32)
+    point[0] = node
+    seen = np.ones((9, 4), bool)
+    observation = ObjectObservation(
+        point=point, is_visible=seen, is_motion_valid=seen, node_of_track=np.arange(4)
+    )
+    scene = bare_scene(node, velocity=np.full((4, 3), 3.0), frames=9)
+    model, parameters = as_model(scene)
+    found = observed_state(model, parameters, scene.control, observation, 7)
+    slope = np.polyfit(np.arange(3, 8) / scene.frame_rate, point[3:8].reshape(5, -1), 1)[0]
+    np.testing.assert_allclose(found.velocity, slope.reshape(4, 3), atol=1e-4)
+    assert np.abs(slope).max() > 0.05
+
+
+def test_the_velocity_is_the_rollouts_if_the_frame_before_shows_no_track() -> None:
+    seen = np.ones((4, 8), bool)
+    seen[LAST - 1] = False
+    found = estimate(observed(np.full((8, 3), 0.002), is_visible=seen))
+    np.testing.assert_allclose(found.velocity, simulate(SCENE)[1][LAST], atol=5e-6)
 
 
 def test_no_node_ends_below_the_ground() -> None:
