@@ -261,20 +261,9 @@ class FittedObject:
         if self.run.holds(sequence):
             return self if sequence.name == self.sequence else self.of(self.run, sequence.name)
         rest = self.model.object_node if self.rest_node is None else self.rest_node
-        placed = place_object(self.run, sequence, (self.model.object_node, rest), progress)
-        parameters = self.parameters.in_world(
-            frame_rate=sequence.frame_rate,
-            ground_height=sequence.ground_height,
-            gravity=sequence.gravity,
-        )
-        model = retopologize(
-            replace(self.model, object_node=placed.node, initial_velocity=placed.velocity),
-            parameters,
-            placed.control[0],
-            fitted=self.parameters,
-            rest_node=rest,
-        )
-        empty = ObjectRollout.empty(model, parameters, placed.control)
+        fitted = self.model, self.parameters, rest
+        placed = place_object(self.run, sequence, fitted, progress)
+        empty = ObjectRollout.empty(placed.model, placed.parameters, placed.control)
         empty.scene = partial(_scene_of, sequence, placed, empty)
         other = FittedObject(empty, rest_node=rest, run=self.run, sequence=sequence.name)
         other.placement = placed

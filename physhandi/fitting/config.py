@@ -235,6 +235,9 @@ class ObjectFitConfig(Settings, frozen=True, kw_only=True):
     holds_still: bool = False
     """Whether springs have rest lengths with which they carry the object at frame 0, against its
     weight, instead of their lengths there, with which it sags."""
+    bends_into_place: bool = False
+    """Whether an object that is simulated in another recording is bent into the shape in which
+    frame 0 shows it there, and is at rest in that, instead of keeping the shape of the fit."""
     starts_at_rest: bool = False
     """Take the object to rest at frame 0 instead of estimating its velocity (PhysTwin)."""
     automatic_substeps: bool = False

@@ -5,14 +5,12 @@ for the recordings of a run.
 """
 
 from collections.abc import Sequence as Listing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
-from scipy.spatial import KDTree
-from scipy.spatial.transform import Rotation
 
 from physhandi.data.attempt import Attempt
 from physhandi.data.layout import SequenceFiles
@@ -26,12 +24,17 @@ from physhandi.fitting.config import PipelineConfig
 from physhandi.fitting.hand_reconstruction import HandFit, keypoint_target, reconstruct_hands
 from physhandi.fitting.hand_refinement import RefinedHands, RefinementProblem, refine_hands
 from physhandi.fitting.object_problem import ObjectProblem, initial_velocity
+from physhandi.fitting.rest_state import hold_still, rest_in_place, resting_clearance
 from physhandi.hand.loading import load_hand_model
 from physhandi.hand.model import HandModel
 from physhandi.hand.motion import HandMotion, control_trajectory
 from physhandi.perception.lifting import observe_object
+from physhandi.perception.registration import bend_object, lay_object
 from physhandi.perception.shape import ObjectShape, shape_of_nodes, shape_of_observation
 from physhandi.progress import Progress
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
+from physhandi.simulation.topology import retopologize
 from physhandi.triangles import vertex_normals
 
 LEAST_CLOUD = 10
@@ -46,49 +49,71 @@ class PlacedObject:
     """The hands of the recording; None if it shows none."""
     observation: ObjectObservation
     """Observation of the object."""
-    node: Float[ndarray, "node 3"]
-    """Object nodes at frame 0 [m]."""
-    velocity: Float[ndarray, "node 3"]
-    """Their velocities at frame 0 [m/s]."""
     control: Float[ndarray, "frame control 3"]
     """Control nodes [m]."""
+    model: SpringMassModel
+    """The object at frame 0, with its fitted springs and new virtual ones."""
+    parameters: SimulationParameters
+    """The fitted ones, in the world of the recording."""
 
 
 def place_object(
     run: RunFolder,
     sequence: Sequence,
-    template: tuple[Float[ndarray, "node 3"], Float[ndarray, "node 3"]],
+    fitted: tuple[SpringMassModel, SimulationParameters, Float[ndarray, "node 3"]],
     progress: Progress,
 ) -> PlacedObject:
-    """Reconstruct the hands of another recording and locate a known object in its frame 0.
+    """Reconstruct the hands of another recording and find a known object in its frame 0.
 
     Args:
         run: Run that fitted the object; its settings are used.
         sequence: The other recording.
-        template: Nodes in a sequence of the run, and at rest [m].
+        fitted: The object in a sequence of the run, its parameters, and its nodes at rest [m].
         progress: Receives reports of the stages.
 
     Raises:
         MissingInputError: If the recording lacks hands, controls or observations of the object.
         FitError: If it shows another object, or its hands too poorly.
-        RunError: If the run's settings cannot be read.
+        RunError: If the run's settings or the kind of its object cannot be read.
     """
     while run.kind == "simulation":
         run = RunFolder.open(Path(run.config["source"]))
     config = PipelineConfig.from_dict(run.config["profile"])
     hands = reconstruct_hands(sequence, config.hand, progress) if sequence.hands else None
     observation = observe_object(sequence, progress)
-    node, _, _ = object_nodes_of(sequence, observation, config, template)
+    known, parameters, rest_node = fitted
+    node, _, _ = object_nodes_of(sequence, observation, config, (known.object_node, rest_node))
+    is_bent = config.object_.bends_into_place and sequence.object_node is None
+    if is_bent:
+        node = bend_object(node, _first_cloud(sequence, observation), sequence.ground_height)
     velocity = np.zeros_like(node)
     if not config.object_.starts_at_rest:
         velocity = initial_velocity(observation, node, sequence.frame_rate)
+    clearance = known.clearance
+    if config.object_.rests_where_seen:
+        # Heights in another pose: here nodes rest where they are seen here.
+        kind, thickness = artefacts.load_shape(run.out)
+        clearance = resting_clearance(node, sequence.ground_height, kind, thickness=thickness)
     motions = () if hands is None else hands.motions
+    control = control_trajectory_of(sequence, motions, config)
+    world = parameters.in_world(
+        frame_rate=sequence.frame_rate,
+        ground_height=sequence.ground_height,
+        gravity=sequence.gravity,
+    )
+    laid = replace(known, object_node=node, initial_velocity=velocity, clearance=clearance)
+    model = retopologize(laid, world, control[0], fitted=parameters, rest_node=rest_node)
+    if is_bent and np.array_equal(rest_node, known.object_node):
+        # The shape at frame 0 was its rest shape, in which springs carried it; so here.
+        model = rest_in_place(model, world)
+        if config.object_.holds_still:
+            model = hold_still(model, control[0], world)
     return PlacedObject(
         hands=hands,
         observation=observation,
-        node=node,
-        velocity=velocity,
-        control=control_trajectory_of(sequence, motions, config),
+        control=control,
+        model=model,
+        parameters=world,
     )
 
 
@@ -128,6 +153,11 @@ def object_nodes_of(
             observation, config.node_spacing, sequence, most_nodes=config.most_nodes
         )
         return shape.node, shape.node, shape
+    return lay_object(template[0], _first_cloud(sequence, observation)), template[1], None
+
+
+def _first_cloud(sequence: Sequence, observation: ObjectObservation) -> Float[ndarray, "point 3"]:
+    """Get what frame 0 shows of an object [m]."""
     cloud = observation.cloud[0] if observation.cloud else observation.point[0]
     cloud = cloud[np.isfinite(cloud).all(axis=1)]
     if len(cloud) < LEAST_CLOUD:
@@ -135,38 +165,7 @@ def object_nodes_of(
             f"Sequence '{sequence.name}' shows only {len(cloud)} object points in frame 0; at "
             f"least {LEAST_CLOUD} are needed to find the object. Check its depth and masks."
         )
-    return lay_object(template[0], cloud), template[1], None
-
-
-def lay_object(
-    template: Float[ndarray, "node 3"], cloud: Float[ndarray, "point 3"], *, iterations: int = 40
-) -> Float[ndarray, "node 3"]:
-    """Move a known object rigidly onto the cloud of another sequence's frame 0.
-
-    Point-to-point ICP from eight headings around the vertical; the best result wins. It assumes
-    that the object starts in about the shape in which it was first reconstructed.
-
-    Args:
-        template: Nodes of the object in the sequence that it was fitted on [m].
-        cloud: Object points at frame 0 of the other sequence [m].
-        iterations: Alignment steps from each heading.
-    """
-    tree = KDTree(cloud)
-    best, best_error = template, np.inf
-    for turn in np.arange(8) * np.pi / 4:
-        heading = Rotation.from_euler("z", turn).as_matrix()
-        node = (template - template.mean(axis=0)) @ heading.T + cloud.mean(axis=0)
-        for _ in range(iterations):
-            target = cloud[tree.query(node)[1]]
-            centred = node - node.mean(axis=0)
-            rotation = Rotation.align_vectors(target - target.mean(axis=0), centred)[0]
-            node = rotation.apply(centred) + target.mean(axis=0)
-        error = float(
-            np.mean(tree.query(node)[0] ** 2) + np.mean(KDTree(node).query(cloud)[0] ** 2)
-        )
-        if error < best_error:
-            best, best_error = node, error
-    return best.astype(np.float32)
+    return cloud
 
 
 def control_trajectory_of(

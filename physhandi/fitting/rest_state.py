@@ -150,6 +150,16 @@ def hold_still(
     return replace(model, rest_length=held.astype(np.float32))
 
 
+def rest_in_place(model: SpringMassModel, parameters: SimulationParameters) -> SpringMassModel:
+    """Make the lengths of object springs at frame 0 their rest lengths, above their floor."""
+    own = model.spring_nodes[: model.object_spring_count]
+    offset = model.object_node[own[:, 1]] - model.object_node[own[:, 0]]
+    length = np.linalg.norm(offset.astype(np.float64), axis=1)
+    rest_length = model.rest_length.copy()
+    rest_length[: len(own)] = np.maximum(length, max(parameters.rest_length_floor, MINIMUM_LENGTH))
+    return replace(model, rest_length=rest_length)
+
+
 def _touching(model: SpringMassModel, parameters: SimulationParameters) -> Int[ndarray, " resting"]:
     """Find the nodes that the ground can push at."""
     if parameters.ground_height is None:
