@@ -245,6 +245,7 @@ class Session(SceneServer):
             state.pose.give_first(self._server.initial_camera)
         if state.is_figure:
             self._comparison.toggle_figure()
+        self._playback.hold()
         self._playback.seek(state.frame)
         self._playback.play(on=state.is_playing)
 
@@ -275,6 +276,7 @@ class Session(SceneServer):
         if not self._has_played:
             self._has_played = True
             self._playback.play()
+        self._playback.release()
         self._let_in(client, self._comparison)
 
     def _reset_view(self, event: Any) -> None:

@@ -44,6 +44,7 @@ class Playback:
         self._limit = frame_count
         self._speed = 1.0
         self._is_playing = False
+        self._is_held = False
         self._does_loop = True
         self._needs_drawing = True
         self._is_closed = False
@@ -95,6 +96,18 @@ class Playback:
             if on and not self._does_loop and int(self._position) >= self.frame_count - 1:
                 self._position = 0.0
         self._change(_is_playing=on)
+
+    def hold(self) -> None:
+        """Stand at this frame, even if the clock is running, until `release`.
+
+        Nobody is looking yet, and would miss the frames that pass until then.
+        """
+        self._change(_is_held=True)
+
+    def release(self) -> None:
+        """Let a running clock go on from where it was held."""
+        if self._is_held:
+            self._change(_is_held=False)
 
     def seek(self, frame: int) -> None:
         """Go to a frame; numbers outside the sequence are moved to its ends."""
@@ -149,7 +162,7 @@ class Playback:
         last = time.monotonic()
         while True:
             with self._condition:
-                while not (self._is_closed or self._needs_drawing or self._is_playing):
+                while not (self._is_closed or self._needs_drawing or self._is_moving()):
                     self._condition.wait()
                     last = time.monotonic()
                 if self._is_closed:
@@ -183,6 +196,10 @@ class Playback:
         step = math.ceil(rate / _MAX_RATE - 1e-9)
         return (int(self._position) + step - self._position) / rate
 
+    def _is_moving(self) -> bool:
+        """Return whether frames pass."""
+        return self._is_playing and not self._is_held
+
     def _is_starved(self) -> bool:
         """Return whether the clock waits for a frame that is still being computed."""
         is_limited = self._limit < self.frame_count
@@ -190,7 +207,7 @@ class Playback:
 
     def _advance(self, elapsed: float) -> bool:
         """Move the clock on; returns whether another frame is due."""
-        if not self._is_playing:
+        if not self._is_moving():
             return False
         before = int(self._position)
         position = self._position + min(elapsed, 0.5) * self._speed * self.frame_rate

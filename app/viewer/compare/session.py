@@ -181,6 +181,7 @@ class CompareSession(SceneServer):
             self._layers_panel.restore(state.layers, state.theme, prefers_dark=state.prefers_dark)
         if state.pose is not None:
             state.pose.give_first(self._server.initial_camera)
+        self._playback.hold()
         self._playback.play(on=state.is_playing)
 
     def _welcome(self, client: viser.ClientHandle) -> None:
@@ -190,6 +191,7 @@ class CompareSession(SceneServer):
         if not self._has_played:
             self._has_played = True
             self._playback.play()
+        self._playback.release()
         self._let_in(client, self._view)
 
     def _reset_view(self, event: Any) -> None:

@@ -127,6 +127,17 @@ def test_the_running_clock_waits_for_frames_that_are_being_computed(film: Film) 
     assert film.moment_of(4) >= 1.0
 
 
+def test_a_held_clock_stands_until_it_is_released(monkeypatch: pytest.MonkeyPatch) -> None:
+    film = Film(monkeypatch, 1000, 10.0)
+    film.playback.hold()
+    film.playback.seek(2)
+    film.playback.play()
+    film.clock.at(50.0, film.playback.release)
+    film.run(50.15)
+    assert film.drawn == [(2, True), (2, True), (3, True)]
+    assert film.moments == pytest.approx([0.0, 50.0, 50.1], abs=0.002)
+
+
 def test_a_frame_that_was_waited_for_is_drawn_at_once(film: Film) -> None:
     film.playback.limit(2)
     film.playback.play()
