@@ -17,6 +17,9 @@ FRAMES = 10
 FITTED = 7
 AXIS = np.arange(5) * 0.05
 NODE = np.stack([*np.meshgrid(AXIS, AXIS, indexing="ij"), np.full((5, 5), 0.2)], -1).reshape(-1, 3)
+_CORNER = (np.arange(4)[:, None] * 5 + np.arange(4)).reshape(-1, 1)
+FACES = np.concatenate([_CORNER + np.array(offset) for offset in ((0, 1, 5), (1, 6, 5))])
+"""Triangles of the sheet's nodes."""
 TRUTH = SimulationParameters(
     connection_radius=0.08,
     max_neighbors=8,

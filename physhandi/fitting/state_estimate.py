@@ -17,9 +17,9 @@ from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.restart import Restart
 from physhandi.simulation.simulator import Rollout, Simulator
 
-VELOCITY_FRAMES = 5
+VELOCITY_FRAMES = 3
 """Last frames over which the velocity is averaged. Over two of them the noise of tracks would be
-more than four times as large; over ten, hands may have turned round."""
+twice as large; the more there are, the farther it lags behind a motion that changes."""
 
 
 def observed_state(

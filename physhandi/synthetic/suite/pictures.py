@@ -165,8 +165,7 @@ def _heading(recording: Sequence, frames: list[int]) -> ndarray:
     last = recording.reconstruction_frames[-1]
     for column, frame in enumerate(frames):
         kind = "start" if frame == 0 else "last fitted" if frame == last else "predicted"
-        text = f"frame {frame}, {kind}" if frame <= last or recording.future_frames else "end"
-        _write(row, text, (6 + column * WIDTH, 15))
+        _write(row, f"frame {frame}, {kind}", (6 + column * WIDTH, 15))
     return row
 
 

@@ -65,7 +65,7 @@ def test_a_node_that_is_not_seen_takes_the_mean_of_the_tracks_around_it() -> Non
         )
 
 
-def test_the_velocity_is_that_of_five_frames_whatever_the_rollout_does() -> None:
+def test_the_velocity_is_that_of_three_frames_whatever_the_rollout_does() -> None:
     random = np.random.default_rng(3)
     node = random.uniform(0.1, 0.2, (4, 3))
     point = (node + random.normal(0, 0.01, (9, 4, 3))).astype(np.float32)
@@ -77,7 +77,7 @@ def test_the_velocity_is_that_of_five_frames_whatever_the_rollout_does() -> None
     scene = bare_scene(node, velocity=np.full((4, 3), 3.0), frames=9)
     model, parameters = as_model(scene)
     found = observed_state(model, parameters, scene.control, observation, 7)
-    slope = np.polyfit(np.arange(3, 8) / scene.frame_rate, point[3:8].reshape(5, -1), 1)[0]
+    slope = np.polyfit(np.arange(5, 8) / scene.frame_rate, point[5:8].reshape(3, -1), 1)[0]
     np.testing.assert_allclose(found.velocity, slope.reshape(4, 3), atol=1e-4)
     assert np.abs(slope).max() > 0.05
 

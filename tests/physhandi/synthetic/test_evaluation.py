@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sheet_sequence import FITTED
+from sheet_sequence import FACES, FITTED
 from suite_world import SETTINGS, order_of, table, write_told
 
 from physhandi.data.sequence import Sequence
@@ -20,10 +20,6 @@ from physhandi.synthetic.suite.cells import Bench
 from physhandi.synthetic.suite.evaluation import evaluate_suite, list_tasks
 from physhandi.synthetic.suite.folder import contact_kind
 from physhandi.synthetic.suite.methods import parse_method
-
-CORNER = (np.arange(4)[:, None] * 5 + np.arange(4)).reshape(-1, 1)
-GRID_FACES = np.concatenate([CORNER + np.array(offset) for offset in ((0, 1, 5), (1, 6, 5))])
-"""Triangles of the sheet's five by five nodes."""
 
 
 @pytest.fixture(scope="module")
@@ -178,7 +174,7 @@ def test_the_true_motion_is_the_floor_that_methods_are_told_above(
     folder = shutil.copytree(low.folder, tmp_path / low.name)
     marker = np.load(folder / "marker.npy")
     np.save(folder / "truth/object_point.npy", marker)
-    np.save(folder / "truth/object_face.npy", GRID_FACES)
+    np.save(folder / "truth/object_face.npy", FACES)
     order = order_of(
         (Sequence.load(folder), high),
         methods=("static", "quick", "true_motion"),

@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from sheet_sequence import FITTED, FRAMES, NODE
+from sheet_sequence import FACES, FITTED, FRAMES, NODE
 from suite_world import write_told
 
 from physhandi.data.camera import PinholeCamera
@@ -23,8 +23,6 @@ from physhandi.synthetic.suite.pictures import (
     write_motion_pictures,
 )
 
-CORNER = (np.arange(4)[:, None] * 5 + np.arange(4)).reshape(-1, 1)
-FACES = np.concatenate([CORNER + np.array(offset) for offset in ((0, 1, 5), (1, 6, 5))])
 # One metre above the sheet, looking down.
 ABOVE = np.array([[1, 0, 0, 0.1], [0, -1, 0, 0.1], [0, 0, -1, 1.2], [0, 0, 0, 1]], np.float64)
 CAMERA = PinholeCamera(
