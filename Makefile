@@ -7,15 +7,18 @@ PORT ?= 8080
 DATA ?= data
 # Without an NVIDIA GPU install torch's CPU build first (docs/getting-started.md); this variable is passed to pip.
 TORCH ?= torch==2.13.0
+PIP_FLAGS := --quiet --disable-pip-version-check --no-compile -c constraints.txt
 
 .PHONY: install demo test races check fmt bench test-gpu pictures browser clean
 
 install: $(STAMP)
 
+# pip would compile with one processor. Some packages hold templates that are no Python: never mind.
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt $(TORCH)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev,synth]"
+	$(BIN)/python -m pip install $(PIP_FLAGS) $(TORCH)
+	$(BIN)/python -m pip install $(PIP_FLAGS) -e ".[dev,synth]"
+	$(BIN)/python -m compileall -qq -j 0 $(VENV)/lib || true
 	touch $@
 
 demo: install

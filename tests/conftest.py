@@ -2,6 +2,7 @@
 
 import os
 import sys
+from pathlib import Path
 
 import pytest
 import warp as wp
@@ -22,20 +23,17 @@ def pytest_configure(config):
 def pytest_collection_modifyitems(config, items):
     """Give processes whole files, those that take longest first, and all browsers to one process.
 
-    Tests with a browser mostly wait, and two browsers without a graphics card hold each other up:
-    beside one of them the other processes compute.
+    Two browsers without a graphics card hold each other up; beside one of them the other process
+    computes.
     """
-    browsers = config.rootpath / "tests" / "e2e"
-    slow = {
-        item.path for item in items if {"e2e", "slow"} & {mark.name for mark in item.iter_markers()}
-    }
-    items.sort(key=lambda item: (item.path.parent != browsers, item.path not in slow))
+    marks = {mark: set[Path]() for mark in ("e2e", "slow")}
     for item in items:
-        group = (
-            "browser"
-            if item.path.parent == browsers
-            else str(item.path.relative_to(config.rootpath))
-        )
+        for mark in marks.keys() & {mark.name for mark in item.iter_markers()}:
+            marks[mark].add(item.path)
+    items.sort(key=lambda item: (item.path not in marks["e2e"], item.path not in marks["slow"]))
+    for item in items:
+        file = str(item.path.relative_to(config.rootpath))
+        group = "browser" if item.path in marks["e2e"] else file
         item.add_marker(pytest.mark.xdist_group(group))
 
 

@@ -74,7 +74,7 @@ class Watched(Progress):
             raise CancelledError("stopped")
 
 
-def test_two_processes_give_the_table_of_one_and_fill_each_cell_once(
+def test_two_processes_give_the_table_of_one_fill_each_cell_once_and_tell_what_is_wrong(
     tmp_path: Path, order: Order
 ) -> None:
     evaluate_suite(order, tmp_path / "one")
@@ -84,6 +84,8 @@ def test_two_processes_give_the_table_of_one_and_fill_each_cell_once(
         found = evaluate_suite(order, out, progress, fill=workers.fill(order, out))
         shares = [process.cpu_affinity() for process in children()]
         assert sorted(shares) == suite_workers._shares(2)
+        told_last = progress.told[-1]
+        refuse_in_their_words(workers, order, tmp_path)
     assert (found["cells"], found["failed"], found["skipped"]) == (CELLS, 0, [])
     assert children() == []
     one, two = table(tmp_path / "one"), table(out)
@@ -96,9 +98,21 @@ def test_two_processes_give_the_table_of_one_and_fill_each_cell_once(
     names = [sorted(p.name for p in (tmp_path / n / "cells").iterdir()) for n in ("one", "two")]
     assert names[0] == names[1]
     assert {Run.open(out / "cells" / name).attempt for name in names[1]} == {1}
-    assert progress.told[-1][:3] == ("suite", CELLS, CELLS)
+    assert told_last[:3] == ("suite", CELLS, CELLS)
     assert any("quick, low" in message for *_, message in progress.told)
     assert "shared by 2 cells at a time" in (out / "report.md").read_text()
+
+
+def refuse_in_their_words(workers: SuiteWorkers, order: Order, folder: Path) -> None:
+    """See that what a process finds wrong is told in its words, and that it works on."""
+    wrong = replace(order, methods=("quick@object_.search.population=1",))
+    told = r"population is 1; expected a whole number from 2"
+    with pytest.raises(UsageError, match=told):
+        evaluate_suite(wrong, folder / "wrong", fill=workers.fill(wrong, folder / "wrong"))
+    making = {"object": "brick", "action": "lift", "seed": 0}
+    with pytest.raises(UsageError, match="no object named 'brick'"):
+        workers.make({folder / "brick": making})
+    assert not (folder / "brick").exists()
 
 
 def test_whatever_is_made_of_other_cells_comes_last(recordings: tuple[Sequence, ...]) -> None:
@@ -170,18 +184,6 @@ def test_a_wish_to_stop_ends_all_processes_and_keeps_what_is_finished(
     stored = json.loads((tmp_path / "cells.json").read_text())
     assert {cell["method"] for cell in stored["cells"]} >= {"static"}
     assert 0 < stored["about"]["missing"] < CELLS
-
-
-def test_what_a_process_finds_wrong_is_told_in_its_words(tmp_path: Path, order: Order) -> None:
-    wrong = replace(order, methods=("quick@object_.search.population=1",))
-    told = r"population is 1; expected a whole number from 2"
-    with SuiteWorkers(2, NullProgress()) as workers:
-        with pytest.raises(UsageError, match=told):
-            evaluate_suite(wrong, tmp_path, fill=workers.fill(wrong, tmp_path))
-        making = {"object": "brick", "action": "lift", "seed": 0}
-        with pytest.raises(UsageError, match="no object named 'brick'"):
-            workers.make({tmp_path / "brick": making})
-    assert not (tmp_path / "brick").exists()
 
 
 def test_an_order_survives_being_told_to_another_process(order: Order) -> None:

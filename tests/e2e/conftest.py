@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,14 +20,21 @@ from playwright.sync_api import (
     expect,
     sync_playwright,
 )
-from scene_page import TIMEOUT_MS
+from scene_page import TIMEOUT_MS, ScenePage
 from waiting import until
 
 from app.jobs.processes import end_processes
 
 ROOT = Path(__file__).parents[2]
 START = "from app.cli import main; main()"
-_CHROMIUM = ["--no-sandbox", "--use-angle=gl-egl", "--ignore-gpu-blocklist"]
+_CHROMIUM = [
+    "--no-sandbox",
+    "--use-angle=gl-egl",
+    "--ignore-gpu-blocklist",
+    # Without a graphics card every picture costs a processor: draw each once, and smooth none.
+    "--disable-gpu-compositing",
+    "--webgl-msaa-sample-count=0",
+]
 _START_SECONDS = 180.0
 _WHOLE_TEST_SECONDS = 900
 """Starting server and browser belongs to the first test of a file."""
@@ -51,10 +59,15 @@ class Served:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Give tests that drive a browser time; what they wait for has limits of its own."""
+    """Give tests that drive a browser time; what they wait for has limits of its own.
+
+    No line is counted while the program runs in a process of its own, where none would be found.
+    """
     for item in items:
         if item.path.parent == Path(__file__).parent:
             item.add_marker(pytest.mark.timeout(_WHOLE_TEST_SECONDS))
+            if "served" in getattr(item, "fixturenames", ()):
+                item.add_marker(pytest.mark.no_cover)
 
 
 @pytest.fixture(scope="module")
@@ -107,8 +120,8 @@ def browser(playwright_driver: Playwright) -> Iterator[Browser]:
     browser.close()
 
 
-@pytest.fixture
-def context(browser: Browser) -> Iterator[BrowserContext]:
+@contextmanager
+def quiet_context(browser: Browser) -> Iterator[BrowserContext]:
     """A browser without history; its pages may not complain of anything."""
     complaints: list[str] = []
     context = browser.new_context(viewport={"width": 1280, "height": 800})
@@ -119,6 +132,27 @@ def context(browser: Browser) -> Iterator[BrowserContext]:
     yield context
     context.close()
     assert complaints == []
+
+
+@pytest.fixture
+def context(browser: Browser) -> Iterator[BrowserContext]:
+    """A browser for one test."""
+    with quiet_context(browser) as context:
+        yield context
+
+
+@pytest.fixture(scope="module")
+def shared_scene(browser: Browser, served: Served) -> Iterator[ScenePage]:
+    """The finished run in the viewer, paused, in a browser that the tests of a file share.
+
+    Opening a scene takes longer than most of what is done in it.
+    """
+    with quiet_context(browser) as context:
+        page = context.new_page()
+        page.goto(served.url)
+        scene = ScenePage.opened_from(page)
+        scene.pause()
+        yield scene
 
 
 @pytest.fixture

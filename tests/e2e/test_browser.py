@@ -2,7 +2,6 @@
 
 import re
 import zipfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import numpy as np
 import psutil
 import pytest
 import yaml
-from playwright.sync_api import Page, expect
+from playwright.sync_api import expect
 from scene_page import ScenePage, object_springs, virtual_springs
 
 from app.jobs.processes import COOKIE
@@ -59,14 +58,6 @@ def fitted() -> Fitted:
     )
 
 
-@pytest.fixture
-def scene(home: Page) -> ScenePage:
-    """The finished run in the viewer, paused."""
-    scene = ScenePage.opened_from(home)
-    scene.pause()
-    return scene
-
-
 def test_the_printed_address_shows_sequences_and_finished_runs(home, fitted, picture):
     expect(home.locator("[data-sequence=towel_fold] h3")).to_contain_text("towel_fold")
     row = home.locator(f"#runs [data-run={fitted.id}]")
@@ -77,7 +68,7 @@ def test_the_printed_address_shows_sequences_and_finished_runs(home, fitted, pic
     picture(home, "home")
 
 
-def test_a_scene_opens_and_plays(home, picture):
+def test_a_scene_opens_plays_and_saves_what_it_shows(home, fitted, tmp_path, picture):
     scene = ScenePage.opened_from(home)
 
     frames = {scene.value("Frame")}
@@ -89,8 +80,28 @@ def test_a_scene_opens_and_plays(home, picture):
     scene.go(40)  # A frame in which much happens.
     picture(home, "viewer")
 
+    scene.go(30)
+    scene.unfold("Export")
 
-def test_sliders_simulate_again_and_reset_returns(scene, fitted, tmp_path, picture):
+    points = ply_vertices(scene.download("PLY", tmp_path))
+    expected = np.concatenate([fitted.rollout[30], fitted.control[30]])
+    np.testing.assert_allclose(points, expected, atol=1e-6)
+
+    # It shows blue object nodes and red control nodes, not an empty canvas; browsers without a
+    # graphics card may be late to draw them.
+    def shows_nodes() -> bool:
+        image = cv2.imread(str(scene.download("PNG", tmp_path)))
+        assert image.shape[0] > 500
+        blue, green, red = (image[..., channel].astype(int) for channel in range(3))
+        objects = np.count_nonzero((blue > 150) & (blue - red > 60))
+        controls = np.count_nonzero((red > 120) & (red - blue > 80) & (red - green > 80))
+        return objects > 1000 and controls > 100
+
+    scene.until(shows_nodes, "a picture of the nodes")
+
+
+def test_sliders_simulate_again_and_reset_returns(shared_scene, fitted, tmp_path, picture):
+    scene = shared_scene
     radius = fitted.parameters["connection_radius"]
     virtual_radius = fitted.parameters["virtual_connection_radius"]
     as_fitted = len(fitted.object_springs(radius)), len(fitted.virtual_springs(virtual_radius))
@@ -132,8 +143,10 @@ def test_sliders_simulate_again_and_reset_returns(scene, fitted, tmp_path, pictu
     scene.until(lambda: scene.value("δ object [mm]") == fitted_radius, "its slider")
 
 
-def test_another_tab_is_left_alone(scene: ScenePage, open_home: Callable[[], Page]):
-    other = ScenePage.opened_from(open_home())
+def test_another_tab_is_left_alone(shared_scene: ScenePage, served):
+    scene, page = shared_scene, shared_scene.page.context.new_page()
+    page.goto(served.url)
+    other = ScenePage.opened_from(page)
     other.pause()
     assert other.page.url != scene.page.url
     other.until(lambda: other.difference() == 0, "the fitted rollout")
@@ -148,27 +161,7 @@ def test_another_tab_is_left_alone(scene: ScenePage, open_home: Callable[[], Pag
     # The other tab is not merely frozen: it answers its own user.
     other.press("1 ▶")
     other.until(lambda: other.value("Frame") != frame, "a step by one frame")
-
-
-def test_the_viewer_saves_what_it_shows(scene, fitted, tmp_path):
-    scene.go(30)
-    scene.unfold("Export")
-
-    points = ply_vertices(scene.download("PLY", tmp_path))
-    expected = np.concatenate([fitted.rollout[30], fitted.control[30]])
-    np.testing.assert_allclose(points, expected, atol=1e-6)
-
-    # It shows blue object nodes and red control nodes, not an empty canvas; browsers without a
-    # graphics card may be late to draw them.
-    def shows_nodes() -> bool:
-        image = cv2.imread(str(scene.download("PNG", tmp_path)))
-        assert image.shape[0] > 500
-        blue, green, red = (image[..., channel].astype(int) for channel in range(3))
-        objects = np.count_nonzero((blue > 150) & (blue - red > 60))
-        controls = np.count_nonzero((red > 120) & (red - blue > 80) & (red - green > 80))
-        return objects > 1000 and controls > 100
-
-    scene.until(shows_nodes, "a picture of the nodes")
+    page.close()
 
 
 def test_a_run_page_exports_the_rollout(home, fitted, tmp_path, picture):

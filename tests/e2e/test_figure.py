@@ -5,18 +5,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, expect
 from scene_page import TIMEOUT_MS, ScenePage
 
 pytestmark = pytest.mark.e2e
 FRAME = 30
-
-
-@pytest.fixture
-def scene(home: Page) -> ScenePage:
-    scene = ScenePage.opened_from(home)
-    scene.pause()
-    return scene
 
 
 def hue(image: np.ndarray, low: int, high: int) -> np.ndarray:
@@ -26,8 +19,9 @@ def hue(image: np.ndarray, low: int, high: int) -> np.ndarray:
 
 
 def test_the_figure_shows_both_topologies_in_one_picture(
-    scene: ScenePage, tmp_path: Path, picture
+    shared_scene: ScenePage, tmp_path: Path, picture
 ) -> None:
+    scene = shared_scene
     scene.page.keyboard.press("f")
     scene.until(lambda: scene.has("PhysTwin-style: simulated 60/60 frames"), "the figure")
     scene.go(FRAME)
@@ -60,7 +54,8 @@ def test_the_figure_shows_both_topologies_in_one_picture(
     scene.until(lambda: scene.has("Compare with PhysTwin"), "the scene")
 
 
-def test_a_scene_is_one_tab_s_own(scene: ScenePage, browser: Browser, served) -> None:
+def test_a_scene_is_one_tab_s_own(shared_scene: ScenePage, browser: Browser, served) -> None:
+    scene = shared_scene
     scene.go(FRAME)
     scene.set("stiffness 10^", -1)
     difference, address = scene.new_difference("another rollout"), scene.page.url

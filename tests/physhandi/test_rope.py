@@ -13,12 +13,13 @@ from physhandi.run import Run
 
 
 @pytest.mark.slow
+@pytest.mark.no_cover  # Quick tests of each stage go through the same lines, in half the time.
 def test_a_rope_predicts_trajectories_it_was_not_fitted_on(tmp_path: Path) -> None:
     folder = recording("rope_mocap")
     for number in (48, 49, 52, 53):
         import_mocap(folder / f"trajectory_{number:03d}.npy", tmp_path / "sequences")
     config = load_profile("default")
-    search = config.object_.search.replace(generations=5, population=8)
+    search = config.object_.search.replace(generations=5, population=8, widening_generations=0)
     first_order = config.object_.first_order.replace(iterations=0)
     config = config.replace(object_=config.object_.replace(search=search, first_order=first_order))
     run = Run.create(

@@ -111,6 +111,7 @@ def test_the_injected_error_has_the_size_that_it_says(truth: HandMotion, width: 
 
 
 @pytest.mark.slow
+@pytest.mark.no_cover  # test_hand_refinement.py goes through the same lines.
 @WIDTHS
 def test_a_third_of_a_random_hand_error_is_recovered(
     run: Run, truth: HandMotion, width: float
@@ -124,6 +125,7 @@ def test_a_third_of_a_random_hand_error_is_recovered(
 
 
 @pytest.mark.slow
+@pytest.mark.no_cover  # test_hand_refinement.py goes through the same lines.
 @WIDTHS
 def test_without_gradients_through_the_simulator_nothing_is_recovered(
     run: Run, truth: HandMotion, width: float, monkeypatch: pytest.MonkeyPatch

@@ -52,6 +52,7 @@ def test_without_mano_the_fit_says_how_to_bring_it(
 
 
 @pytest.mark.slow
+@pytest.mark.no_cover  # Its lines are those of the quick tests of stages and of MANO.
 def test_a_whole_run_uses_mano_and_outlives_it(
     tmp_path: Path, mano: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -62,7 +63,7 @@ def test_a_whole_run_uses_mano_and_outlives_it(
     for view, seen in zip(Sequence.load(folder).views, keypoint, strict=True):
         np.save(view.folder / "keypoint.npy", seen)
     config = load_profile("quick")
-    search = config.object_.search.replace(generations=1, population=4)
+    search = config.object_.search.replace(generations=1, population=4, widening_generations=0)
     first_order = config.object_.first_order.replace(iterations=1)
     config = config.replace(
         hand=config.hand.replace(model="mano", iterations=60, depth_iterations=0),
