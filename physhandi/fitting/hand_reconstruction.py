@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from numpy import ndarray
+from scipy.ndimage import median_filter
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
@@ -55,6 +56,12 @@ _REFRESH = 10
 """Evaluations of the depth loss between two searches for corresponding vertices."""
 _DOUBT = 3.0
 """Depth errors beyond this many standard deviations lose their pull (Cauchy's loss)."""
+_LEAST_POINTS = 8
+"""Measured points that tell how far away a hand is."""
+_BESIDE = 0.01
+"""Distance at which a line of sight still meets a vertex [m]."""
+_STEADY = 0.3
+"""Time over which the median of the way to the measured depth is taken [s]."""
 HAND_STAGE = "hand_reconstruction"
 """Name of the stage in progress reports."""
 
@@ -272,6 +279,7 @@ class HandProblem:
             )
             if self.depth is not None:
                 depth = self.depth
+                self._place_by_depth(depth)
                 self._descend(
                     config.depth_iterations,
                     config.learning_rate / 4,
@@ -286,6 +294,21 @@ class HandProblem:
                 f"The fit of the {self.model.side} hand did not stay finite (loss {after})."
             )
         return SolvedHand(self._motion(), before, after, curve)
+
+    def _place_by_depth(self, target: DepthTarget) -> None:
+        """Move the hand to where depth was measured, if keypoints left it out of the loss's reach.
+
+        One view tells how far away a hand is by its size alone, which differs from hand to hand.
+        """
+        with torch.no_grad():
+            shape, rotation, translation, _ = self.hand()
+            still = torch.zeros_like(translation)
+            local = self.model(shape, self.parameters["articulation"], still, still).vertex
+            vertex = local @ rotation.transpose(-1, -2) + translation[:, None]
+            normal = vertex_normals_torch(vertex, torch.from_numpy(self.model.faces))
+            move = way_to_depth(vertex.numpy(), normal.numpy(), target, self.frame_rate)
+            if np.median(np.linalg.norm(move, axis=1)) > _DOUBT * self.config.depth_noise:
+                translation.add_(torch.from_numpy(move.astype(np.float32)))
 
     def _show(self, loss: float, progress: Progress) -> None:
         """Send the hand's current keypoints to a preview, if one is due."""
@@ -606,6 +629,45 @@ def depth_target(sequence: Sequence, side: HandSide, point_count: int) -> DepthT
         towards_camera=torch.tensor(ray, dtype=torch.float32),
         weight=torch.tensor(weight, dtype=torch.float32),
     )
+
+
+def way_to_depth(
+    vertex: Float[ndarray, "frame vertex 3"],
+    normal: Float[ndarray, "frame vertex 3"],
+    target: DepthTarget,
+    frame_rate: float,
+) -> Float[ndarray, "frame 3"]:
+    """Find how far each frame's hand lies from the depth that was measured of it [m].
+
+    A point is compared with the vertex that its line of sight passes nearest to, of those that face
+    the camera; how far the hand is off aside is left to the keypoints.
+    """
+    known, move = [], []
+    for frame in range(len(vertex)):
+        count = int((target.weight[frame] > 0).sum())
+        if count < _LEAST_POINTS:
+            continue
+        ray = target.towards_camera[frame, :count].numpy().astype(np.float64)
+        point = target.point[frame, :count].numpy().astype(np.float64)
+        offset = point[:, None] - vertex[frame].astype(np.float64)
+        along = (offset * ray[:, None]).sum(axis=2)
+        aside = np.linalg.norm(offset - along[..., None] * ray[:, None], axis=2)
+        aside[ray @ normal[frame].T <= 0.0] = np.inf
+        nearest = aside.argmin(axis=1)
+        rows = np.arange(count)
+        is_hit = aside[rows, nearest] < _BESIDE
+        if is_hit.sum() < _LEAST_POINTS:
+            continue
+        direction = ray[is_hit].mean(axis=0)
+        direction /= np.linalg.norm(direction)
+        known.append(frame)
+        move.append(np.median(along[rows, nearest][is_hit]) * direction)
+    if not known:
+        return np.zeros((len(vertex), 3))
+    window = min(len(known), 2 * round(_STEADY * frame_rate / 2) + 1)
+    steady = median_filter(np.array(move), size=(window, 1), mode="nearest")
+    frames = np.arange(len(vertex))
+    return np.stack([np.interp(frames, known, steady[:, axis]) for axis in range(3)], axis=1)
 
 
 def depth_loss(

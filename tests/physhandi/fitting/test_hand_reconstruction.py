@@ -1,5 +1,6 @@
 """Stage 1 on a made-up hand that is known exactly, and on the real two-camera recording."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import hand_scene as scene
@@ -10,7 +11,13 @@ from recordings import recording
 
 from physhandi.data.importers.stereo import import_stereo
 from physhandi.errors import CancelledError, FitError, MissingInputError, SettingsError
-from physhandi.fitting.hand_reconstruction import HandFit, HandFitConfig, reconstruct_hands
+from physhandi.fitting.hand_reconstruction import (
+    DepthTarget,
+    HandFit,
+    HandFitConfig,
+    reconstruct_hands,
+    way_to_depth,
+)
 from physhandi.hand.loading import load_hand_model
 from physhandi.hand.motion import HandMotion
 from physhandi.metrics.hands import evaluate_hands
@@ -109,6 +116,45 @@ def test_depth_corrects_a_hand_that_one_view_cannot_place(tmp_path: Path) -> Non
     with_depth = _vertex_error(reconstruct_hands(sequence, config), truth)
     assert without.mean() > 0.015
     assert with_depth.mean() < 0.5 * without.mean()
+
+
+def test_depth_places_a_hand_of_unknown_size_that_one_view_takes_for_a_nearer_one(
+    tmp_path: Path,
+) -> None:
+    """A hand that is larger by a seventh looks like one that is nearer by a seventh of 0.6 m."""
+    truth = replace(scene.grasping(frames=4), scale=1.15)
+    keypoint = scene.seen_keypoints([truth], CAMERAS[:1])
+    sequence = scene.write_scene(tmp_path / "a", [truth], CAMERAS[:1], keypoint, depth=True)
+    config = HandFitConfig(iterations=200, depth_iterations=0)
+    assert _vertex_error(reconstruct_hands(sequence, config), truth).mean() > 0.05
+    config = HandFitConfig(iterations=200, depth_iterations=120)
+    assert _vertex_error(reconstruct_hands(sequence, config), truth).mean() < 0.012
+
+
+def test_the_way_to_measured_depth_is_along_the_line_of_sight() -> None:
+    """A ball of dots, seen from above and from aside, that was measured elsewhere."""
+    normal = np.random.default_rng(4).normal(size=(2000, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    vertex = 0.05 * normal
+    sights = np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [0.0, 0.0, 1.0]])
+    ways = np.array([0.08, -0.03, 0.08])
+    point = np.zeros((3, 40, 3))
+    for frame, (sight, way) in enumerate(zip(sights, ways, strict=True)):
+        point[frame] = vertex[normal @ sight > 0.5][:40] + way * sight
+    weight = np.full((3, 40), 1 / 40)
+    weight[2] = 0.0  # Nothing was measured: as in the frame before.
+    target = DepthTarget(
+        point=torch.tensor(point, dtype=torch.float32),
+        towards_camera=torch.tensor(np.repeat(sights[:, None], 40, axis=1), dtype=torch.float32),
+        weight=torch.tensor(weight, dtype=torch.float32),
+    )
+    frames = np.repeat(vertex[None], 3, axis=0), np.repeat(normal[None], 3, axis=0)
+    # At 3 frames a second the median over time is that of a single one.
+    found = way_to_depth(*frames, target, frame_rate=3.0)
+    expected = ways[[0, 1, 1], None] * sights[[0, 1, 1]]
+    np.testing.assert_allclose(found, expected, atol=1e-3)
+    target.weight[:] = 0.0
+    assert np.all(way_to_depth(*frames, target, frame_rate=3.0) == 0.0)
 
 
 def test_what_is_missing_is_said(tmp_path: Path) -> None:
