@@ -56,10 +56,20 @@ class ScenePage:
         return float(self.field(label).input_value())
 
     def set(self, label: str, value: float) -> None:
-        """Type a value beside a slider."""
+        """Put a value into the field beside a slider at once, as pasting does."""
         field = self.field(label)
+        # The field looks for what changed around the caret of the last key, which may be long ago;
+        # emptied, it forgets that caret and reads all of what comes next.
+        field.fill("")
         field.fill(f"{value:g}")
         field.press("Enter")
+        self._send()
+
+    def type(self, label: str, text: str) -> None:
+        """Type over what is in the field beside a slider, key by key."""
+        field = self.field(label)
+        field.press("Control+a")
+        field.press_sequentially(text)
         self._send()
 
     def write(self, label: str, text: str) -> None:

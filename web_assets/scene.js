@@ -1,6 +1,6 @@
 "use strict";
 
-/* A live scene in a frame: keys that work in it and on the page around it, and charts to click. */
+/* A live scene in a frame: keys that work in it and on the page around it, fields, and charts to click. */
 
 {
   const OF_PAGE = ["?", "p", "P", "Tab", "Enter"];
@@ -37,11 +37,22 @@
     return Math.max(0, Math.round(chart.posToVal(event.clientX - over.getBoundingClientRect().left, "x")));
   }
 
+  /* Once a number field of viser's has heard the -0 of a -0.6 that is being typed, it shows 0, and 0.6
+     becomes of it. It hears of -0 only when that is entered or left, and before of what it grows into. */
+  function keepSigns(root) {
+    const isNegativeZero = (field) => field.matches?.(".mantine-NumberInput-input") && Object.is(Number(field.value), -0);
+    const tell = ({ target }) => isNegativeZero(target) && target.dispatchEvent(new Event("input", { bubbles: true }));
+    root.addEventListener("input", (event) => event.isTrusted && isNegativeZero(event.target) && event.stopPropagation(), true);
+    root.addEventListener("keydown", (event) => event.key === "Enter" && tell(event), true);
+    root.addEventListener("focusout", tell, true);
+  }
+
   /* To be called whenever the frame has loaded a scene. */
   globalThis.wireScene = (scene, seek) => {
     const inside = scene.contentWindow;
     const root = inside.document.documentElement;
     let start = 0;
+    keepSigns(root);
     root.addEventListener("keydown", (event) => NOT_FOR_CAMERA.includes(event.code) && event.stopPropagation());
     inside.addEventListener("keydown", (event) => {
       if (event.key === "?" && !isTyping(event)) document.getElementById("help").showModal();

@@ -143,6 +143,29 @@ def test_sliders_simulate_again_and_reset_returns(shared_scene, fitted, tmp_path
     scene.until(lambda: scene.value("δ object [mm]") == fitted_radius, "its slider")
 
 
+def test_a_negative_value_typed_key_by_key_keeps_its_sign(shared_scene: ScenePage):
+    scene, slider = shared_scene, "stiffness 10^"
+
+    def is_simulated(power: float) -> bool:
+        return float(scene.link().get("stiffness_scale", 1)) == pytest.approx(10**power)
+
+    scene.set(slider, -0.7)
+    scene.until(lambda: is_simulated(-0.7), "what was pasted")
+    scene.type(slider, "-0.6")
+    assert scene.value(slider) == -0.6
+    scene.field(slider).press("Enter")
+    scene.until(lambda: is_simulated(-0.6), "what was typed")
+
+    scene.press("Reset")
+    scene.until(lambda: is_simulated(0) and scene.value(slider) == 0, "the fitted stiffness")
+    scene.set(slider, -0.6)  # As before the reset, which must not make it old news.
+    scene.until(lambda: is_simulated(-0.6), "what was pasted once more")
+    scene.type(slider, "-0")
+    assert is_simulated(-0.6)  # It may become any number, until it is entered.
+    scene.field(slider).press("Enter")
+    scene.until(lambda: is_simulated(0), "the fitted stiffness, typed as -0")
+
+
 def test_another_tab_is_left_alone(shared_scene: ScenePage, served):
     scene, page = shared_scene, shared_scene.page.context.new_page()
     page.goto(served.url)

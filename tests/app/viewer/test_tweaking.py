@@ -2,8 +2,9 @@
 
 import re
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ from viewer_client import ViewerClient
 from viewer_world import FRAMES, PARAMETERS, FakeSettings, FolderCatalog
 from waiting import until
 
+from app.viewer.physics.history import Setting
 from app.viewer.physics.keep_panel import RunSaver, SavedRun, UserStorage, run_changes
+from app.viewer.physics.parameters import Knob
 from app.viewer.physics.presets import PresetStore
 from app.viewer.sessions import Sessions
 from physhandi.data.sequence import Sequence
@@ -124,6 +127,55 @@ def test_presets_are_chosen_and_one_parameter_is_put_back(sessions) -> None:
         client.set("Preset", "as fitted")
         client.until(lambda: "nothing: parameters as fitted" in client.texts())
         client.until(lambda: client.value("stiffness 10^") == 0.0)
+
+
+def test_every_control_takes_the_same_value_again_after_a_reset(sessions) -> None:
+    with watch(sessions) as client:
+        session = sessions.get(sessions.list()[0].id)
+        panel = session._object.panel
+        history, fitted = panel.history, panel.history.setting
+        client.set("Simulation", "Hold")  # What is asked for matters, and not what becomes of it.
+
+        def press(name: str, expected: Setting) -> None:
+            client.set("History", name)
+            client.until(lambda: history.setting == expected)
+            written = threading.Event()
+            with panel._lock:  # All that follows from it is handed to the event loop by then.
+                session._guard.on_event_loop(written.set)
+            client.until(written.is_set)
+            for knob, control in controls:
+                assert control.handle.value == knob.to_slider(expected.parameters)
+
+        def take(label: str, value: Any, in_force: Callable[[], bool]) -> None:
+            client.set(label, value)
+            client.until(in_force)
+            chosen = history.setting
+            press("Reset", fitted)
+            client.set(label, value)
+            client.until(lambda: history.setting == chosen)
+            press("Undo", fitted)
+            press("Redo", chosen)
+            press("Reset", fitted)
+
+        controls = panel._sliders._controls
+        assert len(controls) > 15
+        for knob, control in controls:
+            if control.handle.disabled:  # There is no ground whose height could be moved.
+                continue
+            start = control.handle.value
+            value = not start
+            if isinstance(knob, Knob):
+                value = (start + (knob.high if start < knob.high else knob.low)) / 2
+                value = round(value) if knob.is_integer else value
+            expected = knob.from_slider(value)
+            assert expected != getattr(fitted.parameters, knob.field)
+            take(
+                knob.label,
+                value,
+                lambda field=knob.field, to=expected: getattr(history.current, field) == to,
+            )
+        take("Preset", "limp", lambda: history.current.drag == 0.5)
+        take("substeps", "automatic", lambda: history.is_automatic)
 
 
 def test_own_presets_are_shared_by_all_scenes_and_deleted(sessions, storage) -> None:
