@@ -15,11 +15,13 @@ from numpy import ndarray
 from physhandi.data.exporters.scene_data import HandSurface, SceneData, read_scene
 from physhandi.data.layout import MATERIAL_FILE, SequenceFiles
 from physhandi.data.run import RunFolder
+from physhandi.data.run_folder import reading
 from physhandi.data.sequence import Sequence as Recording
 from physhandi.errors import MissingInputError, RunError, UsageError
 from physhandi.object_rollout import ObjectRollout, load_fitted
 from physhandi.progress import Progress, Watcher, watched
 from physhandi.settings import changes as changed_settings
+from physhandi.simulation.contact_intervals import NEVER, ContactIntervals
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import (
     SimulationParameters,
@@ -63,6 +65,7 @@ class FittedObject:
         *,
         attachment: Float[ndarray, "control 3"] | None = None,
         rest_node: Float[ndarray, "node 3"] | None = None,
+        contacts: ContactIntervals | None = None,
         run: RunFolder | None = None,
         sequence: str = "",
     ) -> None:
@@ -73,6 +76,8 @@ class FittedObject:
             attachment: Where the control nodes were when the virtual springs were laid [m];
                 frame 0 of the control nodes, unless refinement has moved the hands since.
             rest_node: Its rest shape [m]; frame 0 if left out.
+            contacts: What the control nodes hold, and when; if left out, what is near them at
+                frame 0, always.
             run: Run that it was fitted in.
             sequence: Name of the sequence.
         """
@@ -81,6 +86,7 @@ class FittedObject:
         self.run = run
         self.sequence = sequence
         self.rest_node = rest_node
+        self.contacts = contacts
         self.placement: PlacedObject | None = None
         """What was found out to lay the object into a recording that it was not fitted in."""
         self._all_controls = np.ascontiguousarray(fitted.control, dtype=np.float32)
@@ -119,10 +125,15 @@ class FittedObject:
             )
         attachment = SequenceFiles(name).attachment
         rest = folder.tensors(MATERIAL_FILE) if folder.has(MATERIAL_FILE) else {}
+        contacts = None
+        if folder.has(file := SequenceFiles(name).contacts):
+            with reading(folder.out / file):
+                contacts = ContactIntervals.from_tensors(folder.tensors(file))
         loaded = cls(
             fitted,
             attachment=folder.array(attachment) if folder.has(attachment) else None,
             rest_node=rest.get("rest_node"),
+            contacts=contacts,
             run=folder,
             sequence=name,
         )
@@ -242,7 +253,7 @@ class FittedObject:
         parameters, is_automatic = changed_parameters(self.parameters, changes)
         rollout = self.begin(parameters, automatic_substeps=is_automatic)
         rest = self.model.object_node if self.rest_node is None else self.rest_node
-        check_springs(self.sequence, rollout.model, parameters, self._attached, rest)
+        check_springs(self.sequence, rollout.model, parameters, self._attached, rest, self.contacts)
         if self.placement is not None and "substeps_per_frame" not in changes:
             needed = stable_substeps(rollout.model, parameters, rollout.control[0])
             count = max(needed, parameters.substeps_per_frame)
@@ -378,7 +389,12 @@ class FittedObject:
         if is_changed <= set(_MATERIAL):
             return _scale_material(model, fitted, parameters) if is_changed else model
         return retopologize(
-            model, parameters, self._attached, fitted=fitted, rest_node=self.rest_node
+            model,
+            parameters,
+            self._attached,
+            fitted=fitted,
+            rest_node=self.rest_node,
+            contacts=self.contacts,
         )
 
     def _placed(
@@ -489,7 +505,10 @@ def _hold_anew(
     parameters: SimulationParameters,
     control_0: Float[ndarray, "control 3"],
 ) -> SpringMassModel:
-    """Join an object to other control nodes: its own springs stay, the virtual ones are new."""
+    """Join an object to other control nodes: its own springs stay, the virtual ones are new.
+
+    They are laid at frame 0, for all frames.
+    """
     springs, length = virtual_springs(
         control_0.astype(np.float64),
         model.object_node.astype(np.float64),
@@ -510,4 +529,5 @@ def _hold_anew(
         stiffness=joined(model.stiffness, parameters.virtual_stiffness),
         damping=joined(model.damping, parameters.damping),
         control_count=len(control_0),
+        attached=np.array([[0, NEVER]], dtype=np.int32),
     )

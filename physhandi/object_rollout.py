@@ -47,6 +47,8 @@ class ObjectRollout:
     """Why the simulation ended early, if it did."""
     restart: Restart | None = None
     """State from which the frames after `restart.frame` start, in place of the rollout's own."""
+    hand_shift: Float[ndarray, "control 3"] | None = None
+    """What a restart that moves hands adds to control nodes [m]; found out when it is needed."""
     scene: Callable[[], SceneData] | None = None
     """Reads the hands and names that `export` writes beside the motion, if they are known."""
     _continued: SpringMassModel | None = field(default=None, init=False, repr=False)
@@ -81,16 +83,35 @@ class ObjectRollout:
         return self.ready >= self.frame_count
 
     def model_in(self, frame: int) -> SpringMassModel:
-        """Get the model of a frame: after a restart rest lengths and clearances are others."""
+        """Get the model of a frame: after a restart rest lengths and clearances are others.
+
+        Springs that are not attached in the frame have no stiffness and no damping.
+        """
         restart = self.restart
         if restart is None or frame <= restart.frame:
-            return self.model
+            return self.model.held_in(frame)
         if self._continued is None:
             own, control = self.position[restart.frame], self.control[restart.frame]
             self._continued = restart.continued(
                 self.model, self.parameters, np.asarray(own), np.asarray(control)
             )
-        return self._continued
+        return self._continued.held_in(frame)
+
+    def held_control(self, frame: int) -> Float[ndarray, "control 3"]:
+        """Give where virtual springs end: after a restart that moves hands not where these are."""
+        control, restart = np.asarray(self.control[frame]), self.restart
+        if restart is None or frame <= restart.frame:
+            return control
+        shift = self.shift_of_hands()
+        return control if shift is None else control + shift
+
+    def shift_of_hands(self) -> Float[ndarray, "control 3"] | None:
+        """Give what is added to control nodes after a restart [m]; None for nothing."""
+        restart = self.restart
+        if self.hand_shift is None and restart is not None and restart.frame < self.ready:
+            own = np.asarray(self.position[restart.frame])
+            self.hand_shift = restart.hand_shift(self.model, own)
+        return self.hand_shift
 
     def restart_arrays(self) -> dict[str, ndarray]:
         """Give what an export needs to tell springs after a restart from those before it.
@@ -98,6 +119,7 @@ class ObjectRollout:
         Returns:
             ``restart_frame``, the last frame before it; ``restart_position`` and
             ``restart_velocity`` of the object nodes, from which the next frame starts [m, m/s];
+            ``restart_hand_shift`` of every control node from then on [m], if hands are moved;
             ``restart_rest_length`` of every spring and ``restart_clearance`` of every node from
             then on [m]. Nothing if no frame that is ready comes after a restart.
         """
@@ -105,6 +127,9 @@ class ObjectRollout:
             return {}
         state = {f"restart_{name}": array for name, array in self.restart.to_tensors().items()}
         model = self.model_in(self.restart.frame + 1)
+        shift = self.shift_of_hands()
+        if shift is not None:
+            state["restart_hand_shift"] = shift
         return state | {
             "restart_rest_length": model.rest_length,
             "restart_clearance": model.clearance,
@@ -120,8 +145,8 @@ class ObjectRollout:
 
     def strains(self, frame: int) -> Float[ndarray, " spring"]:
         """Measure how much longer each spring is than at rest, as a part of its rest length."""
-        position, control = self.position[frame], self.control[frame]
-        return spring_strains(self.model_in(frame), np.asarray(position), np.asarray(control))
+        position, control = self.position[frame], self.held_control(frame)
+        return spring_strains(self.model_in(frame), np.asarray(position), control)
 
     def tensions(self, frame: int) -> Float[ndarray, " spring"]:
         """Compute how hard each spring pulls its ends together [N]."""
@@ -134,7 +159,7 @@ class ObjectRollout:
         return (
             np.asarray(self.position[frame]),
             np.asarray(velocity),
-            np.asarray(self.control[frame]),
+            self.held_control(frame),
             _difference(self.control, frame, self.parameters.frame_rate),
         )
 

@@ -45,6 +45,7 @@ from physhandi.fitting.config import (
     load_profile,
 )
 from physhandi.fitting.config import STAGES as STAGES
+from physhandi.fitting.contact_detection import find_contacts
 from physhandi.fitting.fit_warnings import with_warnings
 from physhandi.fitting.hand_reconstruction import reconstruct_hands
 from physhandi.fitting.object_problem import ObjectProblem, build_problem
@@ -234,6 +235,8 @@ def _object_in(
         object_ = FittedObject.of(source, name)
         if source.has(files.attachment):
             attempt.save_array(files.attachment, artefacts.load_attachment(source.out, name))
+        if object_.contacts is not None:
+            attempt.save_tensors(files.contacts, object_.contacts.to_tensors())
         if object_.fitted.restart is not None:
             attempt.save_tensors(files.restart, object_.fitted.restart.to_tensors())
     else:
@@ -251,7 +254,9 @@ def _object_in(
     return object_
 
 
-def _store_restart(attempt: Attempt, sequence: Sequence, device: str) -> None:
+def _store_restart(
+    attempt: Attempt, sequence: Sequence, device: str, *, moves_hands: bool = False
+) -> None:
     """Estimate the object's state in the last fitted frame, from which prediction starts."""
     fitted = _stored_object(attempt, sequence)
     try:
@@ -262,6 +267,7 @@ def _store_restart(attempt: Attempt, sequence: Sequence, device: str) -> None:
             artefacts.load_observation(attempt.out, sequence.name),
             sequence.reconstruction_frames[-1],
             device=device,
+            moves_hands=moves_hands,
         )
     except MissingInputError as error:
         raise MissingInputError(f"Sequence '{sequence.name}': {error}") from error
@@ -407,13 +413,25 @@ def _problems(
             clearance = resting_clearance(
                 object_node, sequence.ground_height, kind, thickness=thickness
             )
+        observation = artefacts.load_observation(attempt.out, sequence.name)
+        control = artefacts.load_control(attempt.out, sequence.name)
+        contacts = None
+        if config.object_.contact_over_time:
+            contacts = find_contacts(
+                observation,
+                object_node,
+                control,
+                frame_count=len(sequence.reconstruction_frames),
+                frame_rate=sequence.frame_rate,
+            )
         problems.append(
             build_problem(
                 name=sequence.name,
-                observation=artefacts.load_observation(attempt.out, sequence.name),
+                observation=observation,
                 object_node=object_node,
                 rest_node=rest_node,
-                control=artefacts.load_control(attempt.out, sequence.name),
+                control=control,
+                contacts=contacts,
                 frame_count=len(sequence.reconstruction_frames),
                 frame_rate=sequence.frame_rate,
                 ground_height=sequence.ground_height,
@@ -460,6 +478,9 @@ def _stage_springs(
     result = optimise_springs(problems(), parameters, config.object_, progress, device=device)
     for problem in problems():
         artefacts.save_model(attempt, problem.name, result.models[problem.name])
+        if problem.contacts is not None:
+            files = SequenceFiles(problem.name)
+            attempt.save_tensors(files.contacts, problem.contacts.to_tensors())
     first = problems()[0]
     artefacts.save_object(attempt, result.parameters, result.models[first.name], first.rest_node)
     losses = [result.loss_before], [result.loss_after]
@@ -514,7 +535,12 @@ def _stage_evaluation(
         if has_object:
             if config.prediction.restarts and sequence.future_frames:
                 try:
-                    _store_restart(attempt, sequence, device)
+                    _store_restart(
+                        attempt,
+                        sequence,
+                        device,
+                        moves_hands=config.object_.contact_over_time,
+                    )
                 except MissingInputError as error:
                     told = f"Predicted without a restart. {error}"
                     progress.report(EVALUATION, number, len(sequences), message=told)

@@ -51,6 +51,11 @@ class SequenceFiles:
         return f"{self.folder}/attachment.npy"
 
     @property
+    def contacts(self) -> str:
+        """What the hands were found to hold, and when, if springs are attached over time."""
+        return f"{self.folder}/contacts.safetensors"
+
+    @property
     def restart(self) -> str:
         """The observed state from which the predicted frames were simulated, if they were."""
         return f"{self.folder}/restart.safetensors"

@@ -240,6 +240,9 @@ class ObjectFitConfig(Settings, frozen=True, kw_only=True):
     frame 0 shows it there, and is at rest in that, instead of keeping the shape of the fit."""
     starts_at_rest: bool = False
     """Take the object to rest at frame 0 instead of estimating its velocity (PhysTwin)."""
+    contact_over_time: bool = False
+    """Whether virtual springs are attached when a hand is seen to take hold of the object and let
+    go when it leaves or slides, instead of being laid at frame 0 for all frames."""
     automatic_substeps: bool = False
     """Give each candidate the substeps that its own stability limit asks for."""
     most_substeps: Annotated[int, Meta(ge=1, le=1_000_000)] = 2000

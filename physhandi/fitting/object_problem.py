@@ -20,6 +20,7 @@ from torch import Tensor
 from physhandi.data.observation import ObjectObservation
 from physhandi.errors import FitError, SimulationDivergedError
 from physhandi.fitting.config import ObjectFitConfig
+from physhandi.simulation.contact_intervals import ContactIntervals
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
@@ -69,6 +70,8 @@ class ObjectProblem:
     """Position of a track less the weighted mean of its carriers, at frame 0 [m]."""
     surface_count: int | None = None
     """Leading nodes that lie on the surface, which alone enter the Chamfer term; None for all."""
+    contacts: ContactIntervals | None = None
+    """What the hands touch, and when; None for what is near them at frame 0, always."""
 
     @property
     def frame_count(self) -> int:
@@ -134,6 +137,7 @@ def build_problem(
     chamfer_points: Literal["cloud", "tracks"] = "cloud",
     cloud_points: int | None = 300,
     starts_at_rest: bool = False,
+    contacts: ContactIntervals | None = None,
 ) -> ObjectProblem:
     """Reduce a sequence to the tensors that the object fit reads.
 
@@ -153,6 +157,7 @@ def build_problem(
             tracks.
         cloud_points: Most points of a frame that enter the Chamfer term; None for all.
         starts_at_rest: Whether the object rests at frame 0, whatever the tracks say.
+        contacts: What the hands touch, and when; None for what is near them at frame 0, always.
 
     Returns:
         The problem, on the CPU.
@@ -208,6 +213,7 @@ def build_problem(
         carrier_weight=torch.from_numpy(weight),
         track_offset=torch.from_numpy(offset),
         surface_count=surface_count,
+        contacts=contacts,
     )
 
 
@@ -375,6 +381,7 @@ def build_problem_model(
         problem.control[0],
         problem_parameters(parameters, problem),
         rest_node=problem.rest_node,
+        contacts=problem.contacts,
     )
     return replace(model, initial_velocity=problem.initial_velocity, clearance=problem.clearance)
 

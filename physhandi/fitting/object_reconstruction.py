@@ -27,6 +27,7 @@ from physhandi.fitting.preview import RolloutPreview
 from physhandi.fitting.search import SEARCH_STAGE, SearchResult, search_parameters
 from physhandi.fitting.search_bounds import fit_intervals, measure_object
 from physhandi.progress import Progress
+from physhandi.simulation.contact_intervals import ContactIntervals
 from physhandi.simulation.engines.batch import BatchSimulator, MotionTarget
 from physhandi.simulation.engines.cpu import processor_count
 from physhandi.simulation.master_topology import MasterTopology
@@ -80,9 +81,14 @@ def check_problem(
 
     radius = widest("virtual_connection_radius")
     gap = _control_gap(problem.control[0], problem.object_node)
+    if problem.contacts is not None:
+        # An object that nothing has touched yet lies there; hands of another world never come.
+        fitted = problem.control[: problem.frame_count]
+        gap = min(_control_gap(control, problem.object_node) for control in fitted)
+    when = "at frame 0" if problem.contacts is None else "in every fitted frame"
     if gap >= radius and problem.control.shape[1] > 0:
         raise FitError(
-            f"Sequence '{problem.name}': at frame 0 the control nodes are {gap:.3g} m or more away "
+            f"Sequence '{problem.name}': {when} the control nodes are {gap:.3g} m or more away "
             f"from the object, but virtual springs reach {radius:.3g} m at most "
             "(virtual_connection_radius): nothing would hold it. Check that hands or control.npy "
             "lie in the object's world and unit, and that they touch it at frame 0."
@@ -99,12 +105,13 @@ def check_problem(
         )
 
 
-def check_springs(
+def check_springs(  # noqa: PLR0917  (what is checked, then what it was made from)
     name: str,
     model: SpringMassModel,
     parameters: SimulationParameters,
     control_0: Float[ndarray, "control 3"],
     rest_node: Float[ndarray, "node 3"],
+    contacts: ContactIntervals | None = None,
 ) -> None:
     """Refuse parameters that form no object spring or no virtual spring in sequence `name`.
 
@@ -114,6 +121,7 @@ def check_springs(
         parameters: Radii and neighbor limits.
         control_0: Control nodes at frame 0 [m].
         rest_node: The object's rest shape [m].
+        contacts: What the hands hold, and when, if springs are attached over time.
 
     Raises:
         UsageError: If one kind of spring is missing; names the value to change.
@@ -124,8 +132,11 @@ def check_springs(
             f"nearest nodes are {_node_gap(rest_node):.3g} m apart. Raise connection_radius above "
             "that, and max_neighbors to at least 1."
         )
-    if model.virtual_spring_count == 0 and len(control_0):
+    nothing_held = contacts is not None and len(contacts.node) == 0
+    if model.virtual_spring_count == 0 and len(control_0) and not nothing_held:
         gap = _control_gap(control_0, model.object_node)
+        if contacts is not None:
+            gap = float(contacts.distance.min())
         raise UsageError(
             f"No virtual spring forms in sequence '{name}': {_cause(parameters, 'virtual_')} and "
             f"the nearest control node is {gap:.3g} m from the object. Raise "
@@ -202,6 +213,7 @@ class CandidateEvaluator:
                 rest_node=problem.rest_node,
                 initial_velocity=problem.initial_velocity,
                 clearance=problem.clearance,
+                contacts=problem.contacts,
             )
             for problem in self._problems
         ]

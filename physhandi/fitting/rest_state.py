@@ -116,7 +116,7 @@ def hold_still(
     offset = place[model.spring_nodes[:, 1]] - place[model.spring_nodes[:, 0]]
     length = np.linalg.norm(offset, axis=1)
     rest = model.rest_length.astype(np.float64)
-    stiffness = parameters.stiffness_scale * model.stiffness.astype(np.float64)
+    stiffness = parameters.stiffness_scale * model.held_in(0).stiffness.astype(np.float64)
     is_virtual = np.arange(len(rest)) >= model.object_spring_count
     floor = np.where(
         is_virtual,

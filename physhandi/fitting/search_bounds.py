@@ -48,7 +48,8 @@ class ObjectSize:
     grip: float
     """The same of the control nodes at frame 0; at least the node spacing, and at most three."""
     gap: float
-    """Distance between the object and the nearest control node, at frame 0."""
+    """Distance between the object and the nearest control node: at frame 0, or when contacts begin
+    if they are followed over time (0 if there are none)."""
 
 
 def measure_object(problems: Many[ObjectProblem]) -> ObjectSize:
@@ -61,7 +62,7 @@ def measure_object(problems: Many[ObjectProblem]) -> ObjectSize:
     spacing = neighbor_distance(node)
     held = [problem for problem in problems if problem.control.shape[1]]
     grips = [neighbor_distance(problem.control[0].astype(np.float64)) for problem in held]
-    gaps = [KDTree(p.object_node).query(p.control[0])[0].min() for p in held]
+    gaps = [_gap(problem) for problem in held]
     gravity = abs(problems[0].gravity)
     return ObjectSize(
         spacing=spacing,
@@ -70,6 +71,13 @@ def measure_object(problems: Many[ObjectProblem]) -> ObjectSize:
         grip=float(np.clip(max(grips, default=0.0), spacing, _COARSEST_GRIP * spacing)),
         gap=float(max(gaps, default=0.0)),
     )
+
+
+def _gap(problem: ObjectProblem) -> float:
+    if problem.contacts is None:
+        return float(KDTree(problem.object_node).query(problem.control[0])[0].min())
+    distance = problem.contacts.distance
+    return float(distance.min()) if len(distance) else 0.0
 
 
 def neighbor_distance(node: Float[ndarray, "node 3"]) -> float:

@@ -420,6 +420,7 @@ class SpringDescent:
                 initial_position=state[0],
                 initial_velocity=state[1],
                 device=self._device,
+                first_frame=begin,
                 window=reach,
                 **contact,
             )

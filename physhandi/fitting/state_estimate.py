@@ -30,6 +30,7 @@ def observed_state(
     frame: int,
     *,
     device: str = "cpu",
+    moves_hands: bool = False,
 ) -> Restart:
     """Estimate position and velocity of the nodes in a frame.
 
@@ -46,6 +47,7 @@ def observed_state(
         observation: What was seen; only frame 0, the frame itself and those before it are read.
         frame: The frame.
         device: Warp device.
+        moves_hands: Whether hands go on where what they hold was seen (`Restart.moves_hands`).
 
     Raises:
         MissingInputError: If the frame shows no track whose place on the object is known.
@@ -63,6 +65,7 @@ def observed_state(
         frame=frame,
         position=position.astype(np.float32),
         velocity=velocity.astype(np.float32),
+        moves_hands=moves_hands,
     )
 
 

@@ -45,8 +45,8 @@ class ContactReference:
 
     hand: Float[ndarray, "frame point 3"]
     """Vertices of all hands [m]."""
-    is_joined: Bool[ndarray, " node"]
-    """Whether a virtual spring ends at the node."""
+    is_joined: Bool[ndarray, "#frame node"]
+    """Whether a virtual spring ends at the node; in all frames, or in each."""
     kind: LabelKind
     """True contact of the sequence, or proximity of what was observed to the fitted hands."""
     labels: dict[str, ContactLabels]
@@ -56,12 +56,26 @@ class ContactReference:
 
 
 def joined_nodes(
-    virtual_spring_nodes: Int[ndarray, "spring 2"], node_count: int
-) -> Bool[ndarray, " node"]:
-    """Mark the object nodes at which at least one virtual spring ends."""
-    ends = virtual_spring_nodes.reshape(-1)
-    is_joined = np.zeros(node_count, dtype=bool)
-    is_joined[ends[ends < node_count]] = True
+    virtual_spring_nodes: Int[ndarray, "spring 2"],
+    node_count: int,
+    attached: Int[ndarray, "spring 2"] | None = None,
+    frame_count: int = 1,
+) -> Bool[ndarray, "frame node"]:
+    """Mark the object nodes at which at least one virtual spring ends.
+
+    Args:
+        virtual_spring_nodes: The two nodes of each spring.
+        node_count: Number of object nodes.
+        attached: First and last frame in which each spring is attached; all frames if left out.
+        frame_count: Frames; one stands for all if springs are always attached.
+    """
+    node = virtual_spring_nodes.min(axis=1, initial=node_count)
+    first, last = np.array([[0, frame_count]]).T if attached is None else attached.T
+    frame = np.arange(frame_count)[:, None]
+    acts = np.broadcast_to((first <= frame) & (frame <= last), (frame_count, len(node)))
+    is_joined = np.zeros((frame_count, node_count), dtype=bool)
+    at_frame, spring = np.nonzero(acts)
+    is_joined[at_frame, node[spring]] = True
     return is_joined
 
 
@@ -200,7 +214,8 @@ def predicted_contacts(
     """
     is_near = hand_distance(node, reference.hand[: len(node)]) < threshold
     is_near[0] = True
-    return reference.is_joined & is_near
+    joined = reference.is_joined
+    return (joined if len(joined) == 1 else joined[: len(node)]) & is_near
 
 
 def _ratio(part: int, whole: int) -> float | None:

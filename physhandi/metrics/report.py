@@ -692,7 +692,7 @@ def _contact(
         labels = proximity_labels(start, hand, tracks, is_visible)
     return ContactReference(
         hand=hand,
-        is_joined=joined_nodes(virtual, len(node)),
+        is_joined=joined_nodes(virtual, len(node), tensors.get("attached"), len(hand)),
         kind="proximity" if truth is None else "true",
         labels=labels,
         true_proximity=true_proximity_labels(recorded, start, sequence.hands),

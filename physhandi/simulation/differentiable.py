@@ -44,6 +44,7 @@ def rollout(
     initial_position: Float[Tensor, "node 3"] | None = None,
     initial_velocity: Float[Tensor, "node 3"] | None = None,
     device: str = "cpu",
+    first_frame: int = 0,
     window: int | None = None,
     memory: int | None = None,
 ) -> tuple[Float[Tensor, "frame node 3"], Float[Tensor, "frame node 3"]]:
@@ -70,6 +71,7 @@ def rollout(
         initial_velocity: Their velocities at frame 0 [m/s].
         device: Warp device to simulate on. Tensors may be elsewhere; results are where
             `control` is.
+        first_frame: Number of the first frame of `control`, which decides what is attached when.
         window: Frames after which gradients are cut: 1 is PhysTwin's one-frame gradient,
             none the gradient over the whole horizon.
         memory: Memory that substeps may use until the backward pass [B], at least one frame's;
@@ -107,7 +109,7 @@ def rollout(
     ]
     bridge.check(tensors)
     trajectory = bridge.trajectory(tensors, memory)
-    position, velocity = _Rollout.apply(bridge, trajectory, window, *tensors)
+    position, velocity = _Rollout.apply(bridge, trajectory, (first_frame, window), *tensors)
     return position.to(control.device), velocity.to(control.device)
 
 
@@ -133,12 +135,12 @@ class _Rollout(torch.autograd.Function):
         ctx: Any,
         bridge: "_DifferentiableSimulator",
         trajectory: Trajectory | None,
-        window: int | None,
+        frames: tuple[int, int | None],
         *tensors: Tensor,
     ):
         with bridge.stream():
-            position, velocity = bridge.forward(tensors, trajectory)
-        ctx.bridge, ctx.trajectory, ctx.window = bridge, trajectory, window
+            position, velocity = bridge.forward(tensors, trajectory, frames[0])
+        ctx.bridge, ctx.trajectory, ctx.frames = bridge, trajectory, frames
         ctx.save_for_backward(*tensors, position, velocity)
         return position, velocity
 
@@ -146,9 +148,16 @@ class _Rollout(torch.autograd.Function):
     def backward(ctx: Any, *grad_outputs: Tensor):
         *tensors, position, velocity = ctx.saved_tensors
         states = position, velocity
-        window = ctx.window or len(position)
+        first_frame, window = ctx.frames
         with ctx.bridge.stream():
-            gradients = ctx.bridge.backward(tensors, states, grad_outputs, ctx.trajectory, window)
+            gradients = ctx.bridge.backward(
+                tensors,
+                states,
+                grad_outputs,
+                ctx.trajectory,
+                window or len(position),
+                first_frame=first_frame,
+            )
         return None, None, None, *gradients
 
 
@@ -160,6 +169,7 @@ class _DifferentiableSimulator:
     ) -> None:
         self.simulator = Simulator(model, parameters, device)
         self.torch_device = torch.device(wp.device_to_torch(self.simulator.device))
+        self._acts: Tensor | None = None
 
     @cached_property
     def adjoint(self) -> GraphAdjoint | CudaAdjoint | CpuAdjoint:
@@ -206,7 +216,7 @@ class _DifferentiableSimulator:
                 raise ValueError(f"{name} has shape {tuple(value.shape)}; expected {tuple(shape)}.")
 
     def forward(
-        self, tensors: Sequence[Tensor], trajectory: Trajectory | None
+        self, tensors: Sequence[Tensor], trajectory: Trajectory | None, first_frame: int
     ) -> tuple[Tensor, Tensor]:
         """Simulate all frames, store the substeps of some; return positions and velocities."""
         control, *material, position, velocity = tensors
@@ -218,6 +228,7 @@ class _DifferentiableSimulator:
         positions, velocities = [position], [velocity]
         for frame in range(1, len(control)):
             self._place_control(control, frame)
+            self._hold(material, first_frame + frame)
             if trajectory is not None and trajectory.keeps(frame):
                 trajectory.record(frame)
             else:
@@ -234,6 +245,8 @@ class _DifferentiableSimulator:
         outputs: tuple[Tensor, ...],
         trajectory: Trajectory,
         window: int,
+        *,
+        first_frame: int,
     ) -> list[Tensor]:
         """Return the gradients of all tensors, in their order, and release the trajectory."""
         control, *material, _, _ = tensors
@@ -247,12 +260,15 @@ class _DifferentiableSimulator:
             _copy_in(bar, output[-1])
         for frame in range(len(control) - 1, 0, -1):
             self._place_control(control, frame)
+            self._hold(material, first_frame + frame)
             if not trajectory.holds(frame):
                 for place, state in zip(begin, states, strict=True):
                     _copy_in(place, state[frame - 1])
                 trajectory.record(frame)
             adjoint.backward(trajectory.tape(frame))
             start, end, *rest = (_copy_out(value) for value in adjoint.sums)
+            if self._acts is not None:
+                rest[:2] = (value * self._acts for value in rest[:2])
             sums[0][frame - 1] += start
             sums[0][frame] += end
             for total, value in zip(sums[1:], rest, strict=True):
@@ -267,12 +283,25 @@ class _DifferentiableSimulator:
 
     def _place_material(self, material: list[Tensor]) -> None:
         log_stiffness, damping, drag, *coefficients = material
+        self._acts = None
         _copy_in(self.simulator.stiffness, log_stiffness.exp())
         _copy_in(self.simulator.damping, damping)
         self.simulator.override_world(
             velocity_loss=self.simulator.parameters.velocity_loss(float(drag)),
             **{n: float(v) for n, v in zip(SCALARS[1:], coefficients, strict=True)},
         )
+
+    def _hold(self, material: list[Tensor], frame: int) -> None:
+        """Let the springs act that are attached on the way to a frame, and no others."""
+        model = self.simulator.model
+        if model.is_always_attached:
+            return
+        acts = torch.from_numpy(model.acts_in(frame)).to(self.torch_device)
+        if self._acts is None or not torch.equal(acts, self._acts):
+            self._acts = acts
+            log_stiffness, damping = material[:2]
+            _copy_in(self.simulator.stiffness, log_stiffness.exp() * acts)
+            _copy_in(self.simulator.damping, damping * acts)
 
     def _place_control(self, control: Tensor, frame: int) -> None:
         _copy_in(self.simulator.control_start, control[frame - 1])

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Float32, Int, Int32
 from numpy import ndarray
 from scipy.spatial import KDTree
 
+from physhandi.simulation.contact_intervals import NEVER, ContactIntervals
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.topology import MINIMUM_LENGTH, MINIMUM_VIRTUAL_REST_LENGTH
@@ -39,6 +40,8 @@ class MasterTopology:
     """Place among the neighbors of the end that proposes the spring first."""
     object_spring_count: int
     """Number of leading springs that join two object nodes; the others are virtual."""
+    attached: Int32[ndarray, "virtual 2"]
+    """Frames in which each virtual spring is attached and lets go; see `SpringMassModel`."""
 
     @classmethod
     def of(
@@ -50,6 +53,7 @@ class MasterTopology:
         rest_node: Float[ndarray, "node 3"] | None = None,
         initial_velocity: Float[ndarray, "node 3"] | None = None,
         clearance: Float[ndarray, " node"] | None = None,
+        contacts: ContactIntervals | None = None,
     ) -> "MasterTopology":
         """Find the springs of all candidates at once.
 
@@ -61,6 +65,7 @@ class MasterTopology:
             initial_velocity: Of the object nodes at frame 0 [m/s]; at rest if left out.
             clearance: Height above the ground at which each object node touches it [m]; 0 if left
                 out.
+            contacts: What touches, and when; see `topology.build_model`.
         """
         node = np.asarray(object_node, dtype=np.float64)
         rest = node if rest_node is None else np.asarray(rest_node, dtype=np.float64)
@@ -70,12 +75,17 @@ class MasterTopology:
             max(p.connection_radius for p in parameters),
             max(p.max_neighbors for p in parameters),
         )
-        virtual, virtual_length, virtual_rank = _ranked_holds(
-            control,
-            node,
+        reach = (
             max(p.virtual_connection_radius for p in parameters),
             max(p.virtual_max_neighbors for p in parameters),
         )
+        if contacts is None:
+            virtual, virtual_length, virtual_rank = _ranked_holds(control, node, *reach)
+            attached = np.tile(np.array([[0, NEVER]], dtype=np.int32), (len(virtual), 1))
+        else:
+            virtual, virtual_length, virtual_rank, attached = _ranked_contacts(
+                contacts, len(node), *reach
+            )
         still = np.zeros(node.shape)
         return cls(
             object_node=node.astype(np.float32),
@@ -90,6 +100,7 @@ class MasterTopology:
             length=np.concatenate([length, virtual_length]),
             rank=np.concatenate([rank, virtual_rank]).astype(np.int32),
             object_spring_count=len(springs),
+            attached=attached,
         )
 
     def has(self, parameters: SimulationParameters) -> Bool[ndarray, " spring"]:
@@ -140,6 +151,7 @@ class MasterTopology:
             damping=damping[exists].astype(np.float32),
             object_spring_count=int(exists[: self.object_spring_count].sum()),
             control_count=self.control_count,
+            attached=self.attached[exists[self.object_spring_count :]],
         )
 
 
@@ -180,3 +192,17 @@ def _ranked_holds(control: ndarray, node: ndarray, radius: float, most: int) -> 
     order = np.lexsort((control_index, neighbor[is_spring]))
     springs = np.stack([neighbor[is_spring], len(node) + control_index], axis=1)[order]
     return springs, distance[is_spring][order], rank[order]
+
+
+def _ranked_contacts(
+    contacts: ContactIntervals, node_count: int, radius: float, most: int
+) -> tuple[ndarray, ndarray, ndarray, Int32[ndarray, "spring 2"]]:
+    """List contacts as `_ranked_holds` does, and the frames in which they begin and end."""
+    kept = np.flatnonzero(contacts.chosen(radius, most))
+    node, control, interval = (
+        value[kept] for value in (contacts.node, contacts.control, contacts.interval)
+    )
+    order = np.lexsort((interval[:, 0], control, node))
+    springs = np.stack([node, node_count + control], axis=1)[order]
+    distance = contacts.distance[kept][order].astype(np.float64)
+    return springs, distance, contacts.rank[kept][order], interval[order]

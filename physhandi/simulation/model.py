@@ -1,12 +1,14 @@
 """The model that is simulated: nodes and the springs that join them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Int32
+from jaxtyping import Bool, Float32, Int32
 from numpy import ndarray
+
+from physhandi.simulation.contact_intervals import NEVER, acts_in
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -35,10 +37,12 @@ class SpringMassModel:
     """Number of control nodes."""
     clearance: Float32[ndarray, " #node"] = field(default_factory=lambda: np.zeros(1, np.float32))
     """Height above the ground at which each object node touches it [m]; one for all, or each."""
+    attached: Int32[ndarray, "#virtual 2"] = field(default_factory=lambda: _always(1))
+    """Frame in whose state each virtual spring is attached, and the last one before it lets go: it
+    acts on the way from the first to the last; one pair for all, or each."""
 
     def __post_init__(self) -> None:
-        if self.clearance.shape == (1,):
-            object.__setattr__(self, "clearance", np.repeat(self.clearance, self.node_count))
+        self._spread()
         spring_count = len(self.spring_nodes)
         for name in ("rest_length", "stiffness", "damping"):
             value = getattr(self, name)
@@ -67,6 +71,19 @@ class SpringMassModel:
                 f"but there are {spring_count} springs."
             )
         self._check_nodes()
+        if self.attached.shape != (self.virtual_spring_count, 2):
+            raise ValueError(
+                f"attached has shape {self.attached.shape}; "
+                f"expected ({self.virtual_spring_count}, 2), two frames a virtual spring."
+            )
+
+    def _spread(self) -> None:
+        """Give each node and spring its own value where one is given for all."""
+        counts = {"clearance": self.node_count, "attached": self.virtual_spring_count}
+        for name, count in counts.items():
+            value = getattr(self, name)
+            if len(value) == 1:
+                object.__setattr__(self, name, np.repeat(value, max(count, 0), axis=0))
 
     def _check_nodes(self) -> None:
         """Refuse springs whose ends are not the nodes that their kind joins."""
@@ -91,6 +108,29 @@ class SpringMassModel:
         """Number of springs that join a control node to an object node."""
         return len(self.spring_nodes) - self.object_spring_count
 
+    @property
+    def is_always_attached(self) -> bool:
+        """Whether every virtual spring acts in all frames."""
+        return bool(np.all(self.attached == _always(1)))
+
+    def acts_in(self, frame: int) -> Bool[ndarray, " spring"]:
+        """Mark the springs that act on the way to a frame; to frame 0, those of frame 1."""
+        acts = np.ones(len(self.spring_nodes), dtype=bool)
+        acts[self.object_spring_count :] = acts_in(self.attached, frame)
+        return acts
+
+    def held_in(self, frame: int) -> "SpringMassModel":
+        """Give the model of a frame: springs that do not act in it have no stiffness or damping."""
+        if self.is_always_attached:
+            return self
+        acts = self.acts_in(frame).astype(np.float32)
+        return replace(
+            self,
+            stiffness=self.stiffness * acts,
+            damping=self.damping * acts,
+            attached=_always(self.virtual_spring_count),
+        )
+
     def to_tensors(self) -> dict[str, ndarray]:
         """Return every field as an array, ready for safetensors."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
@@ -103,13 +143,14 @@ class SpringMassModel:
     def from_tensors(cls, tensors: Mapping[str, ndarray]) -> "SpringMassModel":
         """Rebuild a model from the arrays of `to_tensors`.
 
-        Models that were stored before nodes had a clearance have none.
+        Models that were stored before nodes had a clearance have none; the virtual springs of those
+        that were stored before springs could be attached later are always attached.
 
         Raises:
             ValueError: If an array is missing, unknown or inconsistent.
         """
         names = {field.name for field in fields(cls)}
-        if set(tensors) | {"clearance"} != names:
+        if set(tensors) | {"clearance", "attached"} != names:
             raise ValueError(
                 f"A spring-mass model needs the arrays {', '.join(sorted(names))}; "
                 f"got {', '.join(sorted(tensors))}."
@@ -118,3 +159,8 @@ class SpringMassModel:
         for name in ("object_spring_count", "control_count"):
             values[name] = int(values[name][0])
         return cls(**values)
+
+
+def _always(count: int) -> Int32[ndarray, "virtual 2"]:
+    """Give the frames of springs that always act."""
+    return np.tile(np.array([[0, NEVER]], dtype=np.int32), (count, 1))

@@ -24,6 +24,8 @@ SHORTEST_SHARE = 1.0 / SAFETY**2
 what the margin of automatic substeps leaves room for."""
 TOUCHING = 3e-3
 """Height above where it touches the ground up to which a node is taken to lie there [m]."""
+FIRM_HOLD = 4
+"""Virtual springs that fix the place of a node, whatever hangs on it."""
 COINCIDENT = 1e-6
 """Nodes nearer to each other than this have no strain that could be kept [m]."""
 
@@ -38,6 +40,9 @@ class Restart:
     """Object nodes in that frame [m]."""
     velocity: Float32[ndarray, "node 3"]
     """Their velocities [m/s]."""
+    moves_hands: bool = False
+    """Whether control nodes go on beside themselves, moved as what they hold is (`hand_shift`), so
+    that virtual springs keep their directions and not only their strain: a grip is what it was."""
 
     def __post_init__(self) -> None:
         if self.frame < 0:
@@ -78,7 +83,9 @@ class Restart:
         """
         rest = model.rest_length.astype(np.float64)
         before = rest * (1.0 + spring_strains(model, position, control))
-        after = rest * (1.0 + spring_strains(model, self.position, control))
+        shift = self.hand_shift(model, position)
+        moved = control if shift is None else control + shift
+        after = rest * (1.0 + spring_strains(model, self.position, moved))
         scale = np.divide(after, before, out=np.ones_like(rest), where=before > COINCIDENT)
         floor = np.full_like(rest, parameters.virtual_rest_length_floor)
         floor[: model.object_spring_count] = parameters.rest_length_floor
@@ -86,6 +93,32 @@ class Restart:
         scaled = np.maximum(scale * rest, shortest)
         clearance = self._clearance(model, parameters.ground_height, position)
         return replace(model, rest_length=scaled.astype(np.float32), clearance=clearance)
+
+    def hand_shift(
+        self, model: SpringMassModel, position: Float[ndarray, "node 3"]
+    ) -> Float32[ndarray, "control 3"] | None:
+        """Give how far control nodes are from where they were seen, in the frames that follow [m].
+
+        A control node is moved as the nodes that it holds are on average; of these, one that
+        `FIRM_HOLD` springs or more hold counts as not moved, because it cannot swing around them.
+
+        Args:
+            model: The springs until the restart.
+            position: The rollout's own nodes in the frame of the restart [m].
+
+        Returns:
+            The shifts; None if hands are not moved.
+        """
+        if not self.moves_hands:
+            return None
+        acts = model.acts_in(self.frame)[model.object_spring_count :]
+        ends = np.sort(model.spring_nodes[model.object_spring_count :][acts], axis=1)
+        control = ends[:, 1] - model.node_count
+        swings = np.bincount(ends[:, 0], minlength=model.node_count) < FIRM_HOLD
+        moved = (swings[:, None] * (np.asarray(self.position, np.float64) - position))[ends[:, 0]]
+        total = [np.bincount(control, moved[:, i], model.control_count) for i in range(3)]
+        count = np.maximum(np.bincount(control, minlength=model.control_count), 1)
+        return (np.stack(total, axis=1) / count[:, None]).astype(np.float32)
 
     def _clearance(
         self,
@@ -103,22 +136,24 @@ class Restart:
     def to_tensors(self) -> dict[str, ndarray]:
         """Return every field as an array, ready for safetensors."""
         frame = np.array([self.frame], dtype=np.int32)
-        return {"frame": frame, "position": self.position, "velocity": self.velocity}
+        state = {"frame": frame, "position": self.position, "velocity": self.velocity}
+        return state | {"moves_hands": np.array([self.moves_hands], dtype=np.int32)}
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, ndarray]) -> "Restart":
-        """Rebuild it from the arrays of `to_tensors`.
+        """Rebuild it from the arrays of `to_tensors`; hands were not moved before it was said.
 
         Raises:
             ValueError: If an array is missing, unknown or inconsistent.
         """
-        if set(tensors) != {"frame", "position", "velocity"}:
+        if set(tensors) | {"moves_hands"} != {"frame", "position", "velocity", "moves_hands"}:
             raise ValueError(
-                "A restart needs the arrays frame, position, velocity; "
+                "A restart needs the arrays frame, position, velocity, moves_hands; "
                 f"got {', '.join(sorted(tensors))}."
             )
         frame = np.asarray(tensors["frame"]).reshape(-1)
         if len(frame) != 1:
             raise ValueError(f"frame has {len(frame)} values; expected one.")
         state = {name: np.asarray(tensors[name], np.float32) for name in ("position", "velocity")}
-        return cls(frame=int(frame[0]), **state)
+        moves = bool(np.asarray(tensors.get("moves_hands", [0])).reshape(-1)[0])
+        return cls(frame=int(frame[0]), moves_hands=moves, **state)

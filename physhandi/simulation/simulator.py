@@ -72,6 +72,7 @@ class Simulator:
         self.control_start = wp.zeros(model.control_count, dtype=wp.vec3, device=self.device)
         self.control_end = wp.zeros(model.control_count, dtype=wp.vec3, device=self.device)
         self.first_divergence = self.array(np.array([_NO_DIVERGENCE]), wp.int32)
+        self._held: ndarray | None = None
         self._no_tape = wp.zeros(0, dtype=wp.vec3, device=self.device)
         self._collision: SelfCollision | None = None
         self._recordings = {
@@ -143,6 +144,7 @@ class Simulator:
                     f"of the {len(self.model.rest_length)} springs."
                 )
             getattr(self, name).assign(np.asarray(value, dtype=np.float32))
+            self._held = None
             self.model = replace(self.model, **{name: np.asarray(value, dtype=np.float32)})
 
     def reset(
@@ -159,12 +161,17 @@ class Simulator:
         self.clearance.assign(self.model.clearance)
         self.first_divergence.fill_(_NO_DIVERGENCE)
 
-    def continue_from(self, restart: Restart, control: Float[ndarray, "control 3"]) -> None:
+    def continue_from(
+        self, restart: Restart, control: Float[ndarray, "control 3"]
+    ) -> Float32[ndarray, "control 3"] | None:
         """Replace the state by another one, in which every spring is strained as it is now.
 
         Args:
             restart: The state; its frame is the one that has been reached.
             control: Where the control nodes are [m].
+
+        Returns:
+            What to add to the control nodes from now on [m]; None for nothing.
 
         Raises:
             ValueError: If it is a state of another number of nodes.
@@ -172,9 +179,11 @@ class Simulator:
         restart.check_nodes(self.model.node_count)
         own = self.position.numpy()
         model = restart.continued(self.model, self.parameters, own, control)
+        shift = restart.hand_shift(self.model, own)
         self.reset(restart.position, restart.velocity)
         self.rest_length.assign(model.rest_length)
         self.clearance.assign(model.clearance)
+        return shift
 
     def step_frame(
         self,
@@ -185,7 +194,7 @@ class Simulator:
         """Advance the state by one frame while the control nodes move on straight lines.
 
         Args:
-            frame: Number of the frame that this reaches; only for the error message.
+            frame: Number of the frame that this reaches, which decides what is attached.
             control_start: Where the control nodes are at the start [m].
             control_end: Where they are at the end [m].
 
@@ -195,8 +204,19 @@ class Simulator:
         if self.model.control_count:
             self.control_start.assign(np.ascontiguousarray(control_start, dtype=np.float32))
             self.control_end.assign(np.ascontiguousarray(control_end, dtype=np.float32))
+        self.hold(frame)
         self.replay_frame()
         self.check_divergence(frame)
+
+    def hold(self, frame: int) -> None:
+        """Let the virtual springs act that are attached on the way to a frame, and no others."""
+        if self.model.is_always_attached:
+            return
+        acts = self.model.acts_in(frame)
+        if self._held is None or not np.array_equal(acts, self._held):
+            self._held = acts
+            self.stiffness.assign(self.model.stiffness * acts)
+            self.damping.assign(self.model.damping * acts)
 
     def frames(
         self, control: Float[ndarray, "frame control 3"], restart: Restart | None = None
@@ -220,12 +240,14 @@ class Simulator:
         if restart is not None:
             restart.check_nodes(self.model.node_count)
         self.reset()
+        shift: ndarray | None = None
         for frame in range(len(control)):
             if frame > 0:
-                self.step_frame(frame, control[frame - 1], control[frame])
+                way = control[frame - 1 : frame + 1]
+                self.step_frame(frame, *(way if shift is None else way + shift))
             yield frame, self.position.numpy().copy(), self.velocity.numpy().copy()
             if restart is not None and frame == restart.frame:
-                self.continue_from(restart, control[frame])
+                shift = self.continue_from(restart, control[frame])
 
     def rollout(
         self, control: Float[ndarray, "frame control 3"], restart: Restart | None = None

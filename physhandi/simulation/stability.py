@@ -43,7 +43,8 @@ def largest_stable_step(
         model: Springs and material.
         parameters: For `stiffness_scale`.
         control: Where the control nodes are at frame 0 [m]. Left out, each virtual spring is
-            taken to act in all directions, which errs on the safe side.
+            taken to act in all directions, which errs on the safe side; one that is attached
+            later always is.
 
     Returns:
         The step; infinity if nothing is stiff or damped.
@@ -183,7 +184,14 @@ class _SpringOperator:
             value = np.concatenate([value, _unit(node[held_node] - place).ravel()])
             column = np.concatenate([column, _coordinates(held_node)])
             row_end = np.concatenate([row_end, row_end[-1] + 3 * np.arange(1, len(held_node) + 1)])
-            anchor = {name: np.zeros(3 * count) for name in rate}
+            # Where a spring that is attached later points then is not known.
+            late = own + np.flatnonzero(model.attached[:, 0] > 0)
+            anchor = {
+                name: np.repeat(np.bincount(held_node[late - own], each[late], minlength=count), 3)
+                for name, each in rate.items()
+            }
+            for each in rate.values():
+                each[late] = 0.0
         shape = (len(row_end) - 1, 3 * count)
         return cls(csr_array((value, column, row_end), shape=shape), rate, anchor)
 

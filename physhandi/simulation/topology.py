@@ -7,6 +7,7 @@ from jaxtyping import Float, Int32
 from numpy import ndarray
 from scipy.spatial import KDTree
 
+from physhandi.simulation.contact_intervals import NEVER, ContactIntervals
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 
@@ -96,8 +97,9 @@ def build_model(
     control_0: Float[ndarray, "control 3"],
     parameters: SimulationParameters,
     rest_node: Float[ndarray, "node 3"] | None = None,
+    contacts: ContactIntervals | None = None,
 ) -> SpringMassModel:
-    """Build the springs of an object and of the control nodes that touch it at frame 0.
+    """Build the springs of an object and of the control nodes that touch it.
 
     Args:
         object_node: Positions of the object nodes at frame 0 [m].
@@ -105,6 +107,8 @@ def build_model(
         parameters: Radii, neighbor limits, rest length floors, stiffness and damping.
         rest_node: The object's rest shape [m], if it differs from frame 0; it decides the
             object springs and their rest lengths.
+        contacts: Pairs that are joined for an interval of frames; if left out, control nodes are
+            joined for all frames to what is near them at frame 0.
 
     Returns:
         The model, at rest. A spring without stiffness is off, its dashpot included (physics.md
@@ -115,12 +119,14 @@ def build_model(
         raise ValueError(f"rest_node has shape {rest.shape}; expected {object_node.shape}.")
     node = np.asarray(object_node, dtype=np.float64)
     springs, length = object_springs(rest, parameters.connection_radius, parameters.max_neighbors)
-    virtual, virtual_length = virtual_springs(
-        np.asarray(control_0, dtype=np.float64),
-        node,
-        parameters.virtual_connection_radius,
-        parameters.virtual_max_neighbors,
-    )
+    reach = parameters.virtual_connection_radius, parameters.virtual_max_neighbors
+    if contacts is None:
+        virtual, virtual_length = virtual_springs(
+            np.asarray(control_0, dtype=np.float64), node, *reach
+        )
+        attached = np.tile(np.array([[0, NEVER]], dtype=np.int32), (len(virtual), 1))
+    else:
+        virtual, virtual_length, attached = contact_springs(contacts, len(node), *reach)
     virtual_floor = max(parameters.virtual_rest_length_floor, MINIMUM_VIRTUAL_REST_LENGTH)
     rest_length = np.concatenate(
         [
@@ -140,7 +146,32 @@ def build_model(
         damping=np.where(stiffness > 0.0, parameters.damping, 0.0).astype(np.float32),
         object_spring_count=len(springs),
         control_count=len(control_0),
+        attached=attached,
     )
+
+
+def contact_springs(
+    contacts: ContactIntervals, node_count: int, radius: float, max_neighbors: int
+) -> tuple[Int32[ndarray, "spring 2"], Float[ndarray, " spring"], Int32[ndarray, "spring 2"]]:
+    """Join control nodes to the object nodes that they touch for an interval of frames.
+
+    Args:
+        contacts: What touches, and when.
+        node_count: Number of object nodes.
+        radius: Object nodes strictly nearer than this are joined [m].
+        max_neighbors: Most springs of one control node at a time.
+
+    Returns:
+        The springs as (object node, `node_count` + control) in ascending order, their lengths [m],
+        and the frames in which they are attached and let go.
+    """
+    kept = np.flatnonzero(contacts.chosen(radius, max_neighbors))
+    node, control, interval = (
+        value[kept] for value in (contacts.node, contacts.control, contacts.interval)
+    )
+    order = np.lexsort((interval[:, 0], control, node))
+    springs = np.stack([node, node_count + control], axis=1)[order].astype(np.int32)
+    return springs, contacts.distance[kept][order].astype(np.float64), interval[order]
 
 
 def retopologize(
@@ -150,6 +181,7 @@ def retopologize(
     *,
     fitted: SimulationParameters,
     rest_node: Float[ndarray, "node 3"] | None = None,
+    contacts: ContactIntervals | None = None,
 ) -> SpringMassModel:
     """Rebuild the springs for other radii or neighbor limits, keeping fitted values.
 
@@ -163,13 +195,13 @@ def retopologize(
         control_0: Positions of the control nodes at frame 0 [m].
         fitted: The parameters whose global stiffness and damping the fitted values refer to.
         rest_node: The object's rest shape [m]; the nodes of frame 0 if left out.
+        contacts: What touches, and when; see `build_model`.
 
     Returns:
         The new model, with the initial velocity and the clearance of the old one.
     """
-    built = build_model(model.object_node, control_0, parameters, rest_node)
-    key = _spring_keys(built.spring_nodes, model.node_count)
-    fitted_key = _spring_keys(model.spring_nodes, model.node_count)
+    built = build_model(model.object_node, control_0, parameters, rest_node, contacts)
+    key, fitted_key = _spring_keys(built), _spring_keys(model)
     _, index, fitted_index = np.intersect1d(key, fitted_key, return_indices=True)
     is_object = fitted_index < model.object_spring_count
     global_stiffness = np.where(is_object, fitted.stiffness, fitted.virtual_stiffness)
@@ -247,10 +279,15 @@ def _rest_ratio(
     return np.where(np.abs(ratio - 1.0) > SAME_LENGTH, ratio, 1.0).astype(np.float32)
 
 
-def _spring_keys(spring_nodes: ndarray, node_count: int) -> ndarray:
-    """Return one number for each unordered pair of nodes."""
-    pair = np.sort(spring_nodes.astype(np.int64), axis=1)
-    return pair[:, 0] + pair[:, 1] * node_count
+def _spring_keys(model: SpringMassModel) -> ndarray:
+    """Return one number for each unordered pair of nodes and the frame that it is joined in."""
+    pair = np.sort(model.spring_nodes.astype(np.int64), axis=1)
+    count = model.node_count
+    key = pair[:, 0] + pair[:, 1] * count
+    key[model.object_spring_count :] += (
+        model.attached[:, 0].astype(np.int64) * count * (count + model.control_count)
+    )
+    return key
 
 
 def _ratio(value: ndarray, reference: ndarray) -> ndarray:

@@ -17,6 +17,7 @@ from physhandi.fitting.artefacts import load_model, load_parameters
 from physhandi.fitting.config import PipelineConfig
 from physhandi.progress import Progress
 from physhandi.run import Run
+from physhandi.simulation.contact_intervals import NEVER
 from physhandi.simulation.simulator import Simulator
 
 
@@ -172,6 +173,42 @@ def simulate(folder: Path, source: Run, sequence: Path, **changes: float) -> Run
     )
     pipeline.run_job(run)
     return Run.open(run.folder)
+
+
+def test_contacts_over_time_are_stored_and_kept_with_other_radii(
+    tmp_path: Path, recordings: Path
+) -> None:
+    late = tmp_path / "late"
+    shutil.copytree(recordings / "low", late)
+    control = np.load(late / "control.npy")
+    control[:1] += np.float32([0.0, 0.0, 0.2])
+    np.save(late / "control.npy", control)
+    config = sheet_config(generations=1, population=4, iterations=1)
+    config = config.replace(object_=config.object_.replace(contact_over_time=True))
+    run = new_run(tmp_path / "fit", [late], config.to_dict())
+    pipeline.run_job(run)
+    run = Run.open(run.folder)
+    object_ = run.object_in("low")
+    contacts, model = object_.contacts, object_.model
+    assert contacts is not None
+    assert object_.fitted.restart is not None
+    assert object_.fitted.restart.moves_hands
+    assert model.virtual_spring_count > 0
+    assert set(model.attached[:, 0].tolist()) == {1}
+    assert set(model.attached[:, 1].tolist()) == {NEVER}
+    # Nothing holds the sheet until then, and afterwards it goes where the hand goes.
+    rollout = run.array("sequences/low/rollout.npy")
+    assert np.abs(object_.fitted.forces(1)).max() == 0.0
+    assert np.abs(object_.fitted.forces(2)).max() > 0.0
+    wider = object_.parameters.virtual_connection_radius * 1.5
+    again = simulate(tmp_path / "wide", run, late, virtual_connection_radius=wider)
+    now = again.object_in("low")
+    expected = contacts.chosen(wider, object_.parameters.virtual_max_neighbors)
+    assert now.model.virtual_spring_count == int(expected.sum())
+    assert now.contacts is not None
+    np.testing.assert_array_equal(now.contacts.interval, contacts.interval)
+    same = simulate(tmp_path / "same", run, late)
+    np.testing.assert_array_equal(same.array("sequences/low/rollout.npy"), rollout)
 
 
 def test_simulating_unchanged_repeats_the_motion(

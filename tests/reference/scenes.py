@@ -36,6 +36,14 @@ def cube_scene(**changes):
     return in_float32(replace(scene, **changes))
 
 
+def held_in_turns(**changes):
+    """Give the cube's five virtual springs to other frames each: two of them to all."""
+    scene = cube_scene(**changes)
+    attached = np.tile([[0, 99]], (len(scene.springs), 1))
+    attached[-5:] = [[0, 1], [1, 2], [1, 99], [0, 99], [2, 3]]
+    return replace(scene, attached=attached)
+
+
 def bare_scene(
     node, velocity=None, springs=(), rest=(), stiffness=(), damping=(), frames=2, **changes
 ):
@@ -172,5 +180,6 @@ def as_model(scene):
         object_spring_count=int(is_object.sum()),
         control_count=scene.control.shape[1],
         clearance=np.float32([0.0] if scene.clearance is None else scene.clearance),
+        **({} if scene.attached is None else {"attached": np.int32(scene.attached)[~is_object]}),
     )
     return model, parameters

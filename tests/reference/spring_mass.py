@@ -1,6 +1,6 @@
 """Float64 NumPy oracle of the spring-mass simulator, written from the equations alone."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,6 +28,7 @@ class Scene:
     self_friction: float = 0.3
     blocks_rest: bool = False  # rest neighbours collide too
     rest_shape: np.ndarray | None = None  # object nodes at rest; none for `node`
+    attached: np.ndarray | None = None  # (spring, 2): the states between which each spring acts
 
 
 def spring_force(scene, x, v):
@@ -104,7 +105,14 @@ def simulate(scene, counts=None):
     if scene.clearance is not None:
         plane += scene.clearance
     states = [(x, v)]
-    for start, end in zip(scene.control[:-1], scene.control[1:], strict=True):
+    everything = scene
+    for frame, (start, end) in enumerate(zip(scene.control[:-1], scene.control[1:], strict=True)):
+        if everything.attached is not None:
+            begin, leave = everything.attached.T
+            on = np.where((begin <= frame) & (frame + 1 <= leave), 1.0, 0.0)
+            scene = replace(
+                everything, stiffness=everything.stiffness * on, damping=everything.damping * on
+            )
         rate = (end - start) * scene.frame_rate * scene.moves
         may = None if scene.distance is None else candidate_table(scene, x)
         for substep in range(scene.substeps):

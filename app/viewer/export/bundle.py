@@ -18,7 +18,6 @@ from physhandi.data.exporters.table import csv_bytes, npz_bytes, rounded
 from physhandi.data.files import plain, without_non_finite, zip_bytes
 from physhandi.errors import MissingInputError
 from physhandi.object_rollout import ObjectRollout
-from physhandi.simulation.forces import spring_strains
 
 logger = logging.getLogger(__name__)
 
@@ -98,10 +97,11 @@ def _tables(sides: dict[str, tuple[ObjectRollout, int]]) -> dict[str, bytes]:
         for node, (place, force) in enumerate(zip(position, rollout.forces(frame), strict=True)):
             nodes.append([side, node, *rounded(place), *rounded(force)])
         ends = np.sort(model.spring_nodes, axis=1)
-        held = np.bincount(ends[first:, 1] - model.node_count, minlength=len(control))
+        acting = ends[first:][rollout.model.acts_in(frame)[first:]]
+        held = np.bincount(acting[:, 1] - model.node_count, minlength=len(control))
         for number, place in enumerate(control):
             controls.append([side, number, *rounded(place), int(held[number])])
-        strain = spring_strains(model, position, control)
+        strain = rollout.strains(frame)
         for number, (node, other) in enumerate(ends.tolist()):
             is_virtual = number >= first
             rest = float(model.rest_length[number])

@@ -124,7 +124,9 @@ def snapshot_npz(snapshot: Snapshot) -> bytes:
     ``b_…``: ``position`` "frame node 3" and ``control`` "frame control 3" [m], ``spring_nodes``,
     ``rest_length`` [m], ``stiffness`` [N], ``object_spring_count``, ``force`` "frame node 3" [N],
     the sum over virtual springs on each object node, and ``frame``, the frame on the screen; of a
-    rollout that restarts also what `ObjectRollout.restart_arrays` gives.
+    rollout that restarts also what `ObjectRollout.restart_arrays` gives, and of one whose virtual
+    springs do not always act ``attached`` "virtual 2", the frame in whose state each is attached
+    and the last one before it lets go.
     """
     content = snapshot.content
     arrays: dict[str, Any] = {}
@@ -176,6 +178,7 @@ def _motion_arrays(rollout: ObjectRollout) -> dict[str, Any]:
         "rest_length": rollout.model.rest_length,
         "stiffness": rollout.model.stiffness,
         "object_spring_count": np.int64(rollout.model.object_spring_count),
+        **({} if rollout.model.is_always_attached else {"attached": rollout.model.attached}),
     }
 
 

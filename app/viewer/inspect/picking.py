@@ -10,6 +10,7 @@ from numpy import ndarray
 from app.viewer.content.content import Content
 from app.viewer.content.layers import Layers
 from physhandi.object_rollout import ObjectRollout
+from physhandi.simulation.model import SpringMassModel
 
 PickKind = Literal["node", "spring", "control", "hand", "marker"]
 
@@ -134,7 +135,7 @@ def _pick_object(ray: Ray, target: Target, rollout: ObjectRollout) -> Pick | Non
             if chosen < count:
                 return Pick(kind="node", index=chosen)
             return Pick(kind="control", index=chosen - count)
-    spring = _pick_spring(ray, point[rollout.model.spring_nodes], own, layers, spacing)
+    spring = _pick_spring(ray, point, rollout.model, frame, layers, spacing)
     if spring is not None:
         return Pick(kind="spring", index=spring)
     hit = first_triangle(ray, position, faces) if layers.surface else None
@@ -144,16 +145,22 @@ def _pick_object(ray: Ray, target: Target, rollout: ObjectRollout) -> Pick | Non
     return Pick(kind="node", index=int(corners[np.argmin(ray.offsets(position[corners])[0])]))
 
 
-def _pick_spring(
-    ray: Ray, ends: Float[ndarray, "spring 2 3"], own: int, layers: Layers, spacing: float
+def _pick_spring(  # noqa: PLR0917  (a ray, what it may meet, and what of that is shown)
+    ray: Ray,
+    point: Float[ndarray, "point 3"],
+    model: SpringMassModel,
+    frame: int,
+    layers: Layers,
+    spacing: float,
 ) -> int | None:
-    start = 0 if layers.object_springs else own
-    stop = len(ends) if layers.virtual_springs else own
-    if stop <= start:
+    is_own = np.arange(len(model.spring_nodes)) < model.object_spring_count
+    is_shown = np.where(is_own, layers.object_springs, layers.virtual_springs)
+    spring = np.flatnonzero(is_shown & model.acts_in(frame))
+    if not len(spring):
         return None
-    nearest = nearest_on_segments(ray, ends[start:stop])
+    nearest = nearest_on_segments(ray, point[model.spring_nodes[spring]])
     at = _nearest(ray, nearest, spacing, within=_LINE_PIXELS)
-    return None if at is None else start + at[0]
+    return None if at is None else int(spring[at[0]])
 
 
 def _pick_hand(ray: Ray, content: Content, frame: int) -> Pick | None:

@@ -14,6 +14,8 @@ from app.viewer.content.content import Content
 from app.viewer.content.layers import Coloring
 from app.viewer.inspect.picking import Pick, PickKind
 from physhandi.object_rollout import ObjectRollout
+from physhandi.simulation.contact_intervals import NEVER
+from physhandi.simulation.model import SpringMassModel
 
 HistoryQuantity = Literal["speed", "force", "strain", "error", "difference", "height", "length"]
 """What a chart can show of a thing."""
@@ -93,6 +95,13 @@ def springs_at(rollout: ObjectRollout, point: int) -> Int[ndarray, " spring"]:
     return np.flatnonzero((rollout.model.spring_nodes == point).any(axis=1))
 
 
+def virtual_springs_at(rollout: ObjectRollout, point: int, frame: int) -> Int[ndarray, " spring"]:
+    """Find the virtual springs that end there and are attached in a frame."""
+    joined = springs_at(rollout, point)
+    acts = rollout.model.acts_in(frame)
+    return joined[(joined >= rollout.model.object_spring_count) & acts[joined]]
+
+
 def reduced(rollout: ObjectRollout, pick: Pick) -> ObjectRollout:
     """Keep only the springs that matter to a thing, so that all its frames are read quickly."""
     model = rollout.model
@@ -109,8 +118,11 @@ def reduced(rollout: ObjectRollout, pick: Pick) -> ObjectRollout:
         stiffness=model.stiffness[chosen],
         damping=model.damping[chosen],
         object_spring_count=int((chosen < model.object_spring_count).sum()),
+        attached=model.attached[
+            chosen[chosen >= model.object_spring_count] - model.object_spring_count
+        ],
     )
-    return replace(rollout, model=smaller)
+    return replace(rollout, model=smaller, hand_shift=rollout.shift_of_hands())
 
 
 def _of_track(
@@ -132,6 +144,16 @@ def _restart_rows(rollout: ObjectRollout, frame: int) -> "Rows":
     if restart is None or frame <= restart.frame:
         return []
     return [("predicted from", f"the observed state at frame {restart.frame}")]
+
+
+def _attached_rows(model: SpringMassModel, spring: int) -> "Rows":
+    """Say in which frames a virtual spring is attached, if not in all."""
+    if spring < model.object_spring_count:
+        return []
+    first, last = model.attached[spring - model.object_spring_count].tolist()
+    if (first, last) == (0, NEVER):
+        return []
+    return [("attached", f"from frame {first}" + ("" if last == NEVER else f" to {last}"))]
 
 
 _NAMED = 6
@@ -218,10 +240,8 @@ class Readings:
         if pick.kind == "spring":
             return point[rollout.model.spring_nodes[[pick.index]]]
         offset = rollout.model.node_count if pick.kind == "control" else 0
-        joined = springs_at(rollout, pick.index + offset)
-        return point[
-            rollout.model.spring_nodes[joined[joined >= rollout.model.object_spring_count]]
-        ]
+        held = virtual_springs_at(rollout, pick.index + offset, rollout_frame)
+        return point[rollout.model.spring_nodes[held]]
 
     def rows(
         self, pick: Pick, rollout: ObjectRollout | None, frame: int, rollout_frame: int
@@ -243,7 +263,7 @@ class Readings:
         own = rollout.model.object_spring_count
         offset = rollout.model.node_count if pick.kind == "control" else 0
         joined = springs_at(rollout, pick.index + offset)
-        held = joined[joined >= own]
+        held = virtual_springs_at(rollout, pick.index + offset, rollout_frame)
         force = rollout.spring_forces(rollout_frame)[held - own].sum(axis=0)
         if pick.kind == "node":
             rows.append(
@@ -305,6 +325,7 @@ class Readings:
             ("pull", f"{number(float(rollout.tensions(frame)[spring]))} N"),
             ("stiffness", f"{number(stiffness)} N"),
             ("damping", f"{number(float(model.damping[spring]))} N·s/m"),
+            *_attached_rows(rollout.model, spring),
         ]
 
     def _node_rows(self, node: int, rollout: ObjectRollout, frame: int, spring_count: int) -> Rows:

@@ -12,6 +12,7 @@ from app.viewer.content.layers import BLUE, GREY, PLAYING_SPRINGS, RED, YELLOW, 
 from app.viewer.scene.framing import Framing
 from app.viewer.scene.nodes import SceneNodes
 from physhandi.object_rollout import ObjectRollout
+from physhandi.simulation.model import SpringMassModel
 
 STEPS = 24
 """Colors of a colored surface."""
@@ -211,15 +212,19 @@ class ObjectDrawing:
         self._style = style or Style()
         self._balls = nodes.spheres if self._style.is_solid else nodes.points
         self._surface = SurfaceDrawing(nodes, root)
-        self._model_shown: ObjectRollout | None = None
+        self._model_shown: tuple[ObjectRollout, int | None] | None = None
         self._attached: Int[ndarray, " control"] = np.zeros(0, np.int64)
 
-    def attached(self, rollout: ObjectRollout) -> Int[ndarray, " control"]:
-        """Find the control nodes that hold the object by a virtual spring."""
-        if rollout is not self._model_shown:
-            springs = rollout.model.spring_nodes[rollout.model.object_spring_count :]
-            self._attached = np.unique(springs.max(axis=1) - rollout.model.node_count)
-            self._model_shown = rollout
+    def attached(
+        self, rollout: ObjectRollout, frame: int | None = None
+    ) -> Int[ndarray, " control"]:
+        """Find the control nodes that hold the object by a virtual spring in a frame, or in any."""
+        model = rollout.model
+        at = None if model.is_always_attached else frame
+        if (rollout, at) != self._model_shown:
+            springs = model.spring_nodes[virtual_springs_in(model, at)]
+            self._attached = np.unique(springs.max(axis=1, initial=0) - model.node_count)
+            self._model_shown = rollout, at
         return self._attached
 
     def hide(self) -> None:
@@ -256,7 +261,7 @@ class ObjectDrawing:
         control = np.asarray(rollout.control[frame], dtype=np.float32)
         style = self._style
         size = style.node_size * self._framing.spacing
-        shown = _thinned(0, len(position), budget.nodes)
+        shown = _thinned(len(position), budget.nodes)
         color = style.node if painted is None else painted.node[shown]
         is_visible = layers.nodes
         self._balls(f"{root}/object/nodes", position[shown], color, size, is_visible=is_visible)
@@ -266,17 +271,18 @@ class ObjectDrawing:
             painted,
             is_visible=layers.surface,
         )
-        self.draw_controls(control, self.attached(rollout), layers)
+        self.draw_controls(control, self.attached(rollout, frame), layers)
         point = np.concatenate([position, control])
-        own = _thinned(0, count, budget.springs)
-        held = _thinned(count, len(rollout.model.spring_nodes), budget.virtual)
+        own = np.arange(count)[_thinned(count, budget.springs)]
+        held = virtual_springs_in(rollout.model, frame)
+        held = held[_thinned(len(held), budget.virtual)]
         for name, chosen, color, width, is_visible in (
             ("virtual", held, style.virtual, style.virtual_width, layers.virtual_springs),
             ("object", own, style.spring, style.spring_width, layers.object_springs),
         ):
             self._nodes.segments(
                 f"{root}/springs/{name}",
-                point[rollout.model.spring_nodes[chosen if is_visible else slice(0)]],
+                point[rollout.model.spring_nodes[chosen if is_visible else chosen[:0]]],
                 painted.springs(chosen) if painted is not None else color,
                 width,
                 is_visible=is_visible,
@@ -310,6 +316,14 @@ class ObjectDrawing:
             self._nodes.points(name, point, style.control, 0.12 * spacing, is_visible=is_shown)
 
 
+def virtual_springs_in(model: SpringMassModel, frame: int | None) -> Int[ndarray, " spring"]:
+    """Find the virtual springs that are attached in a frame, or in any."""
+    first = model.object_spring_count
+    if frame is None:
+        return np.arange(first, len(model.spring_nodes))
+    return first + np.flatnonzero(model.acts_in(frame)[first:])
+
+
 def force_arrows(
     rollout: ObjectRollout, frame: int, force_unit: float, longest: float, most: int
 ) -> Float[ndarray, "arrow 2 3"]:
@@ -336,6 +350,6 @@ def force_arrows(
     return np.stack([start, start + offset], axis=1).astype(np.float32)
 
 
-def _thinned(start: int, stop: int, most: int | None) -> slice:
+def _thinned(count: int, most: int | None) -> slice:
     """Choose springs, thinned out evenly to at most `most`."""
-    return slice(start, stop, 1 if most is None else max(1, -(-(stop - start) // most)))
+    return slice(0, count, 1 if most is None else max(1, -(-count // most)))

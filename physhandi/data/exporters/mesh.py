@@ -50,7 +50,7 @@ def frame_to_ply(scene: SceneData, frame: int) -> bytes:
         vertex,
         color,
         np.concatenate([np.zeros((0, 3), np.int32), *faces]),
-        scene.virtual_springs,
+        scene.virtual_springs_in(frame),
         comments,
     )
 

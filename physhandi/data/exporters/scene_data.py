@@ -59,10 +59,14 @@ class SceneData:
         """Number of frames."""
         return len(self.rollout)
 
-    @property
-    def virtual_springs(self) -> Int[ndarray, "spring 2"]:
-        """Springs between a control node and an object node."""
-        return self.spring_nodes[self.object_spring_count :]
+    def virtual_springs_in(self, frame: int) -> Int[ndarray, "spring 2"]:
+        """Get the springs between control and object nodes that are attached in a frame."""
+        springs = self.spring_nodes[self.object_spring_count :]
+        attached = self.model.get("attached")
+        if attached is None:
+            return springs
+        first, last = attached.T
+        return springs[(first < max(frame, 1)) & (max(frame, 1) <= last)]
 
 
 def read_scene(

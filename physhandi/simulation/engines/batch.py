@@ -16,6 +16,7 @@ from jaxtyping import Float, Float32, Int
 from numpy import ndarray
 
 from physhandi.errors import SimulationDivergedError, UsageError
+from physhandi.simulation.contact_intervals import NEVER
 from physhandi.simulation.engines.cpu import CpuEngine
 from physhandi.simulation.engines.graph import LaunchGraph
 from physhandi.simulation.engines.partition import bisect_nodes
@@ -431,8 +432,9 @@ def _number(parameters: SimulationParameters, name: str, substeps: int) -> float
 class BatchSimulator:
     """Rolls out many candidates that differ in parameters and in topology.
 
-    On CUDA they share every launch and take the substeps of the one that needs most; on a CPU
-    they take turns. Self-collision is not simulated.
+    On CUDA they share every launch and take the substeps of the one that needs most; on a CPU,
+    and where virtual springs are attached for some frames only, they take turns. Self-collision is
+    not simulated.
     """
 
     def __init__(
@@ -533,7 +535,9 @@ class BatchSimulator:
         return BatchLosses(loss, diverged)
 
     def _on_device(self) -> Population | None:
-        if not self.device.is_cuda or len(self.master.object_node) == 0:
+        # One list of springs serves all frames there, so where it changes candidates take turns.
+        changes = np.any(self.master.attached != (0, NEVER))
+        if not self.device.is_cuda or len(self.master.object_node) == 0 or changes:
             return None
         if self._population is None:
             self._population = Population(self.master, self.parameters, self.substeps, self.device)

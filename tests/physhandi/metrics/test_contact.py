@@ -30,7 +30,7 @@ def labels(is_contact: list[list[int]], is_known: list[list[int]] | None = None)
 
 def test_nodes_with_a_virtual_spring_are_joined() -> None:
     springs = np.array([[0, 5], [3, 5], [7, 3]])  # Nodes from 5 on are control nodes.
-    assert joined_nodes(springs, 5).tolist() == [True, False, False, True, False]
+    assert joined_nodes(springs, 5).tolist() == [[True, False, False, True, False]]
     assert not joined_nodes(np.zeros((0, 2), int), 5).any()
 
 
@@ -98,7 +98,7 @@ def test_springs_predict_in_frame_0_and_proximity_afterwards() -> None:
     hand[:, 0, 0] = [0.5, 0.0, 0.02]  # Far away at first, then at node 0, then at node 1.
     reference = ContactReference(
         hand=hand,
-        is_joined=np.array([True, True, False, False, False]),
+        is_joined=np.array([[True, True, False, False, False]]),
         kind="true",
         labels={},
     )

@@ -31,7 +31,7 @@ def touched() -> ContactReference:
     hand = rising(0.1)[:, :1] + np.array([0.0, 0.0, 0.004])
     return ContactReference(
         hand=hand,
-        is_joined=np.array([True, False]),
+        is_joined=np.array([[True, False]]),
         kind="true",
         labels=dict.fromkeys(THRESHOLDS, label),
     )

@@ -11,7 +11,7 @@ from reference.gradients import (
     gradients,
     loss_weights,
 )
-from reference.scenes import as_model, cube_scene, in_float32
+from reference.scenes import as_model, cube_scene, held_in_turns, in_float32
 from reference.spring_mass import simulate
 
 from physhandi.simulation import differentiable
@@ -23,6 +23,7 @@ SCENES = {
     "slippery": {"friction": 0.05, "restitution": 0.9, "ground": 0.003},
     "no ground": {"ground": None},
     "clearance": {"clearance": np.linspace(-0.001, 0.006, 8)},
+    "attached for some frames": {"attached": held_in_turns().attached},
 }
 
 

@@ -130,7 +130,7 @@ def test_a_model_stored_before_nodes_had_a_clearance_has_none():
 def test_a_model_without_one_of_its_arrays_is_refused():
     tensors = as_model(cube_scene())[0].to_tensors()
     del tensors["damping"]
-    with pytest.raises(ValueError, match="needs the arrays clearance, control_count"):
+    with pytest.raises(ValueError, match="needs the arrays attached, clearance"):
         SpringMassModel.from_tensors(tensors)
 
 

@@ -1,0 +1,284 @@
+"""When hands hold an object, found from what was seen of both.
+
+A place of the object that is held stays where it is, seen from the hand; past a hand that arrives,
+leaves, hovers or slides it moves. So each node near a hand is followed in the frame of the hand's
+surface beside it: as long as it stays within a tolerance, the two are in contact.
+
+Of frames after those that are fitted, only the hands are read: what holds in the last fitted frame
+goes on holding, until the hand opens.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+from scipy.ndimage import median_filter
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
+from physhandi.data.observation import ObjectObservation
+from physhandi.fitting.rest_state import node_distance
+from physhandi.fitting.search_bounds import neighbor_distance
+from physhandi.metrics.alignment import best_rotations
+from physhandi.metrics.baselines import last_residual
+from physhandi.simulation.contact_intervals import NEVER, ContactIntervals
+
+NEAR_HAND, LONGEST_HOLD = 1.5, 4.0
+"""Distances from the hand within which a node can be held, and of the longest spring that can be
+laid to it then. In distances of nodes, or of control nodes where these are farther apart."""
+COARSEST_HAND = 3.0
+"""Most that distances of control nodes count, in distances of nodes."""
+SLIP = 1.0
+"""Way by which a node in contact may move, seen from the hand, in distances of nodes."""
+GIVE = 0.5
+"""What its distance from the hand adds to that, as a part of it: what is between them deforms."""
+LATE, EARLY = 0.3, 0.5
+"""Parts of that way within which a node must be to be attached later than frame 0, and to hold on
+before the last frame: it is approaching before, and leaving after."""
+SHORTEST = 0.2
+"""Shortest contact [s]."""
+SMOOTHING = 0.15
+"""Time over which the median of a node's place beside the hand is taken [s]."""
+SURFACE, SURFACE_NODES = 2.0, 8
+"""Radius of a piece of the hand's surface, in distances of nodes, and the control nodes that it
+must have to tell how it turns. Of fewer, only the distance from the node counts."""
+MOST_SURFACE_NODES = 24
+"""Most control nodes of a piece."""
+OPENING = 0.75
+"""Part of a hand's places that hold from which another one must be moved apart for it to open."""
+MOST_PAIRS = 80
+"""Most pairs of a control node at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Hands:
+    """The hands' surfaces over the fitted frames."""
+
+    control: Float[ndarray, "frame control 3"]
+    rotation: Float[ndarray, "frame control 3 3"]
+    turns: Bool[ndarray, " control"]
+    """Whether it is known how the surface around a control node turns."""
+
+    def seen_from(
+        self, place: Float[ndarray, "frame 3"], chosen: Int[ndarray, " chosen"]
+    ) -> Float[ndarray, "chosen frame 3"]:
+        """Give a moving place in the frames of some control nodes; or its distance alone."""
+        offset = (place[:, None] - self.control[:, chosen]).transpose(1, 0, 2)
+        rotation = self.rotation[:, chosen].transpose(1, 0, 2, 3)
+        local = np.einsum("cfji,cfj->cfi", rotation, offset)
+        away = np.zeros_like(local)
+        away[..., 0] = np.linalg.norm(offset, axis=-1)
+        return np.where(self.turns[chosen, None, None], local, away)
+
+
+def find_contacts(
+    observation: ObjectObservation,
+    node: Float[ndarray, "node 3"],
+    control: Float[ndarray, "frame control 3"],
+    *,
+    frame_count: int,
+    frame_rate: float,
+) -> ContactIntervals:
+    """Find what hands hold, and when, in the frames that are fitted.
+
+    Args:
+        observation: What was seen of the object.
+        node: Object nodes at frame 0 [m].
+        control: Control nodes in all frames, also those to predict [m].
+        frame_count: Frames to fit; nothing but the control nodes is read of later ones.
+        frame_rate: Frames a second [Hz].
+
+    Returns:
+        The contacts; a node's distance from each control node is that of the frame in which its
+        contact begins. One that holds in the last fitted frame lasts until the hand opens.
+    """
+    start = np.asarray(node, dtype=np.float64)
+    spacing = node_distance(start)
+    hands = _hands(np.asarray(control[:frame_count], np.float64), SURFACE * spacing)
+    seen = observed_nodes(observation, start, frame_count)
+    near = [KDTree(hand).query(nodes) for hand, nodes in zip(hands.control, seen, strict=True)]
+    distance, nearest = (np.array(values) for values in zip(*near, strict=True))
+    reach = np.clip(neighbor_distance(hands.control[0]), spacing, COARSEST_HAND * spacing)
+    shortest = max(2, round(SHORTEST * frame_rate))
+    window = 2 * round(SMOOTHING * frame_rate / 2) + 1
+    held: list[tuple[int, int, int]] = []
+    for index in np.flatnonzero((distance < NEAR_HAND * reach).any(axis=0)):
+        candidate, which = np.unique(nearest[:, index], return_inverse=True)
+        local = median_filter(
+            hands.seen_from(seen[:, index], candidate), size=(1, window, 1), mode="nearest"
+        )
+        is_near = distance[:, index] < NEAR_HAND * reach
+        tolerance = SLIP * spacing + GIVE * distance[:, index]
+        held += [
+            (int(index), *contact)
+            for contact in _contacts_of(local[which], is_near, tolerance, shortest)
+        ]
+    last = frame_count - 1
+    holding = np.unique([nearest[last, index] for index, _, end in held if end == last]).astype(int)
+    until = _openings(np.asarray(control, np.float64), holding, last, window, spacing)
+    pairs: list[ndarray] = []
+    for index, begin, end in held:
+        away = np.linalg.norm(hands.control[begin] - seen[begin, index], axis=1)
+        near_by = np.flatnonzero(away < LONGEST_HOLD * reach)
+        leaves = end if end < last else until[int(nearest[last, index])]
+        row = np.broadcast_to(np.array([index, begin, leaves]), (len(near_by), 3))
+        pairs.append(np.column_stack([near_by, away[near_by], row]))
+    table = np.concatenate(pairs) if pairs else np.zeros((0, 5))
+    interval = table[:, 3:].astype(np.int64)
+    rank = _ranks(table[:, 0], table[:, 1], interval)
+    kept = rank < MOST_PAIRS
+    return ContactIntervals(
+        node=table[kept, 2].astype(np.int32),
+        control=table[kept, 0].astype(np.int32),
+        distance=table[kept, 1].astype(np.float32),
+        rank=rank[kept].astype(np.int32),
+        interval=interval[kept].astype(np.int32),
+    )
+
+
+def observed_nodes(
+    observation: ObjectObservation, node: Float[ndarray, "node 3"], frame_count: int
+) -> Float[ndarray, "frame node 3"]:
+    """Move the nodes of frame 0 as the tracks around them were seen to move [m].
+
+    In a frame that shows no track whose place on the object is known they stay where they were.
+    """
+    seen = np.empty((frame_count, *node.shape))
+    seen[0] = node
+    for frame in range(1, frame_count):
+        try:
+            seen[frame] = node + last_residual(
+                node,
+                node,
+                observation.point,
+                observation.is_visible,
+                frame,
+                observation.node_of_track,
+            )
+        except ValueError:
+            seen[frame] = seen[frame - 1]
+    return seen
+
+
+def _hands(control: Float[ndarray, "frame control 3"], radius: float) -> _Hands:
+    """Find how the hand's surface around each control node turns after frame 0."""
+    count = control.shape[1]
+    most = min(MOST_SURFACE_NODES, count)
+    distance, near = (
+        np.reshape(value, (count, most)) for value in KDTree(control[0]).query(control[0], k=most)
+    )
+    weight = (distance < radius).astype(np.float64)
+    weight /= weight.sum(axis=1, keepdims=True)
+
+    def shape(place: ndarray) -> ndarray:
+        piece = place[near]
+        return piece - np.einsum("cn,cni->ci", weight, piece)[:, None]
+
+    start = shape(control[0])
+    covariance = [np.einsum("cn,cni,cnj->cij", weight, shape(place), start) for place in control]
+    turns = (weight > 0.0).sum(axis=1) >= SURFACE_NODES
+    rotation = np.broadcast_to(np.eye(3), (*control.shape, 3)).copy()
+    rotation[:, turns] = best_rotations(np.array(covariance)[:, turns])
+    return _Hands(control, rotation, turns)
+
+
+def _contacts_of(
+    local: Float[ndarray, "seed frame 3"],
+    is_near: Bool[ndarray, " frame"],
+    tolerance: Float[ndarray, " frame"],
+    shortest: int,
+) -> list[tuple[int, int]]:
+    """Find a node's contacts: the longest runs of frames in which it stays, and do not overlap.
+
+    Args:
+        local: For each frame as a seed, the node's places seen from the surface nearest to it then.
+        is_near: Whether the node is near a hand.
+        tolerance: How far it may be from its place in a seed's frame.
+        shortest: Fewest frames of a contact.
+
+    Returns:
+        First and last frame of each.
+    """
+    count = len(is_near)
+    frame = np.arange(count)
+    free = is_near.copy()
+    away = np.linalg.norm(local - local[frame, frame][:, None], axis=-1)
+    found: list[tuple[int, int]] = []
+    while free.any():
+        blocked = ~((away < tolerance[:, None]) & free)
+        first = np.where(blocked & (frame <= frame[:, None]), frame, -1).max(axis=1) + 1
+        last = np.where(blocked & (frame >= frame[:, None]), frame, count).min(axis=1) - 1
+        length = np.where(free, last - first + 1, 0)
+        if length.max() < shortest:
+            break
+        longest = np.flatnonzero(length == length.max())
+        drift = [away[seed, first[seed] : last[seed] + 1].mean() for seed in longest]
+        seed = longest[np.argmin(drift)]
+        begin, end = int(first[seed]), int(last[seed])
+        free[begin : end + 1] = False
+        place = local[seed, begin : end + 1]
+        off = np.linalg.norm(place - np.median(place, axis=0), axis=1) / tolerance[seed]
+        attached = begin + np.flatnonzero(off < max(LATE, 1.001 * off.min()))
+        holding = begin + np.flatnonzero(off < max(EARLY, 1.001 * off.min()))
+        begin = begin if begin == 0 else int(attached[0])
+        end = end if end == count - 1 else int(holding[-1])
+        if begin < end:
+            found.append((begin, end))
+    return sorted(found)
+
+
+def _openings(
+    control: Float[ndarray, "frame control 3"],
+    holding: Int[ndarray, " holding"],
+    last: int,
+    window: int,
+    spacing: float,
+) -> dict[int, int]:
+    """Find when hands that hold something in the last fitted frame open.
+
+    A hand opens when the places with which it holds move apart: when half of them are farther from
+    `OPENING` of the others than they were, by the way by which a node in contact may move.
+
+    Args:
+        control: Control nodes in all frames [m].
+        holding: Those that hold.
+        last: The last fitted frame.
+        window: Fitted frames over the median of which they are where they hold.
+        spacing: Distance of nodes [m].
+
+    Returns:
+        For each of `holding` the last frame in which its hand is not open.
+    """
+    until = dict.fromkeys(holding.tolist(), int(NEVER))
+    pair = KDTree(control[0]).query_pairs(spacing, output_type="ndarray")
+    count = control.shape[1]
+    joined = coo_array((np.ones(len(pair)), (pair[:, 0], pair[:, 1])), shape=(count, count))
+    hand = connected_components(joined, directed=False)[1][holding]
+    for number in np.unique(hand):
+        own = holding[hand == number]
+        apart = np.linalg.norm(control[:, own, None] - control[:, None, own], axis=-1)
+        before = np.median(apart[max(0, last + 1 - window) : last + 1], axis=0)
+        growth = np.quantile(apart[last + 1 :] - before, OPENING, axis=2)
+        opened = np.flatnonzero(np.median(growth, axis=1) > SLIP * spacing)
+        if len(opened):
+            until |= dict.fromkeys(own.tolist(), last + int(opened[0]))
+    return until
+
+
+def _ranks(
+    control: Float[ndarray, " pair"],
+    distance: Float[ndarray, " pair"],
+    interval: Int[ndarray, "pair 2"],
+) -> Int[ndarray, " pair"]:
+    """Count, for each pair, the nearer ones of its control node that hold at the same time."""
+    rank = np.zeros(len(control), dtype=np.int64)
+    order = np.argsort(control, kind="stable")
+    for part in np.split(order, np.flatnonzero(np.diff(control[order])) + 1):
+        away, (first, last) = distance[part], interval[part].T
+        is_nearer = away[None] < away[:, None]
+        is_nearer |= (away[None] == away[:, None]) & (part[None] < part[:, None])
+        holds_too = (first[None] < last[:, None]) & (first[:, None] < last[None])
+        rank[part] = (is_nearer & holds_too).sum(axis=1)
+    return rank

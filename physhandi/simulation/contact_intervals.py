@@ -1,0 +1,80 @@
+"""Which control nodes are near which object nodes, and when: what virtual springs are laid from."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int, Int32
+from numpy import ndarray
+
+NEVER = np.iinfo(np.int32).max
+"""Frame in which a contact that lasts to the end of every motion lets go."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ContactIntervals:
+    """Pairs of an object node and a control node that touch, each for an interval of frames."""
+
+    node: Int32[ndarray, " pair"]
+    """Object node."""
+    control: Int32[ndarray, " pair"]
+    """Control node, counted from 0."""
+    distance: Float32[ndarray, " pair"]
+    """How far they are from each other when the contact begins [m]."""
+    rank: Int32[ndarray, " pair"]
+    """Place among the control node's pairs at that time, the nearest first."""
+    interval: Int32[ndarray, "pair 2"]
+    """Frame in which the contact begins, and last frame in which it holds."""
+
+    def __post_init__(self) -> None:
+        count = len(self.node)
+        for name in ("control", "distance", "rank"):
+            if getattr(self, name).shape != (count,):
+                raise ValueError(
+                    f"{name} has shape {getattr(self, name).shape}; expected ({count},)."
+                )
+        if self.interval.shape != (count, 2):
+            raise ValueError(f"interval has shape {self.interval.shape}; expected ({count}, 2).")
+
+    def chosen(self, radius: float, most: int) -> Bool[ndarray, " pair"]:
+        """Mark pairs that are nearer than a radius and within a limit of a control node's pairs."""
+        return (self.distance < radius) & (self.rank < most)
+
+    def of_controls(self, numbers: Int[ndarray, " chosen"]) -> "ContactIntervals":
+        """Keep the pairs of some control nodes, numbered anew in the order given."""
+        place = np.full(int(max(self.control.max(initial=-1), np.max(numbers, initial=-1))) + 1, -1)
+        place[numbers] = np.arange(len(numbers))
+        kept = place[self.control] >= 0
+        pairs = {f.name: getattr(self, f.name)[kept] for f in fields(self)}
+        return ContactIntervals(**pairs | {"control": place[pairs["control"]].astype(np.int32)})
+
+    def to_tensors(self) -> dict[str, ndarray]:
+        """Return every field as an array, ready for safetensors."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, ndarray]) -> "ContactIntervals":
+        """Rebuild it from the arrays of `to_tensors`.
+
+        Raises:
+            ValueError: If an array is missing, unknown or inconsistent.
+        """
+        names = {field.name for field in fields(cls)}
+        if set(tensors) != names:
+            raise ValueError(
+                f"Contacts need the arrays {', '.join(sorted(names))}; "
+                f"got {', '.join(sorted(tensors))}."
+            )
+        return cls(**{name: np.asarray(tensors[name]) for name in names})
+
+
+def acts_in(interval: Int32[ndarray, "item 2"], frame: int) -> Bool[ndarray, " item"]:
+    """Mark what acts on the way to a frame; to frame 0, what does on the way to frame 1.
+
+    Args:
+        interval: Frame in whose state each is attached, and the last one before it lets go.
+        frame: The frame.
+    """
+    first, last = interval.T
+    step = max(frame, 1)
+    return (first < step) & (step <= last)

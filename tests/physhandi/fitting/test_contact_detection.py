@@ -1,0 +1,185 @@
+"""When a made-up hand holds a made-up sheet: what it does is known to the frame."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from physhandi.data.observation import ObjectObservation
+from physhandi.fitting.contact_detection import find_contacts
+from physhandi.simulation.contact_intervals import NEVER, ContactIntervals
+
+SPACING, RATE, FRAMES = 0.01, 30.0, 40
+SHEET = np.array([[SPACING * i, SPACING * j, 0.0] for i in range(9) for j in range(9)])
+MIDDLE = 40
+PALM = np.array([[0.004 * i, 0.004 * j, 0.0] for i in range(-3, 4) for j in range(-3, 4)])
+"""A patch of 24 mm; its middle is control node 24."""
+RISE = np.array([0.0, 0.0, 0.003])
+ABOVE = SHEET[MIDDLE] + RISE
+
+
+def seen(moved: np.ndarray, frames: int = FRAMES) -> ObjectObservation:
+    """The sheet's nodes, moved by so much in every frame, each of them a track."""
+    point = np.stack([SHEET + shift for shift in np.broadcast_to(moved, (frames, 3))])
+    return observation(point)
+
+
+def observation(point: np.ndarray) -> ObjectObservation:
+    visible = np.ones(point.shape[:2], bool)
+    return ObjectObservation(point=point, is_visible=visible, is_motion_valid=visible)
+
+
+def hand(way: np.ndarray) -> np.ndarray:
+    return PALM + np.broadcast_to(way, (len(way), 3))[:, None]
+
+
+def found(what: ObjectObservation, control: np.ndarray, frames: int = FRAMES) -> ContactIntervals:
+    return find_contacts(what, SHEET, control, frame_count=frames, frame_rate=RATE)
+
+
+def at(contacts: ContactIntervals, node: int) -> list[list[int]]:
+    return np.unique(contacts.interval[contacts.node == node], axis=0).tolist()
+
+
+def ramp(begin: int, end: int, to: float, frames: int = FRAMES) -> np.ndarray:
+    """0 until a frame, then evenly to a value that is reached in another."""
+    return to * np.clip((np.arange(frames) - begin) / (end - begin), 0.0, 1.0)
+
+
+def along(axis: int, value: np.ndarray) -> np.ndarray:
+    return value[:, None] * np.eye(3)[axis]
+
+
+def test_what_is_held_from_the_start_is_held_for_ever() -> None:
+    way = along(0, ramp(5, 35, 0.06)) + along(2, ramp(20, 35, 0.03))
+    contacts = found(seen(way), hand(ABOVE + way))
+    assert np.unique(contacts.interval, axis=0).tolist() == [[0, NEVER]]
+    held = np.unique(contacts.node)
+    near = np.linalg.norm(SHEET[:, None] - (ABOVE + PALM)[None], axis=2)
+    np.testing.assert_array_equal(held, np.flatnonzero(near.min(axis=1) < 1.5 * SPACING))
+    assert len(contacts.node) == int((near[held] < 4.0 * SPACING).sum())
+    for pair in range(0, len(contacts.node), 97):
+        expected = near[contacts.node[pair], contacts.control[pair]]
+        assert contacts.distance[pair] == pytest.approx(expected, rel=1e-6)
+    # The nearest of a control node's nodes is its first.
+    of_one = contacts.control == 32
+    order = np.argsort(contacts.rank[of_one])
+    np.testing.assert_array_equal(contacts.rank[of_one][order], np.arange(of_one.sum()))
+    assert np.diff(contacts.distance[of_one][order]).min() > -1e-8
+    assert contacts.node[of_one][order][0] == MIDDLE
+
+
+def test_a_late_hand_holds_once_it_has_come_to_rest() -> None:
+    coming = along(2, 0.03 - ramp(2, 12, 0.03))
+    way = along(1, ramp(20, 38, 0.04))
+    contacts = found(seen(way), hand(ABOVE + coming + way))
+    ((begin, end),) = at(contacts, MIDDLE)
+    assert end == NEVER
+    # It comes by 3 mm a frame; what is left when it is attached is a third of a node's distance.
+    assert 10 <= begin <= 12
+    pair = np.flatnonzero((contacts.node == MIDDLE) & (contacts.control == 24))[0]
+    left = coming[begin, 2]
+    assert contacts.distance[pair] == pytest.approx(0.003 + left, abs=1e-6)
+    assert left < 0.004
+
+
+def test_a_hand_that_lets_go_holds_until_then() -> None:
+    way = along(0, ramp(3, 18, 0.05))
+    leaving = along(2, ramp(22, 32, 0.04))
+    ((begin, end),) = at(found(seen(way), hand(ABOVE + way + leaving)), MIDDLE)
+    assert begin == 0
+    assert 22 <= end <= 24
+
+
+def test_a_hand_that_slides_takes_hold_of_other_places() -> None:
+    sliding = along(0, ramp(14, 22, 0.05))
+    contacts = found(seen(np.zeros(3)), hand(ABOVE + sliding - np.array([0.03, 0.0, 0.0])))
+    ((begin, end),) = at(contacts, MIDDLE - 27)
+    assert begin == 0
+    assert 14 <= end <= 16
+    ((begin, end),) = at(contacts, MIDDLE + 18)
+    assert 20 <= begin <= 22
+    assert end == NEVER
+
+
+@pytest.mark.parametrize("height", [0.004, 0.05], ids=["past", "above"])
+def test_a_hand_that_passes_holds_nothing(height: float) -> None:
+    passing = along(0, np.linspace(-0.2, 0.2, FRAMES))
+    contacts = found(seen(np.zeros(3)), hand(ABOVE + passing + np.array([0.0, 0.0, height])))
+    assert len(contacts.node) == 0
+
+
+def test_a_turning_hand_keeps_what_turns_with_it() -> None:
+    turn = Rotation.from_rotvec(along(1, ramp(5, 35, 1.8))).as_matrix()
+    offset = SHEET - ABOVE
+    sheet = np.einsum("fij,nj->fni", turn, offset) + ABOVE
+    control = np.einsum("fij,nj->fni", turn, PALM) + ABOVE
+    assert at(found(observation(sheet), control), MIDDLE) == [[0, NEVER]]
+    # A sheet that stays is let go of by a hand that turns away from it.
+    ((begin, end),) = at(found(seen(np.zeros(3)), control), MIDDLE + 18)
+    assert begin == 0
+    assert end < 30
+
+
+def test_a_point_controller_holds_what_keeps_its_distance() -> None:
+    turn = Rotation.from_rotvec(along(2, ramp(5, 35, 2.5))).as_matrix()
+    grip = SHEET[MIDDLE]
+    sheet = np.einsum("fij,nj->fni", turn, SHEET - grip) + grip
+    control = np.broadcast_to(grip, (FRAMES, 1, 3))
+    contacts = found(observation(sheet), control)
+    assert np.unique(contacts.interval, axis=0).tolist() == [[0, NEVER]]
+    assert len(np.unique(contacts.node)) == 9
+    # Control nodes that are farther apart than nodes reach as far.
+    sparse = found(observation(sheet), sheet[:, [MIDDLE, MIDDLE + 2, MIDDLE + 18]])
+    assert len(np.unique(sparse.node)) > 9
+    assert np.unique(sparse.interval, axis=0).tolist() == [[0, NEVER]]
+
+
+def test_later_frames_are_not_read() -> None:
+    way = along(0, ramp(3, 18, 0.05))
+    leaving = along(2, ramp(25, 30, 0.04))
+    control = hand(ABOVE + way + leaving)
+    whole, part = found(seen(way), control), found(seen(way), control, frames=22)
+    assert at(whole, MIDDLE)[0][1] < 28
+    assert at(part, MIDDLE) == [[0, NEVER]]
+    nonsense = seen(way)
+    nonsense.point[22:] = 7.0
+    control[22:] = -5.0
+    again = found(nonsense, control, frames=22)
+    for name in ("node", "control", "distance", "rank", "interval"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(part, name))
+
+
+def test_what_a_hand_holds_when_the_fit_ends_is_let_go_when_it_opens() -> None:
+    # Two fingers above and below the sheet that part by 2 mm a frame.
+    way = along(0, ramp(3, 18, 0.05))
+    finger = np.concatenate([PALM + RISE, PALM - RISE])
+    side = np.sign(finger[:, 2])[None, :, None]
+    ends = []
+    for first in (24, 25, 28):
+        opening = along(2, ramp(first, first + 10, 0.01))
+        control = SHEET[MIDDLE] + finger + way[:, None] + side * opening[:, None]
+        ((begin, end),) = at(found(seen(way), control, frames=22), MIDDLE)
+        assert begin == 0
+        ends.append(end)
+    # By more than a node's distance, seen along ways that are aslant.
+    assert 24 + 5 <= ends[0] <= 24 + 9
+    assert [end - ends[0] for end in ends] == [0, 1, 4]
+    opening = along(2, ramp(25, 35, 0.01))
+    control = SHEET[MIDDLE] + finger + way[:, None] + side * opening[:, None]
+    # A hand that goes on, turns or closes does not open, nor do two hands that part.
+    turn = Rotation.from_rotvec(along(1, ramp(24, 39, 1.0))).as_matrix()
+    turned = np.einsum("fij,fnj->fni", turn, control - side * opening[:, None] - SHEET[MIDDLE])
+    closing = SHEET[MIDDLE] + finger + way[:, None] - side * 0.3 * opening[:, None]
+    for other in (turned + SHEET[MIDDLE], closing):
+        assert at(found(seen(way), other, frames=22), MIDDLE) == [[0, NEVER]]
+    hands = np.concatenate(
+        [
+            hand(ABOVE + way),
+            hand(ABOVE + along(1, np.full(FRAMES, 0.04) + 3 * opening[:, 2]) + way),
+        ],
+        axis=1,
+    )
+    contacts = found(seen(way), hands, frames=22)
+    assert np.unique(contacts.interval, axis=0).tolist() == [[0, NEVER]]
+    assert np.any(contacts.control < len(PALM))
+    assert np.any(contacts.control >= len(PALM))
