@@ -254,9 +254,7 @@ def _object_in(
     return object_
 
 
-def _store_restart(
-    attempt: Attempt, sequence: Sequence, device: str, *, moves_hands: bool = False
-) -> None:
+def _store_restart(attempt: Attempt, sequence: Sequence, device: str) -> None:
     """Estimate the object's state in the last fitted frame, from which prediction starts."""
     fitted = _stored_object(attempt, sequence)
     try:
@@ -267,7 +265,7 @@ def _store_restart(
             artefacts.load_observation(attempt.out, sequence.name),
             sequence.reconstruction_frames[-1],
             device=device,
-            moves_hands=moves_hands,
+            moves_hands=(attempt.out / SequenceFiles(sequence.name).contacts).is_file(),
         )
     except MissingInputError as error:
         raise MissingInputError(f"Sequence '{sequence.name}': {error}") from error
@@ -535,12 +533,7 @@ def _stage_evaluation(
         if has_object:
             if config.prediction.restarts and sequence.future_frames:
                 try:
-                    _store_restart(
-                        attempt,
-                        sequence,
-                        device,
-                        moves_hands=config.object_.contact_over_time,
-                    )
+                    _store_restart(attempt, sequence, device)
                 except MissingInputError as error:
                     told = f"Predicted without a restart. {error}"
                     progress.report(EVALUATION, number, len(sequences), message=told)

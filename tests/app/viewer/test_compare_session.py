@@ -43,7 +43,7 @@ def another_run(
             meta["frame_count"] = len(position)
             for name in ("object_node", "initial_velocity", "clearance"):
                 tensors[name] = tensors[name][::step]
-            for name in ("rest_length", "stiffness", "damping"):
+            for name in ("rest_length", "stiffness", "damping", "attached"):
                 tensors[name] = tensors[name][:0]
             tensors["spring_nodes"] = tensors["spring_nodes"][:0]
             tensors["object_spring_count"] = np.zeros(1, np.int32)
