@@ -59,6 +59,7 @@ def test_other_nodes_are_compared_with_the_surface() -> None:
         initial_velocity=np.zeros_like(node),
         clearance=np.zeros(len(node), np.float32),
         spring_nodes=np.zeros((0, 2), np.int32),
+        attached=np.zeros((0, 2), np.int32),
         rest_length=empty,
         stiffness=empty,
         damping=empty,
