@@ -94,6 +94,15 @@ def find_contacts(
         The contacts; a node's distance from each control node is that of the frame in which its
         contact begins. One that holds in the last fitted frame lasts until the hand opens.
     """
+    if control.shape[1] == 0:
+        nothing = np.zeros(0, np.int32)
+        return ContactIntervals(
+            node=nothing,
+            control=nothing,
+            distance=np.zeros(0, np.float32),
+            rank=nothing,
+            interval=np.zeros((0, 2), np.int32),
+        )
     start = np.asarray(node, dtype=np.float64)
     spacing = node_distance(start)
     hands = _hands(np.asarray(control[:frame_count], np.float64), SURFACE * spacing)
@@ -169,7 +178,7 @@ def _hands(control: Float[ndarray, "frame control 3"], radius: float) -> _Hands:
     distance, near = (
         np.reshape(value, (count, most)) for value in KDTree(control[0]).query(control[0], k=most)
     )
-    weight = (distance < radius).astype(np.float64)
+    weight = (distance <= radius).astype(np.float64)
     weight /= weight.sum(axis=1, keepdims=True)
 
     def shape(place: ndarray) -> ndarray:

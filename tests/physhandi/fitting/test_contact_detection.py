@@ -183,3 +183,13 @@ def test_what_a_hand_holds_when_the_fit_ends_is_let_go_when_it_opens() -> None:
     assert np.unique(contacts.interval, axis=0).tolist() == [[0, NEVER]]
     assert np.any(contacts.control < len(PALM))
     assert np.any(contacts.control >= len(PALM))
+
+
+def test_a_single_node_is_held_and_no_hand_holds_nothing() -> None:
+    lone = observation(np.zeros((FRAMES, 1, 3)))
+    control = np.zeros((FRAMES, 2, 3)) + RISE
+    fields = {"frame_count": FRAMES, "frame_rate": RATE}
+    contacts = find_contacts(lone, np.zeros((1, 3)), control, **fields)
+    assert contacts.interval.tolist() == [[0, NEVER], [0, NEVER]]
+    np.testing.assert_allclose(contacts.distance, 0.003, rtol=1e-6)
+    assert len(find_contacts(lone, np.zeros((1, 3)), control[:, :0], **fields).node) == 0
