@@ -7,7 +7,7 @@ from pathlib import Path
 from urllib.parse import parse_qsl, urljoin
 
 import numpy as np
-from playwright.sync_api import Locator, Page
+from playwright.sync_api import Locator, Page, expect
 from scipy.spatial.distance import cdist
 
 _NUMBER = r"([\d.]+(?:e[+-]?\d+)?)"
@@ -82,7 +82,11 @@ class ScenePage:
         self._send()
 
     def press(self, name: str) -> None:
-        self.panel.get_by_role("button", name=name, exact=True).click()
+        button = self.panel.get_by_role("button", name=name, exact=True)
+        expect(button).to_be_enabled()
+        # Lines above it come and go while something is simulated; a mouse that goes down on a
+        # button and up beside it has pressed nothing.
+        button.evaluate("button => button.click()")
         self._send()
 
     def _send(self) -> None:
