@@ -21,7 +21,7 @@ from physhandi.errors import MissingInputError, RunError, UsageError
 from physhandi.object_rollout import ObjectRollout, load_fitted
 from physhandi.progress import Progress, Watcher, watched
 from physhandi.settings import changes as changed_settings
-from physhandi.simulation.contact_intervals import NEVER, ContactIntervals
+from physhandi.simulation.contact_intervals import ContactIntervals, always
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import (
     SimulationParameters,
@@ -529,5 +529,5 @@ def _hold_anew(
         stiffness=joined(model.stiffness, parameters.virtual_stiffness),
         damping=joined(model.damping, parameters.damping),
         control_count=len(control_0),
-        attached=np.array([[0, NEVER]], dtype=np.int32),
+        attached=always(len(springs)),
     )

@@ -245,12 +245,15 @@ class HandProblem:
 
     def depth_term(self, target: DepthTarget) -> Tensor:
         """Compute the weighted depth loss."""
+        faces, noise = torch.from_numpy(self.model.faces), self.config.depth_noise
+        return self.config.depth_weight * depth_loss(self.surface(), faces, target, noise)
+
+    def surface(self) -> Float[Tensor, "frame vertex 3"]:
+        """Pose the hand's vertices in every frame [m, before scale]."""
         shape, rotation, translation, _ = self.hand()
         still = torch.zeros_like(translation)
         local = self.model(shape, self.parameters["articulation"], still, still).vertex
-        vertex = local @ rotation.transpose(-1, -2) + translation[:, None]
-        faces = torch.from_numpy(self.model.faces)
-        return self.config.depth_weight * depth_loss(vertex, faces, target, self.config.depth_noise)
+        return local @ rotation.transpose(-1, -2) + translation[:, None]
 
     def solve(self, progress: Progress) -> SolvedHand:
         """Fit to keypoints, then to keypoints and depth."""
@@ -301,14 +304,11 @@ class HandProblem:
         One view tells how far away a hand is by its size alone, which differs from hand to hand.
         """
         with torch.no_grad():
-            shape, rotation, translation, _ = self.hand()
-            still = torch.zeros_like(translation)
-            local = self.model(shape, self.parameters["articulation"], still, still).vertex
-            vertex = local @ rotation.transpose(-1, -2) + translation[:, None]
+            vertex = self.surface()
             normal = vertex_normals_torch(vertex, torch.from_numpy(self.model.faces))
             move = way_to_depth(vertex.numpy(), normal.numpy(), target, self.frame_rate)
             if np.median(np.linalg.norm(move, axis=1)) > _DOUBT * self.config.depth_noise:
-                translation.add_(torch.from_numpy(move.astype(np.float32)))
+                self.parameters["translation"].add_(torch.from_numpy(move.astype(np.float32)))
 
     def _show(self, loss: float, progress: Progress) -> None:
         """Send the hand's current keypoints to a preview, if one is due."""

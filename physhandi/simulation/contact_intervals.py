@@ -1,7 +1,7 @@
 """Which control nodes are near which object nodes, and when: what virtual springs are laid from."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32
@@ -40,13 +40,25 @@ class ContactIntervals:
         """Mark pairs that are nearer than a radius and within a limit of a control node's pairs."""
         return (self.distance < radius) & (self.rank < most)
 
+    def within(self, radius: float, most: int) -> "ContactIntervals":
+        """Keep the pairs that are `chosen`, in the order of virtual springs: by object node."""
+        kept = np.flatnonzero(self.chosen(radius, most))
+        order = np.lexsort((self.interval[kept, 0], self.control[kept], self.node[kept]))
+        return self._part(kept[order])
+
+    def spring_nodes(self, node_count: int) -> Int32[ndarray, "pair 2"]:
+        """Give the two nodes of each pair: object node, and `node_count` + control."""
+        return np.stack([self.node, node_count + self.control], axis=1).astype(np.int32)
+
     def of_controls(self, numbers: Int[ndarray, " chosen"]) -> "ContactIntervals":
         """Keep the pairs of some control nodes, numbered anew in the order given."""
         place = np.full(int(max(self.control.max(initial=-1), np.max(numbers, initial=-1))) + 1, -1)
         place[numbers] = np.arange(len(numbers))
-        kept = place[self.control] >= 0
-        pairs = {f.name: getattr(self, f.name)[kept] for f in fields(self)}
-        return ContactIntervals(**pairs | {"control": place[pairs["control"]].astype(np.int32)})
+        kept = self._part(np.flatnonzero(place[self.control] >= 0))
+        return replace(kept, control=place[kept.control].astype(np.int32))
+
+    def _part(self, index: Int[ndarray, " part"]) -> "ContactIntervals":
+        return ContactIntervals(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
     def to_tensors(self) -> dict[str, ndarray]:
         """Return every field as an array, ready for safetensors."""
@@ -66,6 +78,11 @@ class ContactIntervals:
                 f"got {', '.join(sorted(tensors))}."
             )
         return cls(**{name: np.asarray(tensors[name]) for name in names})
+
+
+def always(count: int) -> Int32[ndarray, "item 2"]:
+    """Give the frames of so many things that act in all frames."""
+    return np.tile(np.array([[0, NEVER]], dtype=np.int32), (count, 1))
 
 
 def acts_in(interval: Int32[ndarray, "item 2"], frame: int) -> Bool[ndarray, " item"]:

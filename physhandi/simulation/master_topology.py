@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Float32, Int, Int32
 from numpy import ndarray
 from scipy.spatial import KDTree
 
-from physhandi.simulation.contact_intervals import NEVER, ContactIntervals
+from physhandi.simulation.contact_intervals import ContactIntervals, always
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.topology import MINIMUM_LENGTH, MINIMUM_VIRTUAL_REST_LENGTH
@@ -81,11 +81,11 @@ class MasterTopology:
         )
         if contacts is None:
             virtual, virtual_length, virtual_rank = _ranked_holds(control, node, *reach)
-            attached = np.tile(np.array([[0, NEVER]], dtype=np.int32), (len(virtual), 1))
+            attached = always(len(virtual))
         else:
-            virtual, virtual_length, virtual_rank, attached = _ranked_contacts(
-                contacts, len(node), *reach
-            )
+            near = contacts.within(*reach)
+            virtual, virtual_length = near.spring_nodes(len(node)), near.distance.astype(np.float64)
+            virtual_rank, attached = near.rank, near.interval
         still = np.zeros(node.shape)
         return cls(
             object_node=node.astype(np.float32),
@@ -192,17 +192,3 @@ def _ranked_holds(control: ndarray, node: ndarray, radius: float, most: int) -> 
     order = np.lexsort((control_index, neighbor[is_spring]))
     springs = np.stack([neighbor[is_spring], len(node) + control_index], axis=1)[order]
     return springs, distance[is_spring][order], rank[order]
-
-
-def _ranked_contacts(
-    contacts: ContactIntervals, node_count: int, radius: float, most: int
-) -> tuple[ndarray, ndarray, ndarray, Int32[ndarray, "spring 2"]]:
-    """List contacts as `_ranked_holds` does, and the frames in which they begin and end."""
-    kept = np.flatnonzero(contacts.chosen(radius, most))
-    node, control, interval = (
-        value[kept] for value in (contacts.node, contacts.control, contacts.interval)
-    )
-    order = np.lexsort((interval[:, 0], control, node))
-    springs = np.stack([node, node_count + control], axis=1)[order]
-    distance = contacts.distance[kept][order].astype(np.float64)
-    return springs, distance, contacts.rank[kept][order], interval[order]

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32
 from numpy import ndarray
 
-from physhandi.simulation.contact_intervals import NEVER, acts_in
+from physhandi.simulation.contact_intervals import acts_in, always
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,7 +37,7 @@ class SpringMassModel:
     """Number of control nodes."""
     clearance: Float32[ndarray, " #node"] = field(default_factory=lambda: np.zeros(1, np.float32))
     """Height above the ground at which each object node touches it [m]; one for all, or each."""
-    attached: Int32[ndarray, "#virtual 2"] = field(default_factory=lambda: _always(1))
+    attached: Int32[ndarray, "#virtual 2"] = field(default_factory=lambda: always(1))
     """Frame in whose state each virtual spring is attached, and the last one before it lets go: it
     acts on the way from the first to the last; one pair for all, or each."""
 
@@ -111,7 +111,7 @@ class SpringMassModel:
     @property
     def is_always_attached(self) -> bool:
         """Whether every virtual spring acts in all frames."""
-        return bool(np.all(self.attached == _always(1)))
+        return bool(np.all(self.attached == always(1)))
 
     def acts_in(self, frame: int) -> Bool[ndarray, " spring"]:
         """Mark the springs that act on the way to a frame; to frame 0, those of frame 1."""
@@ -128,7 +128,7 @@ class SpringMassModel:
             self,
             stiffness=self.stiffness * acts,
             damping=self.damping * acts,
-            attached=_always(self.virtual_spring_count),
+            attached=always(self.virtual_spring_count),
         )
 
     def to_tensors(self) -> dict[str, ndarray]:
@@ -159,8 +159,3 @@ class SpringMassModel:
         for name in ("object_spring_count", "control_count"):
             values[name] = int(values[name][0])
         return cls(**values)
-
-
-def _always(count: int) -> Int32[ndarray, "virtual 2"]:
-    """Give the frames of springs that always act."""
-    return np.tile(np.array([[0, NEVER]], dtype=np.int32), (count, 1))

@@ -7,7 +7,7 @@ from jaxtyping import Float, Int32
 from numpy import ndarray
 from scipy.spatial import KDTree
 
-from physhandi.simulation.contact_intervals import NEVER, ContactIntervals
+from physhandi.simulation.contact_intervals import ContactIntervals, always
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 
@@ -124,9 +124,11 @@ def build_model(
         virtual, virtual_length = virtual_springs(
             np.asarray(control_0, dtype=np.float64), node, *reach
         )
-        attached = np.tile(np.array([[0, NEVER]], dtype=np.int32), (len(virtual), 1))
+        attached = always(len(virtual))
     else:
-        virtual, virtual_length, attached = contact_springs(contacts, len(node), *reach)
+        near = contacts.within(*reach)
+        virtual, virtual_length = near.spring_nodes(len(node)), near.distance.astype(np.float64)
+        attached = near.interval
     virtual_floor = max(parameters.virtual_rest_length_floor, MINIMUM_VIRTUAL_REST_LENGTH)
     rest_length = np.concatenate(
         [
@@ -148,30 +150,6 @@ def build_model(
         control_count=len(control_0),
         attached=attached,
     )
-
-
-def contact_springs(
-    contacts: ContactIntervals, node_count: int, radius: float, max_neighbors: int
-) -> tuple[Int32[ndarray, "spring 2"], Float[ndarray, " spring"], Int32[ndarray, "spring 2"]]:
-    """Join control nodes to the object nodes that they touch for an interval of frames.
-
-    Args:
-        contacts: What touches, and when.
-        node_count: Number of object nodes.
-        radius: Object nodes strictly nearer than this are joined [m].
-        max_neighbors: Most springs of one control node at a time.
-
-    Returns:
-        The springs as (object node, `node_count` + control) in ascending order, their lengths [m],
-        and the frames in which they are attached and let go.
-    """
-    kept = np.flatnonzero(contacts.chosen(radius, max_neighbors))
-    node, control, interval = (
-        value[kept] for value in (contacts.node, contacts.control, contacts.interval)
-    )
-    order = np.lexsort((interval[:, 0], control, node))
-    springs = np.stack([node, node_count + control], axis=1)[order].astype(np.int32)
-    return springs, contacts.distance[kept][order].astype(np.float64), interval[order]
 
 
 def retopologize(
