@@ -38,7 +38,7 @@ fmt: install
 # One of the two processes has all browsers: beside each other they hold each other up.
 test: install browser
 	rm -f .coverage .coverage.*
-	$(BIN)/python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder --cov --cov-report=term
+	$(BIN)/python -m pytest -n 2 --no-loadscope-reorder --cov --cov-report=term
 
 # Live scenes, jobs and pages while their threads are held up at random.
 races: install

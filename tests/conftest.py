@@ -9,6 +9,10 @@ import warp as wp
 from recordings import recording
 
 
+BROWSERS = ("tests/e2e/", "tests/app/benchmarks/test_viewer_benchmark.py")
+"""Files whose tests start browsers."""
+
+
 def pytest_configure(config):
     """Spare test processes and their children what costs time and proves nothing."""
     # Several processes with a thread for every processor wait for each other longer than they work.
@@ -20,21 +24,30 @@ def pytest_configure(config):
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(config, items):
-    """Give processes whole files, those that take longest first, and all browsers to one process.
-
-    Two browsers without a graphics card hold each other up; beside one of them the other process
-    computes.
-    """
+def pytest_collection_modifyitems(items):
+    """Begin with the browsers, go on with the files that take long."""
     marks = {mark: set[Path]() for mark in ("e2e", "slow")}
     for item in items:
         for mark in marks.keys() & {mark.name for mark in item.iter_markers()}:
             marks[mark].add(item.path)
     items.sort(key=lambda item: (item.path not in marks["e2e"], item.path not in marks["slow"]))
-    for item in items:
-        file = str(item.path.relative_to(config.rootpath))
-        group = "browser" if item.path in marks["e2e"] else file
-        item.add_marker(pytest.mark.xdist_group(group))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """Give processes whole files, and all browsers to one process.
+
+    Two browsers without a graphics card hold each other up; beside one of them the other process
+    computes. (Groups of `--dist loadgroup` are silently ignored by pytest 9.2.)
+    """
+    from xdist.scheduler import LoadScopeScheduling
+
+    class ByFile(LoadScopeScheduling):
+        def _split_scope(self, nodeid):
+            file = nodeid.split("::", 1)[0]
+            return "browser" if file.startswith(BROWSERS) else file
+
+    return ByFile(config, log)
 
 
 DEVICES = ["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)]

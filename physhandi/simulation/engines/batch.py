@@ -16,7 +16,7 @@ from jaxtyping import Float, Float32, Int
 from numpy import ndarray
 
 from physhandi.errors import SimulationDivergedError, UsageError
-from physhandi.simulation.contact_intervals import NEVER
+from physhandi.simulation.contact_intervals import NEVER, acts_in
 from physhandi.simulation.engines.cpu import CpuEngine
 from physhandi.simulation.engines.graph import LaunchGraph
 from physhandi.simulation.engines.partition import bisect_nodes
@@ -240,8 +240,13 @@ class Population:
             self._array(table.swapaxes(0, 1).ravel(), wp.float32),
             self._array(group_reach.T.astype(np.float32), wp.float32),
             *self._entries(master, rest_length, group_reach[:, 0], group_limit),
-            *self._held(master, rest_length),
         ]
+        virtual, start = self._virtual(master)
+        control = master.spring_nodes[virtual].max(axis=1) - self._nodes
+        self._inputs += [start, *self._springs(master, rest_length, control, virtual)]
+        self._held_rank = self._inputs[-1]
+        self._rank = master.rank[virtual]
+        self._attached = master.attached[virtual - master.object_spring_count]
         self._node_of = self._array(self._model_node.astype(np.int32), wp.int32)
         size = len(lanes) * self._nodes * 6
         self._state = [wp.zeros(size, dtype=wp.float32, device=device) for _ in range(2)]
@@ -287,6 +292,8 @@ class Population:
     def _frames(self, control: Float32[ndarray, "frame control 3"]) -> Iterator[int]:
         """Simulate frame by frame, without waiting for the device."""
         path = self._array(control.reshape(-1, 3), wp.vec3)
+        ranks = self._acting_ranks(len(control))
+        held = len(self._rank)
         self._diverged_frame.fill_(-1)
         self._diverged.zero_()
         self._launch(
@@ -301,6 +308,8 @@ class Population:
                     count = len(place)
                     if count:
                         wp.copy(place, path, src_offset=source * count, count=count)
+                if ranks is not None:
+                    wp.copy(self._held_rank, ranks, src_offset=frame * held, count=held)
                 self._frame.replay()
                 self._launch(
                     note_divergence,
@@ -309,6 +318,16 @@ class Population:
                     [self._diverged_frame],
                 )
             yield frame
+
+    def _acting_ranks(self, frame_count: int) -> wp.array | None:
+        """List the rank of every virtual spring for every frame; None if all act in all frames.
+
+        One that does not act on the way to a frame has a rank that no limit reaches.
+        """
+        if np.all(self._attached == (0, NEVER)):
+            return None
+        acts = np.stack([acts_in(self._attached, frame) for frame in range(frame_count)])
+        return self._array(np.where(acts, self._rank, NEVER).astype(np.int32).ravel(), wp.int32)
 
     def _by_candidate(self, value: wp.array) -> ndarray:
         by_lane = value.numpy()[: self._count]
@@ -372,14 +391,12 @@ class Population:
             *self._springs(master, rest_length, other, spring),
         ]
 
-    def _held(self, master: MasterTopology, rest_length: ndarray) -> list[wp.array]:
-        """List virtual springs by object node, the nearest control node first."""
+    def _virtual(self, master: MasterTopology) -> tuple[Int[ndarray, " virtual"], wp.array]:
+        """Order virtual springs by object node, the shortest first; and where each node's begin."""
         spring = np.arange(master.object_spring_count, len(master.length))
-        ends = np.sort(master.spring_nodes[spring], axis=1)
-        source, control = self._numbered(ends[:, 0]), ends[:, 1] - self._nodes
-        start, order = self._sorted(source, master.length[spring])
-        lists = self._springs(master, rest_length, control[order], spring[order])
-        return [self._array(start.astype(np.int32), wp.int32), *lists]
+        node = self._numbered(master.spring_nodes[spring].min(axis=1))
+        start, order = self._sorted(node, master.length[spring])
+        return spring[order], self._array(start.astype(np.int32), wp.int32)
 
     def _numbered(self, node: Int[ndarray, "*ends"]) -> Int[ndarray, "*ends"]:
         """Turn the model's numbers of object nodes into those of the batch."""
@@ -432,9 +449,8 @@ def _number(parameters: SimulationParameters, name: str, substeps: int) -> float
 class BatchSimulator:
     """Rolls out many candidates that differ in parameters and in topology.
 
-    On CUDA they share every launch and take the substeps of the one that needs most; on a CPU,
-    and where virtual springs are attached for some frames only, they take turns. Self-collision is
-    not simulated.
+    On CUDA they share every launch and take the substeps of the one that needs most; on a CPU they
+    take turns. Self-collision is not simulated.
     """
 
     def __init__(
@@ -535,9 +551,7 @@ class BatchSimulator:
         return BatchLosses(loss, diverged)
 
     def _on_device(self) -> Population | None:
-        # One list of springs serves all frames there, so where it changes candidates take turns.
-        changes = np.any(self.master.attached != (0, NEVER))
-        if not self.device.is_cuda or len(self.master.object_node) == 0 or changes:
+        if not self.device.is_cuda or len(self.master.object_node) == 0:
             return None
         if self._population is None:
             self._population = Population(self.master, self.parameters, self.substeps, self.device)
