@@ -8,7 +8,6 @@ import pytest
 import warp as wp
 from recordings import recording
 
-
 BROWSERS = ("tests/e2e/", "tests/app/benchmarks/test_viewer_benchmark.py")
 """Files whose tests start browsers."""
 
