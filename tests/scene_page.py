@@ -100,8 +100,8 @@ class ScenePage:
         return dict(parse_qsl(self.page.request.get(address).json()["query"]))
 
     def frame(self) -> int:
-        """The frame that the server shows."""
-        return int(self.link()["f"])
+        """The frame that the server shows; links of comparisons leave out frame 0."""
+        return int(self.link().get("f", 0))
 
     def pause(self) -> None:
         """Stop the clock; the last frame that it drew may be told after the button has changed."""
