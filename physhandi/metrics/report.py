@@ -4,6 +4,7 @@
 Definitions, units and the paper's columns are in docs/metrics.md.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -163,7 +164,7 @@ def measure_run(
         )
         if not with_baselines:
             motions = {"rollout": motions["rollout"]}
-        curves = {name: error_curves(nodes, reference) for name, nodes in motions.items()}
+        curves = _curves_of(motions, reference)
         report |= _tabulated(motions, curves, substituted, reference, splits)
         if with_baselines and "future" in report:
             report["future"] |= _last_residual(
@@ -249,7 +250,7 @@ def score_rollout(
     """
     frame_count = max(reconstruction_frames.stop, future_frames.stop)
     motions, substituted = _motions(rollout, reference, control, frame_count)
-    curves = {name: error_curves(nodes, reference) for name, nodes in motions.items()}
+    curves = _curves_of(motions, reference)
     splits = {"reconstruction": reconstruction_frames, "future": future_frames}
     return _tabulated(motions, curves, substituted, reference, splits)
 
@@ -380,6 +381,13 @@ def _judged(
             )
             scores |= contact_scores(predicted[name][frames], chosen, prefix + name)
     return scores
+
+
+def _curves_of(motions: Motions, reference: ScoringReference) -> dict[str, Curves]:
+    """Measure motions beside each other: searches for nearest points use a processor each."""
+    with ThreadPoolExecutor(len(motions), thread_name_prefix="physhandi-metrics") as pool:
+        found = pool.map(lambda nodes: error_curves(nodes, reference), motions.values())
+        return dict(zip(motions, found, strict=True))
 
 
 def error_curves(nodes: Float[ndarray, "frame node 3"], reference: ScoringReference) -> Curves:

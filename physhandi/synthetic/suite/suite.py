@@ -105,6 +105,7 @@ SUITES: dict[str, Suite] = {
                 "hand.depth_iterations": 0,
                 "object_.search.generations": 2,
                 "object_.search.population": 4,
+                "object_.search.widening_generations": 0,
                 "object_.first_order.iterations": 2,
                 "refinement.iterations": 0,
             },
