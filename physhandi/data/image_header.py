@@ -1,0 +1,108 @@
+"""The size that an image file announces, read from its first bytes before anything is decoded.
+
+A file of a few hundred bytes can announce a picture that fills all memory.
+"""
+
+import math
+import struct
+from pathlib import Path
+from typing import BinaryIO
+
+from physhandi.data.files import read_array
+
+MOST_PIXELS = 50_000_000
+"""Pixels of the largest image that is decoded: 8,192 x 6,144."""
+_PNG = b"\x89PNG\r\n\x1a\n"
+_JPEG = b"\xff\xd8"
+_EXR = b"\x76\x2f\x31\x01"
+_MOST_SEGMENTS = 4096
+
+
+def announced_size(path: Path) -> tuple[int, int]:
+    """Read the width and height [px] that a PNG, JPEG, EXR or ``.npy`` file announces.
+
+    Raises:
+        ValueError: If it is none of these, ends within its header, or announces more than
+            `MOST_PIXELS`; the message continues a sentence that begins with the file's name.
+        OSError: If it cannot be read.
+    """
+    with path.open("rb") as stream:
+        start = stream.read(32)
+        try:
+            if start.startswith(_PNG):
+                if start[12:16] != b"IHDR":
+                    raise ValueError("has a damaged PNG header")
+                size = struct.unpack(">II", start[16:24])
+            elif start.startswith(_JPEG):
+                size = _jpeg_size(stream)
+            elif start.startswith(_EXR):
+                size = _exr_size(stream)
+            else:
+                size = _npy_size(path)
+        except struct.error:
+            raise ValueError("ends within its header, so it was cut off") from None
+    width, height = size
+    if width < 1 or height < 1 or width * height > MOST_PIXELS:
+        raise ValueError(
+            f"announces {width}x{height} px in a file of {path.stat().st_size} bytes; images of 1 "
+            f"to {MOST_PIXELS} pixels are read"
+        )
+    return width, height
+
+
+def _jpeg_size(stream: BinaryIO) -> tuple[int, int]:
+    """Go from segment to segment until the one that describes the frame."""
+    stream.seek(2)
+    for _ in range(_MOST_SEGMENTS):
+        byte = stream.read(1)
+        while byte not in {b"\xff", b""}:
+            byte = stream.read(1)
+        while byte == b"\xff":
+            byte = stream.read(1)
+        (marker,) = struct.unpack("B", byte)
+        if 0xD0 <= marker <= 0xD9 or marker == 0x01:
+            continue
+        (length,) = struct.unpack(">H", stream.read(2))
+        if 0xC0 <= marker <= 0xCF and marker not in {0xC4, 0xC8, 0xCC}:
+            height, width = struct.unpack(">xHH", stream.read(5))
+            return width, height
+        stream.seek(length - 2, 1)
+    raise ValueError("has no size in its JPEG header")
+
+
+def _exr_size(stream: BinaryIO) -> tuple[int, int]:
+    """Find the attribute ``dataWindow`` among the first of an OpenEXR header."""
+    stream.seek(8)
+    for _ in range(_MOST_SEGMENTS):
+        name = _text(stream)
+        if not name:
+            break
+        _text(stream)  # Type of the attribute.
+        (length,) = struct.unpack("<i", stream.read(4))
+        if name == b"dataWindow":
+            left, top, right, bottom = struct.unpack("<4i", stream.read(16))
+            return right - left + 1, bottom - top + 1
+        stream.seek(max(0, length), 1)
+    raise ValueError("has no size in its OpenEXR header")
+
+
+def _text(stream: BinaryIO) -> bytes:
+    text = b""
+    while len(text) < 256:
+        (byte,) = struct.unpack("c", stream.read(1))
+        if byte == b"\0":
+            return text
+        text += byte
+    raise ValueError("has a damaged OpenEXR header")
+
+
+def _npy_size(path: Path) -> tuple[int, int]:
+    try:
+        shape = read_array(path, mmap=True).shape
+    except ValueError as error:
+        raise ValueError(
+            f"is neither PNG, JPEG, EXR nor a whole .npy file of plain numbers ({error})"
+        ) from None
+    if len(shape) not in (2, 3) or (len(shape) == 3 and math.prod(shape[2:]) > 4):
+        raise ValueError(f"holds an array {shape}; expected one image (row, column)")
+    return shape[1], shape[0]
