@@ -246,7 +246,8 @@ class ObjectFitConfig(Settings, frozen=True, kw_only=True):
     automatic_substeps: bool = False
     """Give each candidate the substeps that its own stability limit asks for."""
     most_substeps: Annotated[int, Meta(ge=1, le=1_000_000)] = 2000
-    """A candidate that needs more substeps a frame than this is not tried."""
+    """A candidate that needs more substeps a frame than this is not tried, nor, with automatic
+    ones, if it needs more than twice as many as the start of the search, if that is more."""
 
 
 class RefinementConfig(Settings, frozen=True, kw_only=True):

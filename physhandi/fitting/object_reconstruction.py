@@ -18,6 +18,7 @@ from physhandi.errors import FitError, UsageError
 from physhandi.fitting.config import ObjectFitConfig, SearchConfig
 from physhandi.fitting.object_problem import (
     ObjectProblem,
+    build_problem_model,
     mean_loss,
     problem_parameters,
     settle_substeps,
@@ -61,6 +62,10 @@ def search_object(
         search, start = fit_intervals(search, start, measure_object(problems))
     for problem in problems:
         check_problem(problem, start, search)
+    if config.automatic_substeps:
+        models = [build_problem_model(problem, start) for problem in problems]
+        needed = settle_substeps(models, start, config).substeps_per_frame
+        config = config.replace(most_substeps=max(config.most_substeps, 2 * needed))
     evaluate = CandidateEvaluator(problems, config, progress, device=device)
     return search_parameters(evaluate, start, search, progress)
 

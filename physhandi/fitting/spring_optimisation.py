@@ -5,7 +5,7 @@
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Many
 from dataclasses import dataclass, replace
 from typing import Any
@@ -134,9 +134,8 @@ def optimise_springs(
         if settings.judges_online:
             loss = float(np.mean([value for value in losses if value is not None]))
         else:
-            loss = mean_loss(
-                problems, now, now_parameters, config, device, on_rollout=preview.update
-            )
+            ahead = iteration + 1 if iteration + 1 < settings.iterations else None
+            loss = descent.present_loss(problems, models, ahead, preview.update)
             preview.show(loss)
         if _is_judged(iteration, settings) and loss < best_loss:
             best, best_parameters, best_loss = now, now_parameters, loss
@@ -319,10 +318,12 @@ def _logarithms(model: SpringMassModel, part: slice) -> Tensor:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FitWindow:
-    """A window of simulated frames whose gradient has been computed."""
+    """A window of simulated frames, whose gradient can be or has been computed."""
 
     frame_losses: Float[Tensor, " frame"]
     """Loss of each frame before the update [m²]."""
+    node: Float[Tensor, "frame_1 node 3"]
+    """The nodes in all its frames, the first included [m]."""
     state: State
     """State of the nodes in the last frame."""
 
@@ -347,6 +348,44 @@ class SpringDescent:
             betas=(0.9, settings.beta_2),
         )
         self._reach: dict[str, int] = {}
+        self._ahead: FitWindow | None = None
+
+    def present_loss(
+        self,
+        problems: Many[ObjectProblem],
+        models: Mapping[str, SpringMassModel],
+        next_iteration: int | None,
+        on_rollout: Callable[[ObjectProblem, Float[Tensor, "frame node 3"]], None],
+    ) -> float:
+        """Simulate the present springs from start to end and compare [m²]; infinite if diverging.
+
+        Where the next pass would simulate just that, it is recorded for its gradient, and the pass
+        need not simulate it once more.
+
+        Args:
+            problems: All sequences.
+            models: Their springs before any update.
+            next_iteration: Number of the iteration that follows; None if there is none.
+            on_rollout: Receives each motion [m].
+        """
+        problem, settings = problems[0], self._config.first_order
+        frame_count = problem.frame_count
+        whole = next_iteration is not None and settings.window is None and len(problems) == 1
+        if not whole or _horizon(next_iteration or 0, settings, frame_count) < frame_count:
+            present = {name: self.material.model(name, model) for name, model in models.items()}
+            parameters = self.material.parameters(self._parameters)
+            return mean_loss(
+                problems, present, parameters, self._config, self._device, on_rollout=on_rollout
+            )
+        model = models[problem.name]
+        start = torch.from_numpy(model.object_node), torch.from_numpy(model.initial_velocity)
+        reach = min(self._reach.get(problem.name, frame_count - 1), frame_count - 1)
+        try:
+            self._ahead = self._simulate(problem, model, (0, frame_count - 1), start, reach)
+        except SimulationDivergedError:
+            return math.inf
+        on_rollout(problem, self._ahead.node.detach())
+        return float(self._ahead.frame_losses.detach().mean())
 
     def fit_pass(
         self, problem: ObjectProblem, model: SpringMassModel, horizon: int
@@ -409,37 +448,56 @@ class SpringDescent:
         reach = min(self._reach.get(problem.name, end - begin), end - begin)
         while reach >= 1:
             self._optimizer.zero_grad()
-            log_stiffness, damping = self.material.of(problem.name)
-            contact: dict[str, Any] = self.material.contact()
-            node, velocity = differentiable.rollout(
-                model,
-                problem_parameters(self._parameters, problem),
-                torch.from_numpy(problem.control[begin : end + 1]),
-                log_stiffness=log_stiffness,
-                damping=damping,
-                initial_position=state[0],
-                initial_velocity=state[1],
-                device=self._device,
-                first_frame=begin,
-                window=reach,
-                **contact,
-            )
-            frame_losses = problem.frame_losses(
-                node[1:],
-                first_frame=begin + 1,
-                track_weight=self._config.track_weight,
-                freeze_counts=self._config.freezes_counts,
-            )
+            window, self._ahead = self._ahead, None
+            if window is None:
+                window = self._simulate(problem, model, frames, state, reach)
             prior = self._config.first_order.prior_weight * self.material.distance_from_start()
-            loss = frame_losses.mean() + prior
+            loss = window.frame_losses.mean() + prior
             loss.backward()
             if steepest is None or self._steepness() <= steepest * float(loss.detach()):
                 if reach < end - begin:
                     self._reach[problem.name] = reach
-                last = node[-1].detach(), velocity[-1].detach()
-                return FitWindow(frame_losses=frame_losses.detach(), state=last)
+                position, velocity = window.state
+                return FitWindow(
+                    frame_losses=window.frame_losses.detach(),
+                    node=window.node.detach(),
+                    state=(position.detach(), velocity.detach()),
+                )
             reach //= 2
         return None
+
+    def _simulate(
+        self,
+        problem: ObjectProblem,
+        model: SpringMassModel,
+        frames: tuple[int, int],
+        state: State,
+        reach: int,
+    ) -> FitWindow:
+        """Simulate a window so that gradients reach back over so many frames."""
+        begin, end = frames
+        log_stiffness, damping = self.material.of(problem.name)
+        contact: dict[str, Any] = self.material.contact()
+        node, velocity = differentiable.rollout(
+            model,
+            problem_parameters(self._parameters, problem),
+            torch.from_numpy(problem.control[begin : end + 1]),
+            log_stiffness=log_stiffness,
+            damping=damping,
+            initial_position=state[0],
+            initial_velocity=state[1],
+            device=self._device,
+            first_frame=begin,
+            window=reach,
+            **contact,
+        )
+        frame_losses = problem.frame_losses(
+            node[1:],
+            first_frame=begin + 1,
+            track_weight=self._config.track_weight,
+            freeze_counts=self._config.freezes_counts,
+        )
+        return FitWindow(frame_losses=frame_losses, node=node, state=(node[-1], velocity[-1]))
 
     def _steepness(self) -> float:
         """Largest norm of the gradients of the logarithms."""

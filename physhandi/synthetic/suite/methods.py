@@ -9,7 +9,8 @@ import shutil
 from collections.abc import Mapping
 from collections.abc import Sequence as Many
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import partial, reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any, Literal
 
@@ -55,6 +56,8 @@ _NAME = re.compile(
     r"(?P<base>[^@+]*)(@(?P<settings>.*?))?(\+(?P<correction>[A-Za-z]\w*))?", re.DOTALL
 )
 _OPENING, _CLOSING = "[{(", "]})"
+_EFFORT = ("iterations", "generations")
+"""Ends of settings that say how much work is done."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,12 +209,18 @@ def method_settings(method: Method, common: Mapping[str, Any]) -> dict[str, Any]
 
     Args:
         method: The method; its own settings win.
-        common: Settings that all methods of a suite share.
+        common: Settings that all methods of a suite share; numbers of iterations and generations
+            are bounds, so that none does more than by itself.
 
     Raises:
         UsageError: If a setting is unknown or out of bounds.
     """
-    return pipeline.settings_of(method.profile, {**common, **method.overrides})
+    own = pipeline.settings_of(method.profile, {})
+    shared = {
+        path: min(value, reduce(getitem, path.split("."), own)) if path.endswith(_EFFORT) else value
+        for path, value in common.items()
+    }
+    return pipeline.settings_of(method.profile, {**shared, **method.overrides})
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -113,8 +113,8 @@ SUITES: dict[str, Suite] = {
         ),
         Suite(
             name="dev",
-            about="Six sequences without images, and 80 first-order steps in every fit so that all "
-            "methods take a quarter of an hour on a fast GPU: for daily work on methods.",
+            about="Six sequences without images, and at most 80 first-order steps a fit so that "
+            "all methods take a quarter of an hour on a fast GPU: for daily work on methods.",
             scenes=_DEV_SCENES,
             seeds=(0,),
             methods=(

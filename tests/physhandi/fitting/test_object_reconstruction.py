@@ -1,6 +1,7 @@
 """Stage 2 recovers a made-up object, alone and from several sequences."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,10 +9,17 @@ import pytest
 from physhandi.data.observation import ObjectObservation
 from physhandi.errors import CancelledError, FitError
 from physhandi.fitting.config import FirstOrderConfig, ObjectFitConfig, SearchConfig, SearchVariable
-from physhandi.fitting.object_problem import ObjectProblem, build_problem, mean_loss
+from physhandi.fitting.object_problem import (
+    ObjectProblem,
+    build_problem,
+    build_problem_model,
+    mean_loss,
+    settle_substeps,
+)
 from physhandi.fitting.object_reconstruction import search_object
 from physhandi.fitting.spring_optimisation import optimise_springs
 from physhandi.progress import NullProgress, Progress
+from physhandi.simulation import differentiable
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.topology import build_model
@@ -87,6 +95,40 @@ def test_springs_of_two_halves_are_told_apart() -> None:
     assert np.median(near) > 1.3 * np.median(far)
     stored = mean_loss(problems, result.models, PARAMETERS, config(), "cpu")
     assert stored == pytest.approx(result.loss_after, rel=1e-6)
+
+
+def test_springs_are_judged_by_what_the_next_pass_simulates(
+    device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem, settings = held_sheet("slow", 0.2), config(iterations=5)
+    simulated, plain = [], differentiable.rollout
+
+    def counted(*given: Any, **named: Any) -> Any:
+        simulated.append(named["window"])
+        return plain(*given, **named)
+
+    monkeypatch.setattr(differentiable, "rollout", counted)
+    result = optimise_springs([problem], PARAMETERS, settings, NullProgress(), device=device)
+    assert len(simulated) == 5
+    losses = [loss for _, loss in result.curve]
+    assert losses == sorted(losses, reverse=True)
+    assert result.loss_after == losses[-1]
+    # The last springs are simulated once more; stopped one pass earlier, their loss is the same.
+    for count in (2, 4):
+        fewer = config(iterations=count)
+        short = optimise_springs([problem], PARAMETERS, fewer, NullProgress(), device=device)
+        assert short.loss_after == pytest.approx(losses[count], rel=1e-5)
+        assert short.loss_after != pytest.approx(losses[count - 1], rel=1e-3)
+
+
+def test_a_start_that_needs_many_substeps_is_searched_all_the_same() -> None:
+    problem = held_sheet("slow", 0.2)
+    few = config().replace(automatic_substeps=True, most_substeps=1)
+    result = search_object([problem], PARAMETERS, few, NullProgress())
+    needed = settle_substeps([build_problem_model(problem, PARAMETERS)], PARAMETERS, few)
+    assert needed.substeps_per_frame > 1
+    assert 1 < result.parameters.substeps_per_frame <= 2 * needed.substeps_per_frame
+    assert result.loss_after < result.loss_before < np.inf
 
 
 @pytest.mark.parametrize("window", [1, 4])
