@@ -4,6 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from physhandi.api import check as check
     from physhandi.api import load as load
     from physhandi.api import open_run as open_run
     from physhandi.api import reconstruct as reconstruct
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 _PLACES = {
+    "check": "api",
     "load": "api",
     "open_run": "api",
     "reconstruct": "api",
@@ -20,7 +22,16 @@ _PLACES = {
     "Sequence": "data.sequence",
     "Run": "run",
 }
-__all__ = ["Run", "Sequence", "__version__", "load", "open_run", "reconstruct", "simulate"]
+__all__ = [
+    "Run",
+    "Sequence",
+    "__version__",
+    "check",
+    "load",
+    "open_run",
+    "reconstruct",
+    "simulate",
+]
 
 
 def __getattr__(name: str) -> object:

@@ -13,6 +13,7 @@ from physhandi.run import Run
 
 if TYPE_CHECKING:
     from physhandi.fitting.config import PipelineConfig
+    from physhandi.fitting.recording_check import RecordingCheck
 
 
 def load(folder: Path | str) -> Sequence:
@@ -25,6 +26,23 @@ def load(folder: Path | str) -> Sequence:
         SequenceError: If something in it is wrong; names file, frame and field.
     """
     return Sequence.load(folder)
+
+
+def check(recording: Sequence | Path | str, *, progress: Watcher = None) -> "RecordingCheck":
+    """Read a whole recording: what each stage of a fit can do with it, and every problem.
+
+    Args:
+        recording: A recording, or its folder, which may be damaged.
+        progress: True shows a bar, a callable is given stage, iteration, total, loss and message.
+
+    Returns:
+        ``stages`` by their names, each with ``is_ready``, ``missing``, ``why`` and ``remedy``, and
+        ``problems``, each with ``level``, ``file``, ``frame``, ``field``, ``message``, ``remedy``.
+    """
+    from physhandi.fitting.recording_check import check_recording
+
+    with watched(progress) as watch:
+        return check_recording(recording, watch)
 
 
 def open_run(folder: Path | str) -> Run:

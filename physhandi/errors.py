@@ -55,7 +55,29 @@ class SettingsError(UsageError):
 
 
 class SequenceError(PhysHandiError):
-    """A sequence folder breaks the format; the message names sequence, file, frame and field."""
+    """A sequence folder breaks the format; the message names sequence, file, frame and field.
+
+    Attributes:
+        file: File or folder below that of the sequence; empty where no single one is to blame.
+        frame: Frame of it.
+        field: Field of ``sequence.yaml``, or place in an array.
+        remedy: What to do, as part of a sentence.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        file: str = "",
+        frame: int | None = None,
+        field: str = "",
+        remedy: str = "",
+    ) -> None:
+        super().__init__(message)
+        self.file = file
+        self.frame = frame
+        self.field = field
+        self.remedy = remedy
 
 
 class RunError(PhysHandiError):

@@ -56,6 +56,12 @@ from physhandi.fitting.placement import (
     refine_sequence,
     store_refined,
 )
+from physhandi.fitting.readiness import (
+    is_moved_by_hands,
+    missing_for_hands,
+    nothing_to_fit,
+    readiness,
+)
 from physhandi.fitting.rest_state import resting_clearance
 from physhandi.fitting.spring_optimisation import optimise_springs
 from physhandi.fitting.state_estimate import observed_state
@@ -135,7 +141,7 @@ def predict(
         CancelledError: If the user asked to stop.
     """
     if not _prepare([sequence], config, attempt, progress):
-        raise MissingInputError(_nothing_to_fit([sequence]))
+        raise MissingInputError(nothing_to_fit([sequence]))
     if attempt.stage_done(EVALUATION):
         return
     artefacts.save_hand_vertices(attempt, sequence.name)
@@ -337,15 +343,15 @@ def _prepare(
     sequences: Many[Sequence], config: PipelineConfig, attempt: Attempt, progress: Progress
 ) -> bool:
     """Reconstruct hands and collect what was seen; tell whether there is an object to fit."""
-    has_object = not any(_missing_for_object(sequence) for sequence in sequences)
-    if not has_object and not all(sequence.hands for sequence in sequences):
-        raise MissingInputError(_nothing_to_fit(sequences))
+    found = readiness(sequences, config)
+    if not found[EVALUATION].is_ready:
+        raise MissingInputError(nothing_to_fit(sequences))
     for sequence in sequences:
         artefacts.save_sequence_meta(attempt, sequence)
     _stage_hands(sequences, config, attempt, progress)
-    if has_object:
+    if found[OBSERVATION].is_ready:
         _stage_observation(sequences, config, attempt, progress)
-    return has_object
+    return found[OBSERVATION].is_ready
 
 
 def _stage_hands(
@@ -356,7 +362,7 @@ def _stage_hands(
         return
     before, after, curve = [], [], []
     for sequence in sequences:
-        if not sequence.hands:
+        if missing_for_hands(sequence):
             continue
         fit = reconstruct_hands(sequence, config.hand, progress)
         artefacts.save_motions(attempt, sequence.name, fit.motions)
@@ -497,9 +503,9 @@ def _stage_refinement(
     """Stage 3: hands whose object moves as it was seen to; point controllers are as they are."""
     if attempt.stage_done(REFINEMENT):
         return
-    held = [sequence for sequence in sequences if sequence.hands and sequence.control is None]
+    held = [sequence for sequence in sequences if is_moved_by_hands(sequence)]
     before, after, curve = [], [], []
-    if config.refinement.iterations and held:
+    if readiness(sequences, config)[REFINEMENT].is_ready:
         by_name = {problem.name: problem for problem in problems()}
         shown = [by_name[sequence.name] for sequence in held]
         results = [
@@ -566,23 +572,6 @@ def _finish(
     if before:
         summary |= {"before": float(np.mean(before)), "after": float(np.mean(after))}
     attempt.finish_stage(stage, summary)
-
-
-def _missing_for_object(sequence: Sequence) -> list[str]:
-    """What a sequence lacks for stage 2: markers, or depth images with masks."""
-    missing = sequence.missing("depth", "mask") if sequence.missing("marker") else []
-    if not sequence.hands and sequence.control is None:
-        missing.append("hands or control")
-    return missing
-
-
-def _nothing_to_fit(sequences: Many[Sequence]) -> str:
-    told = [
-        f"'{sequence.name}' lacks {', '.join(_missing_for_object(sequence))} for the object"
-        + ("" if sequence.hands else " and shows no hands")
-        for sequence in sequences
-    ]
-    return f"There is nothing to fit: {'; '.join(told)}."
 
 
 def run_job(run: RunFolder, progress: Progress | None = None, *, device: str = "cpu") -> None:

@@ -31,15 +31,14 @@ def open_catalog(data_dir: Path | None) -> Catalog:
     return Catalog(read_settings(data_dir=data_dir))
 
 
-def find_sequence(name: str, data_dir: Path | None) -> Sequence:
-    """Open a sequence by folder or by name.
+def folder_of_sequence(name: str, data_dir: Path | None) -> Path:
+    """Find the folder of a sequence by folder or by name, whether or not it can be opened.
 
     Raises:
         UsageError: If there is no such sequence.
-        SequenceError: If it breaks the format.
     """
     if (Path(name) / "sequence.yaml").is_file():
-        return Sequence.load(Path(name))
+        return Path(name)
     catalog = open_catalog(data_dir)
     names = [entry.id for entry in catalog.sequences()]
     if name not in names:
@@ -47,7 +46,17 @@ def find_sequence(name: str, data_dir: Path | None) -> Sequence:
             f"'{name}' is neither a folder with a sequence.yaml nor a known sequence. "
             f"Known are: {', '.join(names) or 'none'}."
         )
-    return catalog.sequence(name)
+    return catalog.sequence_item(name).folder
+
+
+def find_sequence(name: str, data_dir: Path | None) -> Sequence:
+    """Open a sequence by folder or by name.
+
+    Raises:
+        UsageError: If there is no such sequence.
+        SequenceError: If it breaks the format.
+    """
+    return Sequence.load(folder_of_sequence(name, data_dir))
 
 
 def find_run(name: str, data_dir: Path | None) -> Run:

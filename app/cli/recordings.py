@@ -6,18 +6,24 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from app.cli.lookup import find_sequence
+from app.cli.lookup import find_sequence, folder_of_sequence
 from app.cli.output import AsJson, DataDir, Device, show
 from physhandi.data.sequence import Sequence
 from physhandi.devices import pick_device
 from physhandi.errors import PhysHandiError, UsageError
+from physhandi.fitting.config import HANDS, OBSERVATION
+from physhandi.fitting.readiness import StageReadiness
+from physhandi.fitting.recording_check import RecordingCheck, check_recording
 from physhandi.progress import watched
 
 
 def check(
     sequences: Positional[tuple[str, ...]], *, as_json: AsJson = False, data_dir: DataDir = None
 ) -> int:
-    """Read every file of sequences, and say what each of them can be used for.
+    """Read every file of sequences, and say what each stage of a fit can do with them.
+
+    With --json, one sequence gives "stages" (of each: ready, missing, state, why, remedy) and
+    "problems" (level, file, frame, last_frame, field, message, remedy); several give these by name.
 
     Args:
         sequences: Folders or names of sequences.
@@ -26,28 +32,51 @@ def check(
         raise UsageError("Name at least one sequence to check.")
     reports: dict[str, dict[str, Any]] = {}
     for name in sequences:
+        found = RecordingCheck(stages={}, problems=())
         try:
+            with watched(True) as progress:
+                found = check_recording(folder_of_sequence(name, data_dir), progress)
             sequence = find_sequence(name, data_dir)
-            sequence.validate()
         except PhysHandiError as error:
-            reports[name] = {"error": str(error)}
+            reports[name] = {"error": str(error), **_told(found, as_json=as_json)}
             continue
-        hands, control = bool(sequence.hands), sequence.control is not None
-        object_parts = sequence.missing("marker") and sequence.missing("depth", "mask")
-        mover = [] if hands or control else ["hands or control"]
+        if found.error is not None:
+            reports[name] = {"error": found.error, **_told(found, as_json=as_json)}
+            continue
+        of_hands, of_object = found.stages[HANDS], found.stages[OBSERVATION]
         reports[name] = {
             "folder": str(sequence.folder),
             "frames": sequence.frame_count,
             "frame_rate": sequence.frame_rate,
             "views": len(sequence.views),
-            "hands": "can be reconstructed" if hands else "not in it",
-            "object": f"lacks {', '.join([*object_parts, *mover])}"
-            if object_parts or mover
-            else "can be reconstructed",
+            "hands": _use(of_hands) if sequence.hands else "not in it",
+            "object": _use(of_object),
             "shape": sequence.shape or "is found by the fit",
+            **_told(found, as_json=as_json),
         }
-    show(reports, as_json=as_json)
+    only = next(iter(reports.values())) if as_json and len(reports) == 1 else {}
+    show(
+        reports | {key: only[key] for key in ("stages", "problems") if key in only}, as_json=as_json
+    )
     return 1 if any("error" in report for report in reports.values()) else 0
+
+
+def _use(stage: StageReadiness) -> str:
+    return "can be reconstructed" if stage.is_ready else f"lacks {', '.join(stage.missing)}"
+
+
+def _told(found: RecordingCheck, *, as_json: bool) -> dict[str, Any]:
+    """Write what a check found for programs, or with a line for each stage and problem."""
+    if as_json:
+        return found.to_dict()
+    problems = [
+        f"{problem.level}: {problem.message}"
+        + (f" To do: {problem.remedy}." if problem.remedy and problem.level == "warning" else "")
+        for problem in found.problems
+        if problem.message != found.error
+    ]
+    stages = {name: str(stage) for name, stage in found.stages.items()}
+    return {"stages": stages, "problems": problems or None}
 
 
 def synthesize(

@@ -27,6 +27,7 @@ from physhandi.fitting.config import (
     STAGES,
     PipelineConfig,
 )
+from physhandi.fitting.readiness import missing_for_hands, missing_for_object
 from physhandi.run import Run
 
 _MOST_FITS = 5
@@ -65,9 +66,9 @@ class Extent:
         """Add up the frames of a fit's sequences."""
         return cls(
             sum(sequence.frame_count for sequence in sequences),
-            sum(sequence.frame_count for sequence in sequences if sequence.hands),
+            sum(s.frame_count for s in sequences if not missing_for_hands(s)),
             len(sequences),
-            all(not s.missing("marker") or not s.missing("depth", "mask") for s in sequences),
+            not any(missing_for_object(sequence) for sequence in sequences),
         )
 
 

@@ -16,6 +16,7 @@ from typing import Any, BinaryIO, cast
 import numpy as np
 import psutil
 import yaml
+from numpy.lib import format as npy
 from safetensors import numpy as safetensors_numpy
 
 _MAGIC = b"\x93NUMPY"
@@ -179,10 +180,27 @@ def read_array(path: Path, *, mmap: bool = False) -> np.ndarray:
         kinds = {b"": "the file is empty", b"PK": "it is an archive, not one array"}
         raise ValueError(kinds.get(start[:2], "it does not begin as one"))
     try:
+        _check_announced(path)
         mapped: Any = np.load(path, mmap_mode="r", allow_pickle=False)
     except _ODD as error:  # What NumPy lets out of a header that it cannot parse.
         raise ValueError(f"its header is damaged ({error})") from error
     return mapped if mmap else np.array(mapped)
+
+
+def _check_announced(path: Path) -> None:
+    """Refuse an array whose header announces more than its file holds."""
+    with path.open("rb") as stream:
+        readers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+        read = readers.get(npy.read_magic(stream))
+        if read is None:  # Names of fields that are not Latin, which NumPy judges itself.
+            return
+        shape, _, kind = read(stream)
+        announced, there = math.prod(shape) * kind.itemsize, path.stat().st_size - stream.tell()
+        if announced > there:
+            raise ValueError(
+                f"its header announces {shape} numbers of {kind}, {announced} bytes, but "
+                f"{there} follow"
+            )
 
 
 def read_tensors(path: Path) -> dict[str, np.ndarray]:

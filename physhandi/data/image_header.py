@@ -1,10 +1,11 @@
-"""The size that an image file announces, read from its first bytes before anything is decoded.
+"""The size that an image or a video announces, read before anything of it is decoded.
 
 A file of a few hundred bytes can announce a picture that fills all memory.
 """
 
 import math
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -16,6 +17,12 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
 _EXR = b"\x76\x2f\x31\x01"
 _MOST_SEGMENTS = 4096
+_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
+"""Numbers a pixel of each color type of PNG."""
+_DEFLATE = 1032
+"""Bytes that one compressed byte can stand for at most (zlib's technical details)."""
+_CONTAINERS = {b"moov", b"trak", b"mdia", b"minf", b"stbl"}
+"""Boxes of MP4 that lead to sample descriptions."""
 
 
 def announced_size(path: Path) -> tuple[int, int]:
@@ -32,7 +39,7 @@ def announced_size(path: Path) -> tuple[int, int]:
             if start.startswith(_PNG):
                 if start[12:16] != b"IHDR":
                     raise ValueError("has a damaged PNG header")
-                size = struct.unpack(">II", start[16:24])
+                size = _png_size(start, path.stat().st_size)
             elif start.startswith(_JPEG):
                 size = _jpeg_size(stream)
             elif start.startswith(_EXR):
@@ -41,11 +48,83 @@ def announced_size(path: Path) -> tuple[int, int]:
                 size = _npy_size(path)
         except struct.error:
             raise ValueError("ends within its header, so it was cut off") from None
+    check_pixels(size, path)
+    return size
+
+
+def check_pixels(size: tuple[int, int], path: Path) -> None:
+    """Refuse a size without pixels, or with more than are decoded.
+
+    Raises:
+        ValueError: If it is not to be decoded; see `announced_size`.
+    """
     width, height = size
     if width < 1 or height < 1 or width * height > MOST_PIXELS:
         raise ValueError(
             f"announces {width}x{height} px in a file of {path.stat().st_size} bytes; images of 1 "
             f"to {MOST_PIXELS} pixels are read"
+        )
+
+
+def video_size(path: Path) -> tuple[int, int] | None:
+    """Read the width and height [px] that an MP4 video announces in its sample description.
+
+    Returns:
+        Those of the first track that has any; None if the file has no readable sample description,
+        so that only its decoder can tell.
+
+    Raises:
+        ValueError: If it is too large to decode; see `announced_size`.
+        OSError: If it cannot be read.
+    """
+    with path.open("rb") as stream:
+        for kind, content in _boxes(stream, path.stat().st_size):
+            if kind != b"stsd":
+                continue
+            stream.seek(content + 8)  # Version, flags and number of entries.
+            entry = stream.read(36)
+            if len(entry) < 36:
+                continue
+            width, height = struct.unpack(">HH", entry[32:36])
+            if width and height:
+                check_pixels((width, height), path)
+                return width, height
+    return None
+
+
+def _boxes(stream: BinaryIO, end: int) -> Iterator[tuple[bytes, int]]:
+    """Walk through the boxes of an MP4 file (ISO/IEC 14496-12) with those in its containers.
+
+    Gives the kind of each box and where its content begins.
+    """
+    waiting = [(0, end)]
+    for _ in range(_MOST_SEGMENTS):
+        if not waiting:
+            return
+        at, until = waiting.pop()
+        stream.seek(at)
+        header = stream.read(16)
+        if len(header) < 8 or at + 8 > until:
+            continue
+        size, kind, skipped = struct.unpack(">I", header[:4])[0], header[4:8], 8
+        if size == 1 and len(header) == 16:
+            size, skipped = struct.unpack(">Q", header[8:])[0], 16
+        size = size or until - at
+        if size < skipped:
+            continue
+        last = min(at + size, until)
+        waiting.append((last, until))
+        if kind in _CONTAINERS:
+            waiting.append((at + skipped, last))
+        yield kind, at + skipped
+
+
+def _png_size(start: bytes, file_size: int) -> tuple[int, int]:
+    width, height, bits, color = struct.unpack(">IIBB", start[16:26])
+    row = 1 + (width * bits * _CHANNELS.get(color, 1) + 7) // 8
+    if width * height <= MOST_PIXELS and row * height > _DEFLATE * file_size:
+        raise ValueError(
+            f"announces {width}x{height} px, which a file of {file_size} bytes cannot hold"
         )
     return width, height
 

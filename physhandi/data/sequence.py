@@ -2,8 +2,8 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
-from functools import cached_property
+from collections.abc import Callable, Iterator, Mapping
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -49,6 +49,7 @@ VIEW_ARRAYS: _Table = {
 _SIDES = ("right", "left")
 # Axes that must not be empty: without a node or a control there is nothing to simulate.
 _NEEDED = {"control", "marker", "node"}
+_MOST_BYTES = 2**32
 TRUTH_ARRAYS: _Table = {
     **{f"hand_{side}_keypoint.npy": (("frame", 21, 3), _F, False) for side in _SIDES},
     **{f"hand_{side}_vertex.npy": (("frame", f"{side} vertex", 3), _F, False) for side in _SIDES},
@@ -70,55 +71,70 @@ def check_layout(folder: Path, meta: SequenceMeta, views: tuple[View, ...]) -> N
     _check_arrays(folder, folder / TRUTH, meta.name, TRUTH_ARRAYS, {"frame": meta.frame_count})
     for view in views:
         if not view.folder.is_dir():
-            _fail(meta.name, f"views/{view.name}", f"is missing, but {FILE} lists it")
+            _fail(meta.name, f"views/{view.name}", f"is missing, but {FILE} lists it", "add it")
         # Each view has its own number of tracks.
         _check_arrays(folder, view.folder, meta.name, VIEW_ARRAYS, dict(axes))
         has_track = [(view.folder / f).is_file() for f in ("track.npy", "track_visible.npy")]
         if has_track[0] != has_track[1]:
-            _fail(meta.name, f"views/{view.name}", "needs both track.npy and track_visible.npy")
+            reason = "needs both track.npy and track_visible.npy"
+            _fail(meta.name, f"views/{view.name}", reason, "add the other one")
         view.check_presence()
     for view in read_held_out_views(folder, meta.name, meta.frame_count):
         view.check_presence()
     _check_markers(folder, meta, axes)
 
 
-def check_values(
+def value_checks(
     folder: Path, meta: SequenceMeta, views: tuple[View, ...], *, reads_color: bool = True
-) -> None:
-    """Read every frame of every part and check sizes, labels, finiteness and the unit of lengths.
+) -> Iterator[Callable[[], object]]:
+    """Give checks that read every frame of every part, one after the other.
+
+    Sizes, labels, finiteness and the unit of lengths are checked. Each raises a SequenceError at
+    the first thing that is wrong in its file or frame; later ones can be called all the same.
 
     Args:
         folder: Folder of the sequence.
         meta: Its description.
         views: Its views.
         reads_color: Whether color images are decoded too, which takes longest.
-
-    Raises:
-        SequenceError: At the first thing that is wrong.
     """
     name = meta.name
     for file in ARRAYS:
-        _check_finite(folder, folder / file, name)
+        yield partial(_check_finite, folder, folder / file, name)
     for file in TRUTH_ARRAYS:
-        _check_finite(folder, folder / TRUTH / file, name)
-    _check_motion(folder, name)
+        yield partial(_check_finite, folder, folder / TRUTH / file, name)
+    yield partial(_check_motion, folder, name)
     if meta.metric:
-        _check_unit(folder, meta)
+        yield partial(_check_unit, folder, meta)
     for view in (*views, *read_held_out_views(folder, name, meta.frame_count)):
         for file in VIEW_ARRAYS:
-            _check_finite(folder, view.folder / file, name)
-        _check_tracks(view, name)
-        _check_keypoints(view, name)
+            yield partial(_check_finite, folder, view.folder / file, name)
+        yield partial(_check_tracks, view, name)
+        yield partial(_check_keypoints, view, name)
         readers = ((view.has_color and reads_color, view.color), (view.has_mask, view.mask))
         for read in [read for is_there, read in readers if is_there]:
             for frame in range(view.frame_count):
-                read(frame)
+                yield partial(read, frame)
         view.close()
         if view.has_depth:
-            depth = [view.depth(frame).max(initial=0.0) for frame in range(view.frame_count)]
-            doubt = doubt_depth(round(1e3 * float(max(depth))))
-            if doubt is not None and meta.metric:
-                _fail(name, f"views/{view.name}/depth", doubt)
+            yield from _depth_checks(view, meta)
+
+
+def _depth_checks(view: View, meta: SequenceMeta) -> Iterator[Callable[[], object]]:
+    """Read every depth image, then judge the unit by what all of them hold."""
+    largest: list[float] = []
+
+    def read(frame: int) -> None:
+        largest.append(float(view.depth(frame).max(initial=0.0)))
+
+    def judge() -> None:
+        doubt = doubt_depth(round(1e3 * max(largest, default=0.0)))
+        if doubt is not None and meta.metric:
+            _fail(meta.name, f"{view.place}/depth", *_told(doubt))
+
+    for frame in range(view.frame_count):
+        yield partial(read, frame)
+    yield judge
 
 
 def _check_unit(folder: Path, meta: SequenceMeta) -> None:
@@ -126,7 +142,8 @@ def _check_unit(folder: Path, meta: SequenceMeta) -> None:
     for view in meta.views:
         doubt = doubt_position(view.camera.T_world_camera[:3, 3])
         if doubt is not None:
-            _fail(meta.name, f"{FILE}: T_world_camera of view '{view.name}'", doubt[1])
+            field = f"T_world_camera of view '{view.name}'"
+            _fail(meta.name, FILE, *_told(doubt[1]), field=field)
     for file, (axes, kind, _) in ARRAYS.items():
         if kind != _F or not (folder / file).is_file():
             continue
@@ -134,10 +151,11 @@ def _check_unit(folder: Path, meta: SequenceMeta) -> None:
         doubt = doubt_position(position, FARTHEST_POSITION)
         if doubt is not None:
             at = ", ".join(f"{axis} {index}" for axis, index in zip(axes, doubt[0], strict=False))
-            _fail(meta.name, f"{file}: {at}", doubt[1])
+            frame = doubt[0][0] if axes[0] == "frame" else None
+            _fail(meta.name, file, *_told(doubt[1]), frame=frame, field=at)
         small = doubt_extent(position) if file in {"object_node.npy", "rest_node.npy"} else None
         if small is not None:
-            _fail(meta.name, file, small)
+            _fail(meta.name, file, *_told(small))
 
 
 def _check_arrays(
@@ -151,31 +169,37 @@ def _check_arrays(
         try:
             array = read_array(path, mmap=True)
         except (ValueError, OSError) as error:
-            _fail(name, file, f"is not a readable .npy file: {error}")
+            _fail(name, file, f"is not a readable .npy file: {error}", "re-export it")
         text = "(" + ", ".join(str(axis) for axis in axes) + ")"
         if not np.issubdtype(array.dtype, _KINDS[kind]):
-            _fail(name, file, f"holds {array.dtype}; expected {kind} numbers {text}")
+            _fail(name, file, f"holds {array.dtype}", f"expected {kind} numbers {text}")
         pairs = zip(axes, array.shape, strict=False)
         fixed = [isinstance(axis, str) or size == axis for axis, size in pairs]
         if array.ndim != len(axes) or not all(fixed):
-            _fail(name, file, f"has shape {array.shape}; expected axes {text}. Re-export it")
+            reason = f"has shape {array.shape}; expected axes {text}"
+            _fail(name, file, reason, "re-export it")
+        if array.nbytes > _MOST_BYTES:
+            reason = f"has shape {array.shape}, {array.nbytes} bytes; {_MOST_BYTES} are the most"
+            _fail(name, file, reason, "keep fewer points")
         for axis, size in zip(axes, array.shape, strict=True):
             if size == 0 and axis in _NEEDED:
-                _fail(name, file, f"has shape {array.shape}: no {axis} at all. Remove or fill it")
+                reason = f"has shape {array.shape}: no {axis} at all"
+                _fail(name, file, reason, "remove or fill it")
             expected = axis_size.setdefault(axis, size) if isinstance(axis, str) else size
             if size != expected:
                 _fail(
                     name,
                     file,
                     f"has shape {array.shape} for axes {text}; expected {axis} = {expected}, "
-                    f"as {FILE} or another file says. Re-export it or correct {FILE}",
+                    f"as {FILE} or another file says",
+                    f"re-export it or correct {FILE}",
                 )
 
 
 def _check_markers(folder: Path, meta: SequenceMeta, axes: dict[str, int]) -> None:
     for file in ("rest_node.npy", "marker_node.npy"):
         if (folder / file).is_file() and not (folder / "object_node.npy").is_file():
-            _fail(meta.name, file, "is about nodes, but object_node.npy is missing. Add it")
+            _fail(meta.name, file, "is about nodes, but object_node.npy is missing", "add it")
     path = folder / "marker_node.npy"
     nodes = read_array(path) if path.is_file() else np.zeros(0, int)
     node_count = axes.get("node", 0)
@@ -184,15 +208,17 @@ def _check_markers(folder: Path, meta: SequenceMeta, axes: dict[str, int]) -> No
             meta.name,
             "marker_node.npy",
             f"names nodes {nodes.min()} to {nodes.max()}, but object_node.npy has {node_count}",
+            "number nodes from 0",
         )
     marker_count = axes.get("marker", 0)
     wrong = [marker for marker in meta.controlled_markers if marker >= marker_count]
     if wrong:
         reason = f"lists controlled_markers {wrong[0]}, but marker.npy has {marker_count} markers"
-        _fail(meta.name, FILE, reason)
+        _fail(meta.name, FILE, reason, "correct it", field="controlled_markers")
     if (meta.surface_node_count or 0) > node_count:
         reason = f"says surface_node_count {meta.surface_node_count}, but object_node.npy has "
-        _fail(meta.name, FILE, f"{reason}{node_count} nodes")
+        reason = f"{reason}{node_count} nodes"
+        _fail(meta.name, FILE, reason, "correct it", field="surface_node_count")
 
 
 def _check_finite(root: Path, path: Path, name: str) -> None:
@@ -206,7 +232,9 @@ def _check_finite(root: Path, path: Path, name: str) -> None:
         named = ("joint" if axis == 21 else axis for axis in axes)
         at = ", ".join(f"{axis} {index}" for axis, index in zip(named, place[:-1], strict=False))
         file = path.relative_to(root).as_posix()
-        _fail(name, file, f"is {array[place]} at {at}. Repair or cut out these frames")
+        frame = place[0] if axes[0] == "frame" else None
+        remedy = "repair or cut out these frames"
+        _fail(name, file, f"is {array[place]} at {at}", remedy, frame=frame)
 
 
 def _check_motion(folder: Path, name: str) -> None:
@@ -215,7 +243,8 @@ def _check_motion(folder: Path, name: str) -> None:
     if not (folder / file).is_file():
         return
     if not (folder / "marker.npy").is_file():
-        _fail(name, file, "says which motions of markers to trust, but there is no marker.npy")
+        reason = "says which motions of markers to trust, but there is no marker.npy"
+        _fail(name, file, reason, "add it")
     is_valid = read_array(folder / file)
     marker = read_array(folder / "marker.npy")
     is_seen = np.asarray(np.isfinite(marker).all(axis=-1))
@@ -228,7 +257,9 @@ def _check_motion(folder: Path, name: str) -> None:
             name,
             file,
             f"trusts the motion of marker {marker} to frame {frame} from the frame before, but "
-            "marker.npy does not have both positions. Entry [t] must mean frame t-1 to t",
+            "marker.npy does not have both positions",
+            "entry [t] must mean frame t-1 to t",
+            frame=int(frame),
         )
 
 
@@ -240,9 +271,10 @@ def _check_tracks(view: View, name: str) -> None:
         frame, track = lost[0]
         _fail(
             name,
-            f"views/{view.name}/track.npy",
-            f"is NaN at frame {frame}, track {track}, which track_visible.npy calls visible. "
-            "Mark it as not visible",
+            f"{view.place}/track.npy",
+            f"is NaN at frame {frame}, track {track}, which track_visible.npy calls visible",
+            "mark it as not visible",
+            frame=int(frame),
         )
 
 
@@ -252,12 +284,27 @@ def _check_keypoints(view: View, name: str) -> None:
     doubt = doubt_keypoints(view.keypoint, view.camera.width, view.camera.height)
     if doubt is not None:
         frame, hand, joint = doubt[0]
-        file = f"views/{view.name}/keypoint.npy: frame {frame}, hand {hand}, joint {joint}"
-        _fail(name, file, doubt[1])
+        field = f"frame {frame}, hand {hand}, joint {joint}"
+        _fail(name, f"{view.place}/keypoint.npy", *_told(doubt[1]), frame=frame, field=field)
 
 
-def _fail(name: str, file: str, reason: str) -> NoReturn:
-    raise SequenceError(f"Sequence '{name}': {file} {reason}.")
+def _told(doubt: str) -> tuple[str, str]:
+    """Split what is said of a unit into what is wrong and what to do about it."""
+    reason, _, remedy = doubt.partition("; ")
+    return reason, remedy
+
+
+def _fail(
+    name: str, file: str, reason: str, remedy: str, *, frame: int | None = None, field: str = ""
+) -> NoReturn:
+    where = f"{file}: {field}" if field else file
+    raise SequenceError(
+        f"Sequence '{name}': {where} {reason}; {remedy}.",
+        file=file,
+        frame=frame,
+        field=field,
+        remedy=remedy,
+    )
 
 
 _VIEW_PARTS = ("color", "depth", "mask", "keypoint", "track")
@@ -441,7 +488,16 @@ class Sequence:
         Raises:
             SequenceError: At the first thing that is wrong; names file, frame and remedy.
         """
-        check_values(self.folder, self.meta, self.views, reads_color=reads_color)
+        for check in self.checks(reads_color=reads_color):
+            check()
+
+    def checks(self, *, reads_color: bool = True) -> Iterator[Callable[[], object]]:
+        """Give what `validate` does as single checks, so that one can go on after a failed one.
+
+        Args:
+            reads_color: Whether color images are decoded too, which takes longest.
+        """
+        return value_checks(self.folder, self.meta, self.views, reads_color=reads_color)
 
     def fingerprint(self) -> str:
         """Compute a SHA-256 over all names and sizes, and the content of YAML and arrays."""

@@ -117,14 +117,20 @@ def read_meta(folder: Path) -> SequenceMeta:
     where = f"Sequence '{folder.name}'"
     try:
         if path.stat().st_size > _SIZE_LIMIT:
-            raise SequenceError(f"{where}: {FILE} is larger than {_SIZE_LIMIT} bytes.")
+            raise SequenceError(f"{where}: {FILE} is larger than {_SIZE_LIMIT} bytes.", file=FILE)
         content = parse_yaml(path.read_text(encoding="utf-8"))
     except (FileNotFoundError, NotADirectoryError):
         raise SequenceError(
-            f"{where}: {FILE} is missing in {folder}. Give the folder that an importer wrote."
+            f"{where}: {FILE} is missing in {folder}. Give the folder that an importer wrote.",
+            file=FILE,
+            remedy="give the folder that an importer wrote",
         ) from None
     except (ValueError, OSError) as error:
-        raise SequenceError(f"{where}: {FILE} cannot be read as YAML: {error}.") from error
+        raise SequenceError(
+            f"{where}: {FILE} cannot be read as YAML: {error}.",
+            file=FILE,
+            remedy="correct what the line says",
+        ) from error
     return parse_meta(content, where)
 
 
@@ -191,7 +197,12 @@ def _views(fields: "_Fields", where: str) -> tuple[ViewMeta, ...]:
         try:
             views.append(ViewMeta(name=name, camera=PinholeCamera.from_dict(camera)))
         except ValueError as error:
-            raise SequenceError(f"{where}: {FILE}: camera of view '{name}': {error}.") from error
+            raise SequenceError(
+                f"{where}: {FILE}: camera of view '{name}': {error}.",
+                file=FILE,
+                field=f"views[{index}].camera",
+                remedy="correct the calibration",
+            ) from error
         view.finish()
     return tuple(views)
 
@@ -215,12 +226,19 @@ class _Fields:
 
     def __init__(self, content: Any, where: str) -> None:
         if not isinstance(content, dict):
-            raise SequenceError(f"{where} must hold named fields, not {_short(content)}.")
+            raise SequenceError(
+                f"{where} must hold named fields, not {_short(content)}.", file=FILE
+            )
         self._left = dict(cast("dict[Any, Any]", content))
         self._where = where
 
     def fail(self, field_name: str, value: Any, expected: str) -> None:
-        raise SequenceError(f"{self._where}: {field_name} is {_short(value)}; expected {expected}.")
+        raise SequenceError(
+            f"{self._where}: {field_name} is {_short(value)}; expected {expected}.",
+            file=FILE,
+            field=field_name,
+            remedy=f"give {expected}",
+        )
 
     def take(self, name: str, kind: type, default: Any = _MISSING) -> Any:
         value = self._any(name, default)
@@ -231,7 +249,12 @@ class _Fields:
 
     def _any(self, name: str, default: Any) -> Any:
         if name not in self._left and default is _MISSING:
-            raise SequenceError(f"{self._where}: field '{name}' is missing; add it.")
+            raise SequenceError(
+                f"{self._where}: field '{name}' is missing; add it.",
+                file=FILE,
+                field=name,
+                remedy="add it",
+            )
         return self._left.pop(name, default)
 
     def whole(
@@ -275,5 +298,8 @@ class _Fields:
         if self._left:
             key = next(iter(self._left))
             raise SequenceError(
-                f"{self._where}: field {key!r} is not known. Remove it or correct its spelling."
+                f"{self._where}: field {key!r} is not known. Remove it or correct its spelling.",
+                file=FILE,
+                field=str(key)[:80],
+                remedy="remove it or correct its spelling",
             )

@@ -13,10 +13,12 @@ from numpy import ndarray
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.files import read_array
+from physhandi.data.image_header import announced_size, check_pixels, video_size
 from physhandi.errors import SequenceError
 
 _CACHED_FRAMES = 16
 _MILLIMETRE = np.float32(0.001)
+_SMALLER = "re-export the video, smaller"
 
 
 class View:
@@ -34,6 +36,12 @@ class View:
     def __repr__(self) -> str:
         return f"View({str(self.folder)!r})"
 
+    @property
+    def place(self) -> str:
+        """Folder of the view below that of the sequence."""
+        parts = self.folder.parts[-3:]
+        return "/".join(parts if parts[0] == "truth" else parts[1:])
+
     @cached_property
     def has_color(self) -> bool:
         """Whether there are color images or a video."""
@@ -48,6 +56,11 @@ class View:
     def has_mask(self) -> bool:
         """Whether there are masks."""
         return (self.folder / "mask").is_dir()
+
+    @property
+    def has_keypoint(self) -> bool:
+        """Whether keypoints of the hands are stored."""
+        return (self.folder / "keypoint.npy").is_file()
 
     @cached_property
     def keypoint(self) -> Float[ndarray, "frame hand 21 3"] | None:
@@ -69,10 +82,10 @@ class View:
         self._check(frame)
         if (self.folder / "color.mp4").is_file():
             with self._lock:
-                self._video = self._video or _Video(self.folder / "color.mp4")
+                self._video = self._video or self._open_video(frame)
                 image = self._video.read(frame)
             if image is None:
-                self._fail("color.mp4", frame, "cannot be decoded; re-export the video")
+                self._fail("color.mp4", frame, "cannot be decoded", "re-export the video")
         else:
             image = self._image("color", frame, cv2.IMREAD_COLOR)
         self._check_size("color", frame, image)
@@ -82,7 +95,8 @@ class View:
         """Read the depth image of a frame [m]; zero where nothing was measured."""
         image = self._image("depth", frame, cv2.IMREAD_UNCHANGED)
         if image.dtype != np.uint16 or image.ndim != 2:
-            self._fail("depth", frame, f"is {image.dtype}{image.shape}; expected 16-bit grey, mm")
+            reason = f"is {image.dtype}{image.shape}"
+            self._fail("depth", frame, reason, "expected 16-bit grey, mm")
         self._check_size("depth", frame, image)
         return image.astype(np.float32) * _MILLIMETRE
 
@@ -90,10 +104,11 @@ class View:
         """Read the labels of a frame: 0 background, 1 object, 2 right hand, 3 left hand."""
         image = self._image("mask", frame, cv2.IMREAD_UNCHANGED)
         if image.dtype != np.uint8 or image.ndim != 2:
-            self._fail("mask", frame, f"is {image.dtype}{image.shape}; expected 8-bit grey, 0 to 3")
+            reason = f"is {image.dtype}{image.shape}"
+            self._fail("mask", frame, reason, "expected 8-bit grey, 0 to 3")
         self._check_size("mask", frame, image)
         if image.max() > 3:
-            self._fail("mask", frame, f"has label {image.max()}; only 0 to 3 are known")
+            self._fail("mask", frame, f"has label {image.max()}", "only 0 to 3 are known")
         return np.asarray(image)
 
     def files(self, kind: str) -> list[Path]:
@@ -110,13 +125,17 @@ class View:
         video = self.folder / "color.mp4"
         if video.is_file():
             if (self.folder / "color").is_dir():
-                self._fail("color", None, "is there twice: color.mp4 and color/; remove one")
+                self._fail("color", None, "is there twice: color.mp4 and color/", "remove one")
+            try:
+                video_size(video)
+            except (ValueError, OSError) as error:
+                self._fail("color.mp4", None, f"cannot be decoded: it {error}", _SMALLER)
             count = _frame_count(video)
             if count != self.frame_count:
                 self._fail(
                     "color.mp4",
                     None,
-                    f"has {count} frames, but the sequence has {self.frame_count}; "
+                    f"has {count} frames, but the sequence has {self.frame_count}",
                     "cut the video or correct frame_count in sequence.yaml",
                 )
 
@@ -133,21 +152,23 @@ class View:
         if names == expected:
             return
         if len(names) != len(set(names)):
-            self._fail(kind, None, "has a frame twice, as .png and .jpg; remove one of them")
+            self._fail(kind, None, "has a frame twice, as .png and .jpg", "remove one of them")
         missing = sorted(set(expected) - set(names))
         if missing:
             self._fail(
                 kind,
                 int(missing[0]),
                 f"is missing ({kind}/{missing[0]}.png); there are {len(names)} images for "
-                f"{self.frame_count} frames. Add it or lower frame_count in sequence.yaml",
+                f"{self.frame_count} frames",
+                "add it or lower frame_count in sequence.yaml",
             )
         extra = sorted(set(names) - set(expected))
         self._fail(
             kind,
             None,
             f"has {kind}/{extra[0]}, but the sequence has only {self.frame_count} frames "
-            f"(00000 to {expected[-1]}). Remove it or raise frame_count in sequence.yaml",
+            f"(00000 to {expected[-1]})",
+            "remove it or raise frame_count in sequence.yaml",
         )
 
     def _array(self, file: str) -> Any:
@@ -157,7 +178,7 @@ class View:
         try:
             return read_array(path)
         except (ValueError, OSError) as error:
-            self._fail(file, None, f"is not a readable .npy file: {error}")
+            self._fail(file, None, f"is not a readable .npy file: {error}", "re-export it")
 
     def _image(self, kind: str, frame: int, flags: int) -> ndarray:
         self._check(frame)
@@ -165,13 +186,38 @@ class View:
         if kind == "color" and not path.is_file():
             path = path.with_suffix(".jpg")
         if not path.is_file():
-            self._fail(kind, frame, f"is missing ({path.relative_to(self.folder)})")
+            self._fail(kind, frame, f"is missing ({path.relative_to(self.folder)})", "add it")
+        file = path.relative_to(self.folder)
+        try:
+            size = announced_size(path)
+        except (ValueError, OSError) as error:
+            self._fail(kind, frame, f"cannot be decoded: {file} {error}", "re-export it")
+        self._check_announced(kind, frame, size)
         image: ndarray | None = cv2.imread(str(path), flags)
         if image is None:
-            self._fail(
-                kind, frame, f"cannot be decoded ({path.relative_to(self.folder)}); re-export it"
-            )
+            self._fail(kind, frame, f"cannot be decoded ({file})", "re-export it")
         return image
+
+    def _open_video(self, frame: int) -> "_Video":
+        """Open the video if it announces the size of the view's camera."""
+        path = self.folder / "color.mp4"
+        try:
+            size = video_size(path)
+            if size is not None:
+                self._check_announced("color", frame, size)
+            video = _Video(path)
+            if all(video.size):
+                check_pixels(video.size, path)
+                self._check_announced("color", frame, video.size)
+        except (ValueError, OSError) as error:
+            self._fail("color.mp4", frame, f"cannot be decoded: it {error}", _SMALLER)
+        return video
+
+    def _check_announced(self, kind: str, frame: int, size: tuple[int, int]) -> None:
+        """Refuse, before it is decoded, what has not the camera's size even if it is turned."""
+        camera = self.camera
+        if size not in {(camera.width, camera.height), (camera.height, camera.width)}:
+            self._fail_size(kind, frame, size)
 
     def _check(self, frame: int) -> None:
         if not 0 <= frame < self.frame_count:
@@ -179,19 +225,29 @@ class View:
 
     def _check_size(self, kind: str, frame: int, image: ndarray) -> None:
         height, width = image.shape[:2]
-        camera = self.camera
-        if (width, height) != (camera.width, camera.height):
-            self._fail(
-                kind,
-                frame,
-                f"is {width}x{height} px, but the view's camera says "
-                f"{camera.width}x{camera.height}. Re-export it or correct sequence.yaml",
-            )
+        if (width, height) != (self.camera.width, self.camera.height):
+            self._fail_size(kind, frame, (width, height))
 
-    def _fail(self, part: str, frame: int | None, reason: str) -> NoReturn:
+    def _fail_size(self, kind: str, frame: int, size: tuple[int, int]) -> NoReturn:
+        self._fail(
+            kind,
+            frame,
+            f"is {size[0]}x{size[1]} px, but the view's camera says "
+            f"{self.camera.width}x{self.camera.height}",
+            "re-export it or correct sequence.yaml",
+        )
+
+    def _fail(self, part: str, frame: int | None, reason: str, remedy: str) -> NoReturn:
         at = "" if frame is None else f" of frame {frame}"
+        file = f"{self.place}/{part}"
+        if frame is not None and (self.folder / part).is_dir():
+            is_jpeg = (self.folder / part / f"{frame:05d}.jpg").is_file()
+            file += f"/{frame:05d}{'.jpg' if is_jpeg else '.png'}"
         raise SequenceError(
-            f"Sequence '{self._sequence}': view '{self.name}': {part}{at} {reason}."
+            f"Sequence '{self._sequence}': view '{self.name}': {part}{at} {reason}; {remedy}.",
+            file=file,
+            frame=frame,
+            remedy=remedy,
         )
 
 
@@ -203,6 +259,13 @@ class _Video:
         self._capture = cv2.VideoCapture(str(path))
         self._next = 0
         self._cache: OrderedDict[int, ndarray] = OrderedDict()
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height that the decoder announces [px]; zero if it could not open the video."""
+        wanted = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
+        width, height = (round(self._capture.get(side)) for side in wanted)
+        return width, height
 
     def read(self, frame: int) -> ndarray | None:
         """Decode a frame (BGR); None if the video does not have it."""

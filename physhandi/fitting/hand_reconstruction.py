@@ -26,6 +26,7 @@ from physhandi.errors import FitError, MissingInputError
 from physhandi.fitting.adam import Adam
 from physhandi.fitting.config import HandFitConfig
 from physhandi.fitting.one_thread import one_thread
+from physhandi.fitting.readiness import LEAST_PALM_POINTS, PALM, REMEDIES, missing_for_hands
 from physhandi.hand.loading import load_hand_model
 from physhandi.hand.model import HandModel, HandSide
 from physhandi.hand.motion import HandMotion
@@ -34,12 +35,8 @@ from physhandi.perception.keypoints import detect_sequence
 from physhandi.perception.lifting import HAND_LABEL, surface_points
 from physhandi.progress import NullProgress, Preview, Progress
 
-PALM = (0, 1, 5, 9, 13, 17)
-"""Keypoints that move with the palm."""
 _PALM_BONES = ((0, 5), (0, 9), (0, 13), (0, 17), (5, 17))
 """Pairs of palm keypoints whose distances give the scale."""
-_MIN_PALM_POINTS = 4
-"""Palm keypoints that a frame must show for a first guess."""
 _KNUCKLE = ((-1.7, 0.6), (-0.4, 0.4), (-0.25, 0.25))
 _MIDDLE = ((-2.0, 0.2), (-0.08, 0.08), (-0.08, 0.08))
 _LAST = ((-1.5, 0.4), (-0.08, 0.08), (-0.08, 0.08))
@@ -98,7 +95,7 @@ def reconstruct_hands(
         sequence: The recording; its `hands` are fitted.
         config: Settings of the fit.
         progress: Receives a report every tenth iteration.
-        keypoint: Keypoints to fit to [px]; None takes those of the views, or detects them.
+        keypoint: Keypoints to fit to [px]; None takes those of `observed_keypoints`.
 
     Raises:
         MissingInputError: If there is no hand, no view, no color image to detect keypoints in, or
@@ -106,15 +103,15 @@ def reconstruct_hands(
         FitError: If no frame shows a hand well enough for a first guess.
     """
     config, progress = config or HandFitConfig(), progress or NullProgress()
-    if not sequence.hands or not sequence.views:
+    missing = sequence.missing("hands", "views") if keypoint is not None else None
+    missing = missing_for_hands(sequence) if missing is None else missing
+    if missing:
+        remedies = "; ".join(REMEDIES[part] for part in missing)
         raise MissingInputError(
-            f"Sequence '{sequence.name}': stage 1 needs at least one view and one hand; "
-            f"there are {len(sequence.views)} views and {len(sequence.hands)} hands."
+            f"Sequence '{sequence.name}': stage 1 lacks {', '.join(missing)}: {remedies}."
         )
     if keypoint is None:
-        keypoint = given_keypoints(sequence)
-    if keypoint is None:
-        keypoint = detect_sequence(sequence, progress)
+        keypoint = observed_keypoints(sequence, progress)
     fits = []
     for hand, side in enumerate(sequence.hands):
         model = load_hand_model(side, config.model)
@@ -134,12 +131,20 @@ def reconstruct_hands(
     )
 
 
-def given_keypoints(sequence: Sequence) -> Float[ndarray, "view frame hand 21 3"] | None:
-    """Stack the keypoints stored in the sequence [px]; None unless every view has them."""
-    keypoint = [view.keypoint for view in sequence.views]
-    if any(one is None for one in keypoint):
-        return None
-    return np.stack([one for one in keypoint if one is not None])
+def observed_keypoints(
+    sequence: Sequence, progress: Progress
+) -> Float[ndarray, "view frame hand 21 3"]:
+    """Collect the keypoints of all views [px]: stored ones, else those found in color images.
+
+    A view with neither, such as one that recorded depth alone, has NaN throughout.
+    """
+    blank = np.full((sequence.frame_count, len(sequence.hands), 21, 3), np.nan, np.float32)
+    keypoint = {view.name: view.keypoint for view in sequence.views}
+    searched = [view for view in sequence.views if keypoint[view.name] is None and view.has_color]
+    if searched:
+        found = detect_sequence(sequence, progress, views=searched)
+        keypoint |= {view.name: one for view, one in zip(searched, found, strict=True)}
+    return np.stack([blank if one is None else one for one in keypoint.values()])
 
 
 @dataclass(frozen=True)
@@ -424,7 +429,7 @@ def guess_wrist(
     is_known = np.zeros(frame_count, dtype=bool)
     for frame in range(frame_count):
         is_seen = np.isfinite(point[frame, palm]).all(-1)
-        if is_seen.sum() >= _MIN_PALM_POINTS:
+        if is_seen.sum() >= LEAST_PALM_POINTS:
             pose = _align(template[palm][is_seen], point[frame, palm][is_seen] / scale)
             rotation[frame], translation[frame] = pose[0].as_quat(), pose[1]
             is_known[frame] = True
@@ -437,7 +442,7 @@ def guess_wrist(
     if not is_known.any():
         raise FitError(
             f"The {model.side} hand cannot be placed: no frame shows "
-            f"{_MIN_PALM_POINTS} keypoints of its palm apart from each other. Check the keypoints "
+            f"{LEAST_PALM_POINTS} keypoints of its palm apart from each other. Check the keypoints "
             "and the calibration."
         )
     rotation, translation = _bridge(rotation, translation, is_known)
@@ -479,7 +484,7 @@ def _guess_from_one_view(
 ) -> tuple[Rotation, Float[ndarray, " 3"]] | None:
     """Solve perspective-n-point in the view with the most confident palm keypoints."""
     is_seen = np.asarray(np.isfinite(keypoint).all(-1))
-    usable = np.where(is_seen.sum(1) >= _MIN_PALM_POINTS, np.nansum(keypoint[..., 2], 1), 0.0)
+    usable = np.where(is_seen.sum(1) >= LEAST_PALM_POINTS, np.nansum(keypoint[..., 2], 1), 0.0)
     view = int(np.argmax(usable))
     if usable[view] <= 0:
         return None

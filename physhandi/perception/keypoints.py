@@ -52,13 +52,17 @@ class DetectedHand:
 
 
 def detect_sequence(
-    sequence: Sequence, progress: Progress | None = None
+    sequence: Sequence,
+    progress: Progress | None = None,
+    *,
+    views: SequenceOf[View] | None = None,
 ) -> Float[ndarray, "view frame hand 21 3"]:
-    """Find the keypoints of a sequence's hands in all frames of all views.
+    """Find the keypoints of a sequence's hands in all frames.
 
     Args:
-        sequence: The sequence; it must say which hands it shows and have color images.
+        sequence: The sequence; it must say which hands it shows.
         progress: Told after every frame.
+        views: Views to look into, which must have color images; None are all.
 
     Returns:
         Pixel x, pixel y and confidence of each keypoint; NaN where a hand was not found.
@@ -71,17 +75,16 @@ def detect_sequence(
             f"Sequence '{sequence.name}': no hand is named. "
             "Add 'hands: [right]' to sequence.yaml, or left, or both."
         )
-    blind = [view.name for view in sequence.views if not view.has_color]
-    if blind or not sequence.views:
+    views = sequence.views if views is None else views
+    blind = [view.name for view in views if not view.has_color]
+    if blind or not views:
         raise MissingInputError(
             f"Sequence '{sequence.name}': view '{(blind or ['?'])[0]}' has no color images to find "
             "keypoints in. Add color.mp4 or color/, or give keypoint.npy for the view."
         )
     detector = KeypointDetector()
     progress = progress or NullProgress()
-    return np.stack(
-        [detect_view(view, sequence.hands, progress, detector) for view in sequence.views]
-    )
+    return np.stack([detect_view(view, sequence.hands, progress, detector) for view in views])
 
 
 @dataclass(frozen=True)

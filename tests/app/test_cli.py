@@ -385,6 +385,22 @@ def test_sequences_are_checked_file_by_file(terminal: Terminal) -> None:
     assert terminal("check", "sheet") == 1
     assert "sequence.yaml: shape is 'ropes'; expected one of sheet, solid, shell" in terminal.out
     meta.write_text(described)
+    assert terminal("check", "sheet", "--json") == 0
+    told = json.loads(terminal.out)
+    assert list(told["stages"]) == list(pipeline.STAGES)
+    assert told["stages"][pipeline.SEARCH] | {"why": ""} == {
+        "ready": True,
+        "missing": [],
+        "state": "ready",
+        "why": "",
+        "remedy": "",
+    }
+    assert told["stages"][pipeline.HANDS]["missing"] == ["hands"]
+    assert told["problems"] == []
+    assert told["stages"] == told["sheet"]["stages"]
+    assert terminal("check", "sheet") == 0
+    assert "hand_reconstruction: will be skipped, which is no loss" in terminal.out
+    assert "first_order: ready" in terminal.out
     marker = terminal.data_dir / "sequences" / "sheet" / "marker.npy"
     marker.write_bytes(marker.read_bytes()[:-8])
     assert terminal("check", "sheet", "towel_fold") == 1

@@ -164,9 +164,9 @@ def test_what_is_missing_is_said(tmp_path: Path) -> None:
     keypoint[..., :3, :] = np.nan
     with pytest.raises(FitError, match="right hand cannot be placed"):
         reconstruct_hands(scene.write_scene(tmp_path / "a", [truth], CAMERAS, keypoint))
-    with pytest.raises(MissingInputError, match=r"'b': .* there are 0 views and 1 hands"):
+    with pytest.raises(MissingInputError, match=r"'b': stage 1 lacks views: describe"):
         reconstruct_hands(scene.write_scene(tmp_path / "b", [truth], [], None))
-    with pytest.raises(MissingInputError, match=r"'c': view 'view0' has no color"):
+    with pytest.raises(MissingInputError, match=r"'c': stage 1 lacks color or keypoint"):
         reconstruct_hands(scene.write_scene(tmp_path / "c", [truth], CAMERAS, None, depth=True))
     with pytest.raises(SettingsError, match="iterations is 0; expected a whole number from 1"):
         HandFitConfig(iterations=0)
