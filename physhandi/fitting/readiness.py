@@ -62,7 +62,7 @@ ABOUT: Mapping[str, str] = {
 }
 """What each stage makes."""
 
-State = Literal["ready", "not needed", "missing"]
+ReadyState = Literal["ready", "not needed", "missing"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +82,7 @@ class StageReadiness:
         return not self.missing
 
     @property
-    def state(self) -> State:
+    def state(self) -> ReadyState:
         """``ready``, ``missing``, or ``not needed`` where its absence is no loss."""
         if self.is_ready:
             return "ready"

@@ -200,7 +200,8 @@ def _judge_hands(sequence: Sequence) -> tuple[list[Problem], bool]:
     if is_searched or not views:
         return [], True  # Only the networks will tell.
     stored = [view.keypoint for view in views]
-    is_shown = shows_palm(np.stack([one for one in stored if one is not None])).any(axis=0)
+    by_view = shows_palm(np.stack([one for one in stored if one is not None]))
+    is_shown = np.logical_or.reduce(by_view, axis=0)
     found: list[Problem] = []
     for hand, side in enumerate(sequence.hands):
         if not is_shown[:, hand].any():
