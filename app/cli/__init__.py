@@ -14,6 +14,7 @@ from physhandi.errors import PhysHandiError, UsageError, describe
 def build() -> SubcommandApp:
     """Make the tree of commands; their docstrings and types are the help text."""
     imports = SubcommandApp()
+    imports.command(name="capture")(recordings.import_capture)
     imports.command(name="stereo")(recordings.import_stereo)
     imports.command(name="mocap")(recordings.import_mocap)
     imports.command(name="phystwin")(recordings.import_phystwin)

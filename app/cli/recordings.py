@@ -295,6 +295,64 @@ def import_phystwin(
     show({"sequence": str(folder), "run": str(filled.folder), **filled.json("import.json")})
 
 
+def import_capture(
+    source: Positional[Path],
+    *,
+    out: Path,
+    depth_scale: float | None = None,
+    intrinsics: Path | None = None,
+    charuco: str | None = None,
+    start: int = 0,
+    stop: int | None = None,
+    every: int = 1,
+    frame_rate: float | None = None,
+    hands: tuple[Literal["right", "left"], ...] = ("right",),
+    overwrite: bool = False,
+) -> None:
+    """Your own recording by one or several RGB-D or color cameras.
+
+    Args:
+        source: Folder with a folder for each camera (color/, depth/, intrinsics.json), such a
+            folder itself, or what PhysTwin's recorder writes.
+        out: Sequence folder to write.
+        depth_scale: Metres per unit of depth, such as 0.001; above 1, units per metre.
+        intrinsics: File with the intrinsics of all cameras, instead of those in the folder.
+        charuco: Board in the pictures of calibration/CAMERA/, or in the first frames: squares
+            across and down, and the side of a square [m], like 7x5,0.04.
+        start: First frame to import.
+        stop: Frame before which to end.
+        every: Import only every n-th frame.
+        frame_rate: Frames per second, if neither timestamps nor a video tell it.
+        hands: Hands that the recording shows: right, left or both.
+        overwrite: Replace a sequence that is there.
+    """
+    from physhandi.data.importers.board_calibration import CharucoTarget
+    from physhandi.data.importers.capture import CaptureOptions
+    from physhandi.data.importers.capture import import_capture as convert
+
+    options = CaptureOptions(
+        depth_scale=depth_scale,
+        intrinsics=intrinsics,
+        charuco=None if charuco is None else CharucoTarget.parse(charuco),
+        start=start,
+        stop=stop,
+        every=every,
+        frame_rate=frame_rate,
+        hands=hands,
+    )
+    with watched(True) as progress:
+        sequence = convert(source, out, progress, options=options, overwrite=overwrite)
+    told = ("depth_scale", "pairing", "calibration", "notes")
+    show(
+        {
+            "sequence": str(sequence.folder),
+            "frames": sequence.frame_count,
+            "frame_rate": sequence.frame_rate,
+            **{name: sequence.provenance[name] for name in told if sequence.provenance[name]},
+        }
+    )
+
+
 def import_mano(sources: Positional[tuple[Path, ...]], *, out: Path | None = None) -> None:
     """MANO hand models that you have downloaded under their own licence.
 

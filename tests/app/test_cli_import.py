@@ -5,6 +5,7 @@ import pytest
 from mano_file import write_mano
 from phystwin_case import write_case
 from phystwin_experiment import write_experiment
+from raw_capture import RawCapture
 
 from app import cli
 from physhandi.data.sequence import Sequence
@@ -91,3 +92,28 @@ def test_every_option_of_a_motion_capture_import_can_be_given(tmp_path, capsys):
     np.testing.assert_allclose(sequence.object_node[[0, -1]], [[0, 0, 1], [0, 0.32, 1]], atol=1e-6)
     assert call(capsys, *command, *options)[0] != 0
     assert call(capsys, *command, *options, "--overwrite")[0] == 0
+
+
+def test_a_raw_recording_is_imported_and_what_was_assumed_is_told(tmp_path, capsys):
+    raw = RawCapture(tmp_path / "raw").write(4)
+    code, out, error = call(
+        capsys,
+        *("import", "capture", raw.folder, "--out", tmp_path / "ball"),
+        *("--depth-scale", 0.001, "--frame-rate", 20, "--every", 2, "--hands", "left", "right"),
+    )
+    assert code == 0, error
+    sequence = Sequence.load(tmp_path / "ball")
+    assert (sequence.frame_count, sequence.frame_rate) == (2, 10.0)
+    assert sequence.hands == ("left", "right")
+    assert "left on right" in out
+    assert "aligned to color" in out
+
+
+def test_a_raw_recording_needs_a_board_that_makes_sense(tmp_path, capsys):
+    raw = RawCapture(tmp_path / "raw").write(2)
+    code, _, error = call(
+        capsys, "import", "capture", raw.folder, "--out", tmp_path / "x", "--charuco", "7x5,40"
+    )
+    assert code == 2
+    assert "in metres" in error
+    assert not (tmp_path / "x").exists()

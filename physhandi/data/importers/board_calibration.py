@@ -1,0 +1,276 @@
+"""Poses of cameras from pictures of a ChArUco board that lies on the table."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+from numpy import ndarray
+
+from physhandi.errors import ImportFailedError, UsageError
+
+_cv2: Any = cv2
+_aruco: Any = _cv2.aruco
+_FAMILIES = ("4X4", "5X5", "6X6", "7X7")
+_COUNTS = (50, 100, 250, 1000)
+_LEAST_CORNERS = 6
+_SMALL = 640
+"""Narrower pictures are enlarged before markers are looked for [px]."""
+_MOST_ERROR = 2.0
+_MARKER = 0.75
+"""Side of a marker in squares; corners of squares do not depend on it."""
+
+
+@dataclass(frozen=True)
+class CharucoTarget:
+    """A ChArUco board as it was printed."""
+
+    columns: int
+    """Squares along its width."""
+    rows: int
+    """Squares along its height."""
+    square: float
+    """Side of a square [m]."""
+
+    @classmethod
+    def parse(cls, text: str) -> "CharucoTarget":
+        """Read ``WxH,SQUARE``, such as ``7x5,0.04``.
+
+        Raises:
+            UsageError: If it is something else.
+        """
+        found = re.fullmatch(r"(\d{1,3})x(\d{1,3}),(\d*\.?\d+)", text.replace(" ", ""))
+        if found is None:
+            raise UsageError(
+                f"--charuco {text!r} is no board; write squares across and down and the side of a "
+                "square in metres, like 7x5,0.04."
+            )
+        columns, rows, square = int(found[1]), int(found[2]), float(found[3])
+        if not (3 <= columns <= 40 and 3 <= rows <= 40 and 0.004 <= square <= 0.3):
+            raise UsageError(
+                f"--charuco {text!r}: boards have 3 to 40 squares each way, of 0.004 to 0.3 m. The "
+                "side of a square is in metres."
+            )
+        return cls(columns, rows, square)
+
+    def board(self, family: str, *, is_legacy: bool = False) -> Any:
+        """Make OpenCV's board with markers of a family, such as ``5X5``."""
+        count = self.columns * self.rows // 2
+        size = next((size for size in _COUNTS if size >= count), _COUNTS[-1])
+        dictionary = _aruco.getPredefinedDictionary(getattr(_aruco, f"DICT_{family}_{size}"))
+        board = _aruco.CharucoBoard(
+            (self.columns, self.rows), self.square, _MARKER * self.square, dictionary
+        )
+        board.setLegacyPattern(is_legacy)
+        return board
+
+
+@dataclass(frozen=True, eq=False)
+class BoardSighting:
+    """Corners of the board that one picture shows."""
+
+    corner: Float[ndarray, "corner 3"]
+    """Places on the board [m]."""
+    pixel: Float[ndarray, "corner 2"]
+    """Where they are seen, in an image without distortion [px]."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BoardCalibration:
+    """Cameras around the board, which is the table; z is up."""
+
+    T_world_camera: tuple[Float[ndarray, "4 4"], ...]
+    """Maps each camera's coordinates to the world [m]."""
+    error: tuple[float, ...]
+    """Root mean square reprojection error of each camera [px]."""
+    corner_count: tuple[int, ...]
+    """Corners that each camera has seen in all pictures."""
+
+
+def find_board(
+    image: UInt8[ndarray, "row column 3"], target: CharucoTarget
+) -> BoardSighting | None:
+    """Find the board in a picture, whichever family its markers are of; None if it is not there."""
+    gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    # Markers of a few pixels are not read, and corners between them not refined.
+    factor = 2 if image.shape[1] < _SMALL else 1
+    if factor > 1:
+        gray = cv2.resize(gray, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
+    best: BoardSighting | None = None
+    for family in _FAMILIES:
+        # Before version 4.6, OpenCV printed boards with even rows the other way around.
+        for is_legacy in (False, True) if target.rows % 2 == 0 else (False,):
+            board = target.board(family, is_legacy=is_legacy)
+            pixel, number, _, _ = _aruco.CharucoDetector(board).detectBoard(gray)
+            if number is None or len(number) < _LEAST_CORNERS:
+                continue
+            if best is None or len(number) > len(best.corner):
+                corner = np.asarray(board.getChessboardCorners(), np.float64)
+                best = BoardSighting(
+                    corner[np.asarray(number).ravel()],
+                    (np.asarray(pixel, np.float64).reshape(-1, 2) + 0.5) / factor - 0.5,
+                )
+    return best
+
+
+def calibrate_by_board(
+    names: Sequence[str],
+    intrinsics: Sequence[Float[ndarray, "3 3"]],
+    sizes: Sequence[tuple[int, int]],
+    sightings: Sequence[Sequence[BoardSighting | None]],
+) -> BoardCalibration:
+    """Find the pose of every camera; all pictures are adjusted together.
+
+    The world is the board of the first pictures: z = 0 is its plane, and z points to the cameras.
+
+    Args:
+        names: Names of the views, for messages.
+        intrinsics: Intrinsic matrix of each view [px].
+        sizes: Width and height of each view's images [px].
+        sightings: For each view what its pictures show; those of all views with the same number
+            were taken while the board lay in the same place.
+
+    Raises:
+        ImportFailedError: If a view is not tied to the others by the board, or its reprojection
+            error is large.
+    """
+    count = max(len(row) for row in sightings)
+    seen = {
+        (view, place): sighting
+        for view, row in enumerate(sightings)
+        for place, sighting in enumerate(row)
+        if sighting is not None
+    }
+    single = {key: _single_pose(intrinsics[key[0]], sighting) for key, sighting in seen.items()}
+    cameras, boards = _chained(names, count, single)
+    cameras, boards = _adjusted(intrinsics, seen, cameras, boards)
+    error: list[float] = []
+    corner_count: list[int] = []
+    for view, name in enumerate(names):
+        residual = np.concatenate(
+            [
+                _residual(intrinsics[view], cameras[view] @ boards[place], sighting)
+                for (other, place), sighting in seen.items()
+                if other == view
+            ]
+        )
+        rms = float(np.sqrt((residual**2).sum(axis=1).mean()))
+        most = _MOST_ERROR * max(1.0, sizes[view][0] / 848)
+        if rms > most:
+            raise ImportFailedError(
+                f"View '{name}': the board's corners are {rms:.1f} px (rms) from where the "
+                f"calibration puts them; at most {most:.1f} px are accepted. Check this camera's "
+                "intrinsics, that the board is flat and was not moved between the cameras' "
+                "pictures, and its number of squares."
+            )
+        error.append(rms)
+        corner_count.append(len(residual))
+    return BoardCalibration(
+        T_world_camera=_upright(names, [np.linalg.inv(cameras[v]) for v in range(len(names))]),
+        error=tuple(error),
+        corner_count=tuple(corner_count),
+    )
+
+
+def _single_pose(K: ndarray, sighting: BoardSighting) -> Float[ndarray, "4 4"]:
+    """Find where the board is before one camera; of the two mirrored poses, the better one."""
+    _, turns, shifts, _ = _cv2.solvePnPGeneric(
+        sighting.corner, sighting.pixel.reshape(-1, 1, 2), K, None, flags=cv2.SOLVEPNP_IPPE
+    )
+    poses: list[ndarray] = []
+    for turn, shift in zip(turns, shifts, strict=True):
+        pose = np.eye(4)
+        pose[:3, :3] = _cv2.Rodrigues(turn)[0]
+        pose[:3, 3] = np.ravel(shift)
+        poses.append(pose)
+    return min(poses, key=lambda pose: float((_residual(K, pose, sighting) ** 2).sum()))
+
+
+def _residual(K: ndarray, T_camera_board: ndarray, sighting: BoardSighting) -> ndarray:
+    point = sighting.corner @ T_camera_board[:3, :3].T + T_camera_board[:3, 3]
+    depth = np.maximum(point[:, 2:], 1e-6)
+    return (point[:, :2] / depth) @ K[:2, :2].T + K[:2, 2] - sighting.pixel
+
+
+_Poses = dict[int, Float[ndarray, "4 4"]]
+
+
+def _chained(
+    names: Sequence[str], count: int, single: dict[tuple[int, int], ndarray]
+) -> tuple[_Poses, _Poses]:
+    """Carry poses from the first board over to all cameras and all other places of the board."""
+    cameras: _Poses = {}
+    boards: _Poses = {0: np.eye(4)}
+    for _ in range(len(names) + count):
+        for (view, place), T_camera_board in single.items():
+            if place in boards and view not in cameras:
+                cameras[view] = T_camera_board @ np.linalg.inv(boards[place])
+            elif view in cameras and place not in boards:
+                boards[place] = np.linalg.inv(cameras[view]) @ T_camera_board
+    for view, name in enumerate(names):
+        if view not in cameras:
+            is_blind = not any(key[0] == view for key in single)
+            reason = (
+                "no calibration picture shows the board (6 corners are needed at least)"
+                if is_blind
+                else "it never shows the board at a place that another camera shows too"
+            )
+            raise ImportFailedError(
+                f"View '{name}' cannot be calibrated: {reason}. Take sharp pictures in which the "
+                "board is large and whole, and check --charuco."
+            )
+    return cameras, boards
+
+
+def _adjusted(
+    intrinsics: Sequence[ndarray],
+    seen: dict[tuple[int, int], BoardSighting],
+    cameras: _Poses,
+    boards: _Poses,
+) -> tuple[_Poses, _Poses]:
+    """Minimise all reprojection errors; the first board stays where it is."""
+    optimize: Any = import_module("scipy.optimize")
+    views, places = sorted(cameras), sorted(set(boards) - {0})
+
+    def unpacked(value: ndarray) -> tuple[_Poses, _Poses]:
+        steps = value.reshape(-1, 6)
+        moved = {view: _moved(cameras[view], steps[i]) for i, view in enumerate(views)}
+        laid = {p: _moved(boards[p], steps[len(views) + i]) for i, p in enumerate(places)}
+        return moved, {0: boards[0], **laid}
+
+    def residuals(value: ndarray) -> ndarray:
+        moved, laid = unpacked(value)
+        return np.concatenate(
+            [
+                _residual(intrinsics[view], moved[view] @ laid[place], sighting).ravel()
+                for (view, place), sighting in seen.items()
+            ]
+        )
+
+    start = np.zeros(6 * (len(views) + len(places)))
+    found: Any = optimize.least_squares(residuals, start, loss="soft_l1", x_scale="jac")
+    return unpacked(found.x)
+
+
+def _moved(pose: ndarray, step: ndarray) -> ndarray:
+    moved = pose.copy()
+    moved[:3, :3] = _cv2.Rodrigues(step[:3])[0] @ pose[:3, :3]
+    moved[:3, 3] = pose[:3, 3] + step[3:]
+    return moved
+
+
+def _upright(names: Sequence[str], T_board_camera: list[ndarray]) -> tuple[ndarray, ...]:
+    """Turn the world so that the cameras are above the board."""
+    height = np.array([pose[2, 3] for pose in T_board_camera])
+    if (height > 0).any() and (height < 0).any():
+        below = names[int(np.argmin(np.abs(height)))]
+        raise ImportFailedError(
+            f"The cameras are on both sides of the board; view '{below}' is nearest to its plane. "
+            "All must look down on the table that it lies on."
+        )
+    T_world_board = np.diag([1.0, -1.0, -1.0, 1.0]) if (height < 0).all() else np.eye(4)
+    return tuple(T_world_board @ pose for pose in T_board_camera)

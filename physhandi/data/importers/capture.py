@@ -1,0 +1,555 @@
+"""Imports raw RGB-D recordings: synchronised, without distortion, with the table as the ground."""
+
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+from numpy import ndarray
+
+from physhandi.data import sequence as sequences
+from physhandi.data.camera import PinholeCamera
+from physhandi.data.importers.board_calibration import (
+    BoardSighting,
+    CharucoTarget,
+    calibrate_by_board,
+    find_board,
+)
+from physhandi.data.importers.phystwin_files import fail, read_image
+from physhandi.data.importers.recorded_stream import (
+    COLOR_SUFFIXES,
+    RecordedStream,
+    image_size,
+    natural_key,
+)
+from physhandi.data.importers.recorded_view import CALIBRATION, RecordedView, find_views
+from physhandi.data.importers.rectification import Rectifier
+from physhandi.data.importers.stream_pairing import PairedFrames, cut, pair_streams
+from physhandi.data.importers.view_agreement import (
+    cloud,
+    find_table,
+    shared_surface,
+    table_distance_ratio,
+)
+from physhandi.data.sequence_meta import SequenceMeta, Side, ViewMeta
+from physhandi.data.sequence_writer import SequenceWriter
+from physhandi.errors import ImportFailedError, UsageError
+from physhandi.progress import NullProgress, Progress
+
+_STAGE = "import"
+_SAMPLED = 5
+_NEAREST, _FARTHEST = 0.15, 3.5
+"""Distances that the median of a depth image may have, unless the scale is given [m]."""
+_BOUNDS_GIVEN = (0.05, 12.0)
+_SCALES = (1.0, 0.01, 0.001, 0.00025, 0.0002, 0.0001)
+"""Scales of known recorders: metres, centimetres, millimetres, L515, TUM, tenths of millimetres."""
+_JPEG_QUALITY = 95
+_FIRST_FRAMES = 5
+_UPRIGHT = np.cos(np.deg2rad(12))
+_TABLE_SHARE = 0.25
+_WALL = -0.25
+"""A plane whose normal points up the picture less than this may be a wall."""
+_RATIO = (0.95, 1.05)
+_WRONG_SCALE = (0.8, 1.25)
+_RATIO_SHARE = 0.2
+_LEAST_SHARED, _LEAST_SHARED_ABOVE = 0.45, 0.3
+_ABOVE = 0.02
+_PNG_EFFORT = 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureOptions:
+    """What a recording does not say itself."""
+
+    depth_scale: float | None = None
+    """Metres per unit of depth images; a value above 1 is units per metre. None: as recorded."""
+    intrinsics: Path | None = None
+    """File with the intrinsics of all cameras, instead of those in the folder."""
+    charuco: CharucoTarget | None = None
+    """Board from which the cameras' poses are found; None: poses are given."""
+    start: int = 0
+    """First frame that is imported."""
+    stop: int | None = None
+    """Frame before which the import ends; None: all."""
+    every: int = 1
+    """Only every n-th frame is imported."""
+    frame_rate: float | None = None
+    """Frame rate of recordings without times [Hz]."""
+    hands: tuple[Side, ...] = ("right",)
+    """Hands that the recording shows."""
+
+
+@dataclass(eq=False)
+class _Source:
+    """One camera, ready to give its images."""
+
+    view: RecordedView
+    rectifier: Rectifier
+    scale: float
+    color: ndarray | None
+    depth: ndarray | None
+    holes: list[int] = field(default_factory=list[int])
+
+    def color_image(self, frame: int) -> UInt8[ndarray, "row column 3"]:
+        """Read and straighten a color image (BGR)."""
+        assert self.view.color is not None  # noqa: S101 - asked by callers
+        assert self.color is not None  # noqa: S101
+        return self.rectifier.color(self.view.color.read(int(self.color[frame])))
+
+    def depth_image(self, frame: int) -> Float[ndarray, "row column"]:
+        """Read depth for the pixels of the straightened color image [m]."""
+        if self.view.depth is None or self.depth is None or self.depth[frame] < 0:
+            return np.zeros((self.view.size[1], self.view.size[0]), np.float32)
+        raw = self.view.depth.read(int(self.depth[frame])).astype(np.float32)
+        return self.rectifier.depth(raw * np.float32(self.scale))
+
+    def camera(self, T_world_camera: ndarray) -> PinholeCamera:
+        """Make the ideal camera of its images."""
+        return PinholeCamera(self.rectifier.K, T_world_camera, *self.view.size)
+
+
+@dataclass(frozen=True, eq=False)
+class _Placement:
+    """Where the cameras are, and how that was found."""
+
+    poses: tuple[Float[ndarray, "4 4"], ...]
+    ground: float | None
+    report: dict[str, Any]
+    notes: list[str]
+
+
+def import_capture(
+    source_folder: Path | str,
+    out_folder: Path | str,
+    progress: Progress | None = None,
+    *,
+    options: CaptureOptions | None = None,
+    overwrite: bool = False,
+) -> sequences.Sequence:
+    """Convert a raw recording of one or several RGB-D or color cameras into a sequence.
+
+    `Sequence.provenance` tells how streams were paired and calibrated, and all that was repaired or
+    assumed (``notes``).
+
+    Args:
+        source_folder: One folder for each camera with ``color/``, ``depth/`` and intrinsics; or
+            such a folder; or what PhysTwin's recorder writes (docs/your-data.md).
+        out_folder: Folder of the new sequence; its last part names the sequence.
+        progress: Receives a report after every image; may cancel, which leaves nothing.
+        options: What the recording does not say itself.
+        overwrite: Whether to replace a sequence that is there.
+
+    Raises:
+        ImportFailedError: If a file is missing, broken or contradicts another one; names it.
+        UsageError: If an option does not fit the recording.
+        CancelledError: If the user asked to stop.
+    """
+    options, progress = options or CaptureOptions(), progress or NullProgress()
+    if not options.hands or len(set(options.hands)) != len(options.hands):
+        raise UsageError(
+            f"Name each hand that the recording shows once, not {list(options.hands)}."
+        )
+    source = Path(source_folder)
+    views = find_views(source, options.intrinsics)
+    _refuse_same_names(views)
+    with _closing(views):
+        paired = _paired(views, options)
+        sources, notes = _sources(views, paired, options)
+        placement = _place(source, sources, options.charuco)
+        cameras = [one.camera(pose) for one, pose in zip(sources, placement.poses, strict=True)]
+        report = dict(placement.report)
+        report["agreement"] = _check_agreement(sources, cameras, placement, paired.count)
+        notes += [*paired.notes, *placement.notes]
+        with SequenceWriter(out_folder, overwrite=overwrite) as writer:
+            notes += _write(writer, sources, paired, progress)
+            meta = SequenceMeta(
+                name=writer.folder.name,
+                description=f"Recorded by {len(views)} camera{'s' * (len(views) > 1)}.",
+                frame_rate=round(paired.frame_rate, 4),
+                frame_count=paired.count,
+                ground_height=placement.ground,
+                hands=options.hands,
+                views=tuple(
+                    ViewMeta(name=view.name, camera=camera)
+                    for view, camera in zip(views, cameras, strict=True)
+                ),
+                provenance={
+                    "importer": "capture",
+                    "folder": source.resolve().name,
+                    "frames": {"start": options.start, "every": options.every},
+                    "depth_scale": {
+                        one.view.name: one.scale for one in sources if one.view.depth is not None
+                    },
+                    "pairing": _pairing_report(views, paired),
+                    "calibration": {k: v for k, v in report.items() if v},
+                    "notes": notes,
+                },
+            )
+            sequence = writer.finish(meta)
+    return sequence
+
+
+@contextmanager
+def _closing(views: Sequence[RecordedView]) -> Generator[None, None, None]:
+    try:
+        yield
+    finally:
+        for view in views:
+            for stream in view.streams:
+                stream.close()
+
+
+def _refuse_same_names(views: Sequence[RecordedView]) -> None:
+    names = [view.name for view in views]
+    for view in views:
+        if names.count(view.name) > 1:
+            fail(view.folder, "gives a view a name that another one has. Rename the folder")
+
+
+def _paired(views: Sequence[RecordedView], options: CaptureOptions) -> PairedFrames:
+    names = [f"{view.name}/{stream.kind}" for view in views for stream in view.streams]
+    streams = [stream for view in views for stream in view.streams]
+    paired = pair_streams(names, streams, options.frame_rate)
+    return cut(paired, options.start, options.stop, options.every)
+
+
+def _pairing_report(views: Sequence[RecordedView], paired: PairedFrames) -> dict[str, Any]:
+    """Tell how far the images of each stream are from their frames' moments [s]."""
+    names = [f"{view.name}/{stream.kind}" for view in views for stream in view.streams]
+    return {
+        name: {
+            "median_error": round(float(np.nanmedian(np.abs(error))), 6),
+            "largest_error": round(float(np.nanmax(np.abs(error))), 6),
+        }
+        for name, error in zip(names, paired.error, strict=True)
+        if error is not None
+    } or {"by": "number or order of the images"}
+
+
+def _sources(
+    views: Sequence[RecordedView], paired: PairedFrames, options: CaptureOptions
+) -> tuple[list[_Source], list[str]]:
+    sources: list[_Source] = []
+    notes: list[str] = []
+    position = 0
+    for view in views:
+        index: dict[str, ndarray] = {}
+        for stream in view.streams:
+            index[stream.kind] = paired.index[position]
+            position += 1
+        depth_size = None if view.depth is None else (view.depth.width, view.depth.height)
+        rectifier = Rectifier(
+            view.camera, view.size, view.depth_camera, depth_size, view.T_color_depth
+        )
+        source = _Source(view, rectifier, 1.0, index.get("color"), index.get("depth"))
+        notes += view.notes
+        if view.color is None:
+            notes.append(f"View '{view.name}' has no color, so neither keypoints nor masks.")
+        if view.depth is None:
+            notes.append(f"View '{view.name}' has no depth; it serves for hands alone.")
+        else:
+            source.scale = _depth_scale(source, view.depth, options.depth_scale, notes)
+        sources.append(source)
+    return sources, notes
+
+
+def _depth_scale(
+    source: _Source, stream: RecordedStream, given: float | None, notes: list[str]
+) -> float:
+    """Decide how many metres a unit of depth is, and refuse distances that cannot be."""
+    assert source.depth is not None  # noqa: S101 - a view with a stream of depth
+    name = source.view.name
+    there = source.depth[source.depth >= 0]
+    chosen = np.unique(np.linspace(0, len(there) - 1, min(_SAMPLED, len(there))).astype(int))
+    medians: list[float] = []
+    is_float = False
+    for place in chosen:
+        raw = stream.read(int(there[place]))
+        is_float = raw.dtype.kind == "f"
+        known = raw[np.isfinite(raw) & (raw > 0)] if is_float else raw[raw > 0]
+        if known.size:
+            medians.append(float(np.median(known)))
+    if not medians:
+        fail(
+            stream.path,
+            f"holds no distance at all in frames {', '.join(map(str, chosen.tolist()))}: all "
+            "values are 0 or not finite. Record depth again, or remove it to use color alone",
+        )
+    median = float(np.median(medians))
+    scale = given if given is not None else source.view.depth_scale
+    if scale is not None and not (np.isfinite(scale) and scale > 0):
+        raise UsageError(f"--depth-scale is {scale:g}; expected metres per unit, such as 0.001.")
+    low, high = (_NEAREST, _FARTHEST) if given is None else _BOUNDS_GIVEN
+    if scale is None:
+        scale = 0.001 if not is_float or median > 20 else 1.0
+        unit = "millimetres" if scale == 0.001 else "metres"
+        notes.append(f"View '{name}': nothing tells the unit of depth; it is taken for {unit}.")
+    elif scale > 1.0:
+        scale = 1.0 / scale
+    if not low <= scale * median <= high:
+        fits = [f"{s:g}" for s in _SCALES if _NEAREST <= s * median <= _FARTHEST]
+        hint = (
+            f"; {' or '.join(fits)} would make it {_NEAREST:g} to {_FARTHEST:g} m" if fits else ""
+        )
+        fail(
+            stream.path,
+            f"would show things {scale * median:.3g} m away (median) with {scale:g} metres per "
+            f"unit, which is no distance for hands{hint}. Give --depth-scale (TUM: 0.0002)",
+        )
+    return scale
+
+
+def _place(source: Path, sources: list[_Source], target: CharucoTarget | None) -> _Placement:
+    """Find where the cameras are, with z up and the table, where it is known, at a height."""
+    if target is not None:
+        return _by_board(source, sources, target)
+    given = [one.view.T_world_camera for one in sources]
+    if all(pose is not None for pose in given):
+        return _as_given(sources, tuple(cast("list[ndarray]", given)))
+    if len(sources) == 1:
+        return _alone(sources[0])
+    lacking = next(one.view for one, pose in zip(sources, given, strict=True) if pose is None)
+    has_pictures = (source / CALIBRATION).is_dir()
+    remedy = (
+        f"{CALIBRATION}/ is there: say which board it shows, like --charuco 7x5,0.04"
+        if has_pictures
+        else f"Put pictures of a ChArUco board into {CALIBRATION}/{lacking.name}/ (of all views) "
+        "and give --charuco WxH,SQUARE, or add extrinsics.json with T_world_camera of each view"
+    )
+    raise ImportFailedError(
+        f"Nothing tells where the camera of view '{lacking.name}' is. {remedy}."
+    )
+
+
+def _by_board(source: Path, sources: list[_Source], target: CharucoTarget) -> _Placement:
+    sightings = [_sightings(source, one, target, len(sources) == 1) for one in sources]
+    names = [one.view.name for one in sources]
+    found = calibrate_by_board(
+        names,
+        [one.rectifier.K for one in sources],
+        [one.view.size for one in sources],
+        sightings,
+    )
+    report = {
+        "by": f"ChArUco board, {target.columns}x{target.rows} squares of {target.square:g} m",
+        "reprojection_error_px": {
+            name: round(error, 3) for name, error in zip(names, found.error, strict=True)
+        },
+        "corners": dict(zip(names, found.corner_count, strict=True)),
+    }
+    return _Placement(found.T_world_camera, 0.0, report, [])
+
+
+def _sightings(
+    source: Path, one: _Source, target: CharucoTarget, is_alone: bool
+) -> list[BoardSighting | None]:
+    """Look for the board in a view's calibration pictures, else in its first frames."""
+    folder = source / CALIBRATION / one.view.folder.name
+    if is_alone and not folder.is_dir():
+        folder = source / CALIBRATION
+    if not folder.is_dir():
+        if one.view.color is None:
+            fail(folder, "is missing, and the view has no color in which the board could be seen")
+        count = min(_FIRST_FRAMES, 0 if one.color is None else len(one.color))
+        # The board lies still at the beginning, so the first frame in which it is seen is enough.
+        for frame in range(count):
+            found = find_board(one.color_image(frame), target)
+            if found is not None:
+                return [found]
+        return [None]
+    files = [p for p in folder.iterdir() if p.suffix.lower() in COLOR_SUFFIXES]
+    if not files:
+        fail(folder, f"has no pictures of the board ({', '.join(sorted(COLOR_SUFFIXES))})")
+    sightings: list[BoardSighting | None] = []
+    for path in sorted(files, key=natural_key):
+        size = image_size(path)
+        if size != one.view.size:
+            fail(
+                path,
+                f"is {size[0]}x{size[1]} px, but the view's images are {one.view.size[0]}x"
+                f"{one.view.size[1]} px. Take the pictures with the same settings",
+            )
+        image = one.rectifier.color(read_image(path, cv2.IMREAD_COLOR))
+        sightings.append(find_board(image, target))
+    return sightings
+
+
+def _as_given(sources: list[_Source], poses: tuple[ndarray, ...]) -> _Placement:
+    """Take poses as they are; a world that is upside down, or not upright, is turned."""
+    eye = np.stack([pose[:3, 3] for pose in poses])
+    points = [
+        cloud(one.camera(pose), one.depth_image(0))
+        for one, pose in zip(sources, poses, strict=True)
+        if one.view.depth is not None
+    ]
+    report: dict[str, Any] = {"by": "given"}
+    table = find_table(np.concatenate(points), eye, poses[0][:3, 0]) if points else None
+    if table is None or table.share < _TABLE_SHARE:
+        if (eye[:, 2] < 0).all():
+            turned = tuple(np.diag([1.0, -1.0, -1.0, 1.0]) @ pose for pose in poses)
+            return _Placement(turned, None, report, ["The world was upside down and is turned."])
+        return _Placement(poses, None, report, [])
+    up = table.T_table_world[2, :3]
+    if up[2] > _UPRIGHT:
+        ground = float(np.linalg.inv(table.T_table_world)[2, 3])
+        return _Placement(poses, round(ground, 4), report, [])
+    if up[2] < -_UPRIGHT:
+        turned = tuple(np.diag([1.0, -1.0, -1.0, 1.0]) @ pose for pose in poses)
+        ground = -float(np.linalg.inv(table.T_table_world)[2, 3])
+        notes = ["The world was upside down (cameras below the table) and is turned."]
+        return _Placement(turned, round(ground, 4), report, notes)
+    notes = ["The given world is not upright; the largest plane of the clouds becomes z = 0."]
+    return _Placement(tuple(table.T_table_world @ pose for pose in poses), 0.0, report, notes)
+
+
+def _alone(source: _Source) -> _Placement:
+    """Place a single camera above the largest plane that it sees, else let it look straight on."""
+    camera = source.camera(np.eye(4))
+    if source.view.depth is not None:
+        point = cloud(camera, source.depth_image(0))
+        # The camera's x axis stays level; y points down in its picture.
+        table = find_table(point, np.zeros((1, 3)), np.array([1.0, 0.0, 0.0]))
+        is_wall = table is None or table.T_table_world[2, 1] > _WALL
+        if table is not None and table.share >= _TABLE_SHARE and not is_wall:
+            report = {"by": "the largest plane that the camera sees, taken for the table"}
+            return _Placement((table.T_table_world,), 0.0, report, [])
+    upright = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    note = (
+        f"View '{source.view.name}': no table was found, so the top of the picture is taken for "
+        "up, and there is no ground. Give --charuco, or T_world_camera in its intrinsics, if the "
+        "camera looks down."
+    )
+    return _Placement((upright,), None, {"by": "the camera's own axes"}, [note])
+
+
+def _check_agreement(
+    sources: list[_Source],
+    cameras: list[PinholeCamera],
+    placement: _Placement,
+    frame_count: int,
+) -> dict[str, Any]:
+    """Refuse a calibration, or a depth scale, that the measured surfaces contradict."""
+    measured = [n for n, one in enumerate(sources) if one.view.depth is not None]
+    depth = {n: sources[n].depth_image(0) for n in measured}
+    report: dict[str, Any] = {}
+    if "ChArUco" in placement.report["by"]:
+        for n in measured:
+            report.update(_check_table(sources[n], cameras[n], depth[n], placement.notes))
+    pairs = [(a, b) for a in measured for b in measured if a != b]
+    if not pairs:
+        return report
+    later = {n: sources[n].depth_image(frame_count // 2) for n in measured}
+    shared: dict[tuple[int, int], float] = {}
+    for a, b in pairs:
+        for image in (depth, later):
+            whole = shared_surface(cameras[a], image[a], cameras[b], image[b])
+            above = None
+            if placement.ground is not None:
+                height = placement.ground + _ABOVE
+                above = shared_surface(cameras[a], image[a], cameras[b], image[b], height)
+            if whole is None:
+                continue
+            shared[a, b] = min(whole, shared.get((a, b), 1.0))
+            least = min(
+                whole / _LEAST_SHARED, 1.0 if above is None else above / _LEAST_SHARED_ABOVE
+            )
+            if least < 1.0:
+                first, second = sources[a].view.name, sources[b].view.name
+                part = 100 * min(whole, 1.0 if above is None else above)
+                raise ImportFailedError(
+                    f"Views '{first}' and '{second}' contradict each other: only {part:.0f} % of "
+                    f"what '{first}' measures lies on what '{second}' measures. The pose or the "
+                    "intrinsics of one of them, or the depth scale, is wrong. Were cameras moved "
+                    "after the calibration, or two intrinsics exchanged?"
+                )
+            report[f"{sources[a].view.name} on {sources[b].view.name}"] = round(shared[a, b], 3)
+    if not shared:
+        names = ", ".join(sources[n].view.name for n in measured)
+        raise ImportFailedError(
+            f"No two of the views {names} measure a common surface. Their poses or the depth scale "
+            "are wrong, or they look at different things: check the calibration and --depth-scale."
+        )
+    return report
+
+
+def _check_table(
+    source: _Source, camera: PinholeCamera, depth: Float[ndarray, "row column"], notes: list[str]
+) -> dict[str, float]:
+    """Compare the table's distance by depth with its distance by the board."""
+    name = source.view.name
+    ratio, share = table_distance_ratio(camera, depth)
+    if share < _RATIO_SHARE:
+        return {}
+    if not _WRONG_SCALE[0] <= ratio <= _WRONG_SCALE[1]:
+        fail(
+            source.view.folder if source.view.depth is None else source.view.depth.path,
+            f"puts the table {ratio:.3g} times as far from the camera as the board says. The depth "
+            f"scale is not {source.scale:g}; give --depth-scale {source.scale / ratio:.3g}",
+        )
+    if not _RATIO[0] <= ratio <= _RATIO[1]:
+        notes.append(
+            f"View '{name}': by depth, most of what is seen is {ratio:.3g} times as far as the "
+            "board's plane. Unless that is a large object, the board lay higher than the table, or "
+            "its squares have another size."
+        )
+    return {f"table in {name}": round(ratio, 4)}
+
+
+def _write(
+    writer: SequenceWriter, sources: list[_Source], paired: PairedFrames, progress: Progress
+) -> list[str]:
+    """Write all images, frame by frame."""
+    total = len(sources) * paired.count
+    done = 0
+    for frame in range(paired.count):
+        for source in sources:
+            progress.check_cancelled()
+            if source.view.color is not None:
+                _write_color(writer, source, frame)
+            if source.view.depth is not None:
+                _write_depth(writer, source, frame)
+            done += 1
+            progress.report(_STAGE, done, total, None, source.view.name)
+    notes: list[str] = []
+    for source in sources:
+        if source.holes:
+            shown = ", ".join(map(str, source.holes[:5]))
+            more = f" and {len(source.holes) - 5} more" if len(source.holes) > 5 else ""
+            notes.append(
+                f"View '{source.view.name}': depth of frame {shown}{more} holds no distance."
+            )
+    return notes
+
+
+def _write_color(writer: SequenceWriter, source: _Source, frame: int) -> None:
+    stream = source.view.color
+    assert stream is not None  # noqa: S101 - asked by the caller
+    assert source.color is not None  # noqa: S101
+    image = source.color_image(frame)
+    place = f"views/{source.view.name}/color/{frame:05d}"
+    path = stream.files[int(source.color[frame])] if stream.files else None
+    is_png = path is not None and path.suffix.lower() == ".png"
+    if path is not None and not source.rectifier.is_changed:
+        writer.copy(place + (".png" if is_png else ".jpg"), path)
+    else:
+        # What was lossy before stays as small as it was.
+        writer.save_image(
+            place + (".png" if is_png else ".jpg"),
+            np.ascontiguousarray(image[..., ::-1]),
+            compression=_PNG_EFFORT if is_png else None,
+        )
+
+
+def _write_depth(writer: SequenceWriter, source: _Source, frame: int) -> None:
+    depth = source.depth_image(frame)
+    if not depth.any():
+        source.holes.append(frame)
+    writer.save_image(
+        f"views/{source.view.name}/depth/{frame:05d}.png",
+        np.round(depth * 1000).astype(np.uint16),
+        compression=_PNG_EFFORT,
+    )

@@ -1,0 +1,423 @@
+"""One stream of a raw recording: numbered images or a video, and when each image was taken."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from decimal import Decimal
+from pathlib import Path
+from typing import Any, Literal, NoReturn, cast
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from physhandi.data.files import read_array
+from physhandi.data.image_header import MOST_PIXELS, announced_size
+from physhandi.data.importers.phystwin_files import fail
+from physhandi.data.importers.recorded_camera import read_table
+from physhandi.errors import ImportFailedError
+
+StreamKind = Literal["color", "depth"]
+COLOR_SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
+"""Endings of color images."""
+DEPTH_SUFFIXES = frozenset({".png", ".npy", ".exr"})
+"""Endings of depth images."""
+VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mkv", ".mov", ".m4v"})
+"""Endings of color videos."""
+_WORDS: dict[StreamKind, str] = {
+    "color": "color|colour|rgb|image|images|img",
+    "depth": "depth|depths|depth_image|depth_images|depth_raw|aligned_depth|depth_aligned",
+}
+_NUMBER = re.compile(r"\d+(?:\.\d+)?")
+_READING = re.compile(r"\d+(?:\.\d*)?(?:[eE][+-]?\d{1,2})?")
+_UNITS = (1.0, 1e-3, 1e-6, 1e-9)
+_SHORTEST_STEP, _LONGEST_STEP = 2e-3, 2.0
+_LARGEST_TABLE = 64_000_000
+
+
+@dataclass(eq=False, kw_only=True)
+class RecordedStream:
+    """Images of one kind that one camera took, in their order."""
+
+    kind: StreamKind
+    """What the images show."""
+    path: Path
+    """Folder of the images, or the video."""
+    files: tuple[Path, ...] = ()
+    """The images; none if it is a video."""
+    width: int
+    """Width of every image [px]."""
+    height: int
+    """Height of every image [px]."""
+    count: int
+    """Number of images; of a video, as many as its header announces."""
+    number: tuple[int, ...] | None = None
+    """Frame numbers in the names of the images; None if the names do not tell."""
+    time: Float[ndarray, " image"] | None = None
+    """When each image was taken [s]; None if that is not known."""
+    time_source: str = ""
+    """What `time` was read from, for messages."""
+    frame_rate: float | None = None
+    """Frames per second that a video states [Hz]."""
+    _video: Any = field(default=None, repr=False)
+    _next: int = 0
+
+    def name(self, index: int) -> str:
+        """Name an image for messages."""
+        return str(self.files[index]) if self.files else f"{self.path}, frame {index}"
+
+    def read(self, index: int) -> ndarray:
+        """Decode an image: BGR color, or raw depth values. A video is best read forwards.
+
+        Raises:
+            ImportFailedError: If that is not possible, or it has another size than the first one.
+        """
+        image = self._frame(index) if not self.files else self._image(self.files[index])
+        if (image.shape[1], image.shape[0]) != (self.width, self.height):
+            self._refuse(
+                index,
+                f"is {image.shape[1]}x{image.shape[0]} px, but the images before it are "
+                f"{self.width}x{self.height}. All images of a stream need one size",
+            )
+        if self.kind == "depth":
+            self._check_depth(index, image)
+            image = image.reshape(image.shape[:2])
+        return image
+
+    def close(self) -> None:
+        """Release the video decoder."""
+        if self._video is not None:
+            self._video.release()
+            self._video = None
+
+    def _image(self, path: Path) -> ndarray:
+        size = image_size(path)
+        if size != (self.width, self.height):
+            fail(
+                path,
+                f"is {size[0]}x{size[1]} px, but {self.files[0].name} is "
+                f"{self.width}x{self.height}. All images of a stream need one size",
+            )
+        if path.suffix.lower() == ".npy":
+            return read_array(path)
+        flags = cv2.IMREAD_COLOR if self.kind == "color" else cv2.IMREAD_UNCHANGED
+        try:
+            image = cast("ndarray | None", cv2.imread(str(path), flags))
+        except cv2.error:
+            image = None
+        if image is None and path.suffix.lower() == ".exr":
+            fail(
+                path,
+                "cannot be decoded: this build of OpenCV reads no OpenEXR. Convert depth to 16-bit "
+                "PNG or .npy",
+            )
+        if image is None:
+            fail(path, "cannot be decoded; it is damaged or was cut off. Record or export it again")
+        return image
+
+    def _frame(self, index: int) -> ndarray:
+        if self._video is None or index < self._next:
+            self.close()
+            self._video, self._next = cv2.VideoCapture(str(self.path)), 0
+        while self._next < index and self._video.grab():
+            self._next += 1
+        is_read, image = self._video.read() if self._next == index else (False, None)
+        if not is_read or image is None:
+            self._refuse(
+                self._next,
+                f"cannot be decoded, though the video announces {self.count} frames: it was cut "
+                f"off. Export it again, or give --stop {self._next}",
+            )
+        self._next += 1
+        return image
+
+    def _check_depth(self, index: int, image: ndarray) -> None:
+        if image.ndim == 3 and image.shape[2] != 1:
+            self._refuse(
+                index,
+                f"has {image.shape[2]} channels, so it is a picture of depth and holds no "
+                "distances. Export raw 16-bit depth",
+            )
+        if image.dtype == np.uint8:
+            self._refuse(
+                index,
+                "has 8 bits a pixel, which is too coarse for distances. Export raw 16-bit depth",
+            )
+        if image.dtype.kind not in "uif":
+            self._refuse(index, f"holds {image.dtype}; expected numbers")
+
+    def _refuse(self, index: int, reason: str) -> NoReturn:
+        raise ImportFailedError(f"{self.name(index)}: {reason}.")
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Read the size that an image announces [px].
+
+    Raises:
+        ImportFailedError: If it is none, is empty, or announces a size that cannot be.
+    """
+    try:
+        return announced_size(path)
+    except (ValueError, OSError) as error:
+        fail(path, str(error))
+
+
+def find_stream(folder: Path, kind: StreamKind) -> RecordedStream | None:
+    """Find the images of a kind in a camera's folder: a subfolder, a video, or files side by side.
+
+    Raises:
+        ImportFailedError: If there are two candidates, or what is there cannot be read.
+    """
+    word = re.compile(f"(?:{_WORDS[kind]})", re.IGNORECASE)
+    found = [item for item in sorted(folder.iterdir()) if word.fullmatch(item.stem)]
+    folders = [item for item in found if item.is_dir()]
+    is_video = [item for item in found if item.is_file() and item.suffix.lower() in VIDEO_SUFFIXES]
+    if kind == "color" and not folders and not is_video:
+        is_video = [
+            item for item in sorted(folder.iterdir()) if item.suffix.lower() in VIDEO_SUFFIXES
+        ]
+    candidates = [*folders, *(is_video if kind == "color" else [])]
+    if len(candidates) > 1:
+        names = " and ".join(item.name for item in candidates)
+        fail(folder, f"has its {kind} twice, as {names}. Keep one of them")
+    if candidates and candidates[0].is_file():
+        return video_stream(candidates[0])
+    suffixes = COLOR_SUFFIXES if kind == "color" else DEPTH_SUFFIXES
+    if candidates:
+        files = _images(candidates[0], suffixes)
+        if not files:
+            fail(candidates[0], f"has no images ({', '.join(sorted(suffixes))})")
+        return image_stream(kind, candidates[0], files)
+    tag = re.compile(rf"(?:^|[._-])(?:{_WORDS[kind]})(?:$|[._-]|\d)", re.IGNORECASE)
+    files = [path for path in _images(folder, suffixes) if tag.search(path.stem)]
+    return image_stream(kind, folder, files) if files else None
+
+
+def _images(folder: Path, suffixes: frozenset[str]) -> list[Path]:
+    return [
+        path
+        for path in folder.iterdir()
+        if path.is_file()
+        and path.suffix.lower() in suffixes
+        and not path.name.startswith(".")
+        and not re.fullmatch(r"timestamps|.*_timestamps|timestamps_.*", path.stem.lower())
+    ]
+
+
+def natural_key(path: Path) -> tuple[tuple[int, int | str], ...]:
+    """Key by which ``frame_10`` comes after ``frame_9``."""
+    parts = re.split(r"(\d+)", path.stem.lower())
+    return tuple((0, int(part)) if part.isdecimal() else (1, part) for part in parts)
+
+
+def image_stream(kind: StreamKind, path: Path, files: list[Path]) -> RecordedStream:
+    """Order images naturally, and read frame numbers or times from their names.
+
+    Raises:
+        ImportFailedError: If two images have the same number, or the first one cannot be read.
+    """
+    files = sorted(files, key=natural_key)
+    width, height = image_size(files[0])
+    stream = RecordedStream(
+        kind=kind, path=path, files=tuple(files), width=width, height=height, count=len(files)
+    )
+    found = [_NUMBER.findall(file.stem) for file in files]
+    if not all(found):
+        return stream
+    texts = [numbers[-1] for numbers in found]
+    _refuse_twice(files, texts)
+    values = np.array([float(text) for text in texts])
+    if _are_times(texts, values):
+        order = np.argsort(values, kind="stable")
+        stream.files = tuple(files[int(index)] for index in order)
+        exact = [texts[int(index)] for index in order]
+        stream.time = _seconds(path, exact)
+        stream.time_source = f"the names of {path.name}/"
+    else:
+        stream.number = tuple(int(float(text)) for text in texts)
+    return stream
+
+
+def _refuse_twice(files: list[Path], texts: list[str]) -> None:
+    seen: dict[float, Path] = {}
+    for file, text in zip(files, texts, strict=True):
+        other = seen.setdefault(float(text), file)
+        if other is not file:
+            fail(file, f"has the same frame number as {other.name}. Keep one of them")
+
+
+def _are_times(texts: list[str], values: ndarray) -> bool:
+    """Tell whether numbers in names are times: fractions, clock times, or long uneven steps."""
+    if any("." in text for text in texts) or values.max() >= 1e8:
+        return True
+    step = np.diff(np.sort(values))
+    return len(step) > 2 and float(np.median(step)) >= 10 and np.ptp(step) > 0
+
+
+def _seconds(path: Path, texts: list[str]) -> Float[ndarray, " image"]:
+    """Turn clock readings into seconds; the median step tells their unit."""
+    # Nanoseconds since 1970 do not fit into a float: the first reading is taken off.
+    reading = [Decimal(text) for text in texts]
+    first = reading[0]
+    value = np.array([float(one - first) for one in reading])
+    unit = 1.0
+    if len(value) > 1:
+        step = float(np.median(np.abs(np.diff(value))))
+        units = [one for one in _UNITS if _SHORTEST_STEP <= step * one < _LONGEST_STEP]
+        if not units:
+            fail(
+                path,
+                f"holds times that are {step:g} apart, which are neither seconds, ms, µs nor ns "
+                "between the images of a video. Give seconds",
+            )
+        unit = units[0]
+    # Clocks of different streams are compared, so what was taken off comes back.
+    return float(first) * unit + value * unit
+
+
+def video_stream(path: Path) -> RecordedStream:
+    """Open a color video.
+
+    Raises:
+        ImportFailedError: If it cannot be decoded.
+    """
+    capture = cv2.VideoCapture(str(path))
+    try:
+        count, width, height = (
+            round(capture.get(number))
+            for number in (
+                cv2.CAP_PROP_FRAME_COUNT,
+                cv2.CAP_PROP_FRAME_WIDTH,
+                cv2.CAP_PROP_FRAME_HEIGHT,
+            )
+        )
+        rate = float(capture.get(cv2.CAP_PROP_FPS))
+    finally:
+        capture.release()
+    if count < 1 or min(width, height) < 1 or width * height > MOST_PIXELS:
+        fail(
+            path,
+            f"cannot be decoded as a video ({count} frames of {width}x{height} px); it is damaged "
+            "or was cut off. Export it again as H.264 in MP4",
+        )
+    return RecordedStream(
+        kind="color",
+        path=path,
+        width=width,
+        height=height,
+        count=count,
+        frame_rate=rate if 1.0 <= rate <= 1000.0 else None,
+    )
+
+
+def read_times(folder: Path, stream: RecordedStream) -> None:
+    """Give a stream the times that a file beside its images states, if there is one.
+
+    Raises:
+        ImportFailedError: If it is broken, has more or fewer lines than there are images, or its
+            times do not grow; names file and line.
+    """
+    path = _time_file(folder, stream)
+    if path is None:
+        return
+    texts, names = _time_table(path)
+    if names and stream.files:
+        texts = _by_name(path, stream, dict(zip(names, texts, strict=True)))
+    if len(texts) != stream.count:
+        fail(
+            path,
+            f"has {len(texts)} times, but {stream.path.name} has {stream.count} images. There must "
+            "be one for each; remove the file to pair images by number",
+        )
+    stream.time = _seconds(path, texts)
+    stream.time_source = path.name
+    back = np.flatnonzero(np.diff(stream.time) <= 0)
+    if len(back):
+        at = int(back[0]) + 1
+        fail(
+            path,
+            f"goes backwards: entry {at} ({texts[at]}) is not later than entry {at - 1} "
+            f"({texts[at - 1]}). Sort the images by time, or cut the recording there",
+        )
+
+
+def _time_file(folder: Path, stream: RecordedStream) -> Path | None:
+    kind, own = stream.kind, stream.path.stem
+    stems = [f"{kind}_timestamps", f"timestamps_{kind}", f"{own}_timestamps", f"timestamps_{own}"]
+    if kind == "color":
+        stems += ["rgb_timestamps", "timestamps_rgb"]
+    inside = [stream.path / "timestamps"] if stream.path.is_dir() else []
+    places = [folder / stem for stem in stems]
+    if stream.path != folder:
+        places.append(folder / own)  # The lists of the TUM data set: depth.txt beside depth/.
+    places.append(folder / "timestamps")
+    for place in [*inside, *places]:
+        for suffix in (".txt", ".csv", ".json", ".npy"):
+            path = place.with_name(place.name + suffix)
+            if path.is_file():
+                return path
+    return None
+
+
+def _time_table(path: Path) -> tuple[list[str], list[str]]:
+    """Read times as text, and the file names that stand beside them, if any do."""
+    if path.stat().st_size > _LARGEST_TABLE:
+        fail(path, f"is larger than {_LARGEST_TABLE} bytes")
+    if path.suffix == ".npy":
+        return _time_array(path), []
+    if path.suffix == ".json":
+        return _time_json(path)
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, ValueError) as error:
+        fail(path, f"is no text: {error}")
+    rows: list[list[str]] = []
+    names: list[str] = []
+    for number, line in enumerate(lines, 1):
+        fields = [part for part in re.split(r"[\s,;]+", line.partition("#")[0].strip()) if part]
+        readings = [part for part in fields if _READING.fullmatch(part)]
+        if fields and not readings and rows:
+            fail(path, f"line {number} holds no time: {line[:60]!r}")
+        if readings:  # Or it is the heading of a table.
+            rows.append(readings)
+            names.extend(part for part in fields if not _READING.fullmatch(part))
+    columns = list(zip(*rows, strict=False))
+    counted = [tuple(map(str, range(start, start + len(rows)))) for start in (0, 1)]
+    clocks = [list(column) for column in columns if len(columns) == 1 or column not in counted]
+    return clocks[-1] if clocks else [], names if len(names) == len(rows) else []
+
+
+def _time_array(path: Path) -> list[str]:
+    try:
+        value = read_array(path).ravel()
+    except (ValueError, OSError) as error:
+        fail(path, f"is not a readable .npy file: {error}")
+    if value.dtype.kind not in "uif" or not np.isfinite(value).all() or (value < 0).any():
+        fail(path, "holds something else than finite times from 0 on")
+    return [str(item) if value.dtype.kind != "f" else f"{item:.9f}" for item in value.tolist()]
+
+
+def _time_json(path: Path) -> tuple[list[str], list[str]]:
+    table = read_table(path)
+    if isinstance(table, list):
+        return [_time_text(path, value) for value in cast("list[Any]", table)], []
+    if not isinstance(table, dict):
+        fail(path, "holds no times; expected a list, or a time for each image's name")
+    fields = cast("dict[Any, Any]", table)
+    return [_time_text(path, value) for value in fields.values()], [str(name) for name in fields]
+
+
+def _time_text(path: Path, value: Any) -> str:
+    if type(value) not in (int, float) or not np.isfinite(value) or value < 0:
+        fail(path, f"holds {value!r}; expected finite times from 0 on")
+    return str(value) if type(value) is int else f"{value:.9f}"
+
+
+def _by_name(path: Path, stream: RecordedStream, table: Mapping[str, str]) -> list[str]:
+    """Order times as the images that they name."""
+    known = {Path(name).stem: text for name, text in table.items()}
+    for file in stream.files:
+        if file.stem not in known:
+            fail(path, f"has no time for {file.name}. Add it, or remove the image")
+    return [known[file.stem] for file in stream.files]
