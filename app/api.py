@@ -50,6 +50,8 @@ class NewRun(BaseModel):
     """New values of settings by their paths; `GET /api/v1/settings` lists them."""
     parent: ItemId | None = None
     """The run that it was made from."""
+    accepts_missing: bool = False
+    """Whether the object may be left out although depth was recorded; else that is refused."""
 
 
 class Draft(BaseModel):
@@ -187,7 +189,7 @@ def _add_jobs(router: APIRouter, catalog: Catalog, scheduler: Scheduler) -> None
 
     @router.post("/runs/check")
     def check(draft: Draft) -> dict[str, Any]:
-        """Tell what differs from the profile and how long the fit would take."""
+        """Tell which stages would run, what differs from the profile and how long it takes."""
         return check_order(
             catalog, scheduler.forecast, draft.sequences, draft.profile, draft.overrides
         )
@@ -195,7 +197,12 @@ def _add_jobs(router: APIRouter, catalog: Catalog, scheduler: Scheduler) -> None
     @router.post("/runs", status_code=201)
     def launch(new: NewRun) -> dict[str, Any]:
         run = scheduler.launch(
-            new.sequences, new.profile, new.name, overrides=new.overrides, parent=new.parent
+            new.sequences,
+            new.profile,
+            new.name,
+            overrides=new.overrides,
+            parent=new.parent,
+            accepts_missing=new.accepts_missing,
         )
         return describe_run(catalog.run_item(run.id), scheduler)
 

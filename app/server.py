@@ -22,6 +22,7 @@ from app.exports.cache import FileCache, TooManyFilesError
 from app.exports.routes import create_exports
 from app.jobs.catalog import Catalog, NotFoundError
 from app.jobs.machine import Machine
+from app.jobs.order import SkippedObjectError
 from app.jobs.overview import Overview
 from app.jobs.scheduler import QueueFullError, Scheduler
 from app.jobs.views import describe_run
@@ -59,6 +60,7 @@ _STATUS: tuple[tuple[type[PhysHandiError], int, str], ...] = (
     (TooManyFilesError, 429, "too_many_files"),
     (UsageError, 422, "invalid"),
     (SequenceError, 422, "unusable_sequence"),
+    (SkippedObjectError, 422, "skips_object"),
     (MissingInputError, 422, "missing_input"),
     (SimulationError, 422, "invalid"),
 )

@@ -69,6 +69,39 @@ function showForm(button) {
   if (!dialog) return;
   if (button?.dataset.sequence) dialog.querySelector("[name=sequence]").value = button.dataset.sequence;
   dialog.showModal();
+  askReadiness(dialog);
+}
+
+/** Ask which stages a fit of the chosen sequence would run. */
+async function askReadiness(dialog) {
+  const sequence = dialog.querySelector("[name=sequence]")?.value;
+  if (!sequence) return;
+  const place = dialog.querySelector("[data-readiness]");
+  place.hidden = true;
+  const answer = await send("POST", "/api/v1/runs/check", { sequences: [sequence] }).catch(() => null);
+  if (dialog.querySelector("[name=sequence]").value === sequence) showReadiness(place, answer, [sequence]);
+}
+
+/** Say which stages will run and which will be skipped and why, and ask before the object is left out. */
+function showReadiness(place, answer, sequences) {
+  const stages = Object.entries(answer?.stages ?? {});
+  place.hidden = !stages.length;
+  const skipped = stages.filter(([, stage]) => !stage.ready);
+  const summary = place.querySelector("[data-summary]");
+  const link = (id) => Object.assign(document.createElement("a"), { href: `/sequences/${id}/check`, textContent: sequences.length > 1 ? `check ${id}` : "check the recording" });
+  summary.className = answer?.nothing_to_fit ? "problem" : answer?.skips_object ? "doubt" : "dim";
+  summary.textContent = answer?.nothing_to_fit ?? answer?.skips_object ?? (skipped.length ? "These stages have nothing to do; the others will run:" : "All stages will run.");
+  for (const id of sequences) summary.append(" ", link(id));
+  place.querySelector("[data-lights]").replaceChildren(...(answer?.nothing_to_fit ? [] : skipped).map(([name, stage]) => {
+    const item = Object.assign(document.createElement("li"), { className: stage.state.replace(" ", "-") });
+    item.append(Object.assign(document.createElement("strong"), { textContent: name.replaceAll("_", " ") }), ` ${stage.why}`);
+    return item;
+  }));
+  const accept = place.querySelector("[data-accept]");
+  accept.hidden = !answer?.skips_object;
+  const box = accept.querySelector("input");
+  box.required = !accept.hidden;
+  if (accept.hidden) box.checked = false;
 }
 
 async function launch(form) {
@@ -77,6 +110,7 @@ async function launch(form) {
     sequences: [fields.get("sequence")],
     profile: fields.get("profile"),
     name: fields.get("name"),
+    accepts_missing: fields.has("accepts_missing"),
   });
   form.closest("dialog").close();
   form.reset();
@@ -98,6 +132,10 @@ document.addEventListener("click", (event) => {
   else if ("new" in data) showForm(button);
   else if ("help" in data) document.getElementById("help").showModal();
   else if ("close" in data) button.closest("dialog").close();
+});
+
+document.addEventListener("change", (event) => {
+  if (event.target.matches("#launch [name=sequence]")) askReadiness(event.target.closest("dialog"));
 });
 
 document.addEventListener("submit", (event) => {

@@ -141,6 +141,7 @@ async function check() {
   if (number !== asked) return;
   const { problems, expected, message } = answer;
   complain(problems, message);
+  showReadiness(order.querySelector("[data-readiness]"), answer, wanted.sequences);
   const place = order.querySelector("[data-expected]");
   place.textContent = !wanted.sequences.length ? "Choose at least one sequence." : expected ? `Takes ${about(expected.seconds)}, estimated ${expected.basis}.` : "";
 }
@@ -152,10 +153,11 @@ function onChange() {
 }
 
 async function submit() {
+  const accept = order.querySelector("[name=accepts_missing]");
   const response = await fetch("/api/v1/runs", {
     method: "POST",
     headers: { "Content-Type": "application/json" },
-    body: JSON.stringify({ ...draft(), name: order.querySelector("[name=name]").value, parent: order.dataset.parent ?? null }),
+    body: JSON.stringify({ ...draft(), name: order.querySelector("[name=name]").value, parent: order.dataset.parent ?? null, accepts_missing: accept.checked }),
   }).catch(() => {
     throw new Error("The server does not answer. Is it still running?");
   });
@@ -183,7 +185,7 @@ function find(words) {
 order.addEventListener("input", ({ target }) => {
   if ("on" in target.dataset && target.checked) suggest(target.closest("[data-setting]"));
   if ("find" in target.dataset) find(target.value);
-  else onChange();
+  else if (target.name !== "accepts_missing") onChange();
 });
 order.addEventListener("change", (event) => {
   if (!("profileChoice" in event.target.dataset)) return;

@@ -1,5 +1,6 @@
 """Commands that fill, measure and export runs."""
 
+import sys
 from collections.abc import Mapping
 from dataclasses import make_dataclass
 from pathlib import Path
@@ -26,6 +27,7 @@ from physhandi.fitting.config import (
     load_profile,
     parse_override,
 )
+from physhandi.fitting.readiness import skipped_object
 from physhandi.progress import watched
 from physhandi.run import Run
 from physhandi.simulation.parameters import PARAMETERS, SimulationParameters, changed_parameters
@@ -97,6 +99,9 @@ def reconstruct(
     recordings = [find_sequence(name, data_dir) for name in sequences]
     for recording in recordings:
         recording.validate(reads_color=False)  # Tells wrong data before a run is made.
+    told = skipped_object(recordings)
+    if told is not None:
+        print(f"physhandi: warning: {told}", file=sys.stderr)
     base = load_profile(profile)
     stored = fit_settings(base, dict(parse_override(text) for text in settings))
     device = pick_device(device)

@@ -1,6 +1,6 @@
 """What a fit is asked to do: a profile, what differs from it, and the run it is made from."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import lru_cache
 from typing import Any
@@ -8,8 +8,10 @@ from typing import Any
 from app.jobs.catalog import Catalog, RunItem, UnknownRunError
 from app.jobs.eta import Forecast
 from physhandi.data.files import named_fields
-from physhandi.errors import SettingsError, UsageError
+from physhandi.data.sequence import Sequence as Recording
+from physhandi.errors import MissingInputError, SettingsError, UsageError
 from physhandi.fitting.config import (
+    EVALUATION,
     GROUPS,
     PipelineConfig,
     Setting,
@@ -20,6 +22,7 @@ from physhandi.fitting.config import (
     profile_names,
     values_of,
 )
+from physhandi.fitting.readiness import nothing_to_fit, readiness, skipped_object
 from physhandi.run import Run
 
 
@@ -192,6 +195,47 @@ def describe_settings(catalog: Catalog, profile: str | None, run_id: str | None)
     }
 
 
+class SkippedObjectError(MissingInputError):
+    """A fit would leave out an object of which depth was recorded, and nobody agreed to that."""
+
+
+def require_agreement(sequences: Sequence[Recording], *, accepts_missing: bool) -> None:
+    """Refuse a fit of nothing, and one of less than was recorded unless the user accepts that.
+
+    Args:
+        sequences: What is to be fitted.
+        accepts_missing: Whether the object may be left out although depth was recorded.
+
+    Raises:
+        MissingInputError: If there is nothing to fit.
+        SkippedObjectError: If the object would be left out.
+    """
+    if not readiness(sequences)[EVALUATION].is_ready:
+        raise MissingInputError(nothing_to_fit(sequences))
+    told = skipped_object(sequences)
+    if told is not None and not accepts_missing:
+        raise SkippedObjectError(f"{told} To fit the hands alone, accept that (accepts_missing).")
+
+
+def describe_readiness(
+    sequences: Sequence[Recording], config: PipelineConfig | None = None
+) -> dict[str, Any]:
+    """Tell which stages of a fit would run.
+
+    Returns:
+        ``stages`` (``ready missing state why remedy`` of each by its name), and the texts
+        ``nothing_to_fit`` and ``skips_object``, none if that is not so.
+    """
+    if not sequences:
+        return {"stages": {}, "nothing_to_fit": None, "skips_object": None}
+    found = readiness(sequences, config)
+    return {
+        "stages": {name: stage.to_dict() for name, stage in found.items()},
+        "nothing_to_fit": None if found[EVALUATION].is_ready else nothing_to_fit(sequences),
+        "skips_object": skipped_object(sequences),
+    }
+
+
 def check_order(
     catalog: Catalog,
     forecast: Forecast,
@@ -203,7 +247,8 @@ def check_order(
 
     Returns:
         ``problems`` (``field message`` of each setting that is wrong), ``overrides`` that differ
-        from the profile, and ``expected``: ``seconds basis``, none if no earlier fit is known.
+        from the profile, ``expected`` (``seconds basis``, none if no earlier fit is known), and
+        what `describe_readiness` tells.
 
     Raises:
         UsageError: If there is no such profile.
@@ -211,10 +256,14 @@ def check_order(
     """
     base = named_profile(profile)
     sequences = [catalog.sequence(sequence_id) for sequence_id in sequence_ids]
+    found: dict[str, Any] = {"problems": [], "overrides": {}, "expected": None}
     try:
         config = apply_overrides(base, overrides)
     except SettingsError as error:
-        problems = [{"field": path, "message": problem} for path, problem in error.fields.items()]
-        return {"problems": problems, "overrides": {}, "expected": None}
-    expected = forecast.of_order(config.to_dict(), sequences)
-    return {"problems": [], "overrides": overrides_of(config, base), "expected": expected}
+        found["problems"] = [
+            {"field": path, "message": problem} for path, problem in error.fields.items()
+        ]
+        return found | describe_readiness(sequences)
+    found["overrides"] = overrides_of(config, base)
+    found["expected"] = forecast.of_order(config.to_dict(), sequences)
+    return found | describe_readiness(sequences, config)

@@ -14,7 +14,7 @@ from typing import Any
 
 from app.jobs.catalog import Catalog, RunItem
 from app.jobs.eta import Forecast
-from app.jobs.order import default_name, fit_config
+from app.jobs.order import default_name, fit_config, require_agreement
 from app.jobs.processes import (
     WORKER,
     end_processes,
@@ -146,6 +146,7 @@ class Scheduler:
         *,
         overrides: Mapping[str, Any] | None = None,
         parent: str | None = None,
+        accepts_missing: bool = False,
     ) -> Run:
         """Make a run of one or several sequences and queue it.
 
@@ -155,12 +156,14 @@ class Scheduler:
             name: What the user calls it; empty for a name of the program's.
             overrides: Settings that differ from the profile, by their paths.
             parent: Id of the run that it was made from.
+            accepts_missing: Whether the object may be left out although depth was recorded.
 
         Raises:
             UsageError: If there is no sequence or no such profile.
             SettingsError: If settings are unknown or wrong.
             UnknownRunError: If there is no such parent.
             SequenceError: If a sequence is unknown or damaged.
+            MissingInputError: If there is nothing to fit, or the object would be left out.
             QueueFullError: If too many runs wait already.
         """
         if not sequence_ids:
@@ -169,6 +172,7 @@ class Scheduler:
             self._catalog.run_item(parent)
         config = fit_config(profile, overrides, parent)
         sequences = [self._catalog.sequence(sequence_id) for sequence_id in sequence_ids]
+        require_agreement(sequences, accepts_missing=accepts_missing)
         with self._lock:
             if len(self._queue(self._catalog.runs())) >= self._settings.waiting_fits:
                 raise QueueFullError(
