@@ -141,13 +141,7 @@ def optimise_springs(
             best, best_parameters, best_loss = now, now_parameters, loss
         curve.append([float(iteration + 1), loss])
         progress.report(SPRING_STAGE, iteration + 1, settings.iterations, loss, message)
-    if settings.judges_online:
-        best_loss = _finite(
-            mean_loss(problems, best, best_parameters, config, device),
-            "The springs that did best while they were fitted diverge when simulated from start "
-            "to end; raise substeps_per_frame or switch judges_online off in the profile.",
-        )
-    return FirstOrderResult(
+    result = FirstOrderResult(
         models=best,
         parameters=best_parameters,
         loss_before=loss_before,
@@ -155,6 +149,27 @@ def optimise_springs(
         curve=curve,
         stopped=stopped,
     )
+    return _settled(problems, result, config, device)
+
+
+def _settled(
+    problems: Many[ObjectProblem], result: FirstOrderResult, config: ObjectFitConfig, device: str
+) -> FirstOrderResult:
+    """Give the chosen springs the substeps that they need, and judge them if they are not yet.
+
+    Springs that stiffened beyond the margin may hold for the fitted frames and no longer.
+    """
+    needed = settle_substeps(list(result.models.values()), result.parameters, config)
+    needs_more = needed.substeps_per_frame > result.parameters.substeps_per_frame
+    if not needs_more and not config.first_order.judges_online:
+        return result
+    parameters = needed if needs_more else result.parameters
+    loss = _finite(
+        mean_loss(problems, result.models, parameters, config, device),
+        "The springs that did best while they were fitted diverge when simulated from start to "
+        "end; raise substeps_per_frame or switch judges_online off in the profile.",
+    )
+    return replace(result, parameters=parameters, loss_after=loss)
 
 
 def _starting_models(

@@ -41,7 +41,7 @@ AXIS = np.arange(4) * 0.1
 NODE = np.stack([*np.meshgrid(AXIS, AXIS, indexing="ij"), np.zeros((4, 4))], axis=-1).reshape(-1, 3)
 
 
-def held_sheet(name: str, lift: float) -> ObjectProblem:
+def held_sheet(name: str, lift: float, scale: float = 1.0) -> ObjectProblem:
     """A sheet held at two corners that rise; one half is three times as stiff as the other."""
     corner = NODE[[0, 3]] + [0.0, 0.0, 0.01]
     rise = np.linspace(0, 1, FRAMES)[:, None, None] * np.array([0.0, 0.0, lift])
@@ -50,7 +50,8 @@ def held_sheet(name: str, lift: float) -> ObjectProblem:
     middle = NODE[np.minimum(model.spring_nodes, len(NODE) - 1)].mean(axis=1)
     stiffness = np.where(middle[:, 0] < 0.15, 600.0, 200.0).astype(np.float32)
     stiffness[model.object_spring_count :] = 3000.0
-    truth = Simulator(replace(model, stiffness=stiffness), PARAMETERS)
+    finely = PARAMETERS.replace(substeps_per_frame=round(40 * scale**0.5))
+    truth = Simulator(replace(model, stiffness=scale * stiffness), finely)
     position = truth.rollout(control).position
     visible = np.ones(position.shape[:2], bool)
     valid = visible.copy()
@@ -98,7 +99,7 @@ def test_springs_of_two_halves_are_told_apart() -> None:
 
 
 def test_springs_are_judged_by_what_the_next_pass_simulates(
-    device: str, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     problem, settings = held_sheet("slow", 0.2), config(iterations=5)
     simulated, plain = [], differentiable.rollout
@@ -108,7 +109,7 @@ def test_springs_are_judged_by_what_the_next_pass_simulates(
         return plain(*given, **named)
 
     monkeypatch.setattr(differentiable, "rollout", counted)
-    result = optimise_springs([problem], PARAMETERS, settings, NullProgress(), device=device)
+    result = optimise_springs([problem], PARAMETERS, settings, NullProgress())
     assert len(simulated) == 5
     losses = [loss for _, loss in result.curve]
     assert losses == sorted(losses, reverse=True)
@@ -116,9 +117,23 @@ def test_springs_are_judged_by_what_the_next_pass_simulates(
     # The last springs are simulated once more; stopped one pass earlier, their loss is the same.
     for count in (2, 4):
         fewer = config(iterations=count)
-        short = optimise_springs([problem], PARAMETERS, fewer, NullProgress(), device=device)
+        short = optimise_springs([problem], PARAMETERS, fewer, NullProgress())
         assert short.loss_after == pytest.approx(losses[count], rel=1e-5)
         assert short.loss_after != pytest.approx(losses[count - 1], rel=1e-3)
+
+
+def test_springs_that_stiffen_get_the_substeps_that_they_need() -> None:
+    problem = held_sheet("stiff", 0.2, scale=1000.0)
+    soft = PARAMETERS.replace(stiffness=1e4, virtual_stiffness=1e5)
+    automatic = config(iterations=8, learning_rate=0.5).replace(automatic_substeps=True)
+    result = optimise_springs([problem], soft, automatic, NullProgress())
+    first = settle_substeps([build_problem_model(problem, soft)], soft, automatic, safety=1.25**2)
+    needed = settle_substeps(list(result.models.values()), soft, automatic)
+    assert needed.substeps_per_frame > first.substeps_per_frame
+    assert result.parameters.substeps_per_frame == needed.substeps_per_frame
+    problems = [problem]
+    stored = mean_loss(problems, result.models, result.parameters, automatic, "cpu")
+    assert stored == result.loss_after < result.loss_before
 
 
 def test_a_start_that_needs_many_substeps_is_searched_all_the_same() -> None:
