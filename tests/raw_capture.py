@@ -10,6 +10,7 @@ from numpy import ndarray
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.importers.board_calibration import CharucoTarget
+from physhandi.synthetic.raw_capture import photograph_board
 
 WIDTH, HEIGHT, FOCAL = 96, 72, 90.0
 FRAMES = 6
@@ -83,37 +84,10 @@ def intrinsics(camera: PinholeCamera) -> dict[str, float]:
 
 def board_picture(camera: PinholeCamera, lies: ndarray | None = None) -> ndarray:
     """A photograph of the board (BGR); `lies` maps the board's coordinates to the world."""
-    board = BOARD.board("5X5")
-    print_scale = 2500  # px a metre
-    size = (
-        round(BOARD.columns * BOARD.square * print_scale),
-        round(BOARD.rows * BOARD.square * print_scale),
-    )
-    sheet = cv2.cvtColor(board.generateImage(size, marginSize=0), cv2.COLOR_GRAY2BGR)
     if lies is None:  # OpenCV's board has z into the table.
         lies = np.diag([1.0, -1.0, -1.0, 1.0])
         lies[:3, 3] = [-0.14, 0.10, 0.0]
-    from_board = camera.T_camera_world @ lies
-    # A pixel's centre has whole coordinates, and the print begins half a pixel before the first.
-    to_board = np.array(
-        [
-            [1 / print_scale, 0, 0.5 / print_scale],
-            [0, 1 / print_scale, 0.5 / print_scale],
-            [0, 0, 1],
-        ]
-    )
-    homography = camera.K @ from_board[:3][:, [0, 1, 3]] @ to_board
-    back = np.full((camera.height, camera.width, 3), 150, np.uint8)
-    # Four times as fine and then thinned, or edges would be jagged.
-    fine = np.array([[4.0, 0, 1.5], [0, 4.0, 1.5], [0, 0, 1]])
-    large = cv2.warpPerspective(
-        sheet,
-        fine @ homography,
-        (4 * camera.width, 4 * camera.height),
-        dst=cv2.resize(back, None, fx=4, fy=4),
-        borderMode=cv2.BORDER_TRANSPARENT,
-    )
-    return cv2.resize(large, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    return photograph_board(camera, BOARD, lies, family="5X5")
 
 
 @dataclass

@@ -296,9 +296,10 @@ def import_phystwin(
 
 
 def import_capture(
-    source: Positional[Path],
+    source: Positional[Path | None] = None,
     *,
-    out: Path,
+    out: Path | None = None,
+    example: Path | None = None,
     depth_scale: float | None = None,
     intrinsics: Path | None = None,
     charuco: str | None = None,
@@ -315,6 +316,8 @@ def import_capture(
         source: Folder with a folder for each camera (color/, depth/, intrinsics.json), such a
             folder itself, or what PhysTwin's recorder writes.
         out: Sequence folder to write.
+        example: Write a small raw capture into this folder, to try the import on; nothing else is
+            given then.
         depth_scale: Metres per unit of depth, such as 0.001; above 1, units per metre.
         intrinsics: File with the intrinsics of all cameras, instead of those in the folder.
         charuco: Board in the pictures of calibration/CAMERA/, or in the first frames: squares
@@ -326,6 +329,13 @@ def import_capture(
         hands: Hands that the recording shows: right, left or both.
         overwrite: Replace a sequence that is there.
     """
+    if example is not None:
+        if source is not None or out is not None:
+            raise UsageError("--example makes a capture and imports none; give it alone.")
+        _write_example(example)
+        return
+    if source is None or out is None:
+        raise UsageError("Give the folder of a recording and --out, or --example DIR alone.")
     from physhandi.data.importers.board_calibration import CharucoTarget
     from physhandi.data.importers.capture import CaptureOptions
     from physhandi.data.importers.capture import import_capture as convert
@@ -351,6 +361,14 @@ def import_capture(
             **{name: sequence.provenance[name] for name in told if sequence.provenance[name]},
         }
     )
+
+
+def _write_example(folder: Path) -> None:
+    from physhandi.synthetic.raw_capture import write_example_capture
+
+    with watched(True) as progress:
+        written = write_example_capture(folder, progress)
+    show({"capture": str(written), "next": f"see {written / 'README.txt'}"})
 
 
 def import_mano(sources: Positional[tuple[Path, ...]], *, out: Path | None = None) -> None:

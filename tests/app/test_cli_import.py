@@ -117,3 +117,10 @@ def test_a_raw_recording_needs_a_board_that_makes_sense(tmp_path, capsys):
     assert code == 2
     assert "in metres" in error
     assert not (tmp_path / "x").exists()
+
+
+def test_a_capture_is_imported_or_made_but_not_both(tmp_path, capsys):
+    code, _, error = call(capsys, "import", "capture", tmp_path, "--example", tmp_path / "x")
+    assert (code, "give it alone" in error) == (2, True)
+    code, _, error = call(capsys, "import", "capture", tmp_path)
+    assert (code, "--out" in error) == (2, True)

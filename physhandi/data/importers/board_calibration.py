@@ -21,6 +21,12 @@ _LEAST_CORNERS = 6
 _SMALL = 640
 """Narrower pictures are enlarged before markers are looked for [px]."""
 _MOST_ERROR = 2.0
+_CORNER_ERROR = 0.15
+"""Standard deviation of a corner [px]."""
+_DEPTH_ERROR = 0.006
+"""Standard deviation of depth of the table, with what is wrong in it for good [m]."""
+_THICKNESS = 0.005
+"""How much the board may stand out from the table, standard deviation [m]."""
 _MARKER = 0.75
 """Side of a marker in squares; corners of squares do not depend on it."""
 
@@ -122,10 +128,12 @@ def calibrate_by_board(
     intrinsics: Sequence[Float[ndarray, "3 3"]],
     sizes: Sequence[tuple[int, int]],
     sightings: Sequence[Sequence[BoardSighting | None]],
+    tables: Sequence[Float[ndarray, "point 3"]] = (),
 ) -> BoardCalibration:
     """Find the pose of every camera; all pictures are adjusted together.
 
     The world is the board of the first pictures: z = 0 is its plane, and z points to the cameras.
+    With depth of the table, that is z = 0: the board may have some thickness.
 
     Args:
         names: Names of the views, for messages.
@@ -133,6 +141,8 @@ def calibrate_by_board(
         sizes: Width and height of each view's images [px].
         sightings: For each view what its pictures show; those of all views with the same number
             were taken while the board lay in the same place.
+        tables: For each view what it measured on the table, in its camera's coordinates [m]. A
+            board that is small in the picture tells less about tilt than the whole table.
 
     Raises:
         ImportFailedError: If a view is not tied to the others by the board, or its reprojection
@@ -147,7 +157,7 @@ def calibrate_by_board(
     }
     single = {key: _single_pose(intrinsics[key[0]], sighting) for key, sighting in seen.items()}
     cameras, boards = _chained(names, count, single)
-    cameras, boards = _adjusted(intrinsics, seen, cameras, boards)
+    cameras, boards, height = _adjusted(intrinsics, seen, cameras, boards, tables)
     error: list[float] = []
     corner_count: list[int] = []
     for view, name in enumerate(names):
@@ -169,8 +179,11 @@ def calibrate_by_board(
             )
         error.append(rms)
         corner_count.append(len(residual))
+    to_table = np.eye(4)
+    to_table[2, 3] = -height
+    poses = [to_table @ np.linalg.inv(cameras[view]) for view in range(len(names))]
     return BoardCalibration(
-        T_world_camera=_upright(names, [np.linalg.inv(cameras[v]) for v in range(len(names))]),
+        T_world_camera=_upright(names, poses),
         error=tuple(error),
         corner_count=tuple(corner_count),
     )
@@ -231,29 +244,36 @@ def _adjusted(
     seen: dict[tuple[int, int], BoardSighting],
     cameras: _Poses,
     boards: _Poses,
-) -> tuple[_Poses, _Poses]:
-    """Minimise all reprojection errors; the first board stays where it is."""
+    tables: Sequence[ndarray],
+) -> tuple[_Poses, _Poses, float]:
+    """Minimise all reprojection errors, and distances of the table's points from one height.
+
+    The first board stays where it is. Returns cameras, boards and the height of the table above
+    the first board [m], in its own coordinates.
+    """
     optimize: Any = import_module("scipy.optimize")
     views, places = sorted(cameras), sorted(set(boards) - {0})
 
     def unpacked(value: ndarray) -> tuple[_Poses, _Poses]:
-        steps = value.reshape(-1, 6)
+        steps = value[:-1].reshape(-1, 6)
         moved = {view: _moved(cameras[view], steps[i]) for i, view in enumerate(views)}
         laid = {p: _moved(boards[p], steps[len(views) + i]) for i, p in enumerate(places)}
         return moved, {0: boards[0], **laid}
 
     def residuals(value: ndarray) -> ndarray:
         moved, laid = unpacked(value)
-        return np.concatenate(
-            [
-                _residual(intrinsics[view], moved[view] @ laid[place], sighting).ravel()
-                for (view, place), sighting in seen.items()
-            ]
-        )
+        parts = [
+            _residual(intrinsics[view], moved[view] @ laid[place], sighting).ravel() / _CORNER_ERROR
+            for (view, place), sighting in seen.items()
+        ]
+        for view, point in enumerate(tables):
+            up = np.linalg.inv(moved[view])[2]
+            parts.append((point @ up[:3] + up[3] - value[-1]) / _DEPTH_ERROR)
+        return np.concatenate([*parts, value[-1:] / _THICKNESS])
 
-    start = np.zeros(6 * (len(views) + len(places)))
+    start = np.zeros(6 * (len(views) + len(places)) + 1)
     found: Any = optimize.least_squares(residuals, start, loss="soft_l1", x_scale="jac")
-    return unpacked(found.x)
+    return *unpacked(found.x), float(found.x[-1])
 
 
 def _moved(pose: ndarray, step: ndarray) -> ndarray:

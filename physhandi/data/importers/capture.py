@@ -58,6 +58,7 @@ _WRONG_SCALE = (0.8, 1.25)
 _RATIO_SHARE = 0.2
 _LEAST_SHARED, _LEAST_SHARED_ABOVE = 0.45, 0.3
 _ABOVE = 0.02
+_ON_TABLE, _TABLE_POINTS = 0.015, 200
 _PNG_EFFORT = 2
 
 
@@ -254,7 +255,7 @@ def _sources(
         else:
             source.scale = _depth_scale(source, view.depth, options.depth_scale, notes)
         sources.append(source)
-    return sources, notes
+    return sources, list(dict.fromkeys(notes))
 
 
 def _depth_scale(
@@ -262,7 +263,6 @@ def _depth_scale(
 ) -> float:
     """Decide how many metres a unit of depth is, and refuse distances that cannot be."""
     assert source.depth is not None  # noqa: S101 - a view with a stream of depth
-    name = source.view.name
     there = source.depth[source.depth >= 0]
     chosen = np.unique(np.linspace(0, len(there) - 1, min(_SAMPLED, len(there))).astype(int))
     medians: list[float] = []
@@ -287,7 +287,7 @@ def _depth_scale(
     if scale is None:
         scale = 0.001 if not is_float or median > 20 else 1.0
         unit = "millimetres" if scale == 0.001 else "metres"
-        notes.append(f"View '{name}': nothing tells the unit of depth; it is taken for {unit}.")
+        notes.append(f"Nothing tells the unit of depth, so it is taken for {unit}.")
     elif scale > 1.0:
         scale = 1.0 / scale
     if not low <= scale * median <= high:
@@ -328,12 +328,14 @@ def _place(source: Path, sources: list[_Source], target: CharucoTarget | None) -
 def _by_board(source: Path, sources: list[_Source], target: CharucoTarget) -> _Placement:
     sightings = [_sightings(source, one, target, len(sources) == 1) for one in sources]
     names = [one.view.name for one in sources]
-    found = calibrate_by_board(
-        names,
-        [one.rectifier.K for one in sources],
-        [one.view.size for one in sources],
-        sightings,
-    )
+    lenses = [one.rectifier.K for one in sources]
+    sizes = [one.view.size for one in sources]
+    found = calibrate_by_board(names, lenses, sizes, sightings)
+    tables = [
+        _table_points(one, pose) for one, pose in zip(sources, found.T_world_camera, strict=True)
+    ]
+    if any(map(len, tables)):
+        found = calibrate_by_board(names, lenses, sizes, sightings, tables)
     report = {
         "by": f"ChArUco board, {target.columns}x{target.rows} squares of {target.square:g} m",
         "reprojection_error_px": {
@@ -342,6 +344,17 @@ def _by_board(source: Path, sources: list[_Source], target: CharucoTarget) -> _P
         "corners": dict(zip(names, found.corner_count, strict=True)),
     }
     return _Placement(found.T_world_camera, 0.0, report, [])
+
+
+def _table_points(source: _Source, pose: ndarray) -> Float[ndarray, "point 3"]:
+    """Pick points that a view measured on the table, in its camera's coordinates [m]."""
+    if source.view.depth is None:
+        return np.zeros((0, 3))
+    point = cloud(source.camera(pose), source.depth_image(0))
+    near = point[np.abs(point[:, 2]) < _ON_TABLE]
+    chosen = np.linspace(0, len(near) - 1, min(_TABLE_POINTS, len(near))).astype(np.int64)
+    inverse = np.linalg.inv(pose)
+    return near[chosen] @ inverse[:3, :3].T + inverse[:3, 3]
 
 
 def _sightings(

@@ -297,8 +297,8 @@ def _place_depth(view: RecordedView, camera: RecordedCamera) -> None:
             )
         if T_color_depth is None:
             view.notes.append(
-                f"View '{view.name}': depth is taken as aligned to color, since both have the same "
-                "size and nothing else is said."
+                "Depth is taken as aligned to color, where both have the same size and nothing "
+                "else is said."
             )
             return
         depth = view.camera
