@@ -34,6 +34,7 @@ _READING = re.compile(r"\d+(?:\.\d*)?(?:[eE][+-]?\d{1,2})?")
 _UNITS = (1.0, 1e-3, 1e-6, 1e-9)
 _SHORTEST_STEP, _LONGEST_STEP = 2e-3, 2.0
 _LARGEST_TABLE = 64_000_000
+_TAIL = 2048
 
 
 @dataclass(eq=False, kw_only=True)
@@ -101,6 +102,8 @@ class RecordedStream:
             )
         if path.suffix.lower() == ".npy":
             return read_array(path)
+        if not is_whole(path):
+            fail(path, "was cut off: its end is missing. Record or export it again")
         flags = cv2.IMREAD_COLOR if self.kind == "color" else cv2.IMREAD_UNCHANGED
         try:
             image = cast("ndarray | None", cv2.imread(str(path), flags))
@@ -161,6 +164,16 @@ def image_size(path: Path) -> tuple[int, int]:
         return announced_size(path)
     except (ValueError, OSError) as error:
         fail(path, str(error))
+
+
+def is_whole(path: Path) -> bool:
+    """Tell whether a PNG or JPEG has its end; decoders fill what is missing without a word."""
+    with path.open("rb") as stream:
+        stream.seek(0, 2)
+        stream.seek(max(0, stream.tell() - _TAIL))
+        tail = stream.read()
+    ends = {".png": b"IEND", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
+    return ends.get(path.suffix.lower(), b"") in tail
 
 
 def find_stream(folder: Path, kind: StreamKind) -> RecordedStream | None:

@@ -190,16 +190,29 @@ def _shared_poses(source: Path, names: list[str]) -> dict[str, ndarray]:
     if path is None:
         return {}
     table = read_table(path)
-    if isinstance(table, list) and len(cast("list[Any]", table)) == len(names):
-        poses = [read_pose(path, one, f"entry {i}") for i, one in enumerate(cast("Any", table))]
-        return _in_order(path, names, poses)
     if isinstance(table, dict):
         fields = cast("dict[Any, Any]", table)
         missing = [name for name in names if name not in fields]
-        if missing and len(missing) < len(names):
-            fail(path, f"has no pose for the view '{missing[0]}'. Add it")
-        return {n: read_pose(path, fields[n], n) for n in names if n in fields}
-    return {}
+        if len(missing) < len(names):
+            if missing:
+                fail(path, f"has no pose for the view '{missing[0]}'. Add it")
+            return {name: read_pose(path, fields[name], name) for name in names}
+    elif isinstance(table, list) and _lists_poses(cast("list[Any]", table)):
+        entries = cast("list[Any]", table)
+        poses = [read_pose(path, one, f"entry {order}") for order, one in enumerate(entries)]
+        return _in_order(path, names, poses)
+    if len(names) > 1:
+        fail(path, f"has no poses by name; expected one for each of {', '.join(names)}")
+    return {names[0]: read_pose_file(path)}
+
+
+def _lists_poses(table: list[Any]) -> bool:
+    """Tell several matrices from the rows, or the numbers, of one."""
+    return all(
+        isinstance(one, dict)
+        or (isinstance(one, list) and np.size(cast("list[Any]", one)) in (12, 16))
+        for one in table
+    )
 
 
 def _in_order(path: Path, names: list[str], poses: list[ndarray]) -> dict[str, ndarray]:
@@ -237,7 +250,7 @@ def _view(
         depth_scale=camera.depth_scale,
     )
     if view.T_world_camera is None:
-        own = None if is_alone else _table_file(found.folder, _EXTRINSICS, ".txt", ".npy")
+        own = _table_file(found.folder, _EXTRINSICS, ".txt", ".npy")
         view.T_world_camera = None if own is None else read_pose_file(own)
     for one in view.streams:
         read_times(found.folder, one)

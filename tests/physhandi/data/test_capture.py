@@ -261,6 +261,34 @@ def test_the_board_of_the_first_frames_calibrates_too_and_tells_a_wrong_depth_sc
         )
 
 
+@pytest.mark.parametrize("form", ["by name", "list", "of each", "calibrate", "one file"])
+def test_poses_may_stand_in_files_of_their_own(tmp_path, form):
+    raw = RawCapture(tmp_path / "raw").write(2, poses=False)
+    pose = {name: camera.T_world_camera.tolist() for name, camera in CAMERAS.items()}
+    if form == "by name":
+        (raw.folder / "extrinsics.json").write_text(json.dumps(pose))
+    elif form == "list":
+        (raw.folder / "poses.json").write_text(json.dumps(list(pose.values())))
+    elif form == "of each":
+        for name, camera in CAMERAS.items():
+            np.savetxt(raw.folder / name / "pose.txt", camera.T_world_camera)
+    elif form == "calibrate":
+        (raw.folder / "calibrate.pkl").write_bytes(pickle.dumps([*map(np.array, pose.values())]))
+    else:
+        table = {
+            name: {**intrinsics(camera), "world_to_camera": camera.T_camera_world.tolist()}
+            for name, camera in CAMERAS.items()
+        }
+        for name in CAMERAS:
+            (raw.folder / name / "intrinsics.json").unlink()
+        (raw.folder / "cameras.yaml").write_text(json.dumps({"cameras": table}))
+    sequence = import_capture(raw.folder, tmp_path / "out")
+    for view in sequence.views:
+        true = CAMERAS[view.name].T_world_camera
+        assert np.allclose(view.camera.T_world_camera, true, atol=1e-6)
+        assert np.allclose(view.camera.K, CAMERAS[view.name].K)
+
+
 def test_a_moved_camera_is_named(raw, tmp_path):
     pose = CAMERAS["right"].T_world_camera.copy()
     pose[2, 3] += 0.04
