@@ -6,6 +6,7 @@ Definitions, units and the paper's columns are in docs/metrics.md.
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -386,7 +387,7 @@ def _judged(
 def _curves_of(motions: Motions, reference: ScoringReference) -> dict[str, Curves]:
     """Measure motions beside each other: searches for nearest points use a processor each."""
     with ThreadPoolExecutor(len(motions), thread_name_prefix="physhandi-metrics") as pool:
-        found = pool.map(lambda nodes: error_curves(nodes, reference), motions.values())
+        found = pool.map(partial(error_curves, reference=reference), motions.values())
         return dict(zip(motions, found, strict=True))
 
 
