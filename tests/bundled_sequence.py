@@ -30,7 +30,7 @@ from physhandi.synthetic.film.filming import (
     save_video,
 )
 from physhandi.synthetic.film.rendering import Picture, Scene, compose, look_at, paint, photograph
-from physhandi.synthetic.film.sensors import DepthSensor, detect_keypoints, segment, track
+from physhandi.synthetic.film.sensors import DepthSensor, detect_keypoints, shift_outlines, track
 
 FRAME_RATE = 30.0
 """Frames per second [Hz]."""
@@ -218,7 +218,7 @@ def _film(shot: _Shot, scenes: list[Scene], progress: Progress) -> list[Picture]
         picture = photograph(shot.camera, scene)
         offset = level + 0.3 * np.sin(phase + frame / 25.0)
         depth = sensor.measure(picture.depth, picture.cosine, random, offset=offset)
-        mask = segment(picture.label, random)
+        mask = shift_outlines(picture.label, random)
         depth[cv2.dilate((mask > 0).astype(np.uint8), around) == 0] = 0
         for kind, image in (("depth", depth), ("mask", mask)):
             rel = f"{shot.folder}/{kind}/{frame:05d}.png"

@@ -146,6 +146,60 @@ def synthesize(
     show({"sequence": str(sequence.folder), "description": sequence.description})
 
 
+def annotate(
+    sequence: Positional[str],
+    *,
+    click: tuple[str, ...] = (),
+    overwrite: bool = False,
+    data_dir: DataDir = None,
+) -> None:
+    """Find the object that you click on, and hands, in all images, and follow points of it.
+
+    Writes masks and tracks into the sequence; masks that it made before are replaced.
+
+    Args:
+        sequence: Folder or name of a sequence with color and depth.
+        click: Places on the object as view,frame,x,y, frames from 0 and x and y in pixels; one is
+            mostly enough, without any hands alone are found.
+        overwrite: Replace masks and tracks that come from elsewhere.
+    """
+    from physhandi.perception.annotation import annotate as find
+
+    folder = find_sequence(sequence, data_dir).folder
+    clicks = [_click(text) for text in click]
+    with watched(True) as progress:
+        done = find(folder, clicks, progress, overwrite=overwrite)
+    show({"sequence": str(done.folder), "masks": _found(done)})
+
+
+def _found(sequence: Sequence) -> dict[str, Any]:
+    """Count, for each view with masks, the frames in which things and tracks were found."""
+    found: dict[str, Any] = {}
+    for view in sequence.views:
+        if not view.has_mask:
+            continue
+        masks = [view.mask(frame) for frame in range(sequence.frame_count)]
+        alive = None if view.track_visible is None else view.track_visible.sum(axis=1)
+        found[view.name] = {
+            "frames with object": sum(bool((mask == 1).any()) for mask in masks),
+            "frames with hands": sum(bool((mask > 1).any()) for mask in masks),
+            "least tracks in a frame": None if alive is None else int(alive.min()),
+        }
+    return found
+
+
+def _click(text: str) -> Any:
+    from physhandi.perception.segmentation import Click
+
+    try:
+        view, frame, x, y = (part.strip() for part in text.split(","))
+        return Click(view, int(frame), float(x), float(y))
+    except ValueError:
+        raise UsageError(
+            f"--click {text!r} does not name a place; write view,frame,x,y, like camera0,0,320,240."
+        ) from None
+
+
 def _level(text: str) -> tuple[str, float]:
     name, equals, value = text.partition("=")
     try:
@@ -308,6 +362,7 @@ def import_capture(
     every: int = 1,
     frame_rate: float | None = None,
     hands: tuple[Literal["right", "left"], ...] = ("right",),
+    click: tuple[str, ...] = (),
     overwrite: bool = False,
 ) -> None:
     """Your own recording by one or several RGB-D or color cameras.
@@ -327,6 +382,8 @@ def import_capture(
         every: Import only every n-th frame.
         frame_rate: Frames per second, if neither timestamps nor a video tell it.
         hands: Hands that the recording shows: right, left or both.
+        click: Places on the object as view,frame,x,y in the imported images; masks and tracks are
+            then found too, as by `physhandi annotate`.
         overwrite: Replace a sequence that is there.
     """
     if example is not None:
@@ -350,14 +407,26 @@ def import_capture(
         frame_rate=frame_rate,
         hands=hands,
     )
+    clicks = [_click(text) for text in click]
     with watched(True) as progress:
         sequence = convert(source, out, progress, options=options, overwrite=overwrite)
+        if clicks:
+            from physhandi.perception.annotation import annotate as find
+
+            try:
+                sequence = find(sequence.folder, clicks, progress)
+            except UsageError as error:
+                raise UsageError(
+                    f"{error} The recording is imported as {sequence.folder}; click again with "
+                    "physhandi annotate."
+                ) from None
     told = ("depth_scale", "pairing", "calibration", "notes")
     show(
         {
             "sequence": str(sequence.folder),
             "frames": sequence.frame_count,
             "frame_rate": sequence.frame_rate,
+            "masks": _found(sequence) if clicks else None,
             **{name: sequence.provenance[name] for name in told if sequence.provenance[name]},
         }
     )

@@ -5,7 +5,7 @@ import pytest
 from mano_file import write_mano
 from phystwin_case import write_case
 from phystwin_experiment import write_experiment
-from raw_capture import RawCapture
+from raw_capture import CAMERAS, RawCapture, ball, picture
 
 from app import cli
 from physhandi.data.sequence import Sequence
@@ -124,3 +124,29 @@ def test_a_capture_is_imported_or_made_but_not_both(tmp_path, capsys):
     assert (code, "give it alone" in error) == (2, True)
     code, _, error = call(capsys, "import", "capture", tmp_path)
     assert (code, "--out" in error) == (2, True)
+
+
+def test_a_click_with_the_import_makes_masks_and_tracks_at_once(tmp_path, capsys):
+    raw = RawCapture(tmp_path / "raw").write(3)
+    x, y = CAMERAS["left"].project(ball(1)[0]).round()
+    command = ("import", "capture", raw.folder, "--depth-scale", 0.001, "--out")
+    code, out, error = call(capsys, *command, tmp_path / "ball", "--click", f"left,1,{x:g},{y:g}")
+    assert code == 0, error
+    assert "frames with object: 3" in out
+    sequence = Sequence.load(tmp_path / "ball")
+    sequence.validate()
+    assert sequence.missing("mask", "track") == []
+    assert sequence.provenance["masks"]["source"] == "built-in"
+    assert sequence.provenance["importer"] == "capture"
+    for name, view in CAMERAS.items():
+        found = next(view for view in sequence.views if view.name == name).mask(2) == 1
+        true = (picture(view, 2)[0] == [200, 60, 50]).all(axis=-1)
+        assert (found & true).sum() > 0.85 * (found | true).sum()
+    code, _, error = call(capsys, *command, tmp_path / "other", "--click", "left,9,3,3")
+    assert code == 2
+    assert "there is no frame 9" in error
+    assert "click again with physhandi annotate" in error
+    assert Sequence.load(tmp_path / "other").missing("mask") == ["mask"]
+    code, _, error = call(capsys, *command, tmp_path / "third", "--click", "left,9")
+    assert code == 2
+    assert not (tmp_path / "third").exists()

@@ -37,7 +37,7 @@ from physhandi.synthetic.film.rendering import (
     resized,
     shadow_points,
 )
-from physhandi.synthetic.film.sensors import detect_keypoints, segment, track
+from physhandi.synthetic.film.sensors import detect_keypoints, shift_outlines, track
 
 _BODY = 1
 _BIAS_PERIOD = 25.0
@@ -272,7 +272,7 @@ def _film(
             picture.depth, picture.cosine, shot.random, offset=shot.offset(frame), scale=shot.scale
         )
         limit = shot.scale * shot.level.mask_error
-        mask = segment(picture.label, shot.random, error=limit / 2, largest=limit)
+        mask = shift_outlines(picture.label, shot.random, error=limit / 2, largest=limit)
         depth[cv2.dilate((mask > 0).astype(np.uint8), around) == 0] = 0
         for kind, part in (("depth", depth), ("mask", mask)):
             whole = np.zeros((camera.height, camera.width), dtype=part.dtype)

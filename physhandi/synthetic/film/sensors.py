@@ -142,7 +142,7 @@ def smooth_noise(
     return noise * (2.0 * np.sqrt(np.pi) * correlation)
 
 
-def segment(
+def shift_outlines(
     label: UInt8[ndarray, "row column"],
     random: Generator,
     *,

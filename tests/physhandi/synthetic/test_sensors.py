@@ -6,7 +6,7 @@ import pytest
 from physhandi.synthetic.film.sensors import (
     DepthSensor,
     detect_keypoints,
-    segment,
+    shift_outlines,
     smooth_noise,
     track,
 )
@@ -68,7 +68,7 @@ def test_smooth_noise_has_unit_variance_and_is_alike_next_door():
 def test_mask_errors_stay_near_the_outline():
     label = np.zeros((80, 80), dtype=np.uint8)
     label[20:60, 20:60] = 1
-    found = segment(label, rng())
+    found = shift_outlines(label, rng())
     wrong = found != label
     assert 20 < wrong.sum() < 200
     assert not wrong[22:58, 22:58].any()
@@ -141,13 +141,13 @@ def test_mixed_pixels_reach_as_far_from_an_edge_as_told():
 def test_outlines_move_by_up_to_two_pixels_if_told_so():
     label = np.zeros((600, 600), dtype=np.uint8)
     label[50:550, 50:550] = 3
-    found = segment(label, rng(), error=1.0, largest=2.0)
+    found = shift_outlines(label, rng(), error=1.0, largest=2.0)
     wrong = found != label
     assert set(np.unique(found)) == {0, 3}
     assert not wrong[52:548, 52:548].any()
     assert not wrong[:48].any()
     assert 0 < wrong[48].mean() < 0.2 < wrong[49:51].mean()
-    assert not (segment(label, rng(), error=0.0, largest=0.0) != label).any()
+    assert not (shift_outlines(label, rng(), error=0.0, largest=0.0) != label).any()
 
 
 def test_a_wandering_track_is_lost_for_good():

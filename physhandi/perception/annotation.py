@@ -1,0 +1,138 @@
+"""Gives a sequence on disk the masks and tracks that stages 2 and 3 need, from clicks."""
+
+import dataclasses
+import shutil
+from collections.abc import Sequence as Many
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+from numpy import ndarray
+
+import physhandi
+from physhandi.data.files import (
+    sweep_temporary,
+    sync_folder,
+    temporary_name,
+    write_array,
+    write_bytes,
+    write_yaml,
+)
+from physhandi.data.sequence import Sequence
+from physhandi.data.sequence_meta import FILE
+from physhandi.errors import SequenceError, UsageError
+from physhandi.perception.point_tracking import track_points
+from physhandi.perception.segmentation import Click, segment
+from physhandi.progress import NullProgress, Progress
+
+BUILT_IN = "built-in"
+"""What provenance calls masks and tracks that were made here."""
+_FILES = ("mask", "track.npy", "track_visible.npy")
+
+
+def annotate(
+    folder: Path | str,
+    clicks: Many[Click],
+    progress: Progress | None = None,
+    *,
+    overwrite: bool = False,
+) -> Sequence:
+    """Find object and hands in a sequence, follow points of the object, and store both.
+
+    Nothing is written before everything is found. Then every view gets its new mask folder and
+    tracks in place of the old ones, one after the other, and ``sequence.yaml`` says in
+    ``provenance`` where they come from.
+
+    Args:
+        folder: Folder of the sequence.
+        clicks: Places on the object (`Click`); without any, hands alone are found, and no tracks.
+        progress: Told about both stages; may cancel.
+        overwrite: Whether masks and tracks may be replaced that were not made here.
+
+    Returns:
+        The sequence as it is now.
+
+    Raises:
+        UsageError: If a click makes no sense, there is neither click nor hand, or masks are there
+            that were not made here.
+        MissingInputError: If no view has color.
+        CancelledError: If the user asked to stop; what was there is left.
+    """
+    progress = progress or NullProgress()
+    sequence = Sequence.load(Path(folder))
+    if not clicks and not sequence.hands:
+        raise UsageError(
+            f"Sequence '{sequence.name}' names no hand, and there is no click on an object. Click "
+            "on the object in one image (view,frame,x,y)."
+        )
+    if not overwrite:
+        _check_own(sequence)
+    masks = segment(sequence, clicks, progress)
+    tracks = track_points(sequence, masks, progress) if clicks else {}
+    progress.check_cancelled()
+    about = {
+        "source": BUILT_IN,
+        "clicks": [dataclasses.asdict(click) for click in clicks],
+        "version": physhandi.__version__,
+    }
+    for view in sequence.views:
+        sweep_temporary(view.folder.glob(".*.tmp"))
+        if view.name not in masks:
+            continue
+        made = view.folder / temporary_name("annotation")
+        try:
+            _write(made, masks[view.name], tracks.get(view.name))
+            _put_in_place(made, view.folder)
+        finally:
+            shutil.rmtree(made, ignore_errors=True)
+    provenance: dict[str, Any] = {**sequence.provenance, "masks": about}
+    provenance.pop("tracks", None)
+    if tracks:
+        provenance["tracks"] = about
+    meta = dataclasses.replace(sequence.meta, provenance=provenance)
+    write_yaml(sequence.folder / FILE, meta.to_dict())
+    return Sequence.load(sequence.folder)
+
+
+def _check_own(sequence: Sequence) -> None:
+    for part, there in (
+        ("masks", any(view.has_mask for view in sequence.views)),
+        ("tracks", any(view.track is not None for view in sequence.views)),
+    ):
+        about: Any = sequence.provenance.get(part)
+        source = about.get("source") if isinstance(about, dict) else None
+        if there and source != BUILT_IN:
+            raise UsageError(
+                f"Sequence '{sequence.name}' has {part} that were not made here. Allow overwriting "
+                "to replace them, or annotate a copy."
+            )
+
+
+def _write(
+    folder: Path,
+    mask: UInt8[ndarray, "frame row column"],
+    tracks: tuple[ndarray, ndarray] | None,
+) -> None:
+    (folder / "mask").mkdir(parents=True)
+    for frame, label in enumerate(mask):
+        is_encoded, code = cv2.imencode(".png", np.ascontiguousarray(label))
+        if not is_encoded:
+            raise SequenceError(f"The mask of frame {frame} could not be encoded.")
+        write_bytes(folder / "mask" / f"{frame:05d}.png", code.tobytes())
+    if tracks is not None:
+        write_array(folder / "track.npy", tracks[0])
+        write_array(folder / "track_visible.npy", tracks[1])
+
+
+def _put_in_place(made: Path, view_folder: Path) -> None:
+    """Exchange masks and tracks of a view; what was there goes with the temporary folder."""
+    old = made / "old"
+    old.mkdir()
+    for name in _FILES:
+        if (view_folder / name).exists():
+            (view_folder / name).rename(old / name)
+        if (made / name).exists():
+            (made / name).rename(view_folder / name)
+    sync_folder(view_folder)

@@ -1,0 +1,233 @@
+"""Follows points of the object through the images of each view, by pyramidal Lucas-Kanade.
+
+A track goes on while it comes back to where it was when followed backwards (Kalal et al. 2010),
+moves as its neighbors do, and its pixel is the object's, with a depth that does not jump. One that
+does not, or that a hand covers, ends; new ones begin where the object shows room for them.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from numpy import ndarray
+from scipy.spatial import KDTree
+
+from physhandi.data.sequence import Sequence
+from physhandi.data.view import View
+from physhandi.perception.lifting import OBJECT_LABEL
+from physhandi.progress import NullProgress, Progress
+
+_cv2: Any = cv2  # Its type stubs refuse absent starts.
+TRACKING_STAGE = "point_tracking"
+MOST_TRACKS = 300
+"""Tracks that begin in a view's first frame, if there is room."""
+LEAST_TRACKS = 180
+"""Living tracks below which new ones begin, if there is room."""
+
+_WINDOW = (9, 21)
+"""Least and largest side of what of an image is matched [px]."""
+_RETURN = 0.3
+"""Distance from its start at which a track may come back when followed backwards [px]."""
+_DEPTH_JUMP = 0.04
+"""Change of depth in one frame that no track survives [m]."""
+_COMPANY = 8
+"""Neighbors whose motion a track is compared with."""
+_DISAGREEMENT = 1.0
+"""Difference from the median motion of the neighbors that is always allowed [px]."""
+_CLOSEST = 2.5
+"""Least distance between tracks when they begin [px]."""
+_SHORTEST = 3
+"""Frames that a track must live to be kept."""
+
+
+def track_points(
+    sequence: Sequence,
+    masks: dict[str, UInt8[ndarray, "frame row column"]],
+    progress: Progress | None = None,
+) -> dict[str, tuple[Float[ndarray, "frame track 2"], Bool[ndarray, "frame track"]]]:
+    """Follow points of the object's surface.
+
+    Args:
+        sequence: Recording; its own masks and tracks are not read.
+        masks: Labels of views with color, as `segment` gives them; a view needs depth too, without
+            which a track says nothing about space.
+        progress: Told after every frame; may cancel.
+
+    Returns:
+        By view, positions [px], NaN where a track is not seen, and where it is seen. Views without
+        depth, or in which the object is never seen, are left out.
+
+    Raises:
+        CancelledError: If the user asked to stop.
+    """
+    progress = progress or NullProgress()
+    views = [v for v in sequence.views if v.name in masks and v.has_color and v.has_depth]
+    total, result = len(views) * sequence.frame_count, {}
+    for number, view in enumerate(views):
+        tracker = _Tracker(view, masks[view.name])
+        for frame in range(view.frame_count):
+            progress.check_cancelled()
+            tracker.step(frame)
+            done = number * view.frame_count + frame + 1
+            progress.report(TRACKING_STAGE, done, total, None, f"View {view.name}")
+        view.close()
+        paths = tracker.paths()
+        if paths[0].shape[1]:
+            result[view.name] = paths
+    return result
+
+
+@dataclass
+class _Path:
+    begin: int
+    pixel: list[ndarray] = field(default_factory=list)
+
+
+class _Tracker:
+    """The tracks of one view while it is followed from frame to frame."""
+
+    def __init__(self, view: View, mask: UInt8[ndarray, "frame row column"]) -> None:
+        self._view, self._mask = view, mask
+        self._paths: list[_Path] = []
+        self._alive: list[int] = []
+        self._gray = np.zeros((0, 0), dtype=np.uint8)
+        self._depth = np.zeros(0)
+
+    def step(self, frame: int) -> None:
+        """Go on to a frame, the first or the next one."""
+        gray = cv2.cvtColor(self._view.color(frame), cv2.COLOR_RGB2GRAY)
+        is_object = self._mask[frame] == OBJECT_LABEL
+        depth = _solid_depth(self._view.depth(frame), is_object)
+        if self._alive:
+            self._advance(gray, is_object, depth)
+        self._gray = gray
+        count = len(self._alive)
+        if count < (MOST_TRACKS if not self._paths else LEAST_TRACKS):
+            start = np.array([self._paths[track].pixel[-1] for track in self._alive])
+            for pixel in _new_points(gray, is_object & (depth > 0), start.reshape(-1, 2)):
+                self._alive.append(len(self._paths))
+                self._paths.append(_Path(frame, [pixel]))
+        pixel = np.array([self._paths[track].pixel[-1] for track in self._alive])
+        self._depth = _at(depth, pixel.reshape(-1, 2))
+
+    def _advance(
+        self,
+        gray: UInt8[ndarray, "row column"],
+        is_object: Bool[ndarray, "row column"],
+        depth: Float[ndarray, "row column"],
+    ) -> None:
+        start = np.array([self._paths[track].pixel[-1] for track in self._alive])
+        end, is_found = _follow(self._gray, gray, start, _window_size(is_object))
+        here = _at(depth, end)
+        is_good = is_found & (_at(is_object, end) > 0)
+        is_good &= (here == 0) | (self._depth == 0) | (np.abs(here - self._depth) < _DEPTH_JUMP)
+        is_good &= _moves_with_neighbors(start, end, is_good)
+        alive: list[int] = []
+        for track, pixel, good in zip(self._alive, end, is_good, strict=True):
+            if good:
+                self._paths[track].pixel.append(pixel)
+                alive.append(track)
+        self._alive = alive
+
+    def paths(self) -> tuple[Float[ndarray, "frame track 2"], Bool[ndarray, "frame track"]]:
+        """Lay the tracks that lived long enough side by side."""
+        least = min(_SHORTEST, self._view.frame_count)
+        kept = [path for path in self._paths if len(path.pixel) >= least]
+        pixel = np.full((self._view.frame_count, len(kept), 2), np.nan, dtype=np.float32)
+        for track, path in enumerate(kept):
+            pixel[path.begin : path.begin + len(path.pixel), track] = path.pixel
+        return pixel, np.asarray(np.isfinite(pixel).all(axis=-1))
+
+
+def _solid_depth(
+    depth: Float[ndarray, "row column"], is_object: Bool[ndarray, "row column"]
+) -> Float[ndarray, "row column"]:
+    """Leave only the object's depth, without single wrong values; 0 elsewhere."""
+    own = np.where(is_object, depth, 0).astype(np.float32)
+    # The largest of the values around is the farthest; holes (0) must not win, so it is a mean.
+    count = cv2.blur((own > 0).astype(np.float32), (3, 3))
+    mean = cv2.blur(own, (3, 3)) / np.maximum(count, 1e-6)
+    return np.where((count > 0.3) & is_object, mean, 0.0)
+
+
+def _at(image: ndarray, pixel: Float[ndarray, "track 2"]) -> ndarray:
+    """Look up the values of the nearest pixels; 0 outside."""
+    height, width = image.shape
+    column, row = np.nan_to_num(pixel, nan=-1e6).round().astype(np.int64).T
+    inside: ndarray = (row >= 0) & (column >= 0) & (row < height) & (column < width)
+    value = np.zeros(len(pixel), dtype=np.float32)
+    value[inside] = image[row[inside], column[inside]]
+    return value
+
+
+def _window_size(is_object: Bool[ndarray, "row column"]) -> int:
+    """Choose what is matched as wide as the object is thick, so that little else gets into it."""
+    inside = cv2.distanceTransform(is_object.astype(np.uint8), cv2.DIST_L2, 3)
+    thick = 2 * float(np.percentile(inside[is_object], 90)) if is_object.any() else 0.0
+    return int(np.clip(round(thick), *_WINDOW)) | 1
+
+
+def _follow(
+    before: UInt8[ndarray, "row column"],
+    now: UInt8[ndarray, "row column"],
+    start: Float[ndarray, "track 2"],
+    size: int,
+) -> tuple[Float[ndarray, "track 2"], Bool[ndarray, " track"]]:
+    """Find points of an image in the next, and whether they come back from there."""
+    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
+    options = {"winSize": (size, size), "maxLevel": 3, "criteria": stop}
+    first = start.astype(np.float32).reshape(-1, 1, 2)
+    end, found, _ = _cv2.calcOpticalFlowPyrLK(before, now, first, None, **options)
+    back, found_back, _ = _cv2.calcOpticalFlowPyrLK(now, before, end, None, **options)
+    far = np.linalg.norm((back - first).reshape(-1, 2), axis=1)
+    is_found = (found.reshape(-1) > 0) & (found_back.reshape(-1) > 0) & (far < _RETURN)
+    return end.reshape(-1, 2), is_found
+
+
+def _moves_with_neighbors(
+    start: Float[ndarray, "track 2"],
+    end: Float[ndarray, "track 2"],
+    is_good: Bool[ndarray, " track"],
+) -> Bool[ndarray, " track"]:
+    """Tell which tracks move about as the median of their nearest neighbors does."""
+    result = np.ones(len(start), dtype=bool)
+    tracks = np.flatnonzero(is_good)
+    if len(tracks) <= _COMPANY:
+        return result
+    motion = end[tracks] - start[tracks]
+    near = np.asarray(KDTree(start[tracks]).query(start[tracks], k=_COMPANY + 1)[1])[:, 1:]
+    typical: ndarray = np.asarray(np.median(motion[near], axis=1))
+    allowed = np.maximum(_DISAGREEMENT, 0.5 * np.linalg.norm(typical, axis=1))
+    result[tracks] = np.linalg.norm(motion - typical, axis=1) < allowed
+    return result
+
+
+def _new_points(
+    gray: UInt8[ndarray, "row column"],
+    is_free: Bool[ndarray, "row column"],
+    taken: Float[ndarray, "track 2"],
+) -> Float[ndarray, "track 2"]:
+    """Choose where new tracks begin: at corners first, then wherever there is room."""
+    area = int(is_free.sum())
+    wanted = MOST_TRACKS - len(taken)
+    if area == 0 or wanted <= 0:
+        return np.zeros((0, 2))
+    inner = cv2.erode(is_free.astype(np.uint8), np.ones((3, 3), np.uint8))
+    room = inner if inner.sum() > 0.4 * area else is_free.astype(np.uint8)
+    distance = max(_CLOSEST, 0.7 * float(np.sqrt(area / MOST_TRACKS)))
+    for x, y in taken.round().astype(int):
+        cv2.circle(room, (int(x), int(y)), round(distance), 0, -1)
+    corner = _cv2.goodFeaturesToTrack(gray, wanted, 0.001, distance, mask=room, blockSize=3)
+    found = np.zeros((0, 2)) if corner is None else corner.reshape(-1, 2).astype(np.float64)
+    for x, y in found.round().astype(int):
+        cv2.circle(room, (int(x), int(y)), round(distance), 0, -1)
+    more: list[tuple[float, float]] = []
+    for row, column in np.argwhere(room > 0):
+        if len(found) + len(more) >= wanted:
+            break
+        if room[row, column]:
+            more.append((float(column), float(row)))
+            cv2.circle(room, (int(column), int(row)), round(distance), 0, -1)
+    return np.concatenate([found, np.array(more).reshape(-1, 2)])

@@ -1,0 +1,891 @@
+"""Finds object and hands in the color and depth images of a sequence, from clicks on the object.
+
+No network takes part. Each pixel is judged for background, object and hands by its color, by its
+height above what carries the object, by the label that dense optical flow (DIS, Kroeger et al.
+2016) brings from the frame before, and by its distance, in space, from there. Pieces that hang on
+nothing are dropped, and GrabCut (Rother et al. 2004) draws the outline of what is thick enough.
+Labels travel forwards and backwards from the frame of a click. A view without a click begins in the
+frame in which depth and calibration show it most of the object; hands begin, in every frame, at
+their keypoints.
+"""
+
+import itertools
+from collections.abc import Iterator
+from collections.abc import Sequence as Many
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+from numpy import ndarray
+from scipy.ndimage import gaussian_filter
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from physhandi.data.sequence import Sequence
+from physhandi.data.view import View
+from physhandi.errors import MissingInputError, UsageError
+from physhandi.perception.keypoints import KeypointDetector, detect_view
+from physhandi.perception.lifting import HAND_LABEL, OBJECT_LABEL
+from physhandi.perception.tracks import EDGE_STEP
+from physhandi.progress import NullProgress, Progress
+
+_cv2: Any = cv2  # Its type stubs lack optical flow and refuse absent rectangles.
+SEGMENTATION_STAGE = "segmentation"
+_BACKGROUND = 0
+
+# Colors.
+_BINS = (32, 64, 64)
+"""Bins of a color histogram along L, a and b of CIELAB, each 0 to 255."""
+_BLUR = 1.0
+"""Width of the kernel that makes a density of a histogram [bins]."""
+_NEW_ON_BACKGROUND = 0.01
+"""Density of colors that the background has not shown; 1 is that of all colors being alike."""
+_NEW_ON_OBJECT = 0.06
+"""Density of colors that the object has not shown."""
+_NEW_ON_SKIN = 0.02
+"""Density of colors that a hand has not shown."""
+_SHADOWS = (1.0, 0.8, 0.6)
+"""Shares of its lightness with which background is seen, the smaller ones in shadows."""
+_MEMORY = 6.0
+"""Frames' worth of pixels that the colors of a thing are remembered by."""
+_OBJECT_RATE = 0.33
+"""Share of an object's pixels that are learned from in a frame."""
+_SKIN_RATE = 0.02
+"""Share of a hand's pixels that are learned from: skin stays as it is, and what a hand holds must
+not be taken for skin."""
+_SURE = 3.0
+"""Lead of a label's score from which its pixel is learned from."""
+
+# Heights above the support.
+_SUPPORT_BAND = 0.04
+"""Distance from the given ground within which the support is looked for [m]."""
+_LEAST_SUPPORT = 0.25
+"""Share of an image's points that must lie in one plane to call it the support."""
+_SUPPORT_NOISE = 0.002
+"""Least standard deviation of measured heights [m]."""
+_HIGHEST = 0.5
+"""Things are expected up to this height above their support [m]."""
+_LOW = 0.02
+"""Half of the object is expected below this height above its support [m]."""
+_RAISED = 3.0
+"""Evidence against background where something goes on in space that is not on the support."""
+
+# From frame to frame.
+_REACH = 0.010
+"""Distance from where a label is expected that costs nothing [m]."""
+_SLACK = 0.006
+"""Distance beyond `_REACH` that makes a label less likely by a factor e [m]."""
+_FARTHEST = 8.0
+"""Most that distance costs."""
+_STAY = 0.1
+"""Share of pixels whose label is not what flow brings."""
+_SOFT = 1.0
+"""Error of flow [px]."""
+_CORE = 1.0
+"""Evidence for a hand on its bones and palm."""
+
+# What looks alike is decided together.
+_ALIKE = 6.0
+"""Difference of colors that look alike [levels of CIELAB, 0 to 255]."""
+_AROUND = 1.5
+"""Distance within which they count [px]."""
+
+_BRIDGE = 0.015
+"""Pieces that are this near to a hand may hang together behind it [m]."""
+_LEAST_PIECE = 8
+"""Pixels of the smallest piece that a hand may cut off."""
+_HAND_DEPTH = 0.09
+"""Distance of a hand's pixels from its middle, along the view [m]."""
+_HAND_HEIGHT = 0.008
+"""Height above the support from which a pixel can be a hand's [m]."""
+_ROUNDS = 4
+"""Times that colors and labels of a view's first frame are found from each other."""
+_CLICK_RADIUS = 0.012
+"""Radius around a click in which the object's color is looked at [m]."""
+_CLICK_COLOR = 14.0
+"""Difference from the clicked color that is still the object's [levels of CIELAB, 0 to 255]."""
+_LEAST_OBJECT = 12
+"""Pixels of the smallest object."""
+_LEAST_JOINTS = 6
+"""Keypoints of a hand from which its place is known."""
+_WIDER = 0.08
+"""How far a hand goes beyond its core, where it was seen before [core's width]."""
+_BONES = (
+    (0, 1, 2, 3, 4),
+    (5, 6, 7, 8),
+    (9, 10, 11, 12),
+    (13, 14, 15, 16),
+    (17, 18, 19, 20),
+)
+_PALM = (0, 1, 5, 9, 13, 17)
+_PALM_SIDES = ((0, 5), (0, 9), (0, 13), (0, 17), (5, 17))
+_CHUNK = 12
+"""Images that are kept while a video is read backwards."""
+
+_Window = tuple[slice, slice]
+_Anchors = dict[int, tuple[Bool[ndarray, "row column"], Bool[ndarray, "row column"]]]
+"""By a hand's label: what of it is surely there, and from where its distance is counted."""
+
+
+@dataclass(frozen=True)
+class Click:
+    """A place on the object, in one image."""
+
+    view: str
+    """Name of the view."""
+    frame: int
+    """Number of the frame."""
+    x: float
+    """Column [px]."""
+    y: float
+    """Row [px]."""
+
+
+def segment(
+    sequence: Sequence, clicks: Many[Click], progress: Progress | None = None
+) -> dict[str, UInt8[ndarray, "frame row column"]]:
+    """Label the pixels of all views with color.
+
+    Args:
+        sequence: Recording; its own masks are not read. Hands start at its keypoints, which are
+            detected in views that have none stored.
+        clicks: Places on the object; more than one in a view, or in several views, help where one
+            is not enough. Without any, hands alone are labelled.
+        progress: Told after every frame; may cancel.
+
+    Returns:
+        By view: 0 background, 1 object, 2 right hand, 3 left hand.
+
+    Raises:
+        MissingInputError: If no view has color.
+        UsageError: If a click is not on an object; says what to do.
+        CancelledError: If the user asked to stop.
+    """
+    progress = progress or NullProgress()
+    colored = [view for view in sequence.views if view.has_color]
+    if not colored:
+        raise MissingInputError(
+            f"Sequence '{sequence.name}': no view has color images, in which object and hands "
+            "could be found. Add views/<view>/color.mp4 or color/, or give masks."
+        )
+    for click in clicks:
+        _check_place(sequence, click)
+    found = [_Seen(view, sequence, _keypoints(view, sequence, progress)) for view in colored]
+    for seen in found:
+        seen.others = [other for other in found if other is not seen and other.view.has_depth]
+    clicked = [seen for seen in found if any(click.view == seen.view.name for click in clicks)]
+    done, total = 0, len(found) * sequence.frame_count
+    for seen in [*clicked, *(seen for seen in found if seen not in clicked)]:
+        if seen in clicked:
+            mine = [click for click in clicks if click.view == seen.view.name]
+            starts = _clicked_starts(seen, mine)
+        else:
+            starts = _borrowed_start(seen, clicked)
+        for _ in _follow(seen, starts):
+            progress.check_cancelled()
+            done += 1
+            progress.report(SEGMENTATION_STAGE, done, total, None, f"View {seen.view.name}")
+        seen.view.close()
+    return {seen.view.name: seen.label for seen in found}
+
+
+def _told(click: Click) -> str:
+    return f"Click {click.view},{click.frame},{click.x:g},{click.y:g}"
+
+
+def _check_place(sequence: Sequence, click: Click) -> None:
+    where = _told(click)
+    views = {view.name: view for view in sequence.views}
+    if click.view not in views:
+        names = ", ".join(views) or "none"
+        raise UsageError(f"{where}: there is no view '{click.view}'. Views are: {names}.")
+    view = views[click.view]
+    if not (view.has_color and view.has_depth):
+        part = "depth" if view.has_color else "color"
+        raise UsageError(
+            f"{where}: view '{click.view}' has no {part}. Click in a view with color and depth."
+        )
+    if not 0 <= click.frame < sequence.frame_count:
+        raise UsageError(
+            f"{where}: there is no frame {click.frame}. Name one from 0 to "
+            f"{sequence.frame_count - 1}."
+        )
+    width, height = view.camera.width, view.camera.height
+    if not (-0.5 <= click.x <= width - 0.5 and -0.5 <= click.y <= height - 0.5):
+        raise UsageError(
+            f"{where}: is outside of the image. x goes from 0 to {width - 1}, y to {height - 1}."
+        )
+
+
+def _keypoints(
+    view: View, sequence: Sequence, progress: Progress
+) -> Float[ndarray, "frame hand 21 3"] | None:
+    if view.keypoint is not None or not sequence.hands:
+        return view.keypoint
+    return detect_view(view, sequence.hands, progress, KeypointDetector())
+
+
+class _Colors:
+    """How often something shows each color: a histogram, smoothed into a density."""
+
+    def __init__(self, new: float) -> None:
+        self._new = new
+        self._count = np.zeros(int(np.prod(_BINS)), dtype=np.float32)
+        self._logarithm: ndarray | None = None
+
+    def add(self, code: Int[ndarray, " pixel"], weight: float = 1.0) -> None:
+        """Count pixels by the number of their color."""
+        self._count += np.float32(weight) * np.bincount(code, minlength=self._count.size)
+        self._logarithm = None
+
+    def replace(self, code: Int[ndarray, " pixel"]) -> None:
+        """Forget what was counted, and count these pixels."""
+        self._count[:] = 0
+        self.add(code)
+
+    def inherit(self, other: "_Colors") -> None:
+        """Take over what another view has seen."""
+        self._count += other._count
+        self._logarithm = None
+
+    def fade(self, most: float) -> None:
+        """Let at most so many pixels count."""
+        self._count *= np.float32(min(1.0, most / max(float(self._count.sum()), 1e-9)))
+
+    def is_known(self) -> bool:
+        """Tell whether any color was seen."""
+        return bool(self._count.any())
+
+    def log_density(self, code: Int[ndarray, "*shape"]) -> Float[ndarray, "*shape"]:
+        """Compute how much more often than all colors on average these are shown (logarithm)."""
+        if self._logarithm is None:
+            dense = gaussian_filter(self._count.reshape(_BINS), _BLUR, mode="nearest")
+            dense *= dense.size / max(float(dense.sum()), 1e-9)
+            self._logarithm = np.log((1 - self._new) * dense + self._new).reshape(-1)
+        return self._logarithm[code]
+
+
+class _Image:
+    """One frame of one view."""
+
+    def __init__(self, view: View, frame: int) -> None:
+        self.frame = frame
+        self.color = view.color(frame)
+        self.gray = cv2.cvtColor(self.color, cv2.COLOR_RGB2GRAY)
+        self.depth = view.depth(frame) if view.has_depth else np.zeros(self.gray.shape, np.float32)
+
+
+class _Seen:
+    """What is known of a view: its labels, and how object, hands and background look in it."""
+
+    def __init__(
+        self, view: View, sequence: Sequence, keypoint: Float[ndarray, "frame hand 21 3"] | None
+    ) -> None:
+        camera = view.camera
+        self.view = view
+        self.hands = sequence.hands
+        self.ground = sequence.ground_height
+        self.keypoint = keypoint
+        self.others: list[_Seen] = []
+        """Other views with depth, which may show hands that this one's detector did not find."""
+        self.whole: _Window = (slice(0, camera.height), slice(0, camera.width))
+        self.label = np.zeros((view.frame_count, camera.height, camera.width), dtype=np.uint8)
+        self.background = _Colors(_NEW_ON_BACKGROUND)
+        self.things = {OBJECT_LABEL: _Colors(_NEW_ON_OBJECT)}
+        self.things |= {value: _Colors(_NEW_ON_SKIN) for value in HAND_LABEL.values()}
+        row, column = np.mgrid[: camera.height, : camera.width]
+        pixel = np.stack([column, row], axis=-1).astype(np.float64)
+        self.origin = camera.T_world_camera[:3, 3]
+        self.ray = (camera.unproject(pixel, np.ones(row.shape)) - self.origin).astype(np.float32)
+        self.focal = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
+        self.noise = _SUPPORT_NOISE
+        """Standard deviation of heights of the support [m]."""
+        self.clutter = 0.05
+        """Share of the background that is not on the support."""
+        self._rise: ndarray | None = None
+        self._start = 0.0
+
+    def find_support(self, depth: Float[ndarray, "row column"]) -> None:
+        """Find the plane that carries the object, if there is one."""
+        point = self.origin + self.ray[depth > 0][::5] * depth[depth > 0][::5, None]
+        plane, self.noise = _support(point, self.origin, self.ground)
+        if plane is not None:
+            self._rise = (self.ray @ plane[:3]).astype(np.float32)
+            self._start = float(self.origin @ plane[:3] + plane[3])
+
+    def height(
+        self, depth: Float[ndarray, "row column"], window: _Window
+    ) -> Float[ndarray, "row column"]:
+        """Compute heights above the support [m]; NaN where they are not known."""
+        if self._rise is None:
+            return np.full(depth.shape, np.nan, dtype=np.float32)
+        height = self._start + self._rise[window] * depth
+        return np.where(depth > 0, height, np.float32(np.nan))
+
+    def points(
+        self, depth: Float[ndarray, "row column"], mask: Bool[ndarray, "row column"]
+    ) -> Float[ndarray, "point 3"]:
+        """Lift the pixels of a mask that have depth into the world [m]."""
+        at = mask & (depth > 0)
+        return self.origin + self.ray[at].astype(np.float64) * depth[at][:, None]
+
+
+def _support(
+    point: Float[ndarray, "point 3"], eye: Float[ndarray, " 3"], ground: float | None
+) -> tuple[Float[ndarray, " 4"] | None, float]:
+    """Fit the plane that most points lie in, by RANSAC and least squares.
+
+    Returns:
+        Normal towards the eye and offset, None if no plane holds enough points; and the standard
+        deviation of the points' heights [m].
+    """
+    if ground is not None:
+        point = point[np.abs(point[:, 2] - ground) < _SUPPORT_BAND]
+    if len(point) < 200:
+        return None, _SUPPORT_NOISE
+    random = np.random.default_rng(0)
+    inside = np.zeros(len(point), dtype=bool)
+    for _ in range(150):
+        a, b, c = point[random.choice(len(point), 3, replace=False)]
+        normal = np.cross(b - a, c - a)
+        length = np.linalg.norm(normal)
+        if length < 1e-6 or (ground is not None and abs(normal[2]) < 0.98 * length):
+            continue
+        near = np.abs((point - a) @ (normal / length)) < 2 * _SUPPORT_NOISE
+        if near.sum() > inside.sum():
+            inside = near
+    if inside.sum() < max(3, _LEAST_SUPPORT * len(point)):
+        return None, _SUPPORT_NOISE
+    normal, mean, noise = np.zeros(3), np.zeros(3), _SUPPORT_NOISE
+    for _ in range(3):
+        mean = point[inside].mean(axis=0)
+        normal = np.linalg.svd((point[inside] - mean).T @ (point[inside] - mean))[0][:, 2]
+        height = (point - mean) @ normal
+        noise = max(1.4826 * float(np.median(np.abs(height[inside]))), _SUPPORT_NOISE / 2)
+        inside = np.abs(height) < 2.5 * noise
+    normal = normal if (eye - mean) @ normal > 0 else -normal
+    return np.append(normal, -mean @ normal), max(noise, _SUPPORT_NOISE)
+
+
+class _Patch:
+    """What is computed from a window of an image."""
+
+    def __init__(self, seen: _Seen, image: _Image, window: _Window) -> None:
+        self.window = window
+        self.color = np.ascontiguousarray(image.color[window])
+        self.lab = cv2.cvtColor(self.color, cv2.COLOR_RGB2LAB)
+        self.code = _code(self.lab, 1.0)
+        self.depth = image.depth[window]
+        self.has_depth = self.depth > 0
+        self.height = seen.height(self.depth, window)
+
+
+def _code(lab: UInt8[ndarray, "row column 3"], lightness: float) -> Int[ndarray, "row column"]:
+    """Number each pixel's color, seen in that share of its light."""
+    code = np.zeros(lab.shape[:2], dtype=np.int64)
+    for axis, bins in enumerate(_BINS):
+        value = lab[..., axis] * (lightness if axis == 0 else 1.0)
+        code = code * bins + (value.astype(np.int64) * bins) // 256
+    return code
+
+
+@dataclass(frozen=True)
+class _Start:
+    """A frame in which a view's object is known before it is followed."""
+
+    image: _Image
+    seed: Bool[ndarray, "row column"]
+    """Pixels that are surely the object."""
+    click: Click | None = None
+
+
+def _clicked_starts(seen: _Seen, clicks: Many[Click]) -> dict[int, _Start]:
+    starts: dict[int, _Start] = {}
+    for click in clicks:
+        known = starts.get(click.frame)
+        image = known.image if known else _Image(seen.view, click.frame)
+        seed = _around_click(seen, image, click)
+        seed = seed | known.seed if known else seed
+        starts[click.frame] = _Start(image, seed, click)
+    return starts
+
+
+def _around_click(seen: _Seen, image: _Image, click: Click) -> Bool[ndarray, "row column"]:
+    """Choose the pixels next to a click that have its color and depth."""
+    where = _told(click)
+    height, width = image.gray.shape
+    row, column = min(round(click.y), height - 1), min(round(click.x), width - 1)
+    near = image.depth[max(0, row - 1) : row + 2, max(0, column - 1) : column + 2]
+    if not (near > 0).any():
+        raise UsageError(
+            f"{where}: no depth was measured there. Click where the object shows its face to the "
+            "camera, away from its rim."
+        )
+    depth = float(np.median(near[near > 0]))
+    for value, core in _hand_cores(seen, click.frame):
+        if core[row, column]:
+            side = next(side for side, label in HAND_LABEL.items() if label == value)
+            raise UsageError(
+                f"{where}: is on the {side} hand. Click on a part of the object that no hand "
+                "covers, or in another frame."
+            )
+    disc = np.zeros(image.gray.shape, dtype=np.uint8)
+    radius = int(np.clip(_CLICK_RADIUS * seen.focal / depth, 3, 30))
+    cv2.circle(disc, (column, row), radius, 1, -1)
+    lab = cv2.cvtColor(image.color, cv2.COLOR_RGB2LAB).astype(np.float32)
+    alike = (disc > 0) & (np.linalg.norm(lab - lab[row, column], axis=-1) < _CLICK_COLOR)
+    alike &= (image.depth == 0) | (np.abs(image.depth - depth) < EDGE_STEP)
+    alike[row, column] = True
+    label = cv2.connectedComponents(alike.astype(np.uint8))[1]
+    return np.asarray(label == label[row, column])
+
+
+def _borrowed_start(seen: _Seen, clicked: list[_Seen]) -> dict[int, _Start]:
+    """Choose the frame in which a view sees most of what the clicked views call the object."""
+    count = seen.view.frame_count
+    best, most = (0, np.zeros(seen.label.shape[1:], dtype=bool)), -1
+    for frame in sorted({0, count - 1, *range(0, count, max(1, count // 6))}):
+        depth = seen.view.depth(frame) if seen.view.has_depth else None
+        seed = np.zeros(seen.label.shape[1:], dtype=bool)
+        for other in clicked:
+            mask = other.label[frame] == OBJECT_LABEL
+            seed |= _projected(seen, depth, other.points(other.view.depth(frame), mask))
+        for _, core in _hand_cores(seen, frame):
+            seed &= core == 0
+        if seed.sum() > most:
+            best, most = (frame, seed), int(seed.sum())
+    for other in clicked:
+        for value, colors in seen.things.items():
+            colors.inherit(other.things[value])
+    return {best[0]: _Start(_Image(seen.view, best[0]), best[1])}
+
+
+def _projected(
+    seen: _Seen, depth: Float[ndarray, "row column"] | None, point: Float[ndarray, "point 3"]
+) -> Bool[ndarray, "row column"]:
+    """Mark the pixels in which a view sees points of the world."""
+    mark = np.zeros(seen.label.shape[1:], dtype=bool)
+    pixel = np.nan_to_num(seen.view.camera.project(point), nan=-1e6)
+    column, row = np.clip(pixel.round(), -1e6, 1e6).astype(np.int64).T
+    inside: ndarray = (row >= 0) & (column >= 0) & (row < mark.shape[0]) & (column < mark.shape[1])
+    if depth is not None:
+        there = depth[row[inside], column[inside]]
+        gap = np.abs(there - seen.view.camera.camera_depth(point[inside]))
+        inside[inside] = (there == 0) | (gap < EDGE_STEP)
+    mark[row[inside], column[inside]] = True
+    return mark
+
+
+def _follow(seen: _Seen, starts: dict[int, _Start]) -> Iterator[int]:
+    """Label all frames from their nearest start on; yields each that is finished."""
+    frames = sorted(starts)
+    ends = [(a + b) // 2 + 1 for a, b in itertools.pairwise(frames)]
+    bounds = [0, *ends, seen.view.frame_count]
+    for start, low, high in zip(frames, bounds, bounds[1:], strict=False):
+        image, click = starts[start].image, starts[start].click
+        seen.find_support(image.depth)
+        first = seen.label[start] = _begin(seen, image, starts[start].seed)
+        if click is not None and (first == OBJECT_LABEL).sum() < _LEAST_OBJECT:
+            raise UsageError(
+                f"{_told(click)}: nothing there stands out from what is around it. Click on a part "
+                "of the object with a color of its own, or in another view or frame."
+            )
+        yield start
+        for way in (range(start + 1, high), range(start - 1, low - 1, -1)):
+            before, label = image, first
+            for now in _images(seen.view, way):
+                label = seen.label[now.frame] = _advance(seen, before, label, now)
+                before = now
+                yield now.frame
+
+
+def _images(view: View, frames: range) -> Iterator[_Image]:
+    """Read images in any direction; videos, which go forwards only, piece by piece."""
+    if frames.step > 0:
+        yield from (_Image(view, frame) for frame in frames)
+        return
+    for start in range(0, len(frames), _CHUNK):
+        piece = frames[start : start + _CHUNK]
+        yield from reversed([_Image(view, frame) for frame in reversed(piece)])
+
+
+def _hand_cores(seen: _Seen, frame: int) -> Iterator[tuple[int, UInt8[ndarray, "row column"]]]:
+    """Draw bones and palm of each hand whose keypoints are known; yields label and picture."""
+    if seen.keypoint is None:
+        return
+    for hand, side in enumerate(seen.hands):
+        pixel = seen.keypoint[frame, hand, :, :2].astype(np.float64)
+        known = np.asarray(np.isfinite(pixel).all(axis=1))
+        if known.sum() < _LEAST_JOINTS:
+            continue
+        core = np.zeros(seen.label.shape[1:], dtype=np.uint8)
+        at = np.clip(np.where(known[:, None], pixel, 0), -1e4, 1e4).round().astype(np.int32)
+        hull = at[[joint for joint in _PALM if known[joint]]]
+        if known[0] and known[9]:
+            # Keypoint 0 is inside of the wrist; the hand goes on a little.
+            beyond = np.clip(pixel[0] + 0.25 * (pixel[0] - pixel[9]), -1e4, 1e4)
+            hull = np.concatenate([hull, beyond.round().astype(np.int32)[None]])
+        if len(hull) > 2:
+            cv2.fillConvexPoly(core, cv2.convexHull(hull), 1)
+        width = max(1, round(0.16 * _palm_size(pixel)))
+        for bone in _BONES:
+            line = at[[joint for joint in bone if known[joint]]]
+            if len(line) > 1:
+                cv2.polylines(core, [line], isClosed=False, color=1, thickness=width)
+        yield HAND_LABEL[side], core
+
+
+def _palm_size(pixel: Float[ndarray, "21 2"]) -> float:
+    """Measure a palm in the image by the longest of its sides that are seen [px]."""
+    sides = np.array([np.linalg.norm(pixel[a] - pixel[b]) for a, b in _PALM_SIDES])
+    if np.isfinite(sides).any():
+        return float(np.nanmax(sides))
+    return float(np.nanmax(np.nanmax(pixel, axis=0) - np.nanmin(pixel, axis=0))) / 2
+
+
+def _is_raised_hand(
+    core: Bool[ndarray, "row column"],
+    depth: Float[ndarray, "row column"],
+    height: Float[ndarray, "row column"],
+) -> Bool[ndarray, "row column"]:
+    """Leave out what lies on the support, or far before or behind the hand, if depth tells."""
+    raised = core & (depth > 0) & ~(height < 1.5 * _HAND_HEIGHT)
+    if raised.sum() < 5:
+        return core
+    middle = float(np.median(depth[raised]))
+    near = np.abs(depth - middle) < _HAND_DEPTH
+    return core & (depth > 0) & near & ~(height < _HAND_HEIGHT)
+
+
+def _borrowed_cores(seen: _Seen, frame: int, missing: set[int]) -> Iterator[tuple[int, ndarray]]:
+    """Show hands in a view whose keypoints are not known, by those of the others and depth."""
+    own = seen.view.depth(frame) if seen.view.has_depth else None
+    mark = {value: np.zeros(seen.label.shape[1:], dtype=bool) for value in missing}
+    for other in seen.others:
+        for value, core in _hand_cores(other, frame):
+            if value in missing:
+                depth = other.view.depth(frame)
+                at = _is_raised_hand(core > 0, depth, other.height(depth, other.whole))
+                mark[value] |= _projected(seen, own, other.points(depth, at))
+    for value, at in mark.items():
+        closed = cv2.morphologyEx(at.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+        if closed.sum() >= _LEAST_OBJECT:
+            yield value, closed
+
+
+def _hand_anchors(
+    seen: _Seen, patch: _Patch, frame: int, carried: UInt8[ndarray, "row column"] | None
+) -> _Anchors:
+    """Find where hands are: at their keypoints, at those of other views, or where they were."""
+    anchors: _Anchors = {}
+    cores = dict(_hand_cores(seen, frame))
+    missing = {HAND_LABEL[side] for side in seen.hands} - set(cores)
+    if missing:
+        cores |= dict(_borrowed_cores(seen, frame, missing))
+    for value, core in cores.items():
+        inside = _is_raised_hand(core[patch.window] > 0, patch.depth, patch.height)
+        wide = inside
+        if carried is not None and inside.any():
+            reach = max(2, round(_WIDER * float(np.sqrt(core.sum()))))
+            near = cv2.dilate(inside.astype(np.uint8), _disc(reach)) > 0
+            wide = inside | (near & (carried == value))
+        if inside.any():
+            anchors[value] = inside, wide
+    if carried is not None:
+        for value in missing - set(anchors):
+            if (carried == value).sum() >= _LEAST_OBJECT:
+                anchors[value] = np.zeros(carried.shape, dtype=bool), carried == value
+    return anchors
+
+
+def _disc(radius: int) -> UInt8[ndarray, "row column"]:
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2).astype(np.uint8)
+
+
+def _farness(
+    seen: _Seen, patch: _Patch, anchor: Bool[ndarray, "row column"]
+) -> Float[ndarray, "row column"]:
+    """Compute what a label costs by the distance, in space, from where it is expected."""
+    distance, nearest = _cv2.distanceTransformWithLabels(
+        (~anchor).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    rows, columns = np.nonzero(anchor)
+    number = np.zeros(int(nearest.max()) + 1, dtype=np.int64)
+    number[nearest[rows, columns]] = np.arange(len(rows))
+    there = patch.depth[rows, columns]
+    typical = float(np.median(there[there > 0])) if (there > 0).any() else 1.0
+    there = there[number[nearest]]
+    across = distance * np.where(there > 0, there, typical) / seen.focal
+    along = np.where((there > 0) & patch.has_depth, np.abs(patch.depth - there), 0.0)
+    return np.clip((np.hypot(across, along) - _REACH) / _SLACK, 0.0, _FARTHEST)
+
+
+def _height_scores(
+    seen: _Seen, height: Float[ndarray, "row column"]
+) -> tuple[Float[ndarray, "row column"], ...]:
+    """Compute log-likelihoods of heights for background, object and hands."""
+    known = np.isfinite(height)
+    h = np.where(known, height, 0.0)
+    sigma = 1.2 * seen.noise
+    flat = np.exp(-0.5 * (h / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
+    above = 1 / (1 + np.exp(-np.clip(h / (0.7 * sigma), -30, 30)))
+    low = above / (1 + np.exp(np.clip((h - _LOW) / (2 * sigma), -30, 30)))
+    background = (1 - seen.clutter) * flat + seen.clutter / _HIGHEST
+    object_ = 0.5 * low / _LOW + (0.5 * above + 0.02) / _HIGHEST
+    hand = 0.3 * low / _LOW + (above + 0.02) / _HIGHEST
+    return tuple(np.where(known, np.log(x), 0.0) for x in (background, object_, hand))
+
+
+def _judge(
+    seen: _Seen,
+    patch: _Patch,
+    hands: _Anchors,
+    farness: Float[ndarray, "row column"] | None,
+    carried: UInt8[ndarray, "row column"] | None,
+    *,
+    has_object: bool,
+) -> tuple[list[int], Float[ndarray, "label row column"]]:
+    """Score every label in every pixel.
+
+    Args:
+        seen: The view.
+        patch: What is judged.
+        hands: Where hands are.
+        farness: What the object costs by its distance; None where nobody knows where it was.
+        carried: Labels that flow brings.
+        has_object: Whether there is an object to be found.
+    """
+    background, object_, hand = _height_scores(seen, patch.height)
+    background = background + seen.background.log_density(patch.code)
+    labels, scores = [_BACKGROUND], [background]
+    if has_object:
+        score = object_ + seen.things[OBJECT_LABEL].log_density(patch.code)
+        if farness is not None:
+            score = score - farness
+            background -= _RAISED * ((farness < 0.5) & (patch.height > 4 * seen.noise))
+        labels.append(OBJECT_LABEL)
+        scores.append(score)
+    for value, (core, wide) in hands.items():
+        score = hand + seen.things[value].log_density(patch.code)
+        labels.append(value)
+        scores.append(score - _farness(seen, patch, wide) + _CORE * core)
+    if carried is not None:
+        for index, value in enumerate(labels):
+            share = cv2.GaussianBlur((carried == value).astype(np.float32), (0, 0), _SOFT)
+            scores[index] = scores[index] + np.log((1 - _STAY) * share + _STAY / 3)
+    return labels, _decided_together(patch, np.stack(scores).astype(np.float32))
+
+
+def _decided_together(
+    patch: _Patch, score: Float[ndarray, "label row column"]
+) -> Float[ndarray, "label row column"]:
+    """Average scores over the pixels around that look alike."""
+    lab = patch.lab.astype(np.float32)
+    height, width = lab.shape[:2]
+    total, weight = np.zeros_like(score), np.zeros((height, width), dtype=np.float32)
+    wide_score = np.pad(score, ((0, 0), (2, 2), (2, 2)), mode="edge")
+    wide_lab = np.pad(lab, ((2, 2), (2, 2), (0, 0)), mode="edge")
+    for down in range(5):
+        for across in range(5):
+            at = np.s_[down : down + height, across : across + width]
+            far = ((down - 2) ** 2 + (across - 2) ** 2) / (2 * _AROUND**2)
+            unlike = ((wide_lab[at] - lab) ** 2).sum(axis=-1) / np.float32(2 * _ALIKE**2)
+            share = np.exp(-unlike - np.float32(far))
+            total += share * wide_score[:, *at]
+            weight += share
+    return total / weight
+
+
+def _begin(
+    seen: _Seen, image: _Image, seed: Bool[ndarray, "row column"]
+) -> UInt8[ndarray, "row column"]:
+    """Label a first frame, and learn from it how everything looks."""
+    patch = _Patch(seen, image, seen.whole)
+    hands = _hand_anchors(seen, patch, image.frame, None)
+    shadowed = [_code(patch.lab, share) for share in _SHADOWS]
+    for code in shadowed:
+        seen.background.add(code.reshape(-1), 1 / len(_SHADOWS))
+    colors = seen.things[OBJECT_LABEL]
+    for value, (core, _) in hands.items():
+        seen.things[value].add(patch.code[core])
+        seed = seed & ~core
+    if colors.is_known() and seed.any():
+        # The object comes from elsewhere: calibration errs, and what it hits may be beside it.
+        own = colors.log_density(patch.code)
+        rivals = [seen.background, *(seen.things[value] for value in hands)]
+        alike = np.all([own > rival.log_density(patch.code) for rival in rivals], axis=0)
+        seed = alike & (cv2.dilate(seed.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0)
+    has_object = int(seed.sum()) > 0
+    colors.replace(patch.code[seed])
+    label = np.zeros(seed.shape, dtype=np.uint8)
+    farness = None
+    for _ in range(_ROUNDS):
+        labels, score = _judge(seen, patch, hands, None, None, has_object=has_object)
+        if farness is not None:
+            score[0] -= _RAISED * ((farness < 0.5) & (patch.height > 4 * seen.noise))
+        label = np.array(labels, dtype=np.uint8)[score.argmax(axis=0)]
+        if has_object:
+            kept = _hanging_together(seen, patch, label, seed) | seed
+            label[(label == OBJECT_LABEL) & ~kept] = _BACKGROUND
+            colors.replace(patch.code[kept])
+            farness = _farness(seen, patch, kept)
+        for value, (core, _) in hands.items():
+            seen.things[value].replace(patch.code[core & (label == value)])
+        free = cv2.dilate(label, np.ones((3, 3), np.uint8)) == 0
+        seen.background.replace(np.concatenate([code[free] for code in shadowed]))
+        known = free & np.isfinite(patch.height)
+        if known.sum() > 200:
+            off = np.abs(patch.height[known]) > 5 * seen.noise
+            seen.clutter = float(np.clip(off.mean(), 0.003, 0.3))
+    return _outlined(patch, label)
+
+
+def _advance(
+    seen: _Seen, before: _Image, label: UInt8[ndarray, "row column"], now: _Image
+) -> UInt8[ndarray, "row column"]:
+    """Label the frame after (or before) a labelled one."""
+    window = _window(seen, label, now.frame)
+    patch = _Patch(seen, now, window)
+    flow = _cv2.DISOpticalFlow_create(_cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(
+        np.ascontiguousarray(now.gray[window]), np.ascontiguousarray(before.gray[window]), None
+    )
+    row, column = np.mgrid[: flow.shape[0], : flow.shape[1]].astype(np.float32)
+    carried = cv2.remap(
+        np.ascontiguousarray(label[window]),
+        column + flow[..., 0],
+        row + flow[..., 1],
+        cv2.INTER_NEAREST,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    hands = _hand_anchors(seen, patch, now.frame, carried)
+    anchor = carried == OBJECT_LABEL
+    has_object = bool(anchor.any())
+    for value, (core, _) in hands.items():
+        if not seen.things[value].is_known():
+            seen.things[value].add(patch.code[core])
+    farness = _farness(seen, patch, anchor) if has_object else None
+    labels, score = _judge(seen, patch, hands, farness, carried, has_object=has_object)
+    inner = np.array(labels, dtype=np.uint8)[score.argmax(axis=0)]
+    if has_object:
+        kept = _hanging_together(seen, patch, inner, anchor)
+        inner[(inner == OBJECT_LABEL) & ~kept] = _BACKGROUND
+    _learn(seen, patch, labels, score, inner)
+    result = np.zeros_like(label)
+    result[window] = _outlined(patch, inner)
+    return result
+
+
+def _learn(
+    seen: _Seen,
+    patch: _Patch,
+    labels: list[int],
+    score: Float[ndarray, "label row column"],
+    label: UInt8[ndarray, "row column"],
+) -> None:
+    """Follow colors as light and sides of things change."""
+    if len(labels) < 2:
+        return
+    ordered = np.sort(score, axis=0)
+    is_sure = ordered[-1] - ordered[-2] > _SURE
+    for value in labels[1:]:
+        rate = _OBJECT_RATE if value == OBJECT_LABEL else _SKIN_RATE
+        seen.things[value].fade(_MEMORY * max(50, int((label == value).sum())))
+        seen.things[value].add(patch.code[is_sure & (label == value)], rate)
+
+
+def _window(seen: _Seen, label: UInt8[ndarray, "row column"], frame: int) -> _Window:
+    """Choose the part of an image in which all things will be."""
+    mask = label > 0
+    for _, core in _hand_cores(seen, frame):
+        mask = mask | (core > 0)
+    if not mask.any() or (seen.hands and not (label > OBJECT_LABEL).any()):
+        return seen.whole
+    pad = max(24, round(0.08 * mask.shape[1]))
+    spans: list[slice] = []
+    for axis in (0, 1):
+        at = np.flatnonzero(mask.any(axis=1 - axis))
+        low, high = int(at[0]) - pad, int(at[-1]) + pad + 1
+        short = max(0, 96 - (high - low))
+        spans.append(slice(max(0, low - short), min(mask.shape[axis], high + short)))
+    return spans[0], spans[1]
+
+
+def _hanging_together(
+    seen: _Seen,
+    patch: _Patch,
+    label: UInt8[ndarray, "row column"],
+    seed: Bool[ndarray, "row column"],
+) -> Bool[ndarray, "row column"]:
+    """Keep the pieces of the object that hold a seed, or hang on such a piece behind a hand."""
+    is_object = label == OBJECT_LABEL
+    piece = _pieces(seen, patch, is_object)
+    count = int(piece.max()) + 1
+    size = np.bincount(piece[is_object], minlength=count)
+    is_kept = np.bincount(piece[is_object & seed], minlength=count) > 0
+    kept = is_object & is_kept[piece]
+    hand = label > OBJECT_LABEL
+    if kept.any() and hand.any():
+        depth = patch.depth[hand & patch.has_depth]
+        reach = _BRIDGE * seen.focal / float(np.median(depth)) if depth.size else 3.0
+        beside = cv2.dilate(hand.astype(np.uint8), _disc(max(1, round(reach)))) > 0
+        if (beside & kept).any():
+            least = max(_LEAST_PIECE, 0.02 * float(kept.sum()))
+            touches = np.bincount(piece[is_object & beside], minlength=count) > 0
+            kept = is_object & (is_kept | (touches & (size >= least)))[piece]
+    # At depth edges single pixels are pieces of their own.
+    return is_object & (cv2.dilate(kept.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
+
+
+def _pieces(
+    seen: _Seen, patch: _Patch, mask: Bool[ndarray, "row column"]
+) -> Int[ndarray, "row column"]:
+    """Number the pieces of a mask within which no neighbours are a step of depth apart."""
+    result = np.zeros(mask.shape, dtype=np.int64)
+    size = int(mask.sum())
+    if size == 0:
+        return result
+    number = np.zeros(mask.shape, dtype=np.int64)
+    number[mask] = np.arange(size)
+    height, width = mask.shape
+    starts: list[ndarray] = []
+    ends: list[ndarray] = []
+    for down, across in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        a = np.s_[: height - down, max(0, -across) : width - max(0, across)]
+        b = np.s_[down:, max(0, across) : width - max(0, -across)]
+        step = np.abs(patch.depth[a] - patch.depth[b])
+        # A surface may be seen from its side: four times as deep as wide.
+        is_one = step < np.maximum(EDGE_STEP, 4 * patch.depth[a] / seen.focal)
+        is_one |= ~patch.has_depth[a] | ~patch.has_depth[b]
+        is_one &= mask[a] & mask[b]
+        starts.append(number[a][is_one])
+        ends.append(number[b][is_one])
+    start, end = np.concatenate(starts), np.concatenate(ends)
+    graph = coo_array((np.ones(len(start), np.int8), (start, end)), shape=(size, size))
+    result[mask] = connected_components(graph, directed=False)[1]
+    return result
+
+
+def _outlined(patch: _Patch, label: UInt8[ndarray, "row column"]) -> UInt8[ndarray, "row column"]:
+    """Let GrabCut decide the object's outermost pixels, where it is thick enough for it.
+
+    Its smoothness term would eat what is only a few pixels wide, like a rope.
+    """
+    mask = (label == OBJECT_LABEL).astype(np.uint8)
+    thick = cv2.morphologyEx(mask, cv2.MORPH_OPEN, _disc(3))
+    sure = cv2.erode(thick, np.ones((3, 3), np.uint8))
+    rim = (cv2.dilate(thick, np.ones((3, 3), np.uint8)) > 0) & (sure == 0)
+    free = rim & (label <= OBJECT_LABEL)
+    if not sure.any() or not free.any():
+        return label
+    state = np.where(mask > 0, cv2.GC_FGD, cv2.GC_BGD).astype(np.uint8)
+    state[free] = np.where(mask[free] > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD)
+    cv2.setRNGSeed(0)  # Its mixtures of Gaussians start from random places.
+    _cv2.grabCut(
+        patch.color, state, None, np.zeros((1, 65)), np.zeros((1, 65)), 2, cv2.GC_INIT_WITH_MASK
+    )
+    result = label.copy()
+    is_object = (state == cv2.GC_FGD) | (state == cv2.GC_PR_FGD)
+    result[free] = np.where(is_object[free], OBJECT_LABEL, _BACKGROUND)
+    return result

@@ -1,0 +1,56 @@
+"""The command that finds an object from clicks."""
+
+import pytest
+from clicked_disc import FRAMES, disc_click, write_disc
+
+from app import cli
+from physhandi.data.sequence import Sequence
+
+
+def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    with pytest.raises(SystemExit) as end:
+        cli.main([str(argument) for argument in arguments])
+    return int(end.value.code or 0), *capsys.readouterr()
+
+
+def test_a_click_on_the_command_line_gives_masks_and_tracks(tmp_path, capsys):
+    sequence, _ = write_disc(tmp_path / "disc", frames=4)
+    view, frame, x, y = disc_click()
+    place = f"{view},{frame},{x:g},{y:g}"
+    code, out, error = call(capsys, "annotate", sequence.folder, "--click", place)
+    assert code == 0, error
+    assert "frames with object: 4" in out
+    assert "least tracks in a frame: " in out
+    assert "segmentation 8/8" in error
+    assert "point_tracking 8/8" in error
+    done = Sequence.load(sequence.folder)
+    done.validate()
+    assert done.missing("mask", "track") == []
+    assert done.provenance["masks"]["clicks"] == [{"view": view, "frame": 0, "x": x, "y": y}]
+
+
+@pytest.mark.parametrize(
+    ("place", "told"),
+    [
+        ("top,0,40", "write view,frame,x,y"),
+        ("top,first,40,40", "write view,frame,x,y"),
+        (f"top,{FRAMES},40,40", f"there is no frame {FRAMES}"),
+        ("front,0,40,40", "there is no view 'front'"),
+    ],
+)
+def test_a_click_that_makes_no_sense_is_bad_usage(tmp_path, capsys, place, told):
+    sequence, _ = write_disc(tmp_path / "disc")
+    code, out, error = call(capsys, "annotate", sequence.folder, "--click", place)
+    assert (code, out) == (2, "")
+    assert told in error
+    assert not any(view.has_mask for view in Sequence.load(sequence.folder).views)
+
+
+def test_given_masks_stay_unless_overwriting_is_allowed(tmp_path, capsys):
+    sequence, _ = write_disc(tmp_path / "disc", masks=True, frames=2)
+    view, frame, x, y = disc_click()
+    command = ("annotate", sequence.folder, "--click", f"{view},{frame},{x:g},{y:g}")
+    code, _, error = call(capsys, *command)
+    assert code == 2
+    assert "not made here" in error
+    assert call(capsys, *command, "--overwrite")[0] == 0

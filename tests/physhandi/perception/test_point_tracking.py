@@ -1,0 +1,104 @@
+import numpy as np
+import pytest
+from clicked_disc import FRAMES, TOP, cameras, center, write_disc
+
+from physhandi.errors import CancelledError
+from physhandi.perception.point_tracking import LEAST_TRACKS, track_points
+from physhandi.progress import Progress
+
+
+@pytest.fixture(scope="module")
+def disc(tmp_path_factory):
+    return write_disc(tmp_path_factory.mktemp("track") / "disc")
+
+
+def true_paths(view: str, pixel: np.ndarray, is_seen: np.ndarray) -> np.ndarray:
+    """Where the points of the disc that tracks begin on are in every frame [px]."""
+    camera = cameras()[view]
+    eye = camera.T_world_camera[:3, 3]
+    begin = is_seen.argmax(axis=0)
+    start = pixel[begin, np.arange(pixel.shape[1])].astype(float)
+    ray = camera.unproject(start, np.ones(len(start))) - eye
+    place = eye + ray * ((TOP - eye[2]) / ray[:, 2])[:, None]
+    paths = np.zeros(pixel.shape)
+    for frame in range(len(pixel)):
+        moved = place.copy()
+        for track, first in enumerate(begin):
+            moved[track, :2] += center(frame) - center(int(first))
+        paths[frame] = camera.project(moved)
+    return paths
+
+
+def test_tracks_follow_the_surface_to_a_part_of_a_pixel(disc):
+    sequence, labels = disc
+    found = track_points(sequence, labels)
+    assert set(found) == {"top", "side"}
+    for view, (pixel, is_seen) in found.items():
+        assert pixel.dtype == np.float32
+        np.testing.assert_array_equal(np.isfinite(pixel).all(axis=-1), is_seen)
+        moved = np.linalg.norm(true_paths(view, pixel, is_seen)[-1] - pixel[0], axis=-1)
+        assert np.nanmedian(moved) > 8
+        error = np.linalg.norm(true_paths(view, pixel, is_seen) - pixel, axis=-1)
+        assert np.median(error[is_seen]) < 0.2
+        assert np.percentile(error[is_seen], 90) < 0.8
+        assert is_seen.all(axis=0).sum() > 50
+
+
+def test_enough_tracks_live_in_every_frame_and_none_off_the_object(disc):
+    sequence, labels = disc
+    for view, (pixel, is_seen) in track_points(sequence, labels).items():
+        room = int((labels[view] == 1).sum(axis=(1, 2)).min()) / 9
+        assert is_seen.sum(axis=1).min() >= min(0.8 * room, 150)
+        for frame in range(FRAMES):
+            column, row = pixel[frame, is_seen[frame]].round().astype(int).T
+            assert (labels[view][frame, row, column] == 1).all()
+
+
+def test_tracks_end_under_a_hand_and_new_ones_begin_elsewhere(disc):
+    sequence, labels = disc
+    covered = {view: label.copy() for view, label in labels.items()}
+    for frame in range(4, FRAMES):
+        covered["top"][frame, :, : covered["top"].shape[2] // 2][
+            covered["top"][frame, :, : covered["top"].shape[2] // 2] == 1
+        ] = 2
+    pixel, is_seen = track_points(sequence, covered)["top"]
+    left = pixel[3, :, 0] < 50
+    assert left[is_seen[3]].sum() > 10
+    assert not is_seen[4:, left & is_seen[3]].any()
+    assert (is_seen[-1] & ~is_seen[0]).any()
+
+
+def test_a_jump_in_depth_ends_a_track(disc, monkeypatch):
+    sequence, labels = disc
+    view = sequence.views[0]
+    read = type(view).depth
+
+    def deeper(self, frame):
+        depth = read(self, frame)
+        return depth + np.float32(0.2) * (frame >= 5)
+
+    monkeypatch.setattr(type(view), "depth", deeper)
+    _, is_seen = track_points(sequence, labels)["top"]
+    assert (is_seen[4] & is_seen[3]).sum() > 50
+    assert not (is_seen[5] & is_seen[4]).any()
+    assert is_seen[5].sum() > 50
+
+
+def test_a_view_without_an_object_has_no_tracks(disc):
+    sequence, labels = disc
+    nothing = {**labels, "side": np.zeros_like(labels["side"])}
+    assert set(track_points(sequence, nothing)) == {"top"}
+    assert track_points(sequence, {}) == {}
+
+
+def test_tracking_can_be_cancelled(disc):
+    class Impatient(Progress):
+        def check_cancelled(self):
+            raise CancelledError("now")
+
+    with pytest.raises(CancelledError):
+        track_points(*disc, Impatient())
+
+
+def test_the_goal_of_150_tracks_is_below_what_starts_new_ones():
+    assert LEAST_TRACKS > 150

@@ -1,0 +1,143 @@
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from clicked_disc import FRAMES, HEIGHT, WIDTH, cameras, disc_click, write_disc
+
+from physhandi.errors import CancelledError, MissingInputError, UsageError
+from physhandi.perception.segmentation import Click, segment
+from physhandi.progress import Progress
+
+
+def agreement(found: np.ndarray, true: np.ndarray, label: int) -> np.ndarray:
+    """Intersection over union of a label in every frame."""
+    both = ((found == label) & (true == label)).sum(axis=(1, 2))
+    either = ((found == label) | (true == label)).sum(axis=(1, 2))
+    return both / np.maximum(either, 1)
+
+
+@pytest.fixture(scope="module")
+def disc(tmp_path_factory):
+    return write_disc(tmp_path_factory.mktemp("segment") / "disc")
+
+
+@pytest.fixture(scope="module")
+def held_disc(tmp_path_factory):
+    return write_disc(tmp_path_factory.mktemp("segment") / "held", hand=True)
+
+
+@pytest.mark.parametrize("frame", [0, 4, FRAMES - 1])
+def test_one_click_finds_the_object_in_all_frames_of_all_views(disc, frame):
+    sequence, true = disc
+    found = segment(sequence, [Click(*disc_click("top", frame))])
+    assert set(found) == {"top", "side"}
+    for view, label in found.items():
+        assert label.shape == (FRAMES, HEIGHT, WIDTH)
+        assert label.dtype == np.uint8
+        assert set(np.unique(label)) == {0, 1}
+        assert agreement(label, true[view], 1).min() > 0.93
+
+
+def test_clicks_in_two_frames_and_views_agree_with_the_truth(disc):
+    sequence, true = disc
+    clicks = [Click(*disc_click("side", 1)), Click(*disc_click("top", 7))]
+    for view, label in segment(sequence, [*clicks, Click(*disc_click("top", 2))]).items():
+        assert agreement(label, true[view], 1).min() > 0.93
+
+
+def test_hands_are_found_from_keypoints_and_are_never_the_object(held_disc):
+    sequence, true = held_disc
+    found = segment(sequence, [Click(*disc_click())])
+    for view, label in found.items():
+        assert agreement(label, true[view], 1).mean() > 0.9
+        assert agreement(label, true[view], 2).mean() > 0.8
+        taken = (label == 1) & (true[view] == 2)
+        assert taken.sum() < 0.05 * (true[view] == 2).sum()
+        assert (label != 3).all()
+
+
+def test_a_hand_that_one_view_does_not_detect_is_shown_to_it_by_the_other(tmp_path):
+    sequence, true = write_disc(tmp_path / "held", hand=True)
+    path = sequence.folder / "views" / "side" / "keypoint.npy"
+    np.save(path, np.full_like(np.load(path), np.nan))
+    found = segment(type(sequence).load(sequence.folder), [Click(*disc_click())])
+    assert agreement(found["side"], true["side"], 2).mean() > 0.7
+
+
+def test_without_a_click_hands_alone_are_found(held_disc):
+    sequence, true = held_disc
+    for view, label in segment(sequence, []).items():
+        assert set(np.unique(label)) == {0, 2}
+        found = (label == 2) & (true[view] == 2)
+        assert found.sum() > 0.93 * (true[view] == 2).sum()
+        assert agreement(label, true[view], 2).mean() > 0.6
+
+
+def test_the_same_click_gives_the_same_masks(disc):
+    sequence, _ = disc
+    first, second = (segment(sequence, [Click(*disc_click())]) for _ in range(2))
+    for view in first:
+        np.testing.assert_array_equal(first[view], second[view])
+
+
+@pytest.mark.parametrize(
+    ("click", "told"),
+    [
+        (Click("up", 0, 5, 5), "no view 'up'. Views are: top, side"),
+        (Click("top", FRAMES, 5, 5), f"from 0 to {FRAMES - 1}"),
+        (Click("top", 0, WIDTH, 5), f"x goes from 0 to {WIDTH - 1}"),
+        (Click("top", 0, 5, -1), "outside of the image"),
+        (Click("top", 0, float("nan"), 5), "outside of the image"),
+    ],
+)
+def test_a_click_that_is_nowhere_is_refused(disc, click, told):
+    with pytest.raises(UsageError, match=told):
+        segment(disc[0], [click])
+
+
+def test_a_click_on_a_hand_is_refused(held_disc):
+    sequence, true = held_disc
+    row, column = np.argwhere(true["top"][4] == 2).mean(axis=0)
+    with pytest.raises(UsageError, match=r"on the right hand\. Click on a part of the object"):
+        segment(sequence, [Click("top", 4, column, row)])
+
+
+def test_a_click_where_no_depth_was_measured_is_refused(tmp_path):
+    sequence, _ = write_disc(tmp_path / "disc", frames=2)
+    path = sequence.folder / "views" / "top" / "depth" / "00000.png"
+    depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    view, frame, x, y = disc_click()
+    depth[int(y) - 2 : int(y) + 3, int(x) - 2 : int(x) + 3] = 0
+    cv2.imwrite(str(path), depth)
+    with pytest.raises(UsageError, match="no depth was measured there"):
+        segment(sequence, [Click(view, frame, x, y)])
+
+
+def test_a_click_needs_a_view_with_depth_and_segmentation_one_with_color(tmp_path):
+    sequence, _ = write_disc(tmp_path / "disc", frames=2)
+    shutil.rmtree(sequence.folder / "views" / "top" / "depth")
+    reopened = type(sequence).load(sequence.folder)
+    with pytest.raises(UsageError, match="view 'top' has no depth"):
+        segment(reopened, [Click(*disc_click())])
+    for view in cameras():
+        shutil.rmtree(sequence.folder / "views" / view / "color")
+    with pytest.raises(MissingInputError, match="no view has color images"):
+        segment(type(sequence).load(sequence.folder), [])
+
+
+def test_progress_counts_all_frames_and_can_cancel(disc):
+    told: list[tuple[int, int]] = []
+
+    class Watch(Progress):
+        def report(self, stage, iteration, total, loss=None, message=""):
+            assert stage == "segmentation"
+            told.append((iteration, total))
+
+        def check_cancelled(self):
+            if len(told) == 3:
+                raise CancelledError("enough")
+
+    with pytest.raises(CancelledError):
+        segment(disc[0], [Click(*disc_click())], Watch())
+    assert told == [(count, 2 * FRAMES) for count in (1, 2, 3)]
