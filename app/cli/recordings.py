@@ -369,7 +369,7 @@ def import_capture(
 
     Args:
         source: Folder with a folder for each camera (color/, depth/, intrinsics.json), such a
-            folder itself, or what PhysTwin's recorder writes.
+            folder itself, what PhysTwin's recorder writes, or ROS or RealSense bags.
         out: Sequence folder to write.
         example: Write a small raw capture into this folder, to try the import on; nothing else is
             given then.

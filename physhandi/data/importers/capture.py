@@ -1,5 +1,6 @@
 """Imports raw RGB-D recordings: synchronised, without distortion, with the table as the ground."""
 
+import shutil
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -13,6 +14,8 @@ from numpy import ndarray
 
 from physhandi.data import sequence as sequences
 from physhandi.data.camera import PinholeCamera
+from physhandi.data.files import temporary_name
+from physhandi.data.importers.bag import find_bags, unpack_bags
 from physhandi.data.importers.board_calibration import (
     BoardSighting,
     CharucoTarget,
@@ -138,7 +141,8 @@ def import_capture(
 
     Args:
         source_folder: One folder for each camera with ``color/``, ``depth/`` and intrinsics; or
-            such a folder; or what PhysTwin's recorder writes (docs/your-data.md).
+            such a folder; or what PhysTwin's recorder writes; or ROS or RealSense bags
+            (docs/your-data.md).
         out_folder: Folder of the new sequence; its last part names the sequence.
         progress: Receives a report after every image; may cancel, which leaves nothing.
         options: What the recording does not say itself.
@@ -154,10 +158,12 @@ def import_capture(
         raise UsageError(
             f"Name each hand that the recording shows once, not {list(options.hands)}."
         )
-    source = Path(source_folder)
-    views = find_views(source, options.intrinsics)
-    _refuse_same_names(views)
-    with _closing(views):
+    given = Path(source_folder)
+    with (
+        _unpacked(given, Path(out_folder).resolve(), progress) as source,
+        _closing(find_views(source, options.intrinsics)) as views,
+    ):
+        _refuse_same_names(views)
         paired = _paired(views, options)
         sources, notes = _sources(views, paired, options)
         placement = _place(source, sources, options.charuco)
@@ -180,7 +186,7 @@ def import_capture(
                 ),
                 provenance={
                     "importer": "capture",
-                    "folder": source.resolve().name,
+                    "folder": given.resolve().name,
                     "frames": {"start": options.start, "every": options.every},
                     "depth_scale": {
                         one.view.name: one.scale for one in sources if one.view.depth is not None
@@ -195,9 +201,25 @@ def import_capture(
 
 
 @contextmanager
-def _closing(views: Sequence[RecordedView]) -> Generator[None, None, None]:
+def _unpacked(source: Path, out: Path, progress: Progress) -> Generator[Path, None, None]:
+    """Give the recording as folders; bags are unpacked beside the sequence for as long."""
+    bags = find_bags(source)
+    if not bags:
+        yield source
+        return
+    out.parent.mkdir(parents=True, exist_ok=True)
+    folder = out.with_name(temporary_name(out.name))
     try:
-        yield
+        unpack_bags(source, bags, folder, progress)
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def _closing(views: list[RecordedView]) -> Generator[list[RecordedView], None, None]:
+    try:
+        yield views
     finally:
         for view in views:
             for stream in view.streams:

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from physhandi.data.files import read_array
-from physhandi.data.image_header import MOST_PIXELS, announced_size
+from physhandi.data.image_header import MOST_PIXELS, announced_size, video_size
 from physhandi.data.importers.phystwin_files import fail
 from physhandi.data.importers.recorded_camera import read_table
 from physhandi.errors import ImportFailedError
@@ -295,6 +295,10 @@ def video_stream(path: Path) -> RecordedStream:
     Raises:
         ImportFailedError: If it cannot be decoded.
     """
+    try:
+        video_size(path)  # Refuses what is too large before a decoder sees it.
+    except (ValueError, OSError) as error:
+        fail(path, str(error))
     capture = cv2.VideoCapture(str(path))
     try:
         count, width, height = (

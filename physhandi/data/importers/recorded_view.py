@@ -103,8 +103,8 @@ def find_views(source: Path, intrinsics: Path | None = None) -> list[RecordedVie
     """
     if not source.is_dir():
         raise ImportFailedError(
-            f"{source} is not a folder. Give the folder of a recording: one folder for each "
-            "camera, with color and depth in it."
+            f"{source} is not a folder. Give the folder of a recording (one folder for each "
+            "camera, with color and depth in it), or a bag (.bag, .db3, .mcap)."
         )
     if (source / "metadata.json").is_file() and _numbered(source / "color"):
         return _phystwin_views(source)

@@ -1,0 +1,182 @@
+"""ROS 1 and ROS 2 bags, and bags with the topics of RealSense cameras, become sequences."""
+
+import cv2
+import numpy as np
+import pytest
+from raw_capture import CAMERAS, camera_at, picture
+from recorded_bag import TREE, Recorder, jpeg, png, shown, time_of, write_realsense_bag
+
+from physhandi.data.camera import PinholeCamera
+from physhandi.data.importers import bag as bag_reader
+from physhandi.data.importers.capture import import_capture
+from physhandi.errors import CancelledError, ImportFailedError, UsageError
+from physhandi.progress import Progress
+
+FRAMES = 3
+
+
+def beside(camera: PinholeCamera) -> PinholeCamera:
+    """A depth camera 4 cm to the side of a color camera."""
+    shift = np.eye(4)
+    shift[:3, :3] = cv2.Rodrigues(np.array([0.0, 0.02, 0.0]))[0]
+    shift[:3, 3] = [0.04, 0.0, 0.005]
+    K = np.array([[80.0, 0, 50], [0, 80, 36], [0, 0, 1]])
+    return PinholeCamera(K, camera.T_world_camera @ shift, 100, 74)
+
+
+def assert_depth_fits(found: np.ndarray, true: np.ndarray, is_ball: np.ndarray) -> None:
+    known = found > 0
+    assert known[10:-10, 10:-20].mean() > 0.9
+    assert np.median((found - true)[known & is_ball]) == pytest.approx(0.0, abs=4e-3)
+    assert np.median(np.abs(found - true)[known]) < 5e-3
+
+
+def test_a_bag_with_realsense_topics(tmp_path):
+    color = camera_at(30, 2)
+    depth = beside(color)
+    reference = camera_at(33, 2).T_world_camera  # Neither of both: transforms must be chained.
+    write_realsense_bag(tmp_path / "take.bag", color, depth, reference, FRAMES)
+    sequence = import_capture(tmp_path / "take.bag", tmp_path / "out")
+    assert [view.name for view in sequence.views] == ["device_0"]
+    assert sequence.frame_count == FRAMES
+    assert sequence.frame_rate == pytest.approx(30.0, abs=0.01)
+    assert sequence.provenance["depth_scale"] == {"device_0": pytest.approx(0.0001)}
+    view = sequence.views[0]
+    true_color, true_depth = picture(color, 2)
+    assert np.array_equal(view.color(2), true_color)
+    assert_depth_fits(view.depth(2), true_depth, true_color[..., 0] == 200)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "take.bag"]
+
+
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+def test_a_ros_2_bag_of_two_cameras(tmp_path, storage):
+    """Color as JPEG, aligned depth as floats, and unaligned depth, which is not used."""
+    folder = tmp_path / "take"
+    with Recorder(folder, ros=2, storage=storage) as bag:
+        for name, camera in CAMERAS.items():
+            bag.info(f"/{name}/color/camera_info", camera)
+            bag.info(f"/{name}/aligned_depth_to_color/camera_info", camera)
+            bag.info(f"/{name}/depth/camera_info", camera)
+        for frame in range(FRAMES):
+            for number, (name, camera) in enumerate(CAMERAS.items()):
+                color, depth = shown(camera, frame)
+                time = time_of(frame, 2_000_000 * number)
+                bag.coded(f"/{name}/color/image_raw/compressed", jpeg(color), "rgb8; jpeg", time)
+                aligned = f"/{name}/aligned_depth_to_color/image_raw"
+                bag.image(aligned, picture(camera, frame)[1], "32FC1", time)
+                bag.image(f"/{name}/depth/image_rect_raw", np.zeros_like(depth), "16UC1", time)
+    outer = tmp_path / "source"
+    outer.mkdir()
+    folder.rename(outer / "take")
+    # Their poses are told beside the bag.
+    poses = {name: camera.T_world_camera.tolist() for name, camera in CAMERAS.items()}
+    (outer / "extrinsics.json").write_text(str(poses).replace("'", '"'))
+    sequence = import_capture(outer, tmp_path / "out")
+    assert [view.name for view in sequence.views] == ["left", "right"]
+    for view in sequence.views:
+        color, depth = picture(CAMERAS[view.name], 1)
+        assert np.abs(view.color(1).astype(int) - color).mean() < 8
+        assert np.abs(view.depth(1) - depth).max() < 6e-4
+        assert np.allclose(view.camera.T_world_camera, CAMERAS[view.name].T_world_camera)
+    assert sequence.provenance["pairing"]["right/depth"]["largest_error"] == pytest.approx(
+        0.002, abs=1e-4
+    )
+
+
+def test_two_ros_1_bags_with_compressed_depth_and_a_tree_of_frames(tmp_path):
+    source = tmp_path / "takes"
+    source.mkdir()
+    for name, color in (("one", camera_at(30, 2)), ("two", camera_at(80, 2))):
+        depth = beside(color)
+        with Recorder(source / f"{name}.bag", ros=1) as bag:
+            bag.info("/camera/color/camera_info", color)
+            bag.info("/camera/depth/camera_info", depth)
+            link = depth.T_camera_world @ color.T_world_camera
+            make = bag.kind("geometry_msgs/msg/TransformStamped")
+            stamped = [
+                make(bag.header(1, "/depth_optical"), "color_frame", bag.transform(link)),
+                make(bag.header(1, "color_frame"), "color_optical", bag.transform(np.eye(4))),
+                make(bag.header(1, "base"), "depth_optical", bag.transform(reference())),
+            ]
+            tree = bag.kind(TREE)(stamped)
+            bag.write("/tf_static", TREE, tree)
+            for frame in range(FRAMES):
+                image, measured = shown(color, frame)[0], shown(depth, frame)[1]
+                time = time_of(frame)
+                bag.image(
+                    "/camera/color/image_raw", image[..., ::-1], "bgr8", time, "color_optical"
+                )
+                bag.coded(
+                    "/camera/depth/image_rect_raw/compressedDepth",
+                    bytes(12) + png(measured),
+                    "16UC1; compressedDepth png",
+                    time,
+                    "depth_optical",
+                )
+    poses = {
+        "one": camera_at(30, 2).T_world_camera.tolist(),
+        "two": camera_at(80, 2).T_world_camera.tolist(),
+    }
+    (source / "extrinsics.json").write_text(str(poses).replace("'", '"'))
+    sequence = import_capture(source, tmp_path / "out")
+    assert [view.name for view in sequence.views] == ["one", "two"]
+    color, depth = picture(camera_at(80, 2), 2)
+    assert np.array_equal(sequence.views[1].color(2), color)
+    assert_depth_fits(sequence.views[1].depth(2), depth, color[..., 0] == 200)
+
+
+def reference() -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3] = cv2.Rodrigues(np.array([0.4, -0.2, 1.0]))[0]
+    pose[:3, 3] = [1.0, 2.0, 0.5]
+    return pose
+
+
+def small_bag(path, **broken: object):
+    camera = CAMERAS["left"]
+    with Recorder(path, ros=1) as bag:
+        if not broken.get("has_no_info"):
+            bag.info("/camera/color/camera_info", camera)
+        for frame in range(2):
+            code = str(broken.get("code", "rgb8"))
+            bag.image("/camera/color/image_raw", shown(camera, frame)[0], code, time_of(frame))
+    return path
+
+
+def test_broken_bags_are_refused_and_named(tmp_path):
+    cut = small_bag(tmp_path / "cut.bag")
+    cut.write_bytes(cut.read_bytes()[:-200])
+    empty = tmp_path / "empty.bag"
+    with Recorder(empty, ros=1) as bag:
+        bag.info("/camera/color/camera_info", CAMERAS["left"])
+    blind = small_bag(tmp_path / "blind.bag", has_no_info=True)
+    odd = small_bag(tmp_path / "odd.bag", code="bayer_x")
+    for path, words in (
+        (cut, ("cut.bag", "ended properly")),
+        (empty, ("empty.bag", "no color or depth images", "camera_info")),
+        (blind, ("blind.bag", "no CameraInfo", "/camera/color/image_raw")),
+        (odd, ("odd.bag", "/camera/color/image_raw", "image 0", "bayer_x")),
+    ):
+        with pytest.raises(ImportFailedError) as refusal:
+            import_capture(path, tmp_path / "out")
+        assert [word for word in words if word not in str(refusal.value)] == [], refusal.value
+    assert sorted(p.suffix for p in tmp_path.iterdir()) == [".bag"] * 4
+
+
+class _Stops(Progress):
+    def check_cancelled(self) -> None:
+        raise CancelledError("stop")
+
+
+def test_a_cancelled_bag_leaves_nothing(tmp_path):
+    small_bag(tmp_path / "a.bag")
+    with pytest.raises(CancelledError):
+        import_capture(tmp_path / "a.bag", tmp_path / "out", _Stops())
+    assert [path.name for path in tmp_path.iterdir()] == ["a.bag"]
+
+
+def test_without_the_package_the_extra_is_named(tmp_path, monkeypatch):
+    small_bag(tmp_path / "a.bag")
+    monkeypatch.setattr(bag_reader, "find_spec", lambda _: None)
+    with pytest.raises(UsageError, match=r"physhandi\[capture\]"):
+        import_capture(tmp_path / "a.bag", tmp_path / "out")
