@@ -15,6 +15,7 @@ from app.comparison import NewComparison
 from app.ids import ItemId
 from app.jobs.about import RunChanges, change_about
 from app.jobs.catalog import Catalog, NotFoundError
+from app.jobs.checks import check_item
 from app.jobs.listing import RunQuery, page_of, select_runs
 from app.jobs.log import open_log
 from app.jobs.machine import Machine
@@ -124,6 +125,11 @@ def _add_listings(router: APIRouter, catalog: Catalog, scheduler: Scheduler) -> 
     @router.get("/sequences/{sequence_id}")
     def show_sequence(sequence_id: ItemId) -> dict[str, Any]:
         return describe_sequence(catalog.sequence_item(sequence_id))
+
+    @router.get("/sequences/{sequence_id}/check")
+    def check_sequence(sequence_id: ItemId) -> dict[str, Any]:
+        """Read a whole recording: what each stage can do with it, and every problem."""
+        return check_item(catalog.sequence_item(sequence_id)).to_dict()
 
     @router.get("/runs")
     def list_runs(query: Annotated[RunQuery, Query()]) -> dict[str, Any]:

@@ -92,9 +92,14 @@ function showReadiness(place, answer, sequences) {
   summary.className = answer?.nothing_to_fit ? "problem" : answer?.skips_object ? "doubt" : "dim";
   summary.textContent = answer?.nothing_to_fit ?? answer?.skips_object ?? (skipped.length ? "These stages have nothing to do; the others will run:" : "All stages will run.");
   for (const id of sequences) summary.append(" ", link(id));
-  place.querySelector("[data-lights]").replaceChildren(...(answer?.nothing_to_fit ? [] : skipped).map(([name, stage]) => {
-    const item = Object.assign(document.createElement("li"), { className: stage.state.replace(" ", "-") });
-    item.append(Object.assign(document.createElement("strong"), { textContent: name.replaceAll("_", " ") }), ` ${stage.why}`);
+  const groups = new Map();
+  for (const [name, stage] of answer?.nothing_to_fit ? [] : skipped) {
+    if (!groups.has(stage.why)) groups.set(stage.why, { state: stage.state, names: [] });
+    groups.get(stage.why).names.push(name.replaceAll("_", " "));
+  }
+  place.querySelector("[data-lights]").replaceChildren(...[...groups].map(([why, { state, names }]) => {
+    const item = Object.assign(document.createElement("li"), { className: state.replace(" ", "-") });
+    item.append(Object.assign(document.createElement("strong"), { textContent: names.join(", ") }), ` – skipped: ${why}`);
     return item;
   }));
   const accept = place.querySelector("[data-accept]");

@@ -18,6 +18,7 @@ from app.jobs.scheduler import ENDED, Scheduler
 from app.jobs.views import describe_results, describe_run, describe_sequence, follow_run
 from app.jobs.watch import Feed
 from app.pages.browse import add_lists
+from app.pages.checks import add_checks
 from app.pages.diff import LEAST_RUNS, MOST_RUNS, compare_runs
 from app.pages.metrics import METHOD_TEXTS, tabulate
 from app.pages.parameters import parameter_rows
@@ -60,6 +61,7 @@ def create_pages(
     router = APIRouter(include_in_schema=False)
     add_lists(router, catalog, feed, pages, previews=previews)
     add_pictures(router, previews)
+    add_checks(router, catalog, pages)
     add_suites(router, suites, pages)
     _add_launch(router, catalog, overview, pages)
 

@@ -88,6 +88,17 @@ class RecordingCheck:
         }
 
 
+_SCATTERED = Problem(
+    level="warning",
+    message="What masks label as the object in frame 0 has too few neighbouring points with depth.",
+    file="views/*/mask",
+    frame=0,
+    last_frame=0,
+    field=f"label {OBJECT_LABEL}",
+    remedy="check depth and calibration there, or bring the cameras nearer to the object",
+)
+
+
 def check_recording(
     recording: Sequence | Path | str,
     progress: Progress | None = None,
@@ -135,6 +146,8 @@ def check_recording(
         warnings += _judge_masks(sequence, shown)
     if stages[OBSERVATION].is_ready and not _shows_object(sequence, depth):
         stages = stages | _stopped(STAGES[STAGES.index(OBSERVATION) :], SEEN_OBJECT)
+        if not any(problem.frame == 0 for problem in warnings):
+            warnings.append(_SCATTERED)
     warnings += _judge_tracks(sequence)
     progress.report(CHECK_STAGE, total, total)
     return RecordingCheck(stages=stages, problems=tuple(_limited([*errors, *warnings])))

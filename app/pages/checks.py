@@ -1,0 +1,130 @@
+"""The check of a recording: its frames with what is known of them, its stages and its problems."""
+
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Response
+from fastapi.responses import HTMLResponse
+from pydantic import BaseModel, ConfigDict, Field
+from starlette.exceptions import HTTPException
+
+from app.ids import ItemId
+from app.jobs.catalog import Catalog
+from app.jobs.checks import check_item
+from app.pages.render import Pages
+from app.previews.overlay import LAYERS, draw_frame
+from physhandi.data.sequence import Sequence
+from physhandi.data.view import View
+from physhandi.fitting.readiness import ABOUT, readiness
+
+_KEPT = {"Cache-Control": "private, max-age=3600"}
+_AGAIN = {"Cache-Control": "no-store"}
+
+
+class FrameQuery(BaseModel):
+    """What is drawn of a frame; the fields are the parameters of an address."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    layers: Annotated[str, Field(max_length=100)] = ""
+    """Names of layers, with commas."""
+    depth: bool = False
+    """Whether depth is the ground even where there is color."""
+    v: Annotated[str, Field(max_length=40)] = ""
+    """State of the recording's files."""
+
+
+def add_checks(router: APIRouter, catalog: Catalog, pages: Pages) -> None:
+    """Add the pages that check recordings to the routes.
+
+    Args:
+        router: Gets the routes.
+        catalog: Finds sequences.
+        pages: Renders.
+    """
+
+    @router.get("/sequences/{sequence_id}/check")
+    def show_check(
+        sequence_id: ItemId, frame: Annotated[int, Query(ge=0, le=10_000_000)] = 0
+    ) -> HTMLResponse:
+        item = catalog.sequence_item(sequence_id)
+        sequence = item.sequence
+        stages = readiness(sequence) if sequence is not None else {}
+        return pages.render(
+            "check.html",
+            item=item,
+            sequence=sequence,
+            frame=min(frame, sequence.frame_count - 1) if sequence is not None else 0,
+            views=[_described(view) for view in sequence.views] if sequence is not None else [],
+            layers=_layers_of(sequence) if sequence is not None else [],
+            version=_version(item.folder),
+            stages={name: stage.to_dict() for name, stage in stages.items()},
+            about=ABOUT,
+        )
+
+    @router.get("/sequences/{sequence_id}/problems")
+    def show_problems(sequence_id: ItemId) -> HTMLResponse:
+        """Read every file, which takes seconds, and give stages and problems."""
+        item = catalog.sequence_item(sequence_id)
+        found = check_item(item).to_dict()
+        return pages.render("_checked.html", **found, about=ABOUT, is_whole=True)
+
+    @router.get("/sequences/{sequence_id}/views/{view_name}/frames/{frame}")
+    def show_frame(
+        sequence_id: ItemId,
+        view_name: ItemId,
+        frame: int,
+        query: Annotated[FrameQuery, Query()],
+    ) -> Response:
+        item = catalog.sequence_item(sequence_id)
+        version = _version(item.folder)
+        sequence = _opened(item.folder, version)
+        view = next((view for view in sequence.views if view.name == view_name), None)
+        if view is None or not 0 <= frame < view.frame_count:
+            raise HTTPException(404, "This recording has no such view or frame.")
+        layers = frozenset(query.layers.split(",")) & set(LAYERS)
+        content = draw_frame(
+            view, frame, sides=sequence.hands, layers=layers, shows_depth=query.depth
+        )
+        headers = _KEPT if query.v == version else _AGAIN
+        return Response(content, media_type="image/jpeg", headers=headers)
+
+
+def _described(view: View) -> dict[str, Any]:
+    parts = {
+        "color": view.has_color,
+        "depth": view.has_depth,
+        "masks": view.has_mask,
+        "keypoints": view.has_keypoint,
+        "tracks": view.track is not None,
+    }
+    return {
+        "name": view.name,
+        "width": view.camera.width,
+        "height": view.camera.height,
+        "parts": [name for name, is_there in parts.items() if is_there],
+        "lacks": [name for name, is_there in parts.items() if not is_there],
+        "can_choose": view.has_color and view.has_depth,
+    }
+
+
+def _layers_of(sequence: Sequence) -> list[tuple[str, str]]:
+    """Give the layers that some view has, by their names in addresses and for people."""
+    titles = {"mask": "Masks", "keypoint": "Keypoints", "track": "Tracks"}
+    missing = sequence.missing(*LAYERS)
+    return [(layer, titles[layer]) for layer in LAYERS if layer not in missing]
+
+
+@lru_cache(maxsize=8)
+def _opened(folder: Path, _version: str) -> Sequence:
+    """Open a sequence once, so that its videos are not decoded from the start for every frame."""
+    return Sequence.load(folder)
+
+
+def _version(folder: Path) -> str:
+    """Name the state of a recording's files; another one when files come, go or are replaced."""
+    times = [folder.stat().st_mtime_ns, *(p.stat().st_mtime_ns for p in folder.glob("*.*"))]
+    for view in folder.glob("views/*/"):
+        times += [view.stat().st_mtime_ns, *(part.stat().st_mtime_ns for part in view.iterdir())]
+    return f"{max(times):x}-{len(times)}"
