@@ -169,4 +169,4 @@ def test_no_fit_of_dev_makes_more_steps_than_others_may() -> None:
         method = parse_method(name)
         own, cut = (method_settings(method, common) for common in ({}, dev.settings))
         steps = [settings["object_"]["first_order"]["iterations"] for settings in (own, cut)]
-        assert steps == ([200, 80] if method.profile == "phystwin" else [40, 40])
+        assert steps == ([200, 80] if method.profile == "phystwin" else [80, 80])
