@@ -361,6 +361,7 @@ def _stage_hands(
     if attempt.stage_done(HANDS):
         return
     before, after, curve = [], [], []
+    left_out: list[str] = []
     for sequence in sequences:
         if missing_for_hands(sequence):
             continue
@@ -370,8 +371,9 @@ def _stage_hands(
         artefacts.save_hand_points(attempt, sequence, progress)
         before.append(fit.loss_before)
         after.append(fit.loss_after)
+        left_out += [f"Left out. {reason}" for reason in fit.left_out.values()]
         curve = curve or [[float(iteration), loss] for iteration, loss in fit.curve]
-    _finish(attempt, HANDS, before, after, curve)
+    _finish(attempt, HANDS, before, after, curve, note=" ".join(left_out))
 
 
 def _stage_observation(

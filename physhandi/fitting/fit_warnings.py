@@ -21,6 +21,7 @@ from physhandi.data.run_folder import read_yaml
 from physhandi.data.sequence import Sequence
 from physhandi.fitting import artefacts
 from physhandi.fitting.config import INTERVALS, SearchVariable
+from physhandi.fitting.readiness import LEAST_PALM_POINTS, shows_palm, skipped_object
 from physhandi.fitting.search_bounds import bounds_met, interval_text
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import PARAMETERS
@@ -35,6 +36,9 @@ Code = Literal[
     "loose_nodes",
     "few_observations",
     "object_points_removed",
+    "object_skipped",
+    "hand_left_out",
+    "hand_filled",
 ]
 MARGIN, LEAST_EXCESS = 0.1, 5e-4
 """Part of a baseline's error, and length [m], by which a fit must exceed it to be called worse."""
@@ -42,6 +46,8 @@ FEW_POINTS = 10
 """Points of the object below which a frame shows too little of it."""
 FEW_FRAMES = 0.2
 """Share of the fitted frames that may show too little."""
+FEW_SEEN = 0.5
+"""Share of the frames in which a hand must be seen; in others its pose is filled in."""
 _RIVALS: dict[str, tuple[Code, str]] = {
     "static": ("worse_than_static", "an object that stays as it is in frame 0"),
     "rigid_follow": (
@@ -73,7 +79,7 @@ class FitWarning:
 
 
 def with_warnings(out: Path, sequence: Sequence, scores: Mapping[str, Any]) -> dict[str, Any]:
-    """Add what there is to doubt to the measures of a sequence, if an object was fitted in it.
+    """Add what there is to doubt to the measures of a sequence.
 
     Args:
         out: Output folder of the run.
@@ -81,19 +87,20 @@ def with_warnings(out: Path, sequence: Sequence, scores: Mapping[str, Any]) -> d
         scores: Its measures (`metrics.report.score_run`).
 
     Returns:
-        The measures, with ``warnings``: ``code message`` each.
+        The measures, with ``warnings``: ``code message`` each. Without an object they are only
+        there if there are any.
 
     Raises:
         RunError: If a file of the run is damaged.
     """
-    if not (out / SequenceFiles(sequence.name).model).is_file():
-        return dict(scores)
     found = fit_warnings(out, sequence, scores)
+    if not found and not (out / SequenceFiles(sequence.name).model).is_file():
+        return dict(scores)
     return {**scores, "warnings": [asdict(warning) for warning in found]}
 
 
 def fit_warnings(out: Path, sequence: Sequence, scores: Mapping[str, Any]) -> list[FitWarning]:
-    """Collect the doubts about a fitted object in one of its sequences.
+    """Collect the doubts about the hands and the object that were fitted in a sequence.
 
     Args:
         out: Output folder of the run. What it does not hold, such as the intervals of the search
@@ -105,11 +112,16 @@ def fit_warnings(out: Path, sequence: Sequence, scores: Mapping[str, Any]) -> li
         RunError: If a file of the run is damaged.
     """
     files = SequenceFiles(sequence.name)
+    if not (out / files.model).is_file():
+        told = skipped_object([sequence])
+        skipped = [] if told is None else [FitWarning(code="object_skipped", message=told)]
+        return [*skipped, *_unseen_hands(out, sequence)]
     found = [*_at_bounds(out), *_worse_than_baselines(scores), *_doubts_of_shape(out)]
     model = artefacts.load_model(out, sequence.name)
     found += [*_empty_hands(out, sequence, model), *_loose_nodes(model)]
     if (out / files.observation("point")).is_file():
         found += _few_observations(out, sequence)
+    found += _unseen_hands(out, sequence)
     return found
 
 
@@ -193,6 +205,36 @@ def _empty_hands(out: Path, sequence: Sequence, model: SpringMassModel) -> Itera
                 code="hand_holds_nothing",
                 message=f"The {side} hand holds nothing: no virtual spring joins it to the object, "
                 f"so it does not move it. Check where it is in the viewer; {remedy}.",
+            )
+
+
+def _unseen_hands(out: Path, sequence: Sequence) -> Iterator[FitWarning]:
+    """Find hands that stage 1 left out, or whose pose it filled in in most frames."""
+    files = SequenceFiles(sequence.name)
+    if not (out / files.keypoint).is_file():
+        return
+    keypoint = artefacts.load_array(out / files.keypoint)
+    if keypoint.shape[2] != len(sequence.hands):
+        return
+    is_shown = np.logical_or.reduce(shows_palm(keypoint), axis=0)
+    for hand, side in enumerate(sequence.hands):
+        count, total = int(is_shown[:, hand].sum()), len(is_shown)
+        is_fitted = any(
+            (out / file).is_file() for file in (files.hand_motion(side), files.hand_vertex(side))
+        )
+        seen = f"{LEAST_PALM_POINTS} keypoints of its palm are seen in {count} of {total} frames"
+        if not is_fitted:
+            yield FitWarning(
+                code="hand_left_out",
+                message=f"The {side} hand was left out: {seen}, which do not tell where it is. "
+                "Check its keypoints and the calibration, or take it out of 'hands' in "
+                "sequence.yaml.",
+            )
+        elif count < FEW_SEEN * total:
+            yield FitWarning(
+                code="hand_filled",
+                message=f"The {side} hand is seen in few frames: {seen}. In the others its pose "
+                "is filled in by smoothness. Check its keypoints, or cut these frames out.",
             )
 
 

@@ -6,7 +6,7 @@ keypoints and depth.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Many
 from dataclasses import dataclass, field
 
@@ -68,7 +68,7 @@ class HandFit:
     """The result of stage 1."""
 
     motions: tuple[HandMotion, ...]
-    """Motion of each hand, in the order of the sequence's hands."""
+    """Motion of each hand that was found, in the order of the sequence's hands."""
     keypoint: Float[ndarray, "view frame hand 21 3"]
     """Keypoints that the hands were fitted to; NaN where not seen [px]."""
     loss_before: float
@@ -77,6 +77,8 @@ class HandFit:
     """Loss of the result, without depth."""
     curve: list[tuple[int, float]] = field(default_factory=list)
     """Loss of every tenth iteration, summed over the hands."""
+    left_out: Mapping[HandSide, str] = field(default_factory=dict)
+    """Hands that no frame shows well enough to place them, and why; they have no motion."""
 
 
 def reconstruct_hands(
@@ -89,7 +91,8 @@ def reconstruct_hands(
     """Fit a hand model to all frames of a sequence at once.
 
     Shape is constant; a sequence that is not metric gets one scale for each hand. Frames that no
-    view saw are bridged by smoothness; no frame is left out.
+    view saw are bridged by smoothness; no frame is left out. A hand that cannot be placed in any
+    frame is, as long as another one can.
 
     Args:
         sequence: The recording; its `hands` are fitted.
@@ -100,7 +103,7 @@ def reconstruct_hands(
     Raises:
         MissingInputError: If there is no hand, no view, no color image to detect keypoints in, or
             no MANO model although the settings name it.
-        FitError: If no frame shows a hand well enough for a first guess.
+        FitError: If no frame shows any of the hands well enough for a first guess.
     """
     config, progress = config or HandFitConfig(), progress or NullProgress()
     missing = sequence.missing("hands", "views") if keypoint is not None else None
@@ -112,14 +115,21 @@ def reconstruct_hands(
         )
     if keypoint is None:
         keypoint = observed_keypoints(sequence, progress)
-    fits = []
+    fits: list[SolvedHand] = []
+    left_out: dict[HandSide, str] = {}
     for hand, side in enumerate(sequence.hands):
         model = load_hand_model(side, config.model)
         try:
             problem = HandProblem(sequence, keypoint[:, :, hand], model, config)
+        except FitError as error:
+            left_out[side] = str(error)
+            continue
+        try:
             fits.append(problem.solve(progress))
         except FitError as error:
             raise FitError(f"Sequence '{sequence.name}': {error}") from error
+    if not fits:
+        raise FitError(f"Sequence '{sequence.name}': {' '.join(left_out.values())}")
     losses = zip(*(fit.curve for fit in fits), strict=False)
     curve = [(at[0][0], float(sum(loss for _, loss in at))) for at in losses]
     return HandFit(
@@ -128,6 +138,7 @@ def reconstruct_hands(
         loss_before=sum(fit.loss_before for fit in fits),
         loss_after=sum(fit.loss_after for fit in fits),
         curve=curve,
+        left_out=left_out,
     )
 
 

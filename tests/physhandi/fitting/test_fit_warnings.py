@@ -98,6 +98,39 @@ def found(stored: Stored, sequence: Sequence) -> dict[str, list[str]]:
     return messages
 
 
+def test_hands_that_were_hardly_seen_are_told(stored: Stored, sequence: Sequence) -> None:
+    keypoint = np.ones((1, FRAMES, 2, 21, 3))
+    keypoint[:, 5:, 0] = np.nan
+    keypoint[:, 6:, 1] = np.nan  # Six of eleven frames are more than half of them.
+    stored.array("keypoint", keypoint)
+    (filled,) = found(stored, sequence).pop("hand_filled")
+    assert "The right hand is seen in few frames" in filled
+    assert "in 5 of 11 frames" in filled
+    (stored.folder / "hand_right_vertex.npy").unlink()
+    told = found(stored, sequence)
+    assert "The right hand was left out" in told["hand_left_out"][0]
+    assert "hand_filled" not in told
+    # Without an object there are only warnings if there is something to doubt.
+    (stored.folder / "model.safetensors").unlink()
+    assert set(found(stored, sequence)) == {"hand_left_out"}
+    stored.array("keypoint", np.ones((1, FRAMES, 2, 21, 3)))
+    stored.array("hand_right_vertex", np.array([RIGHT]) + RISE)
+    assert "warnings" not in with_warnings(stored.out, sequence, {})
+
+
+def test_an_object_that_was_left_out_is_told(stored: Stored, sequence: Sequence) -> None:
+    (stored.folder / "model.safetensors").unlink()
+    (sequence.folder / "marker.npy").unlink()
+    (sequence.folder / "marker_node.npy").unlink()
+    assert "warnings" not in with_warnings(stored.out, sequence, {})
+    depth = sequence.folder / "views/a/depth"
+    depth.mkdir()
+    again = Sequence(sequence.folder, sequence.meta)
+    (warning,) = with_warnings(stored.out, again, {})["warnings"]
+    assert warning["code"] == "object_skipped"
+    assert "'sheet' lacks mask" in warning["message"]
+
+
 def test_a_good_fit_has_no_warning(stored: Stored, sequence: Sequence) -> None:
     assert stored.built.virtual_spring_count == 2
     # 1 % of a rise of 10 mm a frame is missed; the last residual would miss less.

@@ -9,12 +9,15 @@ import pytest
 import torch
 from recordings import recording
 
+import physhandi as ph
 from physhandi.data.importers.stereo import import_stereo
+from physhandi.data.sequence import Sequence
 from physhandi.errors import CancelledError, FitError, MissingInputError, SettingsError
 from physhandi.fitting.hand_reconstruction import (
     DepthTarget,
     HandFit,
     HandFitConfig,
+    observed_keypoints,
     reconstruct_hands,
     way_to_depth,
 )
@@ -22,7 +25,7 @@ from physhandi.hand.loading import load_hand_model
 from physhandi.hand.motion import HandMotion
 from physhandi.metrics.hands import evaluate_hands
 from physhandi.perception.keypoints import detect_sequence
-from physhandi.progress import Progress
+from physhandi.progress import NullProgress, Progress
 
 QUICK = HandFitConfig(iterations=250)
 
@@ -155,6 +158,55 @@ def test_the_way_to_measured_depth_is_along_the_line_of_sight() -> None:
     np.testing.assert_allclose(found, expected, atol=1e-3)
     target.weight[:] = 0.0
     assert np.all(way_to_depth(*frames, target, frame_rate=3.0) == 0.0)
+
+
+def test_a_hand_that_nobody_sees_does_not_stop_the_other(tmp_path: Path) -> None:
+    motions = [scene.grasping("right", frames=6), scene.grasping("left", frames=6)]
+    keypoint = scene.seen_keypoints(motions, CAMERAS)
+    keypoint[:, :, 1, :19] = np.nan  # Two fingertips do not place a hand.
+    few = HandFitConfig(iterations=20)
+    both = reconstruct_hands(scene.write_scene(tmp_path / "both", motions, CAMERAS, keypoint), few)
+    assert [motion.side for motion in both.motions] == ["right"]
+    assert list(both.left_out) == ["left"]
+    assert "left hand cannot be placed" in both.left_out["left"]
+    assert both.keypoint.shape[2] == 2
+    alone = reconstruct_hands(
+        scene.write_scene(tmp_path / "one", motions[:1], CAMERAS, keypoint[:, :, :1]), few
+    )
+    assert alone.left_out == {}
+    assert (both.loss_before, both.loss_after) == (alone.loss_before, alone.loss_after)
+    for name, array in alone.motions[0].to_tensors().items():
+        assert np.array_equal(array, both.motions[0].to_tensors()[name]), name
+
+
+def test_a_run_goes_on_without_a_hand_that_nobody_sees_and_says_so(tmp_path: Path) -> None:
+    motions = [scene.grasping("right", frames=6), scene.grasping("left", frames=6)]
+    keypoint = scene.seen_keypoints(motions, CAMERAS)
+    keypoint[:, :, 1] = np.nan
+    keypoint[:, 2:, 0] = np.nan
+    sequence = scene.write_scene(tmp_path / "both", motions, CAMERAS, keypoint)
+    few = {"hand.iterations": 2, "hand.depth_iterations": 0}
+    run = ph.reconstruct(sequence, profile="quick", overrides=few, out=tmp_path / "run")
+    warnings = {w["code"]: w["message"] for w in run.warnings}
+    assert set(warnings) == {"hand_left_out", "hand_filled"}
+    assert "The left hand was left out" in warnings["hand_left_out"]
+    assert "seen in 0 of 6 frames" in warnings["hand_left_out"]
+    assert "The right hand is seen in few frames" in warnings["hand_filled"]
+    assert "seen in 2 of 6 frames" in warnings["hand_filled"]
+    (stage,) = [stage for stage in run.stages() if stage["name"] == "hand_reconstruction"]
+    assert stage["summary"]["note"].startswith("Left out. The left hand cannot be placed")
+    assert run.has("sequences/both/hand_right_vertex.npy")
+    assert not run.has("sequences/both/hand_left_vertex.npy")
+
+
+def test_a_view_without_color_and_keypoints_leaves_hands_to_the_others(tmp_path: Path) -> None:
+    truth = scene.grasping(frames=4)
+    keypoint = scene.seen_keypoints([truth], CAMERAS)
+    sequence = scene.write_scene(tmp_path / "a", [truth], CAMERAS, keypoint)
+    (sequence.folder / "views/view0/keypoint.npy").unlink()
+    seen = observed_keypoints(Sequence.load(sequence.folder), NullProgress())
+    assert np.isnan(seen[0]).all()
+    np.testing.assert_array_equal(seen[1:], keypoint[1:])
 
 
 def test_what_is_missing_is_said(tmp_path: Path) -> None:
