@@ -24,7 +24,7 @@ from physhandi.synthetic.film.degradations import depth_sensor, find_preset
 from physhandi.synthetic.film.recording import KEPT_AROUND
 from physhandi.synthetic.synthesize import synthesize
 
-EXAMPLE_BOARD = CharucoTarget(5, 4, 0.07)
+EXAMPLE_BOARD = CharucoTarget(5, 4, 0.09)
 """Board of the example's calibration pictures; large, since its pictures are small."""
 BOARD_FAMILY = "4X4"
 """Family of its markers."""
@@ -38,13 +38,13 @@ _TILT = np.deg2rad(25)
 _README = """A raw capture of two RGB-D cameras: a hand lifts a cloth (made by SynthHDI, CC0).
 
   camera0/, camera1/        color, depth [mm], intrinsics and times of each image
-  calibration/CAMERA/*.png  a ChArUco board of 5 x 4 squares of 70 mm, in three places
+  calibration/CAMERA/*.png  a ChArUco board of 5 x 4 squares of 90 mm, in three places
 
 Import it:
-  physhandi import capture {folder} --out data/sequences/example --charuco 5x4,0.07
+  physhandi import capture {folder} --out data/sequences/example --charuco 5x4,0.09
 
 Give the cloth by a click (camera, frame, pixel x, pixel y):
-  physhandi import capture {folder} --out data/sequences/example --charuco 5x4,0.07 \\
+  physhandi import capture {folder} --out data/sequences/example --charuco 5x4,0.09 \\
       --overwrite --click {click}
 
 Look at it and fit it:

@@ -17,7 +17,7 @@ _cv2: Any = cv2
 _aruco: Any = _cv2.aruco
 _FAMILIES = ("4X4", "5X5", "6X6", "7X7")
 _COUNTS = (50, 100, 250, 1000)
-_LEAST_CORNERS = 6
+_LEAST_CORNERS = 4
 _SMALL = 640
 """Narrower pictures are enlarged before markers are looked for [px]."""
 _MOST_ERROR = 2.0
@@ -104,22 +104,39 @@ def find_board(
     gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     # Markers of a few pixels are not read, and corners between them not refined.
     factor = 2 if image.shape[1] < _SMALL else 1
+    best = _seen_in(gray, factor, target)
+    if best is None or len(best.corner) < (target.columns - 1) * (target.rows - 1) / 2:
+        finer = _seen_in(gray, 2 * factor, target)
+        if finer is not None and (best is None or len(finer.corner) > len(best.corner)):
+            best = finer
+    return best
+
+
+def _seen_in(gray: ndarray, factor: int, target: CharucoTarget) -> BoardSighting | None:
+    """Look for markers of all families in a picture that is enlarged."""
     if factor > 1:
         gray = cv2.resize(gray, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
+    detection = _aruco.DetectorParameters()
+    # More thresholds, and cells of more pixels, read markers that are small and seen from the side.
+    detection.adaptiveThreshWinSizeMax, detection.adaptiveThreshWinSizeStep = 53, 6
+    detection.perspectiveRemovePixelPerCell = 8
+    detection.perspectiveRemoveIgnoredMarginPerCell = 0.2
+    detection.polygonalApproxAccuracyRate = 0.05
     best: BoardSighting | None = None
     for family in _FAMILIES:
         # Before version 4.6, OpenCV printed boards with even rows the other way around.
         for is_legacy in (False, True) if target.rows % 2 == 0 else (False,):
             board = target.board(family, is_legacy=is_legacy)
-            pixel, number, _, _ = _aruco.CharucoDetector(board).detectBoard(gray)
+            detector = _aruco.CharucoDetector(board, _aruco.CharucoParameters(), detection)
+            pixel, number, _, _ = detector.detectBoard(gray)
             if number is None or len(number) < _LEAST_CORNERS:
                 continue
-            if best is None or len(number) > len(best.corner):
-                corner = np.asarray(board.getChessboardCorners(), np.float64)
-                best = BoardSighting(
-                    corner[np.asarray(number).ravel()],
-                    (np.asarray(pixel, np.float64).reshape(-1, 2) + 0.5) / factor - 0.5,
-                )
+            corner = np.asarray(board.getChessboardCorners(), np.float64)[np.ravel(number)]
+            width = np.linalg.svd(corner - corner.mean(axis=0), compute_uv=False)[1]
+            is_row = width < 0.5 * target.square  # Corners on one line leave the pose open.
+            if not is_row and (best is None or len(number) > len(best.corner)):
+                place = (np.asarray(pixel, np.float64).reshape(-1, 2) + 0.5) / factor - 0.5
+                best = BoardSighting(corner, place)
     return best
 
 
@@ -228,7 +245,7 @@ def _chained(
         if view not in cameras:
             is_blind = not any(key[0] == view for key in single)
             reason = (
-                "no calibration picture shows the board (6 corners are needed at least)"
+                "no calibration picture shows the board (4 corners, not all in a row, are needed)"
                 if is_blind
                 else "it never shows the board at a place that another camera shows too"
             )

@@ -97,7 +97,7 @@ def test_the_example_names_its_board_and_a_click_on_the_object(sequence, tmp_pat
     folder = write_example_capture(tmp_path / "try")
     assert asked["changes"] == {"camera_shift": 0.0, "camera_turn": 0.0, "time_skew": 0.0}
     text = (folder / "README.txt").read_text()
-    assert "--charuco 5x4,0.07" in text
+    assert "--charuco 5x4,0.09" in text
     click = next(word for word in text.split() if word.startswith("camera0,0,"))
     x, y = map(int, click.split(",")[2:])
     assert sequence.views[0].mask(0)[y, x] == 1
