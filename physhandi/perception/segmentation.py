@@ -48,6 +48,8 @@ _NEW_ON_SKIN = 0.02
 """Density of colors that a hand has not shown."""
 _SHADOWS = (1.0, 0.8, 0.6)
 """Shares of its lightness with which background is seen, the smaller ones in shadows."""
+_SHADED = 0.1
+"""Share of the object's pixels that count as seen in a shadow, too: that of a hand falls on it."""
 _MEMORY = 6.0
 """Frames' worth of pixels that the colors of a thing are remembered by."""
 _OBJECT_RATE = 0.33
@@ -712,13 +714,9 @@ def _begin(
         seen.things[value].add(patch.code[core])
         seed = seed & ~core
     if colors.is_known() and seed.any():
-        # The object comes from elsewhere: calibration errs, and what it hits may be beside it.
-        own = colors.log_density(patch.code)
-        rivals = [seen.background, *(seen.things[value] for value in hands)]
-        alike = np.all([own > rival.log_density(patch.code) for rival in rivals], axis=0)
-        seed = alike & (cv2.dilate(seed.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0)
+        seed = _own_seed(seen, patch, seed, list(hands))
     has_object = int(seed.sum()) > 0
-    colors.replace(patch.code[seed])
+    _learn_object(colors, shadowed, seed)
     label = np.zeros(seed.shape, dtype=np.uint8)
     farness = None
     for _ in range(_ROUNDS):
@@ -729,7 +727,7 @@ def _begin(
         if has_object:
             kept = _hanging_together(seen, patch, label, seed) | seed
             label[(label == OBJECT_LABEL) & ~kept] = _BACKGROUND
-            colors.replace(patch.code[kept])
+            _learn_object(colors, shadowed, kept)
             farness = _farness(seen, patch, kept)
         for value, (core, _) in hands.items():
             seen.things[value].replace(patch.code[core & (label == value)])
@@ -740,6 +738,25 @@ def _begin(
             off = np.abs(patch.height[known]) > 5 * seen.noise
             seen.clutter = float(np.clip(off.mean(), 0.003, 0.3))
     return _outlined(patch, label)
+
+
+def _learn_object(
+    colors: _Colors, shadowed: list[Int[ndarray, "row column"]], mask: Bool[ndarray, "row column"]
+) -> None:
+    """Learn the object's colors, and what they are in shadows."""
+    colors.replace(shadowed[0][mask])
+    for code in shadowed[1:]:
+        colors.add(code[mask], _SHADED)
+
+
+def _own_seed(
+    seen: _Seen, patch: _Patch, seed: Bool[ndarray, "row column"], hands: list[int]
+) -> Bool[ndarray, "row column"]:
+    """Keep of what other views show where the color is the object's: calibration errs a little."""
+    own = seen.things[OBJECT_LABEL].log_density(patch.code)
+    rivals = [seen.background, *(seen.things[value] for value in hands)]
+    alike = np.all([own > rival.log_density(patch.code) for rival in rivals], axis=0)
+    return alike & (cv2.dilate(seed.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0)
 
 
 def _advance(
@@ -792,7 +809,12 @@ def _learn(
     for value in labels[1:]:
         rate = _OBJECT_RATE if value == OBJECT_LABEL else _SKIN_RATE
         seen.things[value].fade(_MEMORY * max(50, int((label == value).sum())))
-        seen.things[value].add(patch.code[is_sure & (label == value)], rate)
+        of_thing = is_sure & (label == value)
+        seen.things[value].add(patch.code[of_thing], rate)
+        if value == OBJECT_LABEL:
+            for share in _SHADOWS[1:]:
+                code = _code(patch.lab[of_thing][None], share)[0]
+                seen.things[value].add(code, _SHADED * rate)
 
 
 def _window(seen: _Seen, label: UInt8[ndarray, "row column"], frame: int) -> _Window:
