@@ -3,6 +3,7 @@
 import asyncio
 import time
 from collections.abc import Iterable
+from dataclasses import asdict
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Header, Query, Request, Response
@@ -14,6 +15,7 @@ from starlette.exceptions import HTTPException
 from app.comparison import NewComparison
 from app.ids import ItemId
 from app.jobs.about import RunChanges, change_about
+from app.jobs.annotations import Annotations, ClickedPlace
 from app.jobs.catalog import Catalog, NotFoundError
 from app.jobs.checks import check_item
 from app.jobs.listing import RunQuery, page_of, select_runs
@@ -65,6 +67,28 @@ class Draft(BaseModel):
     overrides: Annotated[dict[SettingPath, JsonValue], Field(max_length=200)] = {}
 
 
+class NewClick(BaseModel):
+    """A place on the object, in an image of the recording."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    view: ItemId
+    frame: Annotated[int, Field(ge=0, le=10_000_000)]
+    x: Annotated[float, Field(ge=-1, le=100_000, allow_inf_nan=False)]
+    y: Annotated[float, Field(ge=-1, le=100_000, allow_inf_nan=False)]
+
+
+class NewAnnotation(BaseModel):
+    """Masks and tracks to find."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    clicks: Annotated[list[NewClick], Field(max_length=200)] = []
+    """Places on the object; none finds hands alone."""
+    overwrite: bool = False
+    """Whether masks and tracks may be replaced that came from elsewhere."""
+
+
 class NewSession(BaseModel):
     """A live scene to open."""
 
@@ -96,6 +120,7 @@ def create_api(
     *,
     machine: Machine,
     overview: Overview,
+    annotations: Annotations,
 ) -> APIRouter:
     """Make the routes.
 
@@ -106,9 +131,11 @@ def create_api(
         sessions: Opens live scenes.
         machine: Tells how busy the machine is.
         overview: Describes machine, queue and program.
+        annotations: Finds masks and tracks.
     """
     router = APIRouter(prefix="/api/v1")
     _add_listings(router, catalog, scheduler)
+    _add_annotations(router, annotations)
     _add_results(router, catalog)
     _add_jobs(router, catalog, scheduler)
     _add_sessions(router, sessions)
@@ -153,6 +180,24 @@ def _add_listings(router: APIRouter, catalog: Catalog, scheduler: Scheduler) -> 
                 {"name": name, "description": named_profile(name).description} for name in names
             ]
         }
+
+
+def _add_annotations(router: APIRouter, annotations: Annotations) -> None:
+    @router.post("/sequences/{sequence_id}/annotation", status_code=202)
+    def annotate(sequence_id: ItemId, new: NewAnnotation) -> dict[str, Any]:
+        """Find masks and tracks of a recording from places on its object."""
+        clicks = [ClickedPlace(**click.model_dump()) for click in new.clicks]
+        return asdict(annotations.start(sequence_id, clicks, overwrite=new.overwrite))
+
+    @router.get("/sequences/{sequence_id}/annotation")
+    def show_annotation(sequence_id: ItemId) -> dict[str, Any]:
+        """Tell how far that is."""
+        return asdict(annotations.job(sequence_id))
+
+    @router.delete("/sequences/{sequence_id}/annotation", status_code=204)
+    def cancel_annotation(sequence_id: ItemId) -> Response:
+        annotations.cancel(sequence_id)
+        return Response(status_code=204)
 
 
 def _add_results(router: APIRouter, catalog: Catalog) -> None:

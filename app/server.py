@@ -20,6 +20,7 @@ from app.api import create_api
 from app.comparing import create_comparing
 from app.exports.cache import FileCache, TooManyFilesError
 from app.exports.routes import create_exports
+from app.jobs.annotations import Annotations
 from app.jobs.catalog import Catalog, NotFoundError
 from app.jobs.machine import Machine
 from app.jobs.order import SkippedObjectError
@@ -93,6 +94,7 @@ def create_app(
     sessions = sessions or Sessions(settings, catalog, storage)
     machine = Machine(settings.data_dir)
     feed = Feed(lambda: [describe_run(item, scheduler) for item in catalog.runs()])
+    annotations = Annotations(catalog)
     pages = Pages()
     previews = Previews(settings, catalog)
     file_cache = FileCache(settings.data_dir / "cache" / "exports")
@@ -102,6 +104,7 @@ def create_app(
         scheduler.start()
         previews.start()
         yield
+        annotations.shutdown()
         previews.shutdown()
         scheduler.shutdown()
         sessions.shutdown()
@@ -122,7 +125,15 @@ def create_app(
     app.state.security = security
     overview = Overview(settings, catalog, scheduler, machine)
     app.include_router(
-        create_api(catalog, scheduler, feed, sessions, machine=machine, overview=overview)
+        create_api(
+            catalog,
+            scheduler,
+            feed,
+            sessions,
+            machine=machine,
+            overview=overview,
+            annotations=annotations,
+        )
     )
     app.include_router(
         create_pages(

@@ -45,6 +45,7 @@ function showFigure(figure) {
 function show() {
   frames.querySelector("[data-frame-number]").textContent = `frame ${slider.value} of ${last}`;
   frames.querySelectorAll("figure").forEach(showFigure);
+  showPicks();
   const here = new URL(location.href);
   here.searchParams.set("frame", slider.value);
   history.replaceState(null, "", here);
@@ -81,7 +82,12 @@ if (frames) {
     else return;
     event.preventDefault();
   });
-  frames.addEventListener("click", (event) => event.target.closest("figure")?.classList.toggle("is-large"));
+  frames.addEventListener("click", (event) => {
+    const figure = event.target.closest("figure");
+    if (!figure) return;
+    if (!frames.classList.contains("is-picking")) figure.classList.toggle("is-large");
+    else if (event.target.matches("img")) pick(figure, event);
+  });
   document.addEventListener("DOMContentLoaded", show);
 }
 
@@ -91,3 +97,74 @@ document.addEventListener("click", (event) => {
   go(Number(button.dataset.go));
   frames.scrollIntoView({ behavior: "smooth", block: "start" });
 });
+
+/* ---- masks and tracks from a click ---- */
+
+const annotation = document.getElementById("annotation");
+const part = (name) => annotation.querySelector(`[data-${name}]`);
+const POLL_MS = 600;
+let picks = [];
+
+function pick(figure, event) {
+  const box = figure.querySelector("img").getBoundingClientRect();
+  // Pixels count from their middles.
+  const x = ((event.clientX - box.left) / box.width) * figure.dataset.width - 0.5;
+  const y = ((event.clientY - box.top) / box.height) * figure.dataset.height - 0.5;
+  const tidy = (value) => Math.max(0, Math.round(value * 10) / 10);
+  picks.push({ view: figure.dataset.view, frame: Number(slider.value), x: tidy(x), y: tidy(y) });
+  showPicks();
+}
+
+function showPicks() {
+  if (!annotation) return;
+  frames.querySelectorAll(".pick").forEach((dot) => dot.remove());
+  for (const { view, frame, x, y } of picks) {
+    if (frame !== Number(slider.value)) continue;
+    const figure = frames.querySelector(`[data-view="${view}"]`);
+    const image = figure.querySelector("img");
+    const dot = Object.assign(document.createElement("span"), { className: "pick" });
+    dot.style.left = `${((x + 0.5) / figure.dataset.width) * image.clientWidth}px`;
+    dot.style.top = `${((y + 0.5) / figure.dataset.height) * image.clientHeight}px`;
+    figure.append(dot);
+  }
+  part("picks").replaceChildren(...picks.map(({ view, frame, x, y }, number) => {
+    const item = Object.assign(document.createElement("li"), { textContent: `${view}, frame ${frame}: ${Math.round(x)}, ${Math.round(y)} ` });
+    const undo = Object.assign(document.createElement("button"), { type: "button", className: "mini", textContent: "✕", title: "Take it back" });
+    undo.setAttribute("aria-label", `Take back the click in ${view}, frame ${frame}`);
+    undo.addEventListener("click", () => { picks.splice(number, 1); showPicks(); });
+    item.append(undo);
+    return item;
+  }));
+  part("annotate").disabled = !picks.length;
+}
+
+const own = () => `/api/v1/sequences/${annotation.dataset.sequence}/annotation`;
+
+/** Follow the work until it ends; what was found is then shown by the page itself. */
+function followAnnotation(job, was) {
+  const isRunning = job.state === "running";
+  if (job.state === "done" && was === "running") location.reload();
+  part("finding").hidden = part("stop").hidden = !isRunning;
+  part("annotate").hidden = isRunning;
+  part("unfound").hidden = job.state !== "failed";
+  part("unfound").textContent = job.reason;
+  const { stage, iteration, total } = job.progress;
+  const bar = annotation.querySelector("progress");
+  if (total) [bar.max, bar.value] = [total, iteration];
+  part("found").textContent = stage ? `${stage.replaceAll("_", " ")} · ${iteration} of ${total}` : "starting …";
+  if (isRunning) setTimeout(async () => followAnnotation(await send("GET", own()).catch(() => job), "running"), POLL_MS);
+}
+
+if (annotation) {
+  part("pick").addEventListener("click", () => {
+    const isOn = frames.classList.toggle("is-picking");
+    part("pick").setAttribute("aria-pressed", String(isOn));
+  });
+  part("annotate").addEventListener("click", ({ target }) => busy(target, async () => {
+    if (frames.classList.contains("is-picking")) part("pick").click();
+    followAnnotation(await send("POST", own(), { clicks: picks, overwrite: Boolean(part("overwrite")?.checked) }));
+  }));
+  part("stop").addEventListener("click", ({ target }) => busy(target, () => send("DELETE", own())));
+  addEventListener("resize", showPicks);
+  document.addEventListener("DOMContentLoaded", async () => followAnnotation(await send("GET", own())));
+}

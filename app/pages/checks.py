@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.exceptions import HTTPException
 
 from app.ids import ItemId
-from app.jobs.catalog import Catalog
+from app.jobs.catalog import Catalog, SequenceItem
 from app.jobs.checks import check_item
 from app.pages.render import Pages
 from app.previews.overlay import LAYERS, draw_frame
@@ -58,6 +58,8 @@ def add_checks(router: APIRouter, catalog: Catalog, pages: Pages) -> None:
             frame=min(frame, sequence.frame_count - 1) if sequence is not None else 0,
             views=[_described(view) for view in sequence.views] if sequence is not None else [],
             layers=_layers_of(sequence) if sequence is not None else [],
+            can_annotate=sequence is not None and _can_annotate(item, sequence),
+            is_annotated=sequence is not None and len(sequence.missing("mask", "track")) < 2,
             version=_version(item.folder),
             stages={name: stage.to_dict() for name, stage in stages.items()},
             about=ABOUT,
@@ -107,6 +109,11 @@ def _described(view: View) -> dict[str, Any]:
         "lacks": [name for name, is_there in parts.items() if not is_there],
         "can_choose": view.has_color and view.has_depth,
     }
+
+
+def _can_annotate(item: SequenceItem, sequence: Sequence) -> bool:
+    """Tell whether masks can be found in a recording; those that came with the program stay."""
+    return not item.is_bundled and any(view.has_color for view in sequence.views)
 
 
 def _layers_of(sequence: Sequence) -> list[tuple[str, str]]:

@@ -1,0 +1,119 @@
+"""Masks and tracks from clicks in the browser: started, followed, cancelled, and really found."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from clicked_disc import disc_click, write_disc
+from server_world import World, make_world
+from starlette.testclient import TestClient
+from waiting import until
+
+from app.jobs.annotations import Annotations, ClickedPlace
+from app.jobs.catalog import Catalog
+from app.settings import ServerSettings
+from physhandi.data.sequence import Sequence
+from physhandi.errors import RunError, SequenceError, UsageError
+
+ADDRESS = "/api/v1/sequences/disc/annotation"
+
+
+@pytest.fixture
+def annotations(
+    data_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Annotations]:
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent.parent))
+    catalog = Catalog(ServerSettings(data_dir=data_dir), bundled=tmp_path / "none")
+    annotations = Annotations(catalog, worker="annotation_worker")
+    yield annotations
+    annotations.shutdown()
+
+
+def click(view: str = "front") -> list[ClickedPlace]:
+    return [ClickedPlace(view, 3, 10.5, 20.0)]
+
+
+def test_the_order_reaches_the_process_and_its_end_is_told(
+    annotations: Annotations, data_dir: Path
+) -> None:
+    assert annotations.job("sheet").state == "none"
+    job = annotations.start("sheet", click(), overwrite=True)
+    until(lambda: job.state != "running")
+    assert (job.state, job.reason) == ("done", "")
+    assert job.progress["stage"] == "segmentation"
+    assert annotations.job("sheet") is job
+    told = (data_dir / "sequences/sheet/found.txt").read_text()
+    assert told == "[{'view': 'front', 'frame': 3, 'x': 10.5, 'y': 20.0}]"
+
+
+def test_a_refusal_and_a_death_are_told(annotations: Annotations) -> None:
+    refused = annotations.start("sheet", click(), overwrite=False)
+    until(lambda: refused.state != "running")
+    assert (refused.state, refused.reason) == ("failed", "It has masks that were not made here.")
+    dead = annotations.start("sheet", click("dies"), overwrite=False)
+    until(lambda: dead.state != "running")
+    assert dead.state == "failed"
+    assert "3" in dead.reason
+
+
+def test_one_recording_at_a_time_and_it_can_be_cancelled(annotations: Annotations) -> None:
+    job = annotations.start("sheet", click("waits"), overwrite=True)
+    with pytest.raises(RunError, match="Masks of 'sheet' are being found"):
+        annotations.start("sheet", click(), overwrite=True)
+    annotations.cancel("sheet")
+    until(lambda: job.state != "running")
+    assert job.state == "cancelled"
+    annotations.cancel("sheet")  # Nothing is at work any more.
+    again = annotations.start("sheet", click(), overwrite=True)
+    until(lambda: again.state == "done")
+
+
+def test_what_is_not_there_is_not_begun(annotations: Annotations) -> None:
+    with pytest.raises(SequenceError, match="no sequence 'nowhere'"):
+        annotations.start("nowhere", click(), overwrite=True)
+    with pytest.raises(SequenceError, match="no sequence 'nowhere'"):
+        annotations.job("nowhere")
+
+
+@pytest.fixture
+def world(data_dir: Path) -> World:
+    write_disc(data_dir / "sequences/disc", frames=3)
+    return make_world(data_dir)
+
+
+def post(client: TestClient, address: str = ADDRESS, **fields: Any) -> Any:
+    return client.post(address, json=fields)
+
+
+def test_a_click_in_the_browser_finds_masks_and_tracks(world: World) -> None:
+    client = world.script()
+    page = world.browser().get("/sequences/disc/check").text
+    assert 'id="annotation"' in page
+    assert "Replace those that are there" not in page
+    assert client.get(ADDRESS).json()["state"] == "none"
+    view, frame, x, y = disc_click()
+    place = {"view": view, "frame": frame, "x": x, "y": y}
+    answer = post(client, clicks=[place])
+    assert answer.status_code == 202, answer.text
+    job = until(lambda: (j := client.get(ADDRESS).json())["state"] != "running" and j)
+    assert (job["state"], job["reason"]) == ("done", "")
+    assert job["progress"]["stage"] == "point_tracking"
+    found = Sequence.load(world.settings.sequence_dir / "disc")
+    assert found.missing("mask", "track") == []
+    assert found.provenance["masks"]["clicks"] == [place]
+    assert "Replace those that are there" in world.browser().get("/sequences/disc/check").text
+    assert client.delete(ADDRESS).status_code == 204
+
+
+def test_orders_that_make_no_sense_are_refused(world: World) -> None:
+    client = world.script()
+    assert post(client, clicks=[{"view": "../top", "frame": 0, "x": 1, "y": 1}]).status_code == 422
+    assert post(client, clicks=[{"view": "top", "frame": -1, "x": 1, "y": 1}]).status_code == 422
+    bundled = post(client, "/api/v1/sequences/towel_fold/annotation")
+    assert bundled.status_code == 422
+    assert "came with the program" in bundled.json()["error"]["message"]
+    assert post(client, "/api/v1/sequences/nowhere/annotation").status_code == 404
+    assert 'id="annotation"' not in world.browser().get("/sequences/towel_fold/check").text
+    with pytest.raises(UsageError, match="came with the program"):
+        Annotations(world.catalog).start("towel_fold", [], overwrite=True)
