@@ -523,7 +523,7 @@ def _check_table(
         fail(
             source.view.folder if source.view.depth is None else source.view.depth.path,
             f"puts the table {ratio:.3g} times as far from the camera as the board says. The depth "
-            f"scale is not {source.scale:g}; give --depth-scale {source.scale / ratio:.3g}",
+            f"scale is not {source.scale:g}; give --depth-scale {source.scale / ratio:.2g}",
         )
     if not _RATIO[0] <= ratio <= _RATIO[1]:
         notes.append(
