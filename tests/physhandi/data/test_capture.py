@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import re
 from pathlib import Path
 
 import cv2
@@ -10,6 +11,7 @@ import pytest
 from raw_capture import BOARD, CAMERAS, FRAMES, RawCapture, ball, camera_at, intrinsics, picture
 
 from physhandi.data.camera import PinholeCamera
+from physhandi.data.importers.board_calibration import CharucoTarget, find_board
 from physhandi.data.importers.capture import CaptureOptions, import_capture
 from physhandi.data.importers.recorded_camera import RecordedCamera, read_camera
 from physhandi.data.importers.rectification import Rectifier
@@ -241,6 +243,21 @@ def test_a_board_calibrates_the_cameras_and_lies_on_the_ground(tmp_path):
     report = sequence.provenance["calibration"]
     assert all(0 < error < 0.5 for error in report["reprojection_error_px"].values())
     assert report["agreement"]["table in left"] == pytest.approx(1.0, abs=0.01)
+
+
+def test_the_printed_board_is_the_one_that_is_looked_for():
+    """The drawing in the docs, at 4 pixels a millimetre."""
+    drawing = (Path(__file__).parents[3] / "docs/images/charuco_7x5_40mm.svg").read_text()
+    assert 'width="297mm" height="210mm" viewBox="0 0 297 210"' in drawing
+    sheet = np.full((840, 1188), 255, np.uint8)
+    boxes = re.findall(r"M([\d.]+) ([\d.]+)h([\d.]+)v([\d.]+)h-", drawing)
+    for x, y, width, height in np.array(boxes, float) * 4:
+        sheet[round(y) : round(y + height), round(x) : round(x + width)] = 0
+    found = find_board(cv2.cvtColor(sheet, cv2.COLOR_GRAY2BGR), CharucoTarget.parse("7x5,0.04"))
+    assert found is not None
+    assert len(found.corner) == 24
+    ratio = np.ptp(found.pixel, axis=0) / np.ptp(found.corner[:, :2], axis=0)
+    assert ratio == pytest.approx(4000, rel=0.002)  # Squares are 40 mm.
 
 
 def test_the_board_of_the_first_frames_calibrates_too_and_tells_a_wrong_depth_scale(tmp_path):
