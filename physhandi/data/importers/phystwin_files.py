@@ -16,6 +16,7 @@ from numpy import ndarray
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.files import read_array
 from physhandi.data.foreign import read_untrusted
+from physhandi.data.image_header import announced_size, video_size
 from physhandi.data.length_unit import FARTHEST_POSITION as FARTHEST
 from physhandi.data.sequence_writer import SequenceWriter
 from physhandi.errors import ImportFailedError
@@ -409,6 +410,10 @@ def copy_color(images: CaseImages, frame: int, writer: SequenceWriter, view: str
 
 
 def _check_video(path: Path, images: CaseImages) -> None:
+    try:
+        video_size(path)
+    except (ValueError, OSError) as error:
+        fail(path, str(error))
     capture = cv2.VideoCapture(str(path))
     try:
         count, width, height = (
@@ -487,6 +492,10 @@ def read_image(path: Path, mode: int) -> ndarray:
     Raises:
         ImportFailedError: If that is not possible.
     """
+    try:
+        announced_size(path)  # Refuses what is too large before it is decoded.
+    except (ValueError, OSError) as error:
+        fail(path, f"cannot be decoded as an image: it {error}")
     image = cast("ndarray | None", cv2.imread(str(path), mode))
     if image is None:
         fail(path, "cannot be decoded as an image")

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from physhandi.data.camera import PinholeCamera
+from physhandi.data.image_header import video_size
 from physhandi.data.sequence import Sequence, ViewMeta
 from physhandi.data.sequence_meta import SequenceMeta, Side
 from physhandi.data.sequence_writer import SequenceWriter
@@ -121,6 +122,10 @@ def _find_video(source: Path, camera: int) -> _Video:
             f"{source}: expected one video cam{camera}*.mp4, found {names}. "
             "Keep one video for each camera."
         )
+    try:
+        video_size(paths[0])  # Refuses what is too large before a decoder sees it.
+    except (ValueError, OSError) as error:
+        raise ImportFailedError(f"{paths[0]} {error}. Re-export it, smaller.") from error
     capture = cv2.VideoCapture(str(paths[0]))
     try:
         video = _Video(

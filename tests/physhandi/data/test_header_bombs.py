@@ -1,15 +1,14 @@
 """Nothing is decoded that announces another size than its camera, or more than it can hold."""
 
 import io
-import struct
 import tracemalloc
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from header_bombs import jpeg, mp4, png
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.files import read_array
@@ -18,27 +17,6 @@ from physhandi.data.view import View
 from physhandi.errors import SequenceError
 
 WIDTH, HEIGHT = 48, 36
-
-
-def png(width: int, height: int, *, bits: int = 8, color: int = 0, content: bytes = b"") -> bytes:
-    """Write a PNG by its specification: header, compressed rows, end."""
-
-    def chunk(kind: bytes, body: bytes) -> bytes:
-        return (
-            struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-        )
-
-    header = struct.pack(">IIBBBBB", width, height, bits, color, 0, 0, 0)
-    parts = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(content)) + chunk(b"IEND", b"")
-    return b"\x89PNG\r\n\x1a\n" + parts
-
-
-def jpeg(width: int, height: int) -> bytes:
-    """Encode a small image, and let its header announce another size."""
-    encoded = bytearray(cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))[1].tobytes())
-    at = encoded.index(b"\xff\xc0")
-    encoded[at + 5 : at + 9] = struct.pack(">HH", height, width)
-    return bytes(encoded)
 
 
 def view(folder: Path) -> View:
@@ -135,12 +113,11 @@ def test_a_video_tells_its_size_in_its_sample_description(tmp_path: Path) -> Non
     assert video_size(path) == (WIDTH, HEIGHT)
     view(tmp_path).check_presence()
     assert abs(int(view(tmp_path).color(1).mean()) - 80) < 4
-    at = content.index(b"mp4v", content.index(b"stsd")) + 28
-    assert struct.unpack(">HH", content[at : at + 4]) == (WIDTH, HEIGHT)
-    path.write_bytes(content[:at] + struct.pack(">HH", 60_000, 60_000) + content[at + 4 :])
+    assert mp4(content, WIDTH, HEIGHT) == content
+    path.write_bytes(mp4(content, 60_000, 60_000))
     with pytest.raises(SequenceError, match=r"60000x60000 px.*smaller"):
         view(tmp_path).check_presence()
-    path.write_bytes(content[:at] + struct.pack(">HH", 40, 30) + content[at + 4 :])
+    path.write_bytes(mp4(content, 40, 30))
     with pytest.raises(SequenceError, match="color of frame 0 is 40x30 px"):
         view(tmp_path).color(0)
 

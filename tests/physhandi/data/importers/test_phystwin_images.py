@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from header_bombs import png
 from phystwin_case import FRAMES, HEIGHT, WIDTH, Case, edit_json, write_case, write_video
 from phystwin_damage import Damage, array_file, image_file, moved, refuse, tracks
 
@@ -38,6 +39,10 @@ WRONG: dict[str, tuple[Damage, str]] = {
     "an image that is none": (
         lambda f: (f / "color/2/0.png").write_bytes(b"no") and None,
         r"color/2/0\.png: cannot be decoded",
+    ),
+    "an image that announces more than there is memory": (
+        lambda f: (f / "color/2/0.png").write_bytes(png(100_000, 100_000)) and None,
+        r"color/2/0\.png: cannot be decoded as an image: it announces 100000x100000 px",
     ),
     "an image of another size": (
         image_file("color/1/2.png", GREY[:-2]),

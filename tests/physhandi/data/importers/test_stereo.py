@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from header_bombs import mp4
 from recordings import recording as published
 
 from physhandi.data.importers.stereo import import_stereo
@@ -136,6 +137,10 @@ def test_videos_must_be_there_once_decode_and_agree(recording: Path, tmp_path: P
         import_stereo(tmp_path / "nowhere", tmp_path / "hand")
     _video(recording / "cam1_test.mp4", frame_count=5)
     with pytest.raises(ImportFailedError, match=r"has 5 frames at 30 Hz, but cam0_test\.mp4 has 3"):
+        import_stereo(recording, tmp_path / "hand")
+    whole = (recording / "cam1_test.mp4").read_bytes()
+    (recording / "cam1_test.mp4").write_bytes(mp4(whole, 60_000, 60_000))
+    with pytest.raises(ImportFailedError, match=r"cam1_test\.mp4 announces 60000x60000 px"):
         import_stereo(recording, tmp_path / "hand")
     (recording / "cam1_test.mp4").write_bytes(b"no video")
     with pytest.raises(ImportFailedError, match=r"cam1_test\.mp4 cannot be decoded"):
