@@ -35,7 +35,8 @@ REMEDIES: Mapping[str, str] = {
     "views": "describe every camera below 'views' in sequence.yaml",
     COLOR_OR_KEYPOINT: "add color.mp4 or color/, in which keypoints are found, or keypoint.npy",
     "depth": "add views/<view>/depth/ with 16-bit PNGs in millimetres, or marker.npy",
-    "mask": "make them with one click ('physhandi annotate SEQUENCE --click view,frame,x,y'), or "
+    "mask": "make masks with a click on the object, on the recording's check page or by "
+    "'physhandi annotate SEQUENCE --click view,frame,x,y', or "
     "add views/<view>/mask/ with 8-bit PNGs: 1 object, 2 right hand, 3 left hand",
     DEPTH_WITH_MASK: "add masks to a view that has depth, or depth to one that has masks",
     "object_node": "add object_node.npy, or depth with masks, which tell the object's shape",
