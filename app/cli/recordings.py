@@ -357,6 +357,7 @@ def import_capture(
     depth_scale: float | None = None,
     intrinsics: Path | None = None,
     charuco: str | None = None,
+    april_grid: str | None = None,
     start: int = 0,
     stop: int | None = None,
     every: int = 1,
@@ -377,6 +378,8 @@ def import_capture(
         intrinsics: File with the intrinsics of all cameras, instead of those in the folder.
         charuco: Board in the pictures of calibration/CAMERA/, or in the first frames: squares
             across and down, and the side of a square [m], like 7x5,0.04.
+        april_grid: The same with AprilTags 36h11: tags across and down, the side of a tag and the
+            gap between tags [m], like 6x6,0.03,0.009.
         start: First frame to import.
         stop: Frame before which to end.
         every: Import only every n-th frame.
@@ -393,14 +396,18 @@ def import_capture(
         return
     if source is None or out is None:
         raise UsageError("Give the folder of a recording and --out, or --example DIR alone.")
-    from physhandi.data.importers.board_calibration import CharucoTarget
+    if charuco is not None and april_grid is not None:
+        raise UsageError("--charuco and --april-grid are two boards; give the one that was used.")
+    from physhandi.data.importers.board_calibration import AprilGrid, CharucoTarget
     from physhandi.data.importers.capture import CaptureOptions
     from physhandi.data.importers.capture import import_capture as convert
 
     options = CaptureOptions(
         depth_scale=depth_scale,
         intrinsics=intrinsics,
-        charuco=None if charuco is None else CharucoTarget.parse(charuco),
+        board=CharucoTarget.parse(charuco)
+        if charuco is not None
+        else (AprilGrid.parse(april_grid) if april_grid is not None else None),
         start=start,
         stop=stop,
         every=every,

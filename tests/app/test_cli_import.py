@@ -116,6 +116,16 @@ def test_a_raw_recording_needs_a_board_that_makes_sense(tmp_path, capsys):
     )
     assert code == 2
     assert "in metres" in error
+    for board, words in (
+        (("--april-grid", "6x6,0.03"), "6x6,0.03,0.009"),
+        (("--april-grid", "6x6,30,9"), "in metres"),
+        (("--april-grid", "6x6,0.03,0.009", "--charuco", "7x5,0.04"), "two boards"),
+    ):
+        code, _, error = call(
+            capsys, "import", "capture", raw.folder, "--out", tmp_path / "x", *board
+        )
+        assert code == 2
+        assert words in error
     assert not (tmp_path / "x").exists()
 
 

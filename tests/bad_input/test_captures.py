@@ -316,7 +316,7 @@ def test_broken_pictures_of_the_board_are_refused(tmp_path, kind):
     raw.photograph_board()
     damage(raw)
     with pytest.raises(PhysHandiError) as refusal:
-        import_capture(raw.folder, tmp_path / "out", options=CaptureOptions(charuco=BOARD))
+        import_capture(raw.folder, tmp_path / "out", options=CaptureOptions(board=BOARD))
     message = str(refusal.value)
     assert [word for word in words if word not in message] == [], message
     assert left_behind(tmp_path) == []

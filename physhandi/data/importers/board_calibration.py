@@ -1,4 +1,4 @@
-"""Poses of cameras from pictures of a ChArUco board that lies on the table."""
+"""Poses of cameras from pictures of a board on the table: ChArUco, or a grid of AprilTags."""
 
 import re
 from collections.abc import Sequence
@@ -75,6 +75,61 @@ class CharucoTarget:
         return board
 
 
+@dataclass(frozen=True)
+class AprilGrid:
+    """A grid of AprilTags of the family 36h11, numbered row by row from 0 on."""
+
+    columns: int
+    """Tags along its width."""
+    rows: int
+    """Tags along its height."""
+    side: float
+    """Side of a tag, its black border included [m]."""
+    gap: float
+    """Distance between tags [m]."""
+
+    @classmethod
+    def parse(cls, text: str) -> "AprilGrid":
+        """Read ``WxH,SIDE,GAP``, such as ``6x6,0.03,0.009``.
+
+        Raises:
+            UsageError: If it is something else.
+        """
+        number = r"(\d*\.?\d+)"
+        found = re.fullmatch(rf"(\d{{1,2}})x(\d{{1,2}}),{number},{number}", text.replace(" ", ""))
+        if found is None:
+            raise UsageError(
+                f"--april-grid {text!r} is no grid; write tags across and down, the side of a tag "
+                "and the gap between tags in metres, like 6x6,0.03,0.009."
+            )
+        grid = cls(int(found[1]), int(found[2]), float(found[3]), float(found[4]))
+        is_plausible = 0.005 <= grid.side <= 0.3 and 0 < grid.gap <= grid.side
+        if not (is_plausible and grid.columns * grid.rows >= 2):
+            raise UsageError(
+                f"--april-grid {text!r}: a grid has 2 tags or more, of 0.005 to 0.3 m, and gaps "
+                "that are smaller. Lengths are in metres."
+            )
+        return grid
+
+    def corners(self, tag: int, *, is_from_below: bool) -> Float[ndarray, "4 3"]:
+        """Place a tag's corners, clockwise from the top left one as the board is read [m].
+
+        Args:
+            tag: Number of the tag.
+            is_from_below: Whether tag 0 is at the bottom left, as Kalibr draws, or at the top left,
+                as OpenCV does.
+        """
+        row, column = divmod(tag, self.columns)
+        row = self.rows - 1 - row if is_from_below else row
+        step = self.side + self.gap
+        square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+        return self.side * square + [column * step, row * step, 0.0]
+
+
+Board = CharucoTarget | AprilGrid
+"""What may lie on the table."""
+
+
 @dataclass(frozen=True, eq=False)
 class BoardSighting:
     """Corners of the board that one picture shows."""
@@ -97,13 +152,13 @@ class BoardCalibration:
     """Corners that each camera has seen in all pictures."""
 
 
-def find_board(
-    image: UInt8[ndarray, "row column 3"], target: CharucoTarget
-) -> BoardSighting | None:
+def find_board(image: UInt8[ndarray, "row column 3"], target: Board) -> BoardSighting | None:
     """Find the board in a picture, whichever family its markers are of; None if it is not there."""
     gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     # Markers of a few pixels are not read, and corners between them not refined.
     factor = 2 if image.shape[1] < _SMALL else 1
+    if isinstance(target, AprilGrid):
+        return _tags_in(gray, factor, target) or _tags_in(gray, 2 * factor, target)
     best = _seen_in(gray, factor, target)
     if best is None or len(best.corner) < (target.columns - 1) * (target.rows - 1) / 2:
         finer = _seen_in(gray, 2 * factor, target)
@@ -114,14 +169,7 @@ def find_board(
 
 def _seen_in(gray: ndarray, factor: int, target: CharucoTarget) -> BoardSighting | None:
     """Look for markers of all families in a picture that is enlarged."""
-    if factor > 1:
-        gray = cv2.resize(gray, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
-    detection = _aruco.DetectorParameters()
-    # More thresholds, and cells of more pixels, read markers that are small and seen from the side.
-    detection.adaptiveThreshWinSizeMax, detection.adaptiveThreshWinSizeStep = 53, 6
-    detection.perspectiveRemovePixelPerCell = 8
-    detection.perspectiveRemoveIgnoredMarginPerCell = 0.2
-    detection.polygonalApproxAccuracyRate = 0.05
+    gray, detection = _enlarged(gray, factor), _detection()
     best: BoardSighting | None = None
     for family in _FAMILIES:
         # Before version 4.6, OpenCV printed boards with even rows the other way around.
@@ -137,6 +185,55 @@ def _seen_in(gray: ndarray, factor: int, target: CharucoTarget) -> BoardSighting
             if not is_row and (best is None or len(number) > len(best.corner)):
                 place = (np.asarray(pixel, np.float64).reshape(-1, 2) + 0.5) / factor - 0.5
                 best = BoardSighting(corner, place)
+    return best
+
+
+def _enlarged(gray: ndarray, factor: int) -> ndarray:
+    if factor == 1:
+        return gray
+    return cv2.resize(gray, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
+
+
+def _detection() -> Any:
+    """More thresholds, and cells of more pixels, to read markers that are small or tilted."""
+    detection = _aruco.DetectorParameters()
+    detection.adaptiveThreshWinSizeMax, detection.adaptiveThreshWinSizeStep = 53, 6
+    detection.perspectiveRemovePixelPerCell = 8
+    detection.perspectiveRemoveIgnoredMarginPerCell = 0.2
+    detection.polygonalApproxAccuracyRate = 0.05
+    return detection
+
+
+def _tags_in(gray: ndarray, factor: int, target: AprilGrid) -> BoardSighting | None:
+    """Look for AprilTags; which way they are numbered and turned is found by what fits."""
+    gray, detection = _enlarged(gray, factor), _detection()
+    detection.cornerRefinementMethod = _aruco.CORNER_REFINE_SUBPIX
+    dictionary = _aruco.getPredefinedDictionary(_aruco.DICT_APRILTAG_36H11)
+    quads, numbers, _ = _aruco.ArucoDetector(dictionary, detection).detectMarkers(gray)
+    count = target.columns * target.rows
+    labels: list[int] = [] if numbers is None else np.asarray(numbers).ravel().tolist()
+    seen = {
+        number: np.asarray(quad, np.float64).reshape(4, 2)
+        for quad, number in zip(quads, labels, strict=True)
+        if number < count
+    }
+    if not seen:
+        return None
+    pixel = (np.concatenate(list(seen.values())) + 0.5) / factor - 0.5
+    best: BoardSighting | None = None
+    least = np.inf
+    for is_from_below in (False, True):
+        for turn in range(4):
+            corner = np.concatenate(
+                [np.roll(target.corners(n, is_from_below=is_from_below), turn, 0) for n in seen]
+            )
+            homography, _ = _cv2.findHomography(corner[:, :2], pixel)
+            if homography is None:
+                continue
+            mapped = np.column_stack([corner[:, :2], np.ones(len(corner))]) @ homography.T
+            error = float(np.abs(mapped[:, :2] / mapped[:, 2:] - pixel).mean())
+            if error < least:
+                best, least = BoardSighting(corner, pixel), error
     return best
 
 

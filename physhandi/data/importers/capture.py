@@ -17,8 +17,9 @@ from physhandi.data.camera import PinholeCamera
 from physhandi.data.files import temporary_name
 from physhandi.data.importers.bag import find_bags, unpack_bags
 from physhandi.data.importers.board_calibration import (
+    AprilGrid,
+    Board,
     BoardSighting,
-    CharucoTarget,
     calibrate_by_board,
     find_board,
 )
@@ -44,6 +45,8 @@ from physhandi.errors import ImportFailedError, UsageError
 from physhandi.progress import NullProgress, Progress
 
 _STAGE = "import"
+BY_BOARD = "board"
+"""How provenance begins to say that cameras were calibrated by a board."""
 _SAMPLED = 5
 _NEAREST, _FARTHEST = 0.15, 3.5
 """Distances that the median of a depth image may have, unless the scale is given [m]."""
@@ -73,7 +76,7 @@ class CaptureOptions:
     """Metres per unit of depth images; a value above 1 is units per metre. None: as recorded."""
     intrinsics: Path | None = None
     """File with the intrinsics of all cameras, instead of those in the folder."""
-    charuco: CharucoTarget | None = None
+    board: Board | None = None
     """Board from which the cameras' poses are found; None: poses are given."""
     start: int = 0
     """First frame that is imported."""
@@ -166,7 +169,7 @@ def import_capture(
         _refuse_same_names(views)
         paired = _paired(views, options)
         sources, notes = _sources(views, paired, options)
-        placement = _place(source, sources, options.charuco)
+        placement = _place(source, sources, options.board)
         cameras = [one.camera(pose) for one, pose in zip(sources, placement.poses, strict=True)]
         report = dict(placement.report)
         report["agreement"] = _check_agreement(sources, cameras, placement, paired.count)
@@ -325,7 +328,7 @@ def _depth_scale(
     return scale
 
 
-def _place(source: Path, sources: list[_Source], target: CharucoTarget | None) -> _Placement:
+def _place(source: Path, sources: list[_Source], target: Board | None) -> _Placement:
     """Find where the cameras are, with z up and the table, where it is known, at a height."""
     if target is not None:
         return _by_board(source, sources, target)
@@ -347,7 +350,7 @@ def _place(source: Path, sources: list[_Source], target: CharucoTarget | None) -
     )
 
 
-def _by_board(source: Path, sources: list[_Source], target: CharucoTarget) -> _Placement:
+def _by_board(source: Path, sources: list[_Source], target: Board) -> _Placement:
     sightings = [_sightings(source, one, target, len(sources) == 1) for one in sources]
     names = [one.view.name for one in sources]
     lenses = [one.rectifier.K for one in sources]
@@ -359,13 +362,20 @@ def _by_board(source: Path, sources: list[_Source], target: CharucoTarget) -> _P
     if any(map(len, tables)):
         found = calibrate_by_board(names, lenses, sizes, sightings, tables)
     report = {
-        "by": f"ChArUco board, {target.columns}x{target.rows} squares of {target.square:g} m",
+        "by": f"{BY_BOARD}, {_described(target)}",
         "reprojection_error_px": {
             name: round(error, 3) for name, error in zip(names, found.error, strict=True)
         },
         "corners": dict(zip(names, found.corner_count, strict=True)),
     }
     return _Placement(found.T_world_camera, 0.0, report, [])
+
+
+def _described(target: Board) -> str:
+    size = f"{target.columns}x{target.rows}"
+    if isinstance(target, AprilGrid):
+        return f"{size} AprilTags of {target.side:g} m"
+    return f"ChArUco, {size} squares of {target.square:g} m"
 
 
 def _table_points(source: _Source, pose: ndarray) -> Float[ndarray, "point 3"]:
@@ -380,7 +390,7 @@ def _table_points(source: _Source, pose: ndarray) -> Float[ndarray, "point 3"]:
 
 
 def _sightings(
-    source: Path, one: _Source, target: CharucoTarget, is_alone: bool
+    source: Path, one: _Source, target: Board, is_alone: bool
 ) -> list[BoardSighting | None]:
     """Look for the board in a view's calibration pictures, else in its first frames."""
     folder = source / CALIBRATION / one.view.folder.name
@@ -471,7 +481,7 @@ def _check_agreement(
     measured = [n for n, one in enumerate(sources) if one.view.depth is not None]
     depth = {n: sources[n].depth_image(0) for n in measured}
     report: dict[str, Any] = {}
-    if "ChArUco" in placement.report["by"]:
+    if placement.report["by"].startswith(BY_BOARD):
         for n in measured:
             report.update(_check_table(sources[n], cameras[n], depth[n], placement.notes))
     pairs = [(a, b) for a in measured for b in measured if a != b]

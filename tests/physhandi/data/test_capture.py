@@ -11,7 +11,7 @@ import pytest
 from raw_capture import BOARD, CAMERAS, FRAMES, RawCapture, ball, camera_at, intrinsics, picture
 
 from physhandi.data.camera import PinholeCamera
-from physhandi.data.importers.board_calibration import CharucoTarget, find_board
+from physhandi.data.importers.board_calibration import AprilGrid, CharucoTarget, find_board
 from physhandi.data.importers.capture import CaptureOptions, import_capture
 from physhandi.data.importers.recorded_camera import RecordedCamera, read_camera
 from physhandi.data.importers.rectification import Rectifier
@@ -231,7 +231,7 @@ def test_a_board_calibrates_the_cameras_and_lies_on_the_ground(tmp_path):
     tilted[:3, :3] = cv2.Rodrigues(np.array([0.3, 0.1, 0.5]))[0] @ tilted[:3, :3]
     tilted[:3, 3] = [-0.1, 0.0, 0.05]
     raw.photograph_board(None, tilted)
-    sequence = import_capture(raw.folder, tmp_path / "out", options=CaptureOptions(charuco=BOARD))
+    sequence = import_capture(raw.folder, tmp_path / "out", options=CaptureOptions(board=BOARD))
     assert sequence.ground_height == 0.0
     poses = [view.camera.T_world_camera for view in sequence.views]
     truth = [camera.T_world_camera for camera in cameras.values()]
@@ -243,6 +243,48 @@ def test_a_board_calibrates_the_cameras_and_lies_on_the_ground(tmp_path):
     report = sequence.provenance["calibration"]
     assert all(0 < error < 0.5 for error in report["reprojection_error_px"].values())
     assert report["agreement"]["table in left"] == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize("numbering", ["OpenCV", "Kalibr"])
+def test_a_grid_of_april_tags_calibrates_too(tmp_path, numbering):
+    grid = AprilGrid.parse("4x3,0.06,0.018")
+    tags = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36H11)
+    scale = 1000  # px a metre
+    sheet = np.full((round(0.216 * scale) + 40, round(0.294 * scale) + 40), 255, np.uint8)
+    for tag in range(12):
+        row, column = divmod(tag, 4)
+        # Kalibr numbers from the bottom, and prints each tag upside down as OpenCV sees it.
+        row = 2 - row if numbering == "Kalibr" else row
+        image = cv2.aruco.generateImageMarker(tags, tag, 60)
+        image = image[::-1, ::-1] if numbering == "Kalibr" else image
+        y, x = 20 + row * 78, 20 + column * 78
+        sheet[y : y + 60, x : x + 60] = image
+    cameras = {"left": camera_at(30, 6), "right": camera_at(110, 6)}
+    raw = RawCapture(tmp_path / "raw", cameras).write(2, poses=False)
+    lies = np.diag([1.0, -1.0, -1.0, 1.0])
+    lies[:3, 3] = [-0.15, 0.11, 0.0]
+    for name, camera in cameras.items():
+        to_board = np.array([[1e-3, 0, -0.0195], [0, 1e-3, -0.0195], [0, 0, 1]])
+        from_board = (camera.T_camera_world @ lies)[:3][:, [0, 1, 3]]
+        finer = np.array([[4.0, 0, 1.5], [0, 4.0, 1.5], [0, 0, 1]])
+        fine = cv2.warpPerspective(
+            sheet,
+            finer @ camera.K @ from_board @ to_board,
+            (4 * camera.width, 4 * camera.height),
+            borderValue=140,
+        )
+        small = cv2.resize(fine, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+        (raw.folder / "calibration" / name).mkdir(parents=True)
+        cv2.imwrite(str(raw.folder / "calibration" / name / "0.png"), small)
+    sequence = import_capture(raw.folder, tmp_path / "out", options=CaptureOptions(board=grid))
+    poses = [view.camera.T_world_camera for view in sequence.views]
+    shift, turn = relative_error(poses, [camera.T_world_camera for camera in cameras.values()])
+    assert shift < 3e-3
+    assert turn < 0.3
+    for pose, camera in zip(poses, cameras.values(), strict=True):
+        assert abs(pose[2, 3] - camera.T_world_camera[2, 3]) < 3e-3
+    report = sequence.provenance["calibration"]
+    assert report["corners"] == {"left": 48, "right": 48}
 
 
 def test_the_printed_board_is_the_one_that_is_looked_for():
@@ -267,14 +309,14 @@ def test_the_board_of_the_first_frames_calibrates_too_and_tells_a_wrong_depth_sc
     (raw.folder / "calibration/only/00000.png").replace(raw.folder / "only/color/00000.png")
     (raw.folder / "calibration/only").rmdir()
     (raw.folder / "calibration").rmdir()
-    options = CaptureOptions(charuco=BOARD)
+    options = CaptureOptions(board=BOARD)
     sequence = import_capture(raw.folder, tmp_path / "out", options=options)
     assert abs(sequence.views[0].camera.T_world_camera[2, 3] - camera.T_world_camera[2, 3]) < 3e-3
     with pytest.raises(ImportFailedError, match=r"2 times as far.*--depth-scale 0\.001\b"):
         import_capture(
             raw.folder,
             tmp_path / "wrong",
-            options=CaptureOptions(charuco=BOARD, depth_scale=0.002),
+            options=CaptureOptions(board=BOARD, depth_scale=0.002),
         )
 
 

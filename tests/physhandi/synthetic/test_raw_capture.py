@@ -73,7 +73,7 @@ def test_depth_of_the_table_is_measured_where_the_sequence_keeps_none(sequence, 
 
 def test_the_board_s_pictures_give_the_cameras_back(sequence, tmp_path):
     folder = write_raw_capture(sequence, tmp_path / "raw")
-    options = CaptureOptions(charuco=EXAMPLE_BOARD)
+    options = CaptureOptions(board=EXAMPLE_BOARD)
     found = [
         view.camera.T_world_camera
         for view in import_capture(folder, tmp_path / "back", options=options).views
