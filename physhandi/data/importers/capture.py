@@ -493,7 +493,8 @@ def _check_agreement(
         for image in (depth, later):
             whole = shared_surface(cameras[a], image[a], cameras[b], image[b])
             above = None
-            if placement.ground is not None:
+            # Later what stands above the table may move faster than cameras are synchronous.
+            if placement.ground is not None and image is depth:
                 height = placement.ground + _ABOVE
                 above = shared_surface(cameras[a], image[a], cameras[b], image[b], height)
             if whole is None:

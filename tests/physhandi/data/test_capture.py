@@ -124,6 +124,44 @@ def test_names_that_are_times_pair_a_slow_stream_with_a_fast_one(tmp_path):
     assert np.array_equal(sequence.views[0].color(3), picture(raw.cameras["only"], 6)[0])
 
 
+def test_color_and_depth_may_lie_side_by_side(tmp_path):
+    raw = long_capture(tmp_path / "raw", 3)
+    view = raw.folder / "only"
+    for kind in ("color", "depth"):
+        for path in (view / kind).iterdir():
+            path.rename(view / f"frame-{path.stem}.{kind}.png")
+        (view / kind).rmdir()
+    sequence = import_capture(raw.folder, tmp_path / "out")
+    color, depth = picture(raw.cameras["only"], 2)
+    assert np.array_equal(sequence.views[0].color(2), color)
+    assert np.abs(sequence.views[0].depth(2) - depth).max() < 6e-4
+
+
+def test_a_folder_of_the_tum_data_set(tmp_path):
+    """Lists of times and files beside rgb/ and depth/, 5000 units a metre, one camera."""
+    raw = long_capture(tmp_path / "raw", 4)
+    view = raw.folder / "only"
+    for kind, name, late in (("color", "rgb", 0.0), ("depth", "depth", 0.011)):
+        (view / kind).rename(view / name)
+        lines = ["# timestamp filename"]
+        for frame in range(4):
+            time = f"{1305031102.175304 + frame / 30 + late:.6f}"
+            path = view / name / f"{frame:05d}.png"
+            if name == "depth":
+                image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+                cv2.imwrite(str(path), image * 5)
+            path.rename(view / name / f"{time}.png")
+            lines.append(f"{time} {name}/{time}.png")
+        (view / f"{name}.txt").write_text("\n".join(lines) + "\n")
+    options = CaptureOptions(depth_scale=5000.0)
+    sequence = import_capture(view, tmp_path / "out", options=options)
+    assert (sequence.frame_count, round(sequence.frame_rate, 3)) == (4, 30.0)
+    assert np.array_equal(sequence.views[0].color(3), picture(raw.cameras["only"], 3)[0])
+    assert np.abs(sequence.views[0].depth(3) - picture(raw.cameras["only"], 3)[1]).max() < 6e-4
+    error = sequence.provenance["pairing"]["view0/depth"]["median_error"]
+    assert error == pytest.approx(0.011, abs=1e-4)
+
+
 def test_a_video_gives_color_and_its_frame_rate(tmp_path):
     raw = long_capture(tmp_path / "raw", 5)
     view, camera = raw.folder / "only", raw.cameras["only"]
