@@ -1,8 +1,9 @@
 """Follows points of the object through the images of each view, by pyramidal Lucas-Kanade.
 
 A track goes on while it comes back to where it was when followed backwards (Kalal et al. 2010),
-moves as its neighbors do, and its pixel is the object's, with a depth that does not jump. One that
-does not, or that a hand covers, ends; new ones begin where the object shows room for them.
+moves as its neighbors do, stays as near to them as a surface can, and its pixel is the object's,
+with a depth that does not jump. One that does not (it hangs on a shadow, say), or that a
+hand covers, ends; new ones begin where the object shows room for them.
 """
 
 from dataclasses import dataclass, field
@@ -36,6 +37,14 @@ _COMPANY = 8
 """Neighbors whose motion a track is compared with."""
 _DISAGREEMENT = 1.0
 """Difference from the median motion of the neighbors that is always allowed [px]."""
+_TIED = 0.07
+"""Tracks that begin within this distance of each other are held together by the surface [m]."""
+_STRETCH = 1.15
+"""Factor by which a surface may stretch between them."""
+_STRETCH_ERROR = 0.008
+"""Error of measured distances [m]."""
+_TORN = 0.25
+"""Share of the tracks around it that a sliding one leaves behind."""
 _CLOSEST = 2.5
 """Least distance between tracks when they begin [px]."""
 _SHORTEST = 3
@@ -94,6 +103,8 @@ class _Tracker:
         self._alive: list[int] = []
         self._gray = np.zeros((0, 0), dtype=np.uint8)
         self._depth = np.zeros(0)
+        self._pair = np.zeros((0, 2), dtype=np.int64)
+        self._rest = np.zeros(0)
 
     def step(self, frame: int) -> None:
         """Go on to a frame, the first or the next one."""
@@ -103,7 +114,7 @@ class _Tracker:
         if self._alive:
             self._advance(gray, is_object, depth)
         self._gray = gray
-        count = len(self._alive)
+        count, known = len(self._alive), len(self._paths)
         if count < (MOST_TRACKS if not self._paths else LEAST_TRACKS):
             start = np.array([self._paths[track].pixel[-1] for track in self._alive])
             for pixel in _new_points(gray, is_object & (depth > 0), start.reshape(-1, 2)):
@@ -111,6 +122,7 @@ class _Tracker:
                 self._paths.append(_Path(frame, [pixel]))
         pixel = np.array([self._paths[track].pixel[-1] for track in self._alive])
         self._depth = _at(depth, pixel.reshape(-1, 2))
+        self._tie(pixel.reshape(-1, 2), np.array(self._alive, dtype=np.int64) >= known)
 
     def _advance(
         self,
@@ -124,12 +136,52 @@ class _Tracker:
         is_good = is_found & (_at(is_object, end) > 0)
         is_good &= (here == 0) | (self._depth == 0) | (np.abs(here - self._depth) < _DEPTH_JUMP)
         is_good &= _moves_with_neighbors(start, end, is_good)
+        is_good &= ~self._is_torn(end, here, is_good)
         alive: list[int] = []
         for track, pixel, good in zip(self._alive, end, is_good, strict=True):
             if good:
                 self._paths[track].pixel.append(pixel)
                 alive.append(track)
         self._alive = alive
+
+    def _points(
+        self, pixel: Float[ndarray, "track 2"], depth: Float[ndarray, " track"]
+    ) -> Float[ndarray, "track 3"]:
+        """Lift tracks [m]; NaN where no depth was measured."""
+        point = self._view.camera.unproject(pixel.astype(np.float64), depth.astype(np.float64))
+        return np.where(depth[:, None] > 0, point, np.nan)
+
+    def _tie(self, pixel: Float[ndarray, "track 2"], is_new: Bool[ndarray, " track"]) -> None:
+        """Remember how far new tracks are from those around them."""
+        point = self._points(pixel, self._depth)
+        there = np.flatnonzero(np.isfinite(point).all(axis=1))
+        if not is_new.any() or len(there) < 2:
+            return
+        alive = np.array(self._alive, dtype=np.int64)
+        pair = KDTree(point[there]).query_pairs(_TIED, output_type="ndarray")
+        pair = there[pair[is_new[there[pair]].any(axis=1)]]
+        rest = np.linalg.norm(point[pair[:, 0]] - point[pair[:, 1]], axis=1)
+        self._pair = np.concatenate([self._pair, alive[pair]])
+        self._rest = np.concatenate([self._rest, rest])
+
+    def _is_torn(
+        self,
+        pixel: Float[ndarray, "track 2"],
+        depth: Float[ndarray, " track"],
+        is_good: Bool[ndarray, " track"],
+    ) -> Bool[ndarray, " track"]:
+        """Tell which tracks have left most of those that they began beside, as no surface does."""
+        point = self._points(pixel, depth)
+        number = np.full(len(self._paths), -1, dtype=np.int64)
+        number[np.array(self._alive)[is_good]] = np.flatnonzero(is_good)
+        lives = (number[self._pair] >= 0).all(axis=1)
+        self._pair, self._rest = self._pair[lives], self._rest[lives]
+        pair = number[self._pair]
+        length = np.linalg.norm(point[pair[:, 0]] - point[pair[:, 1]], axis=1)
+        is_long = length > _STRETCH * self._rest + _STRETCH_ERROR
+        count = np.bincount(pair[np.isfinite(length)].ravel(), minlength=len(pixel))
+        long = np.bincount(pair[is_long].ravel(), minlength=len(pixel))
+        return (count >= 4) & (long > _TORN * count)
 
     def paths(self) -> tuple[Float[ndarray, "frame track 2"], Bool[ndarray, "frame track"]]:
         """Lay the tracks that lived long enough side by side."""

@@ -3,6 +3,7 @@ import pytest
 from clicked_disc import FRAMES, TOP, cameras, center, write_disc
 
 from physhandi.errors import CancelledError
+from physhandi.perception import point_tracking
 from physhandi.perception.point_tracking import LEAST_TRACKS, track_points
 from physhandi.progress import Progress
 
@@ -82,6 +83,36 @@ def test_a_jump_in_depth_ends_a_track(disc, monkeypatch):
     assert (is_seen[4] & is_seen[3]).sum() > 50
     assert not (is_seen[5] & is_seen[4]).any()
     assert is_seen[5].sum() > 50
+
+
+def test_tracks_that_slide_over_the_surface_end_since_it_cannot_stretch_so(tmp_path, monkeypatch):
+    """A tenth of the matches hangs on something else, which moves 0.9 px a frame faster."""
+    sequence, labels = write_disc(tmp_path / "disc", frames=14)
+    found = point_tracking._follow
+    hung: list[np.ndarray] = []
+
+    def dragged(before, now, start, size):
+        end, is_found = found(before, now, start, size)
+        where = hung.pop() if hung else start[::10]
+        slides = np.linalg.norm(start[:, None] - where, axis=-1).min(axis=1, initial=9.0) < 1e-3
+        end = end + np.float32(0.9) * np.stack([slides, 0 * slides], axis=-1)
+        hung.append(end[slides])
+        return end, is_found | slides
+
+    monkeypatch.setattr(point_tracking, "_follow", dragged)
+
+    def survivors() -> tuple[int, int]:
+        hung.clear()
+        pixel, is_seen = track_points(sequence, {"top": labels["top"]})["top"]
+        error = np.linalg.norm(pixel - true_paths("top", pixel, is_seen), axis=-1)
+        return int((is_seen & (error > 6)).sum()), int((is_seen & (error < 1)).sum())
+
+    slid, stayed = survivors()
+    monkeypatch.setattr(point_tracking, "_TORN", 2.0)
+    all_slid, all_stayed = survivors()
+    assert all_slid > 20
+    assert slid < 0.6 * all_slid
+    assert stayed > 0.95 * all_stayed
 
 
 def test_a_view_without_an_object_has_no_tracks(disc):
