@@ -34,6 +34,8 @@ _PRESENCE = 0.5
 _SAME_HAND = 0.5
 """Intersection over union from which two detected hands count as one."""
 _MAX_HANDS = 2
+_WINDOW_SHARE = 0.6
+"""Side of the windows in which small hands are looked for, of the image's shorter side."""
 KEYPOINT_STAGE = "keypoint_detection"
 
 
@@ -134,6 +136,8 @@ class KeypointDetector:
         image: UInt8[ndarray, "row column 3"],
         existing: SequenceOf[DetectedHand] = (),
         max_hands: int = _MAX_HANDS,
+        *,
+        finds_small: bool = False,
     ) -> list[DetectedHand]:
         """Search a whole RGB image for hands.
 
@@ -141,9 +145,12 @@ class KeypointDetector:
             image: The image (RGB).
             existing: Hands that are already detected in it; they come first in the result.
             max_hands: Most hands to return, the existing ones included.
+            finds_small: Whether to look into one part of the image after the other, for hands
+                that are too small in the whole of it.
         """
         hands = list(existing)
-        for region in self._find_palms(image):
+        windows = _windows(image) if finds_small else [_whole(image)]
+        for region in (region for window in windows for region in self._find_palms(image, window)):
             if len(hands) >= max_hands:
                 break
             first = self._find_landmarks(image, region)
@@ -177,6 +184,8 @@ def detect_view(
 ) -> Float[ndarray, "frame hand 21 3"]:
     """Follow the given hands through one view.
 
+    Where no frame shows a hand, they are looked for once more as small ones.
+
     Args:
         view: The view; needs color images.
         hands: Hands to look for, in the order of the result's hand axis.
@@ -186,6 +195,20 @@ def detect_view(
     Returns:
         Pixel x, pixel y and confidence of each keypoint; NaN where a hand was not found.
     """
+    result = _follow_through(view, hands, progress, detector, finds_small=False)
+    if np.isnan(result).all():
+        result = _follow_through(view, hands, progress, detector, finds_small=True)
+    return result
+
+
+def _follow_through(
+    view: View,
+    hands: tuple[HandSide, ...],
+    progress: Progress,
+    detector: KeypointDetector,
+    *,
+    finds_small: bool,
+) -> Float[ndarray, "frame hand 21 3"]:
     result = np.full((view.frame_count, len(hands), 21, 3), np.nan, dtype=np.float32)
     previous: list[DetectedHand] = []
     for frame in range(view.frame_count):
@@ -193,7 +216,7 @@ def detect_view(
         image = view.color(frame)
         detected = detector.follow(image, previous)
         if len(detected) < len(hands):
-            detected = detector.detect(image, detected)
+            detected = detector.detect(image, detected, finds_small=finds_small)
         assigned = assign_hands(detected, hands)
         for index, hand in assigned.items():
             result[frame, index, :, :2] = hand.keypoint
@@ -231,18 +254,16 @@ class PalmNetwork:
         self._network = _Network("palm_detection_full.tflite", threads)
         self._anchor = _anchors()
 
-    def __call__(self, image: UInt8[ndarray, "row column 3"]) -> list[Region]:
-        """Find the regions of an RGB image that hold a hand, the most certain first."""
-        height, width = image.shape[:2]
-        side = max(height, width)
-        whole = Region(np.array([width, height]) / 2, float(side), 0.0)
-        box, score = self._network(_crop(image, whole, _PALM_SIZE))
+    def __call__(self, image: UInt8[ndarray, "row column 3"], window: Region) -> list[Region]:
+        """Find the regions that hold a hand in a window of an RGB image, the most certain first."""
+        side = round(window.size)
+        box, score = self._network(_crop(image, window, _PALM_SIZE))
         logit = np.clip(score.reshape(-1).astype(np.float64), -100, 100)
         probability = 1 / (1 + np.exp(-logit))
         keep = probability >= _PALM_SCORE
         value = box.reshape(-1, 9, 2)[keep].astype(np.float64) / _PALM_SIZE
         value[:, [0, 2, 3, 4, 5, 6, 7, 8]] += self._anchor[keep][:, None]
-        offset = (side - np.array([width, height])) / 2
+        offset = side / 2 - window.center
         value = value * side
         value[:, [0, 2, 3, 4, 5, 6, 7, 8]] -= offset
         return [_palm_region(palm) for palm in _merge(value, probability[keep])]
@@ -264,6 +285,20 @@ class LandmarkNetwork:
             presence=float(presence.item()),
             right=float(handedness.item()),
         )
+
+
+def _whole(image: UInt8[ndarray, "row column 3"]) -> Region:
+    """Return the square around an image."""
+    height, width = image.shape[:2]
+    return Region(np.array([width, height]) / 2, float(max(height, width)), 0.0)
+
+
+def _windows(image: UInt8[ndarray, "row column 3"]) -> list[Region]:
+    """Cover an image by squares that overlap by half."""
+    height, width = image.shape[:2]
+    size = _WINDOW_SHARE * min(height, width)
+    rows, columns = (np.arange(size / 2, length - size / 4, size / 2) for length in (height, width))
+    return [Region(np.array([x, y]), size, 0.0) for y in rows for x in columns]
 
 
 def landmark_region(pixel: Float[ndarray, "21 2"]) -> Region:

@@ -89,7 +89,27 @@ def test_hands_are_followed_without_searching(
 
 
 def test_an_empty_image_shows_no_hand(detector: KeypointDetector) -> None:
-    assert detector.detect(np.full((120, 200, 3), 90, np.uint8)) == []
+    empty = np.full((120, 200, 3), 90, np.uint8)
+    assert detector.detect(empty) == detector.detect(empty, finds_small=True) == []
+
+
+def test_hands_that_are_small_in_the_whole_image_are_found(
+    tmp_path: Path, photo: np.ndarray
+) -> None:
+    one = photo.copy()
+    one[:, 360:] = 255
+    scale = 64 / max(photo.shape[:2])
+    little = cv2.resize(one, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    image = np.full((400, 640, 3), 255, np.uint8)
+    image[250 : 250 + little.shape[0], 70 : 70 + little.shape[1]] = little
+    detector = KeypointDetector()
+    assert detector.detect(image) == []
+    keypoint = detect_sequence(_sequence(tmp_path / "far", [image, image], hands=("left",)))
+    assert np.isfinite(keypoint).all()
+    (near,) = detector.detect(one)
+    expected = near.keypoint * scale + [70, 250]
+    error = np.linalg.norm(keypoint[0, :, 0, :, :2] - expected, axis=2)
+    assert error.mean() < 0.08 * np.ptp(expected, axis=0).max()
 
 
 def test_a_region_maps_its_corners_to_the_image() -> None:
