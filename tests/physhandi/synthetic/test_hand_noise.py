@@ -52,7 +52,12 @@ def recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Sequence:
     def fit(_sequence: Sequence, config: Any, _progress: Progress) -> SimpleNamespace:
         keypoint = np.full((1, FRAMES, 1, 21, 3), 30.0, np.float32)
         return SimpleNamespace(
-            motions=(fitted(config),), keypoint=keypoint, loss_before=2.0, loss_after=1.0, curve=[]
+            motions=(fitted(config),),
+            keypoint=keypoint,
+            loss_before=2.0,
+            loss_after=1.0,
+            curve=[],
+            left_out={},
         )
 
     monkeypatch.setattr(pipeline, "reconstruct_hands", fit)
