@@ -134,8 +134,11 @@ def optimise_springs(
         if settings.judges_online:
             loss = float(np.mean([value for value in losses if value is not None]))
         else:
-            ahead = iteration + 1 if iteration + 1 < settings.iterations else None
-            loss = descent.present_loss(problems, models, ahead, preview.update)
+            loss = descent.loss_ahead(problems, models, iteration + 1, preview.update)
+            if loss is None:
+                loss = mean_loss(
+                    problems, now, now_parameters, config, device, on_rollout=preview.update
+                )
             preview.show(loss)
         if _is_judged(iteration, settings) and loss < best_loss:
             best, best_parameters, best_loss = now, now_parameters, loss
@@ -331,6 +334,10 @@ def _logarithms(model: SpringMassModel, part: slice) -> Tensor:
     return torch.log(torch.from_numpy(both).clamp(min=SMALLEST_VALUE)).requires_grad_()
 
 
+def _start(model: SpringMassModel) -> State:
+    return torch.from_numpy(model.object_node), torch.from_numpy(model.initial_velocity)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FitWindow:
     """A window of simulated frames, whose gradient can be or has been computed."""
@@ -339,8 +346,13 @@ class FitWindow:
     """Loss of each frame before the update [m²]."""
     node: Float[Tensor, "frame_1 node 3"]
     """The nodes in all its frames, the first included [m]."""
-    state: State
-    """State of the nodes in the last frame."""
+    velocity: Float[Tensor, "frame_1 node 3"]
+    """Their velocities [m/s]."""
+
+    @property
+    def state(self) -> State:
+        """State of the nodes in the last frame."""
+        return self.node[-1], self.velocity[-1]
 
 
 class SpringDescent:
@@ -365,38 +377,34 @@ class SpringDescent:
         self._reach: dict[str, int] = {}
         self._ahead: FitWindow | None = None
 
-    def present_loss(
+    def loss_ahead(
         self,
         problems: Many[ObjectProblem],
         models: Mapping[str, SpringMassModel],
-        next_iteration: int | None,
+        next_iteration: int,
         on_rollout: Callable[[ObjectProblem, Float[Tensor, "frame node 3"]], None],
-    ) -> float:
-        """Simulate the present springs from start to end and compare [m²]; infinite if diverging.
-
-        Where the next pass would simulate just that, it is recorded for its gradient, and the pass
-        need not simulate it once more.
+    ) -> float | None:
+        """Simulate what the next pass would, which then need not simulate it once more.
 
         Args:
             problems: All sequences.
             models: Their springs before any update.
-            next_iteration: Number of the iteration that follows; None if there is none.
-            on_rollout: Receives each motion [m].
+            next_iteration: Number of the iteration that follows, if one does.
+            on_rollout: Receives the motion [m].
+
+        Returns:
+            Mean loss of the present springs [m²], infinite if they diverge; None if the next pass
+            does not simulate all of them from start to end, or if there is none.
         """
         problem, settings = problems[0], self._config.first_order
-        frame_count = problem.frame_count
-        whole = next_iteration is not None and settings.window is None and len(problems) == 1
-        if not whole or _horizon(next_iteration or 0, settings, frame_count) < frame_count:
-            present = {name: self.material.model(name, model) for name, model in models.items()}
-            parameters = self.material.parameters(self._parameters)
-            return mean_loss(
-                problems, present, parameters, self._config, self._device, on_rollout=on_rollout
-            )
-        model = models[problem.name]
-        start = torch.from_numpy(model.object_node), torch.from_numpy(model.initial_velocity)
-        reach = min(self._reach.get(problem.name, frame_count - 1), frame_count - 1)
+        horizon = _horizon(next_iteration, settings, problem.frame_count)
+        is_whole = settings.window is None and horizon == problem.frame_count
+        if len(problems) > 1 or next_iteration >= settings.iterations or not is_whole:
+            return None
+        model, length = models[problem.name], horizon - 1
+        reach = self._reach_over(problem, length)
         try:
-            self._ahead = self._simulate(problem, model, (0, frame_count - 1), start, reach)
+            self._ahead = self._simulate(problem, model, (0, length), _start(model), reach)
         except SimulationDivergedError:
             return math.inf
         on_rollout(problem, self._ahead.node.detach())
@@ -423,7 +431,7 @@ class SpringDescent:
             SimulationDivergedError: If the motion runs away.
         """
         length = self._config.first_order.window or horizon - 1
-        state = torch.from_numpy(model.object_node), torch.from_numpy(model.initial_velocity)
+        state = _start(model)
         losses = []
         for begin in range(0, horizon - 1, length):
             window = self.fit_window(
@@ -460,7 +468,7 @@ class SpringDescent:
         """
         begin, end = frames
         steepest = self._config.first_order.steepest
-        reach = min(self._reach.get(problem.name, end - begin), end - begin)
+        reach = self._reach_over(problem, end - begin)
         while reach >= 1:
             self._optimizer.zero_grad()
             window, self._ahead = self._ahead, None
@@ -472,11 +480,10 @@ class SpringDescent:
             if steepest is None or self._steepness() <= steepest * float(loss.detach()):
                 if reach < end - begin:
                     self._reach[problem.name] = reach
-                position, velocity = window.state
                 return FitWindow(
                     frame_losses=window.frame_losses.detach(),
                     node=window.node.detach(),
-                    state=(position.detach(), velocity.detach()),
+                    velocity=window.velocity.detach(),
                 )
             reach //= 2
         return None
@@ -512,7 +519,11 @@ class SpringDescent:
             track_weight=self._config.track_weight,
             freeze_counts=self._config.freezes_counts,
         )
-        return FitWindow(frame_losses=frame_losses, node=node, state=(node[-1], velocity[-1]))
+        return FitWindow(frame_losses=frame_losses, node=node, velocity=velocity)
+
+    def _reach_over(self, problem: ObjectProblem, length: int) -> int:
+        """Number of frames that gradients reach back in a window of so many."""
+        return min(self._reach.get(problem.name, length), length)
 
     def _steepness(self) -> float:
         """Largest norm of the gradients of the logarithms."""

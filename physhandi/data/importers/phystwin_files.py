@@ -409,9 +409,16 @@ def copy_color(images: CaseImages, frame: int, writer: SequenceWriter, view: str
         writer.copy(f"views/{view}/color.mp4", source)
 
 
-def _check_video(path: Path, images: CaseImages) -> None:
+def probe_video(path: Path) -> tuple[int, int, int, float]:
+    """Ask a video's decoder for its frame count, width, height [px] and frame rate [Hz].
+
+    What cannot be decoded has a count of 0.
+
+    Raises:
+        ImportFailedError: If it is too large to be decoded, or cannot be read.
+    """
     try:
-        video_size(path)
+        video_size(path)  # Refuses what is too large before a decoder sees it.
     except (ValueError, OSError) as error:
         fail(path, str(error))
     capture = cv2.VideoCapture(str(path))
@@ -424,8 +431,13 @@ def _check_video(path: Path, images: CaseImages) -> None:
                 cv2.CAP_PROP_FRAME_HEIGHT,
             )
         )
+        return count, width, height, float(capture.get(cv2.CAP_PROP_FPS))
     finally:
         capture.release()
+
+
+def _check_video(path: Path, images: CaseImages) -> None:
+    count, width, height, _ = probe_video(path)
     if count != images.frame_count:
         fail(path, f"has {count} frames, but the case has {images.frame_count}")
     images.check_size(path, np.empty((height, width)))

@@ -13,8 +13,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from physhandi.data.files import read_array
-from physhandi.data.image_header import MOST_PIXELS, announced_size, video_size
-from physhandi.data.importers.phystwin_files import fail
+from physhandi.data.image_header import MOST_PIXELS, announced_size
+from physhandi.data.importers.phystwin_files import fail, probe_video
 from physhandi.data.importers.recorded_camera import read_table
 from physhandi.errors import ImportFailedError
 
@@ -295,23 +295,7 @@ def video_stream(path: Path) -> RecordedStream:
     Raises:
         ImportFailedError: If it cannot be decoded.
     """
-    try:
-        video_size(path)  # Refuses what is too large before a decoder sees it.
-    except (ValueError, OSError) as error:
-        fail(path, str(error))
-    capture = cv2.VideoCapture(str(path))
-    try:
-        count, width, height = (
-            round(capture.get(number))
-            for number in (
-                cv2.CAP_PROP_FRAME_COUNT,
-                cv2.CAP_PROP_FRAME_WIDTH,
-                cv2.CAP_PROP_FRAME_HEIGHT,
-            )
-        )
-        rate = float(capture.get(cv2.CAP_PROP_FPS))
-    finally:
-        capture.release()
+    count, width, height, rate = probe_video(path)
     if count < 1 or min(width, height) < 1 or width * height > MOST_PIXELS:
         fail(
             path,

@@ -16,7 +16,7 @@ from jaxtyping import Float, Float32, Int
 from numpy import ndarray
 
 from physhandi.errors import SimulationDivergedError, UsageError
-from physhandi.simulation.contact_intervals import NEVER, acts_in
+from physhandi.simulation.contact_intervals import NEVER, acts_in, always
 from physhandi.simulation.engines.cpu import CpuEngine
 from physhandi.simulation.engines.graph import LaunchGraph
 from physhandi.simulation.engines.partition import bisect_nodes
@@ -324,7 +324,7 @@ class Population:
 
         One that does not act on the way to a frame has a rank that no limit reaches.
         """
-        if np.all(self._attached == (0, NEVER)):
+        if np.all(self._attached == always(1)):
             return None
         acts = np.stack([acts_in(self._attached, frame) for frame in range(frame_count)])
         return self._array(np.where(acts, self._rank, NEVER).astype(np.int32).ravel(), wp.int32)
