@@ -4,6 +4,7 @@ import asyncio
 import time
 from collections.abc import Iterable
 from dataclasses import asdict
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Header, Query, Request, Response
@@ -15,7 +16,6 @@ from starlette.exceptions import HTTPException
 from app.comparison import NewComparison
 from app.ids import ItemId
 from app.jobs.about import RunChanges, change_about
-from app.jobs.annotations import Annotations, ClickedPlace
 from app.jobs.catalog import Catalog, NotFoundError
 from app.jobs.checks import check_item
 from app.jobs.listing import RunQuery, page_of, select_runs
@@ -23,6 +23,7 @@ from app.jobs.log import open_log
 from app.jobs.machine import Machine
 from app.jobs.order import check_order, describe_order, describe_settings
 from app.jobs.overview import Overview
+from app.jobs.recordings.annotations import Annotations, ClickedPlace
 from app.jobs.scheduler import Scheduler
 from app.jobs.streams import News, Streams
 from app.jobs.views import (
@@ -137,7 +138,7 @@ def create_api(
     _add_listings(router, catalog, scheduler)
     _add_annotations(router, annotations)
     _add_results(router, catalog)
-    _add_jobs(router, catalog, scheduler)
+    _add_jobs(router, catalog, scheduler, annotations)
     _add_sessions(router, sessions)
     _add_streams(router, catalog, scheduler, feed, machine)
     _add_system(router, overview)
@@ -232,7 +233,9 @@ def _add_results(router: APIRouter, catalog: Catalog) -> None:
         return Response(content, media_type="application/octet-stream", headers=headers)
 
 
-def _add_jobs(router: APIRouter, catalog: Catalog, scheduler: Scheduler) -> None:
+def _add_jobs(
+    router: APIRouter, catalog: Catalog, scheduler: Scheduler, annotations: Annotations
+) -> None:
     @router.get("/settings")
     def show_settings(profile: ItemId | None = None, run: ItemId | None = None) -> dict[str, Any]:
         """List all settings of a profile, or of a run beside its profile."""
@@ -247,6 +250,7 @@ def _add_jobs(router: APIRouter, catalog: Catalog, scheduler: Scheduler) -> None
 
     @router.post("/runs", status_code=201)
     def launch(new: NewRun) -> dict[str, Any]:
+        annotations.require_settled(new.sequences)
         run = scheduler.launch(
             new.sequences,
             new.profile,
@@ -270,6 +274,7 @@ def _add_jobs(router: APIRouter, catalog: Catalog, scheduler: Scheduler) -> None
 
     @router.post("/runs/{run_id}/resume")
     def resume(run_id: ItemId) -> dict[str, Any]:
+        annotations.require_settled(Path(path).name for path in catalog.run(run_id).sequences)
         scheduler.resume(run_id)
         return describe_run(catalog.run_item(run_id), scheduler)
 

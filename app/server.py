@@ -20,11 +20,11 @@ from app.api import create_api
 from app.comparing import create_comparing
 from app.exports.cache import FileCache, TooManyFilesError
 from app.exports.routes import create_exports
-from app.jobs.annotations import Annotations
 from app.jobs.catalog import Catalog, NotFoundError
 from app.jobs.machine import Machine
 from app.jobs.order import SkippedObjectError
 from app.jobs.overview import Overview
+from app.jobs.recordings.annotations import Annotations
 from app.jobs.scheduler import QueueFullError, Scheduler
 from app.jobs.views import describe_run
 from app.jobs.watch import Feed
@@ -74,6 +74,7 @@ def create_app(
     catalog: Catalog | None = None,
     scheduler: Scheduler | None = None,
     sessions: Sessions | None = None,
+    annotations: Annotations | None = None,
 ) -> FastAPI:
     """Build the application.
 
@@ -83,6 +84,7 @@ def create_app(
         catalog: Finds sequences and runs; none looks where the settings say.
         scheduler: Works through the queue; none makes one for the catalog.
         sessions: Live scenes; none makes them for the catalog.
+        annotations: Finds masks and tracks; none makes one for the catalog.
     """
     security = security or Security(settings)
     catalog = catalog or Catalog(settings)
@@ -94,7 +96,7 @@ def create_app(
     sessions = sessions or Sessions(settings, catalog, storage)
     machine = Machine(settings.data_dir)
     feed = Feed(lambda: [describe_run(item, scheduler) for item in catalog.runs()])
-    annotations = Annotations(catalog)
+    annotations = annotations or Annotations(catalog)
     pages = Pages()
     previews = Previews(settings, catalog)
     file_cache = FileCache(settings.data_dir / "cache" / "exports")

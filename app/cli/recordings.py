@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from app.cli.lookup import find_sequence, folder_of_sequence
+from app.cli.lookup import find_sequence, folder_of_sequence, open_catalog
 from app.cli.output import AsJson, DataDir, Device, show
 from physhandi.data.sequence import Sequence
 from physhandi.devices import pick_device
@@ -163,9 +163,11 @@ def annotate(
             mostly enough, without any hands alone are found.
         overwrite: Replace masks and tracks that come from elsewhere.
     """
+    from app.jobs.scheduler import require_unread
     from physhandi.perception.annotation import annotate as find
 
     folder = find_sequence(sequence, data_dir).folder
+    require_unread(open_catalog(data_dir), folder)
     clicks = [_click(text) for text in click]
     with watched(True) as progress:
         done = find(folder, clicks, progress, overwrite=overwrite)

@@ -410,6 +410,33 @@ class Scheduler:
             time.sleep(0.05)
 
 
+def require_unread(catalog: Catalog, sequence: Path) -> None:
+    """Refuse to change a recording that a run reads, or waits to read.
+
+    Args:
+        catalog: Finds runs.
+        sequence: Folder of the recording.
+
+    Raises:
+        RunError: If there is such a run; names it.
+    """
+    folder = sequence.resolve()
+    for item in catalog.runs():
+        if item.run is None or not any(_is_at(path, folder) for path in item.run.sequences):
+            continue
+        is_at_work = live_holder(item.folder) is not None or supervisor_of(item.folder) is not None
+        if is_at_work or (item.folder / QUEUED).is_file():
+            does = "is being fitted by" if is_at_work else "waits to be fitted by"
+            raise RunError(
+                f"Sequence '{folder.name}' {does} run '{item.run.name}' ({item.id}), which would "
+                "read it half old and half new. Wait until that has ended, or cancel it."
+            )
+
+
+def _is_at(path: str, folder: Path) -> bool:
+    return Path(path).name == folder.name and Path(path).resolve() == folder
+
+
 def _queued_at(path: Path) -> float:
     try:
         return float(json.loads(path.read_text(encoding="utf-8"))["time"])

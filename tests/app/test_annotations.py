@@ -6,13 +6,15 @@ from typing import Any
 
 import pytest
 from clicked_disc import disc_click, write_disc
-from server_world import World, make_world
+from server_world import ORIGIN, TOKEN, World, make_world
 from starlette.testclient import TestClient
 from waiting import until
 
-from app.jobs.annotations import Annotations, ClickedPlace
 from app.jobs.catalog import Catalog
+from app.jobs.recordings.annotations import Annotations, ClickedPlace
+from app.server import create_app
 from app.settings import ServerSettings
+from physhandi.data.lease import Lease
 from physhandi.data.sequence import Sequence
 from physhandi.errors import RunError, SequenceError, UsageError
 
@@ -61,6 +63,9 @@ def test_one_recording_at_a_time_and_it_can_be_cancelled(annotations: Annotation
     job = annotations.start("sheet", click("waits"), overwrite=True)
     with pytest.raises(RunError, match="Masks of 'sheet' are being found"):
         annotations.start("sheet", click(), overwrite=True)
+    annotations.require_settled(["other"])
+    with pytest.raises(RunError, match="Masks and tracks of 'sheet' are being found"):
+        annotations.require_settled(["other", "sheet"])
     annotations.cancel("sheet")
     until(lambda: job.state != "running")
     assert job.state == "cancelled"
@@ -104,6 +109,41 @@ def test_a_click_in_the_browser_finds_masks_and_tracks(world: World) -> None:
     assert found.provenance["masks"]["clicks"] == [place]
     assert "Replace those that are there" in world.browser().get("/sequences/disc/check").text
     assert client.delete(ADDRESS).status_code == 204
+
+
+def test_a_recording_is_not_changed_while_a_fit_reads_it(world: World) -> None:
+    client = world.script()
+    run = client.post("/api/v1/runs", json={"sequences": ["sheet"]}).json()
+    address = "/api/v1/sequences/sheet/annotation"
+    refused = post(client, address, overwrite=True)
+    assert refused.status_code == 409
+    message = refused.json()["error"]["message"]
+    assert f"waits to be fitted by run '{run['name']}' ({run['id']})" in message
+    lease = Lease.acquire(world.settings.run_dir / run["id"])
+    message = post(client, address).json()["error"]["message"]
+    assert "'sheet' is being fitted by run" in message
+    lease.release()
+    client.post(f"/api/v1/runs/{run['id']}/cancel").raise_for_status()
+    assert post(client, address).status_code == 202
+
+
+def test_no_fit_begins_while_masks_are_found(annotations: Annotations, world: World) -> None:
+    app = create_app(
+        world.settings, security=world.security, catalog=world.catalog, annotations=annotations
+    )
+    client = TestClient(app, ORIGIN, headers={"Authorization": f"Bearer {TOKEN}"})
+    annotations.start("sheet", click("waits"), overwrite=True)
+    for address, body in (("", {"sequences": ["sheet"]}), (f"/{stopped(world)}/resume", None)):
+        answer = client.post(f"/api/v1/runs{address}", json=body)
+        assert answer.status_code == 409
+        assert "Masks and tracks of 'sheet' are being found" in answer.json()["error"]["message"]
+
+
+def stopped(world: World) -> str:
+    """A run that was cancelled in line."""
+    run = world.scheduler.launch(["sheet"], "quick")
+    world.scheduler.cancel(run.id)
+    return run.id
 
 
 def test_orders_that_make_no_sense_are_refused(world: World) -> None:

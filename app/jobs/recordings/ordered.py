@@ -1,14 +1,13 @@
-"""The process that finds masks and tracks of a recording: reads the order, tells how far it is."""
+"""The other end of `BackgroundTasks`: reads the order, tells how far it is, hears of a cancel."""
 
 import os
 import threading
 import time
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NoReturn
 
 from physhandi.child import Channel, run_child
 from physhandi.errors import CancelledError
-from physhandi.perception.annotation import annotate
-from physhandi.perception.segmentation import Click
 from physhandi.progress import Progress
 
 _POLITENESS = 5
@@ -16,8 +15,6 @@ _LEAST_PAUSE_S = 0.2
 
 
 class _Told(Progress):
-    """Passes on how far the work is, and hears of a cancel."""
-
     def __init__(self, channel: Channel) -> None:
         self._channel = channel
         self._last = 0.0
@@ -28,7 +25,7 @@ class _Told(Progress):
         stage: str,
         iteration: int,
         total: int,
-        loss: float | None = None,  # noqa: ARG002  # these stages have none
+        loss: float | None = None,  # noqa: ARG002  # such work has none
         message: str = "",
     ) -> None:
         """Tell it, but not more often than anybody can read."""
@@ -43,21 +40,24 @@ class _Told(Progress):
             raise CancelledError("Cancelled; nothing was changed.")
 
 
-def work(channel: Channel) -> None:
-    """Annotate the sequence that the first request names; any further request cancels."""
-    os.nice(_POLITENESS)
-    requests = channel.requests()
-    order: dict[str, Any] = next(requests)
-    told = _Told(channel)
+def work_on_order(work: Callable[[dict[str, Any], Progress], dict[str, Any]]) -> NoReturn:
+    """Do what the first request says and tell what came of it; any further request cancels.
 
-    def hear() -> None:
-        for _ in requests:
-            told.is_cancelled.set()
+    Args:
+        work: Does it; what it returns is the task's result.
+    """
 
-    threading.Thread(target=hear, daemon=True).start()
-    clicks = [Click(**click) for click in order["clicks"]]
-    annotate(order["folder"], clicks, told, overwrite=order["overwrite"])
+    def begin(channel: Channel) -> None:
+        os.nice(_POLITENESS)
+        requests = channel.requests()
+        order: dict[str, Any] = next(requests)
+        told = _Told(channel)
 
+        def hear() -> None:
+            for _ in requests:
+                told.is_cancelled.set()
 
-if __name__ == "__main__":
-    run_child(work)
+        threading.Thread(target=hear, daemon=True).start()
+        channel.tell(result=work(order, told))
+
+    run_child(begin)
