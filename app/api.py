@@ -24,6 +24,8 @@ from app.jobs.machine import Machine
 from app.jobs.order import check_order, describe_order, describe_settings
 from app.jobs.overview import Overview
 from app.jobs.recordings.annotations import Annotations, ClickedPlace
+from app.jobs.recordings.background import BackgroundTasks
+from app.jobs.recordings.imports import ImportOrder, Imports
 from app.jobs.scheduler import Scheduler
 from app.jobs.streams import News, Streams
 from app.jobs.views import (
@@ -90,6 +92,45 @@ class NewAnnotation(BaseModel):
     """Whether masks and tracks may be replaced that came from elsewhere."""
 
 
+CapturePlace = Annotated[str, Field(max_length=1000)]
+
+
+class SurveyQuery(BaseModel):
+    """A recording to look at."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    source: Annotated[CapturePlace, Field(min_length=1)]
+    """Folder or bag, as `GET /api/v1/captures` names it."""
+    intrinsics: CapturePlace = ""
+    """File with the intrinsics of all cameras, named alike; empty for those in the folder."""
+    depth_scale: Annotated[float | None, Field(gt=0, allow_inf_nan=False)] = None
+    """Metres per unit of depth; above 1, units per metre; none as the recording says."""
+
+
+class NewImport(SurveyQuery):
+    """A recording to import; what is left out is found in the recording."""
+
+    name: ItemId
+    """Name of the new sequence."""
+    charuco: Annotated[str, Field(max_length=40)] = ""
+    """ChArUco board of the calibration pictures, like 7x5,0.04."""
+    april_grid: Annotated[str, Field(max_length=40)] = ""
+    """Grid of AprilTags of the calibration pictures, like 6x6,0.03,0.009."""
+    start: Annotated[int, Field(ge=0, le=10_000_000)] = 0
+    """First frame."""
+    stop: Annotated[int | None, Field(ge=1, le=10_000_000)] = None
+    """Frame before which the import ends; none is all."""
+    every: Annotated[int, Field(ge=1, le=10_000)] = 1
+    """Only every n-th frame."""
+    frame_rate: Annotated[float | None, Field(ge=1, le=1000, allow_inf_nan=False)] = None
+    """Frames per second, if the recording does not tell it."""
+    hands: Annotated[list[Literal["right", "left"]], Field(min_length=1, max_length=2)] = ["right"]
+    """Hands that the recording shows."""
+    overwrite: bool = False
+    """Whether a sequence of that name may be replaced."""
+
+
 class NewSession(BaseModel):
     """A live scene to open."""
 
@@ -121,7 +162,9 @@ def create_api(
     *,
     machine: Machine,
     overview: Overview,
+    tasks: BackgroundTasks,
     annotations: Annotations,
+    imports: Imports,
 ) -> APIRouter:
     """Make the routes.
 
@@ -132,13 +175,16 @@ def create_api(
         sessions: Opens live scenes.
         machine: Tells how busy the machine is.
         overview: Describes machine, queue and program.
+        tasks: Tells which recordings are being worked on.
         annotations: Finds masks and tracks.
+        imports: Makes sequences of recordings.
     """
     router = APIRouter(prefix="/api/v1")
     _add_listings(router, catalog, scheduler)
     _add_annotations(router, annotations)
+    _add_imports(router, imports)
     _add_results(router, catalog)
-    _add_jobs(router, catalog, scheduler, annotations)
+    _add_jobs(router, catalog, scheduler, tasks)
     _add_sessions(router, sessions)
     _add_streams(router, catalog, scheduler, feed, machine)
     _add_system(router, overview)
@@ -201,6 +247,50 @@ def _add_annotations(router: APIRouter, annotations: Annotations) -> None:
         return Response(status_code=204)
 
 
+def _add_imports(router: APIRouter, imports: Imports) -> None:
+    @router.get("/captures")
+    def list_captures(folder: CapturePlace = "") -> dict[str, Any]:
+        """List the folders and bags that can be imported, below one of them or at the top."""
+        return {"folder": folder, "entries": [asdict(one) for one in imports.folders.list(folder)]}
+
+    @router.get("/captures/survey")
+    def survey_capture(query: Annotated[SurveyQuery, Query()]) -> dict[str, Any]:
+        """Tell what a recording holds, and what is wrong with it or missing."""
+        return imports.survey(
+            query.source, intrinsics=query.intrinsics, depth_scale=query.depth_scale
+        )
+
+    @router.post("/captures/example", status_code=202)
+    def make_example() -> dict[str, Any]:
+        """Write the example: a raw capture of three made-up cameras."""
+        return asdict(imports.make_example())
+
+    @router.get("/captures/example")
+    def show_example() -> dict[str, Any]:
+        """Tell how far that is."""
+        return asdict(imports.example())
+
+    @router.delete("/captures/example", status_code=204)
+    def cancel_example() -> Response:
+        imports.cancel_example()
+        return Response(status_code=204)
+
+    @router.post("/imports", status_code=202)
+    def import_capture(new: NewImport) -> dict[str, Any]:
+        """Make a sequence of a recording; one that was stopped goes on where it was."""
+        return asdict(imports.start(ImportOrder(**new.model_dump())))
+
+    @router.get("/imports/{sequence_id}")
+    def show_import(sequence_id: ItemId) -> dict[str, Any]:
+        """Tell how far that is."""
+        return asdict(imports.job(sequence_id))
+
+    @router.delete("/imports/{sequence_id}", status_code=204)
+    def cancel_import(sequence_id: ItemId) -> Response:
+        imports.cancel(sequence_id)
+        return Response(status_code=204)
+
+
 def _add_results(router: APIRouter, catalog: Catalog) -> None:
     @router.get("/runs/{run_id}/losses")
     def show_losses(run_id: ItemId) -> dict[str, Any]:
@@ -234,7 +324,7 @@ def _add_results(router: APIRouter, catalog: Catalog) -> None:
 
 
 def _add_jobs(
-    router: APIRouter, catalog: Catalog, scheduler: Scheduler, annotations: Annotations
+    router: APIRouter, catalog: Catalog, scheduler: Scheduler, tasks: BackgroundTasks
 ) -> None:
     @router.get("/settings")
     def show_settings(profile: ItemId | None = None, run: ItemId | None = None) -> dict[str, Any]:
@@ -250,7 +340,7 @@ def _add_jobs(
 
     @router.post("/runs", status_code=201)
     def launch(new: NewRun) -> dict[str, Any]:
-        annotations.require_settled(new.sequences)
+        tasks.require_settled(new.sequences)
         run = scheduler.launch(
             new.sequences,
             new.profile,
@@ -274,7 +364,7 @@ def _add_jobs(
 
     @router.post("/runs/{run_id}/resume")
     def resume(run_id: ItemId) -> dict[str, Any]:
-        annotations.require_settled(Path(path).name for path in catalog.run(run_id).sequences)
+        tasks.require_settled(Path(path).name for path in catalog.run(run_id).sequences)
         scheduler.resume(run_id)
         return describe_run(catalog.run_item(run_id), scheduler)
 

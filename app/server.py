@@ -25,6 +25,8 @@ from app.jobs.machine import Machine
 from app.jobs.order import SkippedObjectError
 from app.jobs.overview import Overview
 from app.jobs.recordings.annotations import Annotations
+from app.jobs.recordings.background import BackgroundTasks
+from app.jobs.recordings.imports import Imports
 from app.jobs.scheduler import QueueFullError, Scheduler
 from app.jobs.views import describe_run
 from app.jobs.watch import Feed
@@ -74,7 +76,7 @@ def create_app(
     catalog: Catalog | None = None,
     scheduler: Scheduler | None = None,
     sessions: Sessions | None = None,
-    annotations: Annotations | None = None,
+    tasks: BackgroundTasks | None = None,
 ) -> FastAPI:
     """Build the application.
 
@@ -84,7 +86,7 @@ def create_app(
         catalog: Finds sequences and runs; none looks where the settings say.
         scheduler: Works through the queue; none makes one for the catalog.
         sessions: Live scenes; none makes them for the catalog.
-        annotations: Finds masks and tracks; none makes one for the catalog.
+        tasks: Has recordings worked on; none makes one.
     """
     security = security or Security(settings)
     catalog = catalog or Catalog(settings)
@@ -96,7 +98,8 @@ def create_app(
     sessions = sessions or Sessions(settings, catalog, storage)
     machine = Machine(settings.data_dir)
     feed = Feed(lambda: [describe_run(item, scheduler) for item in catalog.runs()])
-    annotations = annotations or Annotations(catalog)
+    tasks = tasks or BackgroundTasks()
+    imports = Imports(settings, catalog, tasks)
     pages = Pages()
     previews = Previews(settings, catalog)
     file_cache = FileCache(settings.data_dir / "cache" / "exports")
@@ -106,7 +109,7 @@ def create_app(
         scheduler.start()
         previews.start()
         yield
-        annotations.shutdown()
+        tasks.shutdown()
         previews.shutdown()
         scheduler.shutdown()
         sessions.shutdown()
@@ -134,7 +137,9 @@ def create_app(
             sessions,
             machine=machine,
             overview=overview,
-            annotations=annotations,
+            tasks=tasks,
+            annotations=Annotations(catalog, tasks),
+            imports=imports,
         )
     )
     app.include_router(
@@ -146,6 +151,7 @@ def create_app(
             pages,
             overview=overview,
             previews=previews,
+            imports=imports,
             suites=settings.suite_dir,
         )
     )

@@ -1,6 +1,7 @@
 """Settings of the server, from arguments or ``PHYSHANDI_*`` environment variables."""
 
 import ipaddress
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -30,6 +31,9 @@ class ServerSettings(BaseSettings):
 
     data_dir: Path = Path("data")
     """Folder with ``sequences/`` and ``runs/``; made when missing."""
+    captures: Annotated[tuple[Path, ...], NoDecode] = ()
+    """Folders, besides ``captures/`` of the data folder, from which browsers may import
+    recordings (separated by colons, as in PATH)."""
     host: str = "127.0.0.1"
     """Address to listen on."""
     port: int = Field(default=8080, ge=0, le=65535)
@@ -61,6 +65,22 @@ class ServerSettings(BaseSettings):
             raise ValueError(f"{folder} is a file; name a folder, which is made when missing")
         return folder
 
+    @field_validator("captures", mode="before")
+    @classmethod
+    def _split_paths(cls, value: object) -> object:
+        if isinstance(value, str):
+            return tuple(part for part in value.split(os.pathsep) if part)
+        return value
+
+    @field_validator("captures")
+    @classmethod
+    def _are_folders(cls, value: tuple[Path, ...]) -> tuple[Path, ...]:
+        folders = tuple(path.expanduser().resolve() for path in value)
+        for folder in folders:
+            if not folder.is_dir():
+                raise ValueError(f"{folder} is not a folder; name folders that hold recordings")
+        return folders
+
     @field_validator("allowed_hosts", mode="before")
     @classmethod
     def _split(cls, value: object) -> object:
@@ -86,6 +106,11 @@ class ServerSettings(BaseSettings):
     def sequence_dir(self) -> Path:
         """Folder of imported sequences."""
         return self.data_dir / "sequences"
+
+    @property
+    def capture_dir(self) -> Path:
+        """Folder of raw recordings that wait to be imported."""
+        return self.data_dir / "captures"
 
     @property
     def suite_dir(self) -> Path:

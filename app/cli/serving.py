@@ -16,6 +16,7 @@ def serve(
     port: int | None = None,
     data_dir: DataDir = None,
     device: str | None = None,
+    captures: tuple[Path, ...] = (),
     demo: bool = False,
 ) -> None:
     """Serve the application and print the address to open, until interrupted.
@@ -25,11 +26,15 @@ def serve(
             127.0.0.1).
         port: Port to listen on; 0 takes a free one (PHYSHANDI_PORT, else 8080).
         device: Warp device: auto, cpu or cuda:0 (PHYSHANDI_DEVICE, else auto).
+        captures: Folders, besides `captures/` of the data folder, from which recordings may be
+            imported in the browser (PHYSHANDI_CAPTURES).
         demo: Also queue a quick fit of the bundled sequence.
     """
     from app.server import serve as serve_application
 
-    settings = read_settings(host=host, port=port, data_dir=data_dir, device=device)
+    settings = read_settings(
+        host=host, port=port, data_dir=data_dir, device=device, captures=captures or None
+    )
     named = settings.device if "device" in settings.model_fields_set else "auto"
     settings = settings.model_copy(update={"device": pick_device(named)})
     serve_application(settings, on_ready=lambda url: print(url, flush=True), queue_demo=demo)

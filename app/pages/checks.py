@@ -2,7 +2,7 @@
 
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 from fastapi import APIRouter, Query, Response
 from fastapi.responses import HTMLResponse
@@ -14,6 +14,7 @@ from app.jobs.catalog import Catalog, SequenceItem
 from app.jobs.checks import check_item
 from app.pages.render import Pages
 from app.previews.overlay import LAYERS, draw_frame
+from physhandi.data.files import named_fields
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
 from physhandi.fitting.readiness import ABOUT, readiness
@@ -61,6 +62,7 @@ def add_checks(router: APIRouter, catalog: Catalog, pages: Pages) -> None:
             can_annotate=sequence is not None and _can_annotate(item, sequence),
             is_annotated=sequence is not None and len(sequence.missing("mask", "track")) < 2,
             version=_version(item.folder),
+            imported=_imported(sequence) if sequence is not None else None,
             stages={name: stage.to_dict() for name, stage in stages.items()},
             about=ABOUT,
         )
@@ -109,6 +111,18 @@ def _described(view: View) -> dict[str, Any]:
         "lacks": [name for name, is_there in parts.items() if not is_there],
         "can_choose": view.has_color and view.has_depth,
     }
+
+
+def _imported(sequence: Sequence) -> dict[str, Any] | None:
+    """Collect what an importer noted of what it found, repaired and assumed."""
+    notes = sequence.provenance.get("notes")
+    calibration = named_fields(sequence.provenance.get("calibration")) or {}
+    listed = [str(note) for note in cast("list[Any]", notes)] if isinstance(notes, list) else []
+    if not listed and not calibration:
+        return None
+    errors = named_fields(calibration.get("reprojection_error_px")) or {}
+    error = {view: px for view, px in errors.items() if isinstance(px, float)}
+    return {"notes": listed, "by": str(calibration.get("by", "")), "error": error}
 
 
 def _can_annotate(item: SequenceItem, sequence: Sequence) -> bool:

@@ -14,12 +14,14 @@ from app.jobs.catalog import Catalog, RunItem
 from app.jobs.log import read_log
 from app.jobs.order import describe_settings, order_of
 from app.jobs.overview import Overview
+from app.jobs.recordings.imports import Imports
 from app.jobs.scheduler import ENDED, Scheduler
 from app.jobs.views import describe_results, describe_run, describe_sequence, follow_run
 from app.jobs.watch import Feed
 from app.pages.browse import add_lists
 from app.pages.checks import add_checks
 from app.pages.diff import LEAST_RUNS, MOST_RUNS, compare_runs
+from app.pages.imports import add_imports
 from app.pages.metrics import METHOD_TEXTS, tabulate
 from app.pages.parameters import parameter_rows
 from app.pages.pictures import add_pictures
@@ -44,6 +46,7 @@ def create_pages(
     *,
     overview: Overview,
     previews: Previews,
+    imports: Imports,
     suites: Path,
 ) -> APIRouter:
     """Make the routes of the pages.
@@ -56,12 +59,14 @@ def create_pages(
         pages: Renders.
         overview: Describes machine, queue and program.
         previews: Keeps small pictures.
+        imports: Finds recordings.
         suites: Folder of suites.
     """
     router = APIRouter(include_in_schema=False)
     add_lists(router, catalog, feed, pages, previews=previews)
     add_pictures(router, previews)
     add_checks(router, catalog, pages)
+    add_imports(router, catalog, imports, pages)
     add_suites(router, suites, pages)
     _add_launch(router, catalog, overview, pages)
 

@@ -14,6 +14,7 @@ from numpy import ndarray
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.files import temporary_name
 from physhandi.data.importers.board_calibration import CharucoTarget
+from physhandi.data.importers.capture import BOARD_FILE
 from physhandi.data.importers.recorded_view import CALIBRATION
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
@@ -42,6 +43,8 @@ _README = """A raw capture of three RGB-D cameras: a hand lifts a cloth (made by
 
 Import it:
   physhandi import capture {folder} --out data/sequences/example --charuco 5x4,0.09
+
+(--charuco may be left out here: calibration/board.json tells it, too.)
 
 Give the cloth by a click (camera, frame, pixel x, pixel y):
   physhandi import capture {folder} --out data/sequences/example --charuco 5x4,0.09 \\
@@ -139,6 +142,8 @@ def write_raw_capture(
                 picture = photograph_board(camera, target, T_world_board)
                 noisy = picture + random.normal(0.0, 2.0, picture.shape)
                 _write(pictures / f"{place}.png", np.clip(noisy, 0, 255).astype(np.uint8))
+        board = {"charuco": f"{target.columns}x{target.rows},{target.square:g}"}
+        (begun / CALIBRATION / BOARD_FILE).write_text(json.dumps(board))
         if goal.is_dir():
             goal.rmdir()
         begun.replace(goal)

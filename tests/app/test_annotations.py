@@ -12,6 +12,7 @@ from waiting import until
 
 from app.jobs.catalog import Catalog
 from app.jobs.recordings.annotations import Annotations, ClickedPlace
+from app.jobs.recordings.background import BackgroundTasks
 from app.server import create_app
 from app.settings import ServerSettings
 from physhandi.data.lease import Lease
@@ -27,9 +28,9 @@ def annotations(
 ) -> Iterator[Annotations]:
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent.parent))
     catalog = Catalog(ServerSettings(data_dir=data_dir), bundled=tmp_path / "none")
-    annotations = Annotations(catalog, worker="annotation_worker")
-    yield annotations
-    annotations.shutdown()
+    tasks = BackgroundTasks()
+    yield Annotations(catalog, tasks, worker="annotation_worker")
+    tasks.shutdown()
 
 
 def click(view: str = "front") -> list[ClickedPlace]:
@@ -61,11 +62,11 @@ def test_a_refusal_and_a_death_are_told(annotations: Annotations) -> None:
 
 def test_one_recording_at_a_time_and_it_can_be_cancelled(annotations: Annotations) -> None:
     job = annotations.start("sheet", click("waits"), overwrite=True)
-    with pytest.raises(RunError, match="Masks of 'sheet' are being found"):
-        annotations.start("sheet", click(), overwrite=True)
-    annotations.require_settled(["other"])
     with pytest.raises(RunError, match="Masks and tracks of 'sheet' are being found"):
-        annotations.require_settled(["other", "sheet"])
+        annotations.start("sheet", click(), overwrite=True)
+    annotations.tasks.require_settled(["other"])
+    with pytest.raises(RunError, match="A fit would read it half old and half new"):
+        annotations.tasks.require_settled(["other", "sheet"])
     annotations.cancel("sheet")
     until(lambda: job.state != "running")
     assert job.state == "cancelled"
@@ -129,7 +130,7 @@ def test_a_recording_is_not_changed_while_a_fit_reads_it(world: World) -> None:
 
 def test_no_fit_begins_while_masks_are_found(annotations: Annotations, world: World) -> None:
     app = create_app(
-        world.settings, security=world.security, catalog=world.catalog, annotations=annotations
+        world.settings, security=world.security, catalog=world.catalog, tasks=annotations.tasks
     )
     client = TestClient(app, ORIGIN, headers={"Authorization": f"Bearer {TOKEN}"})
     annotations.start("sheet", click("waits"), overwrite=True)
@@ -156,4 +157,4 @@ def test_orders_that_make_no_sense_are_refused(world: World) -> None:
     assert post(client, "/api/v1/sequences/nowhere/annotation").status_code == 404
     assert 'id="annotation"' not in world.browser().get("/sequences/towel_fold/check").text
     with pytest.raises(UsageError, match="came with the program"):
-        Annotations(world.catalog).start("towel_fold", [], overwrite=True)
+        Annotations(world.catalog, BackgroundTasks()).start("towel_fold", [], overwrite=True)

@@ -1,12 +1,12 @@
 """Masks and tracks that are found for recordings while the server runs, one recording at a time."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 from app.jobs.catalog import Catalog, SequenceItem
-from app.jobs.recordings.background import BackgroundTask, BackgroundTasks
+from app.jobs.recordings.background import BackgroundTask, BackgroundTasks, Work
 from app.jobs.scheduler import require_unread
-from physhandi.errors import RunError, UsageError
+from physhandi.errors import UsageError
 
 _WORKER = "app.jobs.recordings.annotator"
 
@@ -26,17 +26,20 @@ class ClickedPlace:
 
 
 class Annotations:
-    """Finds masks and tracks, and keeps fits and changes of a recording apart."""
+    """Has masks and tracks found for recordings of the data folder."""
 
-    def __init__(self, catalog: Catalog, *, worker: str = _WORKER) -> None:
+    def __init__(self, catalog: Catalog, tasks: BackgroundTasks, *, worker: str = _WORKER) -> None:
         """Prepare.
 
         Args:
             catalog: Finds sequences and the runs that read them.
+            tasks: Has the work done, one piece at a time.
             worker: Module of the process.
         """
         self._catalog = catalog
-        self._tasks = BackgroundTasks(worker, "Masks of '{}' are being found.")
+        self.tasks = tasks
+        """Has the work done."""
+        self._worker = worker
 
     def start(
         self, sequence_id: str, clicks: Sequence[ClickedPlace], *, overwrite: bool
@@ -51,7 +54,7 @@ class Annotations:
         Raises:
             SequenceError: If there is no such recording, or it is damaged.
             UsageError: If it came with the program.
-            RunError: If one is worked on already, or a fit reads this one.
+            RunError: If something is worked on already, or a fit reads this one.
         """
         self._require_own(sequence_id)
         sequence = self._catalog.sequence(sequence_id)
@@ -61,7 +64,10 @@ class Annotations:
             "clicks": [asdict(click) for click in clicks],
             "overwrite": overwrite,
         }
-        return self._tasks.start(sequence_id, order)
+        work = Work(
+            "annotation", sequence_id, f"Masks and tracks of '{sequence_id}' are being found."
+        )
+        return self.tasks.start(work, self._worker, order)
 
     def job(self, sequence_id: str) -> BackgroundTask:
         """Tell how far a recording is; of one that nobody asked for, that there is nothing.
@@ -70,7 +76,7 @@ class Annotations:
             SequenceError: If there is no such recording.
         """
         self._catalog.sequence_item(sequence_id)
-        return self._tasks.task(sequence_id)
+        return self.tasks.task("annotation", sequence_id)
 
     def cancel(self, sequence_id: str) -> None:
         """Stop the work on a recording, which stays as it was; does nothing if none is worked on.
@@ -79,24 +85,7 @@ class Annotations:
             SequenceError: If there is no such recording.
         """
         self._catalog.sequence_item(sequence_id)
-        self._tasks.cancel(sequence_id)
-
-    def require_settled(self, sequence_ids: Iterable[str]) -> None:
-        """Refuse to read recordings whose masks are about to be replaced.
-
-        Raises:
-            RunError: If one of them is worked on.
-        """
-        running = self._tasks.running
-        if running is not None and running in sequence_ids:
-            raise RunError(
-                f"Masks and tracks of '{running}' are being found, which a fit would read half "
-                "old and half new. Wait until that is done, or cancel it."
-            )
-
-    def shutdown(self) -> None:
-        """End what is at work."""
-        self._tasks.shutdown()
+        self.tasks.cancel("annotation", sequence_id)
 
     def _require_own(self, sequence_id: str) -> SequenceItem:
         item = self._catalog.sequence_item(sequence_id)

@@ -8,7 +8,7 @@ from physhandi.perception.segmentation import Click
 from physhandi.progress import Progress
 
 
-def work(order: dict[str, Any], progress: Progress) -> dict[str, Any]:
+def annotate_order(order: dict[str, Any], progress: Progress) -> dict[str, Any]:
     """Annotate the sequence that the order names."""
     clicks = [Click(**click) for click in order["clicks"]]
     annotate(order["folder"], clicks, progress, overwrite=order["overwrite"])
@@ -16,4 +16,4 @@ def work(order: dict[str, Any], progress: Progress) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    work_on_order(work)
+    work_on_order(annotate_order)

@@ -1,6 +1,7 @@
 """Work that the server has done in a child process, one piece at a time, and told about."""
 
 import threading
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -24,28 +25,33 @@ class BackgroundTask:
     """What the process told about what it has made."""
 
 
+@dataclass(frozen=True)
+class Work:
+    """What a piece of work is, for those who must not come in its way."""
+
+    kind: Literal["annotation", "import", "example"]
+    name: str
+    """Sequence that it is about."""
+    doing: str
+    """Sentence that says what is being done."""
+
+
 class BackgroundTasks:
     """Starts the process that works, listens to it, and ends it with the server."""
 
-    def __init__(self, module: str, busy: str) -> None:
-        """Prepare.
-
-        Args:
-            module: What runs in the process: calls `work_on_order`.
-            busy: Sentence that says what is at work; ``{}`` stands for its key.
-        """
-        self._module = module
-        self._busy = busy
+    def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._tasks: dict[str, BackgroundTask] = {}
+        self._tasks: dict[tuple[str, str], BackgroundTask] = {}
+        self._work: Work | None = None
         self._child: Child | None = None
         self._listener: threading.Thread | None = None
 
-    def start(self, key: str, order: dict[str, Any]) -> BackgroundTask:
+    def start(self, work: Work, module: str, order: dict[str, Any]) -> BackgroundTask:
         """Begin a piece of work.
 
         Args:
-            key: What it is asked for by.
+            work: What it is.
+            module: What runs in the process: calls `work_on_order`.
             order: What the process is told.
 
         Raises:
@@ -54,32 +60,47 @@ class BackgroundTasks:
         with self._lock:
             running = self.running
             if running is not None:
-                raise RunError(
-                    f"{self._busy.format(running)} Wait until that is done, or cancel it."
-                )
-            task = self._tasks[key] = BackgroundTask("running")
-            self._child = child = Child(self._module, time_limit_s=_LONGEST_S)
+                raise RunError(f"{running.doing} Wait until that is done, or cancel it.")
+            task = self._tasks[work.kind, work.name] = BackgroundTask("running")
+            self._work = work
+            self._child = child = Child(module, time_limit_s=_LONGEST_S)
             child.send(order)
             self._listener = threading.Thread(
-                target=self._listen, args=(child, task), name=self._module, daemon=True
+                target=self._listen, args=(child, task), name=module, daemon=True
             )
             self._listener.start()
         return task
 
     @property
-    def running(self) -> str | None:
-        """Key of the work that is going on."""
-        tasks = list(self._tasks.items())
-        return next((key for key, task in tasks if task.state == "running"), None)
+    def running(self) -> Work | None:
+        """The work that is going on."""
+        work = self._work
+        if work is not None and self.task(work.kind, work.name).state == "running":
+            return work
+        return None
 
-    def task(self, key: str) -> BackgroundTask:
+    def task(self, kind: str, name: str) -> BackgroundTask:
         """Tell how far a piece of work is; of one that nobody asked for, that there is none."""
-        return self._tasks.get(key, BackgroundTask())
+        return self._tasks.get((kind, name), BackgroundTask())
 
-    def cancel(self, key: str) -> None:
+    def cancel(self, kind: str, name: str) -> None:
         """Stop a piece of work; does nothing if it is not at work."""
-        if self.running == key and self._child is not None:
+        running = self.running
+        if running is not None and (running.kind, running.name) == (kind, name) and self._child:
             self._child.send("cancel")
+
+    def require_settled(self, sequence_ids: Iterable[str]) -> None:
+        """Refuse to read recordings that are about to be replaced.
+
+        Raises:
+            RunError: If one of them is worked on.
+        """
+        running = self.running
+        if running is not None and running.kind != "example" and running.name in sequence_ids:
+            raise RunError(
+                f"{running.doing} A fit would read it half old and half new. Wait until that is "
+                "done, or cancel it."
+            )
 
     def shutdown(self) -> None:
         """End what is at work."""

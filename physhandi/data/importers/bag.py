@@ -22,7 +22,8 @@ from physhandi.errors import UsageError
 from physhandi.progress import Progress
 
 _STAGE = "unpack"
-_SUFFIXES = frozenset({".bag", ".db3", ".mcap"})
+BAG_SUFFIXES = frozenset({".bag", ".db3", ".mcap"})
+"""Endings of bags that are files."""
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _INFO, _TRANSFORM = "sensor_msgs/msg/CameraInfo", "geometry_msgs/msg/Transform"
 _DEPTH_UNITS = "/option/Depth Units/value"
@@ -57,12 +58,12 @@ class _Topic:
 def find_bags(source: Path) -> list[Path]:
     """List the bags of a source: itself, or the files in a folder; none if it holds no bag."""
     if source.is_file():
-        return [source] if source.suffix.lower() in _SUFFIXES else []
+        return [source] if source.suffix.lower() in BAG_SUFFIXES else []
     if not source.is_dir():
         return []
     if (source / "metadata.yaml").is_file():
         return [source]
-    files = [path for path in source.iterdir() if path.suffix.lower() in _SUFFIXES]
+    files = [path for path in source.iterdir() if path.suffix.lower() in BAG_SUFFIXES]
     folders = [path for path in source.iterdir() if (path / "metadata.yaml").is_file()]
     return sorted([*files, *folders])
 

@@ -130,6 +130,19 @@ Board = CharucoTarget | AprilGrid
 """What may lie on the table."""
 
 
+def parse_board(charuco: str, april_grid: str) -> Board | None:
+    """Read the board that was named as one of the two kinds; None if both texts are empty.
+
+    Raises:
+        UsageError: If both are given, or one does not describe a board.
+    """
+    if charuco and april_grid:
+        raise UsageError("--charuco and --april-grid are two boards; give the one that was used.")
+    if april_grid:
+        return AprilGrid.parse(april_grid)
+    return CharucoTarget.parse(charuco) if charuco else None
+
+
 @dataclass(frozen=True, eq=False)
 class BoardSighting:
     """Corners of the board that one picture shows."""

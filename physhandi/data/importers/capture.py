@@ -3,7 +3,7 @@
 import shutil
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
@@ -22,8 +22,10 @@ from physhandi.data.importers.board_calibration import (
     BoardSighting,
     calibrate_by_board,
     find_board,
+    parse_board,
 )
 from physhandi.data.importers.phystwin_files import fail, read_image
+from physhandi.data.importers.recorded_camera import read_table
 from physhandi.data.importers.recorded_stream import (
     COLOR_SUFFIXES,
     RecordedStream,
@@ -41,10 +43,12 @@ from physhandi.data.importers.view_agreement import (
 )
 from physhandi.data.sequence_meta import SequenceMeta, Side, ViewMeta
 from physhandi.data.sequence_writer import SequenceWriter
-from physhandi.errors import ImportFailedError, UsageError
+from physhandi.errors import ImportFailedError, UsageError, describe
 from physhandi.progress import NullProgress, Progress
 
 _STAGE = "import"
+BOARD_FILE = "board.json"
+"""File beside the board's pictures that says which board it is."""
 BY_BOARD = "board"
 """How provenance begins to say that cameras were calibrated by a board."""
 _SAMPLED = 5
@@ -77,7 +81,8 @@ class CaptureOptions:
     intrinsics: Path | None = None
     """File with the intrinsics of all cameras, instead of those in the folder."""
     board: Board | None = None
-    """Board from which the cameras' poses are found; None: poses are given."""
+    """Board from which the cameras' poses are found; None: ``calibration/board.json`` tells, or
+    poses are given."""
     start: int = 0
     """First frame that is imported."""
     stop: int | None = None
@@ -169,7 +174,7 @@ def import_capture(
         _refuse_same_names(views)
         paired = _paired(views, options)
         sources, notes = _sources(views, paired, options)
-        placement = _place(source, sources, options.board)
+        placement = _place(source, sources, options.board or _recorded_board(source))
         cameras = [one.camera(pose) for one, pose in zip(sources, placement.poses, strict=True)]
         report = dict(placement.report)
         report["agreement"] = _check_agreement(sources, cameras, placement, paired.count)
@@ -201,6 +206,128 @@ def import_capture(
             )
             sequence = writer.finish(meta)
     return sequence
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurveyedView:
+    """What a view of a recording holds."""
+
+    name: str
+    """Name."""
+    color: str
+    """Its color images in words; empty if there are none."""
+    depth: str
+    """Its depth images in words; empty if there are none."""
+    focal_length: float
+    """Geometric mean of both focal lengths [px]."""
+    depth_scale: float | None
+    """Metres per unit of depth, as told or found; None if it is not known."""
+    has_pose: bool
+    """Whether the recording states where the camera is."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureSurvey:
+    """What a recording holds, by its headers and a few depth images."""
+
+    bags: tuple[str, ...] = ()
+    """Bags, of which everything else is only known when they are unpacked."""
+    views: tuple[SurveyedView, ...] = ()
+    """Its cameras."""
+    frame_count: int | None = None
+    """Frames that all cameras have."""
+    frame_rate: float | None = None
+    """Frames a second [Hz]."""
+    calibration: str = ""
+    """How the cameras' poses will be found, in words; empty if that is not known."""
+    board: str = ""
+    """Board that the recording names."""
+    notes: tuple[str, ...] = ()
+    """What is repaired or assumed."""
+    problems: tuple[str, ...] = ()
+    """What is missing or wrong, each with what to do; an import would fail."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Give it as plain data."""
+        return asdict(self)
+
+
+def survey_capture(source: Path | str, options: CaptureOptions | None = None) -> CaptureSurvey:
+    """Tell what a recording holds before it is imported.
+
+    Args:
+        source: See `import_capture`.
+        options: What the recording does not say itself.
+    """
+    source, options = Path(source), options or CaptureOptions()
+    bags = find_bags(source)
+    if bags:
+        return CaptureSurvey(bags=tuple(bag.name for bag in bags))
+    try:
+        with _closing(find_views(source, options.intrinsics)) as views:
+            _refuse_same_names(views)
+            return _surveyed(source, views, options)
+    except (ImportFailedError, UsageError, OSError) as error:
+        return CaptureSurvey(problems=(describe(error),))
+
+
+def _surveyed(source: Path, views: list[RecordedView], options: CaptureOptions) -> CaptureSurvey:
+    problems: list[str] = []
+    notes: list[str] = []
+    paired: PairedFrames | None = None
+    scales: dict[str, float] = {}
+    board: Board | None = None
+    try:
+        paired = _paired(views, options)
+        sources, told = _sources(views, paired, options)
+        scales = {one.view.name: one.scale for one in sources if one.view.depth is not None}
+        notes += [*told, *paired.notes]
+    except (ImportFailedError, UsageError) as error:
+        problems.append(str(error))
+    try:
+        board = options.board or _recorded_board(source)
+    except ImportFailedError as error:
+        problems.append(str(error))
+    way = _calibrated_by(source, views, board)
+    if not way:
+        problems.append(_no_pose(source, views))
+    return CaptureSurvey(
+        views=tuple(
+            SurveyedView(
+                name=view.name,
+                color=_in_words(view.color),
+                depth=_in_words(view.depth),
+                focal_length=float(np.sqrt(view.camera.K[0, 0] * view.camera.K[1, 1])),
+                depth_scale=scales.get(view.name),
+                has_pose=view.T_world_camera is not None,
+            )
+            for view in views
+        ),
+        frame_count=None if paired is None else paired.count,
+        frame_rate=None if paired is None else round(paired.frame_rate, 4),
+        calibration=way,
+        board="" if board is None else _described(board),
+        notes=tuple(dict.fromkeys(notes)),
+        problems=tuple(problems),
+    )
+
+
+def _in_words(stream: RecordedStream | None) -> str:
+    if stream is None:
+        return ""
+    kind = "images" if stream.files else "frames of a video"
+    timed = ", with times" if stream.time is not None else ""
+    return f"{stream.count} {kind}, {stream.width} x {stream.height} px{timed}"
+
+
+def _calibrated_by(source: Path, views: list[RecordedView], board: Board | None) -> str:
+    """Say how cameras will be placed; empty if that is not known."""
+    if board is not None:
+        where = "its pictures" if (source / CALIBRATION).is_dir() else "its first frames"
+        return f"the board in {where} ({_described(board)})"
+    if all(view.T_world_camera is not None for view in views):
+        return "the poses that the recording states"
+    return "the largest plane that the camera sees" if len(views) == 1 else ""
 
 
 @contextmanager
@@ -328,6 +455,22 @@ def _depth_scale(
     return scale
 
 
+def _recorded_board(source: Path) -> Board | None:
+    """Read which board the calibration pictures show, if the recording tells it."""
+    path = source / CALIBRATION / BOARD_FILE
+    if not path.is_file():
+        return None
+    table = read_table(path)
+    fields = cast("dict[Any, Any]", table) if isinstance(table, dict) else {}
+    texts = [fields.get(name, "") for name in ("charuco", "april_grid")]
+    if not all(isinstance(text, str) for text in texts) or not any(texts):
+        fail(path, 'names no board; expected {"charuco": "7x5,0.04"} or {"april_grid": "…"}')
+    try:
+        return parse_board(*texts)
+    except UsageError as error:
+        fail(path, str(error).rstrip("."))
+
+
 def _place(source: Path, sources: list[_Source], target: Board | None) -> _Placement:
     """Find where the cameras are, with z up and the table, where it is known, at a height."""
     if target is not None:
@@ -337,7 +480,12 @@ def _place(source: Path, sources: list[_Source], target: Board | None) -> _Place
         return _as_given(sources, tuple(cast("list[ndarray]", given)))
     if len(sources) == 1:
         return _alone(sources[0])
-    lacking = next(one.view for one, pose in zip(sources, given, strict=True) if pose is None)
+    raise ImportFailedError(_no_pose(source, [one.view for one in sources]))
+
+
+def _no_pose(source: Path, views: Sequence[RecordedView]) -> str:
+    """Say which camera's place is not known, and what to do."""
+    lacking = next(view for view in views if view.T_world_camera is None)
     has_pictures = (source / CALIBRATION).is_dir()
     remedy = (
         f"{CALIBRATION}/ is there: say which board it shows, like --charuco 7x5,0.04"
@@ -345,9 +493,7 @@ def _place(source: Path, sources: list[_Source], target: Board | None) -> _Place
         else f"Put pictures of a ChArUco board into {CALIBRATION}/{lacking.name}/ (of all views) "
         "and give --charuco WxH,SQUARE, or add extrinsics.json with T_world_camera of each view"
     )
-    raise ImportFailedError(
-        f"Nothing tells where the camera of view '{lacking.name}' is. {remedy}."
-    )
+    return f"Nothing tells where the camera of view '{lacking.name}' is. {remedy}."
 
 
 def _by_board(source: Path, sources: list[_Source], target: Board) -> _Placement:

@@ -12,7 +12,7 @@ from raw_capture import BOARD, CAMERAS, FRAMES, RawCapture, ball, camera_at, int
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.importers.board_calibration import AprilGrid, CharucoTarget, find_board
-from physhandi.data.importers.capture import CaptureOptions, import_capture
+from physhandi.data.importers.capture import CaptureOptions, import_capture, survey_capture
 from physhandi.data.importers.recorded_camera import RecordedCamera, read_camera
 from physhandi.data.importers.rectification import Rectifier
 from physhandi.errors import CancelledError, ImportFailedError, UsageError
@@ -447,6 +447,54 @@ def test_a_cancelled_import_leaves_nothing(raw, tmp_path):
         import_capture(raw.folder, tmp_path / "out", progress)
     assert progress.count == 3
     assert [path.name for path in tmp_path.iterdir()] == ["raw"]
+
+
+def test_a_survey_tells_what_a_recording_holds(tmp_path):
+    raw = RawCapture(tmp_path / "raw").write(times=True)
+    found = survey_capture(raw.folder)
+    assert (found.frame_count, found.problems) == (FRAMES, ())
+    assert found.frame_rate == pytest.approx(30.0, abs=1e-3)
+    assert found.calibration == "the poses that the recording states"
+    left = found.views[0]
+    assert (left.name, left.depth_scale, left.has_pose) == ("left", 0.001, True)
+    assert left.color == f"{FRAMES} images, 96 x 72 px, with times"
+    assert left.focal_length == pytest.approx(90.0)
+    assert "taken for millimetres" in " ".join(found.notes)
+
+
+def test_a_survey_tells_what_is_missing_and_what_to_do(tmp_path):
+    raw = RawCapture(tmp_path / "raw").write(poses=False)
+    raw.photograph_board()
+    found = survey_capture(raw.folder, CaptureOptions(depth_scale=1.0))
+    assert found.calibration == ""
+    assert "Give --depth-scale" in found.problems[0]
+    assert "calibration/ is there: say which board it shows" in found.problems[1]
+    (raw.folder / "calibration/board.json").write_text('{"charuco": "7x5,0.04"}')
+    found = survey_capture(raw.folder)
+    assert found.problems == ()
+    assert found.calibration == "the board in its pictures (ChArUco, 7x5 squares of 0.04 m)"
+    (raw.folder / "right/intrinsics.json").unlink()
+    (problem,) = survey_capture(raw.folder).problems
+    assert "has no intrinsics" in problem
+    (bag := tmp_path / "a.bag").touch()
+    assert survey_capture(bag).bags == ("a.bag",)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("{}", "names no board"),
+        ('{"charuco": 7}', "names no board"),
+        ('{"charuco": "7 squares"}', "squares across and down"),
+        ('{"charuco": "7x5,0.04", "april_grid": "6x6,0.03,0.01"}', "two boards"),
+    ],
+)
+def test_a_board_that_the_recording_names_badly_is_refused(tmp_path, text, reason):
+    raw = RawCapture(tmp_path / "raw").write(frames=2, poses=False)
+    raw.photograph_board()
+    (raw.folder / "calibration/board.json").write_text(text)
+    with pytest.raises(ImportFailedError, match=rf"board\.json.*{reason}"):
+        import_capture(raw.folder, tmp_path / "out")
 
 
 def spelled(**fields: object) -> RecordedCamera:

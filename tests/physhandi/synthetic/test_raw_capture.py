@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from raw_capture import camera_at, picture
 
-from physhandi.data.importers.capture import CaptureOptions, import_capture
+from physhandi.data.importers.capture import import_capture
 from physhandi.data.sequence import Sequence, ViewMeta
 from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import SequenceWriter
@@ -15,7 +15,6 @@ from physhandi.errors import CancelledError, UsageError
 from physhandi.progress import Progress
 from physhandi.synthetic import raw_capture
 from physhandi.synthetic.raw_capture import (
-    EXAMPLE_BOARD,
     write_example_capture,
     write_raw_capture,
 )
@@ -51,6 +50,7 @@ def test_a_capture_holds_what_a_recorder_writes_and_nothing_else(sequence, tmp_p
     of_view = ["color/00000.png", "color/00001.png", "depth/00000.png", "depth/00001.png"]
     of_view += ["intrinsics.json", "timestamps.txt"]
     assert files == [
+        "calibration/board.json",
         *(f"calibration/{name}/{place}.png" for name in CAMERAS for place in range(3)),
         *(f"{name}/{file}" for name in CAMERAS for file in of_view),
     ]
@@ -73,11 +73,9 @@ def test_depth_of_the_table_is_measured_where_the_sequence_keeps_none(sequence, 
 
 def test_the_board_s_pictures_give_the_cameras_back(sequence, tmp_path):
     folder = write_raw_capture(sequence, tmp_path / "raw")
-    options = CaptureOptions(board=EXAMPLE_BOARD)
-    found = [
-        view.camera.T_world_camera
-        for view in import_capture(folder, tmp_path / "back", options=options).views
-    ]
+    imported = import_capture(folder, tmp_path / "back")  # It tells which board it is.
+    assert imported.provenance["calibration"]["by"].startswith("board, ChArUco, 5x4 squares")
+    found = [view.camera.T_world_camera for view in imported.views]
     true = [camera.T_world_camera for camera in CAMERAS.values()]
     off = np.linalg.inv(np.linalg.inv(found[0]) @ found[1]) @ np.linalg.inv(true[0]) @ true[1]
     assert np.linalg.norm(off[:3, 3]) < 3e-3
