@@ -36,6 +36,8 @@ _SAME_HAND = 0.5
 _MAX_HANDS = 2
 _WINDOW_SHARE = 0.6
 """Side of the windows in which small hands are looked for, of the image's shorter side."""
+_CHUNK = 12
+"""Images that are kept while a video is read backwards."""
 KEYPOINT_STAGE = "keypoint_detection"
 
 
@@ -160,10 +162,19 @@ class KeypointDetector:
         return hands[:max_hands]
 
     def follow(
-        self, image: UInt8[ndarray, "row column 3"], previous: SequenceOf[DetectedHand]
+        self,
+        image: UInt8[ndarray, "row column 3"],
+        previous: SequenceOf[DetectedHand],
+        existing: SequenceOf[DetectedHand] = (),
     ) -> list[DetectedHand]:
-        """Search for the hands of the previous frame near their positions in it."""
-        hands: list[DetectedHand] = []
+        """Search for the hands of the previous frame near their positions in it.
+
+        Args:
+            image: The image (RGB).
+            previous: Hands of a frame next to it.
+            existing: Hands that are already detected in it; they come first in the result.
+        """
+        hands = list(existing)
         for hand in previous:
             self._add(hands, image, landmark_region(hand.keypoint))
         return hands
@@ -182,7 +193,7 @@ class KeypointDetector:
 def detect_view(
     view: View, hands: tuple[HandSide, ...], progress: Progress, detector: KeypointDetector
 ) -> Float[ndarray, "frame hand 21 3"]:
-    """Follow the given hands through one view.
+    """Follow the given hands through one view, and back from where they were first found.
 
     Where no frame shows a hand, they are looked for once more as small ones.
 
@@ -198,6 +209,7 @@ def detect_view(
     result = _follow_through(view, hands, progress, detector, finds_small=False)
     if np.isnan(result).all():
         result = _follow_through(view, hands, progress, detector, finds_small=True)
+    _follow_back(view, result, progress, detector)
     return result
 
 
@@ -224,6 +236,50 @@ def _follow_through(
         previous = list(assigned.values())
         progress.report(KEYPOINT_STAGE, frame + 1, view.frame_count, None, f"View {view.name}")
     return result
+
+
+def _follow_back(
+    view: View,
+    keypoint: Float[ndarray, "frame hand 21 3"],
+    progress: Progress,
+    detector: KeypointDetector,
+) -> None:
+    """Follow each hand into the frames before those in which it was found, as far as it goes.
+
+    A hand is easier to follow than to find: the networks know where to look.
+    """
+    is_found = np.isfinite(keypoint[:, :, 0, 2])
+    lost: dict[int, DetectedHand] = {}
+    images: list[UInt8[ndarray, "row column 3"]] = []
+    for frame in range(view.frame_count - 2, -1, -1):
+        after, here = is_found[frame + 1], is_found[frame]
+        for hand in np.flatnonzero(after & ~here):
+            lost.setdefault(int(hand), _detected(keypoint[frame + 1, hand]))
+        lost = {hand: there for hand, there in lost.items() if after[hand] and not here[hand]}
+        if not lost:
+            images.clear()
+            continue
+        progress.check_cancelled()
+        if not images:  # Videos are read forwards only.
+            first = max(0, frame + 1 - _CHUNK)
+            images = [view.color(number) for number in range(first, frame + 1)]
+        image = images.pop()
+        others = [_detected(keypoint[frame, hand]) for hand in np.flatnonzero(here)]
+        for hand, there in list(lost.items()):
+            found = detector.follow(image, [there], others)[len(others) :]
+            for one in found:
+                keypoint[frame, hand, :, :2], keypoint[frame, hand, :, 2] = (
+                    one.keypoint,
+                    one.confidence,
+                )
+                lost[hand], is_found[frame, hand] = one, True
+                others.append(one)
+
+
+def _detected(keypoint: Float[ndarray, "21 3"]) -> DetectedHand:
+    """Take stored keypoints of a hand, whose side is settled, for a detection."""
+    pixel = keypoint[:, :2].astype(np.float64)
+    return DetectedHand("right", pixel, float(keypoint[0, 2]), 1.0)
 
 
 def assign_hands(

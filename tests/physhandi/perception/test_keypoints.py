@@ -194,6 +194,30 @@ def test_a_sequence_keeps_frames_without_a_hand(tmp_path: Path, photo: np.ndarra
     assert seen[-1] == ("keypoint_detection", 4, 4)
 
 
+def test_hands_are_followed_back_from_where_they_were_found(
+    tmp_path: Path, photo: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = photo.copy()
+    one[:, 360:] = 255
+    blank = np.full_like(one, 255)
+    images = [one, blank, *(np.roll(one, 4 * step, axis=1) for step in range(4))]
+    calls: list[int] = []
+    find = KeypointDetector.detect
+
+    def find_late(self, image, existing=(), *args, **more):
+        calls.append(1)
+        late = len(calls) > 5  # In the last frame alone.
+        return find(self, image, existing, *args, **more) if late else list(existing)
+
+    monkeypatch.setattr(KeypointDetector, "detect", find_late)
+    monkeypatch.setattr("physhandi.perception.keypoints._CHUNK", 2)
+    keypoint = detect_sequence(_sequence(tmp_path / "late", images, hands=("left",)))[0, :, 0]
+    assert np.isnan(keypoint[:2]).all()  # It is lost where an image shows nothing.
+    step = np.median(np.diff(keypoint[2:, :, :2], axis=0), axis=1)
+    np.testing.assert_allclose(step, [[4, 0]] * 3, atol=1.5)
+    assert keypoint[2:, :, 2].min() > 0.9
+
+
 def test_a_sequence_without_hands_or_color_says_so(tmp_path: Path) -> None:
     grey = np.zeros((8, 8, 3), np.uint8)
     with pytest.raises(MissingInputError, match=r"'none': no hand is named"):
