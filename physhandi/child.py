@@ -282,6 +282,7 @@ class Channel:
         self.arguments = sys.argv[1:]
         # Libraries print to standard output; messages have that place to themselves.
         self._messages = os.fdopen(os.dup(1), "w", encoding="utf-8")
+        self._telling = threading.Lock()
         os.dup2(2, 1)
 
     def requests(self) -> Iterator[Any]:
@@ -290,9 +291,10 @@ class Channel:
             yield json.loads(line)
 
     def tell(self, **fields: object) -> None:
-        """Send a message."""
-        self._messages.write(json.dumps(fields) + "\n")
-        self._messages.flush()
+        """Send a message; from any thread."""
+        with self._telling:
+            self._messages.write(json.dumps(fields) + "\n")
+            self._messages.flush()
 
 
 def run_child(work: Callable[[Channel], None]) -> NoReturn:

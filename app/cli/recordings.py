@@ -10,7 +10,7 @@ from app.cli.lookup import find_sequence, folder_of_sequence, open_catalog
 from app.cli.output import AsJson, DataDir, Device, show
 from physhandi.data.sequence import Sequence
 from physhandi.devices import pick_device
-from physhandi.errors import PhysHandiError, UsageError
+from physhandi.errors import PhysHandiError, RunError, UsageError
 from physhandi.fitting.config import HANDS, OBSERVATION
 from physhandi.fitting.readiness import StageReadiness
 from physhandi.fitting.recording_check import RecordingCheck, check_recording
@@ -150,6 +150,9 @@ def annotate(
     sequence: Positional[str],
     *,
     click: tuple[str, ...] = (),
+    mask_model: Path | None = None,
+    track_model: Path | None = None,
+    trust_model_code: bool = False,
     overwrite: bool = False,
     data_dir: DataDir = None,
 ) -> None:
@@ -161,6 +164,10 @@ def annotate(
         sequence: Folder or name of a sequence with color and depth.
         click: Places on the object as view,frame,x,y, frames from 0 and x and y in pixels; one is
             mostly enough, without any hands alone are found.
+        mask_model: Folder of SAM 2 or EdgeTAM that you have (docs/your-data.md), which finds object
+            and hands in the place of what is built in.
+        track_model: Folder of CoTracker3 or TAPNext that you have, which follows the points.
+        trust_model_code: Let the Python code in the tracker's folder be executed.
         overwrite: Replace masks and tracks that come from elsewhere.
     """
     from app.jobs.scheduler import require_unread
@@ -170,7 +177,15 @@ def annotate(
     require_unread(open_catalog(data_dir), folder)
     clicks = [_click(text) for text in click]
     with watched(True) as progress:
-        done = find(folder, clicks, progress, overwrite=overwrite)
+        done = find(
+            folder,
+            clicks,
+            progress,
+            overwrite=overwrite,
+            mask_model=mask_model,
+            track_model=track_model,
+            trusts_model_code=trust_model_code,
+        )
     show({"sequence": str(done.folder), "masks": _found(done)})
 
 
@@ -366,6 +381,9 @@ def import_capture(
     frame_rate: float | None = None,
     hands: tuple[Literal["right", "left"], ...] = ("right",),
     click: tuple[str, ...] = (),
+    mask_model: Path | None = None,
+    track_model: Path | None = None,
+    trust_model_code: bool = False,
     overwrite: bool = False,
 ) -> None:
     """Your own recording by one or several RGB-D or color cameras.
@@ -390,6 +408,9 @@ def import_capture(
         hands: Hands that the recording shows: right, left or both.
         click: Places on the object as view,frame,x,y in the imported images; masks and tracks are
             then found too, as by `physhandi annotate`.
+        mask_model: As for `physhandi annotate`, like the next two.
+        track_model: Folder of a tracker.
+        trust_model_code: Let the Python code in the tracker's folder be executed.
         overwrite: Replace a sequence that is there.
     """
     if example is not None:
@@ -413,6 +434,8 @@ def import_capture(
         frame_rate=frame_rate,
         hands=hands,
     )
+    if not click and (mask_model or track_model):
+        raise UsageError("--mask-model and --track-model find what --click names; give that too.")
     clicks = [_click(text) for text in click]
     with watched(True) as progress:
         sequence = convert(source, out, progress, options=options, overwrite=overwrite)
@@ -420,9 +443,16 @@ def import_capture(
             from physhandi.perception.annotation import annotate as find
 
             try:
-                sequence = find(sequence.folder, clicks, progress)
-            except UsageError as error:
-                raise UsageError(
+                sequence = find(
+                    sequence.folder,
+                    clicks,
+                    progress,
+                    mask_model=mask_model,
+                    track_model=track_model,
+                    trusts_model_code=trust_model_code,
+                )
+            except (UsageError, RunError) as error:
+                raise type(error)(
                     f"{error} The recording is imported as {sequence.folder}; click again with "
                     "physhandi annotate."
                 ) from None

@@ -3,6 +3,7 @@
 import dataclasses
 import shutil
 from collections.abc import Sequence as Many
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +24,16 @@ from physhandi.data.files import (
 from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import FILE
 from physhandi.errors import SequenceError, UsageError
+from physhandi.perception.mask_model import MaskModel
 from physhandi.perception.point_tracking import track_points
 from physhandi.perception.segmentation import Click, segment
+from physhandi.perception.track_model import TrackModel
 from physhandi.progress import NullProgress, Progress
 
 BUILT_IN = "built-in"
 """What provenance calls masks and tracks that were made here."""
+_HASH = "model_sha256"
+"""What it says of those that a model of the user made here."""
 _FILES = ("mask", "track.npy", "track_visible.npy")
 
 
@@ -38,6 +43,9 @@ def annotate(
     progress: Progress | None = None,
     *,
     overwrite: bool = False,
+    mask_model: Path | None = None,
+    track_model: Path | None = None,
+    trusts_model_code: bool = False,
 ) -> Sequence:
     """Find object and hands in a sequence, follow points of the object, and store both.
 
@@ -50,14 +58,20 @@ def annotate(
         clicks: Places on the object (`Click`); without any, hands alone are found, and no tracks.
         progress: Told about both stages; may cancel.
         overwrite: Whether masks and tracks may be replaced that were not made here.
+        mask_model: Folder of SAM 2 or EdgeTAM (`MaskModel`), which finds object and hands in the
+            place of what is built in.
+        track_model: Folder of CoTracker3 or TAPNext (`TrackModel`), which follows the points.
+        trusts_model_code: Whether the user agreed that the tracker's code is executed, in a process
+            of its own.
 
     Returns:
         The sequence as it is now.
 
     Raises:
         UsageError: If a click makes no sense, there is neither click nor hand, or masks are there
-            that were not made here.
+            that were not made here, or a folder holds no such model.
         MissingInputError: If no view has color.
+        RunError: If the process of a tracker fails.
         CancelledError: If the user asked to stop; what was there is left.
     """
     progress = progress or NullProgress()
@@ -69,14 +83,24 @@ def annotate(
         )
     if not overwrite:
         _check_own(sequence)
-    masks = segment(sequence, clicks, progress)
-    tracks = track_points(sequence, masks, progress) if clicks else {}
+    with ExitStack() as ended:
+        tracker = None
+        if track_model is not None:
+            tracker = ended.enter_context(
+                TrackModel(track_model, sequence, is_trusted=trusts_model_code)
+            )
+        finder = None if mask_model is None else MaskModel(mask_model)
+        masks = segment(sequence, clicks, progress, finder)
+        tracks = track_points(sequence, masks, progress, tracker) if clicks else {}
+        about = {
+            part: {
+                **({"source": BUILT_IN} if model is None else model.provenance()),
+                "clicks": [dataclasses.asdict(click) for click in clicks],
+                "version": physhandi.__version__,
+            }
+            for part, model in (("masks", finder), ("tracks", tracker))
+        }
     progress.check_cancelled()
-    about = {
-        "source": BUILT_IN,
-        "clicks": [dataclasses.asdict(click) for click in clicks],
-        "version": physhandi.__version__,
-    }
     for view in sequence.views:
         sweep_temporary(view.folder.glob(".*.tmp"))
         if view.name not in masks:
@@ -87,10 +111,10 @@ def annotate(
             _put_in_place(made, view.folder)
         finally:
             shutil.rmtree(made, ignore_errors=True)
-    provenance: dict[str, Any] = {**sequence.provenance, "masks": about}
+    provenance: dict[str, Any] = {**sequence.provenance, "masks": about["masks"]}
     provenance.pop("tracks", None)
     if tracks:
-        provenance["tracks"] = about
+        provenance["tracks"] = about["tracks"]
     meta = dataclasses.replace(sequence.meta, provenance=provenance)
     write_yaml(sequence.folder / FILE, meta.to_dict())
     return Sequence.load(sequence.folder)
@@ -102,8 +126,8 @@ def _check_own(sequence: Sequence) -> None:
         ("tracks", any(view.track is not None for view in sequence.views)),
     ):
         about: Any = sequence.provenance.get(part)
-        source = about.get("source") if isinstance(about, dict) else None
-        if there and source != BUILT_IN:
+        is_own = isinstance(about, dict) and (about.get("source") == BUILT_IN or _HASH in about)
+        if there and not is_own:
             raise UsageError(
                 f"Sequence '{sequence.name}' has {part} that were not made here. Allow overwriting "
                 "to replace them, or annotate a copy."

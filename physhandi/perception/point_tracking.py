@@ -3,7 +3,8 @@
 A track goes on while it comes back to where it was when followed backwards (Kalal et al. 2010),
 moves as its neighbors do, stays as near to them as a surface can, and its pixel is the object's,
 with a depth that does not jump. One that does not (it hangs on a shadow, say), or that a
-hand covers, ends; new ones begin where the object shows room for them.
+hand covers, ends; new ones begin where the object shows room for them. A track model, where the
+user has one, follows the points in the place of that.
 """
 
 from dataclasses import dataclass, field
@@ -18,6 +19,7 @@ from scipy.spatial import KDTree
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
 from physhandi.perception.lifting import OBJECT_LABEL
+from physhandi.perception.track_model import TrackModel
 from physhandi.progress import NullProgress, Progress
 
 _cv2: Any = cv2  # Its type stubs refuse absent starts.
@@ -49,12 +51,15 @@ _CLOSEST = 2.5
 """Least distance between tracks when they begin [px]."""
 _SHORTEST = 3
 """Frames that a track must live to be kept."""
+_MODEL_ROUNDS = 4
+"""Most frames of a view in which a model is told points to follow."""
 
 
 def track_points(
     sequence: Sequence,
     masks: dict[str, UInt8[ndarray, "frame row column"]],
     progress: Progress | None = None,
+    model: TrackModel | None = None,
 ) -> dict[str, tuple[Float[ndarray, "frame track 2"], Bool[ndarray, "frame track"]]]:
     """Follow points of the object's surface.
 
@@ -63,6 +68,7 @@ def track_points(
         masks: Labels of views with color, as `segment` gives them; a view needs depth too, without
             which a track says nothing about space.
         progress: Told after every frame; may cancel.
+        model: Follows points in the place of what is built in.
 
     Returns:
         By view, positions [px], NaN where a track is not seen, and where it is seen. Views without
@@ -75,6 +81,14 @@ def track_points(
     views = [v for v in sequence.views if v.name in masks and v.has_color and v.has_depth]
     total, result = len(views) * sequence.frame_count, {}
     for number, view in enumerate(views):
+        if model is not None:
+            paths = _followed_by_model(model, view, masks[view.name], progress)
+            view.close()
+            if paths[0].shape[1]:
+                result[view.name] = paths
+            done = (number + 1) * sequence.frame_count
+            progress.report(TRACKING_STAGE, done, total, None, f"View {view.name}")
+            continue
         tracker = _Tracker(view, masks[view.name])
         for frame in range(view.frame_count):
             progress.check_cancelled()
@@ -191,6 +205,44 @@ class _Tracker:
         for track, path in enumerate(kept):
             pixel[path.begin : path.begin + len(path.pixel), track] = path.pixel
         return pixel, np.asarray(np.isfinite(pixel).all(axis=-1))
+
+
+def _followed_by_model(
+    model: TrackModel,
+    view: View,
+    mask: UInt8[ndarray, "frame row column"],
+    progress: Progress,
+) -> tuple[Float[ndarray, "frame track 2"], Bool[ndarray, "frame track"]]:
+    """Let a model follow points of the first frame with the object, and of those with few tracks.
+
+    Where a point is not on the object, it is not seen, whatever the model says.
+    """
+    is_object = mask == OBJECT_LABEL
+    pixel = np.zeros((view.frame_count, 0, 2), dtype=np.float32)
+    seen = np.zeros((view.frame_count, 0), dtype=bool)
+    shown = np.flatnonzero(is_object.any(axis=(1, 2)))
+    asked: set[int] = set()
+    while len(asked) < min(_MODEL_ROUNDS, len(shown)):
+        progress.check_cancelled()
+        alive = seen.sum(axis=1)
+        rest = [int(frame) for frame in shown if frame not in asked]
+        frame = min(rest, key=lambda at: int(alive[at])) if asked else rest[0]
+        if asked and alive[frame] >= LEAST_TRACKS:
+            break
+        asked.add(frame)
+        gray = cv2.cvtColor(view.color(frame), cv2.COLOR_RGB2GRAY)
+        free = _solid_depth(view.depth(frame), is_object[frame]) > 0
+        start = _new_points(gray, free, pixel[frame, seen[frame]])
+        if not len(start):
+            continue
+        place, is_visible = model.follow(view, frame, start, progress)
+        for at in range(view.frame_count):
+            is_visible[at] &= _at(is_object[at], place[at]) > 0
+        pixel = np.concatenate([pixel, place.astype(np.float32)], axis=1)
+        seen = np.concatenate([seen, is_visible], axis=1)
+    kept = seen.sum(axis=0) >= min(_SHORTEST, view.frame_count)
+    pixel, seen = pixel[:, kept], seen[:, kept]
+    return np.where(seen[..., None], pixel, np.float32(np.nan)), seen
 
 
 def _solid_depth(

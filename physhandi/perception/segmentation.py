@@ -1,12 +1,13 @@
 """Finds object and hands in the color and depth images of a sequence, from clicks on the object.
 
-No network takes part. Each pixel is judged for background, object and hands by its color, by its
+Each pixel is judged for background, object and hands by its color, by its
 height above what carries the object, by the label that dense optical flow (DIS, Kroeger et al.
 2016) brings from the frame before, and by its distance, in space, from there. Pieces that hang on
 nothing are dropped, and GrabCut (Rother et al. 2004) draws the outline of what is thick enough.
 Labels travel forwards and backwards from the frame of a click. A view without a click begins in the
 frame in which depth and calibration show it most of the object; hands begin, in every frame, at
-their keypoints.
+their keypoints. No network takes part, unless the user has one (`MaskModel`): it is then told the
+same places, and does the rest.
 """
 
 import itertools
@@ -28,6 +29,7 @@ from physhandi.data.view import View
 from physhandi.errors import MissingInputError, UsageError
 from physhandi.perception.keypoints import KeypointDetector, detect_view
 from physhandi.perception.lifting import HAND_LABEL, OBJECT_LABEL
+from physhandi.perception.mask_model import MaskModel, Prompt
 from physhandi.perception.tracks import EDGE_STEP
 from physhandi.progress import NullProgress, Progress
 
@@ -126,6 +128,15 @@ _PALM_SIDES = ((0, 5), (0, 9), (0, 13), (0, 17), (5, 17))
 _CHUNK = 12
 """Images that are kept while a video is read backwards."""
 
+# What a mask model is told.
+_PLACES = 3
+"""Places of a thing that one frame tells, where nobody clicked."""
+_REMINDED = 30
+"""Frames after which a hand is shown to the model again."""
+_ARM = 0.6
+"""How far a hand goes beyond its bones and palm; what a model finds farther off is the arm [core's
+width]."""
+
 _Window = tuple[slice, slice]
 _Anchors = dict[int, tuple[Bool[ndarray, "row column"], Bool[ndarray, "row column"]]]
 """By a hand's label: what of it is surely there, and from where its distance is counted."""
@@ -146,7 +157,10 @@ class Click:
 
 
 def segment(
-    sequence: Sequence, clicks: Many[Click], progress: Progress | None = None
+    sequence: Sequence,
+    clicks: Many[Click],
+    progress: Progress | None = None,
+    model: MaskModel | None = None,
 ) -> dict[str, UInt8[ndarray, "frame row column"]]:
     """Label the pixels of all views with color.
 
@@ -156,6 +170,7 @@ def segment(
         clicks: Places on the object; more than one in a view, or in several views, help where one
             is not enough. Without any, hands alone are labelled.
         progress: Told after every frame; may cancel.
+        model: Follows object and hands in the place of what is built in.
 
     Returns:
         By view: 0 background, 1 object, 2 right hand, 3 left hand.
@@ -180,12 +195,13 @@ def segment(
     clicked = [seen for seen in found if any(click.view == seen.view.name for click in clicks)]
     done, total = 0, len(found) * sequence.frame_count
     for seen in [*clicked, *(seen for seen in found if seen not in clicked)]:
-        if seen in clicked:
-            mine = [click for click in clicks if click.view == seen.view.name]
-            starts = _clicked_starts(seen, mine)
+        mine = [click for click in clicks if click.view == seen.view.name]
+        starts = _clicked_starts(seen, mine) if mine else _borrowed_start(seen, clicked)
+        if model is None:
+            steps = _follow(seen, starts)
         else:
-            starts = _borrowed_start(seen, clicked)
-        for _ in _follow(seen, starts):
+            steps = _follow_by_model(model, seen, starts, mine)
+        for _ in steps:
             progress.check_cancelled()
             done += 1
             progress.report(SEGMENTATION_STAGE, done, total, None, f"View {seen.view.name}")
@@ -501,6 +517,90 @@ def _follow(seen: _Seen, starts: dict[int, _Start]) -> Iterator[int]:
                 label = seen.label[now.frame] = _advance(seen, before, label, now)
                 before = now
                 yield now.frame
+
+
+def _follow_by_model(
+    model: MaskModel, seen: _Seen, starts: dict[int, _Start], clicks: list[Click]
+) -> Iterator[int]:
+    """Label all frames as a model finds them; yields each that is finished."""
+    for start in starts.values():
+        seen.find_support(start.image.depth)
+    prompts = _prompts(seen, starts, clicks)
+    if not prompts:
+        yield from range(seen.view.frame_count)
+        return
+    for frame, logits in model.follow(seen.view, prompts):
+        things = list(logits)
+        score = np.stack([np.zeros_like(logits[things[0]]), *logits.values()])
+        label = np.array([_BACKGROUND, *things], dtype=np.uint8)[score.argmax(axis=0)]
+        for value, core in _hand_cores(seen, frame):
+            away = cv2.distanceTransform((core == 0).astype(np.uint8), cv2.DIST_L2, 3)
+            label[(label == value) & (away > _ARM * np.sqrt(core.sum()))] = _BACKGROUND
+        seen.label[frame] = label
+        for click in clicks:
+            if click.frame == frame and not (label == OBJECT_LABEL).any():
+                raise UsageError(
+                    f"{_told(click)}: the mask model finds nothing there. Click on another part of "
+                    "the object, or do without --mask-model."
+                )
+        yield frame
+
+
+def _prompts(
+    seen: _Seen, starts: dict[int, _Start], clicks: list[Click]
+) -> dict[int, list[Prompt]]:
+    """Choose what a model is told of object and hands."""
+    nothing = np.zeros((0, 2))
+    places: dict[int, ndarray] = {}
+    for frame in sorted(starts):
+        clicked = [(click.x, click.y) for click in clicks if click.frame == frame]
+        place = np.array(clicked) if clicked else _spread(starts[frame].seed)
+        if len(place):
+            places[frame] = place
+    hands = {HAND_LABEL[side]: _hand_places(seen, HAND_LABEL[side]) for side in seen.hands}
+    prompts: dict[int, list[Prompt]] = {}
+    for frame, place in places.items():
+        others = [known[frame] for known in hands.values() if frame in known]
+        other = np.concatenate(others) if others else nothing
+        prompts.setdefault(OBJECT_LABEL, []).append(Prompt(frame, place, other))
+    for value, known in hands.items():
+        shown = [Prompt(at, place, places.get(at, nothing)) for at, place in known.items()]
+        if shown:
+            prompts[value] = shown
+    return prompts
+
+
+def _hand_places(seen: _Seen, value: int) -> dict[int, Float[ndarray, "point 2"]]:
+    """Find places on a hand in a few frames: of its palm, or as other views show it."""
+    found: dict[int, ndarray] = {}
+    count = seen.view.frame_count
+    if seen.keypoint is not None:
+        hand = [HAND_LABEL[side] for side in seen.hands].index(value)
+        last = -_REMINDED
+        for frame in range(count):
+            palm = seen.keypoint[frame, hand, list(_PALM), :2].astype(np.float64)
+            inside = (palm > -0.5) & (palm < np.array(seen.label.shape[:0:-1]) - 0.5)
+            palm = palm[inside.all(axis=1)]
+            if len(palm) >= _PLACES and frame - last >= _REMINDED:
+                found[frame], last = palm, frame
+    if not found:
+        for frame in sorted({*range(0, count, max(1, count // 6))}):
+            for _, core in _borrowed_cores(seen, frame, {value}):
+                found[frame] = _spread(core > 0)
+    return found
+
+
+def _spread(mask: Bool[ndarray, "row column"]) -> Float[ndarray, "point 2"]:
+    """Choose places inside of a mask, far from its rim and from each other [px]."""
+    room = np.pad(mask, 1).astype(np.uint8)
+    chosen: list[tuple[float, float]] = []
+    while len(chosen) < _PLACES and room.any():
+        inside = cv2.distanceTransform(room, cv2.DIST_L2, 3)
+        row, column = np.unravel_index(int(inside.argmax()), inside.shape)
+        chosen.append((float(column) - 1, float(row) - 1))
+        reach = max(1, round(0.3 * float(np.sqrt(mask.sum()))))
+        cv2.circle(room, (int(column), int(row)), reach, 0, -1)
+    return np.array(chosen).reshape(-1, 2)
 
 
 def _images(view: View, frames: range) -> Iterator[_Image]:

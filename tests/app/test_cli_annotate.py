@@ -2,6 +2,7 @@
 
 import pytest
 from clicked_disc import FRAMES, disc_click, write_disc
+from made_models import write_cotracker
 
 from app import cli
 from physhandi.data.sequence import Sequence
@@ -54,3 +55,20 @@ def test_given_masks_stay_unless_overwriting_is_allowed(tmp_path, capsys):
     assert code == 2
     assert "not made here" in error
     assert call(capsys, *command, "--overwrite")[0] == 0
+
+
+def test_models_of_the_user_are_named_by_their_folders(tmp_path, capsys):
+    sequence, _ = write_disc(tmp_path / "disc", frames=2)
+    view, frame, x, y = disc_click()
+    command = ("annotate", sequence.folder, "--click", f"{view},{frame},{x:g},{y:g}")
+    code, _, error = call(capsys, *command, "--mask-model", tmp_path)
+    assert code == 2
+    assert "is no folder of a mask model" in error
+    folder = write_cotracker(tmp_path / "tracker")
+    code, _, error = call(capsys, *command, "--track-model", folder)
+    assert code == 2
+    assert "--trust-model-code" in error
+    capture = ("import", "capture", tmp_path, "--out", tmp_path / "out", "--track-model", folder)
+    code, _, error = call(capsys, *capture)
+    assert code == 2
+    assert "find what --click names" in error
