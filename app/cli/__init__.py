@@ -48,6 +48,7 @@ def build() -> SubcommandApp:
     app.command(runs.export)
     app.command(recordings.check)
     app.command(recordings.annotate)
+    app.command(recordings.shape)
     app.command(benchmarks, name="benchmark", help="Measure speed; see docs/benchmarks.")
     app.command(serving.doctor)
     return app

@@ -217,6 +217,49 @@ def _click(text: str) -> Any:
         ) from None
 
 
+def shape(
+    sequence: Positional[str],
+    mesh: Positional[Path],
+    *,
+    scale: str = "auto",
+    pose: str | None = None,
+    data_dir: DataDir = None,
+) -> None:
+    """Complete the object in the first frame by a mesh of the whole of it.
+
+    The mesh is laid onto what all views see of the object, colored by them and stored with the
+    sequence; fits then give nodes to the sides that were not seen.
+
+    Args:
+        sequence: Folder or name of a sequence with depth and masks.
+        mesh: GLB, glTF, PLY, OBJ or STL file, in about the shape that the object has in frame 0.
+        scale: Metres for one unit of the file, such as 0.001, or auto.
+        pose: About how it lies, if it is not found: turns about the world's x, y and z axes in
+            degrees, in this order, like 90,0,-30, and, if wanted, the place of the mesh's middle
+            [m], like 90,0,-30,0.1,0,0.05.
+    """
+    from physhandi.perception.mesh_completion import RoughPose, complete_shape
+
+    folder = find_sequence(sequence, data_dir).folder
+    try:
+        metres = None if scale == "auto" else float(scale)
+    except ValueError:
+        raise UsageError(f"--scale {scale!r} is neither a number nor auto.") from None
+    found = complete_shape(
+        folder, mesh, scale=metres, pose=None if pose is None else RoughPose.parse(pose)
+    )
+    show(
+        {
+            "sequence": str(folder),
+            "scale": f"{found.scale:.6g} m for one unit",
+            "median distance": f"{1e3 * found.residual:.1f} mm from the cloud to the mesh",
+            "coverage": f"{100 * found.coverage:.0f} % of the cloud within "
+            f"{1e3 * found.tolerance:.0f} mm of it",
+            "outside": f"{100 * found.outside:.0f} % of its surface where views see nothing",
+        }
+    )
+
+
 def _level(text: str) -> tuple[str, float]:
     name, equals, value = text.partition("=")
     try:

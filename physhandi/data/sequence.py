@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
 from physhandi.data.files import read_array
@@ -39,6 +39,9 @@ ARRAYS: _Table = {
     "validation_track.npy": (("frame", "validation", 3), _F, True),
     "object_node.npy": (("node", 3), _F, False),
     "rest_node.npy": (("node", 3), _F, False),
+    "mesh_vertex.npy": (("mesh vertex", 3), _F, False),
+    "mesh_face.npy": (("mesh face", 3), _I, False),
+    "mesh_color.npy": (("mesh vertex", 3), _I, False),
 }
 VIEW_ARRAYS: _Table = {
     "keypoint.npy": (("frame", "hand", 21, 3), _F, True),
@@ -82,6 +85,7 @@ def check_layout(folder: Path, meta: SequenceMeta, views: tuple[View, ...]) -> N
     for view in read_held_out_views(folder, meta.name, meta.frame_count):
         view.check_presence()
     _check_markers(folder, meta, axes)
+    _check_mesh(folder, meta.name)
 
 
 def value_checks(
@@ -219,6 +223,25 @@ def _check_markers(folder: Path, meta: SequenceMeta, axes: dict[str, int]) -> No
         reason = f"says surface_node_count {meta.surface_node_count}, but object_node.npy has "
         reason = f"{reason}{node_count} nodes"
         _fail(meta.name, FILE, reason, "correct it", field="surface_node_count")
+
+
+def _check_mesh(folder: Path, name: str) -> None:
+    """Check that a mesh of the object is whole, and names corners that it has."""
+    is_there = {file: (folder / file).is_file() for file in ("mesh_vertex.npy", "mesh_face.npy")}
+    for file, other in (("mesh_vertex.npy", "mesh_face.npy"), ("mesh_face.npy", "mesh_vertex.npy")):
+        if is_there[file] and not is_there[other]:
+            _fail(name, file, f"is half a mesh: {other} is missing", "add it, or remove this one")
+    if (folder / "mesh_color.npy").is_file() and not is_there["mesh_vertex.npy"]:
+        _fail(name, "mesh_color.npy", "colors no mesh: mesh_vertex.npy is missing", "remove it")
+    if not is_there["mesh_face.npy"]:
+        return
+    corner = read_array(folder / "mesh_face.npy")
+    count = len(read_array(folder / "mesh_vertex.npy", mmap=True))
+    if not len(corner):
+        _fail(name, "mesh_face.npy", "holds no triangle", "remove the mesh")
+    if not 0 <= corner.min() <= corner.max() < count:
+        reason = f"names corners {corner.min()} to {corner.max()}, but mesh_vertex.npy has {count}"
+        _fail(name, "mesh_face.npy", reason, "number corners from 0")
 
 
 def _check_finite(root: Path, path: Path, name: str) -> None:
@@ -461,6 +484,17 @@ class Sequence:
     def rest_node(self) -> Float[ndarray, "node 3"] | None:
         """The same nodes in the shape without tension [m]."""
         return self._array("rest_node.npy", np.float32)
+
+    @cached_property
+    def mesh(self) -> tuple[Float[ndarray, "vertex 3"], Int[ndarray, "face 3"]] | None:
+        """Whole surface of the object in frame 0: corners [m], and triangles seen from outside."""
+        vertex = self._array("mesh_vertex.npy", np.float32)
+        return None if vertex is None else (vertex, self._array("mesh_face.npy", np.int32))
+
+    @cached_property
+    def mesh_color(self) -> UInt8[ndarray, "vertex 3"] | None:
+        """Color of each corner of the mesh."""
+        return self._array("mesh_color.npy", np.uint8)
 
     def missing(self, *parts: str) -> list[str]:
         """Tell which of the named parts the sequence lacks.

@@ -5,10 +5,12 @@
   along itself. They lie among the points that were seen, because losses compare with those: nodes
   on the centre line of a rope would start half its thickness away.
 * A *solid* gets a voxel grid, filled from its top down to the ground, or to its lowest seen point.
+* With a *mesh* of the whole object, parts of its surface that nothing was seen of get nodes evenly
+  along themselves, and a solid is filled where the mesh says that it is.
 
 Gaps in a surface are closed where the hand may hide it: where no view sees past the object, or,
-without masks, where they are no wider than `MAX_GAP`. Limits: overhangs of a solid are filled, and
-what no view sees beside its outline is not invented.
+without masks, where they are no wider than `MAX_GAP`. Limits without a mesh: overhangs of a solid
+are filled, and what no view sees beside its outline is not invented.
 """
 
 import cv2
@@ -28,6 +30,7 @@ from physhandi.perception.shape_class import (
     poisson_disk_points,
     rim_points,
 )
+from physhandi.triangles import SurfaceSamples
 
 MAX_GAP = 0.04
 """Widest gap in a surface that is closed without knowing whether a hand hides it [m]."""
@@ -294,15 +297,7 @@ def solid_nodes(
         spacing: Edge of a voxel [m].
         ground_height: Height below which there is nothing [m].
     """
-    low = cloud.min(axis=0)
-    stands = ground_height is not None and low[2] - ground_height < STANDING_HEIGHT
-    floor = ground_height if stands and ground_height is not None else low[2]
-    origin = np.array([low[0], low[1], floor])
-    voxel = np.floor((cloud - origin) / spacing).astype(np.int64)
-    key, owner, count = np.unique(voxel, axis=0, return_inverse=True, return_counts=True)
-    owner = owner.reshape(-1)
-    total = [np.bincount(owner, weights=cloud[:, axis]) for axis in range(3)]
-    surface = np.stack(total, axis=1) / count[:, None]
+    origin, key, surface = _surface_voxels(cloud, spacing, ground_height)
     column, of_column = np.unique(key[:, :2], axis=0, return_inverse=True)
     top = np.zeros(len(column), dtype=np.int64)
     np.maximum.at(top, of_column.reshape(-1), key[:, 2])
@@ -317,3 +312,60 @@ def solid_nodes(
     if len(empty) == 0:
         return surface
     return np.concatenate([surface, origin + (empty + 0.5) * spacing])
+
+
+def _surface_voxels(
+    cloud: Float[ndarray, "point 3"], spacing: float, ground_height: float | None
+) -> tuple[Float[ndarray, " 3"], Int[ndarray, "voxel 3"], Float[ndarray, "voxel 3"]]:
+    """Average the points in each voxel: corner of the grid, voxels, and the mean in each [m]."""
+    low = cloud.min(axis=0)
+    stands = ground_height is not None and low[2] - ground_height < STANDING_HEIGHT
+    floor = ground_height if stands and ground_height is not None else low[2]
+    origin = np.array([low[0], low[1], floor])
+    voxel = np.floor((cloud - origin) / spacing).astype(np.int64)
+    key, owner, count = np.unique(voxel, axis=0, return_inverse=True, return_counts=True)
+    owner = owner.reshape(-1)
+    total = [np.bincount(owner, weights=cloud[:, axis]) for axis in range(3)]
+    return origin, key, np.stack(total, axis=1) / count[:, None]
+
+
+def meshed_solid_nodes(
+    cloud: Float[ndarray, "point 3"],
+    spacing: float,
+    ground_height: float | None,
+    mesh: SurfaceSamples,
+) -> Float[ndarray, "node 3"]:
+    """Sample the seen surface on a voxel grid, and what a mesh says of the rest of a solid.
+
+    Args:
+        cloud: Points on the surface [m].
+        spacing: Edge of a voxel [m].
+        ground_height: Height below which there is nothing [m].
+        mesh: Samples of the whole surface in the same place [m].
+    """
+    origin, _, seen = _surface_voxels(cloud, spacing, ground_height)
+    surface = np.concatenate([seen, unseen_surface_nodes(seen, mesh, spacing)])
+    low = np.floor((mesh.point.min(axis=0) - origin) / spacing).astype(np.int64)
+    high = np.ceil((mesh.point.max(axis=0) - origin) / spacing).astype(np.int64)
+    voxel = low + np.indices(tuple(high - low)).reshape(3, -1).T
+    middle = origin + (voxel + 0.5) * spacing
+    # Beside the surface a node is on it already, and winding numbers of samples are not sure.
+    middle = middle[KDTree(surface).query(middle)[0] >= _LEAST_APART * spacing]
+    return np.concatenate([surface, middle[np.abs(mesh.winding_number(middle)) > 0.5]])
+
+
+def unseen_surface_nodes(
+    node: Float[ndarray, "node 3"], mesh: SurfaceSamples, spacing: float
+) -> Float[ndarray, "unseen 3"]:
+    """Sample nodes evenly along those parts of a mesh that are farther than `spacing` from others.
+
+    Args:
+        node: Nodes that come from what was seen [m].
+        mesh: Samples of the whole surface in the same place [m].
+        spacing: Distance between neighbouring nodes [m].
+    """
+    unseen = mesh.point[KDTree(node).query(mesh.point)[0] > spacing]
+    if len(unseen) == 0:
+        return unseen
+    unseen = poisson_disk_points(unseen, _PACKING * spacing)
+    return unseen[KDTree(node).query(unseen)[0] >= _LEAST_APART * spacing]

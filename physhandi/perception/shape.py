@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from scipy.spatial import KDTree
 
@@ -15,9 +15,11 @@ from physhandi.errors import FitError, MissingInputError
 from physhandi.perception.node_sampling import (
     flat_sheet_nodes,
     is_flat,
+    meshed_solid_nodes,
     rope_nodes,
     solid_nodes,
     surface_nodes,
+    unseen_surface_nodes,
 )
 from physhandi.perception.object_points import (
     CALIBRATION_MARGIN,
@@ -26,7 +28,14 @@ from physhandi.perception.object_points import (
     removal,
     silhouette_test,
 )
-from physhandi.perception.shape_class import HiddenTest, cell_size, find_class
+from physhandi.perception.shape_class import (
+    LEAST_LAYERS,
+    FoundClass,
+    HiddenTest,
+    cell_size,
+    find_class,
+)
+from physhandi.triangles import SurfaceSamples, is_closed, sample_surface, triangle_areas
 
 _GROUND_HEIGHT = 0.006
 """Most that a point beside an object may be above the ground to belong to the ground [m]."""
@@ -39,6 +48,9 @@ _FAR = 0.05
 """Distance at which a single removed point is worth one [m]."""
 _SPACING_STEP = 0.0005
 _LEAST_SPACING = 1e-4
+_SAMPLE_SPACING = 0.25
+"""Distance between samples of a mesh, in distances between nodes."""
+_MOST_SAMPLES = 60_000
 _WARNING_CODE = "object_points_removed"
 
 
@@ -149,6 +161,7 @@ def shape_of_observation(
                 else None
             ),
             kind=sequence.shape,
+            mesh=sequence.mesh,
         )
     if most_nodes is not None and len(shape.node) > most_nodes:
         factor = (len(shape.node) / most_nodes) ** (1.0 / _DIMENSION[shape.kind])
@@ -196,6 +209,7 @@ def object_shape(
     is_hidden: HiddenTest | None = None,
     is_possible: HiddenTest | None = None,
     kind: ShapeClass | None = None,
+    mesh: tuple[Float[ndarray, "vertex 3"], Int[ndarray, "face 3"]] | None = None,
 ) -> ObjectShape:
     """Clean the cloud of an object, tell what kind of object it is, and sample its nodes.
 
@@ -206,6 +220,7 @@ def object_shape(
         is_hidden: Where the object may continue unseen.
         is_possible: The same, with room for errors of masks and cameras.
         kind: Kind of object, if it is known.
+        mesh: Corners [m] and triangles of its whole surface, where it is in this frame.
 
     Returns:
         The same for the same cloud.
@@ -219,6 +234,9 @@ def object_shape(
     is_object, removed = object_points(seen, cell_size(seen, spacing), is_possible=is_possible)
     seen = seen[is_object]
     found = find_class(seen, spacing, ground_height=ground_height, is_possible=is_possible)
+    samples = None if mesh is None else _samples(*mesh, spacing, ground_height)
+    if samples is not None and mesh is not None and is_closed(mesh[1]):
+        found = _with_mesh(found, samples, spacing)
     kind_used = kind or found.kind
     if ground_height is not None and kind_used in {"solid", "rope"}:
         thickness = min(found.thickness, float(np.percentile(seen[:, 2], 80)) - ground_height)
@@ -226,14 +244,7 @@ def object_shape(
         if is_ground.any():
             removed = (*removed, removal("ground", seen, is_ground, ~is_ground))
             seen = seen[~is_ground]
-    if kind_used == "solid":
-        node = solid_nodes(seen, spacing, ground_height)
-    elif kind_used == "rope":
-        node = rope_nodes(seen, spacing, is_hidden)
-    elif kind_used == "sheet" and is_flat(seen, spacing):
-        node = flat_sheet_nodes(seen, spacing, is_hidden)
-    else:
-        node = surface_nodes(seen, spacing, is_hidden)
+    node = _nodes(kind_used, seen, spacing, ground_height, is_hidden=is_hidden, mesh=samples)
     if ground_height is not None:
         node[:, 2] = np.maximum(node[:, 2], ground_height)
     return ObjectShape(
@@ -246,6 +257,54 @@ def object_shape(
         removed=removed,
         node=node.astype(np.float32),
     )
+
+
+def _nodes(
+    kind: ShapeClass,
+    seen: Float[ndarray, "point 3"],
+    spacing: float,
+    ground_height: float | None,
+    *,
+    is_hidden: HiddenTest | None,
+    mesh: SurfaceSamples | None,
+) -> Float[ndarray, "node 3"]:
+    """Sample the nodes of an object of a known kind."""
+    if kind == "solid":
+        if mesh is not None:
+            return meshed_solid_nodes(seen, spacing, ground_height, mesh)
+        return solid_nodes(seen, spacing, ground_height)
+    if kind == "rope":
+        node = rope_nodes(seen, spacing, is_hidden)
+    elif kind == "sheet" and is_flat(seen, spacing):
+        node = flat_sheet_nodes(seen, spacing, is_hidden)
+    else:
+        node = surface_nodes(seen, spacing, is_hidden)
+    if mesh is None:
+        return node
+    return np.concatenate([node, unseen_surface_nodes(node, mesh, spacing)])
+
+
+def _samples(
+    vertex: Float[ndarray, "vertex 3"],
+    faces: Int[ndarray, "face 3"],
+    spacing: float,
+    ground_height: float | None,
+) -> SurfaceSamples:
+    """Sample a mesh much more densely than nodes lie; what is in the ground comes onto it."""
+    area = float(triangle_areas(vertex, faces).sum())
+    count = int(np.clip(area / (_SAMPLE_SPACING * spacing) ** 2, 1000, _MOST_SAMPLES))
+    samples = sample_surface(vertex, faces, count)
+    if ground_height is not None:
+        samples.point[:, 2] = np.maximum(samples.point[:, 2], ground_height)
+    return samples
+
+
+def _with_mesh(found: FoundClass, mesh: SurfaceSamples, spacing: float) -> FoundClass:
+    """Correct the kind of a body that was seen from one side only, which looks like a sheet."""
+    if found.kind != "sheet" or mesh.thickness < LEAST_LAYERS * spacing:
+        return found
+    reason = f"its mesh encloses a body that is {1e3 * mesh.thickness:.0f} mm thick on average"
+    return FoundClass(kind="solid", thickness=mesh.thickness, reason=reason)
 
 
 def _is_ground(

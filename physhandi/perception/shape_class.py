@@ -33,7 +33,7 @@ HiddenTest = Callable[[Float[ndarray, "point 3"]], Bool[ndarray, " point"]]
 
 STANDING_HEIGHT = 0.03
 """An object whose lowest point is nearer to the ground than this stands on it [m]."""
-_LEAST_LAYERS = 1.5
+LEAST_LAYERS = 1.5
 """Thickness from which a body is thick, in distances between nodes: room for a second layer."""
 _LEAST_SHARE_OF_WIDTH = 0.1
 """Thickness from which a body is thick, as a share of its second longest side."""
@@ -102,7 +102,7 @@ def find_class(
     cell = cell_size(cloud, 0.5 * spacing)
     patch = poisson_disk_points(cloud, cell)
     extent = np.sort(_extent(patch))[::-1]
-    thick = max(_LEAST_LAYERS * spacing, _LEAST_SHARE_OF_WIDTH * float(extent[1]))
+    thick = max(LEAST_LAYERS * spacing, _LEAST_SHARE_OF_WIDTH * float(extent[1]))
     rope = _rope_of(cloud, patch, cell, spacing)
     if rope is not None:
         return rope

@@ -4,8 +4,16 @@ import numpy as np
 import pytest
 from numpy import ndarray
 from scipy.optimize import minimize
+from scipy.spatial import ConvexHull
 
-from physhandi.triangles import segment_distance, triangle_areas, triangle_distance, vertex_normals
+from physhandi.triangles import (
+    is_closed,
+    sample_surface,
+    segment_distance,
+    triangle_areas,
+    triangle_distance,
+    vertex_normals,
+)
 
 
 def test_vertex_normals_of_a_roof_lie_between_its_sides() -> None:
@@ -61,3 +69,39 @@ def test_the_distance_to_a_segment_is_to_its_line_or_its_ends() -> None:
     point = np.array([[1.0, 3.0, 4.0], [-3.0, 4.0, 0.0], [2.5, 0.0, 0.0]])
     assert segment_distance(point, start, end) == pytest.approx([5.0, 5.0, 0.5])
     assert segment_distance(point[:1], start[:1], start[:1]) == pytest.approx([26**0.5])
+
+
+def slab() -> tuple[np.ndarray, np.ndarray]:
+    """Corners and triangles of a box of 2 x 3 x 0.1, seen from outside."""
+    corner = np.indices((2, 2, 2)).reshape(3, -1).T * [2.0, 3.0, 0.1]
+    faces = ConvexHull(corner).simplices
+    a, b, c = (corner[faces[:, k]] for k in range(3))
+    inwards = (np.cross(b - a, c - a) * (a - [1.0, 1.5, 0.05])).sum(axis=1) < 0
+    faces[inwards] = faces[inwards][:, ::-1]
+    return corner, faces
+
+
+def test_samples_say_what_is_inside() -> None:
+    corner, faces = slab()
+    samples = sample_surface(corner, faces, 6000)
+    assert samples.area * 6000 == pytest.approx(2 * (6.0 + 0.2 + 0.3))
+    # All samples lie on the box, and as many on each side as its area says.
+    height = samples.point[:, 2]
+    assert (np.abs(height - 0.1) < 1e-9).mean() == pytest.approx(6.0 / 13.0, abs=0.002)
+    assert np.all(height[samples.normal[:, 2] > 0.9] > 0.0999)
+    inside = np.array([[1.0, 1.5, 0.05], [0.2, 2.7, 0.05]])
+    outside = np.array([[1.0, 1.5, 0.2], [1.0, 1.5, -0.1], [-0.1, 1.0, 0.05], [9.0, 9.0, 9.0]])
+    assert samples.winding_number(inside) == pytest.approx([1, 1], abs=0.05)
+    assert samples.winding_number(outside) == pytest.approx([0, 0, 0, 0], abs=0.05)
+    # Twice the volume by the area.
+    assert samples.thickness == pytest.approx(2 * 0.6 / 13.0, rel=0.01)
+
+
+def test_a_mesh_with_few_open_edges_is_closed() -> None:
+    _, faces = slab()
+    assert is_closed(faces)
+    assert not is_closed(faces[1:])
+    point = np.random.default_rng(0).normal(size=(300, 3))
+    ball = ConvexHull(point / np.linalg.norm(point, axis=1, keepdims=True))
+    assert is_closed(ball.simplices[1:])
+    assert not is_closed(ball.simplices[::2])
