@@ -31,6 +31,11 @@ def temporary_name(name: str) -> str:
     return f".{name}.{_HOST}-{os.getpid()}-{secrets.token_hex(4)}.tmp"
 
 
+def stopped_name(name: str) -> str:
+    """Name a hidden sibling of a file that nobody writes any more, but that may be gone on with."""
+    return f".{name}.{_HOST}-0-{secrets.token_hex(4)}.tmp"
+
+
 def is_abandoned(path: Path) -> bool:
     """Tell whether a temporary file or folder was left by a process of this host that is gone."""
     parts = path.name.split(".")

@@ -1,5 +1,6 @@
 """Building a sequence folder beside its final place and publishing it in one step."""
 
+import json
 import os
 import shutil
 from collections.abc import Generator, Mapping
@@ -15,6 +16,7 @@ from numpy import ndarray
 
 from physhandi.data.files import (
     is_abandoned,
+    stopped_name,
     sweep_temporary,
     sync_folder,
     temporary_name,
@@ -23,36 +25,49 @@ from physhandi.data.files import (
 )
 from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import FILE, SAFE_NAME, SequenceMeta
-from physhandi.errors import SequenceError
+from physhandi.errors import CancelledError, SequenceError
+
+_ORIGIN, _CHECKPOINTS = ".origin", ".checkpoints"
+"""Files of a sequence that is being written: what it is made of, and how far it is."""
 
 
 class SequenceWriter:
     """Collects the parts of a sequence; the folder appears only when it is whole and valid.
 
-    Use it as a context manager: leaving it without `finish`, or by an exception, leaves nothing.
+    Use it as a context manager: leaving it without `finish`, or by an exception, leaves nothing;
+    but one that may be resumed keeps its hidden folder when the user stops it or it is killed.
     """
 
-    def __init__(self, folder: Path | str, *, overwrite: bool = False) -> None:
-        """Start a sequence.
+    def __init__(self, folder: Path | str, *, overwrite: bool = False, origin: str = "") -> None:
+        """Start a sequence, or go on with one of the same origin.
 
         Args:
             folder: Where the sequence shall appear; its parent is made if needed.
             overwrite: Whether to replace a sequence that is there.
+            origin: Names all that the sequence is made of, if it may be resumed (`checkpoints`);
+                another origin starts afresh.
 
         Raises:
             SequenceError: If the folder exists and `overwrite` is false, or its name is unsafe.
         """
         self.folder = Path(folder).resolve()
         self._overwrite = overwrite
+        self._origin = origin
+        self._unnoted: list[str] = []
         if not SAFE_NAME.fullmatch(self.folder.name):
             raise SequenceError(
                 f"'{self.folder.name}' cannot name a sequence; use 1-64 letters, digits, '_', '-'."
             )
         self.folder.parent.mkdir(parents=True, exist_ok=True)
-        _recover(self.folder)
         self._check_target()
         self._temporary = self.folder.with_name(temporary_name(self.folder.name))
-        self._temporary.mkdir()
+        self._checkpoints = self._take_over() if origin else []
+        _recover(self.folder)
+        self._check_target()
+        if not self._temporary.exists():
+            self._temporary.mkdir()
+            if origin:
+                (self._temporary / _ORIGIN).write_text(origin, encoding="utf-8")
 
     def __enter__(self) -> "SequenceWriter":
         return self
@@ -63,11 +78,32 @@ class SequenceWriter:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        shutil.rmtree(self._temporary, ignore_errors=True)
+        is_stopped = kind is not None and issubclass(kind, CancelledError | KeyboardInterrupt)
+        if is_stopped and (self._temporary / _CHECKPOINTS).exists():
+            self._temporary.rename(self.folder.with_name(stopped_name(self.folder.name)))
+        else:
+            shutil.rmtree(self._temporary, ignore_errors=True)
+
+    @property
+    def checkpoints(self) -> list[Any]:
+        """What `checkpoint` was told before this writer went on; their files are all there."""
+        return list(self._checkpoints)
+
+    def checkpoint(self, state: Any) -> None:
+        """Note that all files up to here are whole, to go on from here if the work is stopped.
+
+        Args:
+            state: Plain data that a later writer of the same origin needs.
+        """
+        files = {rel: self._path(rel).stat().st_size for rel in self._unnoted}
+        self._unnoted.clear()
+        with (self._temporary / _CHECKPOINTS).open("a", encoding="utf-8") as stream:
+            stream.write(json.dumps({"state": state, "files": files}) + "\n")
 
     def save_array(self, rel: str, array: ndarray) -> None:
         """Store an array, for example as ``control.npy``."""
         write_array(self._path(rel), array)
+        self._unnoted.append(rel)
 
     def save_image(
         self,
@@ -95,16 +131,19 @@ class SequenceWriter:
             raise SequenceError(f"Sequence '{self.folder.name}': {rel} could not be written.")
         with _naming(path):
             path.write_bytes(code.tobytes())
+        self._unnoted.append(rel)
 
     def save_yaml(self, rel: str, value: Any) -> None:
         """Store plain data, for example as ``truth/views/a/camera.yaml``."""
         write_yaml(self._path(rel), value)
+        self._unnoted.append(rel)
 
     def copy(self, rel: str, path: Path | str) -> None:
         """Take over a file as it is, for example a video."""
         target = self._path(rel)
         with _naming(target):
             shutil.copyfile(path, target)
+        self._unnoted.append(rel)
 
     def make_folder(self, rel: str) -> None:
         """Make a folder, for example ``views/a`` of a camera that recorded nothing."""
@@ -116,6 +155,8 @@ class SequenceWriter:
         Raises:
             SequenceError: If what was written is not a valid sequence; nothing is published.
         """
+        for name in (_ORIGIN, _CHECKPOINTS):
+            (self._temporary / name).unlink(missing_ok=True)
         write_yaml(self._temporary / FILE, meta.to_dict())
         Sequence.load(self._temporary).validate()
         self._check_target()
@@ -128,6 +169,37 @@ class SequenceWriter:
         if replaced is not None:
             shutil.rmtree(replaced)
         return Sequence.load(self.folder)
+
+    def _take_over(self) -> list[Any]:
+        """Continue in the folder of a writer of the same origin that was stopped or killed."""
+        for path in self.folder.parent.glob(f".{self.folder.name}.*.tmp"):
+            try:
+                if is_abandoned(path) and (path / _ORIGIN).read_text("utf-8") == self._origin:
+                    path.rename(self._temporary)
+                    return self._read_checkpoints()
+            except OSError:  # It has none, or another process was faster.
+                continue
+        return []
+
+    def _read_checkpoints(self) -> list[Any]:
+        """Read what can be trusted: whole lines whose files have the size that was noted."""
+        path = self._temporary / _CHECKPOINTS
+        text = path.read_text("utf-8") if path.is_file() else ""
+        kept: list[str] = []
+        states: list[Any] = []
+        for line in text.splitlines():
+            try:
+                entry = json.loads(line)
+                files: dict[str, int] = entry["files"]
+                is_whole = all((self._temporary / f).stat().st_size == n for f, n in files.items())
+            except (ValueError, KeyError, OSError):
+                break
+            if not is_whole:
+                break
+            kept.append(line + "\n")
+            states.append(entry["state"])
+        path.write_text("".join(kept), "utf-8")
+        return states
 
     def _path(self, rel: str) -> Path:
         parts = PurePosixPath(rel).parts

@@ -1,5 +1,6 @@
 """Imports raw RGB-D recordings: synchronised, without distortion, with the table as the ground."""
 
+import hashlib
 import shutil
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
@@ -12,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
+import physhandi
 from physhandi.data import sequence as sequences
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.files import temporary_name
@@ -152,7 +154,8 @@ def import_capture(
             such a folder; or what PhysTwin's recorder writes; or ROS or RealSense bags
             (docs/your-data.md).
         out_folder: Folder of the new sequence; its last part names the sequence.
-        progress: Receives a report after every image; may cancel, which leaves nothing.
+        progress: Receives a report after every image; may cancel. The same call then goes on where
+            it was stopped, or killed, unless the recording or an option was changed.
         options: What the recording does not say itself.
         overwrite: Whether to replace a sequence that is there.
 
@@ -179,7 +182,8 @@ def import_capture(
         report = dict(placement.report)
         report["agreement"] = _check_agreement(sources, cameras, placement, paired.count)
         notes += [*paired.notes, *placement.notes]
-        with SequenceWriter(out_folder, overwrite=overwrite) as writer:
+        origin = _origin(given, sources, options)
+        with SequenceWriter(out_folder, overwrite=overwrite, origin=origin) as writer:
             notes += _write(writer, sources, paired, progress)
             meta = SequenceMeta(
                 name=writer.folder.name,
@@ -206,6 +210,33 @@ def import_capture(
             )
             sequence = writer.finish(meta)
     return sequence
+
+
+def _origin(given: Path, sources: list[_Source], options: CaptureOptions) -> str:
+    """Name all that images are made from: files, lenses, scales and the choice of frames."""
+    told = hashlib.sha256(repr((physhandi.__version__, options)).encode())
+    for source in sources:
+        view = source.view
+        lenses = [view.camera, *([view.depth_camera] if view.depth_camera is not None else [])]
+        arrays = [lens.K for lens in lenses] + [lens.distortion for lens in lenses]
+        arrays += [
+            one for one in (view.T_color_depth, source.color, source.depth) if one is not None
+        ]
+        told.update(repr((view.name, view.size, source.scale, len(arrays))).encode())
+        for array in arrays:
+            told.update(np.ascontiguousarray(array).tobytes())
+    # Bags are unpacked anew each time, so they stand for their images.
+    files = find_bags(given) or [
+        file
+        for source in sources
+        for stream in source.view.streams
+        for file in stream.files or (stream.path,)
+    ]
+    for file in files:
+        for path in [file] if file.is_file() else sorted(file.rglob("*")):
+            status = path.stat()
+            told.update(f"{path} {status.st_size} {status.st_mtime_ns}\n".encode())
+    return told.hexdigest()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -694,10 +725,15 @@ def _check_table(
 def _write(
     writer: SequenceWriter, sources: list[_Source], paired: PairedFrames, progress: Progress
 ) -> list[str]:
-    """Write all images, frame by frame."""
+    """Write all images, frame by frame; those of an import that was stopped are kept."""
     total = len(sources) * paired.count
     done = 0
-    for frame in range(paired.count):
+    for frame, holes in enumerate(cast("list[list[int]]", writer.checkpoints)):
+        for place in holes:
+            sources[place].holes.append(frame)
+        done += len(sources)
+        progress.report(_STAGE, done, total, None, "goes on")
+    for frame in range(done // len(sources), paired.count):
         for source in sources:
             progress.check_cancelled()
             if source.view.color is not None:
@@ -706,6 +742,8 @@ def _write(
                 _write_depth(writer, source, frame)
             done += 1
             progress.report(_STAGE, done, total, None, source.view.name)
+        holes = [place for place, one in enumerate(sources) if one.holes[-1:] == [frame]]
+        writer.checkpoint(holes)
     notes: list[str] = []
     for source in sources:
         if source.holes:

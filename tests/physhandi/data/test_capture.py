@@ -1,8 +1,10 @@
 """Raw recordings become sequences: paired in time, without distortion, the table at z = 0."""
 
 import json
+import os
 import pickle
 import re
+import subprocess
 from pathlib import Path
 
 import cv2
@@ -441,12 +443,86 @@ class _Stops(Progress):
             raise CancelledError("stop")
 
 
-def test_a_cancelled_import_leaves_nothing(raw, tmp_path):
-    progress = _Stops()
+class _Counts(Progress):
+    """Notes what is reported."""
+
+    def __init__(self) -> None:
+        self.told: list[tuple[int, str]] = []
+
+    def report(self, stage, iteration, total, loss=None, message=""):
+        assert (stage, total) == ("import", 2 * FRAMES)
+        self.told.append((iteration, message))
+
+
+def hidden(folder: Path) -> list[Path]:
+    """What is left of a stopped import; nothing else may be there."""
+    left = [path for path in folder.iterdir() if path.name != "raw"]
+    assert all(path.name.startswith(".out.") and path.suffix == ".tmp" for path in left)
+    return left
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def test_an_import_that_was_stopped_goes_on_where_it_was(raw, tmp_path):
+    nothing = np.zeros((CAMERAS["right"].height, CAMERAS["right"].width), np.uint16)
+    cv2.imwrite(str(raw.folder / "right/depth/00000.png"), nothing)  # Of which a note is left.
     with pytest.raises(CancelledError):
-        import_capture(raw.folder, tmp_path / "out", progress)
-    assert progress.count == 3
-    assert [path.name for path in tmp_path.iterdir()] == ["raw"]
+        import_capture(raw.folder, tmp_path / "out", _Stops())
+    (begun,) = hidden(tmp_path)
+    written = (begun / "views/left/color/00000.png").stat().st_mtime_ns
+    seen = _Counts()
+    sequence = import_capture(raw.folder, tmp_path / "out", seen)
+    assert seen.told[:2] == [(2, "goes on"), (3, "left")]
+    assert seen.told[-1] == (2 * FRAMES, "right")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "raw"]
+    whole = content(import_capture(raw.folder, tmp_path / "raw/whole").folder)
+    parts = content(sequence.folder)
+    whole["sequence.yaml"] = whole["sequence.yaml"].replace(b"name: whole", b"name: out")
+    assert parts == whole
+    kept = sequence.folder / "views/left/color/00000.png"
+    assert kept.stat().st_mtime_ns == written
+    assert "View 'right': depth of frame 0 holds no distance." in sequence.provenance["notes"]
+
+
+@pytest.mark.parametrize("change", ["option", "image", "torn file", "torn note", "other process"])
+def test_what_a_stopped_import_left_is_only_trusted_if_nothing_changed(raw, tmp_path, change):
+    with pytest.raises(CancelledError):
+        import_capture(raw.folder, tmp_path / "out", _Stops())
+    (begun,) = hidden(tmp_path)
+    options = CaptureOptions(hands=("left",) if change == "option" else ("right",))
+    kept = 0
+    if change == "image":
+        os.utime(raw.folder / "left/color/00005.png", (1, 1))
+    elif change == "torn file":
+        (begun / "views/left/depth/00000.png").write_bytes(b"half")
+    elif change == "torn note":
+        note = (begun / ".checkpoints").read_text()
+        (begun / ".checkpoints").write_text(note + note[: len(note) // 2])
+        kept = 2
+    elif change == "other process":  # It was killed, not stopped.
+        dead = subprocess.Popen(["true"])
+        dead.wait()
+        begun.rename(begun.with_name(begun.name.replace("-0-", f"-{dead.pid}-")))
+        kept = 2
+    seen = _Counts()
+    sequence = import_capture(raw.folder, tmp_path / "out", seen, options=options)
+    assert len([1 for _, message in seen.told if message == "goes on"]) == kept // 2
+    assert seen.told[-1][0] == 2 * FRAMES
+    for frame in range(FRAMES):
+        color, depth = picture(CAMERAS["left"], frame)
+        assert np.array_equal(sequence.views[0].color(frame), color)
+        assert np.abs(sequence.views[0].depth(frame) - depth).max() < 6e-4
+    assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
+
+
+def test_a_failed_import_leaves_nothing(raw, tmp_path):
+    (raw.folder / "left/color/00004.png").write_bytes(b"no picture")
+    with pytest.raises(ImportFailedError, match=r"00004\.png"):
+        import_capture(raw.folder, tmp_path / "out")
+    assert hidden(tmp_path) == []
 
 
 def test_a_survey_tells_what_a_recording_holds(tmp_path):
