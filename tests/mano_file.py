@@ -14,6 +14,7 @@ import scipy.sparse
 import torch
 from foreign_pickle import chumpy_array, chumpy_select, python2_pickle
 from scipy.optimize import nnls
+from scipy.spatial.transform import Rotation
 
 from physhandi.hand.open_hand import OpenHand
 
@@ -63,6 +64,27 @@ def mano_arrays(side: str) -> dict[str, Any]:
         arrays["posedirs"] = posedirs.reshape(VERTICES, 3, 135)
         arrays["hands_mean"] = (arrays["hands_mean"].reshape(15, 3) * [1, -1, -1]).reshape(45)
     return arrays
+
+
+def posed_mano(
+    arrays: dict, shape: np.ndarray, pose: np.ndarray, turn: np.ndarray, shift: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """MANO as its paper defines it, one pose at a time; the pose is 45 numbers in MANO's order."""
+    rotation = Rotation.from_rotvec(np.concatenate([turn[None], pose.reshape(15, 3)])).as_matrix()
+    shaped = arrays["v_template"] + arrays["shapedirs"] @ shape
+    joint = arrays["J_regressor"].toarray() @ shaped
+    posed = shaped + arrays["posedirs"] @ (rotation[1:] - np.eye(3)).ravel()
+    world = []
+    for number, parent in enumerate(PARENT):
+        local = np.eye(4)
+        local[:3, :3] = rotation[number]
+        local[:3, 3] = joint[number] - (joint[parent] if parent >= 0 else 0)
+        world.append(world[parent] @ local if parent >= 0 else local)
+    skinning = np.array(world)
+    skinning[:, :3, 3] -= np.einsum("jab,jb->ja", skinning[:, :3, :3], joint)
+    blended = np.einsum("vj,jab->vab", arrays["weights"], skinning)
+    vertex = np.einsum("vab,vb->va", blended, np.c_[posed, np.ones(len(posed))])[:, :3]
+    return vertex + shift, np.array(world)[:, :3, 3] + shift
 
 
 def write_mano(folder: Path, side: str = "right", **changes: Any) -> Path:

@@ -4,6 +4,7 @@ import shutil
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from tyro.conf import Positional, arg
 
 from app.cli.lookup import find_sequence, folder_of_sequence, open_catalog
@@ -531,3 +532,35 @@ def import_mano(sources: Positional[tuple[Path, ...]], *, out: Path | None = Non
 
     folder = out or hands_folder()
     show({"hands": [str(convert(path, folder)) for path in sources]})
+
+
+def import_hands(
+    sequence: Positional[str],
+    results: Positional[Path],
+    *,
+    fill_gaps: bool = False,
+    overwrite: bool = False,
+    data_dir: DataDir = None,
+) -> None:
+    """Keypoints of hands that WiLoR, HaMeR or another method found in the images of a sequence.
+
+    Args:
+        sequence: Folder or name of a sequence.
+        results: File of keypoints, joints or MANO's parameters, .json or .npz (docs/formats.md).
+        fill_gaps: Let the built-in networks look for hands where the file has none.
+        overwrite: Replace keypoints that did not come from such a file.
+    """
+    from physhandi.perception.hand_results import import_hands as convert
+
+    folder = find_sequence(sequence, data_dir).folder
+    with watched(True) as progress:
+        done = convert(folder, results, progress, fills_gaps=fill_gaps, overwrite=overwrite)
+    seen = {
+        view.name: {
+            side: int(np.isfinite(view.keypoint[:, hand]).all(axis=(1, 2)).sum())
+            for hand, side in enumerate(done.hands)
+        }
+        for view in done.views
+        if view.keypoint is not None
+    }
+    show({"sequence": str(done.folder), "frames with keypoints": seen})

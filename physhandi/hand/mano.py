@@ -154,6 +154,13 @@ class ManoHand(HandModel):
         joint = fixed["joint"] + fixed["joint_change"] @ shape
         return joint - joint[:1]
 
+    def wrist_position(self, shape: Float[ndarray, " 10"]) -> Float[ndarray, " 3"]:
+        """Compute where the wrist of the unposed hand is in MANO's own frame [m].
+
+        MANO turns about it, so a wrist's translation is this plus MANO's ``transl``.
+        """
+        return self.wrist + self._joint_change[0] @ shape
+
     def mano_pose(self, articulation: Float[ndarray, "frame 15 3"]) -> Float[ndarray, "frame 45"]:
         """Convert an articulation to MANO's pose (axis-angle, MANO's frame and order) [rad]."""
         turned = np.einsum("jca,fja->fjc", self.joint_axes, articulation)

@@ -166,7 +166,7 @@ class TrackModel:
                 f"{self._folder.name}: gave tracks {pixel.shape} and {visible.shape} in the place "
                 f"of {(*shape, 2)} and {shape}."
             )
-        is_placed: ndarray = np.isfinite(pixel).all(axis=-1)
+        is_placed = np.asarray(np.isfinite(pixel).all(axis=-1))
         return np.where(is_placed[..., None], np.clip(pixel, -1e6, 1e6), 0), visible & is_placed
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from clicked_disc import write_disc
 from mano_file import write_mano
 from phystwin_case import write_case
 from phystwin_experiment import write_experiment
@@ -160,3 +161,21 @@ def test_a_click_with_the_import_makes_masks_and_tracks_at_once(tmp_path, capsys
     code, _, error = call(capsys, *command, tmp_path / "third", "--click", "left,9")
     assert code == 2
     assert not (tmp_path / "third").exists()
+
+
+def test_hands_that_another_method_found_become_keypoints(tmp_path, capsys):
+    sequence, _ = write_disc(tmp_path / "disc", frames=2)
+    text = (sequence.folder / "sequence.yaml").read_text()
+    (sequence.folder / "sequence.yaml").write_text(text.replace("hands: []", "hands: [right]"))
+    results = tmp_path / "hands.npz"
+    shown = np.full((1, 21, 2), 40.0)
+    fields = {"format": "physhandi-hands/1", "frame": [1], "side": "right", "view": "top"}
+    np.savez(results, keypoint=shown, **fields)
+    code, out, error = call(capsys, "import", "hands", sequence.folder, results)
+    assert code == 0, error
+    assert "right: 1" in out
+    assert Sequence.load(sequence.folder).views[0].keypoint[1, 0, 20].tolist() == [40, 40, 1]
+    results.write_bytes(b"")
+    code, _, error = call(capsys, "import", "hands", sequence.folder, results)
+    assert code == 1
+    assert "cannot be read as .npz" in error

@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from mano_file import JOINTS, PARENT, TO_MANO, mano_arrays
-from scipy.spatial.transform import Rotation
+from mano_file import JOINTS, TO_MANO, mano_arrays, posed_mano
 
 from physhandi.errors import MissingInputError
 from physhandi.hand.loading import load_hand_model
@@ -18,27 +17,6 @@ MANO_NAMES = [
     for finger in ("index", "middle", "pinky", "ring", "thumb")
     for joint in (("cmc", "mcp", "ip") if finger == "thumb" else ("mcp", "pip", "dip"))
 ]
-
-
-def _mano(
-    arrays: dict, shape: np.ndarray, pose: np.ndarray, turn: np.ndarray, shift: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """MANO as its paper defines it, one pose at a time; the pose is 45 numbers in MANO's order."""
-    rotation = Rotation.from_rotvec(np.concatenate([turn[None], pose.reshape(15, 3)])).as_matrix()
-    shaped = arrays["v_template"] + arrays["shapedirs"] @ shape
-    joint = arrays["J_regressor"].toarray() @ shaped
-    posed = shaped + arrays["posedirs"] @ (rotation[1:] - np.eye(3)).ravel()
-    world = []
-    for number, parent in enumerate(PARENT):
-        local = np.eye(4)
-        local[:3, :3] = rotation[number]
-        local[:3, 3] = joint[number] - (joint[parent] if parent >= 0 else 0)
-        world.append(world[parent] @ local if parent >= 0 else local)
-    skinning = np.array(world)
-    skinning[:, :3, 3] -= np.einsum("jab,jb->ja", skinning[:, :3, :3], joint)
-    blended = np.einsum("vj,jab->vab", arrays["weights"], skinning)
-    vertex = np.einsum("vab,vb->va", blended, np.c_[posed, np.ones(len(posed))])[:, :3]
-    return vertex + shift, np.array(world)[:, :3, 3] + shift
 
 
 @pytest.mark.parametrize("side", ["right", "left"])
@@ -57,7 +35,7 @@ def test_forward_pass_is_manos(mano: Path, side: str) -> None:
     )
     np.testing.assert_allclose(still, hand.wrist + hand._joint_change[0] @ shape, atol=1e-12)
     for frame in range(3):
-        vertex, joint = _mano(arrays, shape, own[frame], turn[frame], shift[frame] - still)
+        vertex, joint = posed_mano(arrays, shape, own[frame], turn[frame], shift[frame] - still)
         assert np.abs(vertex - (arrays["v_template"] + shift[frame] - still)).max() > 0.05
         np.testing.assert_allclose(pose.vertex[frame], vertex, atol=1e-12)
         named = dict(zip(["wrist", *MANO_NAMES], joint, strict=True))
@@ -79,9 +57,9 @@ def test_pose_blend_shapes_matter(mano: Path) -> None:
     arrays, hand = mano_arrays("right"), ManoHand.load("right")
     pose = np.zeros(45)
     pose[3:6] = (0.2, -0.4, 0.7)
-    with_bulge = _mano(arrays, np.zeros(10), pose, np.zeros(3), -hand.wrist)[0]
+    with_bulge = posed_mano(arrays, np.zeros(10), pose, np.zeros(3), -hand.wrist)[0]
     without = {**arrays, "posedirs": np.zeros((778, 3, 135))}
-    without = _mano(without, np.zeros(10), pose, np.zeros(3), -hand.wrist)[0]
+    without = posed_mano(without, np.zeros(10), pose, np.zeros(3), -hand.wrist)[0]
     assert np.abs(with_bulge - without).max() > 5e-4
 
 
