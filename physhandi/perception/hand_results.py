@@ -29,7 +29,7 @@ from physhandi.hand.mano import ManoHand
 from physhandi.perception.keypoints import KeypointDetector, detect_view
 from physhandi.progress import NullProgress, Progress
 
-FORMAT = "physhandi-hands/1"
+HANDS_FORMAT = "physhandi-hands/1"
 """What a file of results says of itself."""
 _SIDES = ("right", "left")
 _MOST_BYTES = 1 << 30
@@ -139,8 +139,8 @@ class _Results:
     def __init__(self, path: Path, sequence: Sequence) -> None:
         self._path, self._sequence = path, sequence
         fields = _read(path)
-        if str(fields.pop("format", "")) != FORMAT:
-            self._fail("format", None, f"must be '{FORMAT}'")
+        if str(fields.pop("format", "")) != HANDS_FORMAT:
+            self._fail("format", None, f"must be '{HANDS_FORMAT}'")
         self.source = str(fields.pop("source", "") or "another method")
         self._mirrors = bool(fields.pop("left_is_mirrored_right", False))
         unknown = sorted(set(fields) - {*_TEXTS, *_NUMBERS})

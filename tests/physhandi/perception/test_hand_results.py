@@ -12,7 +12,7 @@ from physhandi.data.sequence import Sequence
 from physhandi.errors import ImportFailedError, MissingInputError, UsageError
 from physhandi.fitting.hand_reconstruction import observed_keypoints
 from physhandi.perception import hand_results
-from physhandi.perception.hand_results import FORMAT, import_hands
+from physhandi.perception.hand_results import HANDS_FORMAT, import_hands
 from physhandi.progress import Progress
 
 
@@ -33,7 +33,7 @@ def sequence(bare, tmp_path) -> Sequence:
 
 def write(folder: Path, *, ending: str = "json", **fields: object) -> Path:
     """Write a file of results; a field that is None is left out."""
-    content = {"format": FORMAT, "source": "wilor", **fields}
+    content = {"format": HANDS_FORMAT, "source": "wilor", **fields}
     content = {name: value for name, value in content.items() if value is not None}
     path = folder / f"hands.{ending}"
     if ending == "npz":
