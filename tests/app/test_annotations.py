@@ -1,5 +1,6 @@
 """Masks and tracks from clicks in the browser: started, followed, cancelled, and really found."""
 
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -73,6 +74,20 @@ def test_one_recording_at_a_time_and_it_can_be_cancelled(annotations: Annotation
     annotations.cancel("sheet")  # Nothing is at work any more.
     again = annotations.start("sheet", click(), overwrite=True)
     until(lambda: again.state == "done")
+
+
+def test_the_work_outlives_the_request_that_asked_for_it(annotations: Annotations) -> None:
+    def ask() -> None:
+        job = annotations.start("sheet", click("waits"), overwrite=True)
+        until(lambda: job.progress)
+
+    request = threading.Thread(target=ask)
+    request.start()
+    request.join()
+    job = annotations.job("sheet")
+    annotations.cancel("sheet")
+    until(lambda: job.state != "running")
+    assert (job.state, job.reason) == ("cancelled", "")
 
 
 def test_what_is_not_there_is_not_begun(annotations: Annotations) -> None:

@@ -44,6 +44,8 @@ class BackgroundTasks:
         self._tasks: dict[tuple[str, str], BackgroundTask] = {}
         self._work: Work | None = None
         self._child: Child | None = None
+        self._started = threading.Event()
+        """Whether the process of the latest work was started, or could not be."""
         self._listener: threading.Thread | None = None
 
     def start(self, work: Work, module: str, order: dict[str, Any]) -> BackgroundTask:
@@ -61,12 +63,13 @@ class BackgroundTasks:
             running = self.running
             if running is not None:
                 raise RunError(f"{running.doing} Wait until that is done, or cancel it.")
+            self._started.clear()
+            self._child = None
             task = self._tasks[work.kind, work.name] = BackgroundTask("running")
             self._work = work
-            self._child = child = Child(module, time_limit_s=_LONGEST_S)
-            child.send(order)
+            # The process ends with the thread that starts it, and those of requests come and go.
             self._listener = threading.Thread(
-                target=self._listen, args=(child, task), name=module, daemon=True
+                target=self._attend, args=(module, order, task), name=module, daemon=True
             )
             self._listener.start()
         return task
@@ -86,8 +89,10 @@ class BackgroundTasks:
     def cancel(self, kind: str, name: str) -> None:
         """Stop a piece of work; does nothing if it is not at work."""
         running = self.running
-        if running is not None and (running.kind, running.name) == (kind, name) and self._child:
-            self._child.send("cancel")
+        if running is not None and (running.kind, running.name) == (kind, name):
+            self._started.wait()
+            if self._child is not None:
+                self._child.send("cancel")
 
     def require_settled(self, sequence_ids: Iterable[str]) -> None:
         """Refuse to read recordings that are about to be replaced.
@@ -104,24 +109,30 @@ class BackgroundTasks:
 
     def shutdown(self) -> None:
         """End what is at work."""
-        child, listener = self._child, self._listener
-        if child is not None:
-            child.kill()
-        if listener is not None:
-            listener.join(timeout=5)
+        if self.running is not None:
+            self._started.wait()
+        if self._child is not None:
+            self._child.kill()
+        if self._listener is not None:
+            self._listener.join(timeout=5)
 
-    @staticmethod
-    def _listen(child: Child, task: BackgroundTask) -> None:
-        with child:
-            try:
+    def _attend(self, module: str, order: dict[str, Any], task: BackgroundTask) -> None:
+        """Start the process and listen to it until it ends."""
+        try:
+            with Child(module, time_limit_s=_LONGEST_S) as child:
+                child.send(order)
+                self._child = child
+                self._started.set()
                 for message in child.messages():
                     if "result" in message:
                         task.result = message["result"]
                     else:
                         task.progress = message
-                task.state = "done"
-            except CancelledError:
-                task.state = "cancelled"
-            except (PhysHandiError, OSError) as error:
-                task.reason = describe(error)
-                task.state = "failed"
+            task.state = "done"
+        except CancelledError:
+            task.state = "cancelled"
+        except (PhysHandiError, OSError) as error:
+            task.reason = describe(error)
+            task.state = "failed"
+        finally:
+            self._started.set()
