@@ -125,6 +125,7 @@ class Child:
         threads: int | None = None,
         time_limit_s: float | None = None,
         log: Path | None = None,
+        pass_fds: Collection[int] = (),
     ) -> None:
         """Start it.
 
@@ -134,6 +135,7 @@ class Child:
             threads: See `start_module`.
             time_limit_s: Time after which it is killed [s]; None for no limit.
             log: File that what it prints is appended to; None keeps only the end, in memory.
+            pass_fds: See `start_module`.
         """
         self._module = module
         self._process = start_module(
@@ -143,6 +145,7 @@ class Child:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
+            pass_fds=pass_fds,
             start_new_session=True,
         )
         self._requests = cast("IO[str]", self._process.stdin)

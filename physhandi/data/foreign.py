@@ -618,6 +618,14 @@ def limit(seconds: int, most_bytes: int) -> None:
         resource.setrlimit(kind, (least, least))
 
 
+def limit_data(most_bytes: int) -> None:
+    """Limit what this process may hold in memory, files that it maps apart."""
+    hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
+    least = most_bytes if hard == resource.RLIM_INFINITY else min(most_bytes, hard)
+    resource.setrlimit(resource.RLIMIT_DATA, (least, least))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
 def _work(channel: Channel) -> None:
     """Read the file that the arguments name."""
     source, out, seconds, most_bytes = channel.arguments

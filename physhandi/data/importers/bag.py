@@ -1,6 +1,7 @@
 """Unpacks ROS 1 and ROS 2 bags, RealSense's among them, to what a recorder writes into folders."""
 
 import json
+import logging
 import re
 import shutil
 from collections.abc import Iterator, Mapping
@@ -15,11 +16,15 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from physhandi.child import Channel, Child, ChildEndedError, run_child
+from physhandi.data.foreign import limit_data
 from physhandi.data.image_header import MOST_PIXELS
 from physhandi.data.importers.phystwin_files import fail
 from physhandi.data.importers.recorded_view import CALIBRATION
 from physhandi.errors import UsageError
 from physhandi.progress import Progress
+
+logger = logging.getLogger(__name__)
 
 _STAGE = "unpack"
 BAG_SUFFIXES = frozenset({".bag", ".db3", ".mcap"})
@@ -39,6 +44,9 @@ _CODED = {
 _DEPTHS = {"16uc1": np.uint16, "mono16": np.uint16, "32fc1": np.float32}
 _LEFT_OUT = re.compile(r"infra|confidence|(^|[/_])ir([/_]|$)", re.IGNORECASE)
 _COMPRESSED_DEPTH_HEADER = 12
+_WORKER = "physhandi.data.importers.bag"
+_MEMORY = 4 << 30
+"""Most memory that reading a bag may take [byte]."""
 _PNG_EFFORT = 1
 
 
@@ -91,7 +99,7 @@ def unpack_bags(source: Path, bags: list[Path], folder: Path, progress: Progress
     folder.mkdir()
     for bag in bags:
         prefix = _safe(bag.stem) if len(bags) > 1 else ""
-        _unpack(bag, folder, prefix, progress)
+        _unpack_apart(bag, folder, prefix, progress)
     if source in bags:
         return  # What lies beside a single bag may belong to anything.
     for path in source.iterdir():
@@ -99,6 +107,47 @@ def unpack_bags(source: Path, bags: list[Path], folder: Path, progress: Progress
             shutil.copy(path, folder / path.name)
     if (source / CALIBRATION).is_dir():
         (folder / CALIBRATION).symlink_to((source / CALIBRATION).resolve())
+
+
+def _unpack_apart(bag: Path, folder: Path, prefix: str, progress: Progress) -> None:
+    """Unpack a bag in a child process with limits: what is in it may do harm to what reads it."""
+    paths = [str(bag.absolute()), str(folder.absolute())]
+    with Child(_WORKER, *paths, prefix, threads=1) as child:
+        try:
+            for message in child.messages():
+                progress.check_cancelled()
+                progress.report(_STAGE, message["done"], message["total"], None, message["topic"])
+        except ChildEndedError as error:
+            logger.debug("the reader of %s said: %s", bag, error.last_words)
+            fail(bag, "crashed what reads it. It is damaged or made to do harm; record it again")
+
+
+class _Told(Progress):
+    """Passes on how far a child is."""
+
+    def __init__(self, channel: Channel) -> None:
+        self._channel = channel
+
+    def report(
+        self,
+        stage: str,  # noqa: ARG002  # there is only one
+        iteration: int,
+        total: int,
+        loss: float | None = None,  # noqa: ARG002
+        message: str = "",
+    ) -> None:
+        """Tell it."""
+        self._channel.tell(done=iteration, total=total, topic=message)
+
+
+def _work(channel: Channel) -> None:
+    """Unpack the bag that the arguments name."""
+    bag, folder, prefix = channel.arguments
+    limit_data(_MEMORY)
+    try:
+        _unpack(Path(bag), Path(folder), prefix, _Told(channel))
+    except MemoryError:
+        fail(Path(bag), f"needs more memory than is allowed ({_MEMORY >> 20} MiB)")
 
 
 def _unpack(bag: Path, folder: Path, prefix: str, progress: Progress) -> None:
@@ -379,3 +428,7 @@ def _camera_table(info: Any) -> dict[str, Any]:
         "width": int(info.width),
         "height": int(info.height),
     }
+
+
+if __name__ == "__main__":
+    run_child(_work)

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, UInt8, UInt16
 from numpy import ndarray
 
 from physhandi.data.camera import PinholeCamera
+from physhandi.data.decoding import media_decoder
 from physhandi.data.files import read_array
 from physhandi.data.foreign import read_untrusted
 from physhandi.data.image_header import announced_size, video_size
@@ -421,19 +422,7 @@ def probe_video(path: Path) -> tuple[int, int, int, float]:
         video_size(path)  # Refuses what is too large before a decoder sees it.
     except (ValueError, OSError) as error:
         fail(path, str(error))
-    capture = cv2.VideoCapture(str(path))
-    try:
-        count, width, height = (
-            round(capture.get(number))
-            for number in (
-                cv2.CAP_PROP_FRAME_COUNT,
-                cv2.CAP_PROP_FRAME_WIDTH,
-                cv2.CAP_PROP_FRAME_HEIGHT,
-            )
-        )
-        return count, width, height, float(capture.get(cv2.CAP_PROP_FPS))
-    finally:
-        capture.release()
+    return media_decoder().probe(path)
 
 
 def _check_video(path: Path, images: CaseImages) -> None:
@@ -508,7 +497,7 @@ def read_image(path: Path, mode: int) -> ndarray:
         announced_size(path)  # Refuses what is too large before it is decoded.
     except (ValueError, OSError) as error:
         fail(path, f"cannot be decoded as an image: it {error}")
-    image = cast("ndarray | None", cv2.imread(str(path), mode))
+    image = media_decoder().image(path, mode)
     if image is None:
         fail(path, "cannot be decoded as an image")
     return image

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
 from typing import Any, Literal, NoReturn, cast
@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from physhandi.data.decoding import media_decoder
 from physhandi.data.files import read_array
 from physhandi.data.image_header import MOST_PIXELS, announced_size
 from physhandi.data.importers.phystwin_files import fail, probe_video
@@ -61,8 +62,6 @@ class RecordedStream:
     """What `time` was read from, for messages."""
     frame_rate: float | None = None
     """Frames per second that a video states [Hz]."""
-    _video: Any = field(default=None, repr=False)
-    _next: int = 0
 
     def name(self, index: int) -> str:
         """Name an image for messages."""
@@ -88,9 +87,8 @@ class RecordedStream:
 
     def close(self) -> None:
         """Release the video decoder."""
-        if self._video is not None:
-            self._video.release()
-            self._video = None
+        if not self.files:
+            media_decoder().release(self.path)
 
     def _image(self, path: Path) -> ndarray:
         size = image_size(path)
@@ -105,10 +103,7 @@ class RecordedStream:
         if not is_whole(path):
             fail(path, "was cut off: its end is missing. Record or export it again")
         flags = cv2.IMREAD_COLOR if self.kind == "color" else cv2.IMREAD_UNCHANGED
-        try:
-            image = cast("ndarray | None", cv2.imread(str(path), flags))
-        except cv2.error:
-            image = None
+        image = media_decoder().image(path, flags)
         if image is None and path.suffix.lower() == ".exr":
             fail(
                 path,
@@ -120,19 +115,13 @@ class RecordedStream:
         return image
 
     def _frame(self, index: int) -> ndarray:
-        if self._video is None or index < self._next:
-            self.close()
-            self._video, self._next = cv2.VideoCapture(str(self.path)), 0
-        while self._next < index and self._video.grab():
-            self._next += 1
-        is_read, image = self._video.read() if self._next == index else (False, None)
-        if not is_read or image is None:
+        image, at = media_decoder().frame(self.path, index)
+        if image is None:
             self._refuse(
-                self._next,
+                at,
                 f"cannot be decoded, though the video announces {self.count} frames: it was cut "
-                f"off. Export it again, or give --stop {self._next}",
+                f"off. Export it again, or give --stop {at}",
             )
-        self._next += 1
         return image
 
     def _check_depth(self, index: int, image: ndarray) -> None:

@@ -9,13 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
 
-import cv2
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
 from physhandi.data.camera import PinholeCamera
-from physhandi.data.image_header import video_size
+from physhandi.data.importers.phystwin_files import probe_video
 from physhandi.data.sequence import Sequence, ViewMeta
 from physhandi.data.sequence_meta import SequenceMeta, Side
 from physhandi.data.sequence_writer import SequenceWriter
@@ -122,21 +121,8 @@ def _find_video(source: Path, camera: int) -> _Video:
             f"{source}: expected one video cam{camera}*.mp4, found {names}. "
             "Keep one video for each camera."
         )
-    try:
-        video_size(paths[0])  # Refuses what is too large before a decoder sees it.
-    except (ValueError, OSError) as error:
-        raise ImportFailedError(f"{paths[0]} {error}. Re-export it, smaller.") from error
-    capture = cv2.VideoCapture(str(paths[0]))
-    try:
-        video = _Video(
-            path=paths[0],
-            frame_count=int(capture.get(cv2.CAP_PROP_FRAME_COUNT)),
-            frame_rate=float(capture.get(cv2.CAP_PROP_FPS)),
-            width=int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)),
-            height=int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)),
-        )
-    finally:
-        capture.release()
+    count, width, height, rate = probe_video(paths[0])
+    video = _Video(path=paths[0], frame_count=count, frame_rate=rate, width=width, height=height)
     low, high = _FRAME_RATE_RANGE
     if video.frame_count < 1 or not low <= video.frame_rate <= high:
         raise ImportFailedError(

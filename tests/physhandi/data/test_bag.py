@@ -180,3 +180,11 @@ def test_without_the_package_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr(bag_reader, "find_spec", lambda _: None)
     with pytest.raises(UsageError, match=r"physhandi\[capture\]"):
         import_capture(tmp_path / "a.bag", tmp_path / "out")
+
+
+def test_a_bag_that_crashes_its_reader_is_named(tmp_path, monkeypatch):
+    small_bag(tmp_path / "a.bag")
+    monkeypatch.setattr(bag_reader, "_WORKER", "a_reader_that_ends_at_once")
+    with pytest.raises(ImportFailedError, match=r"a\.bag: crashed what reads it"):
+        import_capture(tmp_path / "a.bag", tmp_path / "out")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.bag"]

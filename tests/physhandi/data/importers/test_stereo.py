@@ -140,7 +140,7 @@ def test_videos_must_be_there_once_decode_and_agree(recording: Path, tmp_path: P
         import_stereo(recording, tmp_path / "hand")
     whole = (recording / "cam1_test.mp4").read_bytes()
     (recording / "cam1_test.mp4").write_bytes(mp4(whole, 60_000, 60_000))
-    with pytest.raises(ImportFailedError, match=r"cam1_test\.mp4 announces 60000x60000 px"):
+    with pytest.raises(ImportFailedError, match=r"cam1_test\.mp4: announces 60000x60000 px"):
         import_stereo(recording, tmp_path / "hand")
     (recording / "cam1_test.mp4").write_bytes(b"no video")
     with pytest.raises(ImportFailedError, match=r"cam1_test\.mp4 cannot be decoded"):

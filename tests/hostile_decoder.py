@@ -1,0 +1,30 @@
+"""A process in the place of the one that decodes, which fails at files by what their names say."""
+
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+from physhandi.child import run_child
+from physhandi.data import decoding
+
+
+def decode(request: dict[str, Any], videos: Any) -> Any:
+    name = Path(request["path"]).stem
+    if name == "crash" or (name == "second" and request.get("index") == 1):
+        os.abort()
+    if name == "once" and not Path(f"{request['path']}.tried").exists():
+        Path(f"{request['path']}.tried").touch()
+        os.abort()
+    if name == "hang":
+        time.sleep(300)
+    if name == "greedy":
+        bytearray(8 << 30)
+    return ORIGINAL(request, videos)
+
+
+ORIGINAL = decoding.decode
+
+if __name__ == "__main__":
+    decoding.decode = decode
+    run_child(decoding.serve)
