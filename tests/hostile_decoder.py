@@ -27,4 +27,4 @@ ORIGINAL = decoding.decode
 
 if __name__ == "__main__":
     decoding.decode = decode
-    run_child(decoding.serve)
+    run_child(decoding.answer_requests)

@@ -245,7 +245,7 @@ def decode(request: dict[str, Any], videos: _Videos) -> tuple[dict[str, Any], nd
     return {}, cast("ndarray | None", cv2.imread(request["path"], request["flags"]))
 
 
-def serve(channel: Channel) -> None:
+def answer_requests(channel: Channel) -> None:
     """Answer requests until there are no more."""
     descriptor, memory = int(channel.arguments[0]), int(channel.arguments[1])
     area = mmap.mmap(descriptor, _ROOM)
@@ -271,4 +271,4 @@ def serve(channel: Channel) -> None:
 
 
 if __name__ == "__main__":
-    run_child(serve)
+    run_child(answer_requests)
