@@ -6,6 +6,7 @@ import pytest
 from clicked_disc import FRAMES, HEIGHT, WIDTH, cameras, disc_click, write_disc
 
 from physhandi.errors import CancelledError, MissingInputError, UsageError
+from physhandi.perception import segmentation
 from physhandi.perception.segmentation import Click, segment
 from physhandi.progress import Progress
 
@@ -72,6 +73,28 @@ def test_without_a_click_hands_alone_are_found(held_disc):
         found = (label == 2) & (true[view] == 2)
         assert found.sum() > 0.93 * (true[view] == 2).sum()
         assert agreement(label, true[view], 2).mean() > 0.6
+
+
+def test_a_view_without_depth_is_judged_in_smaller_images(tmp_path, monkeypatch):
+    sequence, true = write_disc(tmp_path / "held", hand=True)
+    shutil.rmtree(sequence.folder / "views" / "side" / "depth")
+    blind = type(sequence).load(sequence.folder)
+    sizes = []
+    advance = segmentation._advance
+    monkeypatch.setattr(segmentation, "_LONGEST", WIDTH // 2)
+    monkeypatch.setattr(
+        segmentation,
+        "_advance",
+        lambda seen, before, label, now: (
+            sizes.append((seen.view.name, label.shape)) or advance(seen, before, label, now)
+        ),
+    )
+    found = segment(blind, [Click(*disc_click())])
+    assert set(sizes) == {("top", (HEIGHT, WIDTH)), ("side", (HEIGHT // 2, WIDTH // 2))}
+    assert found["side"].shape == found["top"].shape
+    # A shift by a pixel would cost both 3 points more.
+    for label, least in ((1, 0.89), (2, 0.845)):
+        assert agreement(found["side"], true["side"], label).mean() > least
 
 
 def test_the_same_click_gives_the_same_masks(disc):
