@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Header, Query, Request, Response
 from fastapi.responses import StreamingResponse
-from pydantic import BaseModel, ConfigDict, Field, JsonValue
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_validator
 from starlette.background import BackgroundTask
 from starlette.exceptions import HTTPException
 
@@ -23,7 +23,7 @@ from app.jobs.log import open_log
 from app.jobs.machine import Machine
 from app.jobs.order import check_order, describe_order, describe_settings
 from app.jobs.overview import Overview
-from app.jobs.recordings.annotations import Annotations, ClickedPlace
+from app.jobs.recordings.annotations import Annotations, ClickedPlace, PaintedMask
 from app.jobs.recordings.background import BackgroundTasks
 from app.jobs.recordings.imports import ImportOrder, Imports
 from app.jobs.scheduler import Scheduler
@@ -90,6 +90,37 @@ class NewAnnotation(BaseModel):
     """Places on the object; none finds hands alone."""
     overwrite: bool = False
     """Whether masks and tracks may be replaced that came from elsewhere."""
+
+
+class NewMask(BaseModel):
+    """The right mask of an image."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    view: ItemId
+    frame: Annotated[int, Field(ge=0, le=10_000_000)]
+    runs: Annotated[
+        list[Annotated[int, Field(ge=0, le=100_000_000)]], Field(min_length=2, max_length=400_000)
+    ]
+    """Labels row by row, each with how many pixels have it: 0 background, 1 object, 2 right and 3
+    left hand."""
+
+    @field_validator("runs")
+    @classmethod
+    def _are_labels(cls, value: list[int]) -> list[int]:
+        if not set(value[::2]) <= {0, 1, 2, 3}:
+            raise ValueError("labels are 0 to 3, and each is followed by its number of pixels")
+        return value
+
+
+class NewCorrection(BaseModel):
+    """Masks to replace."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    masks: Annotated[list[NewMask], Field(min_length=1, max_length=200)]
+    carry_on: bool = False
+    """Whether other frames are found anew from these, until the next one that was corrected."""
 
 
 CapturePlace = Annotated[str, Field(max_length=1000)]
@@ -235,6 +266,17 @@ def _add_annotations(router: APIRouter, annotations: Annotations) -> None:
         """Find masks and tracks of a recording from places on its object."""
         clicks = [ClickedPlace(**click.model_dump()) for click in new.clicks]
         return asdict(annotations.start(sequence_id, clicks, overwrite=new.overwrite))
+
+    @router.get("/sequences/{sequence_id}/views/{view_name}/frames/{frame}/mask")
+    def show_mask(sequence_id: ItemId, view_name: ItemId, frame: int) -> dict[str, Any]:
+        """Give the labels of an image row by row, each with how many pixels have it."""
+        return asdict(annotations.painted(sequence_id, view_name, frame))
+
+    @router.post("/sequences/{sequence_id}/correction", status_code=202)
+    def correct(sequence_id: ItemId, new: NewCorrection) -> dict[str, Any]:
+        """Replace masks, and follow points anew; `annotation` tells how far that is."""
+        masks = [PaintedMask(mask.view, mask.frame, tuple(mask.runs)) for mask in new.masks]
+        return asdict(annotations.correct(sequence_id, masks, carries_on=new.carry_on))
 
     @router.get("/sequences/{sequence_id}/annotation")
     def show_annotation(sequence_id: ItemId) -> dict[str, Any]:

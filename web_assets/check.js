@@ -9,7 +9,8 @@ const PLAY_MS = 90;
 let playing = null;
 
 function address(view, frame) {
-  const layers = [...frames.querySelectorAll("[name=layer]:checked")].map((box) => box.value).join(",");
+  const isPainted = (layer) => layer === "mask" && frames.classList.contains("is-brushing");
+  const layers = [...frames.querySelectorAll("[name=layer]:checked")].map((box) => box.value).filter((layer) => !isPainted(layer)).join(",");
   const depth = frames.querySelector("[data-depth]")?.checked ? "&depth=true" : "";
   return `/sequences/${frames.dataset.sequence}/views/${view}/frames/${frame}?layers=${layers}${depth}&v=${frames.dataset.version}`;
 }
@@ -46,6 +47,7 @@ function show() {
   frames.querySelector("[data-frame-number]").textContent = `frame ${slider.value} of ${last}`;
   frames.querySelectorAll("figure").forEach(showFigure);
   showPicks();
+  frames.dispatchEvent(new Event("frame-shown"));
   const here = new URL(location.href);
   here.searchParams.set("frame", slider.value);
   history.replaceState(null, "", here);
@@ -84,7 +86,7 @@ if (frames) {
   });
   frames.addEventListener("click", (event) => {
     const figure = event.target.closest("figure");
-    if (!figure) return;
+    if (!figure || frames.classList.contains("is-brushing")) return;
     if (!frames.classList.contains("is-picking")) figure.classList.toggle("is-large");
     else if (event.target.matches("img")) pick(figure, event);
   });
@@ -97,6 +99,12 @@ document.addEventListener("click", (event) => {
   go(Number(button.dataset.go));
   frames.scrollIntoView({ behavior: "smooth", block: "start" });
 });
+
+document.querySelector("[data-cloud]")?.addEventListener("click", ({ target }) => busy(target, async () => {
+  const session = await send("POST", "/api/v1/sessions", { kind: "sequence", id: target.dataset.id });
+  await send("PATCH", `/api/v1/sessions/${session.id}`, { frame: Number(slider.value) });
+  location.href = session.url;
+}));
 
 /* ---- masks and tracks from a click ---- */
 
@@ -157,6 +165,7 @@ function followAnnotation(job, was) {
 
 if (annotation) {
   part("pick").addEventListener("click", () => {
+    if (frames.classList.contains("is-brushing")) part("brush").click();
     const isOn = frames.classList.toggle("is-picking");
     part("pick").setAttribute("aria-pressed", String(isOn));
   });

@@ -18,6 +18,7 @@ from physhandi.data.files import named_fields
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
 from physhandi.fitting.readiness import ABOUT, readiness
+from physhandi.perception.lifting import HAND_LABEL, OBJECT_LABEL
 
 _KEPT = {"Cache-Control": "private, max-age=3600"}
 _AGAIN = {"Cache-Control": "no-store"}
@@ -59,6 +60,7 @@ def add_checks(router: APIRouter, catalog: Catalog, pages: Pages) -> None:
             frame=min(frame, sequence.frame_count - 1) if sequence is not None else 0,
             views=[_described(view) for view in sequence.views] if sequence is not None else [],
             layers=_layers_of(sequence) if sequence is not None else [],
+            labels=_labels_of(sequence) if sequence is not None else [],
             can_annotate=sequence is not None and _can_annotate(item, sequence),
             is_annotated=sequence is not None and len(sequence.missing("mask", "track")) < 2,
             version=_version(item.folder),
@@ -110,6 +112,7 @@ def _described(view: View) -> dict[str, Any]:
         "parts": [name for name, is_there in parts.items() if is_there],
         "lacks": [name for name, is_there in parts.items() if not is_there],
         "can_choose": view.has_color and view.has_depth,
+        "can_correct": view.has_mask,
     }
 
 
@@ -135,6 +138,12 @@ def _layers_of(sequence: Sequence) -> list[tuple[str, str]]:
     titles = {"mask": "Masks", "keypoint": "Keypoints", "track": "Tracks"}
     missing = sequence.missing(*LAYERS)
     return [(layer, titles[layer]) for layer in LAYERS if layer not in missing]
+
+
+def _labels_of(sequence: Sequence) -> list[tuple[int, str]]:
+    """Give what can be painted into masks, by its label."""
+    hands = [(HAND_LABEL[side], f"{side} hand") for side in sequence.hands]
+    return [(OBJECT_LABEL, "object"), *hands, (0, "nothing")]
 
 
 @lru_cache(maxsize=8)

@@ -2,10 +2,12 @@
 
 import dataclasses
 import shutil
+from collections.abc import Mapping
 from collections.abc import Sequence as Many
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -14,6 +16,7 @@ from numpy import ndarray
 
 import physhandi
 from physhandi.data.files import (
+    named_fields,
     sweep_temporary,
     sync_folder,
     temporary_name,
@@ -24,9 +27,10 @@ from physhandi.data.files import (
 from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import FILE
 from physhandi.errors import SequenceError, UsageError
+from physhandi.perception.lifting import HAND_LABEL, OBJECT_LABEL
 from physhandi.perception.mask_model import MaskModel
 from physhandi.perception.point_tracking import track_points
-from physhandi.perception.segmentation import Click, segment
+from physhandi.perception.segmentation import Click, carry_on, segment
 from physhandi.perception.track_model import TrackModel
 from physhandi.progress import NullProgress, Progress
 
@@ -101,6 +105,117 @@ def annotate(
             for part, model in (("masks", finder), ("tracks", tracker))
         }
     progress.check_cancelled()
+    provenance: dict[str, Any] = {**sequence.provenance, "masks": about["masks"]}
+    provenance.pop("tracks", None)
+    if tracks:
+        provenance["tracks"] = about["tracks"]
+    return _store(sequence, masks, tracks, provenance)
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """The right labels of one image."""
+
+    view: str
+    """Name of the view."""
+    frame: int
+    """Number of the frame."""
+    label: UInt8[ndarray, "row column"]
+    """0 background, 1 object, 2 right hand, 3 left hand."""
+
+
+def correct(
+    folder: Path | str,
+    corrections: Many[Correction],
+    progress: Progress | None = None,
+    *,
+    carries_on: bool = False,
+) -> Sequence:
+    """Replace masks of single frames by right ones, and follow the object's points anew.
+
+    ``provenance.masks.corrections`` in ``sequence.yaml`` keeps which frames were corrected. Tracks
+    that were not made here stay.
+
+    Args:
+        folder: Folder of the sequence.
+        corrections: The right masks.
+        progress: Told how far it is; may cancel.
+        carries_on: Whether labels of other frames are found anew from these, forwards and
+            backwards, until the next frame that was corrected or clicked in.
+
+    Raises:
+        UsageError: If a view has no masks to correct, or labels do not fit it.
+        CancelledError: If the user asked to stop; what was there is left.
+    """
+    progress = progress or NullProgress()
+    sequence = Sequence.load(Path(folder))
+    right: dict[str, list[int]] = {}
+    for one in corrections:
+        _check_correction(sequence, one)
+        right.setdefault(one.view, []).append(one.frame)
+    masks = {
+        view.name: np.stack([view.mask(frame) for frame in range(view.frame_count)])
+        for view in sequence.views
+        if view.name in right
+    }
+    for one in corrections:
+        masks[one.view][one.frame] = one.label
+    about = named_fields(sequence.provenance.get("masks")) or {"source": "unknown"}
+    known = [entry for entry in map(named_fields, _listed(about, "corrections")) if entry]
+    if carries_on:
+        clicks = [entry for entry in map(named_fields, _listed(about, "clicks")) if entry]
+        fixed = {
+            view: [int(e["frame"]) for e in (*known, *clicks) if e.get("view") == view]
+            for view in right
+        }
+        fixed = {view: sorted(set(stay) - set(right[view])) for view, stay in fixed.items()}
+        masks = carry_on(sequence, masks, right, fixed, progress)
+    tracks: dict[str, tuple[ndarray, ndarray]] = {}
+    if "tracks" in sequence.provenance and _is_own(sequence, "tracks"):
+        tracks = track_points(sequence, masks, progress)
+    else:
+        for view in sequence.views:
+            if view.track is not None and view.track_visible is not None:
+                tracks[view.name] = np.array(view.track), np.array(view.track_visible)
+    progress.check_cancelled()
+    new = [{"view": one.view, "frame": one.frame, "carried_on": carries_on} for one in corrections]
+    done = {(entry["view"], entry["frame"]) for entry in new}
+    kept = [e for e in known if (e.get("view"), e.get("frame")) not in done]
+    provenance = {**sequence.provenance, "masks": {**about, "corrections": [*kept, *new]}}
+    return _store(sequence, masks, tracks, provenance)
+
+
+def _check_correction(sequence: Sequence, one: Correction) -> None:
+    view = next((view for view in sequence.views if view.name == one.view), None)
+    if view is None or not view.has_mask:
+        raise UsageError(
+            f"View '{one.view}' has no masks that could be corrected. Pick the object first."
+        )
+    if not 0 <= one.frame < view.frame_count:
+        raise UsageError(f"View '{one.view}' has no frame {one.frame}.")
+    size = (view.camera.height, view.camera.width)
+    allowed = {0, OBJECT_LABEL, *(HAND_LABEL[side] for side in sequence.hands)}
+    found = {int(value) for value in np.unique(one.label)}
+    if one.label.shape != size or not found <= allowed:
+        raise UsageError(
+            f"View '{one.view}', frame {one.frame}: a mask has {size[1]}x{size[0]} px of labels "
+            f"{sorted(allowed)}, not {one.label.shape[1]}x{one.label.shape[0]} px of "
+            f"{sorted(found)}."
+        )
+
+
+def _listed(fields: Mapping[str, Any], name: str) -> list[Any]:
+    value = fields.get(name)
+    return cast("list[Any]", value) if isinstance(value, list) else []
+
+
+def _store(
+    sequence: Sequence,
+    masks: Mapping[str, UInt8[ndarray, "frame row column"]],
+    tracks: Mapping[str, tuple[ndarray, ndarray]],
+    provenance: dict[str, Any],
+) -> Sequence:
+    """Give views their new masks and tracks, one after the other, and say where they come from."""
     for view in sequence.views:
         sweep_temporary(view.folder.glob(".*.tmp"))
         if view.name not in masks:
@@ -111,13 +226,14 @@ def annotate(
             _put_in_place(made, view.folder)
         finally:
             shutil.rmtree(made, ignore_errors=True)
-    provenance: dict[str, Any] = {**sequence.provenance, "masks": about["masks"]}
-    provenance.pop("tracks", None)
-    if tracks:
-        provenance["tracks"] = about["tracks"]
     meta = dataclasses.replace(sequence.meta, provenance=provenance)
     write_yaml(sequence.folder / FILE, meta.to_dict())
     return Sequence.load(sequence.folder)
+
+
+def _is_own(sequence: Sequence, part: str) -> bool:
+    about: Any = sequence.provenance.get(part)
+    return isinstance(about, dict) and (about.get("source") == BUILT_IN or _HASH in about)
 
 
 def _check_own(sequence: Sequence) -> None:
@@ -125,9 +241,7 @@ def _check_own(sequence: Sequence) -> None:
         ("masks", any(view.has_mask for view in sequence.views)),
         ("tracks", any(view.track is not None for view in sequence.views)),
     ):
-        about: Any = sequence.provenance.get(part)
-        is_own = isinstance(about, dict) and (about.get("source") == BUILT_IN or _HASH in about)
-        if there and not is_own:
+        if there and not _is_own(sequence, part):
             raise UsageError(
                 f"Sequence '{sequence.name}' has {part} that were not made here. Allow overwriting "
                 "to replace them, or annotate a copy."

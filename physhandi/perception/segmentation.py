@@ -12,7 +12,7 @@ same places, and does the rest.
 
 import dataclasses
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from collections.abc import Sequence as Many
 from dataclasses import dataclass
 from typing import Any
@@ -222,6 +222,59 @@ def segment(
         else seen.label
         for seen, whole in zip(found, colored, strict=True)
     }
+
+
+def carry_on(
+    sequence: Sequence,
+    masks: Mapping[str, UInt8[ndarray, "frame row column"]],
+    right: Mapping[str, Many[int]],
+    fixed: Mapping[str, Many[int]],
+    progress: Progress | None = None,
+) -> dict[str, UInt8[ndarray, "frame row column"]]:
+    """Follow the labels of frames that are right, forwards and backwards.
+
+    Args:
+        sequence: Recording.
+        masks: Labels of views with color.
+        right: By view, frames to follow from; each goes as far as the next one that is fixed, and
+            halfway to the next one of these.
+        fixed: By view, further frames that stay as they are.
+        progress: Told after every frame; may cancel.
+
+    Returns:
+        The labels of the views that `right` names.
+
+    Raises:
+        CancelledError: If the user asked to stop.
+    """
+    progress = progress or NullProgress()
+    views = [view for view in sequence.views if view.name in right]
+    result: dict[str, ndarray] = {}
+    for number, view in enumerate(views):
+        seen = _Seen(view, sequence, _keypoints(view, sequence, progress))
+        seen.label[:] = masks[view.name]
+        count, starts = view.frame_count, sorted(set(right[view.name]))
+        ends = [(start, 0) for start in starts] + [(f, 1) for f in fixed.get(view.name, ())]
+        for start in starts:
+            below = max((end for end in ends if end[0] < start), default=(-1, 1))
+            above = min((end for end in ends if end[0] > start), default=(count, 1))
+            low = below[0] + 1 if below[1] else (below[0] + start) // 2 + 1
+            high = above[0] if above[1] else (start + above[0]) // 2 + 1
+            image = _Image(view, start)
+            seen.find_support(image.depth)
+            for way in (range(start + 1, high), range(start - 1, low - 1, -1)):
+                _learn_given(seen, image, seen.label[start])
+                before, label = image, seen.label[start]
+                for now in _images(view, way):
+                    progress.check_cancelled()
+                    label = seen.label[now.frame] = _advance(seen, before, label, now)
+                    before = now
+                    message = f"View {view.name}"
+                    done, total = number * count + now.frame + 1, len(views) * count
+                    progress.report(SEGMENTATION_STAGE, done, total, None, message)
+        view.close()
+        result[view.name] = seen.label
+    return result
 
 
 def _told(click: Click) -> str:
@@ -895,13 +948,33 @@ def _begin(
             farness = _farness(seen, patch, kept)
         for value, (core, _) in hands.items():
             seen.things[value].replace(patch.code[core & (label == value)])
-        free = cv2.dilate(label, np.ones((3, 3), np.uint8)) == 0
-        seen.background.replace(np.concatenate([code[free] for code in shadowed]))
-        known = free & np.isfinite(patch.height)
-        if known.sum() > 200:
-            off = np.abs(patch.height[known]) > 5 * seen.noise
-            seen.clutter = float(np.clip(off.mean(), 0.003, 0.3))
+        _learn_background(seen, patch, shadowed, label)
     return _outlined(patch, label)
+
+
+def _learn_given(seen: _Seen, image: _Image, label: UInt8[ndarray, "row column"]) -> None:
+    """Learn from a frame whose labels are right how everything looks."""
+    patch = _Patch(seen, image, seen.whole)
+    shadowed = [_code(patch.lab, share) for share in _SHADOWS]
+    _learn_object(seen.things[OBJECT_LABEL], shadowed, label == OBJECT_LABEL)
+    for value in HAND_LABEL.values():
+        seen.things[value].replace(patch.code[label == value])
+    _learn_background(seen, patch, shadowed, label)
+
+
+def _learn_background(
+    seen: _Seen,
+    patch: _Patch,
+    shadowed: list[Int[ndarray, "row column"]],
+    label: UInt8[ndarray, "row column"],
+) -> None:
+    """Learn the colors of what is neither object nor hand, and how much of it is not support."""
+    free = cv2.dilate(label, np.ones((3, 3), np.uint8)) == 0
+    seen.background.replace(np.concatenate([code[free] for code in shadowed]))
+    known = free & np.isfinite(patch.height)
+    if known.sum() > 200:
+        off = np.abs(patch.height[known]) > 5 * seen.noise
+        seen.clutter = float(np.clip(off.mean(), 0.003, 0.3))
 
 
 def _learn_object(

@@ -1,10 +1,12 @@
 """Masks and tracks from clicks in the browser: started, followed, cancelled, and really found."""
 
+import shutil
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from clicked_disc import disc_click, write_disc
 from server_world import ORIGIN, TOKEN, World, make_world
@@ -160,6 +162,46 @@ def stopped(world: World) -> str:
     run = world.scheduler.launch(["sheet"], "quick")
     world.scheduler.cancel(run.id)
     return run.id
+
+
+def test_a_painted_mask_replaces_that_of_its_frame(world: World) -> None:
+    client = world.script()
+    folder = world.settings.sequence_dir / "disc"
+    shutil.rmtree(folder)
+    _, true = write_disc(folder, masks=True, frames=3)
+    address = "/api/v1/sequences/disc/views/top/frames/1/mask"
+    runs = client.get(address).json()["runs"]
+    label = np.repeat(runs[::2], runs[1::2])
+    assert np.array_equal(label, true["top"][1].reshape(-1))
+    assert client.get(address.replace("frames/1", "frames/3")).status_code == 404
+    assert client.get(address.replace("top", "left")).status_code == 404
+    page = world.browser().get("/sequences/disc/check").text
+    assert 'id="brush"' in page
+    assert "data-masked" in page
+    mask: dict[str, Any] = {"view": "top", "frame": 1, "runs": [0, 100, 1, label.size - 100]}
+    place = "/api/v1/sequences/disc/correction"
+    refused = [
+        {"runs": [0, label.size - 1]},
+        {"runs": [0, label.size, 1]},
+        {"runs": [4, label.size]},
+        {"runs": [0, -1, 0, label.size + 1]},
+        {"frame": 3},
+        {"view": "left"},
+    ]
+    for wrong in refused:
+        assert post(client, place, masks=[mask | wrong]).status_code == 422
+    assert post(client, place, masks=[]).status_code == 422
+    bundled = place.replace("disc", "towel_fold")
+    assert "came with the program" in post(client, bundled, masks=[mask]).json()["error"]["message"]
+    assert post(client, place, masks=[mask]).status_code == 202
+    job = until(lambda: (j := client.get(ADDRESS).json())["state"] != "running" and j)
+    assert (job["state"], job["reason"]) == ("done", "")
+    found = Sequence.load(folder)
+    painted = next(view for view in found.views if view.name == "top").mask(1).reshape(-1)
+    assert not painted[:100].any()
+    assert (painted[100:] == 1).all()
+    kept = next(view for view in found.views if view.name == "top").mask(0)
+    assert np.array_equal(kept, true["top"][0])
 
 
 def test_orders_that_make_no_sense_are_refused(world: World) -> None:

@@ -6,7 +6,9 @@ import time
 from pathlib import Path
 
 import pytest
+from clicked_disc import write_disc
 from playwright.sync_api import Page, expect
+from raw_capture import RawCapture
 from scene_page import TIMEOUT_MS
 
 pytestmark = pytest.mark.e2e
@@ -144,3 +146,33 @@ def test_a_recording_is_checked_frame_by_frame(home: Page, base: str) -> None:
     assert front.locator("img").evaluate("image => image.naturalWidth") > 300
     home.get_by_role("button", name="Launch fit").click()
     expect(home.locator("[data-readiness]")).to_contain_text("All stages will run.")
+
+
+def test_a_recording_is_imported_and_its_masks_are_painted(home: Page, base: str, served) -> None:
+    RawCapture(served.data_dir / "captures/ball").write()
+    write_disc(served.data_dir / "sequences/disc", masks=True, frames=2)
+    home.get_by_role("button", name="Import a recording").click()
+    home.get_by_role("link", name="ball").click()
+    expect(home.locator("#survey")).to_contain_text("2 cameras, 6 frames")
+    home.get_by_role("button", name="Import", exact=True).click()
+    expect(home).to_have_url(f"{base}/sequences/ball/check?frame=0")
+    home.goto(f"{base}/sequences/disc/check")
+    home.get_by_role("button", name="Correct masks").click()
+    canvas = home.locator("[data-view=top] canvas")
+    expect(canvas).to_be_visible()
+
+    def label() -> list[int]:
+        """Color of the mask in the image's corner, which the stroke begins in."""
+        return canvas.evaluate("c => [...c.getContext('2d').getImageData(2, 2, 1, 1).data]")
+
+    assert label() == [0, 0, 0, 0]
+    canvas.drag_to(canvas, source_position={"x": 6, "y": 6}, target_position={"x": 60, "y": 6})
+    assert label() == [74, 155, 232, 255]
+    expect(home.get_by_role("button", name="Save the mask")).to_be_enabled()
+    home.keyboard.press("0")
+    canvas.drag_to(canvas, source_position={"x": 6, "y": 6}, target_position={"x": 60, "y": 6})
+    assert label() == [0, 0, 0, 0]
+    home.keyboard.press("Control+z")
+    assert label() == [74, 155, 232, 255]
+    home.keyboard.press("Control+z")
+    expect(home.get_by_role("button", name="Save the mask")).to_be_disabled()

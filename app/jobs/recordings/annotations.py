@@ -3,7 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
-from app.jobs.catalog import Catalog, SequenceItem
+import numpy as np
+
+from app.jobs.catalog import Catalog, NotFoundError, SequenceItem
 from app.jobs.recordings.background import BackgroundTask, BackgroundTasks, Work
 from app.jobs.scheduler import require_unread
 from physhandi.errors import UsageError
@@ -23,6 +25,18 @@ class ClickedPlace:
     """Column [px]."""
     y: float
     """Row [px]."""
+
+
+@dataclass(frozen=True)
+class PaintedMask:
+    """A mask that somebody painted."""
+
+    view: str
+    """View."""
+    frame: int
+    """Frame."""
+    runs: tuple[int, ...]
+    """Labels row by row, each with the number of pixels that have it: ``label, count, …``."""
 
 
 class Annotations:
@@ -68,6 +82,58 @@ class Annotations:
             "annotation", sequence_id, f"Masks and tracks of '{sequence_id}' are being found."
         )
         return self.tasks.start(work, self._worker, order)
+
+    def correct(
+        self, sequence_id: str, masks: Sequence[PaintedMask], *, carries_on: bool
+    ) -> BackgroundTask:
+        """Begin to replace masks of single frames, and to follow the object's points anew.
+
+        Args:
+            sequence_id: The recording.
+            masks: The right masks.
+            carries_on: Whether other frames are found anew from these.
+
+        Raises:
+            SequenceError: If there is no such recording, or it is damaged.
+            UsageError: If it came with the program, or a mask does not fit its view.
+            RunError: If something is worked on already, or a fit reads this one.
+        """
+        self._require_own(sequence_id)
+        sequence = self._catalog.sequence(sequence_id)
+        widths = {view.name: view.camera.width for view in sequence.views}
+        sizes = {view.name: view.camera.width * view.camera.height for view in sequence.views}
+        for mask in masks:
+            is_known = mask.view in sizes and 0 <= mask.frame < sequence.frame_count
+            if not is_known or sum(mask.runs[1::2]) != sizes[mask.view] or len(mask.runs) % 2:
+                raise UsageError(
+                    f"The mask of view '{mask.view}', frame {mask.frame}, does not fit recording "
+                    f"'{sequence_id}', which may have changed. Load the page again."
+                )
+        require_unread(self._catalog, sequence.folder)
+        order = {
+            "folder": str(sequence.folder),
+            "masks": [asdict(mask) | {"width": widths[mask.view]} for mask in masks],
+            "carries_on": carries_on,
+        }
+        work = Work("annotation", sequence_id, f"Masks of '{sequence_id}' are being corrected.")
+        return self.tasks.start(work, self._worker, order)
+
+    def painted(self, sequence_id: str, view_name: str, frame: int) -> PaintedMask:
+        """Give a stored mask for painting.
+
+        Raises:
+            SequenceError: If there is no such recording, or it is damaged.
+            NotFoundError: If it has no such view or frame, or no masks in it.
+        """
+        sequence = self._catalog.sequence(sequence_id)
+        view = next((view for view in sequence.views if view.name == view_name), None)
+        if view is None or not view.has_mask or not 0 <= frame < view.frame_count:
+            raise NotFoundError(f"View '{view_name}' has no mask of frame {frame}.")
+        label = view.mask(frame).reshape(-1)
+        start = np.concatenate([[0], np.flatnonzero(np.diff(label)) + 1])
+        count = np.diff(np.append(start, label.size))
+        runs = np.stack([label[start], count], axis=1).reshape(-1)
+        return PaintedMask(view_name, frame, tuple(runs.tolist()))
 
     def job(self, sequence_id: str) -> BackgroundTask:
         """Tell how far a recording is; of one that nobody asked for, that there is nothing.

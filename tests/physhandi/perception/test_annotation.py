@@ -1,6 +1,7 @@
 import hashlib
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from clicked_disc import FRAMES, disc_click, write_disc
@@ -8,7 +9,7 @@ from clicked_disc import FRAMES, disc_click, write_disc
 import physhandi
 from physhandi.data.sequence import Sequence
 from physhandi.errors import CancelledError, UsageError
-from physhandi.perception.annotation import annotate
+from physhandi.perception.annotation import Correction, annotate, correct
 from physhandi.perception.lifting import observe_object
 from physhandi.perception.segmentation import Click
 from physhandi.progress import Progress
@@ -84,3 +85,65 @@ def test_a_cancelled_or_refused_annotation_leaves_what_was_there(tmp_path):
         annotate(sequence.folder, [])
     assert content(sequence.folder) == before
     assert Sequence.load(sequence.folder).provenance == {}
+
+
+def overlap(found: np.ndarray, true: np.ndarray) -> float:
+    """Intersection over union of the object."""
+    a, b = found == 1, true == 1
+    return float((a & b).sum() / (a | b).sum())
+
+
+def labels(sequence: Sequence, view: str = "top") -> np.ndarray:
+    one = next(one for one in sequence.views if one.name == view)
+    return np.stack([one.mask(frame) for frame in range(one.frame_count)])
+
+
+def test_a_corrected_mask_stands_alone_or_is_carried_on_until_the_next_one(tmp_path):
+    sequence, true = write_disc(tmp_path / "disc", hand=True, masks=True)
+    wrong = np.zeros_like(true["top"])
+    for frame in range(FRAMES):
+        path = sequence.folder / f"views/top/mask/{frame:05d}.png"
+        path.write_bytes(cv2.imencode(".png", wrong[frame])[1].tobytes())
+    done = correct(sequence.folder, [Correction("top", 2, true["top"][2])])
+    assert np.array_equal(labels(done)[2], true["top"][2])
+    assert not labels(done)[np.arange(FRAMES) != 2].any()
+    assert np.array_equal(labels(done, "side"), true["side"])
+    assert done.provenance["masks"] == {
+        "source": "unknown",
+        "corrections": [{"view": "top", "frame": 2, "carried_on": False}],
+    }
+    assert "tracks" not in done.provenance
+    done = correct(sequence.folder, [Correction("top", 5, true["top"][5])], carries_on=True)
+    found = labels(done)
+    done.validate()
+    assert np.array_equal(found[5], true["top"][5])
+    assert not found[:2].any()  # Frame 2 was corrected before: what lies behind it stays.
+    assert np.array_equal(found[2], true["top"][2])
+    assert min(overlap(found[frame], true["top"][frame]) for frame in range(2, FRAMES)) > 0.85
+    assert ((found[FRAMES - 1] == 2) & (true["top"][FRAMES - 1] == 2)).sum() > 50
+    assert [entry["frame"] for entry in done.provenance["masks"]["corrections"]] == [2, 5]
+    again = correct(sequence.folder, [Correction("top", 5, true["top"][5])])
+    assert again.provenance["masks"]["corrections"][1]["carried_on"] is False
+
+
+def test_tracks_that_were_made_here_follow_the_corrected_mask(tmp_path):
+    sequence, _ = write_disc(tmp_path / "disc", frames=6)
+    done = annotate(sequence.folder, [Click(*disc_click())])
+    side = np.load(sequence.folder / "views/side/track.npy")
+    nothing = np.zeros_like(labels(done)[3])
+    done = correct(sequence.folder, [Correction("top", 3, nothing)])
+    top = next(view for view in done.views if view.name == "top")
+    assert top.track_visible is not None
+    assert not top.track_visible[3].any()
+    assert top.track_visible[2].any()
+    kept = np.load(sequence.folder / "views/side/track.npy")
+    assert np.array_equal(kept, side, equal_nan=True)
+    assert done.provenance["masks"]["clicks"] == done.provenance["tracks"]["clicks"]
+    with pytest.raises(UsageError, match="no masks that could be corrected"):
+        correct(sequence.folder, [Correction("left", 0, nothing)])
+    with pytest.raises(UsageError, match="no frame 6"):
+        correct(sequence.folder, [Correction("top", 6, nothing)])
+    with pytest.raises(UsageError, match=r"labels \[0, 1\], not 120x96 px of \[2\]"):
+        correct(sequence.folder, [Correction("top", 0, nothing + 2)])
+    with pytest.raises(UsageError, match="not 119x96 px"):
+        correct(sequence.folder, [Correction("top", 0, nothing[:, 1:])])
