@@ -124,7 +124,7 @@ class Correction:
     """0 background, 1 object, 2 right hand, 3 left hand."""
 
 
-def correct(
+def correct_masks(
     folder: Path | str,
     corrections: Many[Correction],
     progress: Progress | None = None,

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from app.jobs.recordings.ordered import work_on_order
-from physhandi.perception.annotation import Correction, annotate, correct
+from physhandi.perception.annotation import Correction, annotate, correct_masks
 from physhandi.perception.segmentation import Click
 from physhandi.progress import Progress
 
@@ -14,7 +14,7 @@ def annotate_order(order: dict[str, Any], progress: Progress) -> dict[str, Any]:
     """Annotate the sequence that the order names, or correct its masks."""
     if "masks" in order:
         corrections = [_correction(**mask) for mask in order["masks"]]
-        correct(order["folder"], corrections, progress, carries_on=order["carries_on"])
+        correct_masks(order["folder"], corrections, progress, carries_on=order["carries_on"])
         return {}
     clicks = [Click(**click) for click in order["clicks"]]
     annotate(order["folder"], clicks, progress, overwrite=order["overwrite"])

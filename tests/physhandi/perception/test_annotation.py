@@ -9,7 +9,7 @@ from clicked_disc import FRAMES, disc_click, write_disc
 import physhandi
 from physhandi.data.sequence import Sequence
 from physhandi.errors import CancelledError, UsageError
-from physhandi.perception.annotation import Correction, annotate, correct
+from physhandi.perception.annotation import Correction, annotate, correct_masks
 from physhandi.perception.lifting import observe_object
 from physhandi.perception.segmentation import Click
 from physhandi.progress import Progress
@@ -104,7 +104,7 @@ def test_a_corrected_mask_stands_alone_or_is_carried_on_until_the_next_one(tmp_p
     for frame in range(FRAMES):
         path = sequence.folder / f"views/top/mask/{frame:05d}.png"
         path.write_bytes(cv2.imencode(".png", wrong[frame])[1].tobytes())
-    done = correct(sequence.folder, [Correction("top", 2, true["top"][2])])
+    done = correct_masks(sequence.folder, [Correction("top", 2, true["top"][2])])
     assert np.array_equal(labels(done)[2], true["top"][2])
     assert not labels(done)[np.arange(FRAMES) != 2].any()
     assert np.array_equal(labels(done, "side"), true["side"])
@@ -113,7 +113,7 @@ def test_a_corrected_mask_stands_alone_or_is_carried_on_until_the_next_one(tmp_p
         "corrections": [{"view": "top", "frame": 2, "carried_on": False}],
     }
     assert "tracks" not in done.provenance
-    done = correct(sequence.folder, [Correction("top", 5, true["top"][5])], carries_on=True)
+    done = correct_masks(sequence.folder, [Correction("top", 5, true["top"][5])], carries_on=True)
     found = labels(done)
     done.validate()
     assert np.array_equal(found[5], true["top"][5])
@@ -122,7 +122,7 @@ def test_a_corrected_mask_stands_alone_or_is_carried_on_until_the_next_one(tmp_p
     assert min(overlap(found[frame], true["top"][frame]) for frame in range(2, FRAMES)) > 0.85
     assert ((found[FRAMES - 1] == 2) & (true["top"][FRAMES - 1] == 2)).sum() > 50
     assert [entry["frame"] for entry in done.provenance["masks"]["corrections"]] == [2, 5]
-    again = correct(sequence.folder, [Correction("top", 5, true["top"][5])])
+    again = correct_masks(sequence.folder, [Correction("top", 5, true["top"][5])])
     assert again.provenance["masks"]["corrections"][1]["carried_on"] is False
 
 
@@ -131,7 +131,7 @@ def test_tracks_that_were_made_here_follow_the_corrected_mask(tmp_path):
     done = annotate(sequence.folder, [Click(*disc_click())])
     side = np.load(sequence.folder / "views/side/track.npy")
     nothing = np.zeros_like(labels(done)[3])
-    done = correct(sequence.folder, [Correction("top", 3, nothing)])
+    done = correct_masks(sequence.folder, [Correction("top", 3, nothing)])
     top = next(view for view in done.views if view.name == "top")
     assert top.track_visible is not None
     assert not top.track_visible[3].any()
@@ -140,10 +140,10 @@ def test_tracks_that_were_made_here_follow_the_corrected_mask(tmp_path):
     assert np.array_equal(kept, side, equal_nan=True)
     assert done.provenance["masks"]["clicks"] == done.provenance["tracks"]["clicks"]
     with pytest.raises(UsageError, match="no masks that could be corrected"):
-        correct(sequence.folder, [Correction("left", 0, nothing)])
+        correct_masks(sequence.folder, [Correction("left", 0, nothing)])
     with pytest.raises(UsageError, match="no frame 6"):
-        correct(sequence.folder, [Correction("top", 6, nothing)])
+        correct_masks(sequence.folder, [Correction("top", 6, nothing)])
     with pytest.raises(UsageError, match=r"labels \[0, 1\], not 120x96 px of \[2\]"):
-        correct(sequence.folder, [Correction("top", 0, nothing + 2)])
+        correct_masks(sequence.folder, [Correction("top", 0, nothing + 2)])
     with pytest.raises(UsageError, match="not 119x96 px"):
-        correct(sequence.folder, [Correction("top", 0, nothing[:, 1:])])
+        correct_masks(sequence.folder, [Correction("top", 0, nothing[:, 1:])])
