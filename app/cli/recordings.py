@@ -434,7 +434,8 @@ def import_capture(
 
     Args:
         source: Folder with a folder for each camera (color/, depth/, intrinsics.json), such a
-            folder itself, what PhysTwin's recorder writes, or ROS or RealSense bags.
+            folder itself, what PhysTwin's recorder writes, ROS or RealSense bags, or Record3D's
+            .r3d.
         out: Sequence folder to write.
         example: Write a small raw capture into this folder, to try the import on; nothing else is
             given then.

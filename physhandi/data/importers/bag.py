@@ -1,4 +1,4 @@
-"""Unpacks ROS 1 and ROS 2 bags, RealSense's among them, to what a recorder writes into folders."""
+"""Unpacks recordings in one file to folders: bags of ROS 1, ROS 2 and RealSense, and Record3D's."""
 
 import json
 import logging
@@ -20,6 +20,7 @@ from physhandi.child import Channel, Child, ChildEndedError, run_child
 from physhandi.data.foreign import limit_data
 from physhandi.data.image_header import MOST_PIXELS
 from physhandi.data.importers.phystwin_files import fail
+from physhandi.data.importers.record3d import RECORD3D_SUFFIX, unpack_record3d
 from physhandi.data.importers.recorded_view import CALIBRATION
 from physhandi.errors import UsageError
 from physhandi.progress import Progress
@@ -27,8 +28,8 @@ from physhandi.progress import Progress
 logger = logging.getLogger(__name__)
 
 _STAGE = "unpack"
-BAG_SUFFIXES = frozenset({".bag", ".db3", ".mcap"})
-"""Endings of bags that are files."""
+BAG_SUFFIXES = frozenset({".bag", ".db3", ".mcap", RECORD3D_SUFFIX})
+"""Endings of recordings that are one file, and are unpacked."""
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _INFO, _TRANSFORM = "sensor_msgs/msg/CameraInfo", "geometry_msgs/msg/Transform"
 _DEPTH_UNITS = "/option/Depth Units/value"
@@ -91,9 +92,10 @@ def unpack_bags(source: Path, bags: list[Path], folder: Path, progress: Progress
         ImportFailedError: If a bag is broken or holds no images; names the bag and the topic.
         UsageError: If the package that reads bags is not installed.
     """
-    if find_spec("rosbags") is None:
+    ros = [bag for bag in bags if bag.suffix.lower() != RECORD3D_SUFFIX]
+    if ros and find_spec("rosbags") is None:
         raise UsageError(
-            f"Reading {bags[0].name} needs the package rosbags, which is not installed: pip "
+            f"Reading {ros[0].name} needs the package rosbags, which is not installed: pip "
             "install 'physhandi[capture]'."
         )
     folder.mkdir()
@@ -145,7 +147,10 @@ def _work(channel: Channel) -> None:
     bag, folder, prefix = channel.arguments
     limit_data(_MEMORY)
     try:
-        _unpack(Path(bag), Path(folder), prefix, _Told(channel))
+        if Path(bag).suffix.lower() == RECORD3D_SUFFIX:
+            unpack_record3d(Path(bag), Path(folder) / (prefix or "view0"), _Told(channel))
+        else:
+            _unpack(Path(bag), Path(folder), prefix, _Told(channel))
     except MemoryError:
         fail(Path(bag), f"needs more memory than is allowed ({_MEMORY >> 20} MiB)")
 

@@ -151,8 +151,8 @@ def import_capture(
 
     Args:
         source_folder: One folder for each camera with ``color/``, ``depth/`` and intrinsics; or
-            such a folder; or what PhysTwin's recorder writes; or ROS or RealSense bags
-            (docs/your-data.md).
+            such a folder; or what PhysTwin's recorder writes; or ROS or RealSense bags, or
+            Record3D's ``.r3d`` (docs/your-data.md).
         out_folder: Folder of the new sequence; its last part names the sequence.
         progress: Receives a report after every image; may cancel. The same call then goes on where
             it was stopped, or killed, unless the recording or an option was changed.

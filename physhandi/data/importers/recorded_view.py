@@ -104,7 +104,7 @@ def find_views(source: Path, intrinsics: Path | None = None) -> list[RecordedVie
     if not source.is_dir():
         raise ImportFailedError(
             f"{source} is not a folder. Give the folder of a recording (one folder for each "
-            "camera, with color and depth in it), or a bag (.bag, .db3, .mcap)."
+            "camera, with color and depth in it), a bag (.bag, .db3, .mcap) or .r3d."
         )
     if (source / "metadata.json").is_file() and _numbered(source / "color"):
         return _phystwin_views(source)
