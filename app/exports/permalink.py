@@ -11,6 +11,7 @@
 ``color`` …         every choice of `Layers`, by its own name
 ``range``           values at the ends of the color scale, in SI units
 ``scale``           length of the force arrows
+``mass``            what the object weighs [kg], if somebody said so on the screen
 ``from``            view whose image is the backdrop
 ``theme``           ``light`` or ``dark``
 ``fig``             1 for the figure that compares with PhysTwin
@@ -28,6 +29,7 @@ import numpy as np
 
 from app.viewer.content.layers import THEMES, Layers
 from app.viewer.content.session_state import Pose, SessionState
+from physhandi.data.sequence_meta import HEAVIEST, LIGHTEST
 from physhandi.errors import UsageError
 from physhandi.simulation.parameters import AUTOMATIC, PARAMETERS, SimulationParameters
 
@@ -40,8 +42,9 @@ _SCALES, _SPEEDS, _FOVS = (0.1, 5.0), (0.1, 2.0), (1.0, 170.0)
 _UP = (0.0, 0.0, 1.0)
 _KEYS = (
     *("f", "sequence", "cam", "up", "fov", "show", "range", "scale", "from"),
-    *("theme", "fig", "play", "speed", "loop"),
+    *("theme", "fig", "play", "speed", "loop", "mass"),
 )
+_NUMBERS = {"scale": ("force_scale", _SCALES), "mass": ("mass", (LIGHTEST, HEAVIEST))}
 _LAYER_TYPES: dict[str, Any] = get_type_hints(Layers)
 _SWITCHES = tuple(name for name, kind in _LAYER_TYPES.items() if kind is bool and name != "dark")
 _CHOICES: dict[str, tuple[str, ...]] = {
@@ -146,6 +149,8 @@ def _layers_to_query(layers: Mapping[str, Any]) -> dict[str, str]:
         query["range"] = _numbers(layers["color_range"])
     if layers.get("looks_from"):
         query["from"] = str(layers["looks_from"])
+    if layers.get("mass"):
+        query["mass"] = _number(layers["mass"])
     return query
 
 
@@ -166,8 +171,11 @@ def _layers_from_query(query: Mapping[str, str]) -> dict[str, Any]:
                     f"{name}: {query[name][:40]!r} is not one of {', '.join(choices)}."
                 )
             layers[name] = query[name]
-    if "scale" in query:
-        layers["force_scale"] = _real(query, "scale", _SCALES, 1.0)
+    layers |= {
+        field: _real(query, name, ends, 1.0)
+        for name, (field, ends) in _NUMBERS.items()
+        if name in query
+    }
     ends = _reals(query, "range", 2)
     if ends is not None:
         if ends[0] >= ends[1]:

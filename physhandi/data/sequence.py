@@ -431,6 +431,11 @@ class Sequence:
         return self.meta.shape
 
     @property
+    def mass(self) -> float | None:
+        """What the object weighs [kg]; None if nobody weighed it."""
+        return self.meta.mass
+
+    @property
     def provenance(self) -> Mapping[str, Any]:
         """Where the recording comes from."""
         return self.meta.provenance
@@ -541,7 +546,7 @@ class Sequence:
         """Compute a SHA-256 over what was recorded, whatever the sequence is called.
 
         It covers what `fingerprint` covers, but of ``sequence.yaml`` only what describes the
-        recording: not name, description, label, provenance, split and shape.
+        recording: not name, description, label, provenance, split, shape and mass.
         """
         return self._content_fingerprint
 
@@ -552,7 +557,7 @@ class Sequence:
     @cached_property
     def _content_fingerprint(self) -> str:
         fields = self.meta.to_dict()
-        for name in ("name", "description", "label", "provenance", "split", "shape"):
+        for name in ("name", "description", "label", "provenance", "split", "shape", "mass"):
             fields.pop(name, None)
         text = json.dumps(fields, sort_keys=True) + self._digest(leaves_out=frozenset({FILE}))
         return hashlib.sha256(text.encode()).hexdigest()

@@ -23,6 +23,10 @@ SIDES: tuple[Side, Side] = ("right", "left")
 """Hands in the order in which sequences list them."""
 ShapeClass = Literal["sheet", "solid", "shell", "rope"]
 """Kinds of object: a layer, a filled body, a hollow one, or a long thin one."""
+DIMENSION: dict[ShapeClass, int] = {"rope": 1, "sheet": 2, "shell": 2, "solid": 3}
+"""Whether nodes fill a line, a surface or a body."""
+LIGHTEST, HEAVIEST = 1e-6, 1e4
+"""Ends of what an object may weigh [kg]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,6 +75,8 @@ class SequenceMeta:
     """Free label of the user."""
     shape: ShapeClass | None = None
     """Kind of object; None if that is to be found from what the first frame shows."""
+    mass: float | None = None
+    """What the object weighs [kg]; None if nobody weighed it."""
 
     @property
     def reconstruction_count(self) -> int:
@@ -99,6 +105,7 @@ class SequenceMeta:
             "views": [{"name": v.name, "camera": v.camera.to_dict()} for v in self.views],
             "provenance": dict(self.provenance),
             **({} if self.shape is None else {"shape": self.shape}),
+            **({} if self.mass is None else {"mass": self.mass}),
         }
 
 
@@ -164,6 +171,7 @@ def parse_meta(content: Any, where: str) -> SequenceMeta:
         provenance=fields.take("provenance", dict, {}),
         label=fields.take("label", str, ""),
         shape=cast("ShapeClass | None", fields.optional_choice("shape", get_args(ShapeClass))),
+        mass=_mass(fields),
     )
     fields.finish()
     return meta
@@ -176,6 +184,13 @@ def _hands(fields: "_Fields") -> tuple[Side, ...]:
             fields.fail("hands", side, "each of 'right' and 'left' at most once")
         sides.append(side)
     return tuple(sides)
+
+
+def _mass(fields: "_Fields") -> float | None:
+    mass = fields.optional_number("mass")
+    if mass is not None and not LIGHTEST <= mass <= HEAVIEST:
+        fields.fail("mass", mass, f"the object's mass in kilograms, {LIGHTEST:g} to {HEAVIEST:g}")
+    return mass
 
 
 def _markers(fields: "_Fields") -> tuple[int, ...]:

@@ -57,6 +57,7 @@ def save_sequence_meta(output: Attempt, sequence: Sequence) -> None:
             "hands": list(sequence.hands),
             "reconstruction_frames": len(sequence.reconstruction_frames),
             "fingerprint": sequence.content_fingerprint(),
+            **({} if sequence.mass is None else {"mass": sequence.mass}),
         },
     )
 

@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from physhandi.data.observation import ObjectObservation
 from physhandi.data.sequence import Sequence
-from physhandi.data.sequence_meta import ShapeClass
+from physhandi.data.sequence_meta import DIMENSION, ShapeClass
 from physhandi.errors import FitError, MissingInputError
 from physhandi.perception.node_sampling import (
     flat_sheet_nodes,
@@ -41,7 +41,6 @@ _GROUND_HEIGHT = 0.006
 """Most that a point beside an object may be above the ground to belong to the ground [m]."""
 _GROUND_SHARE = 0.25
 """The same, as a share of the object's thickness."""
-_DIMENSION: dict[ShapeClass, int] = {"rope": 1, "sheet": 2, "shell": 2, "solid": 3}
 _FEW = 0.01
 """Share of removed points that is not worth a warning, if they are near."""
 _FAR = 0.05
@@ -164,7 +163,7 @@ def shape_of_observation(
             mesh=sequence.mesh,
         )
     if most_nodes is not None and len(shape.node) > most_nodes:
-        factor = (len(shape.node) / most_nodes) ** (1.0 / _DIMENSION[shape.kind])
+        factor = (len(shape.node) / most_nodes) ** (1.0 / DIMENSION[shape.kind])
         fits = _SPACING_STEP * np.ceil(1.02 * spacing * factor / _SPACING_STEP)
         raise FitError(
             f"{where}The object would get {len(shape.node)} nodes as a {shape.kind} at a "

@@ -16,6 +16,9 @@ from app.viewer.ui.followed import FollowedChoice
 from app.viewer.ui.guard import Guard
 from app.viewer.ui.keyboard import bind
 
+_LIGHTEST, _HEAVIEST = 1e-3, 1e7
+"""Ends of what an object may weigh [g]."""
+
 
 class ColorPanel:
     """A choice, a legend and a range that follows the sequence or is held."""
@@ -41,7 +44,6 @@ class ColorPanel:
         self._color_instead = color_instead
         self._layers = Layers()
         self._painter: Painter | HandPainter | None = None
-        self._is_metric = True
         self._written = ""
         self._turn = threading.Lock()
         gui = server.gui
@@ -60,6 +62,19 @@ class ColorPanel:
                 ),
                 guard,
             )
+            self._mass = FollowedChoice(
+                gui.add_number(
+                    "Mass [g]",
+                    1.0,
+                    min=_LIGHTEST,
+                    max=_HEAVIEST,
+                    step=_LIGHTEST,
+                    hint="What the object weighs. Forces, stiffness and damping are written for "
+                    "it; its motion stays the same",
+                ),
+                guard,
+            )
+        self._mass.handle.on_update(guard.by_user(lambda _: self._weigh()))
         self._choice.on_update(guard.by_user(lambda _: self.choose(self._choice.value)))
         self._hold.on_update(guard.by_user(lambda _: self._toggle_hold()))
         self._range.handle.on_update(guard.by_user(lambda _: self._type()))
@@ -71,7 +86,7 @@ class ColorPanel:
         """Offer the colorings of a content."""
         before = self._layers
         self._layers, self._painter = layers, painter
-        self._is_metric = content.is_metric
+        self._mass.handle.visible = isinstance(painter, Painter) and content.is_metric
         self._folder.visible = self.is_there
         self._choice.options = ("plain", *painter.offered)
         layers.color = before.color if before.color in self._choice.options else "plain"
@@ -113,6 +128,8 @@ class ColorPanel:
         if self._folder.visible != is_shown:
             self._folder.visible = is_shown
         legend = painter.legend if painter is not None and not is_hidden else None
+        if isinstance(painter, Painter):
+            self._mass.show(_rounded(1e3 * painter.kilograms))
         written = "" if legend is None else legend_html(legend, highest=not is_playing)
         if is_playing and self._legend_head(written) == self._legend_head(self._written):
             return
@@ -147,6 +164,13 @@ class ColorPanel:
         else:
             self._layers.color_range = None
         self._redraw()
+
+    def _weigh(self) -> None:
+        """Take over what a user says the object weighs."""
+        grams = float(self._mass.read())
+        if _LIGHTEST <= grams <= _HEAVIEST:  # Half-typed numbers wait until they make sense.
+            self._layers.mass = 1e-3 * grams
+            self._redraw()
 
     def _type(self) -> None:
         """Take over the ends that a user typed, and hold them."""

@@ -10,9 +10,17 @@ from scipy.spatial import KDTree  # pyright: ignore[reportMissingTypeStubs]  # i
 
 from app.viewer.color.difference import surface_difference
 from app.viewer.color.legend import ColorScale, Legend, Limits
-from app.viewer.color.quantities import QUANTITIES, Quantity, Values, in_length_unit, measure
+from app.viewer.color.quantities import (
+    QUANTITIES,
+    Quantity,
+    Values,
+    for_mass,
+    in_length_unit,
+    measure,
+)
 from app.viewer.content.content import Content
 from app.viewer.content.layers import COLORINGS, Coloring, Layers
+from physhandi.data.object_mass import ObjectMass, given_mass
 from physhandi.metrics.alignment import carried_points
 from physhandi.object_rollout import ObjectRollout
 
@@ -165,6 +173,10 @@ class Painter:
         self._has_object = content.fitted is not None
         self._has_hands = bool(content.hands)
         self._length_unit = content.length_unit
+        self._content_mass = content.mass
+        self._node_count = 1 if content.fitted is None else content.fitted.model.node_count
+        self.mass: ObjectMass | None = content.mass
+        """What the object weighs; None if nobody knows."""
         self._ranges: dict[Coloring, tuple[ObjectRollout, ObjectRollout | None, int, Limits]] = {}
         self._legend: Legend | None = None
 
@@ -193,7 +205,25 @@ class Painter:
                     "by which the hand holds it", "that hold it from outside"
                 ),
             )
+        quantity = for_mass(quantity, self.mass, self._node_count)
         return in_length_unit(quantity, self._length_unit)
+
+    @property
+    def kilograms(self) -> float:
+        """What the object weighs as forces are written [kg]: as its model if nobody knows."""
+        return float(self._node_count) if self.mass is None else self.mass.kilograms
+
+    @property
+    def force_factor(self) -> float:
+        """Written value of one newton of the model."""
+        return self.quantity("force").factor
+
+    def weigh(self, kilograms: float | None) -> None:
+        """Write forces for an object of another mass [kg]; None for what the content says."""
+        mass = self._content_mass if kilograms is None else given_mass(kilograms)
+        if mass != self.mass:
+            self.mass = mass
+            self._ranges.clear()
 
     def paint(self, rollout: ObjectRollout, frame: int, layers: Layers) -> Painted | None:
         """Give nodes and springs their colors; None if they are plain.
@@ -242,7 +272,7 @@ class Painter:
         return found
 
     def _measure_range(self, coloring: Coloring, rollout: ObjectRollout) -> Limits:
-        quantity = QUANTITIES[coloring]
+        quantity = self.quantity(coloring)
         count = 1 if quantity.is_static else min(_SAMPLED_FRAMES, rollout.ready)
         frames = np.unique(np.linspace(0, rollout.ready - 1, count).astype(int))
         # The virtual springs are so short that their strain would hide that of all others.
@@ -265,18 +295,20 @@ def nearly_all(value: Float[ndarray, " value"], quantity: Quantity) -> Limits | 
     if len(value) == 0:
         return None
     if quantity.scale == "diverging":
-        high = _rounded_up(float(np.quantile(np.abs(value), _STRONG)))
+        high = _rounded_up(float(np.quantile(np.abs(value), _STRONG)), quantity.factor)
         return -high, high
     if quantity.is_static:
         low, high = np.quantile(value, [1.0 - _STRONG, _STRONG])
         return float(low), float(high)
     some = value[value > 0.0]  # Forces are zero wherever the hand holds nothing.
-    return 0.0, _rounded_up(float(np.quantile(some, _STRONG))) if len(some) else 0.0
+    if len(some) == 0:
+        return 0.0, 0.0
+    return 0.0, _rounded_up(float(np.quantile(some, _STRONG)), quantity.factor)
 
 
-def _rounded_up(value: float) -> float:
-    """Round up to two digits, so that the legend is easy to read."""
+def _rounded_up(value: float, factor: float) -> float:
+    """Round up to two digits of what is written, so that the legend is easy to read."""
     if value <= _LEAST:
         return 0.0
-    step = 10.0 ** (np.floor(np.log10(value)) - 1)
-    return float(np.ceil(value / step - 1e-9) * step)
+    step = 10.0 ** (np.floor(np.log10(factor * value)) - 1)
+    return float(np.ceil(factor * value / step - 1e-9) * step / factor)

@@ -10,6 +10,7 @@ from numpy import ndarray
 from app.viewer.color.colormaps import Scale
 from app.viewer.color.difference import rollout_difference
 from app.viewer.content.layers import Coloring
+from physhandi.data.object_mass import ObjectMass
 from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.forces import node_means
 
@@ -95,6 +96,26 @@ def in_length_unit(quantity: Quantity, unit: str) -> Quantity:
     if quantity.unit == "mm":
         return replace(quantity, unit=unit, factor=1.0)
     return replace(quantity, unit=f"{unit}/s")
+
+
+_OF_FORCE = ("N", "N·s/m")
+
+
+def for_mass(quantity: Quantity, mass: ObjectMass | None, node_count: int) -> Quantity:
+    """Write forces, stiffness and damping for what the object weighs, and say so.
+
+    Args:
+        quantity: The quantity.
+        mass: What the object weighs; None if nobody knows.
+        node_count: Nodes of its model, of 1 kg each.
+    """
+    if quantity.unit not in _OF_FORCE:
+        return quantity
+    if mass is None:
+        return replace(quantity, about=f"{quantity.about}; for nodes of 1 kg each")
+    factor = quantity.factor * mass.force_factor(node_count)
+    about = f"{quantity.about}; for an object of {mass.text} ({mass.source})"
+    return replace(quantity, factor=factor, about=about)
 
 
 ErrorOf = Callable[[ObjectRollout, int], Float[ndarray, " node"]]

@@ -23,6 +23,7 @@ from app.viewer.scene.framing import Framing
 from app.viewer.scene.nodes import ClippedNodes, Plane
 from app.viewer.scene.object_drawing import RGB, ObjectDrawing, Style, share_bytes, strengths
 from app.viewer.scene.scene import FRAME_BYTES, add_ground
+from physhandi.data.object_mass import given_mass
 from physhandi.object_rollout import ObjectRollout
 
 MODES: Mapping[Mode, str] = {"side": "side by side", "overlay": "overlay", "wipe": "wipe"}
@@ -178,6 +179,7 @@ class CompareDrawing:
         self._look = replace(look)
         self._way: Way | None = None
         self._force_scale = 1.0
+        self._newtons: dict[str, float] = dict.fromkeys(SIDE_KEYS, 1.0)
         self._force_units = {False: 0.0, True: 0.0}
         self._is_ground_laid = False
         self._legend_placed: tuple[Any, ...] | None = None
@@ -240,6 +242,7 @@ class CompareDrawing:
         with self._lock, self._server.atomic():
             self._look, self._way = look, way
             self._sides, self._force_scale = sides, layers.force_scale
+            self._newtons = written_newtons(sides, layers.mass)
             if not self._is_ground_laid:
                 self._is_ground_laid = True
                 add_ground(self._nodes, self._content, self._framing, _GROUND)
@@ -318,7 +321,7 @@ class CompareDrawing:
             side.frame,
             shown,
             budget,
-            force_unit=self._force_units[look.is_figure],
+            force_unit=self._force_units[look.is_figure] * self._newtons[key] / self._newtons["a"],
             longest=longest * self._framing.extent,
             painted=painted,
         )
@@ -413,7 +416,7 @@ class CompareDrawing:
         """Write below the figure what its colors mean, and how strong a force an arrow is."""
         eye, nodes, root, line = self._eye, self._nodes, f"{_ROOT}/legend", self._line
         is_shown = self._look.is_figure
-        force_unit = self._force_units[True] * self._force_scale
+        force_unit = self._force_units[True] * self._force_scale / self._newtons["a"]
         placed = (is_shown, force_unit, *eye.right, *eye.up)
         if placed == self._legend_placed:
             return
@@ -499,6 +502,26 @@ def have_same_hands(sides: Sides) -> bool:
         and np.allclose(first[hand], second[hand], rtol=0.0, atol=_SAME_HAND)
         for hand in first
     )
+
+
+def written_newtons(sides: Sides, kilograms: float | None) -> dict[str, float]:
+    """Find what is written for one newton of each side's model.
+
+    Both sides are of one object, whose models may have different numbers of nodes of 1 kg.
+
+    Args:
+        sides: The sides.
+        kilograms: What the object weighs; None for what the sides' contents say. If one of them
+            does not know, forces of both are written as the models have them.
+    """
+    newtons: dict[str, float] = dict.fromkeys(SIDE_KEYS, 1.0)
+    for key, side in sides.items():
+        mass = side.content.mass if kilograms is None else given_mass(kilograms)
+        if mass is None:
+            return dict.fromkeys(SIDE_KEYS, 1.0)
+        if side.rollout is not None:
+            newtons[key] = mass.force_factor(side.rollout.model.node_count)
+    return newtons
 
 
 def difference_scale(end: float, length_unit: str) -> ColorScale:

@@ -1,10 +1,11 @@
 """What a session shows: hands, object, observation and cameras of one sequence."""
 
 import logging
+from collections.abc import Mapping
 from collections.abc import Sequence as Listing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -19,7 +20,8 @@ from app.viewer.content.observed import (
     Tracks,
     lift_keypoints,
 )
-from physhandi.data.layout import SequenceFiles
+from physhandi.data.layout import SHAPE_FILE, SequenceFiles
+from physhandi.data.object_mass import ObjectMass, estimated_mass, given_mass
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
 from physhandi.errors import MissingInputError, PhysHandiError, UsageError
@@ -91,6 +93,8 @@ class Content:
     """Identified markers of a recording, if they are shown without an object."""
     views: Listing[View] = field(default_factory=tuple)
     """The recording's views."""
+    mass: ObjectMass | None = None
+    """What the object weighs; None if it can not even be estimated."""
 
     @property
     def is_metric(self) -> bool:
@@ -144,6 +148,7 @@ def open_run(catalog: Catalog, run_id: str, sequence_name: str | None = None) ->
         observed=_run_observation(run, files) or (_observation(sequence) if sequence else None),
         tracks=_run_tracks(run, files),
         views=sequence.views if sequence else (),
+        mass=_mass(run, meta, sequence) if meta.get("metric", True) else None,
     )
 
 
@@ -164,6 +169,14 @@ def open_sequence(catalog: Catalog, sequence_id: str) -> Content:
         markers=Markers.of(sequence),
         views=sequence.views,
     )
+
+
+def _mass(run: Run, meta: Mapping[str, Any], sequence: Sequence | None) -> ObjectMass | None:
+    """Find what the object weighs: as the recording says today, as it said, or an estimate."""
+    kilograms = meta.get("mass") if sequence is None else sequence.mass
+    if kilograms is not None:
+        return given_mass(float(kilograms))
+    return estimated_mass(run.yaml(SHAPE_FILE)) if run.has(SHAPE_FILE) else None
 
 
 def _recording(catalog: Catalog, run: Run, name: str) -> Sequence | None:

@@ -63,6 +63,8 @@ class Layers:
     """Quantity by which nodes, surface and springs are colored."""
     color_range: tuple[float, float] | None = None
     """Values at the ends of the color scale, in SI units; None for those of the sequence."""
+    mass: float | None = None
+    """What the object weighs [kg], for which forces are shown; None for what the content says."""
 
 
 def default_layers(content: Content) -> Layers:

@@ -16,6 +16,7 @@ from app.viewer.export.snapshot import Snapshot, snapshot_ply
 from physhandi import __version__
 from physhandi.data.exporters.table import csv_bytes, npz_bytes, rounded
 from physhandi.data.files import plain, without_non_finite, zip_bytes
+from physhandi.data.object_mass import given_mass
 from physhandi.errors import MissingInputError
 from physhandi.object_rollout import ObjectRollout
 
@@ -192,7 +193,14 @@ def _readme(snapshot: Snapshot, files: dict[str, bytes]) -> str:
     named = "metres" if content.is_metric else f"{unit}s, which have no metric scale"
     units = [f"Lengths are in {named}, times in seconds."]
     if content.fitted is not None:
-        units.append("Forces are in newtons (a node's unit mass is 1 kg).")
+        units.append("Forces are in newtons of the model, each node of which weighs 1 kg.")
+        mass = content.mass if layers.get("mass") is None else given_mass(layers["mass"])
+        if mass is not None:
+            factor = mass.force_factor(content.fitted.model.node_count)
+            units.append(
+                f"For an object of {mass.text} ({mass.source}), as on the screen, multiply forces, "
+                f"stiffness and damping by {factor:.4g}."
+            )
     color = layers.get("color", "plain")
     about = [line for name, line in _ABOUT if any(file.startswith(name) for file in files)]
     return "\n".join(

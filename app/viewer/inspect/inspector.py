@@ -232,14 +232,15 @@ class Inspector:
         if content is None or scene is None:
             return
         kind: HistoryQuantity = self._kind.value
+        unit, factor = unit_of(kind, content, scene.painter)
         state = (
             chosen,
             kind,
             rollout,
             rollout.ready if rollout is not None else 0,
             scene.painter.reference,
+            factor,
         )
-        unit, factor = unit_of(kind, content, scene.painter)
         if state != self._measured:
             self._curve = factor * follow(chosen, kind, rollout, content, scene.painter)
             self._measured = state

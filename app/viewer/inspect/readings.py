@@ -1,6 +1,6 @@
 """What there is to read of one thing in the scene."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -10,7 +10,7 @@ from numpy import ndarray
 from app.viewer.color.coloring import Painter
 from app.viewer.color.hand_coloring import HandPainter
 from app.viewer.color.legend import number
-from app.viewer.content.content import Content
+from app.viewer.content.content import Content, ShownHand
 from app.viewer.content.layers import Coloring
 from app.viewer.inspect.picking import Pick, PickKind
 from physhandi.object_rollout import ObjectRollout
@@ -156,6 +156,48 @@ def _attached_rows(model: SpringMassModel, spring: int) -> "Rows":
     return [("attached", f"from frame {first}" + ("" if last == NEVER else f" to {last}"))]
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HandLoad:
+    """What a hand does to the object in one frame."""
+
+    held: int
+    """Object nodes that it holds."""
+    force: Float[ndarray, " 3"]
+    """Sum of its forces [N]."""
+    strongest: float
+    """Largest force on one node [N]."""
+    moment: Float[ndarray, " 3"]
+    """Sum of its forces' moments about a point of the hand [N·m]."""
+
+
+def hand_load(
+    force: Float[ndarray, "spring 3"],
+    *,
+    node: Int[ndarray, " spring"],
+    position: Float[ndarray, "node 3"],
+    about: Float[ndarray, " 3"],
+) -> HandLoad:
+    """Sum up the forces of virtual springs on object nodes.
+
+    Args:
+        force: Of each spring on its node [N].
+        node: Node of each spring.
+        position: Object nodes [m].
+        about: Point that moments are about [m].
+    """
+    held, at = np.unique(node, return_inverse=True)
+    of_node = np.zeros((len(held), 3))
+    np.add.at(of_node, at, force)
+    is_held = np.linalg.norm(of_node, axis=1) > 0.0
+    arm = position[held] - about
+    return HandLoad(
+        held=int(is_held.sum()),
+        force=of_node.sum(axis=0),
+        strongest=float(np.linalg.norm(of_node, axis=1).max(initial=0.0)),
+        moment=np.cross(arm, of_node).sum(axis=0).reshape(3),
+    )
+
+
 _NAMED = 6
 Rows = list[tuple[str, str]]
 
@@ -265,20 +307,50 @@ class Readings:
         joined = springs_at(rollout, pick.index + offset)
         held = virtual_springs_at(rollout, pick.index + offset, rollout_frame)
         force = rollout.spring_forces(rollout_frame)[held - own].sum(axis=0)
+        newtons = self._painter.force_factor
         if pick.kind == "node":
             rows.append(
                 (
                     f"force of the {'hand' if self._content.hands else 'controls'}",
-                    self._vector(force, "N", size=True),
+                    self._vector(newtons * force, "N", size=True),
                 )
             )
             rows += self._node_rows(pick.index, rollout, rollout_frame, int((joined < own).sum()))
             rows.append(("held by", self._partners(rollout, rollout_frame, held, is_control=True)))
             rows += _restart_rows(rollout, rollout_frame)
         else:
-            rows.append(("force on the object", self._vector(force, "N", size=True)))
+            rows.append(("force on the object", self._vector(newtons * force, "N", size=True)))
             rows.append(("holds", self._partners(rollout, rollout_frame, held, is_control=False)))
+            rows += self._hand_rows(pick.index, rollout, rollout_frame)
         return rows
+
+    def _hand_rows(self, control: int, rollout: ObjectRollout, frame: int) -> Rows:
+        """Sum up what the whole hand of a control node does to the object."""
+        hand = next((h for h in self._content.hands if control in self._controls_of(h)), None)
+        if hand is None:
+            return []
+        controls = self._controls_of(hand)
+        model = rollout.model
+        ends = model.spring_nodes[model.object_spring_count :]
+        is_own = np.isin(ends.max(axis=1) - model.node_count, controls)
+        load = hand_load(
+            self._painter.force_factor * rollout.spring_forces(frame)[is_own],
+            node=ends[is_own].min(axis=1),
+            position=np.asarray(rollout.position[frame], dtype=np.float64),
+            about=np.asarray(rollout.held_control(frame)[controls].mean(axis=0), np.float64),
+        )
+        unit, factor = length_unit(self._content)
+        return [
+            (f"{hand.side} hand", f"holds {load.held} nodes"),
+            ("its force", self._vector(load.force, "N", size=True)),
+            ("its strongest", f"{number(load.strongest)} N on a node"),
+            ("its moment", self._vector(factor * load.moment, f"N·{unit}", size=True)),
+        ]
+
+    def _controls_of(self, hand: ShownHand) -> range:
+        """Number the control nodes that are a hand's vertices; none if controls are others."""
+        first = self._first_control(hand.side)
+        return range(0) if first is None else range(first, first + hand.vertex.shape[1])
 
     def _recorded_rows(self, pick: Pick, frame: int) -> Rows:
         """Read what needs no simulation: speeds, lengths to neighbors, errors in the images."""
@@ -318,13 +390,14 @@ class Readings:
         stiffness = rollout.parameters.stiffness_scale * float(model.stiffness[spring])
         rest = float(model.rest_length[spring])
         lengths = f"{number(factor * length)} {unit}, at rest {number(factor * rest)} {unit}"
+        newtons = self._painter.force_factor
         return [
             ("joins", " and ".join(names)),
             ("length", lengths),
             ("strain", f"{number(1e2 * float(rollout.strains(frame)[spring]))} %"),
-            ("pull", f"{number(float(rollout.tensions(frame)[spring]))} N"),
-            ("stiffness", f"{number(stiffness)} N"),
-            ("damping", f"{number(float(model.damping[spring]))} N·s/m"),
+            ("pull", f"{number(newtons * float(rollout.tensions(frame)[spring]))} N"),
+            ("stiffness", f"{number(newtons * stiffness)} N"),
+            ("damping", f"{number(newtons * float(model.damping[spring]))} N·s/m"),
             *_attached_rows(rollout.model, spring),
         ]
 
@@ -351,7 +424,7 @@ class Readings:
         """Name what virtual springs join a thing to, the one that pulls hardest first."""
         if len(springs) == 0:
             return "nothing"
-        pull = np.abs(rollout.tensions(frame)[springs])
+        pull = self._painter.force_factor * np.abs(rollout.tensions(frame)[springs])
         ends = rollout.model.spring_nodes[springs]
         partner = ends.max(axis=1) - rollout.model.node_count if is_control else ends.min(axis=1)
         order = np.argsort(-pull, kind="stable")

@@ -96,6 +96,7 @@ class SceneDrawing:
             is_playing: Whether the clock is running, so that less may be sent.
         """
         rollout = rollout if rollout is not None and rollout.ready > 0 else None
+        self.painter.weigh(self.layers.mass)
         painted = (
             None if rollout is None else self.painter.paint(rollout, rollout_frame, self.layers)
         )

@@ -191,6 +191,8 @@ def test_fingerprint_follows_content_and_not_place(tmp_path: Path, folder: Path)
         ({"controlled_markers": [-1]}, "controlled_markers is -1"),
         ({"shape": "blob"}, r"'lift': sequence\.yaml: shape is 'blob'; expected one of sheet, sol"),
         ({"shape": ["rope"]}, "shape is .'rope'.; expected one of"),
+        ({"mass": 0}, "mass is 0.0; expected the object's mass in kilograms, 1e-06 to 10000"),
+        ({"mass": "light"}, "mass is 'light'; expected a finite number"),
     ],
 )
 def test_wrong_fields_are_named(folder: Path, fields: dict[str, object], message: str) -> None:
@@ -283,6 +285,16 @@ def test_a_given_shape_is_read_and_is_no_other_recording(folder: Path) -> None:
     assert named.content_fingerprint() == before.content_fingerprint()
     edit(folder, shape=None)
     assert Sequence.load(folder).shape is None
+
+
+def test_a_given_mass_is_read_and_is_no_other_recording(folder: Path) -> None:
+    before = Sequence.load(folder)
+    assert before.mass is None
+    assert "mass" not in before.meta.to_dict()
+    edit(folder, mass=0.012)
+    weighed = Sequence.load(folder)
+    assert (weighed.mass, weighed.meta.to_dict()["mass"]) == (0.012, 0.012)
+    assert weighed.content_fingerprint() == before.content_fingerprint()
 
 
 def test_surface_nodes_are_among_the_object_nodes(folder: Path) -> None:
