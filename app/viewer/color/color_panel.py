@@ -9,7 +9,7 @@ import viser
 
 from app.viewer.color.coloring import Painter
 from app.viewer.color.hand_coloring import HandPainter
-from app.viewer.color.legend import legend_html
+from app.viewer.color.legend import legend_head, legend_html
 from app.viewer.content.content import Content
 from app.viewer.content.layers import Coloring, Layers
 from app.viewer.ui.followed import FollowedChoice
@@ -62,6 +62,11 @@ class ColorPanel:
                 ),
                 guard,
             )
+            self._fit: Any = gui.add_button(
+                "Fit range to this frame",
+                color="gray",
+                hint="Hold the range that nearly all values of this frame lie in",
+            )
             self._mass = FollowedChoice(
                 gui.add_number(
                     "Mass [g]",
@@ -74,6 +79,7 @@ class ColorPanel:
                 ),
                 guard,
             )
+        self._fit.on_click(guard(lambda _: self._fit_range()))
         self._mass.handle.on_update(guard.by_user(lambda _: self._weigh()))
         self._choice.on_update(guard.by_user(lambda _: self.choose(self._choice.value)))
         self._hold.on_update(guard.by_user(lambda _: self._toggle_hold()))
@@ -131,7 +137,7 @@ class ColorPanel:
         if isinstance(painter, Painter):
             self._mass.show(_rounded(1e3 * painter.kilograms))
         written = "" if legend is None else legend_html(legend, highest=not is_playing)
-        if is_playing and self._legend_head(written) == self._legend_head(self._written):
+        if is_playing and legend_head(written) == legend_head(self._written):
             return
         if written != self._written:
             self._written = written
@@ -142,11 +148,6 @@ class ColorPanel:
         low, high = (_rounded(end * factor) for end in legend.scale.limits)
         self._range.show((low, high))
 
-    @staticmethod
-    def _legend_head(written: str) -> str:
-        """Cut off what changes with every frame."""
-        return written.partition(" · highest ")[0]
-
     def _follow(self) -> None:
         self._choice.value = self._layers.color
         self._hold.value = self._layers.color_range is not None
@@ -154,7 +155,7 @@ class ColorPanel:
 
     def _show_range_fields(self) -> None:
         is_colored = self._layers.color != "plain"
-        self._hold.visible = self._range.handle.visible = is_colored
+        self._hold.visible = self._range.handle.visible = self._fit.visible = is_colored
         self._legend.visible = is_colored
 
     def _toggle_hold(self) -> None:
@@ -164,6 +165,14 @@ class ColorPanel:
         else:
             self._layers.color_range = None
         self._redraw()
+
+    def _fit_range(self) -> None:
+        """Hold the range of what the frame on the screen shows."""
+        legend = self._painter.legend if self._painter is not None else None
+        if legend is not None and legend.frame_limits is not None:
+            self._layers.color_range = legend.frame_limits
+            self._hold.value = True
+            self._redraw()
 
     def _weigh(self) -> None:
         """Take over what a user says the object weighs."""

@@ -9,7 +9,7 @@ from numpy import ndarray
 from scipy.spatial import KDTree  # pyright: ignore[reportMissingTypeStubs]  # it has none
 
 from app.viewer.color.difference import surface_difference
-from app.viewer.color.legend import ColorScale, Legend, Limits
+from app.viewer.color.legend import ColorScale, Legend, Limits, nearly_all, with_width
 from app.viewer.color.quantities import (
     QUANTITIES,
     Quantity,
@@ -128,9 +128,6 @@ def _pitch(node: Float[ndarray, "node 3"]) -> float:
 
 
 _SAMPLED_FRAMES = 16
-_STRONG = 0.98
-"""Part of the values that the range covers; the strongest few are shown as its end."""
-_LEAST = 1e-12
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -177,7 +174,9 @@ class Painter:
         self._node_count = 1 if content.fitted is None else content.fitted.model.node_count
         self.mass: ObjectMass | None = content.mass
         """What the object weighs; None if nobody knows."""
-        self._ranges: dict[Coloring, tuple[ObjectRollout, ObjectRollout | None, int, Limits]] = {}
+        self._ranges: dict[
+            tuple[Coloring, _Parts], tuple[ObjectRollout, ObjectRollout | None, int, Limits]
+        ] = {}
         self._legend: Legend | None = None
 
     @property
@@ -238,15 +237,10 @@ class Painter:
             return None
         quantity = self.quantity(layers.color)
         values = self.measure(layers.color, rollout, frame)
-        limits = layers.color_range or self.limits(layers.color, rollout)
+        limits = layers.color_range or self.limits(layers.color, rollout, layers)
         scale = ColorScale(quantity=quantity, limits=limits)
-        known = values.node[np.isfinite(values.node)]
-        self._legend = Legend(
-            scale=scale,
-            unknown=len(values.node) - len(known),
-            is_known=bool(len(known)),
-            highest=float(known.max(initial=0.0)),
-        )
+        shown = _shown(values, layers.color, rollout, layers)
+        self._legend = Legend.of(scale, values.node, shown=shown)
         return Painted(values=values, scale=scale)
 
     def measure(self, coloring: Coloring, rollout: ObjectRollout, frame: int) -> Values:
@@ -254,61 +248,57 @@ class Painter:
         error_of = self.errors.nodes if self.errors.is_known else None
         return measure(coloring, rollout, frame, error_of=error_of, reference=self.reference)
 
-    def limits(self, coloring: Coloring, rollout: ObjectRollout) -> Limits:
-        """Find the range of a quantity over a rollout.
+    def limits(
+        self, coloring: Coloring, rollout: ObjectRollout, layers: Layers | None = None
+    ) -> Limits:
+        """Find the range of a quantity over a rollout, of those things that layers show.
 
         While a rollout is being computed, the range is measured anew each time that twice as many
         frames are ready.
         """
-        known = self._ranges.get(coloring)
+        layers = layers or Layers()
+        key = coloring, _shown_parts(layers)
+        known = self._ranges.get(key)
         if known is not None and known[0] is rollout and known[1] is self.reference:
             is_enough = rollout.ready == known[2] or (
                 not rollout.is_complete and rollout.ready < 2 * known[2]
             )
             if is_enough:
                 return known[3]
-        found = self._measure_range(coloring, rollout)
-        self._ranges[coloring] = (rollout, self.reference, rollout.ready, found)
+        found = self._measure_range(coloring, rollout, layers)
+        self._ranges[key] = (rollout, self.reference, rollout.ready, found)
         return found
 
-    def _measure_range(self, coloring: Coloring, rollout: ObjectRollout) -> Limits:
+    def _measure_range(self, coloring: Coloring, rollout: ObjectRollout, layers: Layers) -> Limits:
         quantity = self.quantity(coloring)
         count = 1 if quantity.is_static else min(_SAMPLED_FRAMES, rollout.ready)
         frames = np.unique(np.linspace(0, rollout.ready - 1, count).astype(int))
-        # The virtual springs are so short that their strain would hide that of all others.
-        springs = slice(0, rollout.model.object_spring_count if coloring == "strain" else None)
-        parts: list[list[ndarray]] = [[], []]
-        for frame in frames:
-            values = self.measure(coloring, rollout, int(frame))
-            for part, value in zip(parts, (values.node, values.spring[springs]), strict=True):
-                part.append(value[np.isfinite(value)])
-        ends = [nearly_all(np.concatenate(part), quantity) for part in parts]
-        found = [end for end in ends if end is not None]
-        if not found:
-            return (0.0, 1.0 / quantity.factor)
-        low, high = min(end[0] for end in found), max(end[1] for end in found)
-        return (low, high) if high > low else (low, low + (abs(low) or 1.0 / quantity.factor))
+        parts = [
+            _shown(self.measure(coloring, rollout, int(frame)), coloring, rollout, layers)
+            for frame in frames
+        ]
+        return with_width(nearly_all(np.concatenate(parts), quantity), quantity)
 
 
-def nearly_all(value: Float[ndarray, " value"], quantity: Quantity) -> Limits | None:
-    """Find a range that nearly all values lie in; None if there are none."""
-    if len(value) == 0:
-        return None
-    if quantity.scale == "diverging":
-        high = _rounded_up(float(np.quantile(np.abs(value), _STRONG)), quantity.factor)
-        return -high, high
-    if quantity.is_static:
-        low, high = np.quantile(value, [1.0 - _STRONG, _STRONG])
-        return float(low), float(high)
-    some = value[value > 0.0]  # Forces are zero wherever the hand holds nothing.
-    if len(some) == 0:
-        return 0.0, 0.0
-    return 0.0, _rounded_up(float(np.quantile(some, _STRONG)), quantity.factor)
+_Parts = tuple[bool, bool, bool]
 
 
-def _rounded_up(value: float, factor: float) -> float:
-    """Round up to two digits of what is written, so that the legend is easy to read."""
-    if value <= _LEAST:
-        return 0.0
-    step = 10.0 ** (np.floor(np.log10(factor * value)) - 1)
-    return float(np.ceil(factor * value / step - 1e-9) * step / factor)
+def _shown_parts(layers: Layers) -> _Parts:
+    """Tell whether nodes, object springs and virtual springs show colors."""
+    return layers.nodes or layers.surface, layers.object_springs, layers.virtual_springs
+
+
+def _shown(
+    values: Values, coloring: Coloring, rollout: ObjectRollout, layers: Layers
+) -> Float[ndarray, " value"]:
+    """Collect the known values of all that is shown; those of nodes if nothing is."""
+    has_nodes, has_springs, has_virtual = _shown_parts(layers)
+    own = rollout.model.object_spring_count
+    # The virtual springs are so short that their strain would hide that of all others.
+    has_virtual = has_virtual and coloring != "strain"
+    parts = [values.spring[:own].mean(axis=1)] if has_springs else []
+    parts += [values.spring[own:].mean(axis=1)] if has_virtual else []
+    if has_nodes or not parts:
+        parts.append(values.node)
+    value = np.concatenate(parts)
+    return value[np.isfinite(value)]

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from app.viewer.color.coloring import Painted, nearly_all
-from app.viewer.color.legend import ColorScale, Legend, Limits
+from app.viewer.color.coloring import Painted
+from app.viewer.color.legend import ColorScale, Legend, Limits, nearly_all
 from app.viewer.color.quantities import Quantity, Values
 from app.viewer.content.content import Content, ShownHand
 from app.viewer.content.layers import Coloring, Layers
@@ -90,14 +90,8 @@ class HandPainter:
                 values=Values(node=value, spring=np.zeros((0, 2))), scale=scale
             )
         value = np.concatenate([painted[hand.side].values.node for hand in self._hands])
-        known = value[np.isfinite(value)]
-        self.legend = Legend(
-            scale=scale,
-            unknown=len(value) - len(known),
-            is_known=bool(len(known)),
-            highest=float(known.max(initial=0.0)),
-            item="vertex",
-        )
+        shown = value[np.isfinite(value)]
+        self.legend = Legend.of(scale, value, shown=shown, item="vertex")
         return painted
 
     def _error(self, hand: ShownHand) -> Float[ndarray, "frame joint"] | None:

@@ -2,7 +2,7 @@
 
 import html
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -15,6 +15,11 @@ from app.viewer.color.quantities import Quantity
 TICKS = 5
 """Numbers below the scale."""
 _STOPS = 17
+_SHARES = 32
+"""Bars that show how often values are there."""
+_STRONG = 0.98
+"""Part of the values that the range covers; the strongest few are shown as its end."""
+_LEAST = 1e-12
 _INK = {False: (30, 36, 44), True: (226, 230, 236)}
 """Color of the numbers in a picture on a light and on a dark background."""
 _SMALLEST_PICTURE = 160
@@ -83,6 +88,82 @@ class Legend:
     """Highest value in this frame, in SI units; None if it is not written."""
     item: str = "node"
     """What has the values: ``node`` or ``vertex``."""
+    shown: Float[ndarray, " value"] = field(default_factory=lambda: np.zeros(0))
+    """Known values of all that is shown in this frame, in SI units."""
+
+    @classmethod
+    def of(
+        cls,
+        scale: ColorScale,
+        value: Float[ndarray, " item"],
+        *,
+        shown: Float[ndarray, " value"],
+        item: str = "node",
+    ) -> "Legend":
+        """Say what a frame has of a quantity.
+
+        Args:
+            scale: Which color means which value.
+            value: Values of the nodes or vertices, NaN where not known.
+            shown: Known values of all that is shown.
+            item: What has the values: ``node`` or ``vertex``.
+        """
+        known = value[np.isfinite(value)]
+        return cls(
+            scale=scale,
+            unknown=len(value) - len(known),
+            is_known=bool(len(known)),
+            highest=float(known.max(initial=0.0)),
+            item=item,
+            shown=shown,
+        )
+
+    @property
+    def shares(self) -> list[float]:
+        """How many values have each color, as shares of the most frequent one; empty without any.
+
+        From the low to the high end of the scale, where what lies beyond is counted, too.
+        """
+        level = np.clip(self.scale.levels(self.shown), 0.0, 1.0)
+        count, _ = np.histogram(level, _SHARES, (0.0, 1.0))
+        return (count / count.max()).tolist() if len(level) else []
+
+    @property
+    def frame_limits(self) -> Limits | None:
+        """Range that nearly all values of this frame lie in; None if there are none."""
+        quantity = self.scale.quantity
+        found = nearly_all(self.shown, quantity)
+        return None if found is None else with_width(found, quantity)
+
+
+def nearly_all(value: Float[ndarray, " value"], quantity: Quantity) -> Limits | None:
+    """Find a range that nearly all values lie in; None if there are none."""
+    if len(value) == 0:
+        return None
+    if quantity.scale == "diverging":
+        high = _rounded_up(float(np.quantile(np.abs(value), _STRONG)), quantity.factor)
+        return -high, high
+    if quantity.is_static:
+        low, high = np.quantile(value, [1.0 - _STRONG, _STRONG])
+        return float(low), float(high)
+    some = value[value > 0.0]  # Forces are zero wherever the hand holds nothing.
+    if len(some) == 0:
+        return 0.0, 0.0
+    return 0.0, _rounded_up(float(np.quantile(some, _STRONG)), quantity.factor)
+
+
+def _rounded_up(value: float, factor: float) -> float:
+    """Round up to two digits of what is written, so that the legend is easy to read."""
+    if value <= _LEAST:
+        return 0.0
+    step = 10.0 ** (np.floor(np.log10(factor * value)) - 1)
+    return float(np.ceil(factor * value / step - 1e-9) * step / factor)
+
+
+def with_width(limits: Limits | None, quantity: Quantity) -> Limits:
+    """Take a range that has a width, even if all values are the same or none is known."""
+    low, high = limits or (0.0, 1.0 / quantity.factor)
+    return (low, high) if high > low else (low, low + (abs(low) or 1.0 / quantity.factor))
 
 
 def number(value: float) -> str:
@@ -107,6 +188,7 @@ def legend_html(legend: Legend, *, highest: bool = True) -> str:
     at = np.round(np.linspace(0, len(ramp) - 1, _STOPS)).astype(int)
     stops = ",".join(f"rgb({r},{g},{b})" for r, g, b in ramp[at].tolist())
     ticks = "".join(f"<span>{label}</span>" for label in legend.scale.tick_labels)
+    bars = _bars(legend) if highest else ""
     notes = [html.escape(quantity.about)]
     if quantity.is_logarithmic:
         notes.append("logarithmic")
@@ -123,6 +205,7 @@ def legend_html(legend: Legend, *, highest: bool = True) -> str:
         '<div style="padding:0.1em 0.9em 0.5em;font-size:0.8em" data-legend>'
         '<div style="display:flex;justify-content:space-between;margin-bottom:0.2em">'
         f"<b>{html.escape(quantity.label)}</b><span>{html.escape(quantity.unit)}</span></div>"
+        f"{bars}"
         '<div style="height:0.9em;border-radius:0.2em;border:1px solid rgba(128,128,128,0.6);'
         f'background:linear-gradient(to right,{stops})"></div>'
         '<div style="display:flex;justify-content:space-between;'
@@ -130,6 +213,32 @@ def legend_html(legend: Legend, *, highest: bool = True) -> str:
         f'<div style="opacity:0.8;line-height:1.35;margin-top:0.2em">{" · ".join(notes)}</div>'
         "</div>"
     )
+
+
+def legend_head(written: str) -> str:
+    """Cut off what a legend's HTML says of a single frame."""
+    before, mark, after = written.partition(_BARS)
+    head = before + after.partition("</div>")[2] if mark else written
+    return head.partition(" · highest ")[0]
+
+
+_BARS = "<div data-shares "
+
+
+def _bars(legend: Legend) -> str:
+    """Draw how often each color is there, above the scale."""
+    shares = legend.shares
+    if not shares:
+        return ""
+    ramp = legend.scale.ramp
+    place = (np.arange(len(shares)) + 0.5) / len(shares)
+    colors = ramp[np.round(place * (len(ramp) - 1)).astype(int)].tolist()
+    bars = "".join(
+        f'<i style="flex:1;height:{100 * share:.0f}%;background:rgb({r},{g},{b})"></i>'
+        for share, (r, g, b) in zip(shares, colors, strict=True)
+    )
+    style = "display:flex;align-items:flex-end;height:2.2em;gap:1px"
+    return f'{_BARS}style="{style}" title="How often each value is there now">{bars}</div>'
 
 
 def swatches_html(swatches: Iterable[tuple[tuple[int, int, int], str]], *, is_list: bool) -> str:

@@ -122,6 +122,22 @@ def test_the_range_is_that_of_the_sequence_until_it_is_fixed():
     assert painter.legend is None
 
 
+def test_the_range_is_that_of_what_is_shown():
+    take = two_springs()
+    painter = Painter(content_of(take))
+    shown = {"nodes": Layers(virtual_springs=False), "virtual": Layers(nodes=False)}
+    shown["own"] = Layers(nodes=False, virtual_springs=False, object_springs=True)
+    shown["nothing"] = Layers(nodes=False, virtual_springs=False)
+    for name, layers in shown.items():
+        layers.color = "stiffness"
+        painter.paint(take, 2, layers)
+        low, high = painter.limits("stiffness", take, layers)
+        # Springs of 20 and 80 N; nodes 0 and 1 are joined by the first alone.
+        value = {"virtual": 80.0}.get(name, 20.0)
+        assert (low, high) == pytest.approx((value, 2 * value)), name
+        assert set(painter.legend.shown.round(3)) == {value}, name
+
+
 def test_the_range_grows_with_a_rollout_that_is_being_computed():
     fitted = two_springs(20)
     painter = Painter(content_of(fitted))

@@ -9,7 +9,7 @@ from viewer_world import content_of as sheet_with_hands
 from viewer_world import controls
 
 from app.viewer.color.coloring import Painter
-from app.viewer.color.legend import ColorScale, Legend, legend_html, number
+from app.viewer.color.legend import ColorScale, Legend, legend_head, legend_html, number
 from app.viewer.color.quantities import QUANTITIES
 from app.viewer.inspect.picking import Pick
 from app.viewer.inspect.readings import HISTORIES, Readings, follow, unit_of
@@ -181,6 +181,28 @@ def test_the_legend_says_what_is_not_known_and_what_is_highest():
     assert "not known in this frame" in nothing
     assert "highest" not in legend_html(legend("speed", (0.0, 1.0), highest=0.5), highest=False)
     assert "color:black" not in said  # It takes the panel's own color of text.
+
+
+def test_bars_say_how_often_each_color_is_there_and_are_no_part_of_the_head():
+    shown = np.array([0.001, 0.001, 0.0199, 0.5])
+    few = legend("error", (0.0, 0.02), highest=0.5, shown=shown)
+    shares = few.shares
+    assert (len(shares), shares[1], shares[-1], sum(shares)) == (32, 1.0, 1.0, 2.0)
+    assert few.frame_limits == (0.0, pytest.approx(0.48))  # 98 % lie below 0.471, rounded up.
+    said = legend_html(few)
+    assert said.count("<i style") == 32
+    assert "height:100%;background:rgb(" in said
+    quiet = legend_html(few, highest=False)
+    assert "<i style" not in quiet
+    later = legend_html(legend("error", (0.0, 0.02), highest=0.1, shown=0.5 * shown))
+    assert later != said
+    assert legend_head(later) == legend_head(said)
+    other = legend_html(legend("error", (0.0, 0.03), highest=0.5, shown=shown))
+    assert legend_head(other) != legend_head(said)
+    none = legend("error", (0.0, 0.02))
+    assert (none.shares, none.frame_limits) == ([], None)
+    same = legend("stiffness", (1.0, 2.0), shown=np.array([3.0, 3.0]))
+    assert same.frame_limits == (3.0, 6.0)
 
 
 def test_numbers_are_short():
