@@ -24,6 +24,11 @@ _COMMIT_DIGITS = 12
 _SPLITS = {"reconstruction": "fitted frames", "future": "predicted frames"}
 _UNCOMPARED = {"description", "aggregation", "unit", "frames"}
 
+_CHANGED = "parameters."
+"""Settings that begin so are the parameters that a simulation was asked to change."""
+_NOTICED = 0.005
+"""Scores that differ by a smaller share are as good as the same."""
+
 _Scores = dict[tuple[str, str, str], tuple[float, str]]
 
 
@@ -78,18 +83,23 @@ def compare_runs(
         results: `describe_results` of each.
 
     Returns:
-        Sections of facts, scores, found parameters, settings and surroundings; one without rows is
-        left out. Only scores have a best value.
+        Sections of facts, what somebody chose, and what came of it: settings, and parameters where
+        they were chosen, then scores, losses, parameters where they were fitted, and surroundings.
+        One without rows is left out. Only scores have a best value.
     """
     parameters = [result.get("parameters", {}) for result in results]
     surroundings = [_surroundings_of(result.get("environment", {})) for result in results]
+    is_chosen = any(run["kind"] == "simulation" for run in described)
+    found = Section("Parameters that the simulation ended with", _parameter_rows(parameters))
+    losses = [_losses_of(result) for result in results]
     sections = [
         Section("The runs", _fact_rows(described)),
+        *([found] if is_chosen else []),
+        Section("Settings", _setting_rows(configs)),
         *_score_sections([_scores_of(result.get("metrics", {})) for result in results]),
-        Section("Loss at the end of each stage", _plain_rows([_losses_of(r) for r in results])),
-        Section("Parameters that the simulation ended with", _parameter_rows(parameters)),
-        Section("Settings", _plain_rows([_settings_of(config) for config in configs])),
-        Section("Computed with", _plain_rows(surroundings)),
+        Section("Loss at the end of each stage", _plain_rows(losses, counts_absence=False)),
+        *([] if is_chosen else [found]),
+        Section("Computed with", _plain_rows(surroundings, counts_absence=False)),
     ]
     return [section for section in sections if section.rows]
 
@@ -117,15 +127,34 @@ def _fact_rows(described: Sequence[Mapping[str, Any]]) -> list[Row]:
     ]
 
 
-def _plain_rows(columns: Sequence[Mapping[str, Any]]) -> list[Row]:
+def _setting_rows(configs: Sequence[Mapping[str, Any]]) -> list[Row]:
+    """Lay settings side by side; a run that simulates a fitted object again has none of a fit."""
+    columns = [_settings_of(config) for config in configs]
+    changed = [{k: v for k, v in c.items() if k.startswith(_CHANGED)} for c in columns]
+    others = [{k: v for k, v in c.items() if not k.startswith(_CHANGED)} for c in columns]
+    return _plain_rows(changed) + _plain_rows(others, counts_absence=False)
+
+
+def _plain_rows(columns: Sequence[Mapping[str, Any]], *, counts_absence: bool = True) -> list[Row]:
+    """Make a row of every value.
+
+    Args:
+        columns: Values of each run by name.
+        counts_absence: Whether runs differ if one of them lacks what the others agree on.
+    """
     rows: list[Row] = []
     for name in _names(columns):
         values = [column.get(name) for column in columns]
         if any(value is not None for value in values):
             cells = [ComparedCell(text) for text in _texts(columns, name)]
             shown = " / ".join(words(part.rstrip("_")) for part in name.split("."))
-            rows.append(Row(shown, cells, _differ(values)))
+            told = values if counts_absence else _present(values)
+            rows.append(Row(shown, cells, _differ(told)))
     return rows
+
+
+def _present(values: Sequence[Any]) -> list[Any]:
+    return [value for value in values if value is not None]
 
 
 def _parameter_rows(columns: Sequence[Mapping[str, Any]]) -> list[Row]:
@@ -167,7 +196,8 @@ def _score_row(columns: Sequence[_Scores], key: tuple[str, str, str]) -> Row:
     )
     best = (max if is_better_when_higher(words_of_name) else min)(numbers)
     is_score = key[1] != "topology" and not is_count(words_of_name)
-    is_contest = is_score and any(not _same(value, best) for value in numbers)
+    differs = any(not is_same(numbers[0], value, tolerance=_NOTICED) for value in numbers[1:])
+    is_contest = is_score and differs
     cells = [
         ComparedCell(
             figure(scaled(value, unit)[0]),
@@ -177,7 +207,7 @@ def _score_row(columns: Sequence[_Scores], key: tuple[str, str, str]) -> Row:
         for number, value in enumerate(values)
     ]
     shown = " / ".join(words(part) for part in name.split("."))
-    return Row(shown, cells, _differ(values), about_quantity(name), scaled(None, unit)[1])
+    return Row(shown, cells, differs, about_quantity(name), scaled(None, unit)[1])
 
 
 def _scores_of(metrics: Mapping[str, Any]) -> _Scores:

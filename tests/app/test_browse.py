@@ -91,6 +91,29 @@ def test_runs_are_laid_side_by_side_with_the_best_marked_and_the_change_told() -
         row_of(sections, "Computed with", "started")
 
 
+def test_what_was_changed_comes_first_and_scores_only_if_they_really_differ() -> None:
+    fit = {"profile": {"profile": "quick", "object_": {"search": {"seed": 42}}}}
+    again = {"source": "/runs/fit", "parameters": {"drag": 4.0}}
+    results: list[dict[str, Any]] = [
+        {"metrics": scores(0.004, 0.8), "parameters": {"drag": 3.0}, "losses": {"a": {"after": 1}}},
+        {"metrics": scores(0.00401, 0.9), "parameters": {"drag": 4.0}},
+    ]
+    pair = [described(), described(kind="simulation")]
+    sections = compare_runs(pair, [fit, again], results)
+    shown = [(section.name, [row.name for row in section.shown]) for section in sections]
+    assert [part for part in shown if part[1]] == [
+        ("The runs", ["kind"]),
+        ("Parameters that the simulation ended with", ["drag"]),
+        ("Settings", ["parameters / drag"]),
+        ("Scores of towel, fitted frames", ["contact F1 5 mm"]),
+    ]
+    error = row_of(sections, "Scores of towel, fitted frames", "track error")
+    assert [(cell.text, cell.is_best) for cell in error.cells] == [
+        ("4.000", False),
+        ("4.010", False),
+    ]
+
+
 def test_nested_fields_are_named_by_their_path() -> None:
     assert flatten({"a": {"b": 1, "c": {}}, "d": [1]}) == {"a.b": 1, "d": [1]}
 
