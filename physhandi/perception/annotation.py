@@ -29,7 +29,7 @@ from physhandi.data.sequence_meta import FILE
 from physhandi.errors import SequenceError, UsageError
 from physhandi.perception.lifting import HAND_LABEL, OBJECT_LABEL
 from physhandi.perception.mask_model import MaskModel
-from physhandi.perception.point_tracking import track_points
+from physhandi.perception.point_tracking import track_points, visible_on_object
 from physhandi.perception.segmentation import Click, carry_on, segment
 from physhandi.perception.track_model import TrackModel
 from physhandi.progress import NullProgress, Progress
@@ -134,7 +134,7 @@ def correct_masks(
     """Replace masks of single frames by right ones, and follow the object's points anew.
 
     ``provenance.masks.corrections`` in ``sequence.yaml`` keeps which frames were corrected. Tracks
-    that were not made here stay.
+    that were not made here stay; those of a model of the user are hidden where the object is not.
 
     Args:
         folder: Folder of the sequence.
@@ -171,12 +171,16 @@ def correct_masks(
         fixed = {view: sorted(set(stay) - set(right[view])) for view, stay in fixed.items()}
         masks = carry_on(sequence, masks, right, fixed, progress)
     tracks: dict[str, tuple[ndarray, ndarray]] = {}
-    if "tracks" in sequence.provenance and _is_own(sequence, "tracks"):
+    of_tracks = named_fields(sequence.provenance.get("tracks")) or {}
+    if of_tracks.get("source") == BUILT_IN:
         tracks = track_points(sequence, masks, progress)
     else:
         for view in sequence.views:
             if view.track is not None and view.track_visible is not None:
-                tracks[view.name] = np.array(view.track), np.array(view.track_visible)
+                pixel, visible = np.array(view.track), np.array(view.track_visible)
+                if _HASH in of_tracks and view.name in masks:
+                    visible = visible_on_object(masks[view.name], pixel, visible)
+                tracks[view.name] = pixel, visible
     progress.check_cancelled()
     new = [{"view": one.view, "frame": one.frame, "carried_on": carries_on} for one in corrections]
     done = {(entry["view"], entry["frame"]) for entry in new}

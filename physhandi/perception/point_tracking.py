@@ -207,6 +207,16 @@ class _Tracker:
         return pixel, np.asarray(np.isfinite(pixel).all(axis=-1))
 
 
+def visible_on_object(
+    mask: UInt8[ndarray, "frame row column"],
+    pixel: Float[ndarray, "frame track 2"],
+    is_visible: Bool[ndarray, "frame track"],
+) -> Bool[ndarray, "frame track"]:
+    """Tell which of the visible points are on the object, as its masks say."""
+    on = [_at(label == OBJECT_LABEL, place) > 0 for label, place in zip(mask, pixel, strict=True)]
+    return is_visible & np.stack(on)
+
+
 def _followed_by_model(
     model: TrackModel,
     view: View,
@@ -236,8 +246,7 @@ def _followed_by_model(
         if not len(start):
             continue
         place, is_visible = model.follow(view, frame, start, progress)
-        for at in range(view.frame_count):
-            is_visible[at] &= _at(is_object[at], place[at]) > 0
+        is_visible = visible_on_object(mask, place, is_visible)
         pixel = np.concatenate([pixel, place.astype(np.float32)], axis=1)
         seen = np.concatenate([seen, is_visible], axis=1)
     kept = seen.sum(axis=0) >= min(_SHORTEST, view.frame_count)

@@ -147,3 +147,27 @@ def test_tracks_that_were_made_here_follow_the_corrected_mask(tmp_path):
         correct_masks(sequence.folder, [Correction("top", 0, nothing + 2)])
     with pytest.raises(UsageError, match="not 119x96 px"):
         correct_masks(sequence.folder, [Correction("top", 0, nothing[:, 1:])])
+
+
+def test_tracks_of_the_users_model_are_hidden_where_a_correction_shows_no_object(tmp_path):
+    sequence, _ = write_disc(tmp_path / "disc", frames=4)
+    done = annotate(sequence.folder, [Click(*disc_click())])
+    path = sequence.folder / "sequence.yaml"
+    head, tracks = path.read_text().split("  tracks:\n")
+    tracks = tracks.replace("source: built-in", "source: tapnext\n    model_sha256: abc")
+    path.write_text(f"{head}  tracks:\n{tracks}")
+    before = {view.name: (view.track, view.track_visible) for view in done.views}
+    label = labels(done)[2].copy()
+    label[:, : int(disc_click()[2])] = 0
+    done = correct_masks(sequence.folder, [Correction("top", 2, label)])
+    assert done.provenance["tracks"]["source"] == "tapnext"
+    for view in done.views:
+        pixel, visible = before[view.name]
+        np.testing.assert_array_equal(view.track, pixel)
+        hidden = visible & ~view.track_visible
+        assert hidden.any() == (view.name == "top")
+        assert not hidden[[0, 1, 3]].any()
+        assert not (view.track_visible & ~visible).any()
+        if view.name == "top":
+            column, row = pixel[2, view.track_visible[2]].round().astype(int).T
+            assert (label[row, column] == 1).all()
