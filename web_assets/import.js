@@ -23,7 +23,7 @@ async function watch(box, address, onDone, job) {
     const bar = box.querySelector("progress");
     if (total) [bar.max, bar.value] = [total, iteration];
     else bar.removeAttribute("value");
-    at("progress").textContent = stage ? `${stage.replaceAll("_", " ")} · ${iteration} of ${total}${message ? ` · ${message}` : ""}` : "looking at cameras and calibration …";
+    at("progress").textContent = stage ? `${stage.replaceAll("_", " ")} · ${iteration} of ${total}${message ? ` · ${message}` : ""}` : at("progress").dataset.waiting;
     await new Promise((resolve) => setTimeout(resolve, POLL_MS));
     job = await send("GET", address).catch(() => job);
   }
