@@ -100,12 +100,6 @@ document.addEventListener("click", (event) => {
   frames.scrollIntoView({ behavior: "smooth", block: "start" });
 });
 
-document.querySelector("[data-cloud]")?.addEventListener("click", ({ target }) => busy(target, async () => {
-  const session = await send("POST", "/api/v1/sessions", { kind: "sequence", id: target.dataset.id });
-  await send("PATCH", `/api/v1/sessions/${session.id}`, { frame: Number(slider.value) });
-  location.href = session.url;
-}));
-
 /* ---- masks and tracks from a click ---- */
 
 const annotation = document.getElementById("annotation");
