@@ -81,6 +81,7 @@
 
   function begin(figure, canvas, event) {
     if (event.button !== 0) return;
+    isLeaving = false;
     event.preventDefault();
     canvas.setPointerCapture(event.pointerId);
     const key = keyOf(figure);

@@ -48,6 +48,19 @@ document.addEventListener("submit", (event) => {
   });
 });
 
+/* A look at a recording that failed is told in its place. */
+document.addEventListener("htmx:responseError", ({ detail }) => {
+  if (detail.target.id !== "survey") return;
+  let message = `The server answered ${detail.xhr.status}.`;
+  try {
+    message = JSON.parse(detail.xhr.responseText).error.message;
+  } catch {} // Not one of its own answers.
+  const place = detail.target.querySelector("p");
+  place.className = "problem";
+  place.removeAttribute("aria-busy");
+  place.textContent = message;
+});
+
 const example = document.getElementById("example");
 if (example) {
   const choose = () => (location.href = `/import?folder=${encodeURIComponent(example.dataset.place)}`);
