@@ -114,6 +114,7 @@ def reconstruct(
         FitError: If an optimisation has no usable result.
         CancelledError: If the user asked to stop.
     """
+    config = config.replace(object_=config.object_.on(device))
     has_object = _prepare(sequences, config, attempt, progress)
     if has_object:
         # Built once, by the first stage that is not finished yet.
@@ -429,6 +430,7 @@ def _problems(
                 control,
                 frame_count=len(sequence.reconstruction_frames),
                 frame_rate=sequence.frame_rate,
+                most_grips=config.object_.most_grips,
             )
         problems.append(
             build_problem(

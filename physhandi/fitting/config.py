@@ -212,6 +212,29 @@ class FirstOrderConfig(Settings, frozen=True, kw_only=True):
     on the way, the start is no candidate."""
 
 
+class CudaConfig(Settings, frozen=True, kw_only=True):
+    """What stage 2 does otherwise on CUDA; none for the same as elsewhere.
+
+    There candidates side by side cost little, and every substep waits for the one before.
+    """
+
+    population: Annotated[int, Meta(ge=2, le=1000)] | None = None
+    """Candidates a generation on CUDA."""
+    most_generations: Count | None = None
+    """Most generations of the search on CUDA, those with wider intervals not counted."""
+    least_damping: Annotated[float, Meta(ge=0.0, le=1e9)] | None = None
+    """Lowest damping that the search tries on CUDA, scaled as its interval is [N·s/m]. Springs that
+    hardly damp are found by a search of many candidates; they explain the fitted frames and swing
+    in the predicted ones."""
+    most_iterations: Count | None = None
+    """Most passes that fit springs one by one on CUDA; their steps are the longer."""
+    most_substeps: Annotated[int, Meta(ge=1, le=1_000_000)] | None = None
+    """Most substeps of a candidate on CUDA, if that is less than elsewhere."""
+    most_grips: Annotated[int, Meta(ge=1, le=100_000)] | None = None
+    """Most control nodes that hold one object node at a time on CUDA. Hundreds of springs at a node
+    hold it no better than a few, but they need several times as many substeps."""
+
+
 class ObjectFitConfig(Settings, frozen=True, kw_only=True):
     """What stage 2 does."""
 
@@ -243,11 +266,41 @@ class ObjectFitConfig(Settings, frozen=True, kw_only=True):
     contact_over_time: bool = False
     """Whether virtual springs are attached when a hand is seen to take hold of the object and let
     go when it leaves or slides, instead of being laid at frame 0 for all frames."""
+    most_grips: Annotated[int, Meta(ge=1, le=100_000)] | None = None
+    """Most control nodes, the nearest ones, that hold one object node at a time, with contact over
+    time; none for all within the virtual radius."""
     automatic_substeps: bool = False
     """Give each candidate the substeps that its own stability limit asks for."""
     most_substeps: Annotated[int, Meta(ge=1, le=1_000_000)] = 2000
     """A candidate that needs more substeps a frame than this is not tried, nor, with automatic
     ones, if it needs more than twice as many as the start of the search, if that is more."""
+    on_cuda: CudaConfig = field(default_factory=CudaConfig)
+    """What is done otherwise on CUDA."""
+
+    def on(self, device: str) -> "ObjectFitConfig":
+        """Give the settings that hold on a device."""
+        if not device.startswith("cuda"):
+            return self
+        search, springs, cuda = self.search, self.first_order, self.on_cuda
+        if cuda.most_generations is not None:
+            fewer = min(search.generations, cuda.most_generations)
+            search = search.replace(generations=fewer)
+        if cuda.population is not None:
+            search = search.replace(population=cuda.population)
+        damping = search.variables.get("damping")
+        if damping is not None and cuda.least_damping is not None:
+            low = min(max(damping.low, cuda.least_damping), 0.5 * damping.high)
+            variables = search.variables | {"damping": damping.replace(low=low)}
+            search = search.replace(variables=variables)
+        if cuda.most_iterations is not None and springs.iterations > cuda.most_iterations:
+            rate = springs.learning_rate * springs.iterations / max(1, cuda.most_iterations)
+            springs = springs.replace(iterations=cuda.most_iterations, learning_rate=min(rate, 1.0))
+        return self.replace(
+            search=search,
+            first_order=springs,
+            most_substeps=min(self.most_substeps, cuda.most_substeps or self.most_substeps),
+            most_grips=self.most_grips if cuda.most_grips is None else cuda.most_grips,
+        )
 
 
 class RefinementConfig(Settings, frozen=True, kw_only=True):
@@ -483,6 +536,7 @@ GROUPS = {
     "simulation": "Simulation at the start",
     "hand": "Stage 1: hands",
     "object_": "Stage 2: what is compared",
+    "object_.on_cuda": "Stage 2: on CUDA",
     "object_.search": "Stage 2: search",
     INTERVALS: "Stage 2: searched intervals",
     "object_.first_order": "Stage 2: springs one by one",

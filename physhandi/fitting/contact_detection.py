@@ -80,6 +80,7 @@ def find_contacts(
     *,
     frame_count: int,
     frame_rate: float,
+    most_grips: int | None = None,
 ) -> ContactIntervals:
     """Find what hands hold, and when, in the frames that are fitted.
 
@@ -89,6 +90,7 @@ def find_contacts(
         control: Control nodes in all frames, also those to predict [m].
         frame_count: Frames to fit; nothing but the control nodes is read of later ones.
         frame_rate: Frames a second [Hz].
+        most_grips: Most control nodes, the nearest ones, that hold a node at a time; None for all.
 
     Returns:
         The contacts; a node's distance from each control node is that of the frame in which its
@@ -131,6 +133,9 @@ def find_contacts(
     for index, begin, end in held:
         away = np.linalg.norm(hands.control[begin] - seen[begin, index], axis=1)
         near_by = np.flatnonzero(away < LONGEST_HOLD * reach)
+        if most_grips is not None:
+            nearest_first = np.argsort(away[near_by], kind="stable")
+            near_by = np.sort(near_by[nearest_first[:most_grips]])
         leaves = end if end < last else until[int(nearest[last, index])]
         row = np.broadcast_to(np.array([index, begin, leaves]), (len(near_by), 3))
         pairs.append(np.column_stack([near_by, away[near_by], row]))

@@ -7,7 +7,7 @@ compares them with what was observed (physics.md §4.1).
 import math
 from collections.abc import Callable
 from collections.abc import Sequence as Many
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 import numpy as np
@@ -24,11 +24,13 @@ from physhandi.simulation.contact_intervals import ContactIntervals
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
-from physhandi.simulation.stability import stable_substeps
+from physhandi.simulation.stability import bound_substeps, stable_substeps
 from physhandi.simulation.topology import build_model
 
 TRACK_CARRIERS = 4
 """Nodes that carry one observed surface point."""
+MOST_PAIRS = 2**25
+"""Most pairs of a point and a node whose distances are kept at a time on a GPU."""
 SUBSTEP_SAFETY = 1.25
 """Factor by which the substeps exceed the stability limit."""
 
@@ -78,10 +80,21 @@ class ObjectProblem:
         """Number of frames to fit, frame 0 included."""
         return self.cloud.shape[0]
 
+    def on(self, device: str) -> "ObjectProblem":
+        """Copy what is compared with a simulation to a device, where its losses are computed."""
+        tensors = {f.name: getattr(self, f.name) for f in fields(self)}
+        return replace(
+            self, **{n: value.to(device) for n, value in tensors.items() if torch.is_tensor(value)}
+        )
+
     def predict_tracks(self, node: Float[Tensor, "frame node 3"]) -> Float[Tensor, "frame track 3"]:
         """Carry the tracked surface points along with the nodes."""
-        # Unlike that of indexing, which adds in parallel, the gradient of index_select on a CPU is
-        # a sum in the order of the tracks: the same bits every time.
+        # A gradient that adds in parallel would have other bits every time. That of index_select on
+        # a CPU is a sum in the order of the tracks, that of a matrix product on a GPU has an order.
+        if node.is_cuda:
+            matrix = node.new_zeros(len(self.carrier), node.shape[1])
+            matrix = matrix.scatter_add(1, self.carrier, self.carrier_weight)
+            return matrix @ node + self.track_offset
         carrier = node.index_select(1, self.carrier.flatten()).unflatten(1, self.carrier.shape)
         return (carrier * self.carrier_weight[..., None]).sum(dim=2) + self.track_offset
 
@@ -299,8 +312,14 @@ def chamfer_loss(
     Returns:
         One value a frame; 0 where a frame has no points.
     """
-    nearest = _nearest(observed, is_observed, node)
-    chosen = torch.gather(node, 1, nearest[..., None].expand(-1, -1, 3))
+    if node.is_cuda:
+        # Whose gradient adds in a fixed order, unlike that of gather.
+        nearest = _nearest_of_all(observed, node.detach())
+        is_chosen = nearest[..., None] == torch.arange(node.shape[1], device=node.device)
+        chosen = is_chosen.to(node.dtype) @ node
+    else:
+        nearest = _nearest(observed, is_observed, node)
+        chosen = torch.gather(node, 1, nearest[..., None].expand(-1, -1, 3))
     squared = ((torch.nan_to_num(observed) - chosen) ** 2).sum(dim=2) * is_observed
     divisor = is_observed.sum(dim=1) if count is None else count
     return squared.sum(dim=1) / divisor.clamp(min=1)
@@ -361,6 +380,20 @@ def _nearest(
     return nearest.to(node.device)
 
 
+def _nearest_of_all(
+    observed: Float[Tensor, "frame point 3"], node: Float[Tensor, "frame node 3"]
+) -> Int[Tensor, "frame point"]:
+    """Find the nearest node of each observed point by comparing all, as a GPU does fastest."""
+    frames = max(1, MOST_PAIRS // max(1, observed.shape[1] * node.shape[1]))
+    nearest = []
+    for points, nodes in zip(observed.split(frames), node.split(frames), strict=True):
+        squared = (points[..., :1] - nodes[..., 0, None].mT) ** 2
+        for axis in (1, 2):
+            squared += (points[..., axis, None] - nodes[..., axis, None].mT) ** 2
+        nearest.append(squared.argmin(dim=2))
+    return torch.cat(nearest)
+
+
 def problem_parameters(
     parameters: SimulationParameters, problem: ObjectProblem
 ) -> SimulationParameters:
@@ -416,6 +449,7 @@ def mean_loss(
             node, velocity = simulate_problem(problem, models[problem.name], parameters, device)
         except SimulationDivergedError:
             return math.inf
+        node, velocity = (state.to(problem.cloud.device) for state in (node, velocity))
         if on_rollout is not None:
             on_rollout(problem, node)
         frame_losses = problem.frame_losses(
@@ -442,4 +476,14 @@ def settle_substeps(
     if not config.automatic_substeps:
         return parameters
     needed = max(stable_substeps(model, parameters, safety=safety) for model in models)
+    return parameters.replace(substeps_per_frame=10 * math.ceil(needed / 10))
+
+
+def bound_substeps_of(
+    models: Many[SpringMassModel], parameters: SimulationParameters, config: ObjectFitConfig
+) -> SimulationParameters:
+    """Choose no fewer substeps than `settle_substeps`, at a tenth of its cost."""
+    if not config.automatic_substeps:
+        return parameters
+    needed = max(bound_substeps(model, parameters, safety=SUBSTEP_SAFETY) for model in models)
     return parameters.replace(substeps_per_frame=10 * math.ceil(needed / 10))

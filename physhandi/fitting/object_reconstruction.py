@@ -4,6 +4,7 @@
 `check_springs` refuse objects that no parameters, or not these, can hold together.
 """
 
+import math
 from collections.abc import Sequence as Many
 from concurrent.futures import ThreadPoolExecutor
 
@@ -18,6 +19,7 @@ from physhandi.errors import FitError, UsageError
 from physhandi.fitting.config import ObjectFitConfig, SearchConfig
 from physhandi.fitting.object_problem import (
     ObjectProblem,
+    bound_substeps_of,
     build_problem_model,
     mean_loss,
     problem_parameters,
@@ -204,7 +206,7 @@ class CandidateEvaluator:
     def __call__(
         self, candidates: Many[SimulationParameters]
     ) -> list[tuple[SimulationParameters, float]]:
-        """Return each candidate with its substeps filled in, and its loss [m²].
+        """Return each candidate with the substeps that it was simulated with, and its loss [m²].
 
         The loss is infinite if a candidate diverges, has no springs or needs more substeps than
         the configuration allows.
@@ -222,22 +224,45 @@ class CandidateEvaluator:
             )
             for problem in self._problems
         ]
+        is_batched = wp.get_device(self._device).is_cuda
+        choose = bound_substeps_of if is_batched else settle_substeps
         settled, possible = [], []
         for index, parameters in enumerate(candidates):
             models = [master.model(parameters) for master in masters]
-            settled.append(settle_substeps(models, parameters, self._config))
+            settled.append(choose(models, parameters, self._config))
             if self._is_possible(models, settled[-1]):
                 possible.append(index)
+        if is_batched:
+            # A batch takes the substeps of the candidate that needs most. The best one keeps them:
+            # with longer ones it would move otherwise than it was judged, and may diverge.
+            most = max((settled[index].substeps_per_frame for index in possible), default=1)
+            for index in possible:
+                settled[index] = settled[index].replace(substeps_per_frame=most)
         losses = np.full((len(masters), len(candidates)), np.inf)
         for row, master in enumerate(masters):
             self._simulate(row, master, settled, possible, losses[row])
         mean = [float(value) for value in losses.mean(axis=0)]
         winner = int(np.argmin(mean))
+        while is_batched and mean[winner] < self._best_loss:
+            if self._holds_alone(masters, settled[winner]):
+                break
+            mean[winner] = np.inf
+            winner = int(np.argmin(mean))
         if mean[winner] < self._best_loss:
             self._best_loss = mean[winner]
             self._best = settled[winner], masters[0].model(settled[winner])
         self._show_best()
         return list(zip(settled, mean, strict=True))
+
+    def _holds_alone(self, masters: Many[MasterTopology], parameters: SimulationParameters) -> bool:
+        """Tell whether a candidate does not diverge when it is simulated alone.
+
+        In a batch sums are rounded otherwise, and what nearly diverges may do so alone.
+        """
+        pairs = zip(self._problems, masters, strict=True)
+        models = {problem.name: master.model(parameters) for problem, master in pairs}
+        loss = mean_loss(self._problems, models, parameters, self._config, self._device)
+        return math.isfinite(loss)
 
     def _show_best(self) -> None:
         """Show the best candidate in a preview, at most once for each."""

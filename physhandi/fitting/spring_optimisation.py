@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
@@ -98,11 +99,9 @@ def optimise_springs(
     settings = config.first_order
     if settings.truncates_damping:
         parameters = _truncated(parameters)
+    problems = [problem.on(device) for problem in problems]
     models = _starting_models(problems, parameters, config)
-    # Springs may stiffen while they are fitted, so the limit is kept farther away.
-    parameters = settle_substeps(
-        list(models.values()), parameters, config, safety=SUBSTEP_SAFETY * SUBSTEP_SAFETY
-    )
+    parameters = _with_margin(list(models.values()), parameters, config, device)
     material = Material(models, parameters, settings)
     loss_before = _finite(
         mean_loss(problems, models, parameters, config, device),
@@ -196,6 +195,21 @@ def _starting_models(
             )
         models[problem.name] = model
     return models
+
+
+def _with_margin(
+    models: Many[SpringMassModel],
+    parameters: SimulationParameters,
+    config: ObjectFitConfig,
+    device: str,
+) -> SimulationParameters:
+    """Choose substeps with which springs may stiffen while they are fitted.
+
+    A search on a GPU takes more of them than its best candidate needs; they go on being taken.
+    """
+    settled = settle_substeps(models, parameters, config, safety=SUBSTEP_SAFETY * SUBSTEP_SAFETY)
+    is_finer = parameters.substeps_per_frame > settled.substeps_per_frame
+    return parameters if is_finer and wp.get_device(device).is_cuda else settled
 
 
 def _truncated(parameters: SimulationParameters) -> SimulationParameters:
@@ -386,6 +400,8 @@ class SpringDescent:
     ) -> float | None:
         """Simulate what the next pass would, which then need not simulate it once more.
 
+        A GPU simulates the frames beyond the next pass's horizon too, without a gradient.
+
         Args:
             problems: All sequences.
             models: Their springs before any update.
@@ -397,18 +413,30 @@ class SpringDescent:
             does not simulate all of them from start to end, or if there is none.
         """
         problem, settings = problems[0], self._config.first_order
-        horizon = _horizon(next_iteration, settings, problem.frame_count)
-        is_whole = settings.window is None and horizon == problem.frame_count
-        if len(problems) > 1 or next_iteration >= settings.iterations or not is_whole:
+        if len(problems) > 1 or settings.window is not None:
             return None
-        model, length = models[problem.name], horizon - 1
-        reach = self._reach_over(problem, length)
+        last = problem.frame_count - 1
+        length = _horizon(next_iteration, settings, problem.frame_count) - 1
+        if next_iteration >= settings.iterations:
+            length = 0
+        if length < last and not problem.cloud.is_cuda:
+            return None
+        model = models[problem.name]
+        state = _start(model)
+        parts: list[FitWindow] = []
         try:
-            self._ahead = self._simulate(problem, model, (0, length), _start(model), reach)
+            if length > 0:
+                reach = self._reach_over(problem, length)
+                self._ahead = self._simulate(problem, model, (0, length), state, reach)
+                parts, state = [self._ahead], self._ahead.state
+            if length < last:
+                with torch.no_grad():
+                    parts.append(self._simulate(problem, model, (length, last), state, last))
         except SimulationDivergedError:
             return math.inf
-        on_rollout(problem, self._ahead.node.detach())
-        return float(self._ahead.frame_losses.detach().mean())
+        node = [part.node.detach()[min(number, 1) :] for number, part in enumerate(parts)]
+        on_rollout(problem, torch.cat(node))
+        return float(torch.cat([part.frame_losses.detach() for part in parts]).mean())
 
     def fit_pass(
         self, problem: ObjectProblem, model: SpringMassModel, horizon: int
@@ -503,7 +531,7 @@ class SpringDescent:
         node, velocity = differentiable.rollout(
             model,
             problem_parameters(self._parameters, problem),
-            torch.from_numpy(problem.control[begin : end + 1]),
+            torch.from_numpy(problem.control[begin : end + 1]).to(problem.cloud.device),
             log_stiffness=log_stiffness,
             damping=damping,
             initial_position=state[0],

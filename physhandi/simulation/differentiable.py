@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 import torch
 import warp as wp
-from jaxtyping import Float
+from jaxtyping import Float, Int32
+from numpy import ndarray
 from torch import Tensor
 
 from physhandi.simulation.engines.cpu import CpuAdjoint
@@ -23,7 +24,7 @@ from physhandi.simulation.engines.graph_adjoint import GraphAdjoint
 from physhandi.simulation.engines.tape import TapeLayout, Trajectory
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
-from physhandi.simulation.simulator import Simulator
+from physhandi.simulation.simulator import NO_DIVERGENCE, Simulator
 
 CACHED_SIMULATORS = 16
 """Models whose captured graphs and tapes are reused between calls of `rollout`."""
@@ -170,6 +171,8 @@ class _DifferentiableSimulator:
         self.simulator = Simulator(model, parameters, device)
         self.torch_device = torch.device(wp.device_to_torch(self.simulator.device))
         self._acts: Tensor | None = None
+        self._acting: dict[bytes, Tensor] = {}
+        self._acting_at: dict[int, Tensor] = {}
 
     @cached_property
     def adjoint(self) -> GraphAdjoint | CudaAdjoint | CpuAdjoint:
@@ -224,8 +227,11 @@ class _DifferentiableSimulator:
         simulator = self.simulator
         _copy_in(simulator.position, position)
         _copy_in(simulator.velocity, velocity)
-        simulator.first_divergence.fill_(np.iinfo(np.int32).max)
+        simulator.first_divergence.fill_(NO_DIVERGENCE)
         positions, velocities = [position], [velocity]
+        # A GPU is asked once, at the end: a question after every frame would leave it idle.
+        asks_later = simulator.device.is_cuda and simulator.collision is None
+        diverged = []
         for frame in range(1, len(control)):
             self._place_control(control, frame)
             self._hold(material, first_frame + frame)
@@ -233,10 +239,26 @@ class _DifferentiableSimulator:
                 trajectory.record(frame)
             else:
                 simulator.replay_frame()
-            simulator.check_divergence(frame)
+            if asks_later:
+                diverged.append(_copy_out(simulator.first_divergence))
+            else:
+                simulator.check_divergence(frame)
             positions.append(_copy_out(simulator.position))
             velocities.append(_copy_out(simulator.velocity))
+        if diverged:
+            self._check_divergences(torch.cat(diverged).cpu().numpy())
         return torch.stack(positions), torch.stack(velocities)
+
+    def _check_divergences(self, first: Int32[ndarray, " frame"]) -> None:
+        """Raise `SimulationDivergedError` for the first frame that recorded a divergence.
+
+        Args:
+            first: What `Simulator.first_divergence` held after each frame.
+        """
+        frames = np.flatnonzero(first != NO_DIVERGENCE)
+        if len(frames):
+            self.simulator.first_divergence.fill_(int(first[frames[0]]))
+            self.simulator.check_divergence(int(frames[0]) + 1)
 
     def backward(
         self,
@@ -296,12 +318,22 @@ class _DifferentiableSimulator:
         model = self.simulator.model
         if model.is_always_attached:
             return
-        acts = torch.from_numpy(model.acts_in(frame)).to(self.torch_device)
-        if self._acts is None or not torch.equal(acts, self._acts):
+        acts = self._acting_in(frame)
+        if acts is not self._acts:
             self._acts = acts
             log_stiffness, damping = material[:2]
             _copy_in(self.simulator.stiffness, log_stiffness.exp() * acts)
             _copy_in(self.simulator.damping, damping * acts)
+
+    def _acting_in(self, frame: int) -> Tensor:
+        """Mark the springs that act on the way to a frame; the same tensor for the same springs."""
+        if frame not in self._acting_at:
+            acts = self.simulator.model.acts_in(frame)
+            key = acts.tobytes()
+            if key not in self._acting:
+                self._acting[key] = torch.from_numpy(acts).to(self.torch_device)
+            self._acting_at[frame] = self._acting[key]
+        return self._acting_at[frame]
 
     def _place_control(self, control: Tensor, frame: int) -> None:
         _copy_in(self.simulator.control_start, control[frame - 1])

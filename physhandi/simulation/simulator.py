@@ -1,6 +1,6 @@
 """Semi-implicit Euler rollouts of a spring-mass model; one launch or graph replay a frame."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -26,7 +26,8 @@ from physhandi.simulation.stability import explain_divergence
 
 SPEED_LIMIT = 50.0
 """A node faster than this has diverged [m/s]."""
-_NO_DIVERGENCE = np.iinfo(np.int32).max
+NO_DIVERGENCE = np.iinfo(np.int32).max
+"""What `Simulator.first_divergence` holds as long as no node has diverged."""
 _WORLD: Any = World
 
 
@@ -71,7 +72,7 @@ class Simulator:
         self.velocity = self.array(model.initial_velocity, wp.vec3)
         self.control_start = wp.zeros(model.control_count, dtype=wp.vec3, device=self.device)
         self.control_end = wp.zeros(model.control_count, dtype=wp.vec3, device=self.device)
-        self.first_divergence = self.array(np.array([_NO_DIVERGENCE]), wp.int32)
+        self.first_divergence = self.array(np.array([NO_DIVERGENCE]), wp.int32)
         self._held: ndarray | None = None
         self._no_tape = wp.zeros(0, dtype=wp.vec3, device=self.device)
         self._collision: SelfCollision | None = None
@@ -99,27 +100,7 @@ class Simulator:
                 "frame_rate and substeps_per_frame are fixed in a simulator; build a new one."
             )
         self.parameters = parameters
-        height, rate = parameters.ground_height, parameters.simulated_frame_rate
-        values: dict[str, float] = {
-            "dt": parameters.dt,
-            "velocity_loss": parameters.velocity_loss(),
-            "gravity": parameters.gravity,
-            "has_ground": height is not None,
-            "ground_height": 0.0 if height is None else height,
-            "restitution": parameters.restitution,
-            "friction": parameters.friction,
-            "stiffness_scale": parameters.stiffness_scale,
-            "control_rate": rate if parameters.use_control_velocity else 0.0,
-            "collision_distance": parameters.collision_distance,
-            "self_restitution": parameters.self_restitution,
-            "self_friction": parameters.self_friction,
-            "collides_rest_neighbors": parameters.collides_rest_neighbors,
-            "speed_limit": SPEED_LIMIT,
-        }
-        world: Any = np.zeros(1, dtype=_WORLD.numpy_dtype())
-        for name, value in values.items():
-            world[name] = value
-        self.world.assign(world)
+        self.world.assign(world_array([parameters]))
 
     def override_world(self, **values: float) -> None:
         """Set fields of the kernels' `World` directly, bounds unchecked, until the next change."""
@@ -159,7 +140,7 @@ class Simulator:
         self.velocity.assign(np.asarray(velocity, dtype=np.float32))
         self.rest_length.assign(self.model.rest_length)
         self.clearance.assign(self.model.clearance)
-        self.first_divergence.fill_(_NO_DIVERGENCE)
+        self.first_divergence.fill_(NO_DIVERGENCE)
 
     def continue_from(
         self, restart: Restart, control: Float[ndarray, "control 3"]
@@ -371,7 +352,7 @@ class Simulator:
     def check_divergence(self, frame: int) -> None:
         """Raise `SimulationDivergedError` if the last frame recorded a divergence."""
         first = int(self.first_divergence.numpy()[0])
-        if first == _NO_DIVERGENCE:
+        if first == NO_DIVERGENCE:
             return
         substep, node = divmod(first, self.model.node_count)
         material = {
@@ -401,6 +382,32 @@ class Simulator:
             self.launch_substep(substep, (before, self.velocity), (after, self.velocity))
         if places[count % 2] is not self.position:
             wp.copy(self.position, places[count % 2])
+
+
+def world_array(parameters: Sequence[SimulationParameters]) -> ndarray:
+    """Give the kernels' `World` of each simulation."""
+    worlds: Any = np.zeros(len(parameters), dtype=_WORLD.numpy_dtype())
+    for index, each in enumerate(parameters):
+        height, rate = each.ground_height, each.simulated_frame_rate
+        values: dict[str, float] = {
+            "dt": each.dt,
+            "velocity_loss": each.velocity_loss(),
+            "gravity": each.gravity,
+            "has_ground": height is not None,
+            "ground_height": 0.0 if height is None else height,
+            "restitution": each.restitution,
+            "friction": each.friction,
+            "stiffness_scale": each.stiffness_scale,
+            "control_rate": rate if each.use_control_velocity else 0.0,
+            "collision_distance": each.collision_distance,
+            "self_restitution": each.self_restitution,
+            "self_friction": each.self_friction,
+            "collides_rest_neighbors": each.collides_rest_neighbors,
+            "speed_limit": SPEED_LIMIT,
+        }
+        for name, value in values.items():
+            worlds[name][index] = value
+    return worlds
 
 
 def checked_control(control: Float[ndarray, "frame control 3"], count: int) -> ndarray:

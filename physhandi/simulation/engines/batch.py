@@ -1,7 +1,7 @@
 """Simulates many candidates of one object together: on CUDA, one launch a substep for all.
 
 `BatchSimulator` is the entry; `Population` holds the candidates on the device, `LossSum` their
-losses.
+losses. Few candidates are moved side by side instead (`engines.side_by_side`).
 """
 
 from collections.abc import Iterator
@@ -20,6 +20,7 @@ from physhandi.simulation.contact_intervals import NEVER, acts_in, always
 from physhandi.simulation.engines.cpu import CpuEngine
 from physhandi.simulation.engines.graph import LaunchGraph
 from physhandi.simulation.engines.partition import bisect_nodes
+from physhandi.simulation.engines.side_by_side import SideBySide
 from physhandi.simulation.kernels.batch import (
     CANDIDATE_FIELDS,
     block_threads,
@@ -460,6 +461,7 @@ class BatchSimulator:
         device: str = "cpu",
         *,
         threads: int | None = None,
+        side_by_side: bool = True,
     ) -> None:
         """Copy candidates to a device.
 
@@ -469,6 +471,8 @@ class BatchSimulator:
             device: Warp device.
             threads: Threads of a candidate on a CPU, 1 or 2; None for whichever is faster. The
                 bits are the same.
+            side_by_side: Whether few candidates are moved side by side on CUDA, in one launch a
+                frame, or interleaved as many are.
 
         Raises:
             UsageError: If there is no candidate, or candidates differ in what must be common:
@@ -486,7 +490,8 @@ class BatchSimulator:
         self.substeps = max(p.substeps_per_frame for p in parameters)
         self.device = wp.get_device(device)
         self._threads = threads
-        self._population: Population | None = None
+        self._side_by_side = side_by_side
+        self._population: Population | SideBySide | None = None
 
     def rollout(self, control: Float[ndarray, "frame control 3"]) -> BatchRollout:
         """Simulate all frames of a control trajectory.
@@ -499,6 +504,8 @@ class BatchSimulator:
         """
         control = checked_control(control, self.master.control_count)
         population = self._on_device()
+        if isinstance(population, SideBySide):
+            return self._side_by_side_rollout(population, control)
         if population is not None:
             return population.rollout(control)
         shape = (len(self.parameters), len(control), len(self.master.object_node), 3)
@@ -533,6 +540,8 @@ class BatchSimulator:
                 f"control has {len(control)} frames, but {target.frame_count} were observed."
             )
         population = self._on_device()
+        if isinstance(population, SideBySide):
+            return self._side_by_side_losses(population, control[: target.frame_count], target)
         if population is not None:
             return population.losses(control, target)
         loss = np.full(len(self.parameters), np.inf, dtype=np.float32)
@@ -550,12 +559,41 @@ class BatchSimulator:
                 diverged[candidate] = error.frame
         return BatchLosses(loss, diverged)
 
-    def _on_device(self) -> Population | None:
+    def _on_device(self) -> "Population | SideBySide | None":
         if not self.device.is_cuda or len(self.master.object_node) == 0:
             return None
         if self._population is None:
-            self._population = Population(self.master, self.parameters, self.substeps, self.device)
+            candidates = self.master, self.parameters, self.substeps, self.device
+            if self._side_by_side:
+                self._population = SideBySide.of(*candidates)
+            self._population = self._population or Population(*candidates)
         return self._population
+
+    def _side_by_side_rollout(
+        self, bodies: SideBySide, control: Float32[ndarray, "frame control 3"]
+    ) -> BatchRollout:
+        shape = (len(self.parameters), len(control), bodies.nodes, 3)
+        position = np.empty(shape, dtype=np.float32)
+        first = wp.full(shape[0], -1, dtype=wp.int32, device=self.device)
+        for frame, state, diverged in bodies.frames(control):
+            position[:, frame] = state.numpy().reshape(shape[0], shape[2], 6)[..., :3]
+            first = diverged
+        return BatchRollout(position, first.numpy())
+
+    def _side_by_side_losses(
+        self,
+        bodies: SideBySide,
+        control: Float32[ndarray, "frame control 3"],
+        target: MotionTarget,
+    ) -> BatchLosses:
+        """Sum the losses on the device; the host waits once, at the end."""
+        lanes = len(self.parameters)
+        sums = LossSum(target, np.arange(bodies.nodes), lanes=lanes, width=1, device=self.device)
+        first = wp.full(lanes, -1, dtype=wp.int32, device=self.device)
+        for frame, state, diverged in bodies.frames(control):
+            sums.add(frame, state, diverged)
+            first = diverged
+        return BatchLosses(sums.loss.numpy(), first.numpy())
 
     def _alone(
         self, parameters: SimulationParameters, control: Float32[ndarray, "frame control 3"]

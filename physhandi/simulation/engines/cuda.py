@@ -4,7 +4,7 @@
 differentiates.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -14,7 +14,7 @@ from jaxtyping import Int32
 from numpy import ndarray
 
 from physhandi.simulation.engines.frame_sums import FrameSums
-from physhandi.simulation.engines.host import EngineHost
+from physhandi.simulation.engines.host import EngineHost, FrameHost
 from physhandi.simulation.engines.partition import Partition, partition_model
 from physhandi.simulation.engines.tape import Tape
 from physhandi.simulation.engines.tape import TapeLayout as TapeLayout
@@ -149,16 +149,19 @@ class LargeLayout:
 class LargeFrames:
     """The half-edges of one model as the large frame kernel reads them."""
 
-    def __init__(self, simulator: EngineHost, partition: Partition) -> None:
+    def __init__(self, simulator: FrameHost, partition: Partition, *, few_kernels: bool) -> None:
         """Copy the half-edges to the device.
 
         Args:
             simulator: Its state, controls, material and world are read and written.
             partition: Blocks of its model; they must fit the device.
+            few_kernels: Whether one kernel serves models that keep different numbers of half-edges.
         """
         self._simulator = simulator
         self._block_count = partition.block_count
         self.layout = LargeLayout.of(partition, most_large_locals(simulator.device))
+        if few_kernels:
+            self.layout = replace(self.layout, kept=MOST_KEPT)
         columns = arrange_columns(partition, self.layout.lanes, self.layout.threads)
         self._chunk_count = columns.chunk_count
         self._start = simulator.array(columns.start, wp.int32)
@@ -177,7 +180,8 @@ class LargeFrames:
         """Launch one frame, from one state (position, velocity) to another.
 
         Args:
-            blocks: The partition's `own_start`, `local_start`, `local_node` and `model_node`.
+            blocks: The body of each block, then the partition's `own_start`, `local_start`,
+                `local_node` and `model_node`.
             relay: Where blocks publish their nodes.
             tag: First of as many unused tags as substeps, and one more.
             before: State at its start.
@@ -193,7 +197,8 @@ class LargeFrames:
             device=simulator.device,
         )
         inputs: list[Any] = [self._chunk_count, simulator.parameters.substeps_per_frame, tag]
-        inputs += [simulator.world, simulator.clearance, *blocks, self._start, self._packed]
+        body, *places = blocks
+        inputs += [simulator.world, body, simulator.clearance, *places, self._start, self._packed]
         wp.launch(
             large_frame_kernel(layout.lanes, layout.kept, layout.threads, layout.locals),
             dim=self._block_count * layout.threads,
@@ -224,29 +229,49 @@ class BlockLayout:
         needed = partition.most_own * lanes
         return cls(lanes, kept, next((n for n in BLOCK_SIZES if n >= needed), BLOCK_SIZES[-1]))
 
+    def holds(self, partition: Partition) -> bool:
+        """Tell whether every node has its own threads, and every half-edge a register."""
+        has_threads = partition.most_own * self.lanes <= self.threads
+        return has_threads and partition.most_entries <= self.lanes * self.kept
+
 
 class CudaEngine:
     """The arrays of one model for the CUDA kernels."""
 
-    def __init__(self, simulator: EngineHost, partition: Partition) -> None:
+    def __init__(
+        self,
+        simulator: FrameHost,
+        partition: Partition,
+        body_of: Int32[ndarray, " block"] | None = None,
+    ) -> None:
         """Copy a partition to the device.
 
         Args:
             simulator: Its state, controls, material and world are read and written.
             partition: Blocks of its model.
+            body_of: The body that each block is part of, if there are several that do not touch:
+                each has its own world. Their models change often, so few kernels serve all.
         """
         self._simulator = simulator
         self.partition = partition
-        self.layout = BlockLayout.of(partition)
+        self.layout = layout = BlockLayout.of(partition)
+        has_many = body_of is not None
+        if has_many:
+            self.layout = replace(layout, kept=layout.kept + layout.kept % 2)
         names = ("own_start", "local_start", "local_node", "model_node", "entry_start")
         self._map = [simulator.array(getattr(partition, name), wp.int32) for name in names]
         self._map.append(simulator.array(partition.entry, wp.vec2i))
-        count = simulator.model.node_count
+        bodies = np.zeros(partition.block_count, np.int32) if body_of is None else body_of
+        self._body = simulator.array(bodies, wp.int32)
+        count = len(partition.model_node)
         self._relay = wp.zeros(4 * count, dtype=wp.vec4, device=simulator.device)
         self._no_tape = wp.zeros((0, 0), dtype=wp.vec4, device=simulator.device)
         self._tag = 1
         is_large = partition.most_locals > FORWARD_LOCALS
-        self.large = LargeFrames(simulator, partition) if is_large else None
+        is_large = is_large or (has_many and not layout.holds(partition))
+        self.large: LargeFrames | None = None
+        if is_large:
+            self.large = LargeFrames(simulator, partition, few_kernels=has_many)
 
     @staticmethod
     def of(simulator: EngineHost) -> "CudaEngine | None":
@@ -293,12 +318,12 @@ class CudaEngine:
             if tape is not None:
                 raise ValueError("Blocks in dynamic shared memory keep no tape.")
             tag = self.next_tags(substeps + 1)
-            self.large.advance(self._map[:4], self._relay, tag, before, after)
+            self.large.advance([self._body, *self._map[:4]], self._relay, tag, before, after)
             return
         self._launch(
             frame_kernel(self.layout.lanes, self.layout.kept),
             [self.layout.threads, substeps, self.next_tags(substeps + 1), simulator.world],
-            [simulator.clearance, *self._map, *simulator.material],
+            [self._body, simulator.clearance, *self._map, *simulator.material],
             [*simulator.controls, *before],
             [
                 self._relay,
@@ -309,13 +334,19 @@ class CudaEngine:
         )
 
     def launch_adjoint(
-        self, tape: wp.array, is_first: wp.array, state_bars: list[wp.array], bars: list[wp.array]
+        self,
+        tape: wp.array,
+        is_first: wp.array,
+        object_spring_count: int,
+        state_bars: list[wp.array],
+        bars: list[wp.array],
     ) -> None:
         """Launch the adjoint of one frame.
 
         Args:
             tape: What `advance` recorded of it.
             is_first: Which half-edges speak for their springs.
+            object_spring_count: Number of leading springs that join two object nodes.
             state_bars: Adjoints of position and velocity, from the frame's end to its start.
             bars: Where the other adjoints go, in the kernel's order.
         """
@@ -324,7 +355,7 @@ class CudaEngine:
         self._launch(
             adjoint_kernel(self.layout.lanes, self.layout.kept),
             [self.layout.threads, substeps, self.next_tags(substeps), simulator.world],
-            [simulator.clearance, *self._map, is_first, simulator.model.object_spring_count],
+            [simulator.clearance, *self._map, is_first, object_spring_count],
             [*simulator.material, *simulator.controls, tape],
             [*state_bars, self._relay, *bars],
         )
@@ -370,6 +401,7 @@ class CudaAdjoint:
         self._held_bars = [zeros(virtual_count, wp.vec3) for _ in range(2)]
         self.sums = FrameSums.zeros(model, device)
         self._is_first = simulator.array(engine.partition.is_first, wp.int32)
+        self._object_spring_count = model.object_spring_count
         control = model.spring_nodes[model.object_spring_count :].max(axis=1, initial=0) - nodes
         by_control = np.argsort(control, kind="stable")
         start = np.searchsorted(control[by_control], np.arange(model.control_count + 1))
@@ -384,11 +416,7 @@ class CudaAdjoint:
         if not isinstance(engine, CudaEngine) or simulator.parameters.self_collision:
             return None
         partition, layout = engine.partition, engine.layout
-        fits = (
-            partition.most_locals <= ADJOINT_LOCALS
-            and partition.most_own * layout.lanes <= layout.threads
-            and partition.most_entries <= layout.lanes * layout.kept
-        )
+        fits = partition.most_locals <= ADJOINT_LOCALS and layout.holds(partition)
         return CudaAdjoint(simulator, engine) if fits else None
 
     def record(self, tape: Tape) -> None:
@@ -403,6 +431,7 @@ class CudaAdjoint:
         self._engine.launch_adjoint(
             substeps,
             self._is_first,
+            self._object_spring_count,
             [self.position_bar, self.velocity_bar],
             [*sums.material, sums.drag, *sums.ground, *self._held_bars],
         )

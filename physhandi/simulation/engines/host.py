@@ -9,17 +9,16 @@ from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 
 
-class EngineHost(Protocol):
-    """A simulator, as an engine sees it."""
+class FrameHost(Protocol):
+    """What advances by frames of a CUDA engine: a simulator, or several bodies side by side."""
 
-    model: SpringMassModel
     parameters: SimulationParameters
     device: Any
     world: wp.array
+    """Of each body."""
     clearance: wp.array
     first_divergence: wp.array
-    position: wp.array
-    velocity: wp.array
+    """Of each body."""
 
     @property
     def material(self) -> tuple[wp.array, wp.array, wp.array]:
@@ -34,3 +33,11 @@ class EngineHost(Protocol):
     def array(self, value: ndarray, dtype: Any) -> wp.array:
         """Copy an array to the device."""
         ...
+
+
+class EngineHost(FrameHost, Protocol):
+    """A simulator, as an engine sees it."""
+
+    model: SpringMassModel
+    position: wp.array
+    velocity: wp.array

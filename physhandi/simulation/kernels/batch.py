@@ -368,3 +368,53 @@ def note_divergence(
     candidate = wp.tid()
     if diverged[candidate] == 1 and first_frame_out[candidate] < 0:
         first_frame_out[candidate] = frame
+
+
+@wp.kernel
+def hold_springs(
+    step: int,
+    # Model:
+    interval: wp.array[wp.vec2i],
+    stiffness: wp.array[float],
+    damping: wp.array[float],
+    # Out:
+    stiffness_out: wp.array[float],
+    damping_out: wp.array[float],
+):
+    """Let the virtual springs act that are attached in a frame (one thread a spring)."""
+    spring = wp.tid()
+    acts = float(0.0)
+    if interval[spring][0] < step <= interval[spring][1]:
+        acts = 1.0
+    stiffness_out[spring] = acts * stiffness[spring]
+    damping_out[spring] = acts * damping[spring]
+
+
+@wp.kernel
+def interleave_states(
+    # State in:
+    position: wp.array[wp.vec3],
+    velocity: wp.array[wp.vec3],
+    # State out:
+    state_out: wp.array[float],
+):
+    """Lay the states of bodies side by side as `place_of` finds them in groups of one."""
+    node = wp.tid()
+    for k in range(3):
+        state_out[6 * node + k] = position[node][k]
+        state_out[6 * node + 3 + k] = velocity[node][k]
+
+
+@wp.kernel
+def note_first_divergence(
+    frame: int,
+    never: int,
+    # State in:
+    first_divergence: wp.array[int],
+    # State out:
+    first_frame_out: wp.array[int],
+):
+    """Keep the first frame in which each body diverged (one thread a body)."""
+    body = wp.tid()
+    if first_divergence[body] != never and first_frame_out[body] < 0:
+        first_frame_out[body] = frame

@@ -85,6 +85,7 @@ def make_frame_kernel(lanes: int, kept: int) -> wp.Kernel:
         tag: int,
         # Model:
         world: wp.array[World],
+        body_of: wp.array[int],
         clearance: wp.array[float],
         own_start: wp.array[int],
         local_start: wp.array[int],
@@ -114,7 +115,8 @@ def make_frame_kernel(lanes: int, kept: int) -> wp.Kernel:
         lane = place % wp.static(lanes)
         row = place // wp.static(lanes)
         rows = threads // wp.static(lanes)
-        here = world[0]
+        body = body_of[block]
+        here = world[body]
         count = model_node.shape[0]
         first = own_start[block]
         own = own_start[block + 1] - first
@@ -214,7 +216,9 @@ def make_frame_kernel(lanes: int, kept: int) -> wp.Kernel:
                         tape_out[substep, 3 * node + 1] = wp.vec4(v[0], v[1], v[2], 0.0)
                         tape_out[substep, 3 * node + 2] = wp.vec4(free[0], free[1], free[2], 0.0)
                     if is_too_fast(here, motion.velocity):
-                        wp.atomic_min(first_divergence_out, 0, substep * count + model_node[node])
+                        wp.atomic_min(
+                            first_divergence_out, body, substep * count + model_node[node]
+                        )
                     if substep == substeps - 1:
                         position_out[model_node[node]] = motion.position
                         velocity_out[model_node[node]] = motion.velocity

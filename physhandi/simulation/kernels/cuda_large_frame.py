@@ -72,6 +72,7 @@ def make_large_frame_kernel(lanes: int, kept: int, threads: int, locals_: int) -
         tag: int,
         # Model:
         world: wp.array[World],
+        body_of: wp.array[int],
         clearance: wp.array[float],
         own_start: wp.array[int],
         local_start: wp.array[int],
@@ -100,7 +101,8 @@ def make_large_frame_kernel(lanes: int, kept: int, threads: int, locals_: int) -
         lane = place % wp.static(lanes)
         row = place // wp.static(lanes)
         warp_lane = place % 32
-        control_rate = world[0].control_rate
+        body = body_of[block]
+        control_rate = world[body].control_rate
         count = model_node.shape[0]
         first = own_start[block]
         own = own_start[block + 1] - first
@@ -177,7 +179,7 @@ def make_large_frame_kernel(lanes: int, kept: int, threads: int, locals_: int) -
                 force = lane_sum(force, wp.static(lanes))
                 if lane == 0 and i < own:
                     # Read late: its registers are better used for springs until here.
-                    here = world[0]
+                    here = world[body]
                     node = first + i
                     touching = clearance[model_node[node]]
                     motion = advance(here, touching, x, free_velocity(here, v, force))
@@ -187,7 +189,9 @@ def make_large_frame_kernel(lanes: int, kept: int, threads: int, locals_: int) -
                     large_write(later + i, motion.position)
                     large_write(later + wp.static(locals_) + i, motion.velocity)
                     if is_too_fast(here, motion.velocity):
-                        wp.atomic_min(first_divergence_out, 0, substep * count + model_node[node])
+                        wp.atomic_min(
+                            first_divergence_out, body, substep * count + model_node[node]
+                        )
                     if substep == substeps - 1:
                         position_out[model_node[node]] = motion.position
                         velocity_out[model_node[node]] = motion.velocity

@@ -82,12 +82,16 @@ def test_a_candidate_has_the_springs_that_it_would_find_itself():
     assert min(counts) > 0
 
 
+@pytest.mark.parametrize("side_by_side", [True, False])
 @pytest.mark.parametrize("count", [1, 32, 45])
-def test_each_candidate_moves_as_if_it_were_alone(device, count):
+def test_each_candidate_moves_as_if_it_were_alone(device, count, side_by_side):
+    if device == "cpu" and not side_by_side:
+        pytest.skip("candidates on a CPU take turns either way")
     node, control, velocity = scene()
     drawn = candidates(count)
     master = master_of(node, control, drawn, velocity)
-    batch = BatchSimulator(master, drawn, device=device).rollout(control)
+    simulator = BatchSimulator(master, drawn, device=device, side_by_side=side_by_side)
+    batch = simulator.rollout(control)
     assert batch.position.shape == (count, 4, len(node), 3)
     assert np.all(batch.diverged_frame == -1)
     for candidate in range(0, count, 1 if device == "cpu" and count < 4 else 7):
@@ -99,20 +103,22 @@ def test_each_candidate_moves_as_if_it_were_alone(device, count):
 
 
 @pytest.mark.gpu
+@pytest.mark.parametrize("side_by_side", [True, False])
 @pytest.mark.parametrize("side", [3, 9, 13])
-def test_sizes_that_fit_shared_memory_in_different_ways(side):
+def test_sizes_that_fit_shared_memory_in_different_ways(side, side_by_side):
     _needs_cuda()
     node, control, velocity = scene(side)
     drawn = [p.replace(connection_radius=0.03, max_neighbors=60) for p in candidates(3)]
     master = master_of(node, control, drawn, velocity)
-    batch = BatchSimulator(master, drawn, device="cuda:0").rollout(control)
+    batch = BatchSimulator(master, drawn, "cuda:0", side_by_side=side_by_side).rollout(control)
     for candidate, parameters in enumerate(drawn):
         wanted = alone(parameters, node, control, velocity, "cuda:0")
         np.testing.assert_allclose(batch.position[candidate], wanted, atol=5e-6)
 
 
 @pytest.mark.gpu
-def test_a_node_with_more_neighbors_than_fit_is_simulated_too():
+@pytest.mark.parametrize("side_by_side", [True, False])
+def test_a_node_with_more_neighbors_than_fit_is_simulated_too(side_by_side):
     _needs_cuda()
     rng = np.random.default_rng(4)
     node = rng.uniform(0, 0.05, (500, 3)).astype(np.float32)
@@ -122,7 +128,7 @@ def test_a_node_with_more_neighbors_than_fit_is_simulated_too():
         for s in (0.05, 0.2)
     ]
     master = master_of(node, still, drawn, np.zeros_like(node))
-    batch = BatchSimulator(master, drawn, device="cuda:0").rollout(still)
+    batch = BatchSimulator(master, drawn, "cuda:0", side_by_side=side_by_side).rollout(still)
     wanted = alone(drawn[1], node, still, np.zeros_like(node), "cuda:0")
     assert np.abs(wanted[-1] - wanted[0]).max() > 1e-3
     np.testing.assert_allclose(batch.position[1], wanted, atol=5e-6)
@@ -143,12 +149,16 @@ def test_a_thousand_candidates_at_once():
     assert np.array_equal(again.position, batch.position)
 
 
-def test_a_candidate_that_diverges_does_not_harm_the_others(device):
+@pytest.mark.parametrize("side_by_side", [True, False])
+def test_a_candidate_that_diverges_does_not_harm_the_others(device, side_by_side):
+    if device == "cpu" and not side_by_side:
+        pytest.skip("candidates on a CPU take turns either way")
     node, control, velocity = scene()
     drawn = candidates(5)
     drawn[2] = drawn[2].replace(stiffness=1e7, connection_radius=0.02, max_neighbors=19)
     master = master_of(node, control, drawn, velocity)
-    batch = BatchSimulator(master, drawn, device=device).rollout(control)
+    simulator = BatchSimulator(master, drawn, device=device, side_by_side=side_by_side)
+    batch = simulator.rollout(control)
     assert batch.diverged_frame[2] >= 1
     assert np.all(np.delete(batch.diverged_frame, 2) == -1)
     for candidate in (0, 4):
