@@ -29,7 +29,7 @@ from physhandi.simulation.topology import build_model
 
 TRACK_CARRIERS = 4
 """Nodes that carry one observed surface point."""
-MOST_PAIRS = 2**25
+MOST_DISTANCES = 2**25
 """Most pairs of a point and a node whose distances are kept at a time on a GPU."""
 SUBSTEP_SAFETY = 1.25
 """Factor by which the substeps exceed the stability limit."""
@@ -384,7 +384,7 @@ def _nearest_of_all(
     observed: Float[Tensor, "frame point 3"], node: Float[Tensor, "frame node 3"]
 ) -> Int[Tensor, "frame point"]:
     """Find the nearest node of each observed point by comparing all, as a GPU does fastest."""
-    frames = max(1, MOST_PAIRS // max(1, observed.shape[1] * node.shape[1]))
+    frames = max(1, MOST_DISTANCES // max(1, observed.shape[1] * node.shape[1]))
     nearest = []
     for points, nodes in zip(observed.split(frames), node.split(frames), strict=True):
         squared = (points[..., :1] - nodes[..., 0, None].mT) ** 2

@@ -93,8 +93,9 @@ def optimise_springs(
         The best models, as `FirstOrderConfig` ranks them.
 
     Raises:
-        FitError: If the start diverges or has no usable gradient, or if the best-ranked springs
-            diverge. A later failure ends the descent, and the best so far is returned.
+        FitError: If the start diverges, or if the best-ranked springs diverge. Where no gradient is
+            usable, or springs diverge while they are fitted, the descent ends and the best so far
+            is returned, be it the start.
     """
     settings = config.first_order
     if settings.truncates_damping:
@@ -122,8 +123,6 @@ def optimise_springs(
             ]
             message = _skipped_message(problems, losses)
         except (SimulationDivergedError, FitError) as error:
-            if isinstance(error, FitError) and iteration == 0:
-                raise
             stopped = f"Stopped after {iteration} of {settings.iterations} iterations. {error}"
             logger.warning("%s: %s", SPRING_STAGE, stopped)
             progress.report(SPRING_STAGE, iteration, settings.iterations, best_loss, stopped)

@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import warp as wp
 
 from physhandi.data.observation import ObjectObservation
 from physhandi.errors import CancelledError
+from physhandi.fitting import object_reconstruction
 from physhandi.fitting.config import ObjectFitConfig
 from physhandi.fitting.object_problem import (
     ObjectProblem,
@@ -222,3 +224,25 @@ def test_a_candidate_that_fails_in_its_thread_is_told(monkeypatch: pytest.Monkey
     evaluate = CandidateEvaluator([sheet("a", 0.2)], ObjectFitConfig(), NullProgress(), threads=2)
     with pytest.raises(MemoryError, match="no room"):
         evaluate(drawn(3))
+
+
+@pytest.mark.gpu
+def test_the_best_of_a_batch_must_hold_alone_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    if not wp.is_cuda_available():
+        pytest.skip("needs a CUDA device")
+    problems, candidates = [sheet("slow", 0.05)], drawn(3)
+    before = CandidateEvaluator(problems, ObjectFitConfig(), NullProgress(), device="cuda:0")
+    losses = [loss for _, loss in before(candidates)]
+    best = int(np.argmin(losses))
+    alone = object_reconstruction.mean_loss
+
+    def diverging(many, models, parameters, *rest):
+        if parameters.stiffness == candidates[best].stiffness:
+            return math.inf
+        return alone(many, models, parameters, *rest)
+
+    monkeypatch.setattr(object_reconstruction, "mean_loss", diverging)
+    evaluate = CandidateEvaluator(problems, ObjectFitConfig(), NullProgress(), device="cuda:0")
+    judged = [loss for _, loss in evaluate(candidates)]
+    losses[best] = math.inf
+    assert judged == losses

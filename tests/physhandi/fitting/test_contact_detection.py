@@ -193,3 +193,23 @@ def test_a_single_node_is_held_and_no_hand_holds_nothing() -> None:
     assert contacts.interval.tolist() == [[0, NEVER], [0, NEVER]]
     np.testing.assert_allclose(contacts.distance, 0.003, rtol=1e-6)
     assert len(find_contacts(lone, np.zeros((1, 3)), control[:, :0], **fields).node) == 0
+
+
+def test_the_nearest_control_nodes_hold_a_node_if_there_are_many() -> None:
+    control = hand(np.zeros((FRAMES, 3)) + ABOVE)
+    every = found(seen(np.zeros((FRAMES, 3))), control)
+    few = find_contacts(
+        seen(np.zeros((FRAMES, 3))),
+        SHEET,
+        control,
+        frame_count=FRAMES,
+        frame_rate=RATE,
+        most_grips=3,
+    )
+    assert set(few.node) == set(every.node)
+    limited = 0
+    for node in set(every.node.tolist()):
+        nearest = np.sort(every.distance[every.node == node])
+        limited += len(nearest) > 3
+        np.testing.assert_array_equal(np.sort(few.distance[few.node == node]), nearest[:3])
+    assert limited > 3

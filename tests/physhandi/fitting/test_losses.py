@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from physhandi.fitting.object_problem import chamfer_loss, node_acceleration_loss, track_loss
+from physhandi.fitting.object_problem import (
+    ObjectProblem,
+    chamfer_loss,
+    node_acceleration_loss,
+    track_loss,
+)
 
 
 def test_chamfer_is_one_way_and_squared() -> None:
@@ -87,3 +92,52 @@ def test_the_nearest_node_is_found_far_from_the_origin_and_between_padding() -> 
     loss = chamfer_loss(torch.from_numpy(observed), torch.from_numpy(real), torch.from_numpy(node))
     assert loss.tolist() == pytest.approx(expected, rel=1e-3)
     assert min(expected) > 1e-7
+
+
+@pytest.mark.gpu
+def test_a_gpu_computes_the_same_losses_and_the_same_bits_every_time() -> None:
+    if not torch.cuda.is_available():
+        pytest.skip("needs a CUDA device")
+    random = np.random.default_rng(5)
+
+    def draw(*shape: int) -> torch.Tensor:
+        return torch.from_numpy(random.normal(size=shape)).float()
+
+    tracks, nodes = 300, 50
+    problem = ObjectProblem(
+        name="cloud",
+        object_node=np.zeros((nodes, 3), np.float32),
+        rest_node=np.zeros((nodes, 3), np.float32),
+        control=np.zeros((4, 0, 3), np.float32),
+        frame_rate=30.0,
+        ground_height=None,
+        gravity=0.0,
+        initial_velocity=np.zeros((nodes, 3), np.float32),
+        clearance=np.zeros(nodes, np.float32),
+        cloud=draw(4, 200, 3),
+        is_observed=torch.from_numpy(random.random((4, 200)) < 0.8),
+        track=draw(4, tracks, 3),
+        is_valid=torch.from_numpy(random.random((4, tracks)) < 0.8),
+        carrier=torch.from_numpy(random.integers(0, nodes, (tracks, 4))),
+        carrier_weight=torch.from_numpy(random.dirichlet(np.ones(4), tracks)).float(),
+        track_offset=draw(tracks, 3),
+        surface_count=40,
+    )
+    moved = draw(3, nodes, 3)
+
+    def judged(device: str) -> tuple[torch.Tensor, torch.Tensor]:
+        node = moved.to(device).requires_grad_()
+        losses = problem.on(device).frame_losses(node, track_weight=0.7)
+        (losses * torch.arange(1.0, 4.0, device=device)).sum().backward()
+        assert node.grad is not None
+        return losses.detach().cpu(), node.grad.cpu()
+
+    wanted, gradient = judged("cpu")
+    assert wanted.min() > 0.1
+    losses, there = judged("cuda:0")
+    torch.testing.assert_close(losses, wanted, rtol=1e-5, atol=0.0)
+    torch.testing.assert_close(there, gradient, rtol=1e-4, atol=1e-5)
+    for _ in range(5):
+        again = judged("cuda:0")
+        assert torch.equal(again[0], losses)
+        assert torch.equal(again[1], there)

@@ -163,3 +163,25 @@ def test_self_collision_can_be_switched_on_and_searched_in_any_profile() -> None
     assert config.simulation.self_collision
     assert config.simulation.collision_distance == 0.015
     assert config.object_.search.variables["collision_distance"].from_unit(0.5) == 0.025
+
+
+def test_a_profile_does_otherwise_on_cuda_only_what_it_says() -> None:
+    for name in ("quick", "paper", "phystwin"):
+        config = load_profile(name).object_
+        assert config.on("cuda:0") == config
+    config = load_profile("default").object_
+    assert config.on("cpu") is config
+    there = config.on("cuda:0")
+    assert (there.search.population, there.search.generations) == (32, 12)
+    assert there.search.variables["damping"].low == 30.0
+    assert there.search.variables["damping"].high == config.search.variables["damping"].high
+    assert (there.first_order.iterations, there.first_order.learning_rate) == (40, 0.04)
+    assert (there.most_substeps, there.most_grips) == (500, 12)
+    # What asks for less is left as it is.
+    small = config.replace(
+        most_substeps=90,
+        search=config.search.replace(generations=2),
+        first_order=config.first_order.replace(iterations=3),
+    ).on("cuda:0")
+    assert (small.search.generations, small.most_substeps) == (2, 90)
+    assert (small.first_order.iterations, small.first_order.learning_rate) == (3, 0.02)

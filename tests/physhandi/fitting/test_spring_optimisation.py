@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from physhandi.data.observation import ObjectObservation
-from physhandi.errors import FitError
 from physhandi.fitting import spring_optimisation
 from physhandi.fitting.config import FirstOrderConfig, ObjectFitConfig, SearchConfig, SearchVariable
 from physhandi.fitting.object_problem import (
@@ -177,15 +176,17 @@ def test_a_gradient_that_is_lost_on_the_way_ends_the_descent_with_the_best_so_fa
     assert told[-1] == result.stopped
     assert result.stopped in caplog.text
     monkeypatch.setattr(SpringDescent, "fit_pass", lambda *_: None)
-    with pytest.raises(FitError, match="usable gradient"):
-        optimise_springs([sliding_pair(0.3)], PARAMETERS, chosen, NullProgress())
+    result = optimise_springs([sliding_pair(0.3)], PARAMETERS, chosen, NullProgress())
+    assert result.stopped.startswith("Stopped after 0 of 50 iterations. No sequence has a usable")
+    assert result.models["pair"].stiffness.tolist() == [100.0]
 
 
 def test_the_limit_on_gradients_can_be_lifted() -> None:
     problem = sliding_pair(0.3)
     taut = replace(problem, rest_node=problem.object_node * np.float32(0.9))
-    with pytest.raises(FitError, match="usable gradient"):
-        optimise_springs([taut], PARAMETERS, config(steepest=1e-3), NullProgress())
+    kept = optimise_springs([taut], PARAMETERS, config(steepest=1e-3), NullProgress())
+    assert kept.stopped.startswith("Stopped after 0 of")
+    assert kept.loss_after == kept.loss_before
     result = optimise_springs([taut], PARAMETERS, config(), NullProgress())
     assert result.loss_after < result.loss_before
     assert result.stopped == ""

@@ -1,4 +1,4 @@
-"""Candidates as bodies side by side: the same blocks as each would have alone, numbered in a row."""
+"""Candidates as bodies side by side: blocks as each would have alone, numbered in a row."""
 
 import numpy as np
 import pytest
