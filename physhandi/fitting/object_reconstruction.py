@@ -4,7 +4,6 @@
 `check_springs` refuse objects that no parameters, or not these, can hold together.
 """
 
-import math
 from collections.abc import Sequence as Many
 from concurrent.futures import ThreadPoolExecutor
 
@@ -15,7 +14,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial import KDTree
 
-from physhandi.errors import FitError, UsageError
+from physhandi.errors import FitError, SimulationDivergedError, UsageError
 from physhandi.fitting.config import ObjectFitConfig, SearchConfig
 from physhandi.fitting.object_problem import (
     ObjectProblem,
@@ -259,10 +258,12 @@ class CandidateEvaluator:
 
         In a batch sums are rounded otherwise, and what nearly diverges may do so alone.
         """
-        pairs = zip(self._problems, masters, strict=True)
-        models = {problem.name: master.model(parameters) for problem, master in pairs}
-        loss = mean_loss(self._problems, models, parameters, self._config, self._device)
-        return math.isfinite(loss)
+        try:
+            for problem, master in zip(self._problems, masters, strict=True):
+                simulate_problem(problem, master.model(parameters), parameters, self._device)
+        except SimulationDivergedError:
+            return False
+        return True
 
     def _show_best(self) -> None:
         """Show the best candidate in a preview, at most once for each."""

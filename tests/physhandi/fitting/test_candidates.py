@@ -10,7 +10,7 @@ import pytest
 import warp as wp
 
 from physhandi.data.observation import ObjectObservation
-from physhandi.errors import CancelledError
+from physhandi.errors import CancelledError, SimulationDivergedError
 from physhandi.fitting import object_reconstruction
 from physhandi.fitting.config import ObjectFitConfig
 from physhandi.fitting.object_problem import (
@@ -234,14 +234,14 @@ def test_the_best_of_a_batch_must_hold_alone_too(monkeypatch: pytest.MonkeyPatch
     before = CandidateEvaluator(problems, ObjectFitConfig(), NullProgress(), device="cuda:0")
     losses = [loss for _, loss in before(candidates)]
     best = int(np.argmin(losses))
-    alone = object_reconstruction.mean_loss
+    alone = object_reconstruction.simulate_problem
 
-    def diverging(many, models, parameters, *rest):
+    def diverging(problem, model, parameters, device):
         if parameters.stiffness == candidates[best].stiffness:
-            return math.inf
-        return alone(many, models, parameters, *rest)
+            raise SimulationDivergedError("too fast", frame=1, substep=0, node=0)
+        return alone(problem, model, parameters, device)
 
-    monkeypatch.setattr(object_reconstruction, "mean_loss", diverging)
+    monkeypatch.setattr(object_reconstruction, "simulate_problem", diverging)
     evaluate = CandidateEvaluator(problems, ObjectFitConfig(), NullProgress(), device="cuda:0")
     judged = [loss for _, loss in evaluate(candidates)]
     losses[best] = math.inf
