@@ -118,7 +118,7 @@ def test_a_gpu_computes_the_same_losses_and_the_same_bits_every_time() -> None:
         is_observed=torch.from_numpy(random.random((4, 200)) < 0.8),
         track=draw(4, tracks, 3),
         is_valid=torch.from_numpy(random.random((4, tracks)) < 0.8),
-        carrier=torch.from_numpy(random.integers(0, nodes, (tracks, 4))),
+        carrier=torch.from_numpy(random.random((tracks, nodes)).argsort(axis=1)[:, :4].copy()),
         carrier_weight=torch.from_numpy(random.dirichlet(np.ones(4), tracks)).float(),
         track_offset=draw(tracks, 3),
         surface_count=40,
@@ -126,7 +126,7 @@ def test_a_gpu_computes_the_same_losses_and_the_same_bits_every_time() -> None:
     moved = draw(3, nodes, 3)
 
     def judged(device: str) -> tuple[torch.Tensor, torch.Tensor]:
-        node = moved.to(device).requires_grad_()
+        node = moved.clone().to(device).requires_grad_()
         losses = problem.on(device).frame_losses(node, track_weight=0.7)
         (losses * torch.arange(1.0, 4.0, device=device)).sum().backward()
         assert node.grad is not None
