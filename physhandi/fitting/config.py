@@ -62,10 +62,19 @@ class HandFitConfig(Settings, frozen=True, kw_only=True):
     """Hand model to fit: the built-in open hand, or MANO that `physhandi import mano` imported."""
     iterations: Annotated[int, Meta(ge=1, le=100_000)] = 500
     """Updates of the fit to keypoints."""
-    depth_iterations: Count = 150
+    depth_iterations: Count = 250
     """Updates of the fit to keypoints and depth that follow, if a view has depth and masks."""
     learning_rate: Rate = 0.03
     """First step size of the joints [rad]; it falls to a twentieth along a cosine."""
+    depth_learning_rate: Rate = 0.03
+    """The same for the fit to keypoints and depth."""
+    starts_at_depth: bool = True
+    """Whether the hand is moved to where depth was measured before the first update; with one view,
+    depth also tells each frame's pose from its mirror image. In views without masks, the hand's
+    depth is that at its keypoints."""
+    fixed_normals: bool = True
+    """Whether the hand's normals stay as they are between two searches for the vertices that
+    measured points correspond to. Only these vertices are computed then, which is much faster."""
     keypoint_noise: Annotated[float, Meta(ge=1e-4, le=1.0)] = 0.015
     """Error to be expected of a keypoint, as a share of the hand's size in the image."""
     doubt: Annotated[float, Meta(ge=0.1, le=1e3)] = 3.0

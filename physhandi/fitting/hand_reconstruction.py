@@ -33,6 +33,7 @@ from physhandi.hand.motion import HandMotion
 from physhandi.hand.rotation import quaternion_matrix
 from physhandi.perception.keypoints import detect_sequence
 from physhandi.perception.lifting import HAND_LABEL, surface_points
+from physhandi.perception.segmentation import draw_hand
 from physhandi.progress import NullProgress, Preview, Progress
 
 _PALM_BONES = ((0, 5), (0, 9), (0, 13), (0, 17), (5, 17))
@@ -59,6 +60,18 @@ _BESIDE = 0.01
 """Distance at which a line of sight still meets a vertex [m]."""
 _STEADY = 0.3
 """Time over which the median of the way to the measured depth is taken [s]."""
+_TURN = 0.3
+"""Turn of a hand from frame to frame that costs 1 when poses are told from mirrored ones [rad]."""
+_MISSED = 0.06
+"""Error of keypoints that costs 1, as a share of the palm's size in the image."""
+_FAR = 0.005
+"""Distance of measured points from the hand's surface that costs 1 [m]."""
+_UNLIKE = 9.0
+"""Most that this costs: of two poses that are both unlike what was measured, neither is better."""
+_MOST_COST = 20.0
+"""Most that any of these costs."""
+_HALF_HAND = 0.07
+"""Distance of a hand's pixels from their median, along the view [m]."""
 HAND_STAGE = "hand_reconstruction"
 """Name of the stage in progress reports."""
 
@@ -196,6 +209,8 @@ class DepthTarget:
     """One over the frame's number of points; zero on padding."""
     vertex: Tensor | None = None
     """Vertex that each point corresponds to; None before the first evaluation."""
+    normal: Float[Tensor, "frame point 3"] | None = None
+    """Normal of the surface there when `vertex` was found, if normals are held fixed."""
     age: int = 0
     """Evaluations since `vertex` was last updated."""
 
@@ -224,15 +239,29 @@ class HandProblem:
         cameras: list[PinholeCamera] = [view.camera for view in sequence.views]
         self.target: KeypointTarget = keypoint_target(cameras, keypoint, config.keypoint_noise)
         tolerance = config.agreement * float(self.target.noise.max())
-        guess = guess_wrist(cameras, keypoint, model, metric=sequence.metric, tolerance=tolerance)
+        self.depth: DepthTarget | None = None
+        if sequence.metric and config.depth_iterations:
+            self.depth = depth_target(
+                sequence,
+                model.side,
+                config.depth_points,
+                keypoint if config.starts_at_depth else None,
+            )
+        guess = guess_wrist(
+            cameras,
+            keypoint,
+            model,
+            metric=sequence.metric,
+            tolerance=tolerance,
+            depth=self.depth if config.starts_at_depth else None,
+        )
         self.frame_rate = sequence.frame_rate
         self.parameters = _parameters(guess, len(keypoint[0]))
         self.name = sequence.name
         self.joints: Tensor | None = None
         """The 21 keypoints of every frame in the latest evaluation, for previews."""
-        self.depth: DepthTarget | None = None
-        if sequence.metric and config.depth_iterations:
-            self.depth = depth_target(sequence, model.side, config.depth_points)
+        if self.depth is not None and config.starts_at_depth:
+            self._place_by_depth(self.depth)
 
     def hand(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Shape, wrist rotation, wrist position [m] and scale."""
@@ -262,7 +291,21 @@ class HandProblem:
     def depth_term(self, target: DepthTarget) -> Tensor:
         """Compute the weighted depth loss."""
         faces, noise = torch.from_numpy(self.model.faces), self.config.depth_noise
-        return self.config.depth_weight * depth_loss(self.surface(), faces, target, noise)
+        if not self.config.fixed_normals:
+            return self.config.depth_weight * depth_loss(self.surface(), faces, target, noise)
+        if target.vertex is None or target.normal is None or target.age >= _REFRESH:
+            with torch.no_grad():
+                surface = self.surface()
+                normal = vertex_normals_torch(surface, faces)
+                target.vertex, target.age = _correspond(surface, normal, target), 0
+                index = target.vertex[..., None].expand(-1, -1, 3)
+                target.normal = normal.gather(1, index)
+        target.age += 1
+        shape, rotation, translation, _ = self.hand()
+        local = self.model.chosen_vertices(target.vertex, shape, self.parameters["articulation"])
+        vertex = local @ rotation.transpose(-1, -2) + translation[:, None]
+        loss = distance_loss(target.point - vertex, target.normal, target.weight, noise)
+        return self.config.depth_weight * loss
 
     def surface(self) -> Float[Tensor, "frame vertex 3"]:
         """Pose the hand's vertices in every frame [m, before scale]."""
@@ -301,7 +344,7 @@ class HandProblem:
                 self._place_by_depth(depth)
                 self._descend(
                     config.depth_iterations,
-                    config.learning_rate / 4,
+                    config.depth_learning_rate,
                     lambda _: self.loss(config.doubt) + self.depth_term(depth),
                     step,
                     config.iterations,
@@ -386,15 +429,20 @@ class HandProblem:
 
 
 def _parameters(guess: WristGuess, frame_count: int) -> dict[str, Tensor]:
-    articulation = torch.zeros(frame_count, 15, 3)
-    articulation[:, 3:, 0] = -0.3
     return {
         "shape": torch.zeros(10),
-        "articulation": articulation,
+        "articulation": _bent_articulation(frame_count),
         "rotation": torch.tensor(guess.rotation, dtype=torch.float32),
         "translation": torch.tensor(guess.translation, dtype=torch.float32),
         "log_scale": torch.tensor(math.log(guess.scale), dtype=torch.float32),
     }
+
+
+def _bent_articulation(frame_count: int) -> Float[Tensor, "frame 15 3"]:
+    """Bend all fingers a little, as those of a hand that holds something."""
+    articulation = torch.zeros(frame_count, 15, 3)
+    articulation[:, 3:, 0] = -0.3
+    return articulation
 
 
 def _without_jumps(vector: Float[ndarray, "frame 3"]) -> Float[ndarray, "frame 3"]:
@@ -416,8 +464,12 @@ def guess_wrist(
     *,
     metric: bool,
     tolerance: float,
+    depth: DepthTarget | None = None,
 ) -> WristGuess:
     """Align the template's palm with the triangulated palm; interpolate frames that lack one.
+
+    A palm is flat: one view alone shows it about as well mirrored in depth, 60 to 90 degrees away.
+    Where depth is given, the measured points and the frames before and after tell which it is.
 
     Args:
         cameras: Camera of each view.
@@ -425,6 +477,7 @@ def guess_wrist(
         model: Model of the hand.
         metric: Whether lengths are metres; otherwise the scale is estimated too.
         tolerance: Largest reprojection error at which views agree about a keypoint [px].
+        depth: Measured points of the hand, to start from.
 
     Raises:
         FitError: If no frame shows enough of the palm.
@@ -445,8 +498,13 @@ def guess_wrist(
             rotation[frame], translation[frame] = pose[0].as_quat(), pose[1]
             is_known[frame] = True
     if not is_known.any():
-        for frame in range(frame_count):
-            pose = _guess_from_one_view(cameras, keypoint[:, frame, palm], template[palm] * scale)
+        guesses = [
+            _guess_from_one_view(cameras, keypoint[:, frame, palm], template[palm] * scale)
+            for frame in range(frame_count)
+        ]
+        if depth is not None:
+            guesses = _told_from_mirrored(cameras, keypoint[:, :, palm], model, guesses, depth)
+        for frame, pose in enumerate(guesses):
             if pose is not None:
                 rotation[frame], translation[frame] = pose[0].as_quat(), pose[1] / scale
                 is_known[frame] = True
@@ -494,10 +552,8 @@ def _guess_from_one_view(
     template: Float[ndarray, "point 3"],
 ) -> tuple[Rotation, Float[ndarray, " 3"]] | None:
     """Solve perspective-n-point in the view with the most confident palm keypoints."""
-    is_seen = np.asarray(np.isfinite(keypoint).all(-1))
-    usable = np.where(is_seen.sum(1) >= LEAST_PALM_POINTS, np.nansum(keypoint[..., 2], 1), 0.0)
-    view = int(np.argmax(usable))
-    if usable[view] <= 0:
+    is_seen, view = np.asarray(np.isfinite(keypoint).all(-1)), _clearest_view(keypoint)
+    if is_seen[view].sum() < LEAST_PALM_POINTS or np.nansum(keypoint[view, :, 2]) <= 0:
         return None
     camera, indices = cameras[view], np.flatnonzero(is_seen[view, :])
     pixel = camera.undistort(keypoint[view, indices, :2].astype(np.float64))
@@ -512,6 +568,127 @@ def _guess_from_one_view(
     pose = camera.T_world_camera
     rotation = Rotation.from_matrix(pose[:3, :3]) * Rotation.from_rotvec(vector[:, 0])
     return rotation, pose[:3, :3] @ offset[:, 0] + pose[:3, 3]
+
+
+_Pose = tuple[Rotation, Float[ndarray, " 3"]]
+
+
+def _told_from_mirrored(
+    cameras: Many[PinholeCamera],
+    keypoint: Float[ndarray, "view frame point 3"],
+    model: HandModel,
+    guesses: Many[_Pose | None],
+    depth: DepthTarget,
+) -> list[_Pose | None]:
+    """Choose in every frame between a pose and its mirror image, all frames at once (Viterbi).
+
+    What a pose costs: keypoints that it misses, measured points that are far from the posed
+    template's surface, and its turn from the pose before.
+    """
+    palm = _template(model)[list(PALM)]
+    still, bent = torch.zeros(1, 3), _bent_articulation(1)
+    with torch.no_grad():
+        surface = model(torch.zeros(10), bent, still, still).vertex
+        normal = vertex_normals_torch(surface, torch.from_numpy(model.faces))[0].numpy()
+    vertex = surface[0].numpy().astype(np.float64)
+    chain: list[tuple[int, list[_Pose], ndarray]] = []
+    best, source = np.zeros(0), []
+    for frame, guess in enumerate(guesses):
+        if guess is None:
+            continue
+        poses = [guess, *_mirrored(cameras, keypoint[:, frame], palm, guess)]
+        count = int((depth.weight[frame] > 0).sum())
+        point, ray = (
+            part[frame, :count].numpy().astype(np.float64)
+            for part in (depth.point, depth.towards_camera)
+        )
+        cost = np.array([_misfit(pose, vertex, normal, point, ray) for pose in poses])
+        cost += [_missed(cameras, keypoint[:, frame], palm, pose) for pose in poses]
+        if chain:
+            before = chain[-1][1]
+            turn = np.array([[(a[0] * b[0].inv()).magnitude() for b in before] for a in poses])
+            ways = best + np.minimum((turn / _TURN) ** 2, _MOST_COST)
+            source.append(ways.argmin(axis=1))
+            cost = cost + ways.min(axis=1)
+        best = cost
+        chain.append((frame, poses, cost))
+    result: list[_Pose | None] = [None] * len(guesses)
+    choice = int(best.argmin()) if chain else 0
+    for number in range(len(chain) - 1, -1, -1):
+        frame, poses, _ = chain[number]
+        result[frame] = poses[choice]
+        choice = int(source[number - 1][choice]) if number else 0
+    return result
+
+
+def _mirrored(
+    cameras: Many[PinholeCamera],
+    keypoint: Float[ndarray, "view point 3"],
+    palm: Float[ndarray, "point 3"],
+    pose: _Pose,
+) -> list[_Pose]:
+    """Find the other pose in which a palm looks about the same, as it is and laid on keypoints."""
+    camera = cameras[_clearest_view(keypoint)]
+    point = pose[0].apply(palm) + pose[1]
+    way = point.mean(axis=0) - camera.T_world_camera[:3, 3]
+    way /= np.linalg.norm(way)
+    rotation, offset = _align(palm, point - 2 * ((point - point.mean(axis=0)) @ way)[:, None] * way)
+    is_seen = np.isfinite(keypoint[_clearest_view(keypoint)]).all(-1)
+    pixel = camera.undistort(keypoint[_clearest_view(keypoint), is_seen, :2].astype(np.float64))
+    to_camera = Rotation.from_matrix(camera.T_camera_world[:3, :3])
+    vector = (to_camera * rotation).as_rotvec()[:, None]
+    shift = (to_camera.apply(offset) + camera.T_camera_world[:3, 3])[:, None]
+    vector, shift = cv2.solvePnPRefineLM(palm[is_seen], pixel, camera.K, np.zeros(5), vector, shift)
+    mirrored: list[_Pose] = [(rotation, offset)]
+    # Perspective makes it differ a little from the mirror image, or even turn back.
+    if np.isfinite(vector).all() and np.isfinite(shift).all() and shift[2, 0] > 0:
+        laid = to_camera.inv().apply(shift[:, 0]) + camera.T_world_camera[:3, 3]
+        mirrored.append((to_camera.inv() * Rotation.from_rotvec(vector[:, 0]), laid))
+    return mirrored
+
+
+def _missed(
+    cameras: Many[PinholeCamera],
+    keypoint: Float[ndarray, "view point 3"],
+    palm: Float[ndarray, "point 3"],
+    pose: _Pose,
+) -> float:
+    """Compute what a pose costs by the keypoints of the palm that it misses."""
+    view = _clearest_view(keypoint)
+    missed = cameras[view].project(pose[0].apply(palm) + pose[1]) - keypoint[view, :, :2]
+    is_seen = np.isfinite(keypoint[view, :, 0])
+    size = max(float(np.ptp(keypoint[view, is_seen, :2], axis=0).max()), 1.0)
+    return min(float(np.nanmean((missed**2).sum(-1))) / (_MISSED * size) ** 2, _MOST_COST)
+
+
+def _misfit(
+    pose: _Pose,
+    vertex: Float[ndarray, "vertex 3"],
+    normal: Float[ndarray, "vertex 3"],
+    point: Float[ndarray, "point 3"],
+    ray: Float[ndarray, "point 3"],
+) -> float:
+    """Compute what a pose costs by the measured points that are far from the hand's surface.
+
+    How far away the hand is does not count, since the size of the hand is not known yet.
+    """
+    if len(point) < _LEAST_POINTS:
+        return 0.0
+    surface, way = pose[0].apply(vertex) + pose[1], ray.mean(axis=0)
+    way /= np.linalg.norm(way)
+    shown = surface[pose[0].apply(normal) @ way > 0]
+    if not len(shown):
+        return _UNLIKE
+    shown = shown + (np.median(point @ way) - np.median(shown @ way)) * way
+    far = np.asarray(KDTree(shown).query(point)[0])
+    return min(float(np.mean(np.minimum(far / _FAR, 5.0) ** 2)), _UNLIKE)
+
+
+def _clearest_view(keypoint: Float[ndarray, "view point 3"]) -> int:
+    """Choose the view with the most confident keypoints, of those that show enough of them."""
+    is_seen = np.asarray(np.isfinite(keypoint).all(-1))
+    usable = np.where(is_seen.sum(1) >= LEAST_PALM_POINTS, np.nansum(keypoint[..., 2], 1), 0.0)
+    return int(np.argmax(usable))
 
 
 def _bridge(
@@ -614,18 +791,40 @@ def velocity_loss(point: Float[Tensor, "frame joint 3"]) -> Float[Tensor, ""]:
     return ((point[1:] - point[:-1]) ** 2).sum() / point.shape[0]
 
 
-def depth_target(sequence: Sequence, side: HandSide, point_count: int) -> DepthTarget | None:
+def depth_target(
+    sequence: Sequence,
+    side: HandSide,
+    point_count: int,
+    keypoint: Float[ndarray, "view frame 21 3"] | None = None,
+) -> DepthTarget | None:
     """Collect one hand's depth points of all views, at most `point_count` a frame.
 
-    None if no view has depth and masks of this hand.
+    Args:
+        sequence: The recording.
+        side: Which hand.
+        point_count: Most points of a frame.
+        keypoint: Keypoints of this hand, around which it is looked for in views without masks.
+
+    Returns:
+        The points; None if no view has depth and either masks or keypoints of this hand.
     """
-    views = [view for view in sequence.views if view.has_depth and view.has_mask]
+    numbers = [
+        number
+        for number, view in enumerate(sequence.views)
+        if view.has_depth and (view.has_mask or keypoint is not None)
+    ]
     frames = []
     for frame in range(sequence.frame_count):
         point, camera = np.zeros((0, 3)), np.zeros((0, 3))
-        for view in views:
-            is_hand = view.mask(frame) == HAND_LABEL[side]
-            measured = surface_points(view, view.depth(frame), is_hand)
+        for number in numbers:
+            view = sequence.views[number]
+            depth = view.depth(frame)
+            if view.has_mask:
+                is_hand = view.mask(frame) == HAND_LABEL[side]
+            else:
+                assert keypoint is not None  # noqa: S101 - numbers hold no such view otherwise
+                is_hand = _at_keypoints(keypoint[number, frame, :, :2], depth)
+            measured = surface_points(view, depth, is_hand)
             point = np.concatenate([point, measured])
             camera = np.concatenate([camera, view.camera.T_world_camera[:3, 3] - measured])
         chosen = np.linspace(0, len(point) - 1, min(point_count, len(point))).round().astype(int)
@@ -645,6 +844,23 @@ def depth_target(sequence: Sequence, side: HandSide, point_count: int) -> DepthT
         towards_camera=torch.tensor(ray, dtype=torch.float32),
         weight=torch.tensor(weight, dtype=torch.float32),
     )
+
+
+def _at_keypoints(
+    keypoint: Float[ndarray, "21 2"], depth: Float[ndarray, "row column"]
+) -> Bool[ndarray, "row column"]:
+    """Choose the pixels on bones and palm of a hand, without what is far before or behind it.
+
+    Things that hide the hand are before it, and what shows between fingers is behind: half of the
+    pixels must be the hand's.
+    """
+    core = draw_hand(keypoint, depth.shape)
+    if core is None:
+        return np.zeros(depth.shape, dtype=bool)
+    measured = (core > 0) & (depth > 0)
+    if not measured.any():
+        return measured
+    return measured & (np.abs(depth - np.median(depth[measured])) < _HALF_HAND)
 
 
 def way_to_depth(
@@ -709,11 +925,31 @@ def depth_loss(
     target.age += 1
     index = target.vertex[..., None].expand(-1, -1, 3)
     offset = target.point - vertex.gather(1, index)
-    along = (offset * normal.gather(1, index)).sum(-1)
+    return distance_loss(offset, normal.gather(1, index), target.weight, noise)
+
+
+def distance_loss(
+    offset: Float[Tensor, "frame point 3"],
+    normal: Float[Tensor, "frame point 3"],
+    weight: Float[Tensor, "frame point"],
+    noise: float,
+) -> Float[Tensor, ""]:
+    """Measure distances from a surface, mostly along its normal (Cauchy's loss).
+
+    Args:
+        offset: Way from the surface to each point [m].
+        normal: Normal of the surface there.
+        weight: Share of each point in its frame; zero on padding.
+        noise: Expected error of a point [m].
+
+    Returns:
+        Mean over points, then frames, in units of the noise, squared.
+    """
+    along = (offset * normal).sum(-1)
     aside = ((offset**2).sum(-1) - along**2).clamp(min=0)
     squared = (along**2 + 0.1 * aside) / noise**2
     robust = _DOUBT**2 * torch.log1p(squared / _DOUBT**2)
-    return (target.weight * robust).sum() / max(int((target.weight.sum(1) > 0).sum()), 1)
+    return (weight * robust).sum() / max(int((weight.sum(1) > 0).sum()), 1)
 
 
 def vertex_normals_torch(

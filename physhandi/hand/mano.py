@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
@@ -147,6 +147,23 @@ class ManoHand(HandModel):
         tip = self._skin("tip_", shape, bones)
         keypoint = torch.cat([bones.joint + bones.moved, tip], 1)[:, _KEYPOINT]
         return place(keypoint, wrist_rotation, wrist_translation, scale)
+
+    def chosen_vertices(
+        self,
+        index: Int[Tensor, "batch point"],
+        shape: Float[Tensor, " 10"],
+        articulation: Float[Tensor, "batch 15 3"],
+    ) -> Float[Tensor, "batch point 3"]:
+        """Pose some vertices of each surface alone; see `HandModel`."""
+        fixed, bones = self._constants(shape), self._pose_bones(shape, articulation)
+        still = fixed["vertex"] + fixed["shape_change"] @ shape - fixed["joint_change"][0] @ shape
+        change = fixed["pose_change"].unflatten(1, (-1, 3)).movedim(0, 2)
+        shaped, weight, change = (
+            part.index_select(0, index.flatten()).unflatten(0, index.shape)
+            for part in (still, fixed["weight"], change)
+        )
+        shaped = shaped + torch.einsum("bpck,bk->bpc", change, bones.turn.flatten(1))
+        return blend(shaped, weight, bones.joint, bones.rotation, bones.moved)
 
     def bone_origins(self, shape: Float[Tensor, " 10"]) -> Float[Tensor, "16 3"]:
         """Compute where the bones begin in the unposed hand: the wrist, then the 15 joints [m]."""

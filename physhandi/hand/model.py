@@ -101,6 +101,21 @@ class HandModel(ABC):
         """
 
     @abstractmethod
+    def chosen_vertices(
+        self,
+        index: Int[Tensor, "batch point"],
+        shape: Float[Tensor, " 10"],
+        articulation: Float[Tensor, "batch 15 3"],
+    ) -> Float[Tensor, "batch point 3"]:
+        """Pose some vertices of each surface alone, relative to the wrist and not turned [m].
+
+        Args:
+            index: Vertices of each surface; they may repeat.
+            shape: Shape coefficients.
+            articulation: Rotation vector of every joint in its bone's own frame [rad].
+        """
+
+    @abstractmethod
     def bone_origins(self, shape: Float[Tensor, " 10"]) -> Float[Tensor, "16 3"]:
         """Compute where the bones begin in the unposed hand: the wrist, then the 15 joints [m]."""
 

@@ -247,6 +247,20 @@ class OpenHand(HandModel):
         keypoint = self._skin("keypoint", skeleton, *self._turn_bones(skeleton, articulation))
         return place(keypoint, wrist_rotation, wrist_translation, scale)
 
+    def chosen_vertices(
+        self,
+        index: Int[Tensor, "batch point"],
+        shape: Float[Tensor, " 10"],
+        articulation: Float[Tensor, "batch 15 3"],
+    ) -> Float[Tensor, "batch point 3"]:
+        """Pose some vertices of each surface alone; see `HandModel`."""
+        skeleton, flat = self._skeleton(shape), index.flatten()
+        shaped, weight = (
+            part.index_select(0, flat).unflatten(0, index.shape)
+            for part in (self._shaped("vertex", skeleton), self._constants(shape)["vertex_weight"])
+        )
+        return blend(shaped, weight, skeleton.joint, *self._turn_bones(skeleton, articulation))
+
     def bone_origins(self, shape: Float[Tensor, " 10"]) -> Float[Tensor, "16 3"]:
         """Compute where the bones begin in the unposed hand: the wrist, then the 15 joints [m]."""
         return self._skeleton(shape).joint
@@ -284,11 +298,14 @@ class OpenHand(HandModel):
     def _skin(
         self, part: str, skeleton: _Skeleton, rotation: Tensor, moved: Tensor
     ) -> Float[Tensor, "batch point 3"]:
-        fixed = self._constants(rotation)
+        weight, shaped = self._constants(rotation)[f"{part}_weight"], self._shaped(part, skeleton)
+        return blend(shaped, weight, skeleton.joint, rotation, moved)
+
+    def _shaped(self, part: str, skeleton: _Skeleton) -> Float[Tensor, "point 3"]:
+        fixed = self._constants(skeleton.joint)
         weight, point, arm = fixed[f"{part}_weight"], fixed[part], fixed[f"{part}_arm"]
         change = (skeleton.stretch @ arm[..., None])[..., 0] + skeleton.shift
-        shaped = point + (weight[..., None] * change).sum(1)
-        return blend(shaped, weight, skeleton.joint, rotation, moved)
+        return point + (weight[..., None] * change).sum(1)
 
     def _constants(self, like: Tensor) -> dict[str, Tensor]:
         if like.dtype not in self._tensors:

@@ -38,7 +38,7 @@ def turn_bones(
 
 def blend(
     point: Float[Tensor, "*batch point 3"],
-    weight: Float[Tensor, "point 16"],
+    weight: Float[Tensor, "*weights point 16"],
     joint: Float[Tensor, "16 3"],
     rotation: Float[Tensor, "batch 16 3 3"],
     moved: Float[Tensor, "batch 16 3"],
@@ -47,7 +47,7 @@ def blend(
 
     Args:
         point: Points of the unposed hand, the same for the whole batch or not [m].
-        weight: Skinning weights; rows sum to one.
+        weight: Skinning weights, the same for the whole batch or not; rows sum to one.
         joint: Where the bones begin in the unposed hand [m].
         rotation: Rotation of each bone, less the identity.
         moved: How far each bone's origin moved [m].

@@ -732,25 +732,43 @@ def _hand_cores(seen: _Seen, frame: int) -> Iterator[tuple[int, UInt8[ndarray, "
     if seen.keypoint is None:
         return
     for hand, side in enumerate(seen.hands):
-        pixel = seen.keypoint[frame, hand, :, :2].astype(np.float64)
-        known = np.asarray(np.isfinite(pixel).all(axis=1))
-        if known.sum() < _LEAST_JOINTS:
+        core = draw_hand(seen.keypoint[frame, hand, :, :2], seen.label.shape[1:])
+        if core is None:
             continue
-        core = np.zeros(seen.label.shape[1:], dtype=np.uint8)
-        at = np.clip(np.where(known[:, None], pixel, 0), -1e4, 1e4).round().astype(np.int32)
-        hull = at[[joint for joint in _PALM if known[joint]]]
-        if known[0] and known[9]:
-            # Keypoint 0 is inside of the wrist; the hand goes on a little.
-            beyond = np.clip(pixel[0] + 0.25 * (pixel[0] - pixel[9]), -1e4, 1e4)
-            hull = np.concatenate([hull, beyond.round().astype(np.int32)[None]])
-        if len(hull) > 2:
-            cv2.fillConvexPoly(core, cv2.convexHull(hull), 1)
-        width = max(1, round(0.16 * _palm_size(pixel)))
-        for bone in _BONES:
-            line = at[[joint for joint in bone if known[joint]]]
-            if len(line) > 1:
-                cv2.polylines(core, [line], isClosed=False, color=1, thickness=width)
         yield HAND_LABEL[side], core
+
+
+def draw_hand(
+    keypoint: Float[ndarray, "21 2"], shape: tuple[int, ...]
+) -> UInt8[ndarray, "row column"] | None:
+    """Draw bones and palm of a hand into an image, 1 where they are.
+
+    Args:
+        keypoint: Its keypoints; NaN where not known [px].
+        shape: Rows and columns of the image.
+
+    Returns:
+        The picture; None if too few keypoints are known.
+    """
+    pixel = keypoint.astype(np.float64)
+    known = np.asarray(np.isfinite(pixel).all(axis=1))
+    if known.sum() < _LEAST_JOINTS:
+        return None
+    core = np.zeros(shape, dtype=np.uint8)
+    at = np.clip(np.where(known[:, None], pixel, 0), -1e4, 1e4).round().astype(np.int32)
+    hull = at[[joint for joint in _PALM if known[joint]]]
+    if known[0] and known[9]:
+        # Keypoint 0 is inside of the wrist; the hand goes on a little.
+        beyond = np.clip(pixel[0] + 0.25 * (pixel[0] - pixel[9]), -1e4, 1e4)
+        hull = np.concatenate([hull, beyond.round().astype(np.int32)[None]])
+    if len(hull) > 2:
+        cv2.fillConvexPoly(core, cv2.convexHull(hull), 1)
+    width = max(1, round(0.16 * _palm_size(pixel)))
+    for bone in _BONES:
+        line = at[[joint for joint in bone if known[joint]]]
+        if len(line) > 1:
+            cv2.polylines(core, [line], isClosed=False, color=1, thickness=width)
+    return core
 
 
 def _palm_size(pixel: Float[ndarray, "21 2"]) -> float:

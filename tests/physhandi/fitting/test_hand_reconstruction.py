@@ -1,13 +1,16 @@
 """Stage 1 on a made-up hand that is known exactly, and on the real two-camera recording."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import hand_scene as scene
 import numpy as np
 import pytest
 import torch
 from recordings import recording
+from scipy.spatial.transform import Rotation
 
 import physhandi as ph
 from physhandi.data.importers.stereo import import_stereo
@@ -17,10 +20,15 @@ from physhandi.fitting.hand_reconstruction import (
     DepthTarget,
     HandFit,
     HandFitConfig,
+    _guess_from_one_view,
+    _mirrored,
+    _told_from_mirrored,
+    depth_target,
     observed_keypoints,
     reconstruct_hands,
     way_to_depth,
 )
+from physhandi.fitting.readiness import PALM
 from physhandi.hand.loading import load_hand_model
 from physhandi.hand.motion import HandMotion
 from physhandi.metrics.hands import evaluate_hands
@@ -109,16 +117,67 @@ def test_a_view_that_errs_is_outvoted(tmp_path: Path) -> None:
     assert _vertex_error(fit, truth).max() < 0.005
 
 
-def test_depth_corrects_a_hand_that_one_view_cannot_place(tmp_path: Path) -> None:
+@pytest.mark.parametrize("is_new", [True, False])
+def test_depth_corrects_a_hand_that_one_view_cannot_place(tmp_path: Path, is_new: bool) -> None:
     truth = scene.grasping(frames=6)
     keypoint = scene.seen_keypoints([truth], CAMERAS[:1])
     sequence = scene.write_scene(tmp_path / "a", [truth], CAMERAS[:1], keypoint, depth=True)
     config = HandFitConfig(iterations=200, depth_iterations=0)
     without = _vertex_error(reconstruct_hands(sequence, config), truth)
-    config = HandFitConfig(iterations=200, depth_iterations=120)
+    config = HandFitConfig(
+        iterations=200, depth_iterations=120, starts_at_depth=is_new, fixed_normals=is_new
+    )
     with_depth = _vertex_error(reconstruct_hands(sequence, config), truth)
     assert without.mean() > 0.015
     assert with_depth.mean() < 0.5 * without.mean()
+
+
+def test_without_masks_a_hand_is_measured_at_its_keypoints(tmp_path: Path) -> None:
+    truth = scene.grasping(frames=3)
+    keypoint = scene.seen_keypoints([truth], CAMERAS[:1])
+    sequence = scene.write_scene(tmp_path / "a", [truth], CAMERAS[:1], keypoint, depth=True)
+    masked = depth_target(sequence, "right", 10_000)
+    folder = sequence.views[0].folder
+    for path in sorted((folder / "depth").iterdir()):
+        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        image[image == 0] = 900  # A wall behind the hand, and something that hides some fingers.
+        image[:, : int(np.nanmin(keypoint[0, :, 0, :, 0]) + 12)] = 200
+        cv2.imwrite(str(path), image)
+    shutil.rmtree(folder / "mask")
+    blank = Sequence.load(sequence.folder)
+    assert depth_target(blank, "right", 64) is None
+    found = depth_target(blank, "right", 64, keypoint[:, :, 0])
+    assert masked is not None
+    assert found is not None
+    for frame in range(3):
+        true = masked.point[frame][masked.weight[frame] > 0]
+        point = found.point[frame][found.weight[frame] > 0]
+        assert len(point) > 20
+        assert torch.cdist(point, true).min(dim=1).values.max() < 0.015
+    unseen = np.full_like(keypoint[:, :, 0], np.nan)
+    assert depth_target(blank, "right", 64, unseen) is None
+
+
+def test_depth_tells_a_pose_from_its_mirror_image(tmp_path: Path) -> None:
+    truth, model = scene.grasping(frames=6), load_hand_model("right")
+    keypoint = scene.seen_keypoints([truth], CAMERAS[:1])
+    sequence = scene.write_scene(tmp_path / "a", [truth], CAMERAS[:1], keypoint, depth=True)
+    depth = depth_target(sequence, "right", 128)
+    assert depth is not None
+    palm, seen = list(PALM), keypoint[:, :, 0][:, :, list(PALM)]
+    template = model.keypoint_position[palm]
+    true = Rotation.from_rotvec(truth.wrist_rotation)
+    guesses = [_guess_from_one_view(CAMERAS[:1], seen[:, frame], template) for frame in range(6)]
+    assert all(guess is not None for guess in guesses)
+    wrong = list(guesses)
+    for frame in (0, 2, 3):
+        wrong[frame] = _mirrored(CAMERAS[:1], seen[:, frame], template, guesses[frame])[0]
+        assert (wrong[frame][0] * true[frame].inv()).magnitude() > 0.8
+    wrong[4] = None  # Nothing is known of it, and nothing is made up.
+    told = _told_from_mirrored(CAMERAS[:1], seen, model, wrong, depth)
+    assert told[4] is None
+    for frame in (0, 1, 2, 3, 5):
+        assert (told[frame][0] * true[frame].inv()).magnitude() < 0.5
 
 
 def test_depth_places_a_hand_of_unknown_size_that_one_view_takes_for_a_nearer_one(

@@ -88,6 +88,10 @@ def test_made_of_the_open_hand_it_poses_like_the_open_hand(mano: Path) -> None:
     # The pose blend shapes of the made-up file are the rest.
     assert np.abs(ours - expected @ TO_MANO.T).max() < 0.006
     assert moved > 0.05
+    index = torch.tensor([[5, 0, 777, 5]])
+    chosen = hand.chosen_vertices(index, zero[0] + 0.7, articulation)[0].numpy()
+    whole = hand(zero[0] + 0.7, articulation, zero[1], zero[1]).vertex[0].numpy()
+    np.testing.assert_allclose(chosen, whole[index[0]], atol=1e-12)
     assert JOINTS[1] == 1 + JOINT_NAMES.index("index_mcp")
 
 

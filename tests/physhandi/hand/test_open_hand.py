@@ -51,6 +51,18 @@ def test_template_is_as_large_as_a_hand(hand: OpenHand) -> None:
     assert np.abs(hand.template).max() == pytest.approx(0.1897, abs=1e-3)
 
 
+def test_chosen_vertices_are_those_of_the_whole_surface(hand: OpenHand) -> None:
+    random = torch.Generator().manual_seed(1)
+    shape = torch.randn(10, generator=random, dtype=torch.float64)
+    articulation = 0.4 * torch.randn(3, 15, 3, generator=random, dtype=torch.float64)
+    index = torch.randint(0, hand.vertex_count, (3, 7), generator=random)
+    still = torch.zeros(3, 3, dtype=torch.float64)
+    whole = hand(shape, articulation, still, still).vertex
+    expected = torch.stack([surface[chosen] for surface, chosen in zip(whole, index, strict=True)])
+    found = hand.chosen_vertices(index, shape, articulation)
+    torch.testing.assert_close(found, expected, atol=1e-12, rtol=0)
+
+
 @pytest.mark.parametrize("side", ["right", "left"])
 def test_template_is_the_file_moved_to_the_wrist(side: str) -> None:
     mesh = read_skinned_mesh(ASSETS / f"{side}.glb")
