@@ -419,6 +419,7 @@ def import_capture(
     intrinsics: Path | None = None,
     charuco: str | None = None,
     april_grid: str | None = None,
+    by_table: bool = False,
     start: int = 0,
     stop: int | None = None,
     every: int = 1,
@@ -446,6 +447,8 @@ def import_capture(
             calibration/board.json may tell.
         april_grid: The same with AprilTags 36h11: tags across and down, the side of a tag and the
             gap between tags [m], like 6x6,0.03,0.009.
+        by_table: Find where cameras are by the table's own pattern, such as wood or print, which
+            all must see; boards and poses in the recording do not count then.
         start: First frame to import.
         stop: Frame before which to end.
         every: Import only every n-th frame.
@@ -469,10 +472,14 @@ def import_capture(
     from physhandi.data.importers.capture import CaptureOptions
     from physhandi.data.importers.capture import import_capture as convert
 
+    board = parse_board(charuco or "", april_grid or "")
+    if by_table and board is not None:
+        raise UsageError("--by-table needs no board; give it or --charuco or --april-grid.")
     options = CaptureOptions(
         depth_scale=depth_scale,
         intrinsics=intrinsics,
-        board=parse_board(charuco or "", april_grid or ""),
+        board=board,
+        by_table=by_table,
         start=start,
         stop=stop,
         every=every,

@@ -37,6 +37,11 @@ from physhandi.data.importers.recorded_stream import (
 from physhandi.data.importers.recorded_view import CALIBRATION, RecordedView, find_views
 from physhandi.data.importers.rectification import Rectifier
 from physhandi.data.importers.stream_pairing import PairedFrames, cut, pair_streams
+from physhandi.data.importers.table_calibration import (
+    TablePattern,
+    calibrate_by_pattern,
+    see_pattern,
+)
 from physhandi.data.importers.view_agreement import (
     cloud,
     find_table,
@@ -85,6 +90,8 @@ class CaptureOptions:
     board: Board | None = None
     """Board from which the cameras' poses are found; None: ``calibration/board.json`` tells, or
     poses are given."""
+    by_table: bool = False
+    """Whether poses are found from the table's pattern, whatever else tells them."""
     start: int = 0
     """First frame that is imported."""
     stop: int | None = None
@@ -177,7 +184,7 @@ def import_capture(
         _refuse_same_names(views)
         paired = _paired(views, options)
         sources, notes = _sources(views, paired, options)
-        placement = _place(source, sources, options.board or _recorded_board(source))
+        placement = _place(source, sources, options, paired.count)
         cameras = [one.camera(pose) for one, pose in zip(sources, placement.poses, strict=True)]
         report = dict(placement.report)
         report["agreement"] = _check_agreement(sources, cameras, placement, paired.count)
@@ -319,7 +326,7 @@ def _surveyed(source: Path, views: list[RecordedView], options: CaptureOptions) 
         board = options.board or _recorded_board(source)
     except ImportFailedError as error:
         problems.append(str(error))
-    way = _calibrated_by(source, views, board)
+    way = "the pattern of the table" if options.by_table else _calibrated_by(source, views, board)
     if not way:
         problems.append(_no_pose(source, views))
     return CaptureSurvey(
@@ -502,8 +509,13 @@ def _recorded_board(source: Path) -> Board | None:
         fail(path, str(error).rstrip("."))
 
 
-def _place(source: Path, sources: list[_Source], target: Board | None) -> _Placement:
+def _place(
+    source: Path, sources: list[_Source], options: CaptureOptions, frame_count: int
+) -> _Placement:
     """Find where the cameras are, with z up and the table, where it is known, at a height."""
+    if options.by_table and len(sources) > 1:
+        return _by_table(sources, sorted({0, frame_count // 2}))
+    target = options.board or _recorded_board(source)
     if target is not None:
         return _by_board(source, sources, target)
     given = [one.view.T_world_camera for one in sources]
@@ -522,9 +534,45 @@ def _no_pose(source: Path, views: Sequence[RecordedView]) -> str:
         f"{CALIBRATION}/ is there: say which board it shows, like --charuco 7x5,0.04"
         if has_pictures
         else f"Put pictures of a ChArUco board into {CALIBRATION}/{lacking.name}/ (of all views) "
-        "and give --charuco WxH,SQUARE, or add extrinsics.json with T_world_camera of each view"
+        "and give --charuco WxH,SQUARE, add extrinsics.json with T_world_camera of each view, or "
+        "give --by-table if all see a table with a pattern such as wood"
     )
     return f"Nothing tells where the camera of view '{lacking.name}' is. {remedy}."
+
+
+def _by_table(sources: list[_Source], frames: list[int]) -> _Placement:
+    """Place cameras above the table that each of them measures, by the pattern that they share."""
+    tables: list[ndarray] = []
+    patterns: list[list[TablePattern]] = []
+    for one in sources:
+        if one.view.color is None or one.view.depth is None:
+            lacks = "color" if one.view.color is None else "depth"
+            raise ImportFailedError(
+                f"View '{one.view.name}' has no {lacks}, so the table's pattern (--by-table) does "
+                "not tell where its camera is. Use pictures of a board (--charuco)."
+            )
+        tables.append(_table_below(one, frames))
+        camera = one.camera(tables[-1])
+        patterns.append(
+            [see_pattern(camera, one.color_image(f), one.depth_image(f)) for f in frames]
+        )
+    laid, shared = calibrate_by_pattern([one.view.name for one in sources], patterns)
+    poses = tuple(T @ table for T, table in zip(laid, tables, strict=True))
+    report = {"by": "the pattern of the table", "shared_pattern": shared}
+    return _Placement(poses, 0.0, report, [])
+
+
+def _table_below(one: _Source, frames: list[int]) -> Float[ndarray, "4 4"]:
+    """Find the table that a camera looks down on: its pose above it."""
+    camera = one.camera(np.eye(4))
+    point = np.concatenate([cloud(camera, one.depth_image(frame)) for frame in frames])
+    table = find_table(point, np.zeros((1, 3)), np.array([1.0, 0.0, 0.0]))
+    if table is None or table.share < _TABLE_SHARE or table.T_table_world[2, 1] > _WALL:
+        raise ImportFailedError(
+            f"View '{one.view.name}' looks down on no table, so its pattern (--by-table) does not "
+            "tell where the camera is. Use pictures of a board (--charuco)."
+        )
+    return table.T_table_world
 
 
 def _by_board(source: Path, sources: list[_Source], target: Board) -> _Placement:
