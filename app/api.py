@@ -148,6 +148,8 @@ class NewImport(SurveyQuery):
     """ChArUco board of the calibration pictures, like 7x5,0.04."""
     april_grid: Annotated[str, Field(max_length=40)] = ""
     """Grid of AprilTags of the calibration pictures, like 6x6,0.03,0.009."""
+    by_table: bool = False
+    """Whether cameras are placed by the table's own pattern, without board or stated poses."""
     start: Annotated[int, Field(ge=0, le=10_000_000)] = 0
     """First frame."""
     stop: Annotated[int | None, Field(ge=1, le=10_000_000)] = None

@@ -31,7 +31,7 @@ async function watch(box, address, onDone, job) {
 
 function orderOf(form) {
   const fields = new FormData(form);
-  const order = { source: form.dataset.source, hands: fields.getAll("hands"), overwrite: fields.has("overwrite") };
+  const order = { source: form.dataset.source, hands: fields.getAll("hands"), overwrite: fields.has("overwrite"), by_table: fields.has("by_table") };
   for (const name of ["name", "charuco", "april_grid", "intrinsics"]) order[name] = fields.get(name).trim();
   for (const name of ["depth_scale", "start", "stop", "every", "frame_rate"]) if (fields.get(name) !== "") order[name] = Number(fields.get(name));
   return order;

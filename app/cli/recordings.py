@@ -472,13 +472,10 @@ def import_capture(
     from physhandi.data.importers.capture import CaptureOptions
     from physhandi.data.importers.capture import import_capture as convert
 
-    board = parse_board(charuco or "", april_grid or "")
-    if by_table and board is not None:
-        raise UsageError("--by-table needs no board; give it or --charuco or --april-grid.")
     options = CaptureOptions(
         depth_scale=depth_scale,
         intrinsics=intrinsics,
-        board=board,
+        board=parse_board(charuco or "", april_grid or ""),
         by_table=by_table,
         start=start,
         stop=stop,

@@ -26,6 +26,7 @@ ORDER = ImportOrder(
     intrinsics="",
     charuco="",
     april_grid="",
+    by_table=True,
     start=1,
     stop=None,
     every=2,
@@ -95,6 +96,7 @@ def test_the_order_reaches_the_process(imports: Imports, settings: ServerSetting
     options = told["options"]
     assert (options["start"], options["every"], options["hands"]) == (1, 2, ["left"])
     assert options["intrinsics"] is None
+    assert options["by_table"] is True
     example = imports.make_example()
     until(lambda: example.state != "running")
     assert imports.example().result == {"written": "example"}

@@ -32,6 +32,7 @@ class ImportOrder:
     """Place of a file; empty for what is in the recording."""
     charuco: str
     april_grid: str
+    by_table: bool = False
     start: int
     stop: int | None
     every: int

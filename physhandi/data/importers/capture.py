@@ -176,6 +176,8 @@ def import_capture(
         raise UsageError(
             f"Name each hand that the recording shows once, not {list(options.hands)}."
         )
+    if options.by_table and options.board is not None:
+        raise UsageError("--by-table needs no board; give it, or --charuco or --april-grid.")
     given = Path(source_folder)
     with (
         _unpacked(given, Path(out_folder).resolve(), progress) as source,

@@ -8,13 +8,14 @@ import pytest
 from raw_capture import RawCapture, ball, camera_at, picture, rays
 
 from physhandi.data.camera import PinholeCamera
+from physhandi.data.importers.board_calibration import CharucoTarget
 from physhandi.data.importers.capture import CaptureOptions, import_capture, survey_capture
 from physhandi.data.importers.table_calibration import (
     TablePattern,
     calibrate_by_pattern,
     lay_patterns,
 )
-from physhandi.errors import ImportFailedError
+from physhandi.errors import ImportFailedError, UsageError
 
 BY_TABLE = CaptureOptions(by_table=True)
 MILLIMETRE = 0.001
@@ -152,6 +153,9 @@ def test_cameras_find_each_other_by_a_printed_table(tmp_path: Path) -> None:
         for frame in range(2):
             image = photograph(camera, printed(0), frame)
             cv2.imwrite(str(raw.folder / name / f"color/{frame:05d}.png"), image[..., ::-1])
+    both = CaptureOptions(by_table=True, board=CharucoTarget(7, 5, 0.04))
+    with pytest.raises(UsageError, match="needs no board"):
+        import_capture(raw.folder, tmp_path / "none", options=both)
     assert survey_capture(raw.folder, BY_TABLE).calibration == "the pattern of the table"
     sequence = import_capture(raw.folder, tmp_path / "out", options=BY_TABLE)
     left, right = (view.camera.T_world_camera for view in sequence.views)
