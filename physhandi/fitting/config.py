@@ -62,7 +62,7 @@ class HandFitConfig(Settings, frozen=True, kw_only=True):
     """Hand model to fit: the built-in open hand, or MANO that `physhandi import mano` imported."""
     iterations: Annotated[int, Meta(ge=1, le=100_000)] = 500
     """Updates of the fit to keypoints."""
-    depth_iterations: Count = 250
+    depth_iterations: Count = 150
     """Updates of the fit to keypoints and depth that follow, if a view has depth and masks."""
     learning_rate: Rate = 0.03
     """First step size of the joints [rad]; it falls to a twentieth along a cosine."""
