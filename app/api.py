@@ -71,7 +71,7 @@ class Draft(BaseModel):
 
 
 class NewClick(BaseModel):
-    """A place on the object, in an image of the recording."""
+    """A place on the object, in an image of the recording, or the middle of a box around it."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -79,6 +79,9 @@ class NewClick(BaseModel):
     frame: Annotated[int, Field(ge=0, le=10_000_000)]
     x: Annotated[float, Field(ge=-1, le=100_000, allow_inf_nan=False)]
     y: Annotated[float, Field(ge=-1, le=100_000, allow_inf_nan=False)]
+    width: Annotated[float, Field(ge=0, le=100_000, allow_inf_nan=False)] = 0.0
+    """Width of the box [px]; 0 without one."""
+    height: Annotated[float, Field(ge=0, le=100_000, allow_inf_nan=False)] = 0.0
 
 
 class NewAnnotation(BaseModel):

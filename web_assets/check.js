@@ -88,7 +88,6 @@ if (frames) {
     const figure = event.target.closest("figure");
     if (!figure || frames.classList.contains("is-brushing")) return;
     if (!frames.classList.contains("is-picking")) figure.classList.toggle("is-large");
-    else if (event.target.matches("img")) pick(figure, event);
   });
   document.addEventListener("DOMContentLoaded", show);
 }
@@ -107,30 +106,66 @@ const part = (name) => annotation.querySelector(`[data-${name}]`);
 const POLL_MS = 600;
 let picks = [];
 
-function pick(figure, event) {
+const DRAG = 8; // From so many pixels on, a click has become a box.
+let pressed = null;
+
+/** Pixels of the recording, which count from their middles. */
+function placeOf(figure, event) {
   const box = figure.querySelector("img").getBoundingClientRect();
-  // Pixels count from their middles.
-  const x = ((event.clientX - box.left) / box.width) * figure.dataset.width - 0.5;
-  const y = ((event.clientY - box.top) / box.height) * figure.dataset.height - 0.5;
-  const tidy = (value) => Math.max(0, Math.round(value * 10) / 10);
-  picks.push({ view: figure.dataset.view, frame: Number(slider.value), x: tidy(x), y: tidy(y) });
-  showPicks();
+  const tidy = (value, size) => Math.min(Math.max(0, Math.round(value * 10) / 10), size - 1);
+  return [
+    tidy(((event.clientX - box.left) / box.width) * figure.dataset.width - 0.5, figure.dataset.width),
+    tidy(((event.clientY - box.top) / box.height) * figure.dataset.height - 0.5, figure.dataset.height),
+  ];
 }
 
-function showPicks() {
+function pickOf({ figure, from, start }, event) {
+  const to = placeOf(figure, event);
+  const place = { view: figure.dataset.view, frame: Number(slider.value) };
+  if (Math.hypot(event.clientX - start[0], event.clientY - start[1]) < DRAG) return { ...place, x: to[0], y: to[1] };
+  const middle = (at) => Math.round((from[at] + to[at]) * 5) / 10;
+  const size = (at) => Math.round(Math.abs(from[at] - to[at]) * 10) / 10;
+  return { ...place, x: middle(0), y: middle(1), width: size(0), height: size(1) };
+}
+
+if (frames) {
+  frames.addEventListener("pointerdown", (event) => {
+    const figure = event.target.closest("figure");
+    if (event.button !== 0 || !figure || !event.target.matches("img") || !frames.classList.contains("is-picking")) return;
+    event.preventDefault();
+    pressed = { figure, from: placeOf(figure, event), start: [event.clientX, event.clientY] };
+    figure.setPointerCapture(event.pointerId);
+  });
+  frames.addEventListener("dragstart", (event) => frames.classList.contains("is-picking") && event.preventDefault());
+  frames.addEventListener("pointermove", (event) => pressed && showPicks([...picks, pickOf(pressed, event)]));
+  frames.addEventListener("pointercancel", () => { pressed = null; showPicks(); });
+  frames.addEventListener("pointerup", (event) => {
+    if (!pressed) return;
+    picks.push(pickOf(pressed, event));
+    pressed = null;
+    showPicks();
+  });
+}
+
+function showPicks(shown = picks) {
   if (!annotation) return;
   frames.querySelectorAll(".pick").forEach((dot) => dot.remove());
-  for (const { view, frame, x, y } of picks) {
+  for (const { view, frame, x, y, width = 0, height = 0 } of shown) {
     if (frame !== Number(slider.value)) continue;
     const figure = frames.querySelector(`[data-view="${view}"]`);
     const image = figure.querySelector("img");
     const dot = Object.assign(document.createElement("span"), { className: "pick" });
     dot.style.left = `${((x + 0.5) / figure.dataset.width) * image.clientWidth}px`;
     dot.style.top = `${((y + 0.5) / figure.dataset.height) * image.clientHeight}px`;
+    if (width || height) {
+      dot.classList.add("box");
+      dot.style.width = `${(width / figure.dataset.width) * image.clientWidth}px`;
+      dot.style.height = `${(height / figure.dataset.height) * image.clientHeight}px`;
+    }
     figure.append(dot);
   }
-  part("picks").replaceChildren(...picks.map(({ view, frame, x, y }, number) => {
-    const item = Object.assign(document.createElement("li"), { textContent: `${view}, frame ${frame}: ${Math.round(x)}, ${Math.round(y)} ` });
+  part("picks").replaceChildren(...picks.map(({ view, frame, x, y, width, height }, number) => {
+    const item = Object.assign(document.createElement("li"), { textContent: `${view}, frame ${frame}: ${Math.round(x)}, ${Math.round(y)}${width ? `, box ${Math.round(width)} × ${Math.round(height)}` : ""} ` });
     const undo = Object.assign(document.createElement("button"), { type: "button", className: "mini", textContent: "✕", title: "Take it back" });
     undo.setAttribute("aria-label", `Take back the click in ${view}, frame ${frame}`);
     undo.addEventListener("click", () => { picks.splice(number, 1); showPicks(); });
@@ -168,6 +203,6 @@ if (annotation) {
     followAnnotation(await send("POST", own(), { clicks: picks, overwrite: Boolean(part("overwrite")?.checked) }));
   }));
   part("stop").addEventListener("click", ({ target }) => busy(target, () => send("DELETE", own())));
-  addEventListener("resize", showPicks);
+  addEventListener("resize", () => showPicks());
   document.addEventListener("DOMContentLoaded", async () => followAnnotation(await send("GET", own())));
 }

@@ -163,8 +163,9 @@ def annotate(
 
     Args:
         sequence: Folder or name of a sequence with color and depth.
-        click: Places on the object as view,frame,x,y, frames from 0 and x and y in pixels; one is
-            mostly enough, without any hands alone are found.
+        click: Places on the object as view,frame,x,y, frames from 0 and x and y in pixels, or boxes
+            around it, as view,frame,x,y,width,height with the middle first; one is mostly enough,
+            without any hands alone are found.
         mask_model: Folder of SAM 2 or EdgeTAM that you have (docs/your-data.md), which finds object
             and hands in the place of what is built in.
         track_model: Folder of CoTracker3 or TAPNext that you have, which follows the points.
@@ -210,8 +211,9 @@ def _click(text: str) -> Any:
     from physhandi.perception.segmentation import Click
 
     try:
-        view, frame, x, y = (part.strip() for part in text.split(","))
-        return Click(view, int(frame), float(x), float(y))
+        view, frame, *place = (part.strip() for part in text.split(","))
+        x, y, width, height = map(float, place if len(place) == 4 else [*place, "0", "0"])
+        return Click(view, int(frame), x, y, width, height)
     except ValueError:
         raise UsageError(
             f"--click {text!r} does not name a place; write view,frame,x,y, like camera0,0,320,240."

@@ -99,7 +99,7 @@ def annotate(
         about = {
             part: {
                 **({"source": BUILT_IN} if model is None else model.provenance()),
-                "clicks": [dataclasses.asdict(click) for click in clicks],
+                "clicks": [click.to_dict() for click in clicks],
                 "version": physhandi.__version__,
             }
             for part, model in (("masks", finder), ("tracks", tracker))

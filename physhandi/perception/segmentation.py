@@ -111,6 +111,10 @@ _CLICK_RADIUS = 0.012
 """Radius around a click in which the object's color is looked at [m]."""
 _CLICK_COLOR = 14.0
 """Difference from the clicked color that is still the object's [levels of CIELAB, 0 to 255]."""
+_LEAST_BOX, _MOST_OF_WINDOW = 6, 0.8
+"""Least width and height of a box [px], and most that it may cover of what is looked at."""
+_AROUND_BOX = 16
+"""Least that is looked at around a box [px]."""
 _LEAST_OBJECT = 12
 """Pixels of the smallest object."""
 _LEAST_JOINTS = 6
@@ -147,16 +151,25 @@ _Anchors = dict[int, tuple[Bool[ndarray, "row column"], Bool[ndarray, "row colum
 
 @dataclass(frozen=True)
 class Click:
-    """A place on the object, in one image."""
+    """A place on the object, in one image, or a box around it."""
 
     view: str
     """Name of the view."""
     frame: int
     """Number of the frame."""
     x: float
-    """Column [px]."""
+    """Column, of a box that of its middle [px]."""
     y: float
-    """Row [px]."""
+    """Row, of a box that of its middle [px]."""
+    width: float = 0.0
+    """Width of the box; 0 if only the place is known [px]."""
+    height: float = 0.0
+    """Height of the box; 0 if only the place is known [px]."""
+
+    def to_dict(self) -> dict[str, str | int | float]:
+        """Give it as plain data, without the size of a box where there is none."""
+        place = {"view": self.view, "frame": self.frame, "x": self.x, "y": self.y}
+        return place | ({"width": self.width, "height": self.height} if self.width else {})
 
 
 def segment(
@@ -546,6 +559,8 @@ def _clicked_starts(seen: _Seen, clicks: Many[Click]) -> dict[int, _Start]:
 
 def _around_click(seen: _Seen, image: _Image, click: Click) -> Bool[ndarray, "row column"]:
     """Choose the pixels next to a click that have its color and depth."""
+    if click.width > 0 or click.height > 0:
+        return _within_box(seen, image, click)
     where = _told(click)
     height, width = image.gray.shape
     row, column = min(round(click.y), height - 1), min(round(click.x), width - 1)
@@ -572,6 +587,43 @@ def _around_click(seen: _Seen, image: _Image, click: Click) -> Bool[ndarray, "ro
     alike[row, column] = True
     label = cv2.connectedComponents(alike.astype(np.uint8))[1]
     return np.asarray(label == label[row, column])
+
+
+def _within_box(seen: _Seen, image: _Image, click: Click) -> Bool[ndarray, "row column"]:
+    """Choose the pixels in a box that GrabCut tells from what is around it; no hand's."""
+    where, size = _told(click), image.gray.shape
+    middle, half = np.array([click.y, click.x]), np.array([click.height, click.width]) / 2
+    low = np.maximum(np.round(middle - half), 0).astype(int)
+    high = np.minimum(np.round(middle + half) + 1, size).astype(int)
+    pad = np.maximum(_AROUND_BOX, (high - low) // 2)
+    begin, end = np.maximum(low - pad, 0), np.minimum(high + pad, size)
+    share = float(np.prod(high - low) / np.prod(end - begin))
+    if (high - low).min() < _LEAST_BOX or share > _MOST_OF_WINDOW:
+        raise UsageError(
+            f"{where}: the box is {high[1] - low[1]}x{high[0] - low[0]} px. Draw it around the "
+            f"object, at least {_LEAST_BOX} px wide and high, so that something else remains."
+        )
+    window = np.s_[begin[0] : end[0], begin[1] : end[1]]
+    state = np.full(tuple(end - begin), cv2.GC_BGD, dtype=np.uint8)
+    state[low[0] - begin[0] : high[0] - begin[0], low[1] - begin[1] : high[1] - begin[1]] = (
+        cv2.GC_PR_FGD
+    )
+    cv2.setRNGSeed(0)  # Its mixtures of Gaussians start from random places.
+    nothing = np.zeros((1, 65))
+    color = np.ascontiguousarray(image.color[window])
+    _cv2.grabCut(color, state, None, nothing, nothing.copy(), 4, cv2.GC_INIT_WITH_MASK)
+    inside = np.zeros(size, dtype=np.uint8)
+    inside[window] = (state == cv2.GC_FGD) | (state == cv2.GC_PR_FGD)
+    for _, core in _hand_cores(seen, click.frame):
+        inside[core > 0] = 0
+    inside = cv2.erode(inside, np.ones((3, 3), np.uint8))
+    count, label, parts, _ = cv2.connectedComponentsWithStats(inside)
+    if count < 2 or parts[1:, cv2.CC_STAT_AREA].max() < _LEAST_OBJECT:
+        raise UsageError(
+            f"{where}: nothing in the box stands out from what is around it. Click on the object "
+            "instead, or choose another view or frame."
+        )
+    return np.asarray(label == 1 + int(parts[1:, cv2.CC_STAT_AREA].argmax()))
 
 
 def _borrowed_start(seen: _Seen, clicked: list[_Seen]) -> dict[int, _Start]:

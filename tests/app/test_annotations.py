@@ -50,7 +50,9 @@ def test_the_order_reaches_the_process_and_its_end_is_told(
     assert job.progress["stage"] == "segmentation"
     assert annotations.job("sheet") is job
     told = (data_dir / "sequences/sheet/found.txt").read_text()
-    assert told == "[{'view': 'front', 'frame': 3, 'x': 10.5, 'y': 20.0}]"
+    assert told == (
+        "[{'view': 'front', 'frame': 3, 'x': 10.5, 'y': 20.0, 'width': 0.0, 'height': 0.0}]"
+    )
 
 
 def test_a_refusal_and_a_death_are_told(annotations: Annotations) -> None:

@@ -15,16 +15,20 @@ _WORKER = "app.jobs.recordings.annotator"
 
 @dataclass(frozen=True)
 class ClickedPlace:
-    """A place on the object that somebody clicked on."""
+    """A place on the object that somebody clicked on, or a box around it."""
 
     view: str
     """View."""
     frame: int
     """Frame."""
     x: float
-    """Column [px]."""
+    """Column, of a box that of its middle [px]."""
     y: float
-    """Row [px]."""
+    """Row, of a box that of its middle [px]."""
+    width: float = 0.0
+    """Width of the box; 0 if only the place is known [px]."""
+    height: float = 0.0
+    """Height of the box; 0 if only the place is known [px]."""
 
 
 @dataclass(frozen=True)

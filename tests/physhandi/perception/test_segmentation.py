@@ -164,3 +164,28 @@ def test_progress_counts_all_frames_and_can_cancel(disc):
     with pytest.raises(CancelledError):
         segment(disc[0], [Click(*disc_click())], Watch())
     assert told == [(count, 2 * FRAMES) for count in (1, 2, 3)]
+
+
+def test_a_box_around_the_object_serves_as_a_click(tmp_path):
+    sequence, true = write_disc(tmp_path / "disc", frames=4)
+    there = np.argwhere(true["top"][0] == 1)
+    (top, left), (bottom, right) = there.min(0), there.max(0)
+    middle = (float(left + right) / 2, float(top + bottom) / 2)
+    box = Click("top", 0, *middle, float(right - left + 8), float(bottom - top + 6))
+    masks = segment(sequence, [box])
+    for view, found in masks.items():
+        both = (found == 1) & (true[view] == 1)
+        assert both.sum() > 0.9 * ((found == 1) | (true[view] == 1)).sum()
+    assert box.to_dict() == {
+        "view": "top",
+        "frame": 0,
+        "x": middle[0],
+        "y": middle[1],
+        "width": box.width,
+        "height": box.height,
+    }
+    for width, height in ((2.0, 40.0), (400.0, 400.0)):
+        with pytest.raises(UsageError, match="so that something else remains"):
+            segment(sequence, [Click("top", 0, *middle, width, height)])
+    with pytest.raises(UsageError, match="nothing in the box stands out"):
+        segment(sequence, [Click("top", 0, 8.0, 8.0, 8.0, 8.0)])
