@@ -312,6 +312,8 @@ def _check_place(sequence: Sequence, click: Click) -> None:
             f"{sequence.frame_count - 1}."
         )
     width, height = view.camera.width, view.camera.height
+    if not (0 <= click.width <= 2 * width and 0 <= click.height <= 2 * height):
+        raise UsageError(f"{where}: a box has a width and a height in pixels, both positive.")
     if not (-0.5 <= click.x <= width - 0.5 and -0.5 <= click.y <= height - 0.5):
         raise UsageError(
             f"{where}: is outside of the image. x goes from 0 to {width - 1}, y to {height - 1}."

@@ -184,7 +184,10 @@ def test_a_box_around_the_object_serves_as_a_click(tmp_path):
         "width": box.width,
         "height": box.height,
     }
-    for width, height in ((2.0, 40.0), (400.0, 400.0)):
+    for width, height in ((-1.0, 40.0), (40.0, float("nan"))):
+        with pytest.raises(UsageError, match="both positive"):
+            segment(sequence, [Click("top", 0, *middle, width, height)])
+    for width, height in ((2.0, 40.0), (190.0, 190.0)):
         with pytest.raises(UsageError, match="so that something else remains"):
             segment(sequence, [Click("top", 0, *middle, width, height)])
     with pytest.raises(UsageError, match="nothing in the box stands out"):
