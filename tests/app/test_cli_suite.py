@@ -143,8 +143,7 @@ def test_the_tiny_suite_is_made_and_evaluated_by_one_command(
     assert contact_point is not None
     assert 50 < len(contact_point) <= 441
     fits = list((out / "cells").glob(f"{sequence.name}-*"))
-    # One more has the hands as PhysTwin's profile fits them.
-    assert len(fits) == len(find_suite("tiny").methods) + 1
+    assert len(fits) == len(find_suite("tiny").methods)
     for fit in fits:
         nodes = Run.open(fit).array(f"sequences/{sequence.name}/rollout.npy").shape[1]
         assert 50 < nodes <= 441

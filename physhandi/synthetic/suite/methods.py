@@ -205,7 +205,7 @@ def _split(settings: str) -> list[str]:
 
 
 def method_settings(method: Method, common: Mapping[str, Any]) -> dict[str, Any]:
-    """Return all settings of a method as plain data.
+    """Return all settings of a method as plain data; hands are fitted as `default` fits them.
 
     Args:
         method: The method; its own settings win.
@@ -216,11 +216,14 @@ def method_settings(method: Method, common: Mapping[str, Any]) -> dict[str, Any]
         UsageError: If a setting is unknown or out of bounds.
     """
     own = pipeline.settings_of(method.profile, {})
+    # What is compared is what methods make of the same hands.
+    hands = pipeline.settings_of("default", {})["hand"]
+    same_hands = {f"hand.{name}": value for name, value in hands.items()}
     shared = {
         path: min(value, reduce(getitem, path.split("."), own)) if path.endswith(_EFFORT) else value
         for path, value in common.items()
     }
-    return pipeline.settings_of(method.profile, {**shared, **method.overrides})
+    return pipeline.settings_of(method.profile, {**same_hands, **shared, **method.overrides})
 
 
 @dataclass(frozen=True, kw_only=True)
