@@ -58,7 +58,8 @@ def client(session: Session) -> Iterator[ViewerClient]:
     with ViewerClient(f"ws://127.0.0.1:{session.port}") as client:
         enter(client)
         yield client
-    session._comparison.stop()
+        # While it is connected: viser warns of cameras that are moved back for nobody.
+        session._comparison.stop()
 
 
 def enter(client: ViewerClient) -> None:
