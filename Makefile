@@ -13,13 +13,14 @@ PIP_FLAGS := --quiet --disable-pip-version-check --no-compile -c constraints.txt
 
 install: $(STAMP)
 
-# pip would compile with one processor. Some packages hold templates that are no Python: never mind.
-# Of some hundred networks three are used, so they are compiled when they are.
+# A newer pip than a fresh environment has needs half the time. It leaves compiling to the first
+# import: of all modules that are installed few are used.
+export PYTHONDONTWRITEBYTECODE :=
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install $(PIP_FLAGS) --upgrade pip
 	$(BIN)/python -m pip install $(PIP_FLAGS) $(TORCH)
 	$(BIN)/python -m pip install $(PIP_FLAGS) -e ".[dev,synth,capture,models]"
-	$(BIN)/python -m compileall -qq -j 0 -x /transformers/models/ $(VENV)/lib || true
 	touch $@
 
 demo: install

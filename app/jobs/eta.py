@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import statistics
 import threading
 import time
@@ -13,7 +14,7 @@ from typing import Any
 
 from app.jobs.catalog import Catalog, RunItem
 from physhandi.data import sequence as recordings
-from physhandi.data.environment import ENVIRONMENT
+from physhandi.data.environment import ENVIRONMENT, processor_name
 from physhandi.data.files import named_fields
 from physhandi.data.run_folder import CURRENT, EXIT, read_mapping
 from physhandi.errors import PhysHandiError, UsageError
@@ -370,7 +371,12 @@ class Forecast:
             return self._expectations[key]
 
     def _own_machine(self) -> tuple[Any, ...]:
-        """Give the machine of the newest fit on the server's device: most likely this one."""
+        """Describe this machine as its fits do.
+
+        A GPU's name is that of the newest fit on it, since asking the driver takes seconds.
+        """
+        if self._device == "cpu":
+            return self._device, processor_name(), os.cpu_count()
         machines = (fit.machine for fit in self._fits if fit.machine[0] == self._device)
         return next(machines, (self._device,))
 

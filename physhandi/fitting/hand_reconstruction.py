@@ -628,13 +628,13 @@ def _mirrored(
     pose: _Pose,
 ) -> list[_Pose]:
     """Find the other pose in which a palm looks about the same, as it is and laid on keypoints."""
-    camera = cameras[_clearest_view(keypoint)]
+    view = _clearest_view(keypoint)
+    camera, is_seen = cameras[view], np.isfinite(keypoint[view]).all(-1)
     point = pose[0].apply(palm) + pose[1]
     way = point.mean(axis=0) - camera.T_world_camera[:3, 3]
     way /= np.linalg.norm(way)
     rotation, offset = _align(palm, point - 2 * ((point - point.mean(axis=0)) @ way)[:, None] * way)
-    is_seen = np.isfinite(keypoint[_clearest_view(keypoint)]).all(-1)
-    pixel = camera.undistort(keypoint[_clearest_view(keypoint), is_seen, :2].astype(np.float64))
+    pixel = camera.undistort(keypoint[view, is_seen, :2].astype(np.float64))
     to_camera = Rotation.from_matrix(camera.T_camera_world[:3, :3])
     vector = (to_camera * rotation).as_rotvec()[:, None]
     shift = (to_camera.apply(offset) + camera.T_camera_world[:3, 3])[:, None]

@@ -269,6 +269,11 @@ def test_runs_in_line_begin_when_those_before_them_have_ended(
     found = forecast.of_waiting(run, [ahead, ahead, ahead], [], 2)
     assert found is not None
     assert (found["starts_in_s"], found["left_s"]) == (40.0, 80.0)
+    # Also if nothing was ever fitted here, as on the first start with the bundled run.
+    change(world.catalog.run("fitted").folder / ENVIRONMENT, device_name="another processor")
+    foreign = Forecast(world.catalog, "cpu").of_waiting(run, [], [], 1)
+    assert foreign is not None
+    assert foreign["basis"].startswith("roughly")
 
 
 def test_nothing_is_told_where_nothing_is_known(

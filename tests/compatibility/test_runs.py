@@ -311,14 +311,16 @@ def test_a_folder_from_another_machine_opens_where_it_is(tmp_path: Path, old: Ol
 def test_the_index_of_runs_is_used_while_their_files_are_the_same(own_copy: OldFolder) -> None:
     path = own_copy.path / "cache" / "runs.json"
     index = json.loads(path.read_text())
-    assert len(index["runs"]) > 8
-    for folder, entry in index["runs"].items():
+    # It also names a run that was bundled with the old program, which is not here.
+    listed = {f: e for f, e in index["runs"].items() if Path(f).is_relative_to(own_copy.path)}
+    assert len(listed) > 8
+    for folder, entry in listed.items():
         stamp = [(Path(folder) / name).stat() for name in ("job.yaml", "run.yaml")]
         entry["stamp"] = [value for s in stamp for value in (s.st_mtime_ns, s.st_size)]
         entry["about"]["name"] = f"indexed {entry['about']['name']}"
     path.write_text(json.dumps(index))
     (own_copy.run("softer") / "run.yaml").touch()
-    listed = get(serve(own_copy.path).script(), "/api/v1/runs")["runs"]
-    names = {run["id"]: run["name"] for run in listed}
+    runs = get(serve(own_copy.path).script(), "/api/v1/runs")["runs"]
+    names = {run["id"]: run["name"] for run in runs}
     assert names["quick"] == "indexed Sheet, the good one"
     assert names["softer"] == "softer"

@@ -215,7 +215,7 @@ class Painter:
     @property
     def force_factor(self) -> float:
         """Written value of one newton of the model."""
-        return self.quantity("force").factor
+        return 1.0 if self.mass is None else self.mass.force_factor(self._node_count)
 
     def weigh(self, kilograms: float | None) -> None:
         """Write forces for an object of another mass [kg]; None for what the content says."""
