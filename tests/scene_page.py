@@ -46,11 +46,39 @@ class ScenePage:
         found = re.search(re.escape(before) + r"\s*" + _NUMBER + re.escape(after), text)
         return float(found[1]) if found else None
 
+    def row(self, label: str) -> Locator:
+        """A control of the panel with its label."""
+        row = self.panel.locator("label", has_text=re.compile(f"^(● )?{re.escape(label)}$"))
+        return row.locator("xpath=ancestor::div[contains(@class, 'mantine-Flex-root')][1]")
+
     def field(self, label: str) -> Locator:
         """The number beside a slider."""
-        row = self.panel.locator("label", has_text=re.compile(f"^(● )?{re.escape(label)}$"))
-        row = row.locator("xpath=ancestor::div[contains(@class, 'mantine-Flex-root')][1]")
-        return row.locator("input.mantine-NumberInput-input")
+        return self.row(label).locator("input.mantine-NumberInput-input")
+
+    def chosen(self, label: str) -> str:
+        """What a list shows."""
+        return self.row(label).get_by_role("combobox").input_value()
+
+    def choose(self, label: str, option: str) -> None:
+        """Choose from a list."""
+        self.row(label).get_by_role("combobox").click()
+        self.panel.get_by_role("option", name=option, exact=True).click()
+
+    def drag(self, label: str, pixels: int, values: int) -> None:
+        """Drag the handle of a slider aside, so slowly that the slider takes many values."""
+        handle = self.row(label).get_by_role("slider")
+        handle.scroll_into_view_if_needed()
+        box = handle.bounding_box()
+        assert box is not None
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        self.page.mouse.move(x, y)
+        self.page.mouse.down()
+        for number in range(1, values + 1):
+            before = handle.get_attribute("aria-valuenow")
+            self.page.mouse.move(x + pixels * number / values, y)
+            expect(handle).not_to_have_attribute("aria-valuenow", before or "")
+            self._send()
+        self.page.mouse.up()
 
     def value(self, label: str) -> float:
         return float(self.field(label).input_value())

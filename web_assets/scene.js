@@ -47,12 +47,43 @@
     root.addEventListener("focusout", tell, true);
   }
 
+  /* A drag, arrows while they are held, or a number that is typed is one step of undo, which the scene
+     is told the end of by a key of its own (app/viewer/ui/gestures.py). viser sends the last value of a
+     drag up to 50 ms late, but keys at once: they wait for it, unless the next gesture begins before. */
+  const LATE_MS = 60;
+  const MOVED = ".mantine-Slider-root, .mantine-NumberInput-root";
+  const END = { key: "Insert", code: "Insert", ctrlKey: true, altKey: true, shiftKey: true };
+  const STEPS = /^(Arrow|Page|Home$|End$|Enter$)/;
+
+  function tellGestures(inside, root) {
+    let isDown = false;
+    let waiting = null;
+    const tell = () => {
+      if (waiting === null) return;
+      inside.clearTimeout(waiting);
+      waiting = null;
+      root.dispatchEvent(new inside.KeyboardEvent("keydown", END));
+    };
+    const end = () => (waiting ??= inside.setTimeout(tell, LATE_MS));
+    const isMoved = (event) => Boolean(event.target.closest?.(MOVED));
+    root.addEventListener("pointerdown", (event) => { tell(); isDown = isMoved(event); }, true);
+    for (const type of ["pointerup", "pointercancel"]) inside.addEventListener(type, () => { if (isDown) end(); isDown = false; }, true);
+    root.addEventListener("keydown", (event) => event.isTrusted && !event.repeat && tell(), true);
+    root.addEventListener("keyup", (event) => STEPS.test(event.key) && isMoved(event) && end(), true);
+    root.addEventListener("focusout", (event) => isMoved(event) && end(), true);
+  }
+
+  /* Arrows on a slider and blanks on a tab are its own, and step through no frames. */
+  const isOwn = ({ key, target }) => target.closest?.("[role=slider], [role=tab], [role=option]") && (key === " " || STEPS.test(key));
+
   /* To be called whenever the frame has loaded a scene. */
   globalThis.wireScene = (scene, seek) => {
     const inside = scene.contentWindow;
     const root = inside.document.documentElement;
     let start = 0;
     keepSigns(root);
+    tellGestures(inside, root);
+    inside.document.body.addEventListener("keydown", (event) => isOwn(event) && event.stopPropagation());
     root.addEventListener("keydown", (event) => NOT_FOR_CAMERA.includes(event.code) && event.stopPropagation());
     inside.addEventListener("keydown", (event) => {
       if (event.key === "?" && !isTyping(event)) document.getElementById("help").showModal();

@@ -13,31 +13,65 @@ from physhandi.run import Run
 pytestmark = [pytest.mark.e2e, pytest.mark.slow]
 
 
-def test_a_change_is_undone_by_keys_and_simulated_frame_by_frame(home):
-    scene = ScenePage.opened_from(home)
-    scene.pause()
+def test_a_change_is_undone_by_keys_and_simulated_frame_by_frame(shared_scene):
+    scene, keyboard = shared_scene, shared_scene.page.keyboard
     fitted = scene.value("stiffness 10^")
     scene.set("stiffness 10^", -0.7)
     soft = scene.new_difference("a softer object")
 
     # Keys typed into a field are the field's own.
     scene.field("stiffness 10^").blur()
-    home.keyboard.press("Control+z")
+    keyboard.press("Control+z")
     scene.until(lambda: scene.difference() == 0, "the fitted rollout")
     scene.until(lambda: scene.value("stiffness 10^") == fitted, "its slider")
-    home.keyboard.press("Control+Shift+Z")
+    keyboard.press("Control+Shift+Z")
     scene.until(lambda: scene.difference() == soft, "the softer object again")
     scene.until(lambda: scene.has("every frame is new"), "all frames are new")
 
-    home.keyboard.press("h")
+    keyboard.press("h")
     scene.until(lambda: scene.has("Held: the next simulation"), "whatever comes is held")
-    home.keyboard.press("n")
-    home.keyboard.press("n")
+    keyboard.press("n")
+    keyboard.press("n")
     scene.until(lambda: scene.has("Held at frame 2"), "two frames of a held simulation")
     scene.until(lambda: scene.has("frames 0 to 2 of 59 are new"), "the strip of frames")
     scene.until(lambda: scene.value("Frame") == scene.frame() == 2, "the newest frame")
-    home.keyboard.press("h")
+    keyboard.press("h")
     scene.until(lambda: scene.difference() == soft, "all frames")
+
+
+def test_one_gesture_is_one_step_of_the_history(shared_scene):
+    scene, keyboard = shared_scene, shared_scene.page.keyboard
+    name = "d_max virtual"
+
+    def steps_are(*values: int) -> None:
+        last = f"{len(values) - 1} · {name} {values[-2]} → {values[-1]}"
+        scene.until(lambda: scene.chosen("History") == last, f"the step {last}")
+
+    scene.choose("History", "0 · as fitted")  # Another change forgets those that were taken back.
+    taken = [int(scene.value(name))]
+    for _ in range(2):
+        scene.drag(name, 24, values=3)
+        taken.append(int(scene.value(name)))
+        steps_are(*taken)
+    frame, handle = scene.value("Frame"), scene.row(name).get_by_role("slider")
+    handle.focus()
+    for _ in range(3):  # Held, so that it repeats.
+        keyboard.down("ArrowRight")
+    keyboard.up("ArrowRight")
+    scene.until(lambda: scene.value(name) == taken[-1] + 3, "three values more")
+    taken.append(taken[-1] + 3)
+    steps_are(*taken)
+    assert scene.value("Frame") == frame
+    for number in (15, 27):
+        scene.type(name, str(number))
+        scene.field(name).press("Enter")
+        taken.append(number)
+        steps_are(*taken)
+
+    scene.choose("History", f"1 · {name} {taken[0]} → {taken[1]}")
+    scene.until(lambda: scene.value(name) == taken[1], "the first step")
+    scene.until(lambda: scene.link()["virtual_max_neighbors"] == str(taken[1]), "is in force")
+    scene.press("Reset")
 
 
 def test_a_change_is_kept_as_preset_and_run(home, served, tmp_path):

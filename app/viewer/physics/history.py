@@ -1,13 +1,11 @@
 """The parameters that were tried in a session, with undo and redo."""
 
-import time
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from physhandi.simulation.parameters import SimulationParameters
 
-_REST = 3.0
-"""A slider that rested for longer is moved by another gesture [s]."""
+MOST_STEPS = 50
+"""Steps that are kept; the oldest go first. `History.reset` needs none of them."""
 
 
 class Setting(NamedTuple):
@@ -22,27 +20,26 @@ class Setting(NamedTuple):
 class History:
     """The settings that were tried; one gesture is one step.
 
-    A gesture moves one slider, however far and slowly, until another control is used or the slider
-    rests. Changed by one thread at a time; `setting` may be read by any.
+    A gesture moves one control, however far and slowly: from a pointer's going down to its going
+    up, while a key is held, or while a number is typed. Where it ends is told by the page; without
+    a page, changes of one control are one step until another control is used. Changed by one
+    thread at a time; `setting` may be read by any.
     """
 
-    def __init__(
-        self, start: SimulationParameters, clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, start: SimulationParameters) -> None:
         """Begin with the fitted parameters.
 
         Args:
             start: The fitted parameters, to which `reset` returns.
-            clock: Gives the time [s].
         """
         self.start = start
         self.setting = Setting(start)
         """What is in force."""
-        self._clock = clock
         self._steps = [self.setting]
         self._index = 0
-        self._moved: str | None = None
-        self._moved_at = 0.0
+        self._before = 0
+        """Index of the step that the gesture started from."""
+        self._gesture: tuple[str, int] | None = None
 
     @property
     def current(self) -> SimulationParameters:
@@ -54,27 +51,36 @@ class History:
         """Whether the number of substeps is chosen automatically."""
         return self.setting.is_automatic
 
-    def set(self, field: str, value: Any) -> Setting:
-        """Change one parameter, as a slider does that is being moved."""
-        now = self._clock()
-        setting = self.setting._replace(parameters=self.current.replace(**{field: value}))
-        is_same_gesture = field == self._moved and now - self._moved_at < _REST
-        if is_same_gesture and self._index > 0:
-            self._steps[self._index :] = [setting]
-            self.setting = setting
-        else:
-            self._add(setting)
-        self._moved, self._moved_at = field, now
-        return self.setting
+    @property
+    def steps(self) -> tuple[Setting, ...]:
+        """All settings that can be returned to, in the order in which they were tried."""
+        return tuple(self._steps)
+
+    @property
+    def index(self) -> int:
+        """Which of the steps is in force."""
+        return self._index
+
+    def set(self, field: str, value: Any, *, gesture: int = 0) -> Setting:
+        """Change one parameter, as a control does that is being moved.
+
+        Args:
+            field: Name of the parameter.
+            value: Its new value.
+            gesture: Number of the gesture; another one is another step.
+        """
+        changed = self.setting._replace(parameters=self.current.replace(**{field: value}))
+        if field == "substeps_per_frame":
+            changed = changed._replace(is_automatic=False)
+        return self._put(changed, (field, gesture))
 
     def replace(self, parameters: SimulationParameters, *, is_automatic: bool = False) -> Setting:
         """Change all parameters at once."""
-        self._moved = None
-        self._add(Setting(parameters, is_automatic))
-        return self.setting
+        return self._put(Setting(parameters, is_automatic), None)
 
-    def set_substeps(self, number: int, *, is_automatic: bool = False) -> Setting:
-        """Change the number of substeps, and whether it is chosen automatically."""
+    def choose_substeps(self, *, is_automatic: bool) -> Setting:
+        """Have the number of substeps chosen automatically, or take the fitted one."""
+        number = self.start.substeps_per_frame
         changed = self.current.replace(substeps_per_frame=number)
         return self.replace(changed, is_automatic=is_automatic)
 
@@ -86,24 +92,36 @@ class History:
 
     def undo(self) -> Setting:
         """Take the last change back."""
-        return self._go(self._index - 1)
+        return self.go(self._index - 1)
 
     def redo(self) -> Setting:
         """Make the change again that was taken back last."""
-        return self._go(self._index + 1)
+        return self.go(self._index + 1)
+
+    def go(self, index: int) -> Setting:
+        """Return to one of the `steps`, the nearest if there is none of that index."""
+        self._gesture = None
+        self._index = min(max(index, 0), len(self._steps) - 1)
+        self.setting = self._steps[self._index]
+        return self.setting
 
     def reset(self) -> Setting:
         """Return to the fitted parameters; this can be undone."""
         return self.replace(self.start)
 
-    def _add(self, setting: Setting) -> None:
-        if setting != self.setting:
-            self._steps[self._index + 1 :] = [setting]
-            self._index += 1
-            self.setting = setting
-
-    def _go(self, index: int) -> Setting:
-        self._moved = None
-        self._index = min(max(index, 0), len(self._steps) - 1)
-        self.setting = self._steps[self._index]
-        return self.setting
+    def _put(self, setting: Setting, gesture: tuple[str, int] | None) -> Setting:
+        """Bring a setting into force; what a gesture has set before gives way to it."""
+        if setting == self.setting:
+            return setting
+        if gesture is None or gesture != self._gesture:
+            self._before = self._index
+        self._gesture = gesture
+        # A gesture that ends where it began is no step.
+        now = [setting] if setting != self._steps[self._before] else []
+        self._steps[self._before + 1 :] = now
+        surplus = max(len(self._steps) - MOST_STEPS, 0)
+        del self._steps[:surplus]
+        self._before -= surplus
+        self._index = len(self._steps) - 1
+        self.setting = setting
+        return setting

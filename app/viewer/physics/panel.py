@@ -4,6 +4,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from app.viewer.physics.parameters import (
     knobs_of,
 )
 from app.viewer.ui.followed import FollowedChoice
+from app.viewer.ui.gestures import Gestures
 from app.viewer.ui.guard import Guard
 from app.viewer.ui.keyboard import bind
 from physhandi.run import Run
@@ -39,7 +41,8 @@ class SliderSet:
         gui: viser.GuiApi,
         guard: Guard,
         history: History,
-        move: Callable[[Knob | Switch, FollowedChoice], None],
+        gestures: Gestures,
+        move: Callable[[Knob | Switch, FollowedChoice, int], None],
     ) -> None:
         """Prepare; `add` makes the controls where the caller stands.
 
@@ -47,11 +50,14 @@ class SliderSet:
             gui: Where to.
             guard: Wraps the callbacks.
             history: Keeps the parameters.
-            move: Called with a parameter and its control when a user has moved it.
+            gestures: Tells which movements are one.
+            move: Called with a parameter, its control and the number of the gesture when a user
+                has moved it.
         """
         self._gui = gui
         self._guard = guard
         self._history = history
+        self._gestures = gestures
         self._move = move
         self._controls: list[tuple[Knob | Switch, FollowedChoice]] = []
 
@@ -64,9 +70,7 @@ class SliderSet:
         """Add a control for each of some parameters."""
         for knob in knobs:
             control = FollowedChoice(self._make(knob), self._guard)
-            control.handle.on_update(
-                self._guard.by_user(lambda _, knob=knob, control=control: self._move(knob, control))
-            )
+            self._listen(knob, control)
             self._controls.append((knob, control))
 
     def show(self) -> None:
@@ -84,6 +88,12 @@ class SliderSet:
                 control.label = label
             if isinstance(knob, HeightKnob) and control.disabled != (now.ground_height is None):
                 control.disabled = now.ground_height is None
+
+    def _listen(self, knob: Knob | Switch, control: FollowedChoice) -> None:
+        gesture = self._gestures.follow(control.handle)
+        control.handle.on_update(
+            self._guard.by_user(lambda _: self._move(knob, control, gesture()))
+        )
 
     def _make(self, knob: Knob | Switch) -> Any:
         start = knob.to_slider(self._history.start)
@@ -111,7 +121,8 @@ class SubstepsChoice:
         gui: viser.GuiApi,
         guard: Guard,
         history: History,
-        choose: Callable[[int, bool], None],
+        gestures: Gestures,
+        change: Callable[[Callable[[], Setting]], None],
     ) -> None:
         """Add the choice where the caller stands.
 
@@ -119,10 +130,11 @@ class SubstepsChoice:
             gui: Where to.
             guard: Wraps the callbacks.
             history: Keeps the number, and whether it is chosen automatically.
-            choose: Called with the number that a user chose, and whether it is automatic.
+            gestures: Tells what is typed at one go.
+            change: Makes a change of the history, and what follows from it.
         """
         self._history = history
-        self._choose = choose
+        self._change = change
         self._in_use = history.start.substeps_per_frame
         choice: Any = gui.add_dropdown(
             "substeps",
@@ -139,8 +151,9 @@ class SubstepsChoice:
             visible=False,
             hint="More are slower and more exact; too few and the object explodes",
         )
+        gesture = gestures.follow(self._number)
         choice.on_update(guard.by_user(lambda _: self._take_choice()))
-        self._number.on_update(guard.by_user(lambda _: self._take_number()))
+        self._number.on_update(guard.by_user(lambda _: self._take_number(gesture())))
 
     def show(self) -> None:
         """Follow the history."""
@@ -165,18 +178,20 @@ class SubstepsChoice:
 
     def _take_choice(self) -> None:
         history, choice = self._history, self._followed.read()
-        if choice == SUBSTEPS_BY_HAND:
-            # Nothing is simulated anew before another number is typed.
-            self._number.value, self._number.visible = self._in_use, True
-            if not history.is_automatic:
-                return
-            number = self._in_use
-        else:
-            number = history.start.substeps_per_frame
-        self._choose(number, choice == SUBSTEPS_AUTOMATIC)
+        if choice != SUBSTEPS_BY_HAND:
+            is_automatic = choice == SUBSTEPS_AUTOMATIC
+            self._change(lambda: history.choose_substeps(is_automatic=is_automatic))
+            return
+        # Nothing is simulated anew before another number is typed.
+        number = self._number.value = self._in_use
+        self._number.visible = True
+        if history.is_automatic:
+            changed = history.current.replace(substeps_per_frame=number)
+            self._change(lambda: history.replace(changed))
 
-    def _take_number(self) -> None:
-        self._choose(min(max(int(self._number.value), 1), _MOST), False)
+    def _take_number(self, gesture: int) -> None:
+        number = min(max(int(self._number.value), 1), _MOST)
+        self._change(lambda: self._history.set("substeps_per_frame", number, gesture=gesture))
 
 
 def warning(readout: Readout) -> str:
@@ -194,6 +209,8 @@ _REFRESH = 0.2
 _UNDO, _REDO, _RESET = "Undo", "Redo", "Reset"
 _HOLD, _STEP, _GO = "Hold", "1 frame", "Go"
 _PUT_BACK = "choose…"
+_LONGEST_STEP = 60
+"""Characters of a step in the list of steps."""
 
 
 class PhysicsPanel:
@@ -226,6 +243,8 @@ class PhysicsPanel:
         """
         fitted = rollouts.fitted
         self.history = History(fitted.parameters)
+        self._gestures = Gestures(server.gui)
+        self._step_texts: dict[tuple[Setting, Setting], str] = {}
         self._rollouts = rollouts
         self._is_held = False
         self._changed: dict[str, tuple[str, ...]] = {}
@@ -245,12 +264,9 @@ class PhysicsPanel:
             self._presets = PresetChoice(
                 gui, guard, self.history, length_unit=unit, store=store, choose=self._replace
             )
-            self._sliders = SliderSet(gui, guard, self.history, self._move)
+            self._sliders = SliderSet(gui, guard, self.history, self._gestures, self._move)
             self._sliders.add(*knobs_of("springs", parameters, length_unit=unit))
-            buttons = gui.add_button_group(
-                "History", (_UNDO, _REDO, _RESET), hint="Ctrl+Z and Ctrl+Shift+Z"
-            )
-            buttons.on_click(guard(lambda event: self._press(event.target.value)))
+            self._steps = self._add_steps(gui, guard)
             pace = gui.add_button_group(
                 "Simulation",
                 (_HOLD, _STEP, _GO),
@@ -270,7 +286,9 @@ class PhysicsPanel:
             self._put_back.handle.on_update(guard.by_user(lambda _: self._put_one_back()))
             with gui.add_folder("More physics", expand_by_default=False):
                 self._sliders.add(*knobs_of("more", parameters, length_unit=unit))
-                self._substeps = SubstepsChoice(gui, guard, self.history, self._set_substeps)
+                self._substeps = SubstepsChoice(
+                    gui, guard, self.history, self._gestures, self._change
+                )
             with gui.add_folder("Ground", expand_by_default=False):
                 self._sliders.add(*ground_knobs(parameters, length_unit=unit, low=low, high=high))
             with gui.add_folder("Self-collision", expand_by_default=False):
@@ -297,6 +315,7 @@ class PhysicsPanel:
         self.close()
         for command in self._commands:
             command.remove()
+        self._gestures.remove()
         self._folder.remove()
 
     def close(self) -> None:
@@ -350,6 +369,21 @@ class PhysicsPanel:
             lines.append("**Held: the next simulation waits at frame 0**")
         return "<br/>".join(lines)
 
+    def _add_steps(self, gui: viser.GuiApi, guard: Guard) -> FollowedChoice:
+        """Add undo, redo, reset and the list of steps."""
+        buttons = gui.add_button_group(
+            "Steps", (_UNDO, _REDO, _RESET), hint="Ctrl+Z and Ctrl+Shift+Z"
+        )
+        buttons.on_click(guard(lambda event: self._press(event.target.value)))
+        steps = FollowedChoice(
+            gui.add_dropdown(
+                "History", _numbered(["as fitted"]), hint="What was tried; go to any of it"
+            ),
+            guard,
+        )
+        steps.handle.on_update(guard.by_user(lambda _: self._go_to_step()))
+        return steps
+
     def _add_keys(self, server: viser.ViserServer, guard: Guard) -> list[viser.CommandHandle]:
         actions: dict[Action, Callable[[], None]] = {
             "undo": lambda: self._press(_UNDO),
@@ -363,18 +397,20 @@ class PhysicsPanel:
             for command in bind(server, guard, action, lambda _, __, act=act: act())
         ]
 
-    def _move(self, knob: Knob | Switch, control: FollowedChoice) -> None:
+    def _move(self, knob: Knob | Switch, control: FollowedChoice, gesture: int) -> None:
         with self._lock:
             before = self.history.setting
-            setting = self.history.set(knob.field, knob.from_slider(control.read()))
+            value = knob.from_slider(control.read())
+            setting = self.history.set(knob.field, value, gesture=gesture)
             if setting != before:
                 self._simulate(setting)
 
     def _replace(self, parameters: SimulationParameters, is_automatic: bool) -> None:
         self._change(lambda: self.history.replace(parameters, is_automatic=is_automatic))
 
-    def _set_substeps(self, number: int, is_automatic: bool) -> None:
-        self._change(lambda: self.history.set_substeps(number, is_automatic=is_automatic))
+    def _go_to_step(self) -> None:
+        index = int(self._steps.read().partition(" ")[0])
+        self._change(lambda: self.history.go(index))
 
     def _put_one_back(self) -> None:
         fields = self._changed.get(self._put_back.read())
@@ -405,6 +441,7 @@ class PhysicsPanel:
         if self.keep is not None:
             self.keep.show()
         self._show_changes()
+        self._show_steps()
 
     def _set_pace(self, name: str) -> None:
         """Hold the simulation, compute one frame of it or let it run."""
@@ -425,3 +462,37 @@ class PhysicsPanel:
         self._put_back.show(_PUT_BACK)
         self._put_back.handle.visible = bool(changes)
         self._changes.content = f"Changed: {text or 'nothing: parameters as fitted'}"
+
+    def _show_steps(self) -> None:
+        """List the steps, each by what it changed."""
+        history, known = self.history, self._step_texts
+        pairs = list(pairwise(history.steps))
+        self._step_texts = {
+            pair: known.get(pair) or step_text(self._sliders.knobs, *pair) for pair in pairs
+        }
+        begins = "as fitted" if history.steps[0] == Setting(history.start) else "before"
+        names = _numbered([begins, *(self._step_texts[pair] for pair in pairs)])
+        self._steps.offer(names)
+        self._steps.show(names[history.index])
+
+
+def step_text(knobs: tuple[Knob | Switch, ...], before: Setting, after: Setting) -> str:
+    """Say what a step changed, for example ``δ object [mm] 20 → 35``.
+
+    Args:
+        knobs: The sliders and boxes.
+        before: What was in force before it.
+        after: What is in force after it.
+    """
+    is_automatic = after.is_automatic and not before.is_automatic
+    changes = changes_in(knobs, before.parameters, after.parameters, is_automatic=is_automatic)
+    texts = [change.text for change in changes]
+    if before.is_automatic and not after.is_automatic:
+        texts.append(f"substeps automatic → {after.parameters.substeps_per_frame}")
+    text = ", ".join(texts)
+    return text if len(text) <= _LONGEST_STEP else f"{text[: _LONGEST_STEP - 1]}…"
+
+
+def _numbered(texts: list[str]) -> tuple[str, ...]:
+    """Number the steps, so that no two are called the same."""
+    return tuple(f"{number} · {text}" for number, text in enumerate(texts))

@@ -161,7 +161,7 @@ def test_a_session_follows_frames_and_sliders(measured) -> None:
             expected = 1e3 * np.linalg.norm(offset[9].astype(np.float64), axis=1).mean()
             assert expected > 0.1
             client.until(lambda: f"re-simulated {expected:.3g} mm" in shown(client))
-            client.set("History", "Reset")
+            client.set("Steps", "Reset")
             client.until(lambda: "re-simulated" not in shown(client))
     finally:
         sessions.shutdown()
@@ -177,7 +177,7 @@ def test_a_slider_that_is_not_as_fitted_has_a_dot(sessions) -> None:
         client.until(lambda: "● drag [1/s]" in labels())
         assert "drag [1/s]" not in labels()
         assert sum(label.startswith("● ") for label in labels()) == 1
-        client.set("History", "Undo")
+        client.set("Steps", "Undo")
         client.until(lambda: "drag [1/s]" in labels())
 
 

@@ -1,18 +1,11 @@
-from app.viewer.physics.history import History
+from app.viewer.physics.history import MOST_STEPS, History
 from physhandi.simulation.parameters import SimulationParameters
 
 START = SimulationParameters(connection_radius=0.0237, damping=20.0)
 
 
-class Clock:
-    now = 0.0
-
-    def __call__(self) -> float:
-        return self.now
-
-
 def test_undo_redo_and_reset() -> None:
-    history = History(START, Clock())
+    history = History(START)
     history.set("drag", 5.0)
     history.set("max_neighbors", 40)
     assert history.undo().parameters.max_neighbors == START.max_neighbors
@@ -27,7 +20,7 @@ def test_undo_redo_and_reset() -> None:
 
 
 def test_one_parameter_is_put_back_and_automatic_substeps_are_undone() -> None:
-    history = History(START, Clock())
+    history = History(START)
     history.set("drag", 5.0)
     history.replace(history.current, is_automatic=True)
     history.set("gravity", 1.0)
@@ -42,38 +35,75 @@ def test_one_parameter_is_put_back_and_automatic_substeps_are_undone() -> None:
     assert history.reset() == (START, False)
 
 
-def test_one_drag_of_a_slider_is_one_step_however_slow_it_is() -> None:
-    clock = Clock()
-    history = History(START, clock)
+def drags(history: History) -> list[float]:
+    return [step.parameters.drag for step in history.steps]
+
+
+def test_one_gesture_is_one_step_however_many_values_it_has() -> None:
+    history = History(START)
     for step in range(24):
-        history.set("drag", 4.0 + 0.1 * step)
-        clock.now += 2.0
-    assert history.current.drag == 4.0 + 0.1 * 23
+        history.set("drag", 4.0 + 0.1 * step, gesture=1)
+    assert drags(history) == [START.drag, 4.0 + 0.1 * 23]
+    history.set("drag", 7.0, gesture=2)
+    history.set("drag", 8.0, gesture=2)
+    history.set("gravity", 1.0, gesture=2)
+    history.set("drag", 9.0, gesture=2)
+    assert drags(history) == [START.drag, 4.0 + 0.1 * 23, 8.0, 8.0, 9.0]
+
+
+def test_a_gesture_that_was_taken_back_begins_another_step() -> None:
+    history = History(START)
+    history.set("drag", 4.0, gesture=1)
     assert history.undo() == (START, False)
+    history.set("drag", 5.0, gesture=1)
+    assert drags(history) == [START.drag, 5.0]
+
+
+def test_a_gesture_that_ends_where_it_began_is_no_step() -> None:
+    history = History(START)
+    history.set("drag", 4.0, gesture=1)
+    history.set("drag", START.drag, gesture=1)
+    assert (drags(history), history.index) == ([START.drag], 0)
+    history.set("drag", 5.0, gesture=1)
+    assert drags(history) == [START.drag, 5.0]
     assert history.undo() == (START, False)
 
 
-def test_a_slider_that_rested_or_was_left_for_another_control_begins_a_step() -> None:
-    clock = Clock()
-    history = History(START, clock)
-    history.set("drag", 4.0)
-    clock.now += 10.0
-    history.set("drag", 5.0)
-    history.set("gravity", 1.0)
-    history.set("drag", 6.0)
-    history.undo()
-    history.set("drag", 7.0)  # Another gesture than the one that was taken back.
-    drags = [history.current.drag]
-    while history.undo().parameters != START:
-        drags.append(history.current.drag)
-    assert drags == [7.0, 5.0, 5.0, 4.0]
+def test_every_step_can_be_gone_to_until_another_change_is_made() -> None:
+    history = History(START)
+    for number, drag in enumerate((4.0, 5.0, 6.0)):
+        history.set("drag", drag, gesture=number)
+    assert history.go(1).parameters.drag == 4.0
+    assert history.go(3).parameters.drag == 6.0
+    assert history.go(99).parameters.drag == 6.0
+    history.go(2)
+    history.set("drag", 7.0, gesture=9)
+    assert drags(history) == [START.drag, 4.0, 5.0, 7.0]
+
+
+def test_the_oldest_steps_go_and_a_gesture_stays_whole() -> None:
+    history = History(START)
+    for number in range(MOST_STEPS + 5):
+        history.set("drag", 100.0 + number, gesture=number)
+        history.set("drag", 200.0 + number, gesture=number)
+    assert drags(history) == [200.0 + number for number in range(5, MOST_STEPS + 5)]
+    assert history.reset() == (START, False)
+
+
+def test_typed_substeps_are_no_longer_automatic() -> None:
+    history = History(START)
+    history.choose_substeps(is_automatic=True)
+    for number in (1, 12, 120):
+        history.set("substeps_per_frame", number, gesture=4)
+    assert history.setting == (START.replace(substeps_per_frame=120), False)
+    assert history.undo() == (START, True)
 
 
 def test_a_value_that_is_there_already_is_no_step() -> None:
-    history = History(START, Clock())
+    history = History(START)
     history.set("drag", START.drag)
     history.replace(START)
-    history.set_substeps(START.substeps_per_frame)
+    history.choose_substeps(is_automatic=False)
     history.set("drag", 5.0)
     assert history.undo() == (START, False)
     assert history.redo().parameters.drag == 5.0

@@ -91,7 +91,7 @@ def test_the_fit_is_kept_while_sliders_move_the_other(client: ViewerClient, run:
     # What is kept next is the rollout of now, from which the fit differs as much.
     client.set("Keep as A", "this rollout")
     client.until(lambda: "mean 0 mm" in said(client))
-    client.set("History", "Reset")
+    client.set("Steps", "Reset")
     client.until(lambda: told in said(client))
     client.until(lambda: is_fitted(client, "b", fitted))
     client.set("Stop comparing", True)
@@ -120,7 +120,7 @@ def test_a_key_compares_with_what_was_kept_last_or_with_the_fit(
     client.until(lambda: is_fitted(client, "a", fitted))
     press(client, "V")
     client.until(lambda: client.find("Colors of A and B") == "")
-    client.set("History", "Reset")
+    client.set("Steps", "Reset")
     press(client, "V")
     client.until(lambda: client.find("Colors of A and B") != "")
     client.until(lambda: is_fitted(client, "b", fitted))

@@ -38,7 +38,7 @@ def test_a_slider_re_simulates_and_undo_goes_back(sessions) -> None:
         )
         client.until(lambda: " ms a frame" in client.texts())
         client.until(lambda: "δ object [mm] 35 → 60" in client.texts())
-        client.set("History", "Undo")
+        client.set("Steps", "Undo")
         client.until(lambda: object_springs(client) == first)
         client.until(lambda: client.value("δ object [mm]") == 35.0)
 
@@ -62,7 +62,7 @@ def test_nodes_of_the_sheet_collide_when_the_box_is_ticked(sessions) -> None:
                 and far_from_fitted(client.texts()) > 3.0
             )
         )
-        client.set("History", "Reset")
+        client.set("Steps", "Reset")
         client.until(lambda: "as fitted" in client.texts())
         client.until(lambda: client.value("nodes collide") is False)
 
@@ -81,7 +81,7 @@ def test_a_diverged_simulation_is_told_and_the_slider_still_works(sessions) -> N
                 if "Notification" in m["type"]
             )
         )
-        client.set("History", "Reset")
+        client.set("Steps", "Reset")
         client.until(lambda: "Stopped" not in client.texts())
 
 

@@ -98,7 +98,7 @@ def test_a_held_simulation_is_stepped_and_the_strip_shows_what_is_new(sessions) 
         assert session._object.at(5)[0].parameters.drag == PARAMETERS.drag
         client.set("Simulation", "Go")
         client.until(lambda: "every frame is new" in drawn(client))
-        client.set("History", "Reset")
+        client.set("Steps", "Reset")
         client.until(lambda: "is new" not in drawn(client))
 
 
@@ -122,7 +122,7 @@ def test_presets_are_chosen_and_one_parameter_is_put_back(sessions) -> None:
         client.until(lambda: "stiffness x1 → x0.1, drag [1/s] 3 → 0.5" in client.texts())
         client.until(lambda: client.value("damping [N·s/m]") == 2.0)
         client.until(lambda: client.value("Preset") == "by hand")
-        client.set("History", "Undo")
+        client.set("Steps", "Undo")
         client.until(lambda: client.value("Preset") == "limp")
         client.set("Preset", "as fitted")
         client.until(lambda: "nothing: parameters as fitted" in client.texts())
@@ -137,7 +137,7 @@ def test_every_control_takes_the_same_value_again_after_a_reset(sessions) -> Non
         client.set("Simulation", "Hold")  # What is asked for matters, and not what becomes of it.
 
         def press(name: str, expected: Setting) -> None:
-            client.set("History", name)
+            client.set("Steps", name)
             client.until(lambda: history.setting == expected)
             written = threading.Event()
             with panel._lock:  # All that follows from it is handed to the event loop by then.
