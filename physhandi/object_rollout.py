@@ -1,6 +1,7 @@
 """One rollout of the object: the fitted one, or one that is being simulated now."""
 
-from collections.abc import Callable
+import logging
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -10,10 +11,13 @@ from numpy import ndarray
 
 from physhandi.data.exporters.export import export_scene
 from physhandi.data.exporters.scene_data import SceneData
-from physhandi.data.layout import PARAMETERS_FILE, SequenceFiles
+from physhandi.data.files import named_fields
+from physhandi.data.layout import PARAMETERS_FILE, SHAPE_FILE, SequenceFiles
 from physhandi.data.run import RunFolder
 from physhandi.data.run_folder import reading
-from physhandi.errors import UsageError
+from physhandi.data.view import View
+from physhandi.errors import SequenceError, UsageError
+from physhandi.metrics.photometric import frame_0_colors
 from physhandi.simulation.forces import (
     spring_strains,
     spring_tensions,
@@ -21,8 +25,12 @@ from physhandi.simulation.forces import (
     virtual_spring_forces,
 )
 from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.object_surface import ObjectSurface, lay_surface
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.restart import Restart
+from physhandi.triangles import vertex_normals
+
+logger = logging.getLogger(__name__)
 
 _FORMATS = {".glb": "gltf", ".npz": "npz", ".csv": "csv", ".ply": "ply", "": "ply"}
 
@@ -267,6 +275,37 @@ def load_fitted(run: RunFolder, sequence_name: str) -> ObjectRollout | None:
         ready=len(position),
         restart=restart,
     )
+
+
+def load_surface(
+    run: RunFolder, fitted: ObjectRollout, views: Sequence[View]
+) -> ObjectSurface | None:
+    """Lay the smooth surface of a run's object through its nodes, in the colors of frame 0.
+
+    Args:
+        run: Says what kind of object it is; without that the nodes tell.
+        fitted: Rollout of its nodes.
+        views: Views of the recording; those with color and masks lend their colors.
+
+    Returns:
+        The surface, without colors if no view has any; None if the nodes have no surface.
+    """
+    shape = (named_fields(run.yaml(SHAPE_FILE)) or {}) if run.has(SHAPE_FILE) else {}
+    kind, width = shape.get("shape"), shape.get("thickness")
+    surface = lay_surface(
+        fitted.model.object_node,
+        kind=kind if isinstance(kind, str) else None,
+        thickness=width if isinstance(width, float) and width > 0.0 else None,
+    )
+    if surface is None:
+        return None
+    vertex = surface.place(fitted.position[0]).astype(np.float64)
+    try:
+        color = frame_0_colors(views, vertex, vertex_normals(vertex, surface.face))
+    except SequenceError as error:  # What can be told of the object does not need a recording.
+        logger.info("the surface of the object has no colors: %s", error)
+        return surface
+    return replace(surface, color=color)
 
 
 def _difference(

@@ -1,6 +1,6 @@
 """The moving picture of one sequence or run: what it shows, and its two files."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,8 +13,10 @@ from app.previews.draw import HEIGHT, WIDTH, Motion, draw_motion
 from app.previews.links import marker_links
 from physhandi.data.files import named_fields, temporary_name
 from physhandi.data.layout import SequenceFiles
-from physhandi.data.sequence import Sequence
+from physhandi.data.sequence import Sequence as Recording
 from physhandi.data.view import View
+from physhandi.errors import PhysHandiError
+from physhandi.object_rollout import load_fitted, load_surface
 from physhandi.run import Run
 
 _FRAMES = 28
@@ -70,7 +72,7 @@ def clip_of_sequence(folder: Path, *, is_still: bool = False) -> Clip | None:
     Raises:
         SequenceError: If the sequence is damaged.
     """
-    sequence = Sequence.load(folder)
+    sequence = Recording.load(folder)
     frames, frame_ms = _sampled(sequence.frame_count, sequence.frame_rate, is_still=is_still)
     for kind in ("color", "depth"):
         for view in sequence.views:
@@ -99,8 +101,8 @@ def clip_of_run(folder: Path, *, is_still: bool = False) -> Clip | None:
         RunError: If the run is damaged.
     """
     run = Run.open(folder)
-    for name in run.sequence_names:
-        motion = _found_motion(run, SequenceFiles(name))
+    for name, recording in zip(run.sequence_names, run.sequences, strict=True):
+        motion = _found_motion(run, name, Path(recording))
         if motion.frame_count:
             rate = _rate_of(run, name)
             frames, frame_ms = _sampled(motion.frame_count, rate, is_still=is_still)
@@ -124,7 +126,8 @@ def _rate_of(run: Run, name: str) -> float:
     return float(rate) if isinstance(rate, int | float) and rate > 0 else _USUAL_RATE
 
 
-def _found_motion(run: Run, files: SequenceFiles) -> Motion:
+def _found_motion(run: Run, name: str, recording: Path) -> Motion:
+    files = SequenceFiles(name)
     hands: list[tuple[Float[ndarray, "frame vertex 3"], Int[ndarray, "face 3"] | None]] = []
     for side in _SIDES:
         stored, face = files.hand_vertex(side), files.hand_face(side)
@@ -133,12 +136,22 @@ def _found_motion(run: Run, files: SequenceFiles) -> Motion:
     if not run.has(files.rollout):
         return Motion(hands=tuple(hands))
     node = run.array(files.rollout)
+    fitted = load_fitted(run, name)
     return Motion(
         hands=tuple(hands),
         node=node,
         control=run.array(files.control) if not hands and run.has(files.control) else None,
         spring=_springs(run, files.model, node.shape[1]),
+        surface=None if fitted is None else load_surface(run, fitted, _views(recording)),
     )
+
+
+def _views(recording: Path) -> Sequence[View]:
+    """Open the views that lend the object its colors; none if the recording is not there."""
+    try:
+        return Recording.load(recording).views
+    except PhysHandiError:
+        return ()
 
 
 def _springs(run: Run, rel: str, node_count: int) -> Int[ndarray, "spring 2"]:
@@ -151,7 +164,7 @@ def _springs(run: Run, rel: str, node_count: int) -> Int[ndarray, "spring 2"]:
     return model["spring_nodes"][inner][shortest[: min(4 * node_count, _LINK_COUNT)]]
 
 
-def _recorded_motion(sequence: Sequence) -> Motion:
+def _recorded_motion(sequence: Recording) -> Motion:
     marker, control = sequence.marker, sequence.control
     if marker is None and control is None and sequence.object_node is not None:
         return Motion(node=np.repeat(sequence.object_node[None], sequence.frame_count, axis=0))

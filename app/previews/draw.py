@@ -10,6 +10,7 @@ from app.previews.camera import fitting_camera
 from physhandi.data.camera import PinholeCamera
 from physhandi.rendering.renderer import render
 from physhandi.rendering.shapes import Balls, Segments, Shape, Surface
+from physhandi.simulation.object_surface import ObjectSurface
 
 WIDTH, HEIGHT = 384, 240
 """Size of a preview [px]."""
@@ -20,7 +21,7 @@ _MARKER = np.array([63.0, 174.0, 92.0])
 _SPRING = np.array([[112.0, 160.0, 208.0]])
 _LIGHT = np.array([-0.35, -0.65, -0.67])
 """Where the light comes from, in the camera's axes."""
-_SKIN_SHADING, _POINT_SHADING = 0.9, 0.5
+_SKIN_SHADING, _OBJECT_SHADING, _POINT_SHADING = 0.9, 0.5, 0.5
 _FADING = 0.3
 """How much darker the farthest points are than the nearest."""
 _SKIN_RADIUS = 1.0
@@ -41,6 +42,8 @@ class Motion:
     """Points that move the object, where there is no hand."""
     spring: Int[ndarray, "spring 2"] = field(default_factory=lambda: np.empty((0, 2), dtype=int))
     """Object nodes, or markers where there are no nodes, that lines join."""
+    surface: ObjectSurface | None = None
+    """Surface of the object, which is drawn in place of nodes and springs."""
 
     @property
     def tracks(self) -> list[Float[ndarray, "frame point 3"]]:
@@ -89,15 +92,21 @@ def _shapes(camera: PinholeCamera, motion: Motion, frame: int) -> list[Shape]:
             color = _SKIN[None]
             shapes.append(Surface(vertex=vertex, faces=faces, color=color, shading=_SKIN_SHADING))
     radius = _radius(motion)
+    surface = motion.surface if motion.node is not None else None
+    if surface is not None and motion.node is not None:
+        vertex = surface.place(motion.node[frame]).astype(float)
+        color = _NODE[None] if surface.color is None else surface.color.astype(float)
+        shape = Surface(vertex=vertex, faces=surface.face, color=color, shading=_OBJECT_SHADING)
+        shapes.append(shape)
     for track, color in (
-        (motion.node, _NODE),
+        (motion.node if surface is None else None, _NODE),
         (motion.marker, _MARKER),
         (motion.control, _CONTROL),
     ):
         if track is not None:
             shapes.append(_balls(camera, np.asarray(track[frame], dtype=float), color, radius))
     linked = motion.node if motion.node is not None else motion.marker
-    if linked is not None:
+    if linked is not None and surface is None:
         ends = np.asarray(linked[frame], dtype=float)[motion.spring]
         shapes.append(Segments(ends=ends, width=1.0, color=_SPRING))
     return shapes

@@ -23,7 +23,7 @@ from physhandi.errors import PhysHandiError
 logger = logging.getLogger(__name__)
 
 PreviewKind = Literal["run", "sequence"]
-_VERSION = 1
+_VERSION = 2
 _BATCH = 8
 _ENDED_FROM_OUTSIDE = (-signal.SIGTERM, -signal.SIGINT)
 _PATIENCE = 10.0

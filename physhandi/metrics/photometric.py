@@ -23,6 +23,8 @@ DISC = 0.75
 """Radius of a drawn node, in distances between nodes: neighbouring discs overlap."""
 _BEHIND = 0.015
 """A node farther behind the measured surface than this is hidden [m]."""
+_STRAIGHT, _LEAST_COSINE = 4, 0.05
+"""Power of the cosine by which views count that look at a surface, and the least such cosine."""
 _FULL = 255.0
 _LEAST_ERROR = 1e-10
 
@@ -89,11 +91,22 @@ def shaded_psnr(
 
 
 def frame_0_colors(
-    views: Sequence[View], node: Float[ndarray, "node 3"]
+    views: Sequence[View],
+    node: Float[ndarray, "node 3"],
+    normal: Float[ndarray, "node 3"] | None = None,
 ) -> UInt8[ndarray, "node 3"] | None:
     """Assign each node the mean color of the views that see it in frame 0.
 
-    A node that no view sees takes the color of the nearest visible one; None without visible nodes.
+    Args:
+        views: Those that have color and masks count.
+        node: Points on the object's surface [m].
+        normal: Directions of the surface there, of either sign. With them the color is that of the
+            views that look straight at it, and not of pixels at the object's outline, into which
+            what is behind it is mixed; without, all views count alike.
+
+    Returns:
+        Colors; a node that no view sees takes that of the nearest visible one. None without
+        visible nodes.
     """
     total, count = np.zeros((len(node), 3)), np.zeros(len(node))
     for view in views:
@@ -105,12 +118,20 @@ def frame_0_colors(
         inside = np.asarray((pixel >= 0).all(axis=1))
         inside &= (pixel[:, 0] < width) & (pixel[:, 1] < height)
         column, row = np.where(inside[:, None], pixel, 0).T
-        is_seen = inside & (mask[row, column] == OBJECT)
+        is_object = mask == OBJECT
+        if normal is not None:
+            is_object = cv2.erode(is_object.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        is_seen = inside & is_object[row, column]
         if view.has_depth:
             measured = view.depth(0)[row, column]
             is_seen &= view.camera.camera_depth(node) < measured + _BEHIND
-        total[is_seen] += color[row, column][is_seen]
-        count[is_seen] += 1
+        weight = np.ones(len(node))
+        if normal is not None:
+            ray = node - view.camera.T_world_camera[:3, 3]
+            ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+            weight = np.maximum(np.abs(np.sum(ray * normal, axis=1)), _LEAST_COSINE) ** _STRAIGHT
+        total[is_seen] += weight[is_seen, None] * color[row, column][is_seen]
+        count[is_seen] += weight[is_seen]
     colored = np.flatnonzero(count)
     if not len(colored):
         return None

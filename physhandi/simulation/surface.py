@@ -20,21 +20,29 @@ _REACH = 2.6
 """Neighbors are not farther away than this many typical distances to the fourth one."""
 _LINE, _PLANE = 0.06, 0.18
 """Second and third extent, relative to the one before, below which nodes form a line or plane."""
-_LARGEST_CIRCLE, _LARGEST_SPHERE = 1.35, 1.5
+_LARGEST_CIRCLE, _LARGEST_SPHERE = 1.35, 2.0
 """Largest circumradius of triangles and tetrahedra, in distances to the fourth neighbor."""
 _LEAST_VOTES, _GAP_ROUNDS = 2, 3
 _OVERLAP = 0.5
 """Cosine of the angle below which two triangles at an edge cover each other."""
+_LEAST_LEVEL = 0.7
+"""Cosine of the largest angle between one layer over a plane and that plane."""
+_LEAST_APART = 0.3
+"""Least distance of its nodes in the plane, in typical distances: two layers have nearer ones."""
 _FLATTEST = 1e-6
 _SHAKE = 0.03
 """Part of the sampling by which nodes are moved, so that no four of a grid lie on one circle."""
 
 
-def triangulate_nodes(node: Float[ndarray, "node 3"]) -> Int[ndarray, "face 3"]:
+def triangulate_nodes(
+    node: Float[ndarray, "node 3"], *, kind: str | None = None
+) -> Int[ndarray, "face 3"]:
     """Lay triangles through the nodes of an object.
 
     Args:
         node: Nodes of the object at rest or in its first frame [m].
+        kind: ``solid`` for the outside of a volume, ``sheet`` or ``shell`` for one layer of nodes;
+            anything else to tell it by the nodes.
 
     Returns:
         Triangles, turned the same way around wherever they meet; none where the nodes have no
@@ -43,22 +51,48 @@ def triangulate_nodes(node: Float[ndarray, "node 3"]) -> Int[ndarray, "face 3"]:
     point = np.asarray(node, dtype=np.float64)
     if len(point) < 4 or not np.isfinite(point).all():
         return np.zeros((0, 3), np.int32)
-    tree: Any = KDTree(point)
-    distance, near = tree.query(point, k=min(_AROUND + 1, len(point)))
-    pitch = float(np.median(distance[:, min(4, len(point) - 1)]))
-    if pitch <= 0.0:
+    around = _Neighborhoods(point)
+    if around.pitch <= 0.0 or around.is_line:
         return np.zeros((0, 3), np.int32)
-    is_near = distance <= _REACH * pitch
-    shake = np.random.default_rng(0).uniform(-_SHAKE, _SHAKE, point.shape)
-    point = point + pitch * shake
-    axes, extent = _local_axes(point, near, is_near)
-    second = np.median(extent[:, 1] / np.maximum(extent[:, 0], 1e-12))
-    third = np.median(extent[:, 2] / np.maximum(extent[:, 1], 1e-12))
-    if second < _LINE:
-        return np.zeros((0, 3), np.int32)
-    if third < _PLANE:
-        return _sheet(point, near, is_near, axes, _LARGEST_CIRCLE * pitch)
-    return _volume(point, _LARGEST_SPHERE * pitch)
+    if kind in {"sheet", "shell"} or (kind != "solid" and around.is_flat):
+        faces = _height_field(around)
+        return _sheet(around) if faces is None else faces
+    return _volume(around.point, _LARGEST_SPHERE * around.pitch)
+
+
+def is_line(node: Float[ndarray, "node 3"]) -> bool:
+    """Tell whether nodes lie along a line, as those of a thin rope do."""
+    return _Neighborhoods(np.asarray(node, np.float64)).is_line
+
+
+def typical_distance(node: Float[ndarray, "node 3"]) -> float:
+    """Measure the typical distance of a node to its fourth neighbor [m]."""
+    return _Neighborhoods(np.asarray(node, np.float64)).pitch
+
+
+class _Neighborhoods:
+    """How an object lies around each of its nodes.
+
+    Attributes:
+        point: The nodes, shaken a little.
+        pitch: Typical distance to the fourth neighbor [m].
+        near: Numbers of the nearest nodes ``(node, neighbor)``, each node its own first one.
+        is_near: Which of them are within reach.
+        axes: Principal axes of each neighborhood, as rows ``(node, 3, 3)``.
+    """
+
+    def __init__(self, point: Float[ndarray, "node 3"]) -> None:
+        tree: Any = KDTree(point)
+        distance, self.near = tree.query(point, k=min(_AROUND + 1, len(point)))
+        self.pitch = float(np.median(distance[:, min(4, len(point) - 1)]))
+        self.is_near = distance <= _REACH * self.pitch
+        shake = np.random.default_rng(0).uniform(-_SHAKE, _SHAKE, point.shape)
+        self.point = point + self.pitch * shake
+        self.axes, extent = _local_axes(self.point, self.near, self.is_near)
+        second = np.median(extent[:, 1] / np.maximum(extent[:, 0], 1e-12))
+        third = np.median(extent[:, 2] / np.maximum(extent[:, 1], 1e-12))
+        self.is_line = bool(second < _LINE)
+        self.is_flat = bool(third < _PLANE)
 
 
 def _local_axes(
@@ -76,14 +110,28 @@ def _local_axes(
     return vectors[:, :, ::-1].transpose(0, 2, 1), extent
 
 
-def _sheet(
-    point: Float[ndarray, "node 3"],
-    near: Int[ndarray, "node neighbor"],
-    is_near: Bool[ndarray, "node neighbor"],
-    axes: Float[ndarray, "node 3 3"],
-    largest: float,
-) -> Int[ndarray, "face 3"]:
+def _height_field(around_nodes: _Neighborhoods) -> Int[ndarray, "face 3"] | None:
+    """Triangulate one layer over a plane all at once; None if the nodes are not one."""
+    point, pitch = around_nodes.point, around_nodes.pitch
+    axes = np.linalg.svd(point - point.mean(axis=0), full_matrices=False)[2]
+    plane: Any = (point - point.mean(axis=0)) @ axes[:2].T
+    if np.abs(around_nodes.axes[:, 2] @ axes[2]).min() < _LEAST_LEVEL:
+        return None
+    tree: Any = KDTree(plane)
+    if tree.query(plane, k=2)[0][:, 1].min() < _LEAST_APART * pitch:
+        return None
+    faces = Delaunay(plane).simplices.astype(np.int32)
+    corner = plane[faces]
+    side, other = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+    is_turned = side[:, 0] * other[:, 1] < side[:, 1] * other[:, 0]
+    faces[is_turned] = faces[is_turned][:, ::-1]
+    return faces[_circumradius(point[faces]) <= _LARGEST_CIRCLE * pitch]
+
+
+def _sheet(around_nodes: _Neighborhoods) -> Int[ndarray, "face 3"]:
     """Keep the triangles on which the tangent planes of their corners agree."""
+    point, largest = around_nodes.point, _LARGEST_CIRCLE * around_nodes.pitch
+    near, is_near, axes = around_nodes.near, around_nodes.is_near, around_nodes.axes
     votes: dict[tuple[int, ...], int] = {}
     for center in range(len(point)):
         around = near[center, is_near[center]]

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from app.settings import BUNDLED
 from physhandi.child import PACKAGE_ROOT, ChildEndedError
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence import Sequence
+from physhandi.simulation.object_surface import lay_surface
 
 SQUARE = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
 
@@ -68,6 +70,19 @@ def test_a_point_is_drawn_where_the_camera_sees_it_on_a_clear_ground() -> None:
         assert nearest.max() < 3.0
         assert np.linalg.norm(green[:, None] - seen[None], axis=-1).min(axis=1).max() < 12.0
     assert colored(second, 1)[:, 0].mean() < colored(first, 1)[:, 0].mean() - 10
+
+
+def test_the_surface_of_an_object_is_drawn_in_its_own_colors_in_place_of_its_nodes() -> None:
+    x, y = np.meshgrid(np.linspace(-1, 1, 8), np.linspace(-1, 1, 8))
+    node = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1)
+    surface = lay_surface(node, kind="sheet")
+    red = np.tile(np.array([220, 20, 20], np.uint8), (surface.vertex_count, 1))
+    pairs = np.stack([np.arange(63), np.arange(1, 64)], axis=1)
+    motion = Motion(node=node[None], spring=pairs, surface=replace(surface, color=red))
+    picture = draw_motion(motion, [0])[0]
+    covered = int((picture[..., 3] > 200).sum())
+    assert len(colored(picture, 0)) > 0.98 * covered > 10_000
+    assert len(colored(draw_motion(replace(motion, surface=surface), [0])[0], 2)) > 10_000
 
 
 def test_a_surface_hides_what_lies_behind_it_and_not_what_lies_before() -> None:

@@ -6,10 +6,12 @@ import yaml
 from safetensors.numpy import save_file
 from viewer_world import PARAMETERS, make_run
 
+from app.settings import BUNDLED
 from physhandi.data.layout import SequenceFiles
+from physhandi.data.sequence import Sequence
 from physhandi.errors import RunError
 from physhandi.fitted_object import FittedObject
-from physhandi.object_rollout import load_fitted
+from physhandi.object_rollout import load_fitted, load_surface
 from physhandi.run import Run
 from physhandi.simulation.forces import spring_strains
 from physhandi.simulation.restart import SHORTEST_SHARE, Restart
@@ -162,3 +164,25 @@ def test_a_damaged_restart_is_named(restarted, tmp_path: Path) -> None:
     save_file(shorter, run.out / SequenceFiles("lift").restart)
     with pytest.raises(RunError, match=r"restart\.safetensors.*position has 5 nodes"):
         FittedObject.of(run, "lift")
+
+
+def test_the_surface_has_the_colors_of_the_first_frame() -> None:
+    """A teal towel of 18 by 13 cm; its free end has a wide and a narrow white stripe."""
+    run = Run.open(BUNDLED / "runs" / "towel_fold_quick")
+    fitted = load_fitted(run, "towel_fold")
+    surface = load_surface(run, fitted, Sequence.load(BUNDLED / "towel_fold").views)
+    vertex = surface.place(fitted.position[0])
+    far = vertex[:, 0].max() - vertex[:, 0]
+    for low, high, color in (
+        (0.0, 0.002, (49, 136, 152)),
+        (0.025, 0.03, (242, 238, 214)),
+        (0.045, 0.12, (49, 136, 152)),
+    ):
+        found = surface.color[(far >= low) & (far <= high)]
+        np.testing.assert_allclose(np.median(found, axis=0), color, atol=6)
+    # Without the recording it is the same surface in no color.
+    plain = load_surface(run, fitted, ())
+    assert plain.color is None
+    np.testing.assert_array_equal(
+        plain.place(fitted.position[9]), surface.place(fitted.position[9])
+    )

@@ -1,5 +1,6 @@
 """Discs of known size before a camera that looks straight down."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -107,6 +108,34 @@ def test_nodes_have_the_color_of_their_pixel_or_of_their_neighbour(view: View) -
     np.testing.assert_array_equal(found[node[:, 0] < 0], np.broadcast_to(RED, (100, 3)))
     np.testing.assert_array_equal(found[node[:, 0] > 0], np.broadcast_to(BLUE, (101, 3)))
     assert frame_0_colors([view], grid() + np.array([0.0, 5.0, 0.0])) is None
+
+
+def test_views_that_look_straight_at_a_surface_decide_its_color(view: View, tmp_path: Path) -> None:
+    folder = tmp_path / "aside"
+    blue_first = np.full((60, 80, 3), BLUE[::-1], np.uint8)
+    for kind, image in (("color", blue_first), ("mask", np.ones((60, 80), np.uint8))):
+        (folder / kind).mkdir(parents=True)
+        cv2.imwrite(str(folder / kind / "00000.png"), image)
+    half, high = 0.5, np.sqrt(0.75)  # It looks at the origin from 60° beside the vertical.
+    pose = np.eye(4)
+    pose[:3] = [[half, 0, -high, high], [0, -1, 0, 0], [-high, 0, -half, half]]
+    aside = View(folder, "scene", replace(CAMERA, T_world_camera=pose), 1)
+    point, up = np.array([[-0.02, 0.0, 0.0]]), np.array([[0.0, 0.0, -1.0]])
+    both = frame_0_colors([view, aside], point)
+    np.testing.assert_allclose(both, [[100, 0, 100]], atol=1)
+    # The cosine of 60° to the fourth power is 1/16.
+    straight = frame_0_colors([view, aside], point, up)
+    np.testing.assert_allclose(straight, [[200 * 16 / 17, 0, 200 / 17]], atol=1)
+
+
+def test_with_normals_pixels_at_the_outline_lend_no_color(view: View) -> None:
+    rim = np.array([[-0.2, 0.0, 0.0], [-0.18, 0.0, 0.0]])
+    image = view.color(0)
+    image[30, 20] = (0, 255, 0)
+    cv2.imwrite(str(next(iter(view.files("color")))), image[..., ::-1])
+    up = np.tile([0.0, 0.0, 1.0], (2, 1))
+    assert frame_0_colors([view], rim)[0].tolist() == [0, 255, 0]
+    assert frame_0_colors([view], rim, up).tolist() == [list(RED), list(RED)]
 
 
 def test_the_right_motion_beats_standing_still(view: View) -> None:
