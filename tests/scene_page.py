@@ -53,7 +53,7 @@ class ScenePage:
 
     def field(self, label: str) -> Locator:
         """The number beside a slider."""
-        return self.row(label).locator("input.mantine-NumberInput-input")
+        return self.row(label).locator("input.mantine-NumberInput-input:visible")
 
     def chosen(self, label: str) -> str:
         """What a list shows."""
@@ -81,7 +81,7 @@ class ScenePage:
         self.page.mouse.up()
 
     def value(self, label: str) -> float:
-        return float(self.field(label).input_value())
+        return float(self.field(label).input_value().removeprefix("×"))
 
     def set(self, label: str, value: float) -> None:
         """Put a value into the field beside a slider at once, as pasting does."""

@@ -76,6 +76,75 @@
   /* Arrows on a slider and blanks on a tab are its own, and step through no frames. */
   const isOwn = ({ key, target }) => target.closest?.("[role=slider], [role=tab], [role=option]") && (key === " " || STEPS.test(key));
 
+  /* A slider of powers of ten has factors as its marks, and its field shows and takes factors, too: ×0.2. */
+  const FACTOR = "×";
+  const factor = (power) => {
+    const text = String(Number((10 ** power).toPrecision(3)));
+    return FACTOR + (text.includes(".") || text.length > 1 ? text : `${text}.0`);
+  };
+
+  function write(field, text) {
+    const inside = field.ownerDocument.defaultView;
+    const { set } = Object.getOwnPropertyDescriptor(inside.HTMLInputElement.prototype, "value");
+    for (const value of ["", text]) {
+      set.call(field, value);
+      field.dispatchEvent(new inside.Event("input", { bubbles: true }));
+    }
+  }
+
+  /* viser's own field stays, out of sight, and is written into. */
+  function addFactor(slider, handle) {
+    const plain = slider.nextElementSibling;
+    const shown = plain.cloneNode(true);
+    const field = shown.querySelector("input");
+    const show = () => {
+      handle.setAttribute("aria-valuetext", factor(handle.ariaValueNow));
+      if (field !== field.ownerDocument.activeElement) field.value = factor(handle.ariaValueNow);
+    };
+    field.removeAttribute("id");
+    field.addEventListener("keydown", (event) => event.key === "Enter" && field.blur());
+    field.addEventListener("change", () => {
+      const power = Math.log10(Number(field.value.replace(FACTOR, "").trim()) || Number.NaN);
+      const [low, high] = [handle.ariaValueMin, handle.ariaValueMax].map(Number);
+      if (Number.isFinite(power)) write(plain.querySelector("input"), Math.min(Math.max(power, low), high).toFixed(6));
+    });
+    field.addEventListener("blur", show);
+    plain.style.display = "none";
+    slider.parentElement.append(shown);
+    new MutationObserver(show).observe(handle, { attributeFilter: ["aria-valuenow"] });
+    show();
+  }
+
+  const ICONS = { "list-search": "All commands", adjustments: "Connection and camera", "arrow-back": "Back to the panel" };
+
+  /* viser writes names beside its sliders and fields, and draws icons, but tells eyes alone. */
+  function name(root) {
+    for (const [icon, text] of Object.entries(ICONS)) {
+      root.querySelector(`button .tabler-icon-${icon}`)?.closest("button").setAttribute("aria-label", text);
+    }
+    for (const label of root.querySelectorAll("label[for]")) {
+      const row = label.closest(".mantine-Flex-root");
+      const text = label.textContent.replace(/^● (.*)$/, "$1, changed");
+      for (const part of row?.querySelectorAll("[role=slider], .mantine-NumberInput-input") ?? []) {
+        if (part.ariaLabel !== text) part.ariaLabel = text;
+      }
+      const slider = row?.querySelector(".mantine-Slider-root");
+      const isOfFactors = slider?.querySelector(".mantine-Slider-markLabel")?.textContent.startsWith(FACTOR);
+      if (isOfFactors && !slider.nextElementSibling.nextElementSibling) addFactor(slider, slider.querySelector("[role=slider]"));
+    }
+  }
+
+  function keepNamed(inside, root) {
+    let isDue = false;
+    const look = () => { isDue = false; name(root); };
+    const later = () => {
+      if (!isDue) inside.requestAnimationFrame(look);
+      isDue = true;
+    };
+    new inside.MutationObserver(later).observe(root, { childList: true, characterData: true, subtree: true });
+    later();
+  }
+
   /* To be called whenever the frame has loaded a scene. */
   globalThis.wireScene = (scene, seek) => {
     const inside = scene.contentWindow;
@@ -83,6 +152,7 @@
     let start = 0;
     keepSigns(root);
     tellGestures(inside, root);
+    keepNamed(inside, root);
     inside.document.body.addEventListener("keydown", (event) => isOwn(event) && event.stopPropagation());
     root.addEventListener("keydown", (event) => NOT_FOR_CAMERA.includes(event.code) && event.stopPropagation());
     inside.addEventListener("keydown", (event) => {

@@ -284,7 +284,7 @@ def _change(first: Any, value: Any) -> str:
     percent = 100.0 * (value - first) / abs(first)
     sign = "+" if percent > 0 else "−"  # noqa: RUF001  # the sign for minus
     if abs(percent) >= 1000:
-        return f"{sign}{abs(percent) / 100:.0f}×"  # noqa: RUF001  # times
+        return f"{sign}{abs(percent) / 100:.0f}×"  # times
     return f"{sign}{abs(percent):.0f} %" if abs(percent) >= 1 else f"{sign}{abs(percent):.1g} %"
 
 

@@ -35,7 +35,7 @@ _LATEX = (
     ("\\", "\\textbackslash{}"),
     *((sign, f"\\{sign}") for sign in "_%&#$"),
     ("δ", "$\\delta$"),
-    ("×", "$\\times$"),  # noqa: RUF001
+    ("×", "$\\times$"),
     ("↑", "$\\uparrow$"),
     ("±", "$\\pm$"),
     ("–", "--"),  # noqa: RUF001

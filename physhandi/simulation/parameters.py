@@ -89,7 +89,7 @@ class SimulationParameters(Settings, frozen=True, kw_only=True):
             is_length=True,
             slider=Slider(
                 group="springs",
-                hint="Object nodes nearer than this get a spring.",
+                hint="Connection radius: object nodes nearer than this get a spring.",
                 widest=0.08,
                 step=0.0005,
             ),
@@ -103,7 +103,9 @@ class SimulationParameters(Settings, frozen=True, kw_only=True):
             effect="topology",
             label="d_max object",
             slider=Slider(
-                group="springs", hint="Most object springs that one node starts.", widest=80
+                group="springs",
+                hint="Max neighbors: most object springs that one node starts.",
+                widest=80,
             ),
         ),
     ] = 29
@@ -116,7 +118,8 @@ class SimulationParameters(Settings, frozen=True, kw_only=True):
             is_length=True,
             slider=Slider(
                 group="springs",
-                hint="A control node holds the object nodes nearer than this.",
+                hint="Connection radius: a control node of the hand holds the object nodes nearer "
+                "than this.",
                 widest=0.08,
                 step=0.0005,
             ),
@@ -130,7 +133,9 @@ class SimulationParameters(Settings, frozen=True, kw_only=True):
             effect="topology",
             label="d_max virtual",
             slider=Slider(
-                group="springs", hint="Most virtual springs of one control node.", widest=80
+                group="springs",
+                hint="Max neighbors: most virtual springs of one control node of the hand.",
+                widest=80,
             ),
         ),
     ] = 6
@@ -142,7 +147,7 @@ class SimulationParameters(Settings, frozen=True, kw_only=True):
             label="k object",
             slider=Slider(
                 group="more",
-                hint="Multiplies the stiffness of object springs alone.",
+                hint="Multiplies the stiffness of object springs alone; ×1 is as fitted.",
                 step=0.05,
                 scale="relative power",
             ),
@@ -155,7 +160,7 @@ class SimulationParameters(Settings, frozen=True, kw_only=True):
             label="stiffness",
             slider=Slider(
                 group="springs",
-                hint="Multiplies the stiffness of every spring: 0 is as fitted, -1 a tenth.",
+                hint="Multiplies the stiffness of every spring; ×1 is as fitted.",
                 step=0.05,
                 scale="power",
             ),
@@ -169,7 +174,7 @@ class SimulationParameters(Settings, frozen=True, kw_only=True):
             label="k virtual",
             slider=Slider(
                 group="more",
-                hint="Multiplies the stiffness of virtual springs alone.",
+                hint="Multiplies the stiffness of virtual springs alone; ×1 is as fitted.",
                 step=0.05,
                 scale="relative power",
             ),

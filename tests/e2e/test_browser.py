@@ -118,7 +118,7 @@ def test_sliders_simulate_again_and_reset_returns(shared_scene, fitted, tmp_path
     scene.go(40)
     picture(scene.page, "tweak")
 
-    scene.set("stiffness 10^", -1)
+    scene.set("stiffness", 0.1)
     softer = scene.new_difference("a third rollout", by_radius)
     assert softer > 0
     scene.unfold("Export")
@@ -130,7 +130,7 @@ def test_sliders_simulate_again_and_reset_returns(shared_scene, fitted, tmp_path
 
     scene.press("Undo")
     scene.until(lambda: scene.difference() == by_radius, "the rollout of δ = 45 mm")
-    scene.until(lambda: scene.value("stiffness 10^") == 0, "its slider")
+    scene.until(lambda: scene.value("stiffness") == 1, "its slider")
 
     virtual = fitted.virtual_springs(0.012)
     assert len(virtual) != as_fitted[1]
@@ -143,12 +143,15 @@ def test_sliders_simulate_again_and_reset_returns(shared_scene, fitted, tmp_path
     scene.until(lambda: scene.value("δ object [mm]") == fitted_radius, "its slider")
 
 
-def test_a_negative_value_typed_key_by_key_keeps_its_sign(shared_scene: ScenePage):
-    scene, slider = shared_scene, "stiffness 10^"
+def test_values_typed_key_by_key_keep_their_sign_and_factors_are_typed_as_such(
+    shared_scene: ScenePage,
+):
+    scene, slider = shared_scene, "height [mm]"
 
-    def is_simulated(power: float) -> bool:
-        return float(scene.link().get("stiffness_scale", 1)) == pytest.approx(10**power)
+    def is_simulated(height: float) -> bool:
+        return float(scene.link().get("ground_height", 0)) == pytest.approx(1e-3 * height)
 
+    scene.unfold("Ground")
     scene.set(slider, -0.7)
     scene.until(lambda: is_simulated(-0.7), "what was pasted")
     scene.type(slider, "-0.6")
@@ -157,13 +160,28 @@ def test_a_negative_value_typed_key_by_key_keeps_its_sign(shared_scene: ScenePag
     scene.until(lambda: is_simulated(-0.6), "what was typed")
 
     scene.press("Reset")
-    scene.until(lambda: is_simulated(0) and scene.value(slider) == 0, "the fitted stiffness")
+    scene.until(lambda: is_simulated(0) and scene.value(slider) == 0, "the fitted height")
     scene.set(slider, -0.6)  # As before the reset, which must not make it old news.
     scene.until(lambda: is_simulated(-0.6), "what was pasted once more")
     scene.type(slider, "-0")
     assert is_simulated(-0.6)  # It may become any number, until it is entered.
     scene.field(slider).press("Enter")
-    scene.until(lambda: is_simulated(0), "the fitted stiffness, typed as -0")
+    scene.until(lambda: is_simulated(0), "the fitted height, typed as -0")
+    scene.unfold("Ground")
+
+    handle = scene.row("stiffness").get_by_role("slider", name="stiffness")
+    expect(handle).to_have_attribute("aria-valuetext", "×1.0")
+    for typed, shown in (("×0.25", "×0.25"), ("400", "×10")):
+        scene.type("stiffness", typed)
+        scene.field("stiffness").press("Enter")
+        expect(scene.field("stiffness")).to_have_value(shown)
+        expect(handle).to_have_attribute("aria-valuetext", shown)
+        factor = float(shown[1:])
+        scene.until(
+            lambda to=factor: float(scene.link()["stiffness_scale"]) == to, "what was typed"
+        )
+    scene.press("Reset")
+    expect(scene.field("stiffness")).to_have_value("×1.0")
 
 
 def test_another_tab_is_left_alone(shared_scene: ScenePage, served):

@@ -57,7 +57,7 @@ def test_the_figure_shows_both_topologies_in_one_picture(
 def test_a_scene_is_one_tab_s_own(shared_scene: ScenePage, browser: Browser, served) -> None:
     scene = shared_scene
     scene.go(FRAME)
-    scene.set("stiffness 10^", -1)
+    scene.set("stiffness", 0.1)
     difference, address = scene.new_difference("another rollout"), scene.page.url
 
     second = scene.page.context.new_page()
@@ -67,7 +67,7 @@ def test_a_scene_is_one_tab_s_own(shared_scene: ScenePage, browser: Browser, ser
     original = address.partition("?")[0]
     copied.until(lambda: second.url.partition("?")[0] != original, "an address of its own")
     copied.until(lambda: copied.value("Frame") == copied.frame() == FRAME, "the same frame")
-    copied.set("stiffness 10^", 0.5)
+    copied.set("stiffness", 3)
     copied.new_difference("a rollout of its own", difference)
     scene.until(lambda: scene.difference() == difference, "the first tab as it was")
 
@@ -75,7 +75,7 @@ def test_a_scene_is_one_tab_s_own(shared_scene: ScenePage, browser: Browser, ser
     second.reload()
     copied.until(lambda: copied.has("object springs"), "the scene again")
     assert second.url.partition("?")[0] == own
-    copied.until(lambda: copied.value("stiffness 10^") == 0.5, "its stiffness")
+    copied.until(lambda: copied.value("stiffness") == 3, "its stiffness")
 
     stranger = browser.new_context().new_page()
     stranger.set_default_timeout(TIMEOUT_MS)

@@ -16,6 +16,8 @@ from app.viewer.live.client import STARTING, LiveRollouts, Readout
 from app.viewer.physics.history import History, Setting
 from app.viewer.physics.keep_panel import KeepPanel, PresetChoice, UserStorage
 from app.viewer.physics.parameters import (
+    FACTOR_MARKS,
+    POWER_DIGITS,
     HeightKnob,
     Knob,
     Switch,
@@ -28,7 +30,7 @@ from app.viewer.ui.gestures import Gestures
 from app.viewer.ui.guard import Guard
 from app.viewer.ui.keyboard import bind
 from physhandi.run import Run
-from physhandi.simulation.parameters import SimulationParameters
+from physhandi.simulation.parameters import PARAMETERS, SimulationParameters
 
 _CHANGED = "● "
 
@@ -102,10 +104,12 @@ class SliderSet:
         if knob.is_integer:
             low, high = int(knob.low), int(knob.high)
             return self._gui.add_slider(knob.label, low, high, 1, int(start), hint=knob.hint)
+        marks = FACTOR_MARKS if knob.is_logarithm else None
         slider = self._gui.add_slider(
-            knob.label, knob.low, knob.high, knob.step, start, hint=knob.hint
+            knob.label, knob.low, knob.high, knob.step, start, hint=knob.hint, marks=marks
         )
-        slider.precision = min(slider.precision + 1, 7)  # Typed values may be finer.
+        # Typed values may be finer.
+        slider.precision = POWER_DIGITS if knob.is_logarithm else min(slider.precision + 1, 7)
         return slider
 
 
@@ -149,7 +153,7 @@ class SubstepsChoice:
             max=_MOST,
             step=1,
             visible=False,
-            hint="More are slower and more exact; too few and the object explodes",
+            hint=PARAMETERS["substeps_per_frame"].about,
         )
         gesture = gestures.follow(self._number)
         choice.on_update(guard.by_user(lambda _: self._take_choice()))

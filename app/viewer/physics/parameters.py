@@ -14,8 +14,13 @@ from physhandi.simulation.parameters import (
 )
 
 _DIGITS = 3
+_FACTOR_DIGITS = 4
+POWER_DIGITS = 6
+"""Decimals of the logarithm of a factor, so that a factor of four digits is met exactly."""
 _POWERS = (-2.0, 1.0)
 """Ends of a slider of a power of ten."""
+FACTOR_MARKS = ((-2.0, "×0.01"), (-1.0, "×0.1"), (0.0, "×1"), (1.0, "×10"))
+"""What a slider of a power of ten says; by these marks the page knows it and shows factors."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +46,7 @@ class Knob:
     is_integer: bool = False
     """Whether only whole numbers make sense."""
     is_logarithm: bool = False
-    """Whether the slider shows the decimal logarithm."""
+    """Whether the slider moves the decimal logarithm; its marks are factors."""
 
     def to_slider(self, parameters: SimulationParameters) -> float:
         """Find the slider value of a parameter, moved into the slider's range.
@@ -52,19 +57,21 @@ class Knob:
         if self.is_logarithm:
             value = math.log10(max(value, 1e-12))
         value = min(max(value, self.low), self.high)
+        if self.is_logarithm:
+            return round(value, POWER_DIGITS)
         return round(value) if self.is_integer else float(f"{value:.{_DIGITS}g}")
 
     def from_slider(self, value: float) -> float:
         """Find the parameter of a slider value; values outside the range are moved into it."""
         value = min(max(value, self.low), self.high)
         if self.is_logarithm:
-            value = 10.0**value
+            value = float(f"{10.0**value:.{_FACTOR_DIGITS}g}")
         return round(value) if self.is_integer else value / self.scale
 
     def text(self, parameters: SimulationParameters) -> str:
         """Write the parameter as a person reads it."""
         value = getattr(parameters, self.field) * self.scale
-        return f"x{value:.3g}" if self.is_logarithm else f"{value:.4g}"
+        return f"×{value:.3g}" if self.is_logarithm else f"{value:.4g}"
 
     def differs(self, start: SimulationParameters, now: SimulationParameters) -> bool:
         """Tell whether two sets of parameters differ in this one."""
@@ -103,7 +110,7 @@ class Switch:
 
 def name_of(knob: Knob | Switch) -> str:
     """Give the name by which a parameter is known outside of its folder."""
-    return (knob.name or knob.label).replace(" 10^", "")
+    return knob.name or knob.label
 
 
 def knobs(parameters: SimulationParameters, *, length_unit: str) -> tuple[Knob | Switch, ...]:
@@ -144,7 +151,7 @@ def _control(
             return None
         return Knob(
             field=name,
-            label=f"{label} 10^",
+            label=label,
             low=_POWERS[0],
             high=_POWERS[1],
             step=slider.step,

@@ -153,7 +153,7 @@ def test_a_session_follows_frames_and_sliders(measured) -> None:
             client.until(lambda: "object springs" in client.texts())
             rest_at(client, 9)
             client.until(lambda: "fit 9 mm from the tracks" in shown(client))
-            client.set("stiffness 10^", -1.0)
+            client.set("stiffness", -1.0)
             client.until(lambda: "re-simulated" in shown(client))
             client.until(lambda: f"simulated {FRAMES}/{FRAMES}" in client.texts())
             take, _ = session._object.at(0)

@@ -40,13 +40,16 @@ def test_a_wider_fit_widens_its_slider() -> None:
 
 def test_stiffness_is_moved_by_powers_of_ten() -> None:
     knob = next(k for k in knobs(START, length_unit="m") if k.field == "stiffness_scale")
-    assert knob.from_slider(-1.0) == pytest.approx(0.1)
+    assert (knob.label, knob.from_slider(-1.0), knob.from_slider(0.5)) == ("stiffness", 0.1, 3.162)
+    for factor in (0.01, 0.2, 0.3333, 7.654):
+        moved = START.replace(stiffness_scale=factor)
+        assert knob.from_slider(knob.to_slider(moved)) == factor
 
 
 def test_what_changed_is_said_in_the_sliders_units() -> None:
     now = SimulationParameters(connection_radius=0.035, damping=20.0, stiffness_scale=0.5)
     text = what_changed(knobs(START, length_unit="m"), START, now)
-    assert text == "δ object [mm] 23.7 → 35, stiffness x1 → x0.5"
+    assert text == "δ object [mm] 23.7 → 35, stiffness ×1 → ×0.5"
     assert what_changed(knobs(START, length_unit="m"), START, START) == ""
     other = START.replace(use_control_velocity=False, rest_length_floor=0.0)
     changes = changes_in(knobs(START, length_unit="m"), START, other, is_automatic=True)
