@@ -50,6 +50,28 @@ async function openScene(button) {
   location.href = session.url;
 }
 
+/* A file for which every frame is drawn is made first, with a bar, and then fetched. */
+async function fetchSlowFile(address, about) {
+  const line = document.createElement("p");
+  const bar = document.createElement("progress");
+  line.append(`${about}: the download begins when it is ready.`, bar);
+  document.getElementById("toast").append(line);
+  try {
+    for (;;) {
+      const file = await send("POST", address);
+      if (file.state === "failed") throw new Error(file.message);
+      if (file.state === "ready") {
+        location.href = file.url;
+        return;
+      }
+      if (file.of) Object.assign(bar, { max: file.of, value: file.done });
+      await new Promise((done) => setTimeout(done, 500));
+    }
+  } finally {
+    line.remove();
+  }
+}
+
 async function act(button) {
   await send("POST", `/api/v1/runs/${button.dataset.id}/${button.dataset.act}`);
   toast(button.dataset.act === "cancel" ? "Cancelling …" : "Back in line");
@@ -129,6 +151,11 @@ async function launch(form) {
 document.addEventListener("click", (event) => {
   const button = event.target.closest("button");
   if (event.target.matches("dialog")) event.target.close();
+  const slow = event.target.closest("a[data-slow-file]");
+  if (slow) {
+    event.preventDefault();
+    fetchSlowFile(slow.href, slow.dataset.slowFile).catch((error) => toast(error.message, true));
+  }
   if (!button) return;
   const data = button.dataset;
   if ("open" in data) busy(button, () => openScene(button));

@@ -48,6 +48,22 @@
     toast("Link copied: it opens this run as you see it now.");
   }
 
+  /* What the link restores is filmed: parameters, layers and camera as they are now. */
+  async function film(entry) {
+    const link = await send("GET", `/api/v1/sessions/${session}/link`);
+    const address = link.url.replace(/^\/runs\/([^/]+)\/view\??/, "/api/v1/runs/$1/export?");
+    const query = new URLSearchParams(entry.dataset.sessionFilm);
+    await fetchSlowFile(`${address}${address.endsWith("?") ? "" : "&"}${query}`, "Filming");
+  }
+
+  for (const entry of document.querySelectorAll("[data-session-film]")) {
+    entry.addEventListener("click", (event) => {
+      event.preventDefault();
+      entry.closest("details").open = false;
+      film(entry).catch((error) => toast(error.message, true));
+    });
+  }
+
   /* Outside of localhost and https, browsers have no clipboard for pages but this one. */
   function copyByHand(text, place) {
     const field = place.body.appendChild(place.createElement("textarea"));

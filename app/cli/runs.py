@@ -179,13 +179,16 @@ def evaluate_hands(
 def export(
     run: Positional[str],
     *,
-    format: Literal["ply", "gltf", "npz", "csv", "yaml", "png", "zip", "viser", "html"],  # noqa: A002  # the option's name
+    format: Literal[  # noqa: A002  # the option's name
+        "ply", "gltf", "npz", "csv", "yaml", "png", "mp4", "gif", "zip", "viser", "html"
+    ],
     out: Path,
     sequence: str | None = None,
     frame: int | None = None,
     link: str = "",
     width: int = 1280,
     height: int = 720,
+    turn: float = 0.0,
     overwrite: bool = False,
     device: Device = "auto",
     data_dir: DataDir = None,
@@ -195,16 +198,17 @@ def export(
     Args:
         run: Folder or id of a finished run.
         format: ply: meshes and points per frame; gltf: one .glb that moves, hands skinned; npz and
-            csv: trajectories; yaml: parameters and metrics; png: a picture; zip: a picture with all
-            its data; viser: a recording for viser's player; html: one file that plays in any
-            browser.
+            csv: trajectories; yaml: parameters and metrics; png: a picture; mp4 and gif: a film of
+            all frames; zip: a picture with all its data; viser: a recording for viser's player;
+            html: one file that plays in any browser.
         out: File or folder to write.
         sequence: Which sequence of the run; none takes the first one.
         frame: Only this frame (ply), or which one (png, zip).
         link: Link of the viewer, or its part after "?": camera, layers, colors; parameters of the
             simulation that it changes have the object simulated anew.
-        width: Width of a picture in pixels, 16 to 4096.
-        height: Height of a picture in pixels, 16 to 4096.
+        width: Width of a picture or film in pixels, 16 to 4096.
+        height: Height of a picture or film in pixels, 16 to 4096.
+        turn: Angle in degrees by which the camera of a film goes round what it looks at.
         overwrite: Replace what is there.
     """
     from app.exports.shell import ExportOptions
@@ -219,10 +223,18 @@ def export(
         frame=frame,
         width=width,
         height=height,
+        turn=turn,
         device=pick_device(device) if link else "cpu",
         overwrite=overwrite,
     )
-    print(export_file(finished, options, open_catalog(data_dir)))
+    with watched(True) as progress:
+        made = export_file(
+            finished,
+            options,
+            open_catalog(data_dir),
+            lambda done, of: progress.report(f"export as {format}", done, of),
+        )
+    print(made)
 
 
 def _measured(run: str, data_dir: Path | None) -> dict[str, Any]:

@@ -5,20 +5,20 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import FileResponse, Response
-from pydantic import Field
+from pydantic import BaseModel, Field
 from starlette.background import BackgroundTask
 from starlette.exceptions import HTTPException
 
-from app.exports.cache import FileCache
+from app.exports.cache import FileCache, FileJob
 from app.exports.links import CLOSED, address, read_query
 from app.exports.making import store_take
 from app.exports.permalink import state_from_query, state_to_query
-from app.exports.request import LARGEST, SMALLEST, SUFFIXES, FileRequest
-from app.exports.schema import MEDIA_TYPES, RunFormat, errors, files
+from app.exports.request import LARGEST, LARGEST_TURN, SMALLEST, SUFFIXES, FileRequest
+from app.exports.schema import MEDIA_TYPES, RunFormat, SlowFormat, errors, files
 from app.ids import ItemId
 from app.jobs.catalog import Catalog
 from app.viewer.export.snapshot import snapshot_yaml
@@ -26,16 +26,60 @@ from app.viewer.session import Session
 from app.viewer.sessions import Sessions
 from physhandi.data.exporters import export_run
 from physhandi.data.layout import SequenceFiles
-from physhandi.errors import PhysHandiError, RunError, UsageError
+from physhandi.errors import PhysHandiError, RunError, UsageError, describe
 from physhandi.run import Run
 
-_OWN_FIELDS = ("format", "width", "height", "download")
+_OWN_FIELDS = ("format", "width", "height", "turn", "download")
+_SIDE = "Of PNG, ZIP and films [px]."
 _SIMPLE = ("ply", "gltf", "npz", "csv", "yaml")
 PictureSide = Annotated[int, Field(ge=SMALLEST, le=LARGEST)]
+Turn = Annotated[
+    float,
+    Query(
+        ge=-LARGEST_TURN,
+        le=LARGEST_TURN,
+        allow_inf_nan=False,
+        description="Angle by which the camera of a film goes round [degrees].",
+    ),
+]
 LinkField = Annotated[
     str | None,
     Query(max_length=600, description="As in a link of the viewer; see the page's “Copy link”."),
 ]
+
+
+class FileProgress(BaseModel):
+    """How far a file is that is being made."""
+
+    state: Literal["making", "ready", "failed"]
+    """Whether it is being made, is there, or could not be made."""
+    done: int
+    """Frames that are finished."""
+    of: int
+    """Frames that there are; 0 before that is known."""
+    url: str
+    """The file."""
+    bytes: int = 0
+    """Its size, when it is ready."""
+    message: str = ""
+    """Why it could not be made."""
+
+
+def describe_progress(work: FileJob, url: str) -> FileProgress:
+    """Tell how far a file is.
+
+    Args:
+        work: What makes it.
+        url: Where it is fetched.
+    """
+    size, message = 0, ""
+    if work.state == "ready":
+        size = work.path.stat().st_size
+    elif work.state == "failed" and (error := work.future.exception()) is not None:
+        message = describe(error)
+    return FileProgress(
+        state=work.state, done=work.done, of=work.of, url=url, bytes=size, message=message
+    )
 
 
 def create_files(catalog: Catalog, sessions: Sessions, file_cache: FileCache) -> APIRouter:
@@ -60,8 +104,9 @@ def create_files(catalog: Catalog, sessions: Sessions, file_cache: FileCache) ->
         kind: Annotated[RunFormat, Query(alias="format")],
         sequence: Annotated[str | None, Query(max_length=200)] = None,
         f: Annotated[int | None, Query(ge=0, description="Frame of PNG, ZIP and PLY.")] = None,
-        width: Annotated[PictureSide, Query(description="Of PNG and ZIP [px].")] = 1280,
-        height: Annotated[PictureSide, Query(description="Of PNG and ZIP [px].")] = 720,
+        width: Annotated[PictureSide, Query(description=_SIDE)] = 1280,
+        height: Annotated[PictureSide, Query(description=_SIDE)] = 720,
+        turn: Turn = 0.0,
         cam: LinkField = None,
         fov: LinkField = None,
         show: LinkField = None,
@@ -72,9 +117,10 @@ def create_files(catalog: Catalog, sessions: Sessions, file_cache: FileCache) ->
         """Write a run as a file that other programs read.
 
         `ply`, `gltf`, `npz`, `csv`: motion; `yaml`: parameters and metrics; `png`: a picture;
-        `zip`: a picture with all its data; `viser`, `html`: a recording that plays without
-        the server. All fields of a link are understood. A parameter of the simulation by its
-        name, such as `drag=4`, has the object simulated anew before it is written.
+        `mp4`, `gif`: a film of all frames; `zip`: a picture with all its data; `viser`, `html`: a
+        recording that plays without the server. All fields of a link are understood. A parameter
+        of the simulation by its name, such as `drag=4`, has the object simulated anew before it is
+        written.
         """
         del cam, fov, show, color, scale, theme  # Read with the rest of the link.
         query = read_query(request, without=_OWN_FIELDS)
@@ -85,8 +131,27 @@ def create_files(catalog: Catalog, sessions: Sessions, file_cache: FileCache) ->
         if kind == "yaml":
             raise UsageError("format: yaml describes the run itself; leave changed parameters out.")
         order = request_of(catalog, catalog.run(run_id), kind, query)
-        path = file_cache.make(replace(order, width=width, height=height))
+        path = file_cache.make(replace(order, width=width, height=height, turn=turn))
         return _answer(path, run_id, kind, query)
+
+    @router.post("/runs/{run_id}/export", responses=errors(404, 409, 422, 429))
+    def prepare(
+        *,
+        request: Request,
+        run_id: ItemId,
+        kind: Annotated[SlowFormat, Query(alias="format")],
+        width: Annotated[PictureSide, Query(description=_SIDE)] = 1280,
+        height: Annotated[PictureSide, Query(description=_SIDE)] = 720,
+        turn: Turn = 0.0,
+    ) -> FileProgress:
+        """Have a file made that takes a while, unless it is there, and tell how far it is.
+
+        All fields of a link are understood, as where the file is fetched.
+        """
+        query = read_query(request, without=_OWN_FIELDS)
+        order = request_of(catalog, catalog.run(run_id), kind, query)
+        work = file_cache.begin(replace(order, width=width, height=height, turn=turn))
+        return describe_progress(work, f"/api/v1/runs/{run_id}/export?{request.url.query}")
 
     @router.get(
         "/sessions/{session_id}/export",
@@ -94,11 +159,13 @@ def create_files(catalog: Catalog, sessions: Sessions, file_cache: FileCache) ->
         responses=files() | errors(404, 409, 422, 429),
     )
     def export_scene(
+        *,
         request: Request,
         session_id: ItemId,
         kind: Annotated[RunFormat, Query(alias="format")],
-        width: Annotated[PictureSide, Query(description="Of PNG and ZIP [px].")] = 1280,
-        height: Annotated[PictureSide, Query(description="Of PNG and ZIP [px].")] = 720,
+        width: Annotated[PictureSide, Query(description=_SIDE)] = 1280,
+        height: Annotated[PictureSide, Query(description=_SIDE)] = 720,
+        turn: Turn = 0.0,
     ) -> Response:
         """Write what a live scene shows: the rollout that its sliders asked for, as it looks."""
         session = sessions.find(session_id, request.state.owner)
@@ -111,7 +178,7 @@ def create_files(catalog: Catalog, sessions: Sessions, file_cache: FileCache) ->
         if "theme" not in query and state.prefers_dark:
             query["theme"] = "dark"
         order = _order_of_scene(catalog, session, kind, query)
-        order = replace(order, width=width, height=height, link=snapshot.link)
+        order = replace(order, width=width, height=height, turn=turn, link=snapshot.link)
         take = snapshot.rollout
         if take is None:
             return _answer(file_cache.make(order), session.target, kind, query)

@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from app.exports.movie import film_scene
 from app.exports.offscreen import Offscreen
 from app.exports.recording import record_scene
 from app.exports.request import FileRequest
@@ -100,6 +101,18 @@ def make(order: FileRequest, out: Path, report: Report = lambda _done, _of: None
     if order.format in {"viser", "html"}:
         as_html = order.format == "html"
         write_bytes(out, record_scene(content, take, state, report, as_html=as_html))
+        return
+    if order.format in {"mp4", "gif"}:
+        film_scene(
+            content,
+            take,
+            state,
+            report,
+            out,
+            as_gif=order.format == "gif",
+            size=(order.width, order.height),
+            turn=order.turn,
+        )
         return
     snapshot = Snapshot(
         content=content,

@@ -9,10 +9,9 @@ from urllib.parse import urlencode
 import viser
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import FileResponse, HTMLResponse
-from pydantic import BaseModel
 
-from app.exports.cache import FileCache, FileJob
-from app.exports.files import request_of
+from app.exports.cache import FileCache
+from app.exports.files import FileProgress, describe_progress, request_of
 from app.exports.links import read_query
 from app.exports.permalink import state_from_query
 from app.exports.request import FileRequest
@@ -20,30 +19,13 @@ from app.exports.schema import errors, files
 from app.ids import ItemId
 from app.jobs.catalog import Catalog
 from app.pages.render import Pages
-from physhandi.errors import UsageError, describe
+from physhandi.errors import UsageError
 
 _CLIENT = Path(viser.__file__).parent / "client" / "build" / "index.html"
 _CAMERA = ("cam", "up", "fov")
 _KNOWN = ("sequence", "theme", *_CAMERA)
 SequenceField = Annotated[str | None, Query(max_length=200)]
 ThemeField = Annotated[Literal["light", "dark"], Query()]
-
-
-class Replay(BaseModel):
-    """How far a replay is."""
-
-    state: Literal["making", "ready", "failed"]
-    """Whether it is being made, is there, or could not be made."""
-    done: int
-    """Frames that are recorded."""
-    of: int
-    """Frames that there are; 0 before that is known."""
-    url: str
-    """The file."""
-    bytes: int = 0
-    """Its size, when it is ready."""
-    message: str = ""
-    """Why it could not be made."""
 
 
 def create_replays(catalog: Catalog, file_cache: FileCache, pages: Pages) -> APIRouter:
@@ -92,11 +74,11 @@ def create_replays(catalog: Catalog, file_cache: FileCache, pages: Pages) -> API
     @router.post("/api/v1/runs/{run_id}/replay", responses=errors(404, 409, 422, 429))
     def prepare(
         run_id: ItemId, sequence: SequenceField = None, theme: ThemeField = "light"
-    ) -> Replay:
+    ) -> FileProgress:
         """Have the replay of a run made, unless it is there, and tell how far it is."""
         work = file_cache.begin(order(run_id, sequence, theme))
         query = {"theme": theme} | ({"sequence": sequence} if sequence else {})
-        return _describe(work, f"/api/v1/runs/{run_id}/replay.viser?{urlencode(query)}")
+        return describe_progress(work, f"/api/v1/runs/{run_id}/replay.viser?{urlencode(query)}")
 
     @router.get(
         "/api/v1/runs/{run_id}/replay.viser",
@@ -121,17 +103,6 @@ def create_replays(catalog: Catalog, file_cache: FileCache, pages: Pages) -> API
         return Response(content, media_type="text/html", headers=headers)
 
     return router
-
-
-def _describe(work: FileJob, url: str) -> Replay:
-    size, message = 0, ""
-    if work.state == "ready":
-        size = work.path.stat().st_size
-    elif work.state == "failed" and (error := work.future.exception()) is not None:
-        message = describe(error)
-    return Replay(
-        state=work.state, done=work.done, of=work.of, url=url, bytes=size, message=message
-    )
 
 
 def _camera(query: Mapping[str, str]) -> dict[str, Any]:

@@ -9,12 +9,14 @@ from app.exports.permalink import state_from_query
 from app.viewer.content.session_state import SessionState
 from physhandi.errors import UsageError
 
-Format = Literal["png", "viser", "html", "zip", "ply", "gltf", "npz", "csv"]
+Format = Literal["png", "mp4", "gif", "viser", "html", "zip", "ply", "gltf", "npz", "csv"]
 FORMATS: tuple[Format, ...] = get_args(Format)
 SUFFIXES: dict[str, str] = {"gltf": "glb", "ply": "zip"}
 """How the files of formats end, if not like the format."""
 SMALLEST, LARGEST = 16, 4_096
 """Shortest and longest side of a picture [px]."""
+LARGEST_TURN = 3_600.0
+"""Largest angle by which the camera of a film goes round [degrees]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,9 +36,11 @@ class FileRequest:
     take: str = ""
     """Folder with a rollout that was simulated elsewhere; see `store_take`."""
     width: int = 1280
-    """Width of a picture [px]."""
+    """Width of a picture or film [px]."""
     height: int = 720
-    """Height of a picture [px]."""
+    """Height of a picture or film [px]."""
+    turn: float = 0.0
+    """Angle by which the camera of a film goes round [degrees]."""
     device: str = "cpu"
     """Warp device, if parameters were changed."""
     link: str = ""
@@ -54,6 +58,10 @@ class FileRequest:
         for name, size in (("width", self.width), ("height", self.height)):
             if not SMALLEST <= size <= LARGEST:
                 raise UsageError(f"{name}: {size} is not between {SMALLEST} and {LARGEST} pixels.")
+        if not abs(self.turn) <= LARGEST_TURN:
+            raise UsageError(
+                f"turn: {self.turn} is not between -{LARGEST_TURN:g} and {LARGEST_TURN:g} degrees."
+            )
         state = state_from_query(self.query)
         if state.is_figure:
             raise UsageError(

@@ -4,7 +4,11 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, Field
 
-RunFormat = Literal["ply", "gltf", "npz", "csv", "yaml", "png", "zip", "viser", "html"]
+RunFormat = Literal[
+    "ply", "gltf", "npz", "csv", "yaml", "png", "mp4", "gif", "zip", "viser", "html"
+]
+SlowFormat = Literal["mp4", "gif", "viser", "html"]
+"""Formats for which every frame is drawn."""
 MEDIA_TYPES: dict[str, str] = {
     "ply": "application/zip",
     "gltf": "model/gltf-binary",
@@ -12,6 +16,8 @@ MEDIA_TYPES: dict[str, str] = {
     "csv": "text/csv",
     "yaml": "application/yaml",
     "png": "image/png",
+    "mp4": "video/mp4",
+    "gif": "image/gif",
     "zip": "application/zip",
     "viser": "application/octet-stream",
     "html": "text/html",

@@ -7,7 +7,7 @@ from typing import Any
 from urllib.parse import parse_qsl, urlsplit
 
 from app.exports.files import request_of
-from app.exports.making import make
+from app.exports.making import Report, make
 from app.exports.permalink import state_from_query
 from app.exports.request import SUFFIXES, FileRequest
 from app.jobs.catalog import Catalog
@@ -34,19 +34,27 @@ class ExportOptions:
     """Width of a picture [px]."""
     height: int = 720
     """Height of a picture [px]."""
+    turn: float = 0.0
+    """Angle by which the camera of a film goes round [degrees]."""
     device: str = "cpu"
     """Warp device, if the link changes parameters."""
     overwrite: bool = False
     """Whether to replace what is there."""
 
 
-def export(run: Run, options: ExportOptions, catalog: Catalog) -> Path:
+def export(
+    run: Run,
+    options: ExportOptions,
+    catalog: Catalog,
+    report: Report = lambda _done, _of: None,
+) -> Path:
     """Write a run as a file.
 
     Args:
         run: A finished run.
         options: What is asked for.
         catalog: Finds recordings that have moved.
+        report: Told how many frames are finished, and of how many.
 
     Returns:
         What was written.
@@ -86,7 +94,7 @@ def export(run: Run, options: ExportOptions, catalog: Catalog) -> Path:
     if out.is_dir() or (out.exists() and not options.overwrite):
         raise UsageError(f"{out} exists already. Choose another path, or allow overwriting.")
     out.parent.mkdir(parents=True, exist_ok=True)
-    make(order, out)
+    make(order, out, report)
     return out
 
 
@@ -118,6 +126,7 @@ def _order(
         recordings=whole.recordings,
         width=options.width,
         height=options.height,
+        turn=options.turn,
         device=options.device,
         link=whole.link,
     )

@@ -1,0 +1,153 @@
+"""Films of a scene, drawn frame by frame: MP4 and GIF."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import PIL.Image
+from jaxtyping import UInt8
+from numpy import ndarray
+
+from app.exports.offscreen import Offscreen
+from app.exports.scene_picture import draw_scene
+from app.viewer.color.legend import draw_legend
+from app.viewer.content.content import Content
+from app.viewer.content.session_state import Pose, SessionState
+from physhandi.data.files import temporary_name
+from physhandi.errors import UsageError
+from physhandi.object_rollout import ObjectRollout
+
+MOST_FILMED_PIXELS = 4_000_000_000
+"""Longer or larger films are refused: drawing so many pixels takes about ten minutes."""
+_GIF_STEP_MS = 10
+"""Pictures of a GIF are shown for a multiple of this time [ms]."""
+_GIF_COLORS = 256
+_GIF_SHORTEST_MS = 20
+"""Browsers show pictures of a GIF that are due sooner much later."""
+
+
+def film_scene(
+    content: Content,
+    take: ObjectRollout | None,
+    state: SessionState,
+    report: Callable[[int, int], None],
+    out: Path,
+    *,
+    as_gif: bool,
+    size: tuple[int, int],
+    turn: float = 0.0,
+) -> None:
+    """Film all frames of a sequence, in one step or not at all.
+
+    MP4 is encoded as VP9, which needs no licence; browsers and players of today show it. It has an
+    even number of columns and rows, so of an odd size the last is left out.
+
+    Args:
+        content: What can be shown.
+        take: The object's rollout; None without an object.
+        state: Layers, camera, theme and speed, as `complete_state` returns them.
+        report: Told how many frames are filmed, and of how many.
+        out: File to write.
+        as_gif: Whether to write a GIF instead of an MP4.
+        size: Columns and rows [px].
+        turn: Angle by which the camera goes round what it looks at, from the first frame to one
+            after the last, so that a whole turn repeats without a jump [degrees].
+
+    Raises:
+        UsageError: If the film would be too long for its size, or cannot be encoded.
+    """
+    count, pixels = content.frame_count, size[0] * size[1]
+    if count * pixels > MOST_FILMED_PIXELS:
+        raise UsageError(
+            f"'{content.sequence_name}' has {count} frames; choose a picture of at most "
+            f"{MOST_FILMED_PIXELS // count:,} pixels instead of {size[0]} x {size[1]}."
+        )
+    pictures = _pictures(content, take, state, report, size=size, turn=turn)
+    rate = content.frame_rate * state.speed
+    suffix = "gif" if as_gif else "mp4"  # Tells OpenCV the format.
+    temporary = out.with_name(f"{temporary_name(out.stem)}.{suffix}")
+    try:
+        if as_gif:
+            _write_gif(temporary, pictures, rate)
+        else:
+            _write_mp4(temporary, pictures, rate, size)
+        temporary.replace(out)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _pictures(
+    content: Content,
+    take: ObjectRollout | None,
+    state: SessionState,
+    report: Callable[[int, int], None],
+    *,
+    size: tuple[int, int],
+    turn: float,
+) -> Iterator[UInt8[ndarray, "row column 3"]]:
+    """Draw frame after frame (red, green, blue)."""
+    count = content.frame_count
+    with Offscreen(content, take, state) as scene:
+        for frame in range(count):
+            scene.recorded = frame / content.frame_rate
+            scene.draw(frame, is_playing=False)
+            pose = turned_pose(scene.pose, np.radians(turn) * frame / count)
+            image = draw_scene(scene.server, pose, *size, is_dark=scene.is_dark)
+            if scene.legend is not None:
+                image = draw_legend(image, scene.legend, is_dark=scene.is_dark)
+            yield np.ascontiguousarray(image)
+            report(frame + 1, count)
+
+
+def turned_pose(pose: Pose, angle: float) -> Pose:
+    """Move a camera round what it looks at, anticlockwise seen from above.
+
+    Args:
+        pose: Where it stands.
+        angle: By how much [rad].
+    """
+    up = pose.up / np.linalg.norm(pose.up)
+    arm = pose.position - pose.look_at
+    along = (arm @ up) * up
+    across = arm - along
+    moved = along + np.cos(angle) * across + np.sin(angle) * np.cross(up, across)
+    return Pose(position=pose.look_at + moved, look_at=pose.look_at, up=pose.up, fov=pose.fov)
+
+
+def _write_mp4(path: Path, pictures: Iterator[ndarray], rate: float, size: tuple[int, int]) -> None:
+    codec = cv2.VideoWriter.fourcc(*"vp09")
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, codec, rate, size)
+    try:
+        if not writer.isOpened():
+            raise UsageError(
+                "This build of OpenCV has no encoder of VP9: install opencv-python-headless from "
+                "PyPI, or choose gif."
+            )
+        for picture in pictures:
+            writer.write(np.ascontiguousarray(picture[..., ::-1]))
+    finally:
+        writer.release()
+
+
+def _write_gif(path: Path, pictures: Iterator[ndarray], rate: float) -> None:
+    # OpenCV's GIFs have one table of colors for all pictures, and patterns in plain areas.
+    first, *others = (
+        PIL.Image.fromarray(picture).quantize(
+            _GIF_COLORS, PIL.Image.Quantize.MEDIANCUT, dither=PIL.Image.Dither.NONE
+        )
+        for picture in pictures
+    )
+    durations = gif_durations(1 + len(others), rate)
+    first.save(path, save_all=True, append_images=others, duration=durations, loop=0)
+
+
+def gif_durations(count: int, rate: float) -> list[int]:
+    """Give how long each picture is shown, so that none is late by more than half a step [ms].
+
+    Args:
+        count: Number of pictures.
+        rate: Pictures per second [Hz].
+    """
+    due = np.arange(count + 1) * max(1e3 / rate, _GIF_SHORTEST_MS) / _GIF_STEP_MS
+    return [int(step) * _GIF_STEP_MS for step in np.diff(np.floor(due + 0.5))]

@@ -1,0 +1,119 @@
+"""Films, read back by a decoder and compared with pictures of single frames."""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import PIL.Image
+import pytest
+from server_world import World
+
+from app.cli import main
+from app.exports.movie import gif_durations, turned_pose
+from app.exports.request import FileRequest
+from app.viewer.content.session_state import Pose
+
+RUN = "/api/v1/runs/fitted/export"
+LOOK = "show=nodes&width=160&height=120"
+
+
+def frames_of(path: Path) -> tuple[float, list[np.ndarray]]:
+    capture: Any = cv2.VideoCapture(str(path))
+    frames = []
+    while True:
+        is_read, frame = capture.read()
+        if not is_read:
+            return capture.get(cv2.CAP_PROP_FPS), frames
+        frames.append(frame)
+
+
+def picture(world: World, frame: int) -> np.ndarray:
+    content = world.script().get(f"{RUN}?format=png&f={frame}&{LOOK}").content
+    image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
+    return image.astype(int)
+
+
+def middle(image: np.ndarray) -> np.ndarray:
+    """Mean row and column of the nodes, which are blue [px]."""
+    blue = np.maximum(image[..., 0].astype(float) - image[..., 2] - 20.0, 0.0)
+    return np.array([np.average(np.indices(blue.shape)[axis], weights=blue) for axis in (0, 1)])
+
+
+def test_a_film_shows_every_frame_at_its_time(
+    world: World, made: list[FileRequest], tmp_path: Path
+) -> None:
+    (tmp_path / "a.mp4").write_bytes(world.script().get(f"{RUN}?format=mp4&{LOOK}").content)
+    rate, frames = frames_of(tmp_path / "a.mp4")
+    count = len(world.catalog.run("fitted").array("sequences/sheet/rollout.npy"))
+    assert (rate, len(frames), frames[0].shape) == (30.0, count, (120, 160, 3))
+    (tmp_path / "a.gif").write_bytes(world.script().get(f"{RUN}?format=gif&{LOOK}").content)
+    with PIL.Image.open(tmp_path / "a.gif") as gif:
+        assert (gif.n_frames, gif.info["loop"], gif.size) == (count, 0, (160, 120))
+        gif.seek(count - 1)
+        last = np.asarray(gif.convert("RGB"))[..., ::-1].astype(int)
+    first, end = middle(picture(world, 0)), middle(picture(world, count - 1))
+    before = middle(picture(world, count - 2))
+    assert min(np.linalg.norm(first - end), np.linalg.norm(before - end)) > 4.0
+    for seen, exact in ((frames[0], first), (frames[-1], end), (last, end)):
+        np.testing.assert_allclose(middle(seen), exact, atol=1.0)
+
+
+def test_the_progress_of_a_film_is_told_until_it_can_be_fetched(
+    world: World, made: list[FileRequest]
+) -> None:
+    query = f"format=gif&turn=90&{LOOK}"
+    answer = world.script().post(f"{RUN}?{query}")
+    told = answer.json()
+    assert told["url"] == f"{RUN}?{query}", answer.text
+    assert told["state"] in {"making", "ready"}
+    film = world.script().get(told["url"])
+    assert film.headers["content-type"] == "image/gif"
+    assert film.headers["content-disposition"] == 'attachment; filename="fitted.gif"'
+    assert [order.turn for order in made] == [90.0]
+    ready = world.script().post(f"{RUN}?{query}").json()
+    assert (ready["state"], ready["bytes"]) == ("ready", len(film.content))
+    for bad in ("format=png", f"{query}&turn=3601", f"{query}&turn=nan", "format=mp4&color=magic"):
+        assert world.script().post(f"{RUN}?{bad}").status_code == 422
+
+
+def test_the_command_films_and_says_what_is_too_long(
+    world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any
+) -> None:
+    out, data = tmp_path / "a.mp4", str(world.settings.data_dir)
+    order = ["export", "fitted", "--format", "mp4", "--out", str(out), "--data-dir", data]
+    with pytest.raises(SystemExit) as end:
+        main([*order, "--width", "97", "--height", "65", "--turn", "-45"])
+    assert end.value.code in {0, None}
+    _, frames = frames_of(out)
+    assert frames[0].shape == (64, 96, 3)
+    monkeypatch.setattr("app.exports.movie.MOST_FILMED_PIXELS", 90_000)
+    with pytest.raises(SystemExit) as end:
+        main([*order, "--overwrite"])
+    assert end.value.code
+    assert "choose a picture of at most 9,000 pixels" in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.glob("*.mp4")) == ["a.mp4"]
+    assert frames_of(out)[1]
+
+
+def test_the_camera_goes_round_the_upward_axis() -> None:
+    start = Pose(
+        position=np.array([3.0, 1.0, 2.0]),
+        look_at=np.array([1.0, 1.0, 0.5]),
+        up=np.array([0.0, 0.0, 2.0]),
+        fov=0.8,
+    )
+    quarter = turned_pose(start, np.pi / 2)
+    np.testing.assert_allclose(quarter.position, [1.0, 3.0, 2.0], atol=1e-12)
+    np.testing.assert_array_equal(quarter.look_at, start.look_at)
+    np.testing.assert_allclose(turned_pose(start, 2 * np.pi).position, start.position, atol=1e-12)
+
+
+@pytest.mark.parametrize(("rate", "whole"), [(30.0, 2000), (24.0, 2500), (120.0, 1200)])
+def test_a_gif_lasts_as_long_as_its_sequence_unless_that_is_too_fast(
+    rate: float, whole: int
+) -> None:
+    durations = gif_durations(60, rate)
+    assert sum(durations) == whole
+    assert all(20 <= duration <= 50 and duration % 10 == 0 for duration in durations)
