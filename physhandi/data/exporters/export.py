@@ -84,8 +84,8 @@ def export_scene(
 
     Args:
         scene: The motion.
-        format: ``ply``, ``npz``, ``csv`` (trajectories) or ``gltf``; see `export_run`. ``mjcf`` is a
-            ZIP of the object as a MuJoCo scene with the hand's motion.
+        format: ``ply``, ``npz``, ``csv`` (trajectories) or ``gltf``; see `export_run`. ``mjcf`` is
+            a ZIP of the object as a MuJoCo scene with the hand's motion.
         out_path: File to write; all frames as PLY go to a ``.zip`` or a folder.
         frame: Only this frame (PLY).
         overwrite: Whether to replace an export that is there.

@@ -69,7 +69,7 @@ if __name__ == "__main__":
     for frame, position in enumerate(play(folder)):
         distance = np.linalg.norm(position - rollout[frame], axis=-1).mean()
         travel = np.linalg.norm(rollout[frame] - rollout[0], axis=-1).mean()
-        print(f"frame {frame}: {1e3 * distance:.1f} mm from the rollout, moved {1e3 * travel:.1f} mm")
+        print(f"frame {frame}: moved by {1e3 * travel:.1f} mm, {1e3 * distance:.1f} mm from ours")
 '''
 
 
@@ -207,9 +207,15 @@ class _Twin:
         rest = self._model["rest_length"].astype(np.float64)
         columns = (self._stiffness(rest), self._factor * self._model["damping"], rest)
         for ends, *values in zip(self._ends, *columns, strict=True):
-            names = ("stiffness", "damping", "springlength")
-            numbers = {name: _number(float(x)) for name, x in zip(names, values, strict=True)}
-            tendon = SubElement(tendons, "spatial", width="0.0003", **numbers)
+            stiffness, damping, length = (_number(float(value)) for value in values)
+            tendon = SubElement(
+                tendons,
+                "spatial",
+                width="0.0003",
+                stiffness=stiffness,
+                damping=damping,
+                springlength=length,
+            )
             for end in ends:
                 SubElement(tendon, "site", site=f"end{end}")
 
