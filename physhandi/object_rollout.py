@@ -17,7 +17,7 @@ from physhandi.data.run import RunFolder
 from physhandi.data.run_folder import reading
 from physhandi.data.view import View
 from physhandi.errors import SequenceError, UsageError
-from physhandi.metrics.photometric import frame_0_colors
+from physhandi.metrics.photometric import seen_colors
 from physhandi.simulation.forces import (
     spring_strains,
     spring_tensions,
@@ -215,7 +215,6 @@ class ObjectRollout:
             "spring_nodes": self.model.spring_nodes,
             "object_spring_count": self.model.object_spring_count,
             "model": self.model.to_tensors() | self.restart_arrays(),
-            "parameters": self.parameters.to_dict(),
         }
         if self.scene is None:
             rate = self.parameters.frame_rate
@@ -302,7 +301,7 @@ def load_surface(
         return None
     vertex = surface.place(fitted.position[0]).astype(np.float64)
     try:
-        color = frame_0_colors(views, vertex, vertex_normals(vertex, surface.face))
+        color = seen_colors(views, vertex, vertex_normals(vertex, surface.face))
     except SequenceError as error:  # What can be told of the object does not need a recording.
         logger.info("the surface of the object has no colors: %s", error)
         return surface

@@ -56,6 +56,14 @@ class FakeSettings:
     device: str = "cpu"
 
 
+def show_parts(client: ViewerClient) -> None:
+    """Show nodes and springs of the object in place of its surface."""
+    client.set("Surface", False)
+    for part in ("Object nodes", "Control nodes", "Virtual springs", "Object springs"):
+        client.set(part, True)
+    client.until(lambda: {"/object/nodes", "/springs/virtual"} <= set(client.nodes))
+
+
 def rest_at(client: ViewerClient, frame: int) -> None:
     """Stop the clock at a frame, once it plays as it does when somebody looks."""
     client.until(lambda: client.find("Pause"))

@@ -6,6 +6,7 @@
   const WATCH_MS = 15000;
   const FOLLOW_MS = 2000;
   const LINK_KEY = "p";
+  const HINT = "physhandi.first-hint";
   const scene = document.getElementById("scene");
   const isDark = matchMedia("(prefers-color-scheme: dark)");
   let session = scene.dataset.session;
@@ -94,6 +95,23 @@
     if (answer && (answer.status === 404 || answer.status === 401)) location.reload();
   }
 
+  /* Told once in a browser. */
+  function giveHint() {
+    const hint = document.querySelector("[data-first-hint]");
+    try {
+      if (localStorage.getItem(HINT)) return;
+    } catch {
+      return;
+    }
+    hint.hidden = false;
+    hint.querySelector("[data-close-hint]").addEventListener("click", () => {
+      localStorage.setItem(HINT, "seen");
+      hint.remove();
+      scene.contentWindow.focus();
+    });
+  }
+
+  giveHint();
   forwardKeys(scene);
   scene.addEventListener("load", settle);
   if (scene.contentDocument?.readyState === "complete") settle();

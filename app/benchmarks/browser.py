@@ -40,12 +40,12 @@ _WATCH = """(() => {
   const look = ({ data }) => {
     if (data?.type !== "message_batch") return;
     for (const message of data.messages) {
-      const moved = message.type === "SceneNodeUpdateMessage" && message.name === "/object/nodes"
-        && message.updates.points;
+      const moved = message.type === "SceneNodeUpdateMessage" && message.name === "/object/surface"
+        && message.updates.vertices;
       if (!moved) continue;
       watch.frames += 1;
-      if (watch.arrived || !watch.expected || !watch.pressed || !isNew(message.updates.points))
-        continue;
+      if (watch.arrived || !watch.expected || !watch.pressed
+        || !isNew(moved.subarray(0, watch.expected.count))) continue;
       watch.arrived = performance.now();
       // The next callback draws it; when the one after that begins, it is on its way to the screen.
       const note = () => { watch.drawn = performance.now(); };
@@ -69,8 +69,11 @@ _OPEN = """(id) => fetch("/api/v1/sessions", {
 }).then((answer) => answer.json()).then((answer) => { location.href = answer.url; })"""
 _CLOSE = """() => fetch(`/api/v1/sessions/${location.pathname.split("/").pop()}`, {
   method: "DELETE" })"""
+_COMPARED = 600
+"""Coordinates by which frames are told apart."""
 _EXPECT = """([rollout, before, tolerance]) => Object.assign(window.physhandiWatch, {
-  expected: { rollout, before, tolerance }, pressed: 0, arrived: 0, drawn: 0,
+  expected: { rollout, before, tolerance, count: rollout[0].length },
+  pressed: 0, arrived: 0, drawn: 0,
 })"""
 
 
@@ -141,7 +144,7 @@ def measure_slider_in_browser(
         moves: Where to.
 
     Returns:
-        Time from the press to the arrival of the first node positions that only the new rollout
+        Time from the press to the arrival of the first surface that only the new rollout
         has (``arrived_…``), and until they are drawn; and how many frames a second arrived.
     """
     arrived: list[float] = []
@@ -160,7 +163,7 @@ def measure_slider_in_browser(
         scene.wait_for_function("() => window.physhandiWatch.frames > 30")
         opened = 1e-3 * float(page.evaluate("() => performance.now()"))
         for move in moves:
-            pair = [r.reshape(len(r), -1).tolist() for r in (move.rollout, before)]
+            pair = [r.reshape(len(r), -1)[:, :_COMPARED].tolist() for r in (move.shown, before)]
             scene.evaluate(_EXPECT, [*pair, TOLERANCE])
             _press(page, scene, slider, move)
             scene.wait_for_function("() => window.physhandiWatch.drawn > 0")
@@ -168,7 +171,7 @@ def measure_slider_in_browser(
             arrived.append(1e-3 * (told["arrived"] - told["pressed"]))
             drawn.append(1e-3 * (told["drawn"] - told["pressed"]))
             page.wait_for_timeout(300)
-            before = move.rollout
+            before = move.shown
         rate = _rate(page, scene)
         page.evaluate(_CLOSE)
     when = {f"arrived_{name}": value for name, value in percentiles(arrived).items()}

@@ -15,6 +15,7 @@ from app.viewer.physics.parameters import Knob, knobs
 from physhandi.data.layout import SequenceFiles
 from physhandi.errors import UsageError
 from physhandi.fitted_object import FittedObject
+from physhandi.object_rollout import ObjectRollout, load_surface
 from physhandi.run import Run
 
 FIELDS = ("stiffness_scale", "connection_radius")
@@ -31,8 +32,8 @@ class Move:
 
     value: float
     """Value on the slider."""
-    rollout: Float[ndarray, "frame node 3"]
-    """Object node positions [m], simulated by the benchmark itself."""
+    shown: Float[ndarray, "frame vertex 3"]
+    """Where the object's surface is [m], simulated by the benchmark itself."""
 
 
 class MeasuredSlider:
@@ -46,6 +47,7 @@ class MeasuredSlider:
             sequence: One of its sequences.
             field: Parameter that the slider moves.
         """
+        self._run = run
         self._fitted = FittedObject.of(run, sequence)
         meta = run.yaml(SequenceFiles(sequence).meta)
         unit = "m" if meta.get("metric", True) else str(meta.get("length_unit", "units"))
@@ -59,8 +61,8 @@ class MeasuredSlider:
 
     @property
     def fitted(self) -> Float[ndarray, "frame node 3"]:
-        """The fitted rollout [m]."""
-        return np.asarray(self._fitted.fitted.position)
+        """Where the surface is in the fitted rollout [m]."""
+        return shown_places(self._run, self._fitted.fitted)
 
     def moves(self, count: int) -> list[Move]:
         """Choose positions, each further than the one before, and simulate them.
@@ -78,9 +80,9 @@ class MeasuredSlider:
         while len(chosen) < count and self.knob.low < value < self.knob.high:
             value = round(value + step, 6)
             move = self._move(value)
-            if float(np.abs(move.rollout[1] - before[1]).max()) > TOLERANCE:
+            if float(np.abs(move.shown[1] - before[1]).max()) > TOLERANCE:
                 chosen.append(move)
-                before = move.rollout
+                before = move.shown
         return chosen
 
     def _move(self, value: float) -> Move:
@@ -90,15 +92,27 @@ class MeasuredSlider:
         rollout = self._fitted.begin(parameters)
         for _ in self._fitted.fill(rollout):
             pass
-        return Move(value, np.asarray(rollout.position))
+        return Move(value, shown_places(self._run, rollout))
+
+
+def shown_places(run: Run, rollout: ObjectRollout) -> Float[ndarray, "frame vertex 3"]:
+    """Find where the surface of a rollout's object is in all frames [m].
+
+    Raises:
+        UsageError: If the object has none.
+    """
+    surface = load_surface(run, rollout, ())
+    if surface is None:
+        raise UsageError(f"The object of '{run.name}' has no surface whose motion could be heard.")
+    return np.stack([surface.place(position) for position in rollout.position])
 
 
 def is_new_frame(
-    shown: Float[ndarray, "node 3"],
-    rollout: Float[ndarray, "frame node 3"],
-    before: Float[ndarray, "frame node 3"],
+    shown: Float[ndarray, "vertex 3"],
+    rollout: Float[ndarray, "frame vertex 3"],
+    before: Float[ndarray, "frame vertex 3"],
 ) -> bool:
-    """Tell whether nodes stand as in a frame of one rollout and in none of the one before."""
+    """Tell whether an object stands as in a frame of one rollout and in none of the one before."""
 
     def is_of(frames: ndarray) -> bool:
         return bool((np.abs(frames - shown).max(axis=(1, 2)) <= TOLERANCE).any())
@@ -120,7 +134,7 @@ def measure_slider(
             frame is that one.
 
     Returns:
-        Time from the slider's message to that of the first node positions that only the new
+        Time from the slider's message to that of the first surface that only the new
         rollout has, also one by one (``seconds``).
     """
     session = served.open("run", run_id)
@@ -138,14 +152,14 @@ def measure_slider(
             start = time.perf_counter()
             label = slider.knob.label
             client.set(label, move.value)
-            new, old = move.rollout, before
+            new, old = move.shown, before
             seconds.append(
                 screen.seconds_until(lambda p, new=new, old=old: is_new_frame(p, new, old)) - start
             )
             if number % _DRAGGED == _DRAGGED - 1:
                 total = f"simulated {len(new)}/{len(new)}"
                 client.until(lambda total=total: total in client.texts())
-            before = move.rollout
+            before = move.shown
     served.shut(session)
     return {"moves": len(moves), **percentiles(seconds), "seconds": seconds}
 
@@ -174,7 +188,7 @@ def measure_first_move(
     with served.watch(session) as client:
         screen = Screen(client)
         for move in moves:
-            new, old = move.rollout, before
+            new, old = move.shown, before
             begin = time.perf_counter()
             client.set(slider.knob.label, move.value)
 
@@ -184,7 +198,7 @@ def measure_first_move(
                 return is_new_frame(shown, new, old)
 
             seconds.append(screen.seconds_until(is_there) - begin)
-            before = move.rollout
+            before = move.shown
     served.shut(session)
     return {
         "server_start_ms": 1e3 * served.start_seconds,

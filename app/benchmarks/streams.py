@@ -13,7 +13,7 @@ from numpy import ndarray
 from app.benchmarks.served import Served, ServerFailedError
 from app.benchmarks.viewer_client import ViewerClient
 
-_NODES = "/object/nodes"
+_SURFACE = "/object/surface"
 _ARROWS = "/forces"
 _SETTLING_S = 3.0
 _PATIENCE = 60.0
@@ -31,7 +31,7 @@ class Screen:
     def __init__(self, client: ViewerClient) -> None:
         self.client = client
         # A new scene begins to play when its first client is there.
-        client.until(lambda: self.is_playing and _NODES in client.nodes, _PATIENCE)
+        client.until(lambda: self.is_playing and _SURFACE in client.nodes, _PATIENCE)
 
     @property
     def is_playing(self) -> bool:
@@ -39,9 +39,9 @@ class Screen:
         return bool(self.client.find("Pause"))
 
     @property
-    def positions(self) -> Float[ndarray, "node 3"]:
-        """Object node positions on the screen [m]."""
-        return self.client.array(_NODES, "points")
+    def positions(self) -> Float[ndarray, "vertex 3"]:
+        """Where the object's surface is on the screen [m]."""
+        return self.client.array(_SURFACE, "vertices")
 
     def play(self, *, on: bool) -> None:
         """Press the button that starts or stops the clock."""
@@ -50,7 +50,7 @@ class Screen:
             self.client.until(lambda: self.is_playing == on, _PATIENCE)
 
     def seconds_until(self, is_there: Callable[[ndarray], bool]) -> float:
-        """Wait until node positions arrive of which something is true.
+        """Wait until the surface arrives at a place of which something is true.
 
         Returns:
             When they arrived [s, clock of `time.perf_counter`].
@@ -62,7 +62,7 @@ class Screen:
         while time.monotonic() < end:
             for message in self.client.take_in(0.5):
                 is_moved = message["type"] == "SceneNodeUpdateMessage" and (
-                    message["name"] == _NODES and "points" in message["updates"]
+                    message["name"] == _SURFACE and "vertices" in message["updates"]
                 )
                 if is_moved and is_there(self.positions):
                     return self.client.moment
@@ -73,14 +73,14 @@ class Screen:
 
 
 def measure_scrub(
-    served: Served, run_id: str, rollout: Float[ndarray, "frame node 3"], moves: int
+    served: Served, run_id: str, shown: Float[ndarray, "frame vertex 3"], moves: int
 ) -> dict[str, Any]:
-    """Drag the timeline of a paused scene, and wait for the nodes of each frame.
+    """Drag the timeline of a paused scene, and wait for the object in each frame.
 
     Args:
         served: The server.
         run_id: The run to show.
-        rollout: Where its object nodes are [m].
+        shown: Where the surface of its object is [m].
         moves: How often.
 
     Returns:
@@ -93,12 +93,14 @@ def measure_scrub(
         screen.play(on=False)
         for move in range(moves):
             # No two frames in turn are alike, and none is far from the one before for long.
-            frame = (7 + 23 * move) % len(rollout)
+            frame = (7 + 23 * move) % len(shown)
             client.listen(0.1)
             start = time.perf_counter()
             client.set("Frame", frame)
-            wanted = rollout[frame]
-            seconds.append(screen.seconds_until(lambda p, w=wanted: np.allclose(p, w)) - start)
+            wanted = shown[frame]
+            seconds.append(
+                screen.seconds_until(lambda p, w=wanted: np.allclose(p, w, atol=1e-6)) - start
+            )
     served.shut(session)
     return {"moves": moves, **percentiles(seconds)}
 

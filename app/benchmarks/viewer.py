@@ -196,8 +196,8 @@ class _Bench:
             return measure_first_paint(self._served(), browser, self._effort.visits)
 
     def _scrub(self) -> dict[str, Any]:
-        rollout = self._run.array(SequenceFiles(self._sequence).rollout)
-        return measure_scrub(self._served(), self._run.id, rollout, 3 * self._effort.moves)
+        shown = MeasuredSlider(self._run, self._sequence, FIELDS[0]).fitted
+        return measure_scrub(self._served(), self._run.id, shown, 3 * self._effort.moves)
 
     def _slider(self) -> dict[str, Any]:
         kinds: dict[str, Any] = {}

@@ -17,6 +17,7 @@ from app.viewer.scene.scene import FRAME_BYTES, SceneDrawing
 from app.viewer.scene.scene_server import start_viser
 from app.viewer.ui.guard import plain
 from physhandi.object_rollout import ObjectRollout
+from physhandi.simulation.object_surface import ObjectSurface
 
 GRID = 2.0**-14
 """Positions of recordings are rounded to a multiple of this part of the scene's size."""
@@ -126,19 +127,33 @@ class _RoundedTake(ObjectRollout):
         return self.exact.spring_forces(frame)
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _RoundedSurface(ObjectSurface):
+    """A surface whose vertices are rounded as well."""
+
+    step: float
+
+    def place(self, node: Float[ndarray, "node 3"]) -> Float[ndarray, "vertex 3"]:
+        return _on_grid(super().place(node), self.step)
+
+
+def _on_grid(point: ndarray, step: float) -> ndarray:
+    return (np.round(np.asarray(point, np.float64) / step) * step).astype(np.float32)
+
+
 def _rounded(
     content: Content, take: ObjectRollout | None, step: float
 ) -> tuple[Content, ObjectRollout | None]:
     """Round all that moves to a grid, on which half of a float's digits are zero."""
-
-    def rounded(point: ndarray) -> ndarray:
-        return (np.round(np.asarray(point, np.float64) / step) * step).astype(np.float32)
-
-    hands = tuple(replace(hand, vertex=rounded(hand.vertex)) for hand in content.hands)
-    control = None if content.control is None else rounded(content.control)
-    content = replace(content, hands=hands, control=control)
+    hands = tuple(replace(hand, vertex=_on_grid(hand.vertex, step)) for hand in content.hands)
+    control = None if content.control is None else _on_grid(content.control, step)
+    surface = content.surface
+    if surface is not None:
+        own = {field.name: getattr(surface, field.name) for field in fields(surface)}
+        surface = _RoundedSurface(**own, step=step)
+    content = replace(content, hands=hands, control=control, surface=surface)
     if take is None:
         return content, None
     known = {field.name: getattr(take, field.name) for field in fields(take) if field.init}
-    known |= {"position": rounded(take.position), "control": rounded(take.control)}
+    known |= {"position": _on_grid(take.position, step), "control": _on_grid(take.control, step)}
     return content, _RoundedTake(**known, exact=take)

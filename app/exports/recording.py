@@ -6,6 +6,7 @@ from html import escape
 from app.exports.offscreen import Offscreen
 from app.viewer.content.content import Content
 from app.viewer.content.session_state import SessionState
+from app.viewer.ui.scene_frame import with_script
 from physhandi.errors import UsageError
 from physhandi.object_rollout import ObjectRollout
 
@@ -59,6 +60,6 @@ def record_scene(
             report(frame + 1, count)
         if not as_html:
             return serializer.serialize()
-        page = serializer.as_html(dark_mode=scene.is_dark)
+        page = with_script(serializer.as_html(dark_mode=scene.is_dark))
     title = escape(f"{content.title} · PhysHanDI")
     return page.replace("<title>Viser</title>", f"<title>{title}</title>", 1).encode()

@@ -2,11 +2,9 @@
 
 import gzip
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
 
-import viser
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import FileResponse, HTMLResponse
 
@@ -19,9 +17,9 @@ from app.exports.schema import errors, files
 from app.ids import ItemId
 from app.jobs.catalog import Catalog
 from app.pages.render import Pages
+from app.viewer.ui.scene_frame import scene_page
 from physhandi.errors import UsageError
 
-_CLIENT = Path(viser.__file__).parent / "client" / "build" / "index.html"
 _CAMERA = ("cam", "up", "fov")
 _KNOWN = ("sequence", "theme", *_CAMERA)
 SequenceField = Annotated[str | None, Query(max_length=200)]
@@ -40,7 +38,7 @@ def create_replays(catalog: Catalog, file_cache: FileCache, pages: Pages) -> API
         pages: Renders.
     """
     router = APIRouter()
-    client = _CLIENT.read_bytes()
+    client = scene_page()
     packed = gzip.compress(client, mtime=0)
 
     def order(run_id: str, sequence: str | None, theme: str) -> FileRequest:

@@ -156,12 +156,14 @@ class _View:
             _in_world(node.vertices, rotation, position),
             np.asarray(node.faces, np.int64),
         )
+        color = _colors(node.color)
         if node.flat_shading:
             vertex, faces = facets(vertex, faces)
         yield Surface(
             vertex=vertex,
             faces=faces,
-            color=_colors(node.color),
+            # Behind the color of a mesh may be those of its vertices.
+            color=color[1:] if len(color) > 1 else color,
             opacity=1.0 if node.opacity is None else float(node.opacity),
             shading=_SHADING,
         )

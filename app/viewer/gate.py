@@ -5,10 +5,8 @@ import gzip
 import logging
 from collections import Counter
 from collections.abc import Coroutine
-from pathlib import Path
 from typing import Any
 
-import viser
 import websockets
 from fastapi import APIRouter, HTTPException, Request, Response, WebSocket
 from starlette.responses import RedirectResponse
@@ -17,10 +15,10 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 from app.viewer.sessions import Sessions
+from app.viewer.ui.scene_frame import scene_page
 
 logger = logging.getLogger(__name__)
 
-_PAGE = Path(viser.__file__).parent / "client" / "build" / "index.html"
 _PROTOCOL = "viser-v"
 _GONE = (
     "This live scene does not exist, was closed, or belongs to another browser. "
@@ -44,7 +42,7 @@ def create_gate(sessions: Sessions) -> APIRouter:
     """
     watching: Counter[str] = Counter()
     router = APIRouter(include_in_schema=False)
-    page = _PAGE.read_bytes()
+    page = scene_page()
     packed = gzip.compress(page, mtime=0)
 
     @router.get("/viewer/{session_id}/")

@@ -208,7 +208,7 @@ class Session(SceneServer):
         framing = frame_content(content)
         scene = SceneDrawing(self._server, content, framing)
         self._view = ViewSwitch(scene, self._comparison)
-        self._layers.replace(content, scene.layers, framing, has_surface=scene.may_have_surface)
+        self._layers.replace(content, scene.layers, framing)
         painter = scene.painter if content.fitted is not None else scene.hand_painter
         self._colors.replace(content, scene.layers, painter)
         self._inspector.replace(content, scene, framing)

@@ -90,19 +90,22 @@ def shaded_psnr(
     return 10.0 * float(np.log10(_FULL**2 / max(error, _LEAST_ERROR)))
 
 
-def frame_0_colors(
+def seen_colors(
     views: Sequence[View],
     node: Float[ndarray, "node 3"],
     normal: Float[ndarray, "node 3"] | None = None,
+    *,
+    frame: int = 0,
 ) -> UInt8[ndarray, "node 3"] | None:
-    """Assign each node the mean color of the views that see it in frame 0.
+    """Assign each node the mean color of the views that see it in a frame.
 
     Args:
         views: Those that have color and masks count.
-        node: Points on the object's surface [m].
+        node: Points on the object's surface in that frame [m].
         normal: Directions of the surface there, of either sign. With them the color is that of the
             views that look straight at it, and not of pixels at the object's outline, into which
             what is behind it is mixed; without, all views count alike.
+        frame: The frame, which all of these views have.
 
     Returns:
         Colors; a node that no view sees takes that of the nearest visible one. None without
@@ -112,7 +115,7 @@ def frame_0_colors(
     for view in views:
         if not (view.has_color and view.has_mask):
             continue
-        mask, color = view.mask(0), view.color(0)
+        mask, color = view.mask(frame), view.color(frame)
         pixel = np.nan_to_num(view.camera.project(node), nan=-1.0).round().astype(np.int64)
         height, width = mask.shape
         inside = np.asarray((pixel >= 0).all(axis=1))
@@ -123,7 +126,7 @@ def frame_0_colors(
             is_object = cv2.erode(is_object.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
         is_seen = inside & is_object[row, column]
         if view.has_depth:
-            measured = view.depth(0)[row, column]
+            measured = view.depth(frame)[row, column]
             is_seen &= view.camera.camera_depth(node) < measured + _BEHIND
         weight = np.ones(len(node))
         if normal is not None:
@@ -161,7 +164,7 @@ def photometric_curves(
         return {}
     node = rollout.astype(np.float64)
     radius = DISC * resolution(node[0])
-    color = frame_0_colors(views, node[0]) if view.has_color else None
+    color = seen_colors(views, node[0]) if view.has_color else None
     shown = np.zeros((node.shape[1], 3), dtype=np.uint8) if color is None else color
     iou, psnr = np.full(len(node), np.nan), np.full(len(node), np.nan)
     for frame in range(min(len(node), view.frame_count)):

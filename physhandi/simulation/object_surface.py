@@ -76,6 +76,8 @@ class ObjectSurface:
         if not is_known.all():
             share: ndarray = self.weight @ is_known.astype(np.float32)
             carried = np.where(share > 0.5, carried / np.maximum(share, 0.5), np.nan)
+        if is_known.any():  # A rope's ends are beyond the values around them.
+            carried = np.clip(carried, value[is_known].min(), value[is_known].max())
         if self.tube is None:
             return carried
         return np.concatenate([carried[:1], np.repeat(carried[1:-1], _SIDES), carried[-1:]])
@@ -154,10 +156,10 @@ def lay_surface(
         (np.ones(len(used)), (np.arange(len(used)), used)), shape=(len(used), len(point))
     )
     is_corner = _corners(point[used], face)
-    if _Edges(face).is_border.any():
-        if _height_of(point[used], face) < 0.0:
-            face = face[:, ::-1]
-    else:  # The outside of a body of cubes has steps.
+    is_open = bool(_Edges(face).is_border.any())
+    if _facing(point[used], face, is_open=is_open) < 0.0:
+        face = face[:, ::-1]
+    if not is_open:  # The outside of a body of cubes has steps.
         weight = _Edges(face).smoothing(weight.shape[0], is_corner) @ weight
     while True:
         edges = _Edges(face)
@@ -170,10 +172,14 @@ def lay_surface(
     return ObjectSurface(face=face.astype(np.int32), weight=_rows(weight))
 
 
-def _height_of(point: Float[ndarray, "vertex 3"], face: Int[ndarray, "face 3"]) -> float:
-    """Add up how far triangles look upwards, weighted by their area."""
+def _facing(
+    point: Float[ndarray, "vertex 3"], face: Int[ndarray, "face 3"], *, is_open: bool
+) -> float:
+    """Add up how far triangles look up or, if they are closed, out, weighted by their area."""
     a, b, c = (point[face[:, corner]] for corner in range(3))
-    return float(np.cross(b - a, c - a)[:, 2].sum())
+    normal = np.cross(b - a, c - a)
+    out = (a + b + c) / 3 - point.mean(axis=0)
+    return float(normal[:, 2].sum() if is_open else np.sum(normal * out))
 
 
 def _rows(weight: Any) -> Any:

@@ -1,6 +1,7 @@
 """Addresses of commit 57a38d7: of live scenes, comparisons and lists."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +58,11 @@ def test_an_address_opens_a_scene_whose_link_is_the_one_of_then(
         assert world.sessions.get(session) is not None
         link = client.get(f"/api/v1/sessions/{session}/link").json()
         world.sessions.close(session)
-        assert link["url"] == scene["link_of_the_open_scene"], scene["title"]
+        now, then = link["url"], scene["link_of_the_open_scene"]
+        if "show" not in scene["query"]:
+            # What is usual where an address does not say what is shown has changed since.
+            now, then = (re.sub("&show=[a-z_,]+", "", one) for one in (now, then))
+        assert now == then, scene["title"]
 
 
 def test_parameters_of_a_link_move_the_object_as_they_did(old: OldFolder, tmp_path: Path) -> None:

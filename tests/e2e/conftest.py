@@ -188,6 +188,8 @@ def picture() -> Callable[[Page, str], None]:
             notices = page.frame_locator("#scene").locator(".mantine-Notification-closeButton")
             for _ in range(notices.count()):
                 notices.first.click()
+        if page.locator("[data-first-hint]").is_visible():
+            page.get_by_role("button", name="Got it").click()
         page.mouse.move(640, 790)
         expect(page.locator(".shot.pending:not(:has(img))")).to_have_count(0)
         page.wait_for_timeout(_SETTLE_MS)

@@ -58,6 +58,17 @@ def fitted() -> Fitted:
     )
 
 
+_COLORS_OF_VERTICES = """() => {
+  let mesh = null;
+  const group = __viserMutable.nodeRefFromName["/object/surface"];
+  group.traverse((part) => (mesh ??= part.isMesh ? part : null));
+  const colors = mesh.material.vertexColors ? mesh.geometry.getAttribute("color").array : [];
+  const [low, high] = [Math.min, Math.max].map((pick) => colors.reduce((a, b) => pick(a, b)));
+  return [low, high, colors.length];
+}"""
+"""Least and largest share of the mesh's own color that a vertex has, and how many there are."""
+
+
 def test_the_printed_address_shows_sequences_and_finished_runs(home, fitted, picture):
     expect(home.locator("[data-sequence=towel_fold] h3")).to_contain_text("towel_fold")
     row = home.locator(f"#runs [data-run={fitted.id}]")
@@ -87,17 +98,29 @@ def test_a_scene_opens_plays_and_saves_what_it_shows(home, fitted, tmp_path, pic
     expected = np.concatenate([fitted.rollout[30], fitted.control[30]])
     np.testing.assert_allclose(points, expected, atol=1e-6)
 
-    # It shows blue object nodes and red control nodes, not an empty canvas; browsers without a
-    # graphics card may be late to draw them.
-    def shows_nodes() -> bool:
+    # It shows the teal towel and the hand, not an empty canvas; browsers without a graphics card
+    # may be late to draw them.
+    def shows_the_object() -> bool:
         image = cv2.imread(str(scene.download("PNG", tmp_path)))
         assert image.shape[0] > 500
         blue, green, red = (image[..., channel].astype(int) for channel in range(3))
         objects = np.count_nonzero((blue > 150) & (blue - red > 60))
-        controls = np.count_nonzero((red > 120) & (red - blue > 80) & (red - green > 80))
-        return objects > 1000 and controls > 100
+        skin = np.count_nonzero((red > 150) & (red - blue > 30) & (red - green > 20))
+        return objects > 1000 and skin > 1000
 
-    scene.until(shows_nodes, "a picture of the nodes")
+    scene.until(shows_the_object, "a picture of towel and hand")
+    inside = next(frame for frame in home.frames if "/viewer/" in frame.url)
+    # Each vertex has a color of its own: stripes are lighter than what is between them.
+    low, high, count = inside.evaluate(_COLORS_OF_VERTICES)
+    assert count == 3 * 1961
+    assert low < 0.5
+    assert high > 2.0
+    assert inside.get_by_text("Opening the scene").count() == 0
+    if home.locator("[data-first-hint]").is_visible():  # A picture was taken without it.
+        home.get_by_role("button", name="Got it").click()
+    home.reload()
+    scene.until(lambda: scene.has("object springs"), "the scene again")
+    expect(home.locator("[data-first-hint]")).to_be_hidden()
 
 
 def test_sliders_simulate_again_and_reset_returns(shared_scene, fitted, tmp_path, picture):

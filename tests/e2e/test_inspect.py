@@ -98,7 +98,7 @@ def test_keys_colors_and_clicks_work_in_the_scene_and_around_it(scene, picture):
     for count in (10, 20, 30):
         page.keyboard.press("Shift+ArrowRight")
         scene.until(lambda count=count: scene.value("Frame") == count, f"frame {count}")
-    for layer in "156":
+    for layer in "123":  # Nodes alone.
         press_and_see(scene, layer, "show")
 
     before = blue_at_rest(scene)
@@ -122,6 +122,7 @@ def test_keys_colors_and_clicks_work_in_the_scene_and_around_it(scene, picture):
 
     scene.until(lambda: goes_to_a_frame_of_the_chart(scene), "the frame in the chart")
 
+    press_and_see(scene, "3", "show")
     picture(page, "inspect")
     page.keyboard.press("?")
     help_overlay = page.locator("dialog#help")

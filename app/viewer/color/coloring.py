@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 from scipy.spatial import KDTree  # pyright: ignore[reportMissingTypeStubs]  # it has none
 
+from app.viewer.color.colormaps import paint_levels
 from app.viewer.color.difference import surface_difference
 from app.viewer.color.legend import ColorScale, Legend, Limits, nearly_all, with_width
 from app.viewer.color.quantities import (
@@ -23,6 +24,7 @@ from app.viewer.content.layers import COLORINGS, Coloring, Layers
 from physhandi.data.object_mass import ObjectMass, given_mass
 from physhandi.metrics.alignment import carried_points
 from physhandi.object_rollout import ObjectRollout
+from physhandi.simulation.object_surface import ObjectSurface
 
 _SHARERS = 4
 """Tracks that tell the error of a node."""
@@ -148,6 +150,10 @@ class Painted:
     def level(self) -> Float[ndarray, " node"]:
         """Places of the nodes on the scale, from 0 to 1; NaN where nothing is known."""
         return self.scale.levels(self.values.node)
+
+    def vertices(self, surface: ObjectSurface) -> UInt8[ndarray, "vertex 3"]:
+        """Give the colors of a surface that follows the nodes."""
+        return paint_levels(surface.carry(self.level), self.scale.quantity.scale)
 
     def springs(self, chosen: slice | ndarray) -> UInt8[ndarray, "segment 2 3"]:
         """Give the colors of both ends of some springs."""

@@ -49,7 +49,11 @@ def paint_values(
         scale: Which colors.
         is_logarithmic: Whether equal ratios, instead of differences, are equal steps.
     """
-    level = levels(value, limits, is_logarithmic=is_logarithmic)
+    return paint_levels(levels(value, limits, is_logarithmic=is_logarithmic), scale)
+
+
+def paint_levels(level: Float[ndarray, "*item"], scale: Scale) -> UInt8[ndarray, "*item 3"]:
+    """Give places on a scale, from 0 to 1, their colors; NaN gets `UNKNOWN`."""
     index = np.nan_to_num(level * (_STEPS - 1)).round().astype(np.int64)
     color = table(scale)[index]
     color[np.isnan(level)] = UNKNOWN

@@ -18,7 +18,7 @@ from app.viewer.color.quantities import QUANTITIES, Values, from_nodes, in_lengt
 from app.viewer.compare.camera import Box, Eye
 from app.viewer.compare.sides import SIDE_KEYS, ComparedSide, Sides
 from app.viewer.content.content import Content
-from app.viewer.content.layers import GREEN, SKIN, YELLOW, Layers
+from app.viewer.content.layers import GREEN, SKIN, YELLOW, Layers, has_few_springs
 from app.viewer.scene.framing import Framing
 from app.viewer.scene.nodes import ClippedNodes, Plane
 from app.viewer.scene.object_drawing import RGB, ObjectDrawing, Style, share_bytes, strengths
@@ -296,22 +296,26 @@ class CompareDrawing:
             return
         # Springs would hide the other side long before they have faded.
         is_strong = strength > 0.5 and not look.is_ghost(key)
+        # Two objects are told apart by nodes and springs, also where one is shown by its surface.
+        has_object = layers.nodes or layers.surface
+        has_parts = look.is_figure and layers.surface
+        has_springs = layers.object_springs or (layers.surface and has_few_springs(rollout))
         shown = replace(
             layers,
-            nodes=layers.nodes and look.is_figure,
+            nodes=has_object and look.is_figure,
             surface=False,
             color="plain",
             all_controls=layers.all_controls and look.is_figure,
-            controls=layers.controls and is_strong,
-            virtual_springs=layers.virtual_springs and is_strong,
-            object_springs=layers.object_springs and is_strong,
+            controls=(layers.controls or has_parts) and is_strong,
+            virtual_springs=(layers.virtual_springs or has_parts) and is_strong,
+            object_springs=has_springs and is_strong,
             forces=layers.forces and is_strong,
         )
         hands = sum(hand.vertex.shape[1] for hand in side.content.hands) if layers.hands else 0
         observed = PLAYING_OBSERVED if layers.observed and not look.is_figure else 0
         points = rollout.model.node_count + len(used.attached(rollout)) + hands + observed
         point_bytes = 12 if look.is_figure else 15
-        budget = share_bytes(FRAME_BYTES // 2 - point_bytes * points, rollout, layers, ARROWS)
+        budget = share_bytes(FRAME_BYTES // 2 - point_bytes * points, rollout, shown, ARROWS)
         if not is_playing:
             budget = replace(budget, virtual=None, springs=None)
         painted = self._painted(key, side, other)
@@ -330,7 +334,7 @@ class CompareDrawing:
         point = np.asarray(rollout.position[side.frame], dtype=np.float32)
         color = self._colors(key, rollout, painted, is_dark=layers.dark)
         size = look.node_size(key) * self._framing.spacing
-        is_visible = layers.nodes and strength > 0.0
+        is_visible = has_object and strength > 0.0
         self._nodes.points(colored_path, point, color, size, is_visible=is_visible)
 
     def _painted(self, key: str, side: ComparedSide, other: ComparedSide) -> Painted | None:

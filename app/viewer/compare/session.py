@@ -230,9 +230,8 @@ def _side(key: str, content: Content, frame: int) -> ComparedSide:
 
 def _first_layers(content: Content) -> Layers:
     """Show objects and hands; what holds the object would hide how two of them differ."""
-    return replace(
-        default_layers(content), controls=False, virtual_springs=False, forces=False, cameras=False
-    )
+    first = default_layers(replace(content, surface=None))
+    return replace(first, controls=False, virtual_springs=False, forces=False, cameras=False)
 
 
 def _place_first(server: viser.ViserServer, framing: Framing) -> None:

@@ -25,8 +25,9 @@ from physhandi.data.object_mass import ObjectMass, estimated_mass, given_mass
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
 from physhandi.errors import MissingInputError, PhysHandiError, UsageError
-from physhandi.object_rollout import ObjectRollout, load_fitted
+from physhandi.object_rollout import ObjectRollout, load_fitted, load_surface
 from physhandi.run import Run
+from physhandi.simulation.object_surface import ObjectSurface
 
 logger = logging.getLogger(__name__)
 
@@ -95,6 +96,8 @@ class Content:
     """The recording's views."""
     mass: ObjectMass | None = None
     """What the object weighs; None if it can not even be estimated."""
+    surface: ObjectSurface | None = None
+    """The smooth surface of the object; None if its nodes have none."""
 
     @property
     def is_metric(self) -> bool:
@@ -134,6 +137,9 @@ def open_run(catalog: Catalog, run_id: str, sequence_name: str | None = None) ->
     meta = run.yaml(files.meta)
     sequence = _recording(catalog, run, name)
     control = run.array(files.control) if run.has(files.control) else None
+    fitted = load_fitted(run, name)
+    views = sequence.views if sequence else ()
+    of_recording = _observation(sequence) if sequence else None
     return Content(
         title=run.name,
         sequence_name=name,
@@ -144,11 +150,12 @@ def open_run(catalog: Catalog, run_id: str, sequence_name: str | None = None) ->
         ground_height=meta.get("ground_height"),
         hands=_hands(run, files, [str(side) for side in meta.get("hands", [])]),
         control=control,
-        fitted=load_fitted(run, name),
-        observed=_run_observation(run, files) or (_observation(sequence) if sequence else None),
+        fitted=fitted,
+        observed=_run_observation(run, files, views) or of_recording,
         tracks=_run_tracks(run, files),
-        views=sequence.views if sequence else (),
+        views=views,
         mass=_mass(run, meta, sequence) if meta.get("metric", True) else None,
+        surface=None if fitted is None else load_surface(run, fitted, views),
     )
 
 
@@ -221,10 +228,10 @@ def _faces(side: Literal["right", "left"], vertex_count: int) -> Int[ndarray, "f
     return np.asarray(model.faces, dtype=np.int32)
 
 
-def _run_observation(run: Run, files: SequenceFiles) -> Observed | None:
+def _run_observation(run: Run, files: SequenceFiles, views: Listing[View]) -> Observed | None:
     clouds = files.observation("cloud"), files.observation("cloud_end")
     if all(run.has(name) for name in clouds):
-        return CloudSet(run.array(clouds[0]), run.array(clouds[1]))
+        return CloudSet(run.array(clouds[0]), run.array(clouds[1]), views)
     seen = files.observation("point"), files.observation("is_visible")
     if not all(run.has(name) for name in seen):
         return None

@@ -36,7 +36,7 @@ class Layers:
     nodes: bool = True
     """Object nodes."""
     surface: bool = False
-    """Surface of the object, laid through its nodes."""
+    """Smooth surface of the object, which follows its nodes."""
     controls: bool = True
     """Control nodes that hold the object by a virtual spring."""
     all_controls: bool = False
@@ -68,15 +68,24 @@ class Layers:
 
 
 def default_layers(content: Content) -> Layers:
-    """Choose what is shown at first: the result if there is one, else the recording."""
-    has_object = content.fitted is not None
+    """Choose what is shown at first: the result if there is one, else the recording.
+
+    Nodes and springs would hide the surface of an object, and come in its place if it has none.
+    """
+    has_object, has_surface = content.fitted is not None, content.surface is not None
     return Layers(
+        surface=has_surface,
+        nodes=not has_surface,
+        controls=not has_surface,
+        virtual_springs=not has_surface,
         observed=not has_object or (content.tracks is not None and content.tracks.node is not None),
         cameras=not has_object and bool(content.views),
-        object_springs=content.fitted is not None and _has_few_springs(content.fitted),
+        object_springs=content.fitted is not None
+        and not has_surface
+        and has_few_springs(content.fitted),
     )
 
 
-def _has_few_springs(rollout: ObjectRollout) -> bool:
+def has_few_springs(rollout: ObjectRollout) -> bool:
     """Return whether all springs fit into a playing frame; with them nodes look like cloth."""
     return rollout.model.object_spring_count <= PLAYING_SPRINGS

@@ -11,6 +11,7 @@ from app.previews.links import MOST_MARKERS, marker_links
 from physhandi.data.camera import triangulate
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
+from physhandi.metrics.photometric import seen_colors
 
 _POINTS = 5_000
 _GREEN = np.array([46, 160, 67], dtype=np.uint8)
@@ -42,9 +43,24 @@ class PointSet:
 class CloudSet:
     """Clouds of all frames, one after the other in one array."""
 
-    def __init__(self, point: Float[ndarray, "point 3"], end: Int[ndarray, " frame"]) -> None:
+    def __init__(
+        self,
+        point: Float[ndarray, "point 3"],
+        end: Int[ndarray, " frame"],
+        views: Listing[View] = (),
+    ) -> None:
+        """Keep the clouds.
+
+        Args:
+            point: Points of all frames.
+            end: Where each frame's points end.
+            views: Views that lend the points their colors.
+        """
         self._point = point
         self._end = end
+        self._views = [view for view in views if view.has_color and view.has_mask]
+        self._frame = 0
+        self._known: dict[int, UInt8[ndarray, "*point 3"]] = {}
 
     def points(self, frame: int) -> Float[ndarray, "point 3"]:
         """Find the cloud of a frame, thinned out [m]."""
@@ -52,11 +68,18 @@ class CloudSet:
             return np.zeros((0, 3), np.float32)
         start = int(self._end[frame - 1]) if frame > 0 else 0
         point = np.asarray(self._point[start : int(self._end[frame])], dtype=np.float32)
+        self._frame = frame
         return point[:: max(1, -(-len(point) // _POINTS))]
 
-    def colors(self) -> UInt8[ndarray, " 3"]:
-        """All points are green."""
-        return _GREEN
+    def colors(self) -> UInt8[ndarray, "*point 3"]:
+        """Give the colors that the views show where the points are; all green without views."""
+        frame = self._frame
+        if not self._views or frame >= self._views[0].frame_count:
+            return _GREEN
+        if frame not in self._known:
+            color = seen_colors(self._views, self.points(frame).astype(np.float64), frame=frame)
+            self._known[frame] = _GREEN if color is None else color
+        return self._known[frame]
 
 
 class DepthCloud:

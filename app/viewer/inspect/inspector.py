@@ -179,7 +179,6 @@ class Inspector:
                 rollout_frame=rollout_frame,
                 layers=scene.layers,
                 spacing=framing.spacing,
-                faces=scene.faces,
             )
             found = pick(ray, target, prefers_hand=prefers_hand)
         if found is not None:

@@ -76,14 +76,13 @@ class Target:
     """Which parts are drawn."""
     spacing: float
     """Typical distance of nodes [m]."""
-    faces: Int[ndarray, "face 3"]
-    """Triangles of the object's surface."""
 
 
 def pick(ray: Ray, target: Target, *, prefers_hand: bool = False) -> Pick | None:
     """Find what a click means; None if there is nothing near it.
 
-    Nodes come before springs, and both before the hand, through which they are seen.
+    Nodes come before springs, and both before the hand, through which they are seen; of the
+    object's surface and the hand the nearer one counts.
 
     Args:
         ray: Where it points.
@@ -91,12 +90,14 @@ def pick(ray: Ray, target: Target, *, prefers_hand: bool = False) -> Pick | None
         prefers_hand: Whether the hand comes first.
     """
     content, frame, layers = target.content, target.frame, target.layers
-    hand = _pick_hand(ray, content, frame) if layers.hands else None
+    hand, hand_depth = _pick_hand(ray, content, frame) if layers.hands else (None, np.inf)
     if prefers_hand and hand is not None:
         return hand
     found = None
     if target.rollout is not None:
         found = _pick_object(ray, target, target.rollout)
+        if found is None and layers.surface:
+            found = _pick_surface(ray, target, target.rollout, within=hand_depth)
     elif content.control is not None and layers.controls:
         at = _nearest(ray, np.asarray(content.control[frame]), target.spacing)
         found = None if at is None else Pick(kind="control", index=at[0])
@@ -115,7 +116,7 @@ def _pick_marker(ray: Ray, target: Target) -> Pick | None:
 
 def _pick_object(ray: Ray, target: Target, rollout: ObjectRollout) -> Pick | None:
     frame, layers = target.rollout_frame, target.layers
-    spacing, faces = target.spacing, target.faces
+    spacing = target.spacing
     position = np.asarray(rollout.position[frame], dtype=np.float64)
     control = np.asarray(rollout.control[frame], dtype=np.float64)
     count, own = rollout.model.node_count, rollout.model.object_spring_count
@@ -136,13 +137,22 @@ def _pick_object(ray: Ray, target: Target, rollout: ObjectRollout) -> Pick | Non
                 return Pick(kind="node", index=chosen)
             return Pick(kind="control", index=chosen - count)
     spring = _pick_spring(ray, point, rollout.model, frame, layers, spacing)
-    if spring is not None:
-        return Pick(kind="spring", index=spring)
-    hit = first_triangle(ray, position, faces) if layers.surface else None
-    if hit is None:
+    return None if spring is None else Pick(kind="spring", index=spring)
+
+
+def _pick_surface(
+    ray: Ray, target: Target, rollout: ObjectRollout, *, within: float
+) -> Pick | None:
+    """Find the node nearest to where the ray meets the object's surface, if it does so in time."""
+    position = np.asarray(rollout.position[target.rollout_frame], dtype=np.float64)
+    surface = target.content.surface
+    if surface is None or surface.node_count != len(position):
         return None
-    corners = faces[hit[0]]
-    return Pick(kind="node", index=int(corners[np.argmin(ray.offsets(position[corners])[0])]))
+    hit = first_triangle(ray, surface.place(position), surface.face)
+    if hit is None or hit[1] > within:
+        return None
+    place = ray.origin + hit[1] * ray.direction
+    return Pick(kind="node", index=int(np.argmin(np.linalg.norm(position - place, axis=1))))
 
 
 def _pick_spring(  # noqa: PLR0917  (a ray, what it may meet, and what of that is shown)
@@ -163,8 +173,8 @@ def _pick_spring(  # noqa: PLR0917  (a ray, what it may meet, and what of that i
     return None if at is None else int(spring[at[0]])
 
 
-def _pick_hand(ray: Ray, content: Content, frame: int) -> Pick | None:
-    """Find the vertex of the hand's surface that is nearest to where the ray enters it."""
+def _pick_hand(ray: Ray, content: Content, frame: int) -> tuple[Pick | None, float]:
+    """Find the vertex nearest to where the ray enters a hand, and how far away that is [m]."""
     best: tuple[float, Pick] | None = None
     for hand in content.hands:
         vertex = np.asarray(hand.vertex[min(frame, len(hand.vertex) - 1)], dtype=np.float64)
@@ -178,7 +188,7 @@ def _pick_hand(ray: Ray, content: Content, frame: int) -> Pick | None:
                 at = int(corners[np.argmin(ray.offsets(vertex[corners])[0])]), hit[1]
         if at is not None and (best is None or at[1] < best[0]):
             best = at[1], Pick(kind="hand", index=at[0], side=hand.side)
-    return None if best is None else best[1]
+    return (None, np.inf) if best is None else (best[1], best[0])
 
 
 def _nearest(

@@ -103,9 +103,7 @@ class LayersPanel:
         bind(server, guard, "theme", lambda _, __: self._turn_theme())
         self._prefers_dark = False
 
-    def replace(
-        self, content: Content, layers: Layers, framing: Framing, *, has_surface: bool = False
-    ) -> None:
+    def replace(self, content: Content, layers: Layers, framing: Framing) -> None:
         """Show the switches that a content needs, as its layers stand."""
         self._layers, self._framing = layers, framing
         layers.dark, layers.force_scale = self._is_dark, self._scale.value
@@ -114,7 +112,7 @@ class LayersPanel:
         is_there = {
             "hands": bool(content.hands or content.skeletons),
             "nodes": has_object,
-            "surface": has_surface,
+            "surface": content.surface is not None,
             "controls": has_control,
             "all_controls": has_object,
             "virtual_springs": has_object,

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import viser
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
 _GRID = {
@@ -14,6 +14,8 @@ _GRID = {
 }
 """Colors of the grid's thin and thick lines on a light and on a dark background."""
 
+_DARKEST = 32
+"""Least brightness of a mesh's own color, by which those of its vertices are divided."""
 _LINEAR = np.round(
     255
     * np.where(
@@ -57,27 +59,25 @@ class SceneNodes:
         name: str,
         vertex: Float[ndarray, "vertex 3"],
         face: Int[ndarray, "face 3"],
-        color: tuple[int, int, int],
+        color: tuple[int, int, int] | UInt8[ndarray, "vertex 3"],
         *,
         is_visible: bool,
         opacity: float | None = 0.62,
-        is_flat: bool = False,
     ) -> None:
-        """Draw a surface: semi-transparent or, without `opacity`, solid; smooth or in facets."""
-        node = self._nodes.get(name)
-        if node is None and is_visible:
-            self._nodes[name] = self._scene.add_mesh_simple(
-                name,
-                vertex,
-                face,
-                color=color,
-                opacity=opacity,
-                side="double",
-                flat_shading=is_flat,
-            )
-        elif node is not None and is_visible:
-            node.vertices, node.color = vertex, color
-            node.faces = np.asarray(face, dtype=np.uint32)
+        """Draw a surface of one color, or of a color each vertex.
+
+        viser's meshes have one color. The colors of vertices follow it in the same field, for our
+        own part of the page (`web_assets/scene_frame.js`); viser alone shows their mean.
+        """
+        node: Any = self._nodes.get(name)
+        if is_visible:
+            if node is None:
+                node = self._nodes[name] = self._scene.add_mesh_simple(
+                    name, vertex, face, opacity=opacity, side="double"
+                )
+            node.vertices, node.faces = vertex, np.asarray(face, dtype=np.uint32)
+            node.opacity = opacity
+            node.color = color if isinstance(color, tuple) else with_mean(color)
         self.show(name, is_visible=is_visible)
 
     def points(
@@ -247,6 +247,12 @@ class SceneNodes:
         cell, section = _GRID[is_dark]
         if node is not None and tuple(node.cell_color) != cell:
             node.cell_color, node.section_color = cell, section
+
+
+def with_mean(color: UInt8[ndarray, "vertex 3"]) -> UInt8[ndarray, "mean_and_vertex 3"]:
+    """Put the mean of colors before them; dark ones are brightened, since they divide others."""
+    mean = np.maximum(color.mean(axis=0, keepdims=True), _DARKEST)
+    return np.concatenate([mean.round().astype(np.uint8), color])
 
 
 def _sphere(radius: float) -> tuple[Float[ndarray, "vertex 3"], Int[ndarray, "face 3"]]:

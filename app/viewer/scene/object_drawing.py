@@ -7,103 +7,15 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from app.viewer.color.coloring import Painted
-from app.viewer.color.colormaps import UNKNOWN
 from app.viewer.content.layers import BLUE, GREY, PLAYING_SPRINGS, RED, YELLOW, Layers
 from app.viewer.scene.framing import Framing
 from app.viewer.scene.nodes import SceneNodes
 from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.object_surface import ObjectSurface
 
-STEPS = 24
-"""Colors of a colored surface."""
-_PLAIN = (92, 142, 230)
-_OPACITY = None
-
-
-class SurfaceDrawing:
-    """Draws a surface below one path of the scene; used by one thread."""
-
-    def __init__(self, nodes: SceneNodes, root: str) -> None:
-        self._nodes = nodes
-        self._root = f"{root}/object/surface"
-
-    def draw(
-        self,
-        position: Float[ndarray, "node 3"],
-        faces: Int[ndarray, "face 3"],
-        painted: Painted | None,
-        *,
-        is_visible: bool,
-    ) -> None:
-        """Bring the surface to a frame.
-
-        Args:
-            position: Object nodes [m].
-            faces: Triangles between them.
-            painted: The nodes' colors; None for one color.
-            is_visible: Whether it is shown.
-        """
-        is_visible = is_visible and len(faces) > 0
-        plain = f"{self._root}/plain"
-        is_plain = is_visible and painted is None
-        used, local = _compact(faces) if is_plain else _NOTHING
-        self._nodes.mesh(
-            plain, position[used], local, _PLAIN, is_visible=is_plain, opacity=_OPACITY
-        )
-        step = None if painted is None or not is_visible else face_steps(painted.level, faces)
-        for number in range(STEPS + 1):
-            self._facets(number, position, faces, step, painted)
-
-    def _facets(
-        self,
-        number: int,
-        position: Float[ndarray, "node 3"],
-        faces: Int[ndarray, "face 3"],
-        step: Int[ndarray, " face"] | None,
-        painted: Painted | None,
-    ) -> None:
-        """Draw the triangles of one step of the scale."""
-        name = f"{self._root}/step_{number:02d}"
-        chosen = faces[step == number] if step is not None else faces[:0]
-        if len(chosen) == 0 or painted is None:
-            self._nodes.show(name, is_visible=False)
-            return
-        used, local = _compact(chosen)
-        color = UNKNOWN
-        if number < STEPS:
-            ramp = painted.scale.ramp
-            at = round((number + 0.5) / STEPS * (len(ramp) - 1))
-            color = (int(ramp[at, 0]), int(ramp[at, 1]), int(ramp[at, 2]))
-        self._nodes.mesh(
-            name, position[used], local, color, is_visible=True, opacity=None, is_flat=True
-        )
-
-
-def face_steps(
-    level: Float[ndarray, " node"], faces: Int[ndarray, "face 3"]
-) -> Int[ndarray, " face"]:
-    """Tell which step of the scale each triangle has: the mean of its corners' levels.
-
-    Corners that are not known are left out; a triangle without known corners gets `STEPS`.
-    """
-    corner = level[faces]
-    is_known = np.isfinite(corner)
-    count = is_known.sum(axis=1)
-    mean = np.where(is_known, corner, 0.0).sum(axis=1) / np.maximum(count, 1)
-    step = np.minimum((mean * STEPS).astype(np.int64), STEPS - 1)
-    return np.where(count > 0, step, STEPS)
-
-
-_NOTHING = (np.zeros(0, np.int64), np.zeros((0, 3), np.uint32))
-
-
-def _compact(
-    faces: Int[ndarray, "face 3"],
-) -> tuple[Int[ndarray, " used"], Int[ndarray, "face 3"]]:
-    """Number the corners of triangles anew, without gaps; also gives the old numbers."""
-    used, local = np.unique(faces, return_inverse=True)
-    return used, local.reshape(-1, 3).astype(np.uint32)
-
+_PLAIN = (186, 190, 198)
+"""Color of a surface that nothing has seen."""
 
 RGB = tuple[int, int, int]
 
@@ -188,7 +100,7 @@ class Style:
     """Width of object springs in pixels."""
     virtual_width: float = 2.0
     """Width of virtual springs in pixels."""
-    arrow_width: float = 0.0022
+    arrow_width: float = 0.003
     """Width of force arrows as a part of the scene's extent."""
 
 
@@ -211,7 +123,6 @@ class ObjectDrawing:
         self._root = root
         self._style = style or Style()
         self._balls = nodes.spheres if self._style.is_solid else nodes.points
-        self._surface = SurfaceDrawing(nodes, root)
         self._model_shown: tuple[ObjectRollout, int | None] | None = None
         self._attached: Int[ndarray, " control"] = np.zeros(0, np.int64)
 
@@ -242,7 +153,7 @@ class ObjectDrawing:
         force_unit: float,
         longest: float,
         painted: Painted | None = None,
-        faces: Int[ndarray, "face 3"] | None = None,
+        surface: ObjectSurface | None = None,
     ) -> None:
         """Bring the object to a frame.
 
@@ -253,8 +164,9 @@ class ObjectDrawing:
             budget: How much may be sent.
             force_unit: Length of an arrow of 1 N.
             longest: No arrow is longer than this.
-            painted: Colors of nodes and springs; None for those of the style.
-            faces: Triangles between the nodes; None without a surface.
+            painted: Colors of nodes, surface and springs; None for those of the style, and for
+                what the surface looks like.
+            surface: The object's surface; None if it has none.
         """
         root, count = self._root, rollout.model.object_spring_count
         position = np.asarray(rollout.position[frame], dtype=np.float32)
@@ -265,12 +177,8 @@ class ObjectDrawing:
         color = style.node if painted is None else painted.node[shown]
         is_visible = layers.nodes
         self._balls(f"{root}/object/nodes", position[shown], color, size, is_visible=is_visible)
-        self._surface.draw(
-            position,
-            np.zeros((0, 3), np.int32) if faces is None else faces,
-            painted,
-            is_visible=layers.surface,
-        )
+        if surface is not None and surface.node_count == len(position):
+            self._draw_surface(surface, position, painted, is_visible=layers.surface)
         self.draw_controls(control, self.attached(rollout, frame), layers)
         point = np.concatenate([position, control])
         own = np.arange(count)[_thinned(count, budget.springs)]
@@ -295,6 +203,23 @@ class ObjectDrawing:
         arrows = arrows[np.linalg.norm(arrows[:, 1] - arrows[:, 0], axis=-1) > shortest]
         width = style.arrow_width * self._framing.extent
         self._nodes.arrows(f"{root}/forces", arrows, style.arrow, width)
+
+    def _draw_surface(
+        self,
+        surface: ObjectSurface,
+        position: Float[ndarray, "node 3"],
+        painted: Painted | None,
+        *,
+        is_visible: bool,
+    ) -> None:
+        name = f"{self._root}/object/surface"
+        if not is_visible:
+            self._nodes.show(name, is_visible=False)
+            return
+        color = surface.color if painted is None else painted.vertices(surface)
+        vertex = surface.place(position)
+        shown = _PLAIN if color is None else color
+        self._nodes.mesh(name, vertex, surface.face, shown, is_visible=True, opacity=None)
 
     def draw_controls(
         self,

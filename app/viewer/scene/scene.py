@@ -6,8 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import viser
-from jaxtyping import Int
-from numpy import ndarray
 
 from app.viewer.color.coloring import Painted, Painter
 from app.viewer.color.hand_coloring import HandPainter
@@ -20,12 +18,10 @@ from app.viewer.scene.nodes import SceneNodes
 from app.viewer.scene.object_drawing import (
     Budget,
     ObjectDrawing,
-    SurfaceDrawing,
     automatic_force_unit,
     share_bytes,
 )
 from physhandi.object_rollout import ObjectRollout
-from physhandi.simulation.surface import triangulate_nodes
 
 FRAME_BYTES = 92_000
 """What a frame may weigh while the clock is running; springs and arrows give way."""
@@ -34,10 +30,12 @@ _PLAYING_ARROWS = 400
 _PLAYING_OBSERVED = 2_000
 _LEAST_BYTES = 12_000
 """Springs and arrows get at least this much of a playing frame."""
+_OBSERVED = 0.16
+"""Diameter of other observed points, in distances between nodes: through them all is seen."""
+_SEE_THROUGH = 0.62
+"""Opacity of hands through which nodes and springs are seen."""
 _FEW_POINTS = 100
 """So few observed points are markers, and drawn larger."""
-_MANY_NODES = 2_500
-"""The surface of more nodes is not laid before somebody asks for it."""
 
 
 class SceneDrawing:
@@ -71,10 +69,6 @@ class SceneDrawing:
         self._force_unit = automatic_force_unit(content.fitted, framing)
         self.painter = Painter(content)
         self.hand_painter = HandPainter(content)
-        self._skins = {
-            h.side: SurfaceDrawing(self._nodes, f"/skin/{h.side}") for h in content.hands
-        }
-        self._faces: Int[ndarray, "face 3"] | None = None
         self._cameras = CameraNodes(server, content.views, framing, clock)
         self._aim()
         add_ground(self._nodes, content, framing)
@@ -112,7 +106,7 @@ class SceneDrawing:
                     force_unit=self._force_unit,
                     longest=0.22 * self._framing.extent,
                     painted=painted,
-                    faces=self.faces if self.layers.surface else None,
+                    surface=self._content.surface,
                 )
             elif self._content.control is not None:
                 control = np.asarray(self._content.control[frame], dtype=np.float32)
@@ -125,23 +119,6 @@ class SceneDrawing:
             )
             self._draw_ground(rollout)
             self._nodes.color_ground("/ground", is_dark=self.layers.dark)
-
-    @property
-    def may_have_surface(self) -> bool:
-        """Whether there are triangles; of many nodes it is not yet known."""
-        fitted = self._content.fitted
-        if fitted is None:
-            return False
-        return fitted.model.node_count > _MANY_NODES or len(self.faces) > 0
-
-    @property
-    def faces(self) -> Int[ndarray, "face 3"]:
-        """Triangles between the object's nodes; none where they have no surface."""
-        if self._faces is None:
-            fitted = self._content.fitted
-            node = np.zeros((0, 3)) if fitted is None else fitted.model.object_node
-            self._faces = triangulate_nodes(node)
-        return self._faces
 
     def hide(self) -> None:
         """Hide everything until the next frame is drawn."""
@@ -178,15 +155,28 @@ class SceneDrawing:
             else:
                 of_hand = painted.get(hand.side)
                 is_plain = is_visible and of_hand is None
-                self._nodes.mesh(name, vertex, hand.face, color, is_visible=is_plain)
+                self._nodes.mesh(
+                    name, vertex, hand.face, color, is_visible=is_plain, opacity=self._hand_opacity
+                )
                 is_painted = is_visible and of_hand is not None
-                self._skins[hand.side].draw(vertex, hand.face, of_hand, is_visible=is_painted)
+                color = SKIN[hand.side] if of_hand is None else of_hand.node
+                name = f"/skin/{hand.side}"
+                self._nodes.mesh(
+                    name, vertex, hand.face, color, is_visible=is_painted, opacity=None
+                )
         for index, skeleton in enumerate(self._content.skeletons):
             bones = skeleton[frame][BONES]
             bones = bones[np.isfinite(bones).all(axis=(1, 2))]
             self._nodes.segments(
                 f"/hand/skeleton_{index}", bones, SKIN["right"], 4.0, is_visible=is_visible
             )
+
+    @property
+    def _hand_opacity(self) -> float | None:
+        """How much hands hide: all where there is no overlay that is to be seen through them."""
+        layers = self.layers
+        has_overlay = layers.nodes or layers.controls or layers.virtual_springs
+        return _SEE_THROUGH if has_overlay or layers.all_controls else None
 
     def _draw_observed(
         self,
@@ -210,7 +200,7 @@ class SceneDrawing:
             distance = self.painter.errors.points(point[::every], rollout, rollout_frame)
             color = painted.scale.paint(distance)
         is_few = len(point) <= _FEW_POINTS
-        size = 0.012 * self._framing.extent if is_few else 0.4 * self._framing.spacing
+        size = 0.012 * self._framing.extent if is_few else _OBSERVED * self._framing.spacing
         self._nodes.points("/observed", point[::every], color, size, is_visible=True)
 
     def _draw_lines_of_markers(
@@ -241,11 +231,10 @@ class SceneDrawing:
         point_count += _PLAYING_OBSERVED if layers.observed else 0
         if layers.hands:
             point_count += sum(hand.vertex.shape[1] for hand in self._content.hands)
-        if layers.surface:
-            # Where colors divide the surface, triangles are sent as well, and corners twice.
-            node_count = len(np.unique(self.faces))
-            is_plain = layers.color == "plain"
-            point_count += node_count if is_plain else 2 * node_count + len(self.faces)
+        surface = self._content.surface
+        if layers.surface and surface is not None:
+            point_count += surface.vertex_count
+            point_count += 0 if layers.color == "plain" else surface.vertex_count // 4
         left = self._frame_bytes - 12 * point_count
         budget = share_bytes(left, rollout, layers, _PLAYING_ARROWS)
         if left >= _LEAST_BYTES or not layers.surface:

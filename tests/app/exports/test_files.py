@@ -17,6 +17,7 @@ from viser_file import Recording
 from app.exports.request import FileRequest
 from app.exports.schema import MEDIA_TYPES
 from physhandi.fitted_object import FittedObject
+from physhandi.object_rollout import load_fitted, load_surface
 from physhandi.run import Run
 from physhandi.simulation.simulator import Simulator
 
@@ -105,8 +106,11 @@ def test_recordings_come_as_files_and_as_pages(
     world: World, made: list[FileRequest], run: Run
 ) -> None:
     recording = Recording.read(fetch(world, "viser"))
-    shown = recording.at(recording.seconds)["/object/nodes"]["points"].reshape(-1, 3)
-    np.testing.assert_allclose(shown, rollout(run)[-1], atol=2e-4)
+    scene = recording.at(recording.seconds)
+    shown = scene["/object/surface"]["vertices"].reshape(-1, 3)
+    surface = load_surface(run, load_fitted(run, "sheet"), ())
+    np.testing.assert_allclose(shown, surface.place(rollout(run)[-1]), atol=2e-4)
+    assert len(scene["/object/surface"]["color"]) == 3  # It was never filmed in color.
     page = world.script().get(f"{RUN}?format=html")
     assert "__VISER_EMBED_DATA__" in page.text
     assert page.headers["content-security-policy"].startswith("default-src 'none'")

@@ -10,6 +10,7 @@ import viser
 
 from app.exports.scene_picture import BACKGROUND, draw_scene
 from app.viewer.content.session_state import Pose
+from app.viewer.scene.nodes import with_mean
 from app.viewer.scene.scene_server import start_viser
 
 RED, BLUE, GRAY = (200, 10, 10), (10, 10, 200), (100, 100, 100)
@@ -246,3 +247,18 @@ def test_nodes_are_placed_by_all_that_they_hang_on(server: viser.ViserServer, sc
     focal = FOCAL * 300 / 2.5
     assert column.mean() == pytest.approx(149.5 + 0.3 * focal, abs=0.5)
     assert row.mean() == pytest.approx(149.5 - 0.3 * focal, abs=0.5)
+
+
+def test_colors_of_vertices_follow_that_of_their_mesh(
+    server: viser.ViserServer, scene: Any
+) -> None:
+    mesh = scene.add_mesh_simple("/square", SQUARE, QUAD, side="double")
+    top_is_red = np.array([BLUE, BLUE, RED, RED], np.uint8)
+    mesh.color = with_mean(top_is_red)
+    image = draw(server)
+    red, blue = covered(image, 0), covered(image, 2)
+    assert red.sum() > 1_000
+    assert blue.sum() > 1_000
+    assert np.argwhere(red)[:, 0].max() < np.argwhere(blue)[:, 0].min()
+    mesh.color = RED
+    assert covered(draw(server), 0).sum() > 2 * red.sum()

@@ -33,7 +33,7 @@ def test_the_command_paints_what_a_link_shows(world: World, tmp_path: Path) -> N
 def test_a_link_that_changes_parameters_is_simulated(
     world: World, run: Run, tmp_path: Path
 ) -> None:
-    options = ExportOptions(format="npz", out=tmp_path / "a.npz", link="drag=9&f=3")
+    options = ExportOptions(format="npz", out=tmp_path / "a.npz", link="drag=9&f=3&show=nodes")
     with np.load(export(run, options, world.catalog)) as arrays:
         changed = arrays["rollout"]
     plain = replace(options, link="f=3", out=tmp_path / "b.npz")

@@ -105,7 +105,6 @@ def test_only_an_attached_spring_can_be_clicked(take: ObjectRollout) -> None:
             rollout_frame=frame,
             layers=Layers(nodes=False, controls=False, hands=False),
             spacing=0.1,
-            faces=np.zeros((0, 3), np.int32),
         )
         return pick(Ray(origin=eye, direction=np.array([0.0, 1.0, 0.0]), pixel=1e-3), target)
 

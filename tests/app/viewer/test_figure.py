@@ -156,10 +156,10 @@ def test_both_sides_are_shown_in_one_scale_and_the_scene_comes_back(
         return len(units[0]) == 1 and np.allclose(unit, unit[0], rtol=1e-3, atol=0)
 
     client.until(is_to_scale)
-    client.until(lambda: client.visible.get("/object/nodes") is False)
+    client.until(lambda: client.visible.get("/object/surface") is False)
     client.tell_camera()
     client.set("Back to the scene", True)
-    client.until(lambda: client.visible["/object/nodes"] and client.camera["fov"] > 0.5)
+    client.until(lambda: client.visible["/object/surface"] and client.camera["fov"] > 0.5)
     client.until(lambda: client.camera["look_at"] == pytest.approx([0, 0, 0]))
     client.until(lambda: client.camera["position"] == pytest.approx([1, 1, 1]))
     assert session._comparison._view is None

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -46,5 +48,9 @@ def test_the_overview_stands_between_the_recording_cameras(catalog, recording) -
 def test_a_run_hides_the_recording_at_first_and_a_recording_shows_it(catalog, recording) -> None:
     of_run = default_layers(open_run(catalog, "sheet"))
     of_recording = default_layers(open_sequence(catalog, recording.sequence.name))
-    assert (of_run.observed, of_run.cameras, of_run.object_springs) == (False, False, True)
+    assert (of_run.observed, of_run.cameras) == (False, False)
+    # Springs would hide the surface, and come in its place where there is none.
+    assert (of_run.surface, of_run.nodes, of_run.object_springs) == (True, False, False)
+    bare = default_layers(replace(open_run(catalog, "sheet"), surface=None))
+    assert (bare.surface, bare.nodes, bare.object_springs) == (False, True, True)
     assert (of_recording.observed, of_recording.cameras) == (True, True)

@@ -18,6 +18,7 @@ from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+from app.settings import WEB_ASSETS
 from app.viewer.content.session_state import SessionState
 from app.viewer.gate import create_gate
 from app.viewer.sessions import Sessions
@@ -58,13 +59,15 @@ def fetch(url: str, **headers: str) -> tuple[int, bytes]:
             return error.code, error.read()
 
 
-def test_the_page_is_viser_s_own_and_nothing_else_is_served(address, sessions) -> None:
+def test_the_page_is_viser_s_with_one_script_and_nothing_else_is_served(address, sessions) -> None:
     session = sessions.open("run", "sheet", "me")
     page = Path(viser.__file__).parent / "client" / "build" / "index.html"
+    script = (WEB_ASSETS / "scene_frame.js").read_bytes()
+    expected = page.read_bytes().replace(b"</head>", b"<script>%b</script></head>" % script)
     base = f"http://{address}/viewer/{session}"
-    assert fetch(f"{base}/") == (200, page.read_bytes())
+    assert fetch(f"{base}/") == (200, expected)
     status, packed = fetch(f"{base}/", **{"Accept-Encoding": "gzip"})
-    assert (status, gzip.decompress(packed)) == (200, page.read_bytes())
+    assert (status, gzip.decompress(packed)) == (200, expected)
     for path in (
         "/index.html",
         "/../../../etc/passwd",
@@ -86,7 +89,7 @@ def test_a_client_gets_the_scene_through_the_gate(address, sessions, slash) -> N
     session = sessions.open("run", "sheet", "me")
     with ViewerClient(f"ws://{address}/viewer/{session}{slash}") as client:
         assert client.connection.subprotocol == PROTOCOL
-        client.until(lambda: {"/object/nodes", "/springs/virtual"} <= set(client.nodes))
+        client.until(lambda: {"/object/surface", "/forces"} <= set(client.nodes))
         client.until(lambda: "object springs" in client.texts())
         client.until(lambda: sessions.list()[0].client_count == 1)
     until(lambda: sessions.list()[0].client_count == 0)
@@ -122,7 +125,7 @@ def test_another_browser_finds_nothing(address, sessions) -> None:
         headers = {"X-Owner": owner}
         if allowed:
             with ViewerClient(address, additional_headers=headers) as client:
-                client.until(lambda: "/object/nodes" in client.nodes)
+                client.until(lambda: "/object/surface" in client.nodes)
         else:
             with pytest.raises(InvalidStatus) as refused:
                 ViewerClient(address, additional_headers=headers)
@@ -179,7 +182,7 @@ def has_heard_all(state: SessionState) -> bool:
     assert state.pose is not None
     return (
         (state.speed, state.theme, state.layers.dark) == (0.5, "dark", True)
-        and not state.layers.virtual_springs
+        and state.layers.nodes
         and state.pose.position.tolist() == [0.3, 0.2, 0.1]
         and (state.frame, state.is_playing) == (7, False)
     )
@@ -199,7 +202,7 @@ def test_a_second_tab_gets_a_copy_with_the_same_state(address, sessions) -> None
         hear_all(sessions.get(session)._server, client)
         rest_at(client, 7)
         client.set("Speed", 0.5)
-        client.set("Virtual springs", False)
+        client.set("Object nodes", True)
         client.set("Background", "dark")
         client.set("stiffness", -1.0)
         client.tell_camera(position=(0.3, 0.2, 0.1), look_at=(0.0, 0.1, 0.0))
@@ -213,14 +216,14 @@ def test_a_second_tab_gets_a_copy_with_the_same_state(address, sessions) -> None
         assert (state.sequence_name, state.frame, state.is_playing) == ("drag", 7, False)
         assert (state.speed, state.theme) == (0.5, "dark")
         assert state.parameters.stiffness_scale == pytest.approx(0.1)
-        assert (state.layers.virtual_springs, state.layers.dark) == (False, True)
+        assert (state.layers.nodes, state.layers.dark) == (True, True)
         with ViewerClient(f"ws://{address}/viewer/{copied.id}") as second:
             second.until(lambda: f"simulated {FRAMES}/{FRAMES}" in second.texts())
             second.until(lambda: " from the fitted rollout" in second.texts())
             second.until(lambda: {"/object/nodes", "/forces"} <= set(second.nodes))
             second.until(lambda: first_positions(second)[-1:] == [pytest.approx((0.3, 0.2, 0.1))])
-            names = ("Sequence", "Frame", "Speed", "stiffness", "Virtual springs", "Background")
-            wanted = ["drag", 7, 0.5, -1.0, False, "dark"]
+            names = ("Sequence", "Frame", "Speed", "stiffness", "Object nodes", "Background")
+            wanted = ["drag", 7, 0.5, -1.0, True, "dark"]
             second.until(lambda: [second.value(name) for name in names] == wanted)
             assert "/springs/virtual" not in second.nodes
             fitted = own._content.fitted.position[7]

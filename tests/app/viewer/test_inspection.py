@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from viewer_client import ViewerClient
-from viewer_world import PARAMETERS, hear_all, rest_at
+from viewer_world import PARAMETERS, hear_all, rest_at, show_parts
 
 from app.keys import KEYS, LAYER_KEYS, Key
 from app.viewer.color.colormaps import table
@@ -19,7 +19,7 @@ def paused(sessions, run):
     position = run.array("sequences/lift/rollout.npy")
     session = sessions.get(sessions.open("run", "sheet", "me"))
     with ViewerClient(f"ws://127.0.0.1:{session.port}") as client:
-        client.until(lambda: "/object/nodes" in client.nodes)
+        show_parts(client)
         rest_at(client, FRAME)
         client.until(lambda: session._playback.frame == FRAME and not session._playback.is_playing)
         client.until(lambda: np.array_equal(shown(client), position[FRAME]))
@@ -140,25 +140,34 @@ def test_colors_are_sent_only_when_they_change(paused, run) -> None:
     client.until(lambda: sent("colors") > before)
 
 
-def test_a_surface_is_drawn_plain_and_in_colors(paused) -> None:
-    _, client = paused
-    press(client, "3")
-    client.until(lambda: "/object/surface/plain" in client.nodes)
-    faces = client.array("/object/surface/plain", "faces")
-    assert len(faces) == 2 * 8 * 8
-    client.set("Color by", "strain")
-
-    def parts() -> list[str]:
-        return [
-            n for n in client.nodes if "surface/step" in n and client.visible.get(n) is not False
-        ]
-
-    client.until(lambda: client.visible.get("/object/surface/plain") is False)
-    client.until(lambda: len(parts()) > 1)
-    client.until(lambda: sum(len(client.array(n, "faces")) for n in parts()) == 128)
-    assert all(client.nodes[name]["flat_shading"] for name in parts())
-    press(client, "3")
-    client.until(lambda: not parts())
+def test_a_scene_opens_on_the_surface_which_is_drawn_plain_and_in_colors(sessions, run) -> None:
+    position = run.array("sequences/lift/rollout.npy")
+    session = sessions.get(sessions.open("run", "sheet", "me"))
+    with ViewerClient(f"ws://127.0.0.1:{session.port}") as client:
+        client.until(lambda: "/object/surface" in client.nodes)
+        rest_at(client, FRAME)
+        client.until(lambda: session._playback.frame == FRAME and not session._playback.is_playing)
+        # It came with hand and forces alone: nothing else was sent.
+        assert not [n for n in client.nodes if n.startswith(("/object/nodes", "/springs"))]
+        surface = session._content.surface
+        expected = surface.place(position[FRAME])
+        client.until(lambda: np.array_equal(client.array("/object/surface", "vertices"), expected))
+        np.testing.assert_array_equal(client.array("/object/surface", "faces"), surface.face)
+        # No view has seen this object: it has one color.
+        assert len(client.nodes["/object/surface"]["color"]) == 3
+        client.set("Color by", "speed")
+        count = 3 * (1 + surface.vertex_count)
+        client.until(lambda: len(client.nodes["/object/surface"]["color"]) == count)
+        color = np.frombuffer(bytes(client.nodes["/object/surface"]["color"]), np.uint8)
+        color = color.reshape(-1, 3)
+        np.testing.assert_allclose(color[0], np.maximum(color[1:].mean(axis=0), 32), atol=0.5)
+        painted = session._view.scene.painter.paint(
+            session._content.fitted, FRAME, session._view.scene.layers
+        )
+        np.testing.assert_array_equal(color[1:], painted.vertices(surface))
+        assert len(np.unique(color[1:], axis=0)) > 20
+        press(client, "3")
+        client.until(lambda: client.visible.get("/object/surface") is False)
 
 
 def test_a_click_reads_a_node_and_its_history_until_escape(paused, run) -> None:

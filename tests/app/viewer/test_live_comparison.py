@@ -80,7 +80,7 @@ def test_the_fit_is_kept_while_sliders_move_the_other(client: ViewerClient, run:
     client.set("Keep as A", "the fit")
     client.until(lambda: "/compare/b/object/compared" in client.nodes)
     client.until(lambda: "mean 0 mm" in said(client) and "equal parameters" in said(client))
-    client.until(lambda: client.visible.get("/object/nodes") is False)
+    client.until(lambda: client.visible.get("/object/surface") is False)
     client.set("stiffness", -1.5)
     client.until(lambda: "From A to B: stiffness" in said(client))
     client.until(lambda: is_done(client) and mean_difference(client) > 0.1)
@@ -95,7 +95,7 @@ def test_the_fit_is_kept_while_sliders_move_the_other(client: ViewerClient, run:
     client.until(lambda: told in said(client))
     client.until(lambda: is_fitted(client, "b", fitted))
     client.set("Stop comparing", True)
-    client.until(lambda: client.visible["/object/nodes"] is True)
+    client.until(lambda: client.visible["/object/surface"] is True)
     client.until(lambda: client.find("Colors of A and B") == "")
 
 
@@ -113,7 +113,7 @@ def test_a_key_compares_with_what_was_kept_last_or_with_the_fit(
     client.set("Keep as A", "this rollout")
     client.until(lambda: "mean 0 mm" in said(client))
     press(client, "V")
-    client.until(lambda: client.visible.get("/object/nodes") is True)
+    client.until(lambda: client.visible.get("/object/surface") is True)
     # What was kept is on the screen itself, so that the fit tells more.
     press(client, "V")
     client.until(lambda: client.find("Colors of A and B") != "")

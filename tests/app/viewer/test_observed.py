@@ -50,7 +50,6 @@ def test_a_click_tells_a_marker_and_how_far_its_neighbors_are(content):
         rollout_frame=0,
         layers=Layers(observed=True),
         spacing=0.02,
-        faces=np.zeros((0, 3), np.int32),
     )
     found = pick(ray, target)
     assert found == Pick(kind="marker", index=2)

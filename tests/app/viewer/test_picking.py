@@ -1,13 +1,15 @@
 """Clicks at places of which it is known what lies there."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from viewer_world import content_of, controls
 
 from app.viewer.content.layers import Layers
 from app.viewer.inspect.picking import Pick, Ray, Target, first_triangle, nearest_on_segments, pick
+from physhandi.simulation.object_surface import lay_surface
 
-NO_FACES = np.zeros((0, 3), np.int32)
 EYE = np.array([0.0, 0.0, 1.0])
 
 
@@ -24,7 +26,7 @@ def world():
     return content_of({"right": (vertex, face)}, controls((0, 0, 1)))
 
 
-def target_of(world, layers, faces=NO_FACES, spacing=0.025):
+def target_of(world, layers, spacing=0.025):
     return Target(
         content=world,
         rollout=world.fitted,
@@ -32,12 +34,11 @@ def target_of(world, layers, faces=NO_FACES, spacing=0.025):
         rollout_frame=0,
         layers=layers,
         spacing=spacing,
-        faces=faces,
     )
 
 
-def click(world, target, *, layers, faces=NO_FACES, **options):
-    return pick(ray_to(target), target_of(world, layers, faces), **options)
+def click(world, target, *, layers, **options):
+    return pick(ray_to(target), target_of(world, layers), **options)
 
 
 def test_a_click_on_a_node_finds_it_through_the_hand(world):
@@ -78,13 +79,16 @@ def test_a_control_node_is_found_where_it_holds_the_object(world):
     assert click(world, target, layers=layers) == Pick(kind="control", index=int(held[3]))
 
 
-def test_on_the_surface_the_nearest_corner_counts(world):
+def test_on_the_surface_the_nearest_node_counts_unless_a_hand_is_before_it(world):
     layers = Layers(nodes=False, controls=False, virtual_springs=False, hands=False, surface=True)
     node = world.fitted.position[0]
-    faces = np.array([[0, 1, 9], [1, 10, 9]], np.int32)
-    inside = 0.6 * node[9] + 0.2 * node[0] + 0.2 * node[1]
-    assert click(world, inside, layers=layers, faces=faces) == Pick(kind="node", index=9)
-    assert click(world, node[80], layers=layers, faces=faces) is None
+    shown = replace(world, surface=lay_surface(node, kind="sheet"))
+    inside = 0.6 * node[20] + 0.2 * node[11] + 0.2 * node[12]
+    assert click(shown, inside, layers=layers) == Pick(kind="node", index=20)
+    assert click(shown, node[80] + [0.1, 0.1, 0.0], layers=layers) is None
+    assert click(world, inside, layers=layers) is None
+    # The hand is a sheet above the object.
+    assert click(shown, inside, layers=replace(layers, hands=True)).kind == "hand"
 
 
 def test_a_click_beside_everything_finds_nothing(world):

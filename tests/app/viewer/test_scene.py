@@ -11,6 +11,7 @@ from app.viewer.content.layers import PLAYING_SPRINGS
 from app.viewer.scene.framing import frame_content
 from app.viewer.scene.scene import SceneDrawing
 from physhandi.object_rollout import ObjectRollout
+from physhandi.simulation.object_surface import lay_surface
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.topology import build_model
 
@@ -45,6 +46,7 @@ def large_content() -> Content:
         ),
         control=control,
         fitted=fitted,
+        surface=lay_surface(node, kind="solid"),
     )
 
 
@@ -64,8 +66,9 @@ def test_a_large_scene_is_thinned_while_it_plays_and_whole_when_it_rests(
     assert take is not None
     assert take.model.object_spring_count > 10 * PLAYING_SPRINGS
     scene = SceneDrawing(server, content, frame_content(content))
-    scene.layers.object_springs = True
-    scene.layers.color, scene.layers.surface = color, surface
+    layers = scene.layers
+    layers.object_springs = layers.virtual_springs = layers.controls = layers.nodes = True
+    layers.color, layers.surface = color, surface
     springs = "/springs/object" if color == "plain" else "/springs/object_painted"
     scene.draw(0, take, 0, is_playing=True)
     with ViewerClient(f"ws://127.0.0.1:{server.get_port()}") as client:

@@ -9,7 +9,16 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 from viewer_client import ViewerClient
-from viewer_world import FRAMES, PARAMETERS, FakeSettings, controls, hear_all, rest_at, sheet
+from viewer_world import (
+    FRAMES,
+    PARAMETERS,
+    FakeSettings,
+    controls,
+    hear_all,
+    rest_at,
+    sheet,
+    show_parts,
+)
 from waiting import WatchedLock, until
 
 from app.viewer import session
@@ -37,7 +46,8 @@ def open_tab(sessions: Sessions) -> tuple[str, ViewerClient]:
 
 
 def stop_at(client: ViewerClient, frame: int) -> None:
-    client.until(lambda: "object springs" in client.texts() and "/object/nodes" in client.nodes)
+    client.until(lambda: "object springs" in client.texts())
+    show_parts(client)
     rest_at(client, frame)
 
 

@@ -12,8 +12,8 @@ from physhandi.data.view import View
 from physhandi.metrics.photometric import (
     Drawing,
     draw_nodes,
-    frame_0_colors,
     photometric_curves,
+    seen_colors,
     shaded_psnr,
     silhouette_iou,
 )
@@ -102,12 +102,12 @@ def grid() -> np.ndarray:
 
 
 def test_nodes_have_the_color_of_their_pixel_or_of_their_neighbour(view: View) -> None:
-    found = frame_0_colors([view], grid())
+    found = seen_colors([view], grid())
     assert found is not None
     node = grid()
     np.testing.assert_array_equal(found[node[:, 0] < 0], np.broadcast_to(RED, (100, 3)))
     np.testing.assert_array_equal(found[node[:, 0] > 0], np.broadcast_to(BLUE, (101, 3)))
-    assert frame_0_colors([view], grid() + np.array([0.0, 5.0, 0.0])) is None
+    assert seen_colors([view], grid() + np.array([0.0, 5.0, 0.0])) is None
 
 
 def test_views_that_look_straight_at_a_surface_decide_its_color(view: View, tmp_path: Path) -> None:
@@ -121,10 +121,10 @@ def test_views_that_look_straight_at_a_surface_decide_its_color(view: View, tmp_
     pose[:3] = [[half, 0, -high, high], [0, -1, 0, 0], [-high, 0, -half, half]]
     aside = View(folder, "scene", replace(CAMERA, T_world_camera=pose), 1)
     point, up = np.array([[-0.02, 0.0, 0.0]]), np.array([[0.0, 0.0, -1.0]])
-    both = frame_0_colors([view, aside], point)
+    both = seen_colors([view, aside], point)
     np.testing.assert_allclose(both, [[100, 0, 100]], atol=1)
     # The cosine of 60° to the fourth power is 1/16.
-    straight = frame_0_colors([view, aside], point, up)
+    straight = seen_colors([view, aside], point, up)
     np.testing.assert_allclose(straight, [[200 * 16 / 17, 0, 200 / 17]], atol=1)
 
 
@@ -134,8 +134,8 @@ def test_with_normals_pixels_at_the_outline_lend_no_color(view: View) -> None:
     image[30, 20] = (0, 255, 0)
     cv2.imwrite(str(next(iter(view.files("color")))), image[..., ::-1])
     up = np.tile([0.0, 0.0, 1.0], (2, 1))
-    assert frame_0_colors([view], rim)[0].tolist() == [0, 255, 0]
-    assert frame_0_colors([view], rim, up).tolist() == [list(RED), list(RED)]
+    assert seen_colors([view], rim)[0].tolist() == [0, 255, 0]
+    assert seen_colors([view], rim, up).tolist() == [list(RED), list(RED)]
 
 
 def test_the_right_motion_beats_standing_still(view: View) -> None:

@@ -75,6 +75,9 @@ def test_a_surface_moves_with_its_nodes(node, kind):
     value = surface.carry(node[:, 0])
     offset = surface.place(node)[:, 0] - value
     assert np.abs(offset).max() < (0.02 if kind == "rope" else 1e-5)
+    # None is beyond all others, which the ends of a rope would be.
+    ends = (node[:, 0] > 0.9).astype(float)
+    assert (surface.carry(ends).min(), surface.carry(ends).max()) == (0.0, 1.0)
 
 
 def test_a_rope_becomes_a_tube_of_its_thickness():
@@ -118,6 +121,18 @@ def test_unknown_values_stay_unknown_around_their_nodes():
     place, carried = surface.place(node), surface.carry(value)
     assert np.isnan(carried[place[:, 0] < 0.4]).all()
     np.testing.assert_allclose(carried[place[:, 0] > 0.6], 7.0, rtol=1e-5)
+
+
+def test_a_shell_of_scattered_nodes_is_closed_and_keeps_its_inside_empty():
+    index = np.arange(400) + 0.5
+    height, turn = 1 - 2 * index / 400, np.pi * (1 + 5**0.5) * index
+    ring = np.sqrt(1 - height**2)
+    node = np.stack([ring * np.cos(turn), ring * np.sin(turn), height], axis=1)
+    surface = lay_surface(node, kind="shell")
+    vertex = surface.place(node).astype(float)
+    assert euler(surface.face) == 2
+    assert np.linalg.norm(vertex, axis=1) == pytest.approx(0.99, abs=0.01)
+    assert volume(vertex, surface.face) == pytest.approx(4 / 3 * np.pi, rel=0.05)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,102 @@
+"use strict";
+
+/* Part of viser's page wherever we show it, live, as a replay or in a file: what it lacks for our scenes.
+
+   Meshes of viser have one color. Where more bytes follow that, they are the colors of the vertices.
+   Until the first frame is drawn, the page is covered: its parts come one by one. */
+
+{
+  const LONGEST_MS = 10000;
+  const SHOWN = ["MeshMessage", "PointCloudMessage", "LineSegmentsMessage", "CameraFrustumMessage", "BatchedMeshesMessage"];
+  const LINEAR = Float32Array.from({ length: 256 }, (_, value) => (value < 10.32 ? value / 3294.6 : ((value / 255 + 0.055) / 1.055) ** 2.4));
+  const given = new WeakMap();
+
+  function meshOf(group, count) {
+    let found = null;
+    group.traverse((part) => {
+      if (!found && part.isMesh && part.geometry.getAttribute("position")?.count === count) found = part;
+    });
+    return found;
+  }
+
+  /* Colors of vertices are multiplied with that of the mesh. */
+  function fill(attribute, colors) {
+    for (let place = 3; place < colors.length; place += 1) attribute.array[place - 3] = LINEAR[colors[place]] / LINEAR[colors[place % 3]];
+    attribute.needsUpdate = true;
+    given.set(attribute, colors);
+  }
+
+  function paint(group, colors) {
+    const count = colors.length / 3 - 1;
+    const mesh = meshOf(group, count);
+    if (!mesh) return false;
+    const { geometry, material } = mesh;
+    const place = geometry.getAttribute("position");
+    let attribute = geometry.getAttribute("color");
+    if (material.vertexColors && attribute?.count === count && given.get(attribute) === colors) return false;
+    if (attribute?.count !== count) {
+      attribute = new place.constructor(new Float32Array(3 * count), 3);
+      geometry.setAttribute("color", attribute);
+    }
+    if (given.get(attribute) !== colors) fill(attribute, colors);
+    if (!material.vertexColors) {
+      material.vertexColors = true;
+      material.needsUpdate = true;
+    }
+    return true;
+  }
+
+  function unpaint(group) {
+    let isChanged = false;
+    group.traverse((part) => {
+      if (!part.isMesh || !part.material.vertexColors || !part.geometry.getAttribute("color")) return;
+      part.material.vertexColors = false;
+      part.material.needsUpdate = true;
+      isChanged = true;
+    });
+    return isChanged;
+  }
+
+  const painted = new Set();
+
+  function follow() {
+    requestAnimationFrame(follow);
+    const [tree, viewer] = [window.__viserSceneTree, window.__viserMutable];
+    if (!tree || !viewer) return;
+    let [isChanged, hasContent] = [false, false];
+    for (const [name, node] of Object.entries(tree.getState())) {
+      const colors = node?.message.type === "MeshMessage" ? node.message.props.color : [];
+      const group = viewer.nodeRefFromName[name];
+      if (!group) continue;
+      hasContent ||= SHOWN.includes(node.message.type);
+      if (colors.length > 3) {
+        painted.add(name);
+        isChanged = paint(group, colors) || isChanged;
+      } else if (painted.delete(name)) {
+        isChanged = unpaint(group) || isChanged;
+      }
+    }
+    if (isChanged) viewer.requestRender();
+    else if (hasContent) uncover();
+  }
+
+  /* Here is no body yet, so that nothing is seen before. */
+  const cover = document.documentElement.appendChild(document.createElement("div"));
+  const isDark = window.__VISER_EMBED_CONFIG__?.darkMode ?? (location.search.includes("darkMode") || matchMedia("(prefers-color-scheme: dark)").matches);
+  const [ground, ink] = isDark ? ["#1a1b1e", "#9aa3af"] : ["#fff", "#6b7480"];
+  cover.textContent = "Opening the scene …";
+  cover.style.cssText = `position:fixed;inset:0;z-index:100000;display:grid;place-items:center;background:${ground};color:${ink};font:15px system-ui,sans-serif;transition:opacity .2s`;
+
+  function uncover() {
+    if (!cover.isConnected || cover.style.opacity) return;
+    /* What is in the scene now is drawn in the next frame. */
+    requestAnimationFrame(() => requestAnimationFrame(() => {
+      cover.style.opacity = "0";
+      cover.style.pointerEvents = "none";
+      setTimeout(() => cover.remove(), 250);
+    }));
+  }
+
+  setTimeout(uncover, LONGEST_MS);
+  follow();
+}
