@@ -215,6 +215,7 @@ class ObjectRollout:
             "spring_nodes": self.model.spring_nodes,
             "object_spring_count": self.model.object_spring_count,
             "model": self.model.to_tensors() | self.restart_arrays(),
+            "parameters": self.parameters.to_dict(),
         }
         if self.scene is None:
             rate = self.parameters.frame_rate

@@ -116,11 +116,11 @@ def create_files(catalog: Catalog, sessions: Sessions, file_cache: FileCache) ->
     ) -> FileResponse:
         """Write a run as a file that other programs read.
 
-        `ply`, `gltf`, `npz`, `csv`: motion; `yaml`: parameters and metrics; `png`: a picture;
-        `mp4`, `gif`: a film of all frames; `zip`: a picture with all its data; `viser`, `html`: a
-        recording that plays without the server. All fields of a link are understood. A parameter
-        of the simulation by its name, such as `drag=4`, has the object simulated anew before it is
-        written.
+        `ply`, `gltf`, `npz`, `csv`: motion; `mjcf`: the object as a MuJoCo scene; `yaml`:
+        parameters and metrics; `png`: a picture; `mp4`, `gif`: a film of all frames; `zip`: a
+        picture with all its data; `viser`, `html`: a recording that plays without the server. All
+        fields of a link are understood. A parameter of the simulation by its name, such as
+        `drag=4`, has the object simulated anew before it is written.
         """
         del cam, fov, show, color, scale, theme  # Read with the rest of the link.
         query = read_query(request, without=_OWN_FIELDS)
@@ -253,7 +253,7 @@ def _check_frame(run: Run, query: Mapping[str, str]) -> None:
 def _name(target: str, kind: str, query: Mapping[str, str]) -> str:
     frame = f"_{int(query.get('f', '0')):05d}" if kind in {"png", "zip"} else ""
     suffix = SUFFIXES.get(kind, kind)
-    return f"{target}{frame}{'_ply' if kind == 'ply' else ''}.{suffix}"
+    return f"{target}{frame}{f'_{kind}' if kind in {'ply', 'mjcf'} else ''}.{suffix}"
 
 
 def _answer(path: Path, target: str, kind: str, query: Mapping[str, str]) -> FileResponse:

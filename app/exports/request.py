@@ -9,9 +9,9 @@ from app.exports.permalink import state_from_query
 from app.viewer.content.session_state import SessionState
 from physhandi.errors import UsageError
 
-Format = Literal["png", "mp4", "gif", "viser", "html", "zip", "ply", "gltf", "npz", "csv"]
+Format = Literal["png", "mp4", "gif", "viser", "html", "zip", "ply", "gltf", "npz", "csv", "mjcf"]
 FORMATS: tuple[Format, ...] = get_args(Format)
-SUFFIXES: dict[str, str] = {"gltf": "glb", "ply": "zip"}
+SUFFIXES: dict[str, str] = {"gltf": "glb", "ply": "zip", "mjcf": "zip"}
 """How the files of formats end, if not like the format."""
 SMALLEST, LARGEST = 16, 4_096
 """Shortest and longest side of a picture [px]."""

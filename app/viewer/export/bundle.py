@@ -16,7 +16,6 @@ from app.viewer.export.snapshot import Snapshot, snapshot_ply
 from physhandi import __version__
 from physhandi.data.exporters.table import csv_bytes, npz_bytes, rounded
 from physhandi.data.files import plain, without_non_finite, zip_bytes
-from physhandi.data.object_mass import given_mass
 from physhandi.errors import MissingInputError
 from physhandi.object_rollout import ObjectRollout
 
@@ -194,7 +193,7 @@ def _readme(snapshot: Snapshot, files: dict[str, bytes]) -> str:
     units = [f"Lengths are in {named}, times in seconds."]
     if content.fitted is not None:
         units.append("Forces are in newtons of the model, each node of which weighs 1 kg.")
-        mass = content.mass if layers.get("mass") is None else given_mass(layers["mass"])
+        mass = snapshot.mass
         if mass is not None:
             factor = mass.force_factor(content.fitted.model.node_count)
             units.append(

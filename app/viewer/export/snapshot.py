@@ -15,6 +15,7 @@ from physhandi.data.exporters.mesh import frame_files, frame_to_ply, ply_bytes
 from physhandi.data.exporters.scene_data import HandSurface, SceneData, read_skins
 from physhandi.data.exporters.table import csv_bytes, npz_bytes, rounded
 from physhandi.data.files import zip_bytes
+from physhandi.data.object_mass import ObjectMass, given_mass
 from physhandi.errors import MissingInputError
 from physhandi.object_rollout import ObjectRollout
 from physhandi.run import Run
@@ -49,6 +50,12 @@ class Snapshot:
     link: str = ""
     """Address on this server that shows the same; empty if there is none."""
 
+    @property
+    def mass(self) -> ObjectMass | None:
+        """What the object weighs on the screen; None if nobody knows."""
+        given = None if self.layers is None else self.layers.mass
+        return self.content.mass if given is None else given_mass(given)
+
 
 def scene_data(snapshot: Snapshot) -> SceneData:
     """Collect the motion that a snapshot belongs to: the rollout's frames that are ready.
@@ -77,6 +84,7 @@ def scene_data(snapshot: Snapshot) -> SceneData:
         },
         joints={hand.side: hand.joint for hand in content.hands if hand.joint is not None},
         run="" if run is None else run.id,
+        mass=snapshot.mass,
         skins={} if run is None else read_skins(run, content.sequence_name),
     )
     if rollout is None:

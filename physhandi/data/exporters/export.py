@@ -9,6 +9,7 @@ from numpy import ndarray
 
 from physhandi.data.exporters.gltf import scene_to_gltf
 from physhandi.data.exporters.mesh import frame_files
+from physhandi.data.exporters.mjcf import mjcf_files
 from physhandi.data.exporters.scene_data import SceneData, read_scene
 from physhandi.data.exporters.table import (
     write_npz,
@@ -21,7 +22,7 @@ from physhandi.data.run import RunFolder
 from physhandi.errors import UsageError
 
 FORMATS = ("ply", "npz", "csv", "yaml", "gltf")
-SCENE_FORMATS = ("ply", "npz", "csv", "gltf")
+SCENE_FORMATS = ("ply", "npz", "csv", "gltf", "mjcf")
 
 
 def export_run(
@@ -83,7 +84,8 @@ def export_scene(
 
     Args:
         scene: The motion.
-        format: ``ply``, ``npz``, ``csv`` (trajectories) or ``gltf``; see `export_run`.
+        format: ``ply``, ``npz``, ``csv`` (trajectories) or ``gltf``; see `export_run`. ``mjcf`` is
+            a ZIP of the object as a MuJoCo scene with the hand's motion.
         out_path: File to write; all frames as PLY go to a ``.zip`` or a folder.
         frame: Only this frame (PLY).
         overwrite: Whether to replace an export that is there.
@@ -115,6 +117,7 @@ def _write_scene(
         "npz": lambda path: write_npz(path, scene),
         "gltf": lambda path: write_bytes(path, scene_to_gltf(scene)),
         "csv": lambda path: write_trajectories(path, scene),
+        "mjcf": lambda path: write_bytes(path, zip_bytes(mjcf_files(scene))),
     }
     if format in whole:
         return _publish(out, whole[format], is_folder=False)

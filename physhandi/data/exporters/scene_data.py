@@ -2,12 +2,14 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
 from physhandi.data.layout import SequenceFiles
+from physhandi.data.object_mass import ObjectMass
 from physhandi.data.run import RunFolder
 from physhandi.data.sequence_meta import SIDES
 from physhandi.errors import RunError, UsageError
@@ -49,6 +51,10 @@ class SceneData:
     """The 21 joints of each hand by its side (frame joint 3) [m], of runs that hold them."""
     model: Mapping[str, ndarray] = field(default_factory=dict[str, ndarray])
     """The springs' tensors, as a run stores them; none without an object."""
+    parameters: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    """What the object was simulated with, by name; none if that is not known."""
+    mass: ObjectMass | None = None
+    """What the object weighs; None if nobody knows."""
     skins: Mapping[str, Mapping[str, ndarray]] = field(
         default_factory=dict[str, Mapping[str, ndarray]]
     )

@@ -1,0 +1,130 @@
+"""The object in MuJoCo: moves as in our rollout, weighs what it weighs, and is held when it was."""
+
+import io
+import runpy
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from server_world import World
+
+from app.cli import main
+from app.settings import BUNDLED
+from physhandi.data.exporters.mjcf import mjcf_files
+from physhandi.data.exporters.scene_data import SceneData
+from physhandi.data.object_mass import given_mass
+from physhandi.errors import UsageError
+from physhandi.object_rollout import ObjectRollout
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
+
+mujoco: Any = pytest.importorskip("mujoco")
+
+
+def played(folder: Path, **options: Any) -> np.ndarray:
+    """Simulate an unpacked export with the script that is in it."""
+    play = runpy.run_path(str(folder / "play.py"))["play"]
+    return np.stack([position.copy() for position in play(folder, **options)])
+
+
+def unpacked(scene: SceneData, folder: Path) -> Path:
+    folder.mkdir()
+    for name, content in mjcf_files(scene):
+        (folder / name).write_bytes(content)
+    return folder
+
+
+@pytest.mark.slow
+def test_the_bundled_towel_folds_in_mujoco_as_in_our_rollout(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = BUNDLED / "runs" / "towel_fold_quick"
+    with pytest.raises(SystemExit) as end:
+        main(["export", str(run), "--format", "mjcf", "--out", str(tmp_path / "towel.zip")])
+    assert end.value.code in {0, None}, capsys.readouterr().err
+    with zipfile.ZipFile(tmp_path / "towel.zip") as archive:
+        archive.extractall(tmp_path / "towel")
+    rollout = np.load(next(run.rglob("rollout.npy")))
+    position = played(tmp_path / "towel")
+    moved = np.linalg.norm(rollout - rollout[0], axis=-1).mean(axis=1)
+    assert moved[-1] > 0.05
+    distance = np.linalg.norm(position - rollout, axis=-1).mean(axis=1)
+    assert distance[0] < 1e-6
+    assert distance.mean() < 0.003 < 0.1 * moved.mean()
+    text = (tmp_path / "towel" / "scene.xml").read_text()
+    assert "the object weighs 8.2" in text
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "towel" / "scene.xml"))
+    assert model.body_mass.sum() == pytest.approx(0.0082, rel=0.02)
+
+
+def pendulum(**changes: Any) -> ObjectRollout:
+    """A node that hangs on a control node, beside one that falls; made without a simulation."""
+    values: dict[str, Any] = {
+        "object_node": np.array([[0.0, 0.0, 0.4], [0.3, 0.0, 0.25]], np.float32),
+        "initial_velocity": np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]], np.float32),
+        "spring_nodes": np.array([[0, 2]], np.int32),
+        "rest_length": np.array([0.1], np.float32),
+        "stiffness": np.array([40.0], np.float32),
+        "damping": np.array([0.0], np.float32),
+        "object_spring_count": 0,
+        "control_count": 1,
+        "clearance": np.array([0.0, 0.05], np.float32),
+    }
+    model = SpringMassModel(**(values | changes))
+    parameters = SimulationParameters(
+        drag=0.0, gravity=9.81, ground_height=0.0, substeps_per_frame=100, friction=0.3
+    )
+    control = np.tile(np.array([[[0.0, 0.0, 0.5]]], np.float32), (11, 1, 1))
+    return ObjectRollout.empty(model, parameters, control)
+
+
+def scene_of(rollout: ObjectRollout, kilograms: float | None = None) -> SceneData:
+    rollout.ready = rollout.frame_count
+    mass = None if kilograms is None else given_mass(kilograms)
+    return replace(rollout.scene_data(), sequence="made", mass=mass)
+
+
+@pytest.mark.parametrize("kilograms", [None, 0.03])
+def test_springs_gravity_and_the_ground_are_those_of_closed_forms(
+    tmp_path: Path, kilograms: float | None
+) -> None:
+    position = played(unpacked(scene_of(pendulum(), kilograms), tmp_path / "twin"))
+    time = np.arange(11) / 30.0
+    # One kilogram on a spring of 40 N / 0.1 m, let go at its rest length.
+    rate = np.sqrt(400.0)
+    height = 0.4 - 9.81 / rate**2 * (1.0 - np.cos(rate * time))
+    assert height.min() < 0.36
+    np.testing.assert_allclose(position[:, 0, 2], height, atol=2e-3)
+    # The other one flies until it touches the ground 5 cm above it.
+    flies = time < np.sqrt(2 * 0.2 / 9.81)
+    expected = np.stack([0.3 + 0.5 * time, 0.25 - 0.5 * 9.81 * time**2], axis=1)
+    assert 3 < flies.sum() < 10
+    np.testing.assert_allclose(position[flies, 1][:, [0, 2]], expected[flies], atol=2e-3)
+    assert position[-1, 1, 2] == pytest.approx(0.05, abs=4e-3)
+
+
+def test_a_spring_holds_only_while_it_is_attached(tmp_path: Path) -> None:
+    rollout = pendulum(attached=np.array([[3, 6]], np.int32))
+    position = played(unpacked(scene_of(rollout), tmp_path / "twin"))[:, 0, 2]
+    time = np.arange(11) / 30.0
+    np.testing.assert_allclose(position[:4], 0.4 - 0.5 * 9.81 * time[:4] ** 2, atol=1e-3)
+    acceleration = 900.0 * np.diff(position, 2)
+    assert (acceleration[3:5] > 0.0).all()
+    np.testing.assert_allclose(acceleration[7:], -9.81, atol=0.2)
+
+
+def test_what_cannot_be_simulated_is_refused_and_the_server_offers_the_rest(
+    world: World, made: list[Any]
+) -> None:
+    bare = replace(scene_of(pendulum()), model={})
+    with pytest.raises(UsageError, match="made' has no object"):
+        list(mjcf_files(bare))
+    answer = world.script().get("/api/v1/runs/fitted/export?format=mjcf&mass=0.5")
+    assert answer.headers["content-disposition"] == 'attachment; filename="fitted_mjcf.zip"'
+    with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
+        assert set(archive.namelist()) == {"scene.xml", "motion.npz", "play.py"}
+        model = mujoco.MjModel.from_xml_string(archive.read("scene.xml").decode())
+    assert model.body_mass.sum() == pytest.approx(0.5)
