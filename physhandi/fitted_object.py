@@ -12,17 +12,18 @@ import warp as wp
 from jaxtyping import Float
 from numpy import ndarray
 
-from physhandi.data.exporters.scene_data import HandSurface, SceneData, read_scene
+from physhandi.data.exporters.scene_data import MovingSurface, SceneData, read_scene
 from physhandi.data.layout import MATERIAL_FILE, SequenceFiles
 from physhandi.data.run import RunFolder
 from physhandi.data.run_folder import reading
 from physhandi.data.sequence import Sequence as Recording
-from physhandi.errors import MissingInputError, RunError, UsageError
-from physhandi.object_rollout import ObjectRollout, load_fitted
+from physhandi.errors import MissingInputError, RunError, SequenceError, UsageError
+from physhandi.object_rollout import ObjectRollout, load_fitted, load_surface
 from physhandi.progress import Progress, Watcher, watched
 from physhandi.settings import changes as changed_settings
 from physhandi.simulation.contact_intervals import ContactIntervals, always
 from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.object_surface import ObjectSurface
 from physhandi.simulation.parameters import (
     SimulationParameters,
     changed_parameters,
@@ -137,7 +138,7 @@ class FittedObject:
             run=folder,
             sequence=name,
         )
-        fitted.scene = loaded.scene
+        fitted.scene, fitted.surface = loaded.scene, loaded.surface
         return loaded
 
     def __repr__(self) -> str:
@@ -178,7 +179,7 @@ class FittedObject:
         if automatic_substeps:
             parameters = with_stable_substeps(parameters, model, self._control[0])
         rollout = ObjectRollout.empty(model, parameters, self._control, self.fitted.restart)
-        rollout.scene = self.fitted.scene
+        rollout.scene, rollout.surface = self.fitted.scene, self.fitted.surface
         return rollout
 
     def fill(self, rollout: ObjectRollout, device: str = "cpu") -> Iterator[Frame]:
@@ -276,6 +277,7 @@ class FittedObject:
         placed = place_object(self.run, sequence, fitted, progress)
         empty = ObjectRollout.empty(placed.model, placed.parameters, placed.control)
         empty.scene = partial(_scene_of, sequence, placed, empty)
+        empty.surface = self.fitted.surface
         other = FittedObject(empty, rest_node=rest, run=self.run, sequence=sequence.name)
         other.placement = placed
         return other
@@ -364,6 +366,22 @@ class FittedObject:
         if self.run is None:
             raise RunError("The object belongs to no run, so nothing is known of its hands.")
         return read_scene(self.run, self.sequence)
+
+    def surface(self) -> ObjectSurface | None:
+        """Lay the object's smooth surface, in the colors of its recording if that is still there.
+
+        Returns:
+            None if the object belongs to no run, or its nodes have no surface.
+        """
+        run = self.run
+        if run is None:
+            return None
+        place = run.sequences[run.sequence_names.index(self.sequence)]
+        try:
+            views = Recording.load(place).views
+        except SequenceError:
+            views = ()  # A run can be used without its recording.
+        return load_surface(run, self.fitted, views)
 
     def _choose_controls(self, chosen: Sequence[int] | None) -> None:
         wanted = None if chosen is None else tuple(chosen)
@@ -469,7 +487,7 @@ def _scene_of(sequence: Recording, placed: "PlacedObject", rollout: ObjectRollou
         spring_nodes=rollout.model.spring_nodes,
         object_spring_count=rollout.model.object_spring_count,
         hands={
-            m.side: HandSurface(
+            m.side: MovingSurface(
                 vertex=m.vertices(models[m.side]).astype(np.float32),
                 face=np.asarray(models[m.side].faces, np.int32),
             )

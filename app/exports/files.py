@@ -15,7 +15,7 @@ from starlette.exceptions import HTTPException
 
 from app.exports.cache import FileCache, FileJob
 from app.exports.links import CLOSED, address, read_query
-from app.exports.making import store_take
+from app.exports.making import store_take, surface_of
 from app.exports.permalink import state_from_query, state_to_query
 from app.exports.request import LARGEST, LARGEST_TURN, SMALLEST, SUFFIXES, FileRequest
 from app.exports.schema import MEDIA_TYPES, RunFormat, SlowFormat, errors, files
@@ -122,12 +122,12 @@ def create_files(catalog: Catalog, sessions: Sessions, file_cache: FileCache) ->
         fields of a link are understood. A parameter of the simulation by its name, such as
         `drag=4`, has the object simulated anew before it is written.
         """
-        del cam, fov, show, color, scale, theme  # Read with the rest of the link.
+        del sequence, cam, fov, show, color, scale, theme  # Read with the rest of the link.
         query = read_query(request, without=_OWN_FIELDS)
         state = state_from_query(query)
         is_changed = bool(state.parameter_changes) or state.automatic_substeps
         if kind in _SIMPLE and not is_changed:
-            return _simple(catalog, run_id, kind, sequence, f)
+            return _simple(catalog, catalog.run(run_id), kind, query, f)
         if kind == "yaml":
             raise UsageError("format: yaml describes the run itself; leave changed parameters out.")
         order = request_of(catalog, catalog.run(run_id), kind, query)
@@ -266,10 +266,10 @@ def _attached(content: bytes, name: str, kind: str) -> Response:
 
 
 def _simple(
-    catalog: Catalog, run_id: str, kind: str, sequence: str | None, frame: int | None
+    catalog: Catalog, run: Run, kind: str, query: Mapping[str, str], frame: int | None
 ) -> FileResponse:
     """Write what needs no scene to be drawn."""
-    run = catalog.run(run_id)
+    run_id = run.id
     if not run.is_published:
         raise RunError(f"Run '{run_id}' is {run.state}: there is nothing to export yet.")
     run.verify(allows_more=True)
@@ -279,7 +279,12 @@ def _simple(
         name = f"{run_id}_{frame:05d}.ply" if is_one else f"{run_id}.{SUFFIXES.get(kind, kind)}"
         name = f"{run_id}_ply.zip" if kind == "ply" and not is_one else name
         path = export_run(
-            run, kind, folder / name, sequence=sequence, frame=frame if is_one else None
+            run,
+            kind,
+            folder / name,
+            sequence=query.get("sequence"),
+            frame=frame if is_one else None,
+            surface=surface_of(request_of(catalog, run, kind, query)),
         )
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)

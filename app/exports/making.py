@@ -22,6 +22,7 @@ from app.viewer.export.snapshot import Snapshot, scene_data
 from app.viewer.restoring import complete_state
 from physhandi.child import Channel, run_child
 from physhandi.data.exporters import export_scene
+from physhandi.data.exporters.scene_data import MovingSurface
 from physhandi.data.files import write_atomically, write_bytes, write_json
 from physhandi.data.sequence import Sequence
 from physhandi.errors import UsageError
@@ -129,6 +130,15 @@ def make(order: FileRequest, out: Path, report: Report = lambda _done, _of: None
         write_bytes(out, content_)
     else:
         export_scene(scene_data(snapshot), order.format, out, overwrite=True)
+
+
+def surface_of(order: FileRequest) -> MovingSurface | None:
+    """Lay the surface of a run's object over the frames of its fitted rollout, if it is shown."""
+    if order.format not in {"ply", "gltf"}:
+        return None
+    content, _ = _open(order, order.check())
+    fitted = content.fitted
+    return None if fitted is None else fitted.moved_surface(content.surface)
 
 
 class _Places:

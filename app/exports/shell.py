@@ -7,7 +7,7 @@ from typing import Any
 from urllib.parse import parse_qsl, urlsplit
 
 from app.exports.files import request_of
-from app.exports.making import Report, make
+from app.exports.making import Report, make, surface_of
 from app.exports.permalink import state_from_query
 from app.exports.request import SUFFIXES, FileRequest
 from app.jobs.catalog import Catalog
@@ -76,6 +76,7 @@ def export(
             sequence=state.sequence_name,
             frame=options.frame,
             overwrite=options.overwrite,
+            surface=surface_of(_order(run, options, query, catalog)),
         )
     if options.format == "yaml":
         raise UsageError("yaml describes the run itself; leave changed parameters out of the link.")

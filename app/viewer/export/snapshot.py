@@ -12,7 +12,7 @@ from app.viewer.content.content import Content
 from app.viewer.content.layers import GREEN, RED, SKIN, Layers
 from physhandi.data.exporters.gltf import scene_to_gltf
 from physhandi.data.exporters.mesh import frame_files, frame_to_ply, ply_bytes
-from physhandi.data.exporters.scene_data import HandSurface, SceneData, read_skins
+from physhandi.data.exporters.scene_data import MovingSurface, SceneData, read_skins
 from physhandi.data.exporters.table import csv_bytes, npz_bytes, rounded
 from physhandi.data.files import zip_bytes
 from physhandi.data.object_mass import ObjectMass, given_mass
@@ -80,7 +80,7 @@ def scene_data(snapshot: Snapshot) -> SceneData:
         spring_nodes=np.zeros((0, 2), np.int32),
         object_spring_count=0,
         hands={
-            hand.side: HandSurface(vertex=hand.vertex, face=hand.face) for hand in content.hands
+            hand.side: MovingSurface(vertex=hand.vertex, face=hand.face) for hand in content.hands
         },
         joints={hand.side: hand.joint for hand in content.hands if hand.joint is not None},
         run="" if run is None else run.id,
@@ -89,7 +89,8 @@ def scene_data(snapshot: Snapshot) -> SceneData:
     )
     if rollout is None:
         return hands_alone
-    return replace(rollout, scene=lambda: hands_alone).scene_data()
+    surface = content.surface
+    return replace(rollout, scene=lambda: hands_alone, surface=lambda: surface).scene_data()
 
 
 def snapshot_ply(snapshot: Snapshot) -> bytes:

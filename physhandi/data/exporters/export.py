@@ -1,16 +1,14 @@
 """Exports runs and simulated motion to all formats, atomically."""
 
 import shutil
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
-
-from jaxtyping import Int
-from numpy import ndarray
 
 from physhandi.data.exporters.gltf import scene_to_gltf
 from physhandi.data.exporters.mesh import frame_files
 from physhandi.data.exporters.mjcf import mjcf_files
-from physhandi.data.exporters.scene_data import SceneData, read_scene
+from physhandi.data.exporters.scene_data import MovingSurface, SceneData, read_scene
 from physhandi.data.exporters.table import (
     write_npz,
     write_summary,
@@ -33,7 +31,7 @@ def export_run(
     sequence: str | None = None,
     frame: int | None = None,
     overwrite: bool = False,
-    faces: Mapping[str, Int[ndarray, "face 3"]] | None = None,
+    surface: MovingSurface | None = None,
 ) -> Path:
     """Write a run, or one sequence of it, in another format.
 
@@ -42,13 +40,14 @@ def export_run(
         format: ``ply`` (nodes, hand meshes and virtual springs), ``npz`` (motion and springs),
             ``csv`` (a file: trajectories; a folder: also parameters and metrics) or ``yaml``
             (settings, parameters, losses and metrics of the whole run), or ``gltf`` (one ``.glb``
-            file: skinned hands, object nodes and springs, moving).
+            file: skinned hands, object nodes, springs and surface, moving).
         out_path: File to write; all frames as PLY go to a ``.zip``. Without the format's suffix,
             PLY and CSV make a folder.
         sequence: Which sequence; None takes the first.
         frame: Only this frame (PLY); None takes all, which needs a folder.
         overwrite: Whether to replace an export that is there.
-        faces: Triangles of the hands by side, for runs that do not hold them.
+        surface: Smooth surface of the object over all frames (PLY, glTF), which a run does not
+            hold; see `load_surface`.
 
     Returns:
         The file or folder written.
@@ -66,7 +65,7 @@ def export_run(
     _check_target(out, format, is_folder=is_folder, overwrite=overwrite)
     if format == "yaml":
         return _publish(out, lambda path: write_summary(path, run), is_folder=False)
-    scene = read_scene(run, sequence, faces)
+    scene = replace(read_scene(run, sequence), surface=surface)
     if format == "csv" and is_folder:
         return _publish(out, lambda path: write_tables(path, run, scene), is_folder=True)
     return _write_scene(scene, format, out, frame, is_folder=is_folder)

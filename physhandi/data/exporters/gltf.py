@@ -12,10 +12,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
-from physhandi.data.exporters.scene_data import HandSurface, SceneData
+from physhandi.data.exporters.scene_data import MovingSurface, SceneData
 from physhandi.triangles import vertex_normals
 
 POINTS, LINES, TRIANGLES = 0, 1, 4
@@ -131,10 +131,17 @@ class GltfDocument:
         target = {"node": node, "path": path}
         self._channels.append({"sampler": len(self._samplers) - 1, "target": target})
 
-    def morph_targets(self, position: Float[ndarray, "frame point 3"]) -> dict[str, Any]:
+    def morph_targets(
+        self,
+        position: Float[ndarray, "frame point 3"],
+        normal: Float[ndarray, "frame point 3"] | None = None,
+    ) -> dict[str, Any]:
         """Store every later frame as a displacement from the first, as a primitive has them."""
         moved = position[1:].astype(np.float32) - position[:1].astype(np.float32)
         targets = [{"POSITION": self.add_positions(frame)} for frame in moved]
+        if normal is not None:
+            for target, turned in zip(targets, normal[1:] - normal[:1], strict=True):
+                target["NORMAL"] = self.add_attribute(turned.astype(np.float32))
         return {"targets": targets} if targets else {}
 
     def animate_morph(self, node: int) -> None:
@@ -173,7 +180,7 @@ _OBJECT, _SPRING, _HAND = (0.045, 0.156, 0.716), (0.35, 0.45, 0.75), (0.753, 0.4
 
 
 def scene_to_gltf(scene: SceneData) -> bytes:
-    """Describe hands, object nodes and object springs of all frames as binary glTF (``.glb``).
+    """Describe hands, object nodes, springs and surface of all frames as binary glTF (``.glb``).
 
     A hand without a skin (in runs of version 0.1) becomes a mesh with a morph target a frame.
     """
@@ -186,6 +193,8 @@ def scene_to_gltf(scene: SceneData) -> bytes:
             _add_moving_surface(document, side, hand, scene.frame_count)
     if scene.rollout.shape[1]:
         _add_object(document, scene)
+    if scene.surface is not None and scene.surface.face is not None:
+        _add_object_surface(document, scene.surface, scene.surface.face)
     return document.to_bytes()
 
 
@@ -225,7 +234,7 @@ def _add_skinned_hand(
 
 
 def _add_moving_surface(
-    document: GltfDocument, side: str, hand: HandSurface, frame_count: int
+    document: GltfDocument, side: str, hand: MovingSurface, frame_count: int
 ) -> None:
     name, vertex = f"{side}_hand", hand.vertex[:frame_count]
     primitive: dict[str, Any] = {
@@ -254,6 +263,37 @@ def _add_object(document: GltfDocument, scene: SceneData) -> None:
         primitives.append({**shared, **lines})
     mesh = document.add_mesh("object", primitives)
     document.animate_morph(document.add_node("object", document.world, mesh=mesh))
+
+
+def _add_object_surface(
+    document: GltfDocument, surface: MovingSurface, face: Int[ndarray, "face 3"]
+) -> None:
+    normal = np.stack([_normals(vertex, face) for vertex in surface.vertex])
+    attributes = {
+        "POSITION": document.add_positions(surface.vertex[0]),
+        "NORMAL": document.add_attribute(normal[0]),
+    }
+    if surface.color is not None:
+        attributes["COLOR_0"] = document.add_attribute(_linear(surface.color))
+    material = document.add_material(
+        "object_surface", _OBJECT if surface.color is None else (1.0, 1.0, 1.0)
+    )
+    primitive = {
+        "attributes": attributes,
+        "indices": document.add_indices(face),
+        "material": material,
+        "mode": TRIANGLES,
+        **document.morph_targets(surface.vertex, normal),
+    }
+    mesh = document.add_mesh("object_surface", [primitive])
+    document.animate_morph(document.add_node("object_surface", document.world, mesh=mesh))
+
+
+def _linear(color: UInt8[ndarray, "vertex 3"]) -> Float[ndarray, "vertex 3"]:
+    """Turn colors (sRGB, IEC 61966-2-1) into amounts of light, of which glTF's vertices speak."""
+    value = color.astype(np.float32) / 255
+    light = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    return light.astype(np.float32)
 
 
 def _normals(vertex: ndarray, faces: ndarray) -> ndarray:

@@ -16,8 +16,9 @@ _OBJECT, _CONTROL, _HAND = (
 def frame_to_ply(scene: SceneData, frame: int) -> bytes:
     """Describe one frame as binary PLY.
 
-    Vertices are the object nodes, then the control nodes, then the hand vertices; hands whose
-    vertices are the control nodes are not repeated. Colors tell them apart.
+    Vertices are the object nodes, then the control nodes, the hand vertices, and those of the
+    object's surface; hands whose vertices are the control nodes are not repeated. Colors tell them
+    apart.
 
     Args:
         scene: The motion.
@@ -38,6 +39,11 @@ def frame_to_ply(scene: SceneData, frame: int) -> bytes:
         if hand.face is not None:
             faces.append(np.asarray(hand.face) + offset)
         offset += hand.vertex.shape[1]
+    surface = scene.surface
+    if surface is not None and surface.face is not None:
+        parts.append(surface.vertex[frame])
+        colors.append(_OBJECT if surface.color is None else surface.color)
+        faces.append(surface.face + offset)
     vertex = np.concatenate(parts).astype(np.float32)
     color = np.concatenate(
         [np.broadcast_to(c, (len(part), 3)) for part, c in zip(parts, colors, strict=True)]

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
 from physhandi.data.layout import SequenceFiles
@@ -16,13 +16,15 @@ from physhandi.errors import RunError, UsageError
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class HandSurface:
-    """The moving surface of one hand."""
+class MovingSurface:
+    """The moving surface of a hand or of the object."""
 
     vertex: Float[ndarray, "frame vertex 3"]
     """Vertex positions [m]."""
     face: Int[ndarray, "face 3"] | None
     """Triangles; None if the run does not hold them."""
+    color: UInt8[ndarray, "vertex 3"] | None = None
+    """Colors (sRGB); None if they are not known."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -43,8 +45,10 @@ class SceneData:
     """Nodes that each spring joins; object nodes first, then control nodes."""
     object_spring_count: int
     """Number of leading springs that join two object nodes; the others are virtual springs."""
-    hands: dict[str, HandSurface]
+    hands: dict[str, MovingSurface]
     """Surface of each hand by its side."""
+    surface: MovingSurface | None = None
+    """Smooth surface of the object; None if it has none or it was not laid."""
     run: str = ""
     """Id of the run."""
     joints: Mapping[str, ndarray] = field(default_factory=dict[str, ndarray])
@@ -75,15 +79,12 @@ class SceneData:
         return springs[(first < max(frame, 1)) & (max(frame, 1) <= last)]
 
 
-def read_scene(
-    run: RunFolder, sequence: str | None, faces: Mapping[str, Int[ndarray, "face 3"]] | None = None
-) -> SceneData:
+def read_scene(run: RunFolder, sequence: str | None) -> SceneData:
     """Collect the motion of one sequence of a run.
 
     Args:
         run: The run.
         sequence: Name of the sequence; None takes the first one.
-        faces: Triangles of the hands by side, for runs that do not hold them.
 
     Raises:
         UsageError: If the run has no such sequence.
@@ -98,14 +99,12 @@ def read_scene(
     if not run.has(files.meta):
         raise RunError(f"Run '{run.id}' has nothing of sequence '{name}'; it is {run.state}.")
     meta = run.yaml(files.meta)
-    hands: dict[str, HandSurface] = {}
+    hands: dict[str, MovingSurface] = {}
     for side in SIDES:
         if run.has(files.hand_vertex(side)):
-            face = None if faces is None else faces.get(side)
-            if run.has(files.hand_face(side)):
-                face = run.array(files.hand_face(side))
+            face = run.array(files.hand_face(side)) if run.has(files.hand_face(side)) else None
             vertex = run.array(files.hand_vertex(side))
-            hands[side] = HandSurface(vertex=vertex, face=face)
+            hands[side] = MovingSurface(vertex=vertex, face=face)
     rollout, control = (
         run.array(file) if run.has(file) else None for file in (files.rollout, files.control)
     )

@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from physhandi.data.exporters import export_run
+from physhandi.data.exporters.scene_data import MovingSurface
 from physhandi.data.exporters.scene_data import SceneData
 from physhandi.data.exporters.table import flat, safe_cell, write_csv, write_trajectories
 from physhandi.errors import RunError, UsageError
@@ -93,6 +94,21 @@ def test_a_frame_can_be_read_by_trimesh(tmp_path: Path) -> None:
     assert (colors[NODES:, 0] > colors[NODES:, 2]).all()
     assert read_edges(path.read_bytes()).tolist() == SPRINGS[2:].tolist()
     assert b"comment world z-up, lengths in m\n" in path.read_bytes()
+
+
+@pytest.mark.parametrize("controls", ["hand", "sparse"])
+def test_the_surface_of_the_object_comes_after_all_else(tmp_path: Path, controls: str) -> None:
+    run = make_run(tmp_path / "fit", controls=controls)
+    plain = load_mesh(export_run(run, "ply", tmp_path / "plain.ply", frame=2))
+    vertex = np.random.default_rng(8).normal(size=(FRAMES, 3, 3)).astype(np.float32)
+    color = np.array([[1, 2, 3], [4, 5, 6], [7, 8, 9]], np.uint8)
+    surface = MovingSurface(vertex=vertex, face=np.array([[0, 2, 1]], np.int32), color=color)
+    path = export_run(run, "ply", tmp_path / "f.ply", frame=2, surface=surface)
+    mesh, count = load_mesh(path), len(plain.vertices)
+    np.testing.assert_array_equal(mesh.vertices[:count], plain.vertices)
+    np.testing.assert_array_equal(mesh.vertices[count:], vertex[2])
+    np.testing.assert_array_equal(mesh.visual.vertex_colors[count:, :3], color)
+    np.testing.assert_array_equal(mesh.faces, [*plain.faces, [count, count + 2, count + 1]])
 
 
 def test_hands_beside_sparse_controls_are_written_too(tmp_path: Path) -> None:

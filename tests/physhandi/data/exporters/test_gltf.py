@@ -1,6 +1,7 @@
 """The glTF export, read back by pygltflib and animated by a small player of its own."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from gltf_player import Player
 from pygltflib import GLTF2
 
 from physhandi.data.exporters import export_run
+from physhandi.data.exporters.scene_data import MovingSurface
 from physhandi.errors import UsageError
 from physhandi.fitting.artefacts import save_hand_vertices, save_motions
 from physhandi.hand.motion import HandMotion
@@ -45,6 +47,45 @@ def _run(folder: Path, *, has_object: bool = True) -> Run:
             attempt.save_tensors(f"{base}/model.safetensors", {"spring_nodes": SPRINGS, **counts})
         attempt.publish()
     return Run.open(run.folder)
+
+
+def _pyramid() -> MovingSurface:
+    """A pyramid over the x-y plane whose top rises, in four gray levels."""
+    vertex = np.tile(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32), (4, 1, 1))
+    vertex[:, 3, 2] += np.arange(FRAMES)
+    face = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], np.int32)
+    color = np.repeat(np.array([[0], [10], [128], [255]], np.uint8), 3, axis=1)
+    return MovingSurface(vertex=vertex, face=face, color=color)
+
+
+def test_the_object_has_triangles_that_move_in_its_own_colors(tmp_path: Path) -> None:
+    surface = _pyramid()
+    path = export_run(_run(tmp_path / "fit"), "gltf", tmp_path / "fit.glb", surface=surface)
+    player = Player(path)
+    node = player.gltf.nodes[player.node("object_surface")]
+    (primitive,) = player.gltf.meshes[node.mesh].primitives
+    np.testing.assert_array_equal(player.array(primitive.indices).reshape(-1, 3), surface.face)
+    light = player.array(primitive.attributes.COLOR_0)[:, 0]
+    # By the table of IEC 61966-2-1: the levels 0, 10, 128 and 255.
+    np.testing.assert_allclose(light, [0.0, 0.003035, 0.215861, 1.0], atol=1e-6)
+    for frame in range(FRAMES):
+        moved = player.vertices("object_surface", frame)
+        np.testing.assert_allclose(moved, surface.vertex[frame], atol=1e-6)
+    start = player.array(primitive.attributes.NORMAL)
+    for frame in range(1, FRAMES):
+        normal = start + player.array(primitive.targets[frame - 1]["NORMAL"])
+        # By area: sides along the axes have normals h, the base 1.
+        height = 1.0 + frame
+        expected = -np.array([height, height, 1.0]) / np.sqrt(2 * height**2 + 1)
+        np.testing.assert_allclose(normal[0], expected, atol=1e-5)
+    scene = trimesh_scene(path)
+    assert len(scene.geometry["object_surface"].faces) == 4
+
+
+def trimesh_scene(path: Path) -> Any:
+    import trimesh
+
+    return trimesh.load(path)
 
 
 def test_skinned_hands_move_as_in_the_run(tmp_path: Path) -> None:
