@@ -10,8 +10,7 @@ import pytest
 import yaml
 
 from physhandi.data.exporters import export_run
-from physhandi.data.exporters.scene_data import MovingSurface
-from physhandi.data.exporters.scene_data import SceneData
+from physhandi.data.exporters.scene_data import MovingSurface, SceneData
 from physhandi.data.exporters.table import flat, safe_cell, write_csv, write_trajectories
 from physhandi.errors import RunError, UsageError
 from physhandi.run import Run
