@@ -142,8 +142,11 @@ class ScenePage:
         self.set("Frame", frame)
         self.until(lambda: self.value("Frame") == self.frame() == frame, f"frame {frame}")
 
-    def unfold(self, folder: str) -> None:
-        self.panel.get_by_text(folder, exact=True).click()
+    def tab(self, name: str) -> None:
+        """Open a tab of the panel."""
+        tab = self.panel.get_by_role("tab", name=name, exact=True)
+        tab.click()
+        expect(tab).to_have_attribute("aria-selected", "true")
 
     def download(self, name: str, path: Path) -> Path:
         """Press a button of the export panel and keep the file that the browser gets."""

@@ -21,10 +21,20 @@
     if (event.key === " " && event.target.closest?.("button, summary, a")) return;
     event.preventDefault();
     event.stopImmediatePropagation();
-    const { key, code, shiftKey, ctrlKey, metaKey, altKey } = event;
-    const inside = scene.contentWindow;
+    press(event, scene.contentWindow);
+  }
+
+  function press({ key, code, shiftKey, ctrlKey, metaKey, altKey }, inside) {
     const copy = new inside.KeyboardEvent("keydown", { key, code, shiftKey, ctrlKey, metaKey, altKey, bubbles: true, cancelable: true });
     inside.document.documentElement.dispatchEvent(copy);
+  }
+
+  /* viser takes a ticked box and a list that was chosen from for fields in which somebody types. */
+  function keepKeys(inside, root) {
+    root.addEventListener("click", (event) => event.target.closest?.("[role=option]") && inside.setTimeout(() => inside.document.activeElement?.blur()));
+    root.addEventListener("keydown", (event) => {
+      if (event.target.matches?.("input[type=checkbox]") && ![" ", "Tab"].includes(event.key)) press(event, inside);
+    });
   }
 
   /* The frame under a click in a chart over frames; none in any other chart, or after a drag. */
@@ -115,6 +125,15 @@
     show();
   }
 
+  /* Boxes to tick stand in two columns. */
+  function halve(row) {
+    const isBox = (place) => Boolean(place?.querySelector("input[type=checkbox]"));
+    const place = row.parentElement;
+    if (!isBox(place.previousElementSibling) && !isBox(place.nextElementSibling)) return;
+    Object.assign(place.style, { display: "inline-block", width: "50%", verticalAlign: "top" });
+    row.firstElementChild.style.width = "calc(100% - 1.5em)";
+  }
+
   const ICONS = { "list-search": "All commands", adjustments: "Connection and camera", "arrow-back": "Back to the panel" };
 
   /* viser writes names beside its sliders and fields, and draws icons, but tells eyes alone. */
@@ -128,20 +147,46 @@
       for (const part of row?.querySelectorAll("[role=slider], .mantine-NumberInput-input") ?? []) {
         if (part.ariaLabel !== text) part.ariaLabel = text;
       }
+      if (row?.querySelector("input[type=checkbox]")) halve(row);
       const slider = row?.querySelector(".mantine-Slider-root");
       const isOfFactors = slider?.querySelector(".mantine-Slider-markLabel")?.textContent.startsWith(FACTOR);
       if (isOfFactors && !slider.nextElementSibling.nextElementSibling) addFactor(slider, slider.querySelector("[role=slider]"));
     }
   }
 
+  /* The tab that was open last, in this tab of the browser; at first the sliders, where there are any. */
+  const TAB = "physhandi-tab";
+  const tabsOf = (root) => [...(root.querySelector("[role=tablist]")?.querySelectorAll("[role=tab]") ?? [])];
+  const openTab = (tab) => (tab.dispatchEvent(new tab.ownerDocument.defaultView.KeyboardEvent("keydown", { key: "Enter", bubbles: true })), tab.click());
+
+  function openFirst(root) {
+    const tabs = tabsOf(root);
+    const named = (text) => tabs.find((tab) => tab.textContent.trim() === text);
+    const first = named(sessionStorage.getItem(TAB)) ?? named("Physics");
+    if (first && first.ariaSelected !== "true") openTab(first);
+    return tabs.length > 0;
+  }
+
   function keepNamed(inside, root) {
     let isDue = false;
-    const look = () => { isDue = false; name(root); };
+    let isOpen = false;
+    let known = null;
+    const look = () => {
+      isDue = false;
+      name(root);
+      const wish = root.querySelector("[data-wish]")?.dataset;
+      const wished = isOpen && wish && wish.wish !== known && tabsOf(root).find((tab) => tab.textContent.trim() === wish.tab);
+      known = wish?.wish;
+      if (wished) openTab(wished);
+      const chosen = tabsOf(root).find((tab) => tab.ariaSelected === "true");
+      if (isOpen && chosen) sessionStorage.setItem(TAB, chosen.textContent.trim());
+      isOpen ||= openFirst(root);
+    };
     const later = () => {
       if (!isDue) inside.requestAnimationFrame(look);
       isDue = true;
     };
-    new inside.MutationObserver(later).observe(root, { childList: true, characterData: true, subtree: true });
+    new inside.MutationObserver(later).observe(root, { childList: true, characterData: true, subtree: true, attributeFilter: ["aria-selected"] });
     later();
   }
 
@@ -152,6 +197,7 @@
     let start = 0;
     keepSigns(root);
     tellGestures(inside, root);
+    keepKeys(inside, root);
     keepNamed(inside, root);
     inside.document.body.addEventListener("keydown", (event) => isOwn(event) && event.stopPropagation());
     root.addEventListener("keydown", (event) => NOT_FOR_CAMERA.includes(event.code) && event.stopPropagation());

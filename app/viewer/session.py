@@ -26,6 +26,7 @@ from app.viewer.scene.layers_panel import LayersPanel, add_legend, set_theme
 from app.viewer.scene.scene import SceneDrawing
 from app.viewer.scene.scene_server import SceneServer
 from app.viewer.ui.keyboard import bind
+from app.viewer.ui.tabs import TabName, Tabs
 from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.parameters import parameter_changes
 
@@ -173,29 +174,37 @@ class Session(SceneServer):
     def _build(self) -> None:
         server, guard = self._server, self._guard
         set_theme(server, dark=False)
-        self._legend = add_legend(server, self._content)
+        simulated: tuple[TabName, ...] = ("Physics",) if self.kind == "run" else ()
+        tabs = self._tabs = Tabs(server.gui, "Play", "Look", *simulated, "Inspect", "Export")
+        with tabs["Play"]:
+            self._legend = add_legend(server, self._content)
         if len(self._names) > 1:
             now = self._content.sequence_name
             choice = server.gui.add_dropdown("Sequence", self._names, initial_value=now)
             choice.on_update(guard.by_user(lambda _: self._switch(choice)))
-        self._timeline = TimelinePanel(server, self._playback, guard)
+        self._timeline = TimelinePanel(server, self._playback, guard, pace=tabs["Play"])
         self._restart = RestartMark(server, self._timeline.behind_slider)
         self._strip = FrameStrip(server, self._timeline.behind_slider + 0.1)
-        self._comparison = LiveComparison(
-            server,
-            guard,
-            self._live,
-            self.id,
-            newest=self._newest,
-            redraw=self._playback.redraw,
-        )
-        self._colors = ColorPanel(
-            server, guard, self._playback.redraw, color_instead=self._comparison.next_tint
-        )
-        self._inspector = Inspector(server, guard, self._playback.redraw)
-        self._physics_place = server.gui.add_folder(None)
-        self._layers = LayersPanel(server, self._content, guard, self._playback.redraw)
-        export = self._export = ExportPanel(server, guard, self.snapshot)
+        with tabs["Play"]:
+            self._comparison = LiveComparison(
+                server,
+                guard,
+                self._live,
+                self.id,
+                newest=self._newest,
+                redraw=self._playback.redraw,
+            )
+        with tabs["Look"]:
+            self._colors = ColorPanel(
+                server, guard, self._playback.redraw, color_instead=self._comparison.next_tint
+            )
+            self._layers = LayersPanel(server, guard, self._playback.redraw)
+        with tabs["Inspect"]:
+            self._inspector = Inspector(
+                server, guard, self._playback.redraw, open_tab=lambda: tabs.open("Inspect")
+            )
+        with tabs["Export"]:
+            export = self._export = ExportPanel(server, guard, self.snapshot)
         bind(server, guard, "reset", lambda event, _: self._reset_view(event))
         bind(server, guard, "snapshot", lambda event, _: export.save("PNG", event.client))
         self._fill()
@@ -218,19 +227,19 @@ class Session(SceneServer):
         self._comparison.offer(content, framing, run.folder if run is not None else None)
         if content.fitted is None or run is None:
             return
-        with self._physics_place:
-            self._object = ObjectSession(
-                self._server,
-                self._guard,
-                self._playback,
-                session=self.id,
-                live=self._live,
-                content=content,
-                fitted=content.fitted,
-                run=run,
-                strip=self._strip,
-                storage=self._storage,
-            )
+        self._object = ObjectSession(
+            self._server,
+            self._guard,
+            self._playback,
+            tabs=self._tabs,
+            session=self.id,
+            live=self._live,
+            content=content,
+            fitted=content.fitted,
+            run=run,
+            strip=self._strip,
+            storage=self._storage,
+        )
 
     def _restore(self, state: SessionState) -> None:
         """Go on where another session stands."""

@@ -86,13 +86,14 @@ def test_a_scene_opens_plays_and_saves_what_it_shows(home, fitted, tmp_path, pic
     scene.until(lambda: len(frames.add(scene.value("Frame")) or frames) >= 3, "playing")
     scene.pause()
     before = scene.value("Frame")
+    scene.tab("Play")
     scene.press("1 ▶")
     scene.until(lambda: scene.value("Frame") == (before + 1) % 60, "a step by one frame")
     scene.go(40)  # A frame in which much happens.
     picture(home, "viewer")
 
     scene.go(30)
-    scene.unfold("Export")
+    scene.tab("Export")
 
     points = ply_vertices(scene.download("PLY", tmp_path))
     expected = np.concatenate([fitted.rollout[30], fitted.control[30]])
@@ -144,13 +145,14 @@ def test_sliders_simulate_again_and_reset_returns(shared_scene, fitted, tmp_path
     scene.set("stiffness", 0.1)
     softer = scene.new_difference("a third rollout", by_radius)
     assert softer > 0
-    scene.unfold("Export")
+    scene.tab("Export")
     with np.load(scene.download("NPZ", tmp_path)) as data:
         pairs = data["spring_nodes"][: data["object_spring_count"]].tolist()
         assert set(map(tuple, pairs)) == wide
         moved = np.linalg.norm(data["position"] - fitted.rollout, axis=-1).mean()
     assert softer == pytest.approx(1e3 * moved, rel=0.01)
 
+    scene.tab("Physics")
     scene.press("Undo")
     scene.until(lambda: scene.difference() == by_radius, "the rollout of δ = 45 mm")
     scene.until(lambda: scene.value("stiffness") == 1, "its slider")
@@ -174,7 +176,7 @@ def test_values_typed_key_by_key_keep_their_sign_and_factors_are_typed_as_such(
     def is_simulated(height: float) -> bool:
         return float(scene.link().get("ground_height", 0)) == pytest.approx(1e-3 * height)
 
-    scene.unfold("Ground")
+    scene.tab("Ground")
     scene.set(slider, -0.7)
     scene.until(lambda: is_simulated(-0.7), "what was pasted")
     scene.type(slider, "-0.6")
@@ -190,7 +192,7 @@ def test_values_typed_key_by_key_keep_their_sign_and_factors_are_typed_as_such(
     assert is_simulated(-0.6)  # It may become any number, until it is entered.
     scene.field(slider).press("Enter")
     scene.until(lambda: is_simulated(0), "the fitted height, typed as -0")
-    scene.unfold("Ground")
+    scene.tab("Springs")
 
     handle = scene.row("stiffness").get_by_role("slider", name="stiffness")
     expect(handle).to_have_attribute("aria-valuetext", "×1.0")
@@ -223,6 +225,7 @@ def test_another_tab_is_left_alone(shared_scene: ScenePage, served):
     assert (*other.rollout(), other.value("Frame")) == (*springs, 0, frame)
     assert other.value("δ object [mm]") == radius
     # The other tab is not merely frozen: it answers its own user.
+    other.tab("Play")
     other.press("1 ▶")
     other.until(lambda: other.value("Frame") != frame, "a step by one frame")
     page.close()

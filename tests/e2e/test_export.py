@@ -62,7 +62,7 @@ def test_a_link_opens_a_scene_whose_files_agree_with_the_server_s(
     assert told["stiffness_scale"] == ["0.5"]
     scene.until(lambda: query(home) == told, "the address tells the same")
 
-    scene.unfold("Export")
+    scene.tab("Export")
     with zipfile.ZipFile(scene.download("ZIP", tmp_path)) as archive:
         names = set(archive.namelist())
         seen = cv2.imdecode(np.frombuffer(archive.read("picture.png"), np.uint8), 1)

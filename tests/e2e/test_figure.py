@@ -23,10 +23,11 @@ def test_the_figure_shows_both_topologies_in_one_picture(
 ) -> None:
     scene = shared_scene
     scene.page.keyboard.press("f")
+    scene.tab("Play")
     scene.until(lambda: scene.has("PhysTwin-style: simulated 60/60 frames"), "the figure")
     scene.go(FRAME)
     picture(scene.page, "figure_view")
-    scene.unfold("Export")
+    scene.tab("Export")
     with np.load(scene.download("NPZ", tmp_path)) as data:
         assert data["ours_frame"] == data["phystwin_frame"] == FRAME
         assert data["phystwin_control"].shape == (60, 30, 3)
@@ -50,12 +51,14 @@ def test_the_figure_shows_both_topologies_in_one_picture(
     assert min(object_nodes) > 2_000
     assert max(object_nodes) < 2 * min(object_nodes)
     assert min(virtual_springs) > 500
-    scene.page.frame_locator("#scene").get_by_role("button", name="Back to the scene").click()
+    scene.tab("Play")
+    scene.press("Back to the scene")
     scene.until(lambda: scene.has("Compare with PhysTwin"), "the scene")
 
 
 def test_a_scene_is_one_tab_s_own(shared_scene: ScenePage, browser: Browser, served) -> None:
     scene = shared_scene
+    scene.tab("Physics")
     scene.go(FRAME)
     scene.set("stiffness", 0.1)
     difference, address = scene.new_difference("another rollout"), scene.page.url

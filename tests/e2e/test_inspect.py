@@ -104,6 +104,7 @@ def test_keys_colors_and_clicks_work_in_the_scene_and_around_it(scene, picture):
     before = blue_at_rest(scene)
     for _ in range(5):
         press_and_see(scene, "c", "color")
+    scene.tab("Look")
     scene.until(lambda: scene.has("Speed"), "the legend")
     scene.until(lambda: blue(shot_of(scene)) < 0.1 * before, "other colors than plain blue")
     scene.until(lambda: yellow(shot_of(scene)) > 50, "the fastest nodes are yellow")

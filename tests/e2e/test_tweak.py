@@ -74,12 +74,53 @@ def test_one_gesture_is_one_step_of_the_history(shared_scene):
     scene.press("Reset")
 
 
+_HANGS_OVER = """tab => {
+    let place = tab;
+    while (!/auto|scroll/.test(getComputedStyle(place).overflowY)) place = place.parentElement;
+    return place.scrollHeight - place.clientHeight;
+}"""
+
+
+def test_every_tab_fits_its_window_and_is_reached_by_keys(shared_scene):
+    scene, page = shared_scene, shared_scene.page
+    page.set_viewport_size({"width": 1440, "height": 900})
+    scene.tab("Physics")
+    scene.set("d_max virtual", 15)  # What is changed takes two lines more.
+    scene.until(lambda: scene.has("every frame is new"), "all frames")
+    for name in ("Springs", "More", "Ground", "Collisions"):
+        scene.tab(name)
+        assert scene.panel.get_by_role("tab", name=name).evaluate(_HANGS_OVER) <= 0, name
+    page.keyboard.press("v")
+    for name in ("Export", "Inspect", "Look", "Play"):
+        tab = scene.panel.get_by_role("tab", name=name, exact=True)
+        tab.focus()
+        page.keyboard.press("Enter")
+        expect(tab).to_have_attribute("aria-selected", "true")
+        tab.blur()  # Where it has the focus, Home is the first tab.
+        frame = scene.value("Frame")
+        page.keyboard.press("End" if frame == 0 else "Home")  # Keys work in every tab.
+        scene.until(lambda at=frame: scene.value("Frame") != at, "another frame")
+        if name == "Look":
+            page.keyboard.press("v")
+            scene.choose("Color by", "stiffness")
+            scene.until(lambda: scene.has("Force per unit strain"), "the legend")
+            scene.row("Cameras").get_by_role("checkbox").check()  # Keys go on working.
+            page.keyboard.press("v")
+        if name == "Play":
+            scene.until(lambda: scene.has("Swap sides"), "the comparison")
+        assert tab.evaluate(_HANGS_OVER) <= 0, name
+    page.keyboard.press("v")
+    scene.tab("Physics")
+    scene.press("Reset")
+    page.set_viewport_size({"width": 1280, "height": 800})
+
+
 def test_a_change_is_kept_as_preset_and_run(home, served, tmp_path):
     scene = ScenePage.opened_from(home)
     scene.pause()
     scene.set("stiffness", 0.2)
     scene.new_difference("a softer object")
-    scene.unfold("Keep")
+    scene.tab("Export")
     scene.write("name", "Soft <b>towel")
     scene.press("Run")
     scene.until(lambda: scene.has("Saved as run"), "a published run", seconds=240)
@@ -89,7 +130,6 @@ def test_a_change_is_kept_as_preset_and_run(home, served, tmp_path):
     (preset,) = (served.data_dir / "presets").iterdir()
     assert yaml.safe_load(preset.read_text())["parameters"] == {"stiffness_scale": 0.2}
 
-    scene.unfold("Export")
     with np.load(scene.download("NPZ", tmp_path)) as data:
         shown = data["position"]
     with home.context.expect_page() as opened:

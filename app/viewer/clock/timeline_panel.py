@@ -22,7 +22,22 @@ _PACES = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0)
 class TimelinePanel:
     """Play, scrub, step, speed and loop, with hot keys."""
 
-    def __init__(self, server: viser.ViserServer, playback: Playback, guard: Guard) -> None:
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        playback: Playback,
+        guard: Guard,
+        *,
+        pace: viser.GuiTabHandle,
+    ) -> None:
+        """Add the clock.
+
+        Args:
+            server: Where to.
+            playback: The clock.
+            guard: Wraps the callbacks.
+            pace: Where step, speed and loop are, which are needed less often.
+        """
         self._playback = playback
         self._loop_of_events = server.get_event_loop()
         self._settling: asyncio.TimerHandle | None = None
@@ -31,9 +46,10 @@ class TimelinePanel:
         self._frame = gui.add_slider(
             "Frame", 0, max(playback.frame_count - 1, 1), 1, 0, hint="Arrow keys step by one frame"
         )
-        step = gui.add_button_group("Step", ("◀ 1", "1 ▶"), hint="Left and right arrow keys")
-        speed = gui.add_slider("Speed", *_SPEEDS, 0.1, 1.0, hint="Sequence seconds per second")
-        loop = gui.add_checkbox("Loop", initial_value=True)
+        with pace:
+            step = gui.add_button_group("Step", ("◀ 1", "1 ▶"), hint="Left and right arrow keys")
+            speed = gui.add_slider("Speed", *_SPEEDS, 0.1, 1.0, hint="Sequence seconds per second")
+            loop = gui.add_checkbox("Loop", initial_value=True)
         self._speed, self._loop = speed, loop
 
         self._play.on_click(guard(lambda _: playback.toggle()))

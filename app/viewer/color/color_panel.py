@@ -47,7 +47,7 @@ class ColorPanel:
         self._written = ""
         self._turn = threading.Lock()
         gui = server.gui
-        self._folder = gui.add_folder("Colors", visible=False)
+        self._folder = gui.add_folder(None, visible=False)
         with self._folder:
             self._choice: Any = gui.add_dropdown(
                 "Color by", ("plain",), hint="C: the next one, shift C: the one before"

@@ -25,6 +25,7 @@ from app.viewer.scene.layers_panel import LayersPanel, set_theme
 from app.viewer.scene.scene_server import SceneServer
 from app.viewer.ui.guard import plain
 from app.viewer.ui.keyboard import bind
+from app.viewer.ui.tabs import Tabs
 
 
 class CompareSession(SceneServer):
@@ -144,20 +145,24 @@ class CompareSession(SceneServer):
         self._layers = _first_layers(shown)
         _place_first(server, framing)
         rollouts = [content.fitted for content in pair.contents if content.fitted is not None]
-        self._timeline = TimelinePanel(server, self._playback, guard)
-        self._view = CompareView(
-            server,
-            guard,
-            content=shown,
-            framing=framing,
-            rollouts=rollouts,
-            cameras=self._cameras,
-            look=Look(mode=self._ask.mode, tint=self._ask.color),
-            redraw=self._playback.redraw,
-        )
-        self._layers_panel = LayersPanel(server, shown, guard, self._playback.redraw)
+        tabs = Tabs(server.gui, "Play", "Look", "Export")
+        self._timeline = TimelinePanel(server, self._playback, guard, pace=tabs["Play"])
+        with tabs["Play"]:
+            self._view = CompareView(
+                server,
+                guard,
+                content=shown,
+                framing=framing,
+                rollouts=rollouts,
+                cameras=self._cameras,
+                look=Look(mode=self._ask.mode, tint=self._ask.color),
+                redraw=self._playback.redraw,
+            )
+        with tabs["Look"]:
+            self._layers_panel = LayersPanel(server, guard, self._playback.redraw)
         self._layers_panel.replace(shown, self._layers, framing)
-        export = ExportPanel(server, guard, self.snapshot)
+        with tabs["Export"]:
+            export = ExportPanel(server, guard, self.snapshot)
         bind(server, guard, "color", lambda _, __: self._view.panel.next_tint(1))
         bind(server, guard, "color_back", lambda _, __: self._view.panel.next_tint(-1))
         bind(server, guard, "reset", lambda event, _: self._reset_view(event))

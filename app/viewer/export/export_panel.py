@@ -49,7 +49,7 @@ class ExportPanel:
     def __init__(
         self, server: viser.ViserServer, guard: Guard, snapshot: Callable[[], Snapshot]
     ) -> None:
-        """Add the panel.
+        """Add the panel where the caller stands.
 
         Args:
             server: Where to.
@@ -59,25 +59,24 @@ class ExportPanel:
         self._snapshot = snapshot
         self._groups: dict[str, viser.GuiButtonGroupHandle] = {}
         gui = server.gui
-        with gui.add_folder("Export", expand_by_default=False):
-            for label, options, hint in (
-                (
-                    "Frame",
-                    _FRAME,
-                    "Picture of this view; points; a ZIP with all data of this view",
-                ),
-                ("Motion", _MOTION, "All simulated frames as glTF, PLY files or arrays"),
-                ("Tables", _TABLES, "Means and forces of each frame; parameters"),
-            ):
-                buttons = gui.add_button_group(label, options, hint=hint)
-                buttons.on_click(guard(self._press))
-                self._groups[label] = buttons
-            self._size = gui.add_dropdown("Picture", tuple(_SIZES), hint="Size of PNG and ZIP")
-            side = (_SMALLEST_SIDE, LARGEST_SIDE, 1)
-            self._width = gui.add_number("Width", 1600, min=side[0], max=side[1], step=side[2])
-            self._height = gui.add_number("Height", 1200, min=side[0], max=side[1], step=side[2])
-            self._size.on_update(guard.by_user(lambda _: self._show_sides()))
-            self._show_sides()
+        for label, options, hint in (
+            (
+                "Frame",
+                _FRAME,
+                "Picture of this view; points; a ZIP with all data of this view",
+            ),
+            ("Motion", _MOTION, "All simulated frames as glTF, PLY files or arrays"),
+            ("Tables", _TABLES, "Means and forces of each frame; parameters"),
+        ):
+            buttons = gui.add_button_group(label, options, hint=hint)
+            buttons.on_click(guard(self._press))
+            self._groups[label] = buttons
+        self._size = gui.add_dropdown("Picture", tuple(_SIZES), hint="Size of PNG and ZIP")
+        side = (_SMALLEST_SIDE, LARGEST_SIDE, 1)
+        self._width = gui.add_number("Width", 1600, min=side[0], max=side[1], step=side[2])
+        self._height = gui.add_number("Height", 1200, min=side[0], max=side[1], step=side[2])
+        self._size.on_update(guard.by_user(lambda _: self._show_sides()))
+        self._show_sides()
 
     def offer(self, content: Content) -> None:
         """Show the files that a content can be saved as: motion and tables need a result."""

@@ -45,16 +45,25 @@ def clickable(content: Content) -> str:
 class Inspector:
     """The panel of the thing that was clicked; clicks and the clock come in different threads."""
 
-    def __init__(self, server: viser.ViserServer, guard: Guard, redraw: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        guard: Guard,
+        redraw: Callable[[], None],
+        *,
+        open_tab: Callable[[], None] = lambda: None,
+    ) -> None:
         """Add the panel, which says what to do until something is clicked.
 
         Args:
             server: Where to.
             guard: Wraps the callbacks.
             redraw: Draws the current frame again.
+            open_tab: Brings the panel into sight.
         """
         self._server = server
         self._redraw = redraw
+        self._open_tab = open_tab
         self._lock = threading.RLock()
         self._nodes = SceneNodes(server)
         self._content: Content | None = None
@@ -68,7 +77,7 @@ class Inspector:
         self._refreshed = 0.0
         self._invitation = ""
         gui = server.gui
-        self._folder = gui.add_folder("Inspect", expand_by_default=True)
+        self._folder = gui.add_folder(None)
         with self._folder:
             self._text = gui.add_html("")
             self._kind: Any = gui.add_dropdown("History of", ("speed",), visible=False)
@@ -183,6 +192,7 @@ class Inspector:
             found = pick(ray, target, prefers_hand=prefers_hand)
         if found is not None:
             self.look_at(found)
+            self._open_tab()
 
     def _mark(
         self,

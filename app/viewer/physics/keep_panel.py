@@ -278,7 +278,8 @@ class KeepPanel:
         self._store = storage.presets
         self._saver = storage.saver
         self._closed = threading.Event()
-        with gui.add_folder("Keep", expand_by_default=False):
+        self._folder = gui.add_folder("Keep these parameters")
+        with self._folder:
             self._name: Any = gui.add_text("name", "", hint="Of the preset or the run")
             buttons = gui.add_button_group(
                 "Save as",
@@ -324,6 +325,10 @@ class KeepPanel:
         }
         error = html.escape(run.error or "See its page.")
         _write(self._progress, texts.get(run.state, f"✗ Run {link} failed: {error}"))
+
+    def remove(self) -> None:
+        """Take the folder away."""
+        self._folder.remove()
 
     def close(self) -> None:
         """Stop listening."""

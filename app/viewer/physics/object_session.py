@@ -14,6 +14,7 @@ from app.viewer.physics.error_panel import ErrorPanel, load_track_error
 from app.viewer.physics.keep_panel import UserStorage
 from app.viewer.physics.panel import PhysicsPanel
 from app.viewer.ui.guard import Guard, notify
+from app.viewer.ui.tabs import Tabs
 from physhandi.object_rollout import ObjectRollout
 from physhandi.run import Run
 
@@ -30,6 +31,7 @@ class ObjectSession:
         guard: Guard,
         playback: Playback,
         *,
+        tabs: Tabs,
         session: str,
         live: SimulationClient,
         content: Content,
@@ -38,12 +40,13 @@ class ObjectSession:
         strip: "FrameStrip",
         storage: UserStorage | None = None,
     ) -> None:
-        """Listen to the live simulation and add the panels where the caller stands.
+        """Listen to the live simulation and add the panels.
 
         Args:
             server: Where to.
             guard: Wraps the callbacks.
             playback: The session's clock.
+            tabs: Where the panels go.
             session: Id of the session.
             live: The process that simulates.
             content: What is shown.
@@ -66,11 +69,14 @@ class ObjectSession:
             sequence=content.sequence_name,
             on_change=self._follow,
         )
-        self.panel = PhysicsPanel(server, guard, content, self._rollouts, run=run, storage=storage)
+        self.panel = PhysicsPanel(
+            server, guard, content, self._rollouts, tabs=tabs, run=run, storage=storage
+        )
         """The sliders."""
         error = load_track_error(run, content.sequence_name, fitted.frame_count)
         doubts = [w["code"] for w in run.warnings if w["sequence"] == content.sequence_name]
-        self._errors = ErrorPanel(server, content, fitted, error, doubts)
+        with tabs["Inspect"]:
+            self._errors = ErrorPanel(server, content, fitted, error, doubts)
         self._is_shown = True
         self._show_readout(at_once=True)
 
@@ -201,7 +207,7 @@ def strip_html(readout: Readout) -> str:
     )
     track = "margin:-0.3em 6.6em 0.2em 11.7em"
     style = "font-size:0.7em;line-height:1.4;opacity:0.85"
-    caption = f"<div style='text-align:right;padding-right:1.2em'>{_caption(readout)}</div>"
+    caption = f"<div style='text-align:right;padding:0 1.2em 0.5em 0'>{_caption(readout)}</div>"
     return f"<div style='{style}'><div style='{track}'>{bar}</div>{caption}</div>"
 
 

@@ -29,6 +29,8 @@ from app.viewer.ui.followed import FollowedChoice
 from app.viewer.ui.gestures import Gestures
 from app.viewer.ui.guard import Guard
 from app.viewer.ui.keyboard import bind
+from app.viewer.ui.tabs import Tabs
+from physhandi.object_rollout import ObjectRollout
 from physhandi.run import Run
 from physhandi.simulation.parameters import PARAMETERS, SimulationParameters
 
@@ -232,6 +234,7 @@ class PhysicsPanel:
         content: Content,
         rollouts: LiveRollouts,
         *,
+        tabs: Tabs,
         run: Run,
         storage: UserStorage | None = None,
     ) -> None:
@@ -242,6 +245,7 @@ class PhysicsPanel:
             guard: Wraps the callbacks.
             content: What is shown.
             rollouts: Simulate what the sliders say.
+            tabs: Where the panel goes, and what keeps its parameters.
             run: The run whose object is simulated.
             storage: Where presets and runs are kept; None where nothing can be kept.
         """
@@ -258,18 +262,17 @@ class PhysicsPanel:
         self._lock = threading.Lock()
         self._readout_lock = threading.Lock()
         self.keep: KeepPanel | None = None
-        gui, unit, parameters = server.gui, content.length_unit, fitted.parameters
-        height = np.asarray(fitted.position[0])[:, 2]
-        low, high = float(height.min()), float(height.max())
+        gui, unit = server.gui, content.length_unit
         store = None if storage is None else storage.presets
-        self._folder = gui.add_folder("Physics")
+        with tabs["Physics"]:
+            self._folder = gui.add_folder(None)
         with self._folder:
             self._status = gui.add_markdown("")
             self._presets = PresetChoice(
                 gui, guard, self.history, length_unit=unit, store=store, choose=self._replace
             )
             self._sliders = SliderSet(gui, guard, self.history, self._gestures, self._move)
-            self._sliders.add(*knobs_of("springs", parameters, length_unit=unit))
+            self._substeps = self._add_sliders(gui, guard, fitted, unit)
             self._steps = self._add_steps(gui, guard)
             pace = gui.add_button_group(
                 "Simulation",
@@ -288,16 +291,8 @@ class PhysicsPanel:
                 guard,
             )
             self._put_back.handle.on_update(guard.by_user(lambda _: self._put_one_back()))
-            with gui.add_folder("More physics", expand_by_default=False):
-                self._sliders.add(*knobs_of("more", parameters, length_unit=unit))
-                self._substeps = SubstepsChoice(
-                    gui, guard, self.history, self._gestures, self._change
-                )
-            with gui.add_folder("Ground", expand_by_default=False):
-                self._sliders.add(*ground_knobs(parameters, length_unit=unit, low=low, high=high))
-            with gui.add_folder("Self-collision", expand_by_default=False):
-                self._sliders.add(*knobs_of("self-collision", parameters, length_unit=unit))
-            if storage is not None:
+        if storage is not None:
+            with tabs["Export"]:
                 self.keep = KeepPanel(
                     gui,
                     guard,
@@ -320,6 +315,8 @@ class PhysicsPanel:
         for command in self._commands:
             command.remove()
         self._gestures.remove()
+        if self.keep is not None:
+            self.keep.remove()
         self._folder.remove()
 
     def close(self) -> None:
@@ -372,6 +369,25 @@ class PhysicsPanel:
         elif readout.is_held:
             lines.append("**Held: the next simulation waits at frame 0**")
         return "<br/>".join(lines)
+
+    def _add_sliders(
+        self, gui: viser.GuiApi, guard: Guard, fitted: ObjectRollout, unit: str
+    ) -> SubstepsChoice:
+        """Add the sliders, a tab for each group of them."""
+        parameters = fitted.parameters
+        height = np.asarray(fitted.position[0])[:, 2]
+        low, high = float(height.min()), float(height.max())
+        groups = gui.add_tab_group()
+        with groups.add_tab("Springs"):
+            self._sliders.add(*knobs_of("springs", parameters, length_unit=unit))
+        with groups.add_tab("More"):
+            self._sliders.add(*knobs_of("more", parameters, length_unit=unit))
+            substeps = SubstepsChoice(gui, guard, self.history, self._gestures, self._change)
+        with groups.add_tab("Ground"):
+            self._sliders.add(*ground_knobs(parameters, length_unit=unit, low=low, high=high))
+        with groups.add_tab("Collisions"):
+            self._sliders.add(*knobs_of("self-collision", parameters, length_unit=unit))
+        return substeps
 
     def _add_steps(self, gui: viser.GuiApi, guard: Guard) -> FollowedChoice:
         """Add undo, redo, reset and the list of steps."""

@@ -61,9 +61,8 @@ def _grid_label(content: Content, framing: Framing) -> str:
 class LayersPanel:
     """What is shown, and from where."""
 
-    def __init__(
-        self, server: viser.ViserServer, content: Content, guard: Guard, redraw: Callable[[], None]
-    ) -> None:
+    def __init__(self, server: viser.ViserServer, guard: Guard, redraw: Callable[[], None]) -> None:
+        """Add the switches where the caller stands; `replace` shows those that are needed."""
         self._server = server
         self._guard = guard
         self._redraw = redraw
@@ -74,31 +73,30 @@ class LayersPanel:
         # Two quick presses of a key are heard in threads of their own.
         self._turn = threading.Lock()
         gui = server.gui
-        with gui.add_folder("Layers", expand_by_default=content.fitted is None):
-            for field, label in (
-                ("hands", "Hands"),
-                ("nodes", "Object nodes"),
-                ("surface", "Surface"),
-                ("controls", "Control nodes"),
-                ("all_controls", "All control nodes"),
-                ("virtual_springs", "Virtual springs"),
-                ("object_springs", "Object springs"),
-                ("forces", "Force arrows"),
-                ("observed", "Observed points"),
-                ("cameras", "Cameras"),
-                ("ground", "Grid"),
-            ):
-                switch = gui.add_checkbox(label, initial_value=True)
-                switch.on_update(guard.by_user(self._switch(field)))
-                self._switches[field] = switch
-            self._scale = gui.add_slider(
-                "Arrow scale", 0.1, 5.0, 0.1, 1.0, hint="Length of the force arrows"
-            )
-            self._scale.on_update(guard.by_user(self._rescale))
-            self._place: Any = gui.add_dropdown("View from", (_OVERVIEW,))
-            self._place.on_update(guard.by_user(self._look))
-            self._theme = gui.add_dropdown("Background", THEMES)
-            self._theme.on_update(guard.by_user(lambda _: self._dress()))
+        for field, label in (
+            ("hands", "Hands"),
+            ("nodes", "Object nodes"),
+            ("surface", "Surface"),
+            ("controls", "Control nodes"),
+            ("all_controls", "All control nodes"),
+            ("virtual_springs", "Virtual springs"),
+            ("object_springs", "Object springs"),
+            ("forces", "Force arrows"),
+            ("observed", "Observed points"),
+            ("cameras", "Cameras"),
+            ("ground", "Grid"),
+        ):
+            switch = gui.add_checkbox(label, initial_value=True)
+            switch.on_update(guard.by_user(self._switch(field)))
+            self._switches[field] = switch
+        self._scale = gui.add_slider(
+            "Arrow scale", 0.1, 5.0, 0.1, 1.0, hint="Length of the force arrows"
+        )
+        self._scale.on_update(guard.by_user(self._rescale))
+        self._place: Any = gui.add_dropdown("View from", (_OVERVIEW,))
+        self._place.on_update(guard.by_user(self._look))
+        self._theme = gui.add_dropdown("Background", THEMES)
+        self._theme.on_update(guard.by_user(lambda _: self._dress()))
         bind(server, guard, "layer", lambda _, number: self._press(LAYER_KEYS[number][0]))
         bind(server, guard, "theme", lambda _, __: self._turn_theme())
         self._prefers_dark = False

@@ -5,6 +5,9 @@ from typing import Any
 
 import viser
 
+END_KEY = ("insert", "cmd/ctrl+alt+shift")
+"""Key by which the page tells that a gesture ends, which people have no use for."""
+
 
 class Gestures:
     """Numbers the gestures by which users move controls: drags, held keys, typed numbers.
@@ -24,8 +27,8 @@ class Gestures:
         self._command = gui.add_command(
             "Begin another step of undo",
             description="What is changed next is taken back by itself",
-            hotkey="insert",
-            modifier="cmd/ctrl+alt+shift",
+            hotkey=END_KEY[0],
+            modifier=END_KEY[1],
         )
         self._command.on_trigger(self._end)
 

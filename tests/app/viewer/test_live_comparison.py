@@ -137,7 +137,8 @@ def test_the_figure_and_what_was_kept_take_turns(client: ViewerClient) -> None:
     client.until(lambda: f"PhysTwin-style: simulated {FRAMES}/{FRAMES}" in said(client))
     client.until(lambda: re.search(r"mean [\d.]+ mm", said(client)))
     # The keys of the colors are those of what is shown.
-    client.until(lambda: client.gui[client.find("Colors")]["visible"] is False)
+    colors = next(m for m in client.messages if m.get("uuid") == client.find("Color by"))
+    client.until(lambda: client.gui[colors["container_uuid"]]["visible"] is False)
     press(client, "C")
     client.until(lambda: client.value("Colors of A and B") == "of A and B")
     press(client, "C")

@@ -140,7 +140,7 @@ def test_a_recording_shows_keypoints_depth_and_cameras(sessions, recording) -> N
         client.until(lambda: {"/cameras/view0", "/cameras/view1"} <= set(client.nodes))
         client.until(lambda: "/hand/skeleton_0" in client.nodes)
         assert not any(name.startswith("/object") for name in client.nodes)
-        assert not any(p.get("label") == "Physics" for p in client.gui.values())
+        assert not any(p.get("label") == "Preset" for p in client.gui.values())
 
 
 def test_a_run_without_an_object_shows_hands_and_cameras(sessions, catalog, recording) -> None:
@@ -160,7 +160,7 @@ def test_a_run_without_an_object_shows_hands_and_cameras(sessions, catalog, reco
         attempt.publish()
     with watch(sessions, "run", "hands") as client:
         client.until(lambda: {"/hand/right", "/cameras/view1"} <= set(client.nodes))
-        assert not any(p.get("label") == "Physics" for p in client.gui.values())
+        assert not any(p.get("label") == "Preset" for p in client.gui.values())
         client.set("View from", "view0")
         client.until(lambda: client.nodes["/cameras/view0"]["scale"] > 0.2)
 

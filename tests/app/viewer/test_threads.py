@@ -20,6 +20,7 @@ from app.viewer.compare.camera import Eye
 from app.viewer.content.content import Content
 from app.viewer.live.client import LiveRequest, SimulationClient
 from app.viewer.live.wire import Message
+from app.viewer.physics.history import Setting
 from app.viewer.session import Session
 from app.viewer.sessions import Sessions
 
@@ -208,13 +209,17 @@ def test_what_is_moved_last_is_asked_for_last(sessions: Sessions) -> None:
         controls = {knob.field: (knob, control) for knob, control in panel._sliders._controls}
         knob, control = controls["drag"]
         control.handle._impl.value = 7.0
-        first = beside(lambda: panel._move(knob, control))
+        first = beside(lambda: panel._move(knob, control, 1))
         assert rollouts.has_begun.wait(PATIENCE)
         control.handle._impl.value = 9.0
         # Whichever comes first: what shows the parameters in force leaves what a user moved.
+
+        def substeps() -> Setting:
+            return panel.history.set("substeps_per_frame", 77)
+
         others = [
-            beside(lambda: panel._set_substeps(77, False)),
-            beside(lambda: panel._move(knob, control)),
+            beside(lambda: panel._change(substeps)),
+            beside(lambda: panel._move(knob, control, 1)),
         ]
         rollouts.may_end.set()
         for thread in (first, *others):
