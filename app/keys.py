@@ -153,7 +153,7 @@ KEYS: tuple[KeyGroup, ...] = (
         keys=(
             Key(
                 shown=("V",),
-                about="compare with the rollout kept as A, or with the fit; again to stop",
+                about="compare with the rollout kept as A, or with what was fitted; again to stop",
                 action="pin",
                 hotkeys=("V",),
             ),

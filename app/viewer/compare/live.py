@@ -22,7 +22,7 @@ from app.viewer.physics.parameters import changes_in, knobs
 from app.viewer.scene.framing import Framing
 from app.viewer.ui.guard import Guard, notify
 from app.viewer.ui.keyboard import bind
-from physhandi.errors import MissingInputError
+from physhandi.errors import MissingInputError, UsageError
 from physhandi.object_rollout import ObjectRollout
 
 _FIGURE_ON, _FIGURE_OFF = "Back to the scene", "Compare with PhysTwin"
@@ -133,14 +133,25 @@ class LiveComparison:
             self._figure_button.visible = self.offers_figure
 
     def toggle(self) -> None:
-        """Compare with the rollout that was kept last, or with the fit; or stop comparing."""
+        """Compare with the rollout that was kept last, or with the fit; or stop comparing.
+
+        Raises:
+            UsageError: If both have the parameters of what is shown, which would be compared with
+                itself.
+        """
         with self._lock:
             if self.is_on and self._compared == "kept":
                 self._leave()
             elif self._keep_buttons.visible and self._content is not None:
-                kept = self._last_kept
-                is_new = kept is not None and kept is not self._newest()
-                self._enter("kept", kept if is_new else self._content.fitted)
+                newest = self._newest()
+                now = newest.parameters if newest is not None else None
+                others = (self._last_kept, self._content.fitted)
+                other = next((o for o in others if o is not None and o.parameters != now), None)
+                if other is None:
+                    raise UsageError(
+                        "Nothing is changed yet. Move a slider; V compares with the fit."
+                    )
+                self._enter("kept", other)
         self._redraw()
 
     def keep(self, *, is_fit: bool) -> None:
