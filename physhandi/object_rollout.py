@@ -32,7 +32,7 @@ from physhandi.triangles import vertex_normals
 
 logger = logging.getLogger(__name__)
 
-_FORMATS = {".glb": "gltf", ".npz": "npz", ".csv": "csv", ".ply": "ply", "": "ply"}
+_FORMATS = {".glb": "gltf", ".usd": "usd", ".npz": "npz", ".csv": "csv", ".ply": "ply", "": "ply"}
 
 
 @dataclass(eq=False, kw_only=True)
@@ -186,9 +186,9 @@ class ObjectRollout:
         """Write the frames that are ready, with the control nodes, the springs and the hands.
 
         Args:
-            path: File to write; its suffix says how: ``.glb`` (skinned hands, nodes and springs,
-                moving), ``.npz``, ``.csv`` or, for one frame, ``.ply``. A name without suffix is a
-                folder of PLY files, one a frame.
+            path: File to write; its suffix says how: ``.glb`` or ``.usd`` (skinned hands, nodes
+                and surface, moving), ``.npz``, ``.csv`` or, for one frame, ``.ply``. A name without
+                suffix is a folder of PLY files, one a frame.
             frame: The frame (PLY).
             overwrite: Whether to replace what is there.
 

@@ -180,7 +180,19 @@ def export(
     run: Positional[str],
     *,
     format: Literal[  # noqa: A002  # the option's name
-        "ply", "gltf", "npz", "csv", "yaml", "png", "mp4", "gif", "zip", "viser", "html", "mjcf"
+        "ply",
+        "gltf",
+        "npz",
+        "csv",
+        "yaml",
+        "png",
+        "mp4",
+        "gif",
+        "zip",
+        "viser",
+        "html",
+        "usd",
+        "mjcf",
     ],
     out: Path,
     sequence: str | None = None,
@@ -197,11 +209,11 @@ def export(
 
     Args:
         run: Folder or id of a finished run.
-        format: ply: meshes and points per frame; gltf: one .glb that moves, hands skinned; npz and
-            csv: trajectories; yaml: parameters and metrics; png: a picture; mp4 and gif: a film of
-            all frames; zip: a picture with all its data; viser: a recording for viser's player;
-            html: one file that plays in any browser; mjcf: the object as a MuJoCo scene with the
-            hand's motion and a script that simulates it (ZIP).
+        format: ply: meshes and points per frame; gltf and usd: one file that moves, hands skinned;
+            npz and csv: trajectories; yaml: parameters and metrics; png: a picture; mp4 and gif: a
+            film of all frames; zip: a picture with all its data; viser: a recording for viser's
+            player; html: one file that plays in any browser; mjcf: the object as a MuJoCo scene
+            with the hand's motion and a script that simulates it (ZIP).
         out: File or folder to write.
         sequence: Which sequence of the run; none takes the first one.
         frame: Only this frame (ply), or which one (png, zip).

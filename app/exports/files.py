@@ -31,7 +31,7 @@ from physhandi.run import Run
 
 _OWN_FIELDS = ("format", "width", "height", "turn", "download")
 _SIDE = "Of PNG, ZIP and films [px]."
-_SIMPLE = ("ply", "gltf", "npz", "csv", "yaml")
+_SIMPLE = ("ply", "gltf", "usd", "npz", "csv", "yaml")
 PictureSide = Annotated[int, Field(ge=SMALLEST, le=LARGEST)]
 Turn = Annotated[
     float,
@@ -116,7 +116,7 @@ def create_files(catalog: Catalog, sessions: Sessions, file_cache: FileCache) ->
     ) -> FileResponse:
         """Write a run as a file that other programs read.
 
-        `ply`, `gltf`, `npz`, `csv`: motion; `mjcf`: the object as a MuJoCo scene; `yaml`:
+        `ply`, `gltf`, `usd`, `npz`, `csv`: motion; `mjcf`: the object as a MuJoCo scene; `yaml`:
         parameters and metrics; `png`: a picture; `mp4`, `gif`: a film of all frames; `zip`: a
         picture with all its data; `viser`, `html`: a recording that plays without the server. All
         fields of a link are understood. A parameter of the simulation by its name, such as

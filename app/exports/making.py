@@ -134,7 +134,7 @@ def make(order: FileRequest, out: Path, report: Report = lambda _done, _of: None
 
 def surface_of(order: FileRequest) -> MovingSurface | None:
     """Lay the surface of a run's object over the frames of its fitted rollout, if it is shown."""
-    if order.format not in {"ply", "gltf"}:
+    if order.format not in {"ply", "gltf", "usd"}:
         return None
     content, _ = _open(order, order.check())
     fitted = content.fitted

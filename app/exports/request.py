@@ -9,7 +9,9 @@ from app.exports.permalink import state_from_query
 from app.viewer.content.session_state import SessionState
 from physhandi.errors import UsageError
 
-Format = Literal["png", "mp4", "gif", "viser", "html", "zip", "ply", "gltf", "npz", "csv", "mjcf"]
+Format = Literal[
+    "png", "mp4", "gif", "viser", "html", "zip", "ply", "gltf", "npz", "csv", "usd", "mjcf"
+]
 FORMATS: tuple[Format, ...] = get_args(Format)
 SUFFIXES: dict[str, str] = {"gltf": "glb", "ply": "zip", "mjcf": "zip"}
 """How the files of formats end, if not like the format."""

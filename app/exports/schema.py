@@ -5,7 +5,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, Field
 
 RunFormat = Literal[
-    "ply", "gltf", "npz", "csv", "yaml", "png", "mp4", "gif", "zip", "viser", "html", "mjcf"
+    "ply", "gltf", "npz", "csv", "yaml", "png", "mp4", "gif", "zip", "viser", "html", "usd", "mjcf"
 ]
 SlowFormat = Literal["mp4", "gif", "viser", "html"]
 """Formats for which every frame is drawn."""
@@ -21,6 +21,7 @@ MEDIA_TYPES: dict[str, str] = {
     "zip": "application/zip",
     "viser": "application/octet-stream",
     "html": "text/html",
+    "usd": "application/octet-stream",
     "mjcf": "application/zip",
 }
 

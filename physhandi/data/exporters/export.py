@@ -15,12 +15,13 @@ from physhandi.data.exporters.table import (
     write_tables,
     write_trajectories,
 )
+from physhandi.data.exporters.usd import scene_to_usd
 from physhandi.data.files import temporary_name, write_bytes, zip_bytes
 from physhandi.data.run import RunFolder
 from physhandi.errors import UsageError
 
-FORMATS = ("ply", "npz", "csv", "yaml", "gltf")
-SCENE_FORMATS = ("ply", "npz", "csv", "gltf", "mjcf")
+FORMATS = ("ply", "npz", "csv", "yaml", "gltf", "usd")
+SCENE_FORMATS = ("ply", "npz", "csv", "gltf", "usd", "mjcf")
 
 
 def export_run(
@@ -39,8 +40,9 @@ def export_run(
         run: The run to export.
         format: ``ply`` (nodes, hand meshes and virtual springs), ``npz`` (motion and springs),
             ``csv`` (a file: trajectories; a folder: also parameters and metrics) or ``yaml``
-            (settings, parameters, losses and metrics of the whole run), or ``gltf`` (one ``.glb``
-            file: skinned hands, object nodes, springs and surface, moving).
+            (settings, parameters, losses and metrics of the whole run), ``gltf`` (one ``.glb``
+            file: skinned hands, object nodes, springs and surface, moving), or ``usd`` (the same
+            without springs, for which usd-core must be installed).
         out_path: File to write; all frames as PLY go to a ``.zip``. Without the format's suffix,
             PLY and CSV make a folder.
         sequence: Which sequence; None takes the first.
@@ -83,8 +85,8 @@ def export_scene(
 
     Args:
         scene: The motion.
-        format: ``ply``, ``npz``, ``csv`` (trajectories) or ``gltf``; see `export_run`. ``mjcf`` is
-            a ZIP of the object as a MuJoCo scene with the hand's motion.
+        format: ``ply``, ``npz``, ``csv`` (trajectories), ``gltf`` or ``usd``; see `export_run`.
+            ``mjcf`` is a ZIP of the object as a MuJoCo scene with the hand's motion.
         out_path: File to write; all frames as PLY go to a ``.zip`` or a folder.
         frame: Only this frame (PLY).
         overwrite: Whether to replace an export that is there.
@@ -116,6 +118,7 @@ def _write_scene(
         "npz": lambda path: write_npz(path, scene),
         "gltf": lambda path: write_bytes(path, scene_to_gltf(scene)),
         "csv": lambda path: write_trajectories(path, scene),
+        "usd": lambda path: write_bytes(path, scene_to_usd(scene)),
         "mjcf": lambda path: write_bytes(path, zip_bytes(mjcf_files(scene))),
     }
     if format in whole:

@@ -49,6 +49,7 @@ def test_motion_of_a_run_is_what_its_arrays_hold(world: World, run: Run, tmp_pat
         assert len(archive.namelist()) == len(truth)
         vertex = read_ply(archive.read("frame_00004.ply"), tmp_path)
     np.testing.assert_allclose(vertex[: truth.shape[1]], truth[4], atol=1e-6)
+    assert fetch(world, "usd").startswith(b"PXR-USDC")
     one = world.script().get(f"{RUN}?format=ply&f=4")
     np.testing.assert_array_equal(read_ply(one.content, tmp_path), vertex)
 

@@ -6,61 +6,16 @@ from typing import Any
 import numpy as np
 import pytest
 from gltf_player import Player
+from moving_scene import FRAMES, RATE, SPRINGS, pyramid, write_run
 from pygltflib import GLTF2
 
 from physhandi.data.exporters import export_run
-from physhandi.data.exporters.scene_data import MovingSurface
 from physhandi.errors import UsageError
-from physhandi.fitting.artefacts import save_hand_vertices, save_motions
-from physhandi.hand.motion import HandMotion
-from physhandi.run import Run
-
-FRAMES, NODES, RATE = 4, 5, 25.0
-SPRINGS = np.array([[0, 1], [1, 2], [3, 4], [NODES + 3, 0]], np.int32)
-
-
-def _motions() -> tuple[HandMotion, ...]:
-    random = np.random.default_rng(1)
-    return tuple(
-        HandMotion(
-            side=side,
-            shape=random.normal(size=10),
-            articulation=0.5 * random.normal(size=(FRAMES, 15, 3)),
-            wrist_rotation=2 * random.normal(size=(FRAMES, 3)),
-            wrist_translation=0.3 * random.normal(size=(FRAMES, 3)),
-        )
-        for side in ("right", "left")
-    )
-
-
-def _run(folder: Path, *, has_object: bool = True) -> Run:
-    run = Run.create(folder, name="fit", kind="reconstruction", sequences=["/data/lift"], config={})
-    rollout = np.random.default_rng(4).normal(size=(FRAMES, NODES, 3)).astype(np.float32)
-    with run.begin_attempt() as attempt:
-        base = "sequences/lift"
-        attempt.save_yaml(f"{base}/meta.yaml", {"frame_rate": RATE, "length_unit": "m"})
-        save_motions(attempt, "lift", _motions())
-        save_hand_vertices(attempt, "lift")
-        if has_object:
-            attempt.save_array(f"{base}/rollout.npy", rollout)
-            counts = {"object_spring_count": np.array([3], np.int32)}
-            attempt.save_tensors(f"{base}/model.safetensors", {"spring_nodes": SPRINGS, **counts})
-        attempt.publish()
-    return Run.open(run.folder)
-
-
-def _pyramid() -> MovingSurface:
-    """A pyramid over the x-y plane whose top rises, in four gray levels."""
-    vertex = np.tile(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32), (4, 1, 1))
-    vertex[:, 3, 2] += np.arange(FRAMES)
-    face = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], np.int32)
-    color = np.repeat(np.array([[0], [10], [128], [255]], np.uint8), 3, axis=1)
-    return MovingSurface(vertex=vertex, face=face, color=color)
 
 
 def test_the_object_has_triangles_that_move_in_its_own_colors(tmp_path: Path) -> None:
-    surface = _pyramid()
-    path = export_run(_run(tmp_path / "fit"), "gltf", tmp_path / "fit.glb", surface=surface)
+    surface = pyramid()
+    path = export_run(write_run(tmp_path / "fit"), "gltf", tmp_path / "fit.glb", surface=surface)
     player = Player(path)
     node = player.gltf.nodes[player.node("object_surface")]
     (primitive,) = player.gltf.meshes[node.mesh].primitives
@@ -89,7 +44,7 @@ def trimesh_scene(path: Path) -> Any:
 
 
 def test_skinned_hands_move_as_in_the_run(tmp_path: Path) -> None:
-    run = _run(tmp_path / "fit")
+    run = write_run(tmp_path / "fit")
     player = Player(export_run(run, "gltf", tmp_path / "fit.glb"))
     for side in ("right", "left"):
         expected = run.array(f"sequences/lift/hand_{side}_vertex.npy")
@@ -112,7 +67,7 @@ def test_skinned_hands_move_as_in_the_run(tmp_path: Path) -> None:
 
 
 def test_the_object_moves_as_in_the_run(tmp_path: Path) -> None:
-    run = _run(tmp_path / "fit")
+    run = write_run(tmp_path / "fit")
     player = Player(export_run(run, "gltf", tmp_path / "fit.glb"))
     node = player.node("object")
     nodes, springs = player.gltf.meshes[player.gltf.nodes[node].mesh].primitives
@@ -131,7 +86,7 @@ def test_the_object_moves_as_in_the_run(tmp_path: Path) -> None:
 
 
 def test_a_hand_without_a_skin_becomes_a_moving_surface(tmp_path: Path) -> None:
-    run = _run(tmp_path / "fit", has_object=False)
+    run = write_run(tmp_path / "fit", has_object=False)
     (run.out / "sequences/lift/hand_left_skin.safetensors").unlink()
     player = Player(export_run(run, "gltf", tmp_path / "fit.glb"))
     assert "object" not in [node.name for node in player.gltf.nodes]
@@ -146,7 +101,7 @@ def test_a_hand_without_a_skin_becomes_a_moving_surface(tmp_path: Path) -> None:
 
 
 def test_the_file_is_whole(tmp_path: Path) -> None:
-    path = export_run(_run(tmp_path / "fit"), "gltf", tmp_path / "fit.glb")
+    path = export_run(write_run(tmp_path / "fit"), "gltf", tmp_path / "fit.glb")
     content = path.read_bytes()
     assert int.from_bytes(content[8:12], "little") == len(content)
     gltf = GLTF2().load(str(path))
@@ -161,11 +116,11 @@ def test_the_file_is_whole(tmp_path: Path) -> None:
         "left_hand",
     }
     with pytest.raises(UsageError, match="exists already"):
-        export_run(_run(tmp_path / "again"), "gltf", path)
+        export_run(write_run(tmp_path / "again"), "gltf", path)
 
 
 def test_trimesh_reads_it(tmp_path: Path) -> None:
     import trimesh
 
-    scene = trimesh.load(export_run(_run(tmp_path / "fit"), "gltf", tmp_path / "fit.glb"))
+    scene = trimesh.load(export_run(write_run(tmp_path / "fit"), "gltf", tmp_path / "fit.glb"))
     assert {"right_hand", "left_hand"} <= set(scene.geometry)
