@@ -402,7 +402,7 @@ class FittedObject:
     def _build(self, parameters: SimulationParameters) -> SpringMassModel:
         fitted, model = self.parameters, self.model
         if self._chosen is not None:
-            return _hold_anew(model, parameters, self._attached)
+            return _hold_anew(model, parameters, self._attached, self._chosen)
         is_changed = set(_BUILT_IN) & set(changed_settings(fitted, parameters))
         if is_changed <= set(_MATERIAL):
             return _scale_material(model, fitted, parameters) if is_changed else model
@@ -522,11 +522,17 @@ def _hold_anew(
     model: SpringMassModel,
     parameters: SimulationParameters,
     control_0: Float[ndarray, "control 3"],
+    chosen: tuple[int, ...],
 ) -> SpringMassModel:
-    """Join an object to other control nodes: its own springs stay, the virtual ones are new.
+    """Join an object to some of its control nodes: its own springs stay, the virtual ones are new.
 
-    They are laid at frame 0, for all frames.
+    They are laid at frame 0, for all frames. A rope bends only if the node that says how it is held
+    is among them.
     """
+    rod = model.rod
+    if rod is not None:
+        is_held = rod.held_by in chosen
+        rod = replace(rod, held_by=chosen.index(rod.held_by)) if is_held else None
     springs, length = virtual_springs(
         control_0.astype(np.float64),
         model.object_node.astype(np.float64),
@@ -548,4 +554,5 @@ def _hold_anew(
         damping=joined(model.damping, parameters.damping),
         control_count=len(control_0),
         attached=always(len(springs)),
+        rod=rod,
     )

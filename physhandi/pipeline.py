@@ -51,6 +51,7 @@ from physhandi.fitting.hand_reconstruction import reconstruct_hands
 from physhandi.fitting.object_problem import ObjectProblem, build_problem
 from physhandi.fitting.object_reconstruction import search_object
 from physhandi.fitting.placement import (
+    bends_as_rod,
     control_trajectory_of,
     object_nodes_of,
     refine_sequence,
@@ -63,6 +64,7 @@ from physhandi.fitting.readiness import (
     readiness,
 )
 from physhandi.fitting.rest_state import resting_clearance
+from physhandi.fitting.rope.fit import fit_rope, start_rope
 from physhandi.fitting.spring_optimisation import optimise_springs
 from physhandi.fitting.state_estimate import observed_state
 from physhandi.metrics.report import measure_run, score_run
@@ -119,8 +121,9 @@ def reconstruct(
     if has_object:
         # Built once, by the first stage that is not finished yet.
         problems = cache(lambda: _problems(sequences, config, attempt))
-        _stage_search(problems, config, attempt, progress, device)
-        _stage_springs(problems, config, attempt, progress, device)
+        is_rod = bends_as_rod(sequences, config)
+        _stage_search(problems, config, attempt, progress, device, is_rod=is_rod)
+        _stage_springs(problems, config, attempt, progress, device, is_rod=is_rod)
         _stage_refinement(sequences, problems, config, attempt, progress, device=device)
     return _stage_evaluation(sequences, config, attempt, progress, device, has_object=has_object)
 
@@ -389,9 +392,9 @@ def _stage_observation(
         observation = observe_object(sequence, progress)
         node, rest_node, shape = object_nodes_of(sequence, observation, config, template)
         template = (node, rest_node) if template is None else template
-        control = control_trajectory_of(
-            sequence, artefacts.load_motions(attempt.out, sequence.name), config
-        )
+        motions = artefacts.load_motions(attempt.out, sequence.name)
+        is_rod = bends_as_rod(sequences, config)
+        control = control_trajectory_of(sequence, motions, config, is_rod=is_rod)
         files = SequenceFiles(sequence.name)
         artefacts.save_observation(attempt, sequence.name, observation)
         attempt.save_array(files.object_node, node.astype(np.float32))
@@ -423,7 +426,7 @@ def _problems(
         observation = artefacts.load_observation(attempt.out, sequence.name)
         control = artefacts.load_control(attempt.out, sequence.name)
         contacts = None
-        if config.object_.contact_over_time:
+        if config.object_.contact_over_time and not bends_as_rod(sequences, config):
             contacts = find_contacts(
                 observation,
                 object_node,
@@ -460,11 +463,17 @@ def _stage_search(
     attempt: Attempt,
     progress: Progress,
     device: str,
+    *,
+    is_rod: bool,
 ) -> None:
     """Stage 2, zeroth-order: topology and the other global parameters."""
     if attempt.stage_done(SEARCH):
         return
-    result = search_object(problems(), config.simulation, config.object_, progress, device=device)
+    settings = config.simulation, config.object_
+    if is_rod:
+        result = start_rope(problems(), *settings, progress)
+    else:
+        result = search_object(problems(), *settings, progress, device=device)
     attempt.save_yaml(PARAMETERS_FILE, result.parameters.to_dict())
     searched = {name: variable.to_dict() for name, variable in result.intervals.items()}
     attempt.save_yaml(SEARCH_FILE, {"intervals": searched, "widened": list(result.widened)})
@@ -478,12 +487,17 @@ def _stage_springs(
     attempt: Attempt,
     progress: Progress,
     device: str,
+    *,
+    is_rod: bool,
 ) -> None:
-    """Stage 2, first-order: a stiffness and a damping for each spring."""
+    """Stage 2, first-order: a stiffness and a damping for each spring; or how a rope bends."""
     if attempt.stage_done(SPRINGS):
         return
     parameters = artefacts.load_parameters(attempt.out)
-    result = optimise_springs(problems(), parameters, config.object_, progress, device=device)
+    if is_rod:
+        result = fit_rope(problems(), parameters, config.object_, progress)
+    else:
+        result = optimise_springs(problems(), parameters, config.object_, progress, device=device)
     for problem in problems():
         artefacts.save_model(attempt, problem.name, result.models[problem.name])
         if problem.contacts is not None:

@@ -314,7 +314,7 @@ def import_mocap(
     controlled_markers: tuple[int, ...] = (0, 1, 11, 12),
     recording_rate: float = 100.0,
     frame_rate: float = 30.0,
-    nodes_per_segment: int = 4,
+    nodes_per_segment: int = 1,
     node_spacing: float | None = None,
     rest_shape: Literal["straight", "first_frame"] = "straight",
     up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z",
@@ -330,7 +330,8 @@ def import_mocap(
         controlled_markers: Markers that sit on the grippers, counted from 0.
         recording_rate: Frames per second of the recording.
         frame_rate: Frames per second of the sequences.
-        nodes_per_segment: Object nodes from one marker to the next.
+        nodes_per_segment: Object nodes from one marker to the next; ropes bend as elastic rods
+            with 1.
         node_spacing: Distance between nodes [m], in the place of --nodes-per-segment.
         rest_shape: Shape without tension: straight with median segment lengths, or as in the first
             frame.

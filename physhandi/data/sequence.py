@@ -33,6 +33,7 @@ _Table = dict[str, tuple[tuple[str | int, ...], str, bool]]
 # File: axes ("frame" is the sequence's), kind of number, whether NaN may stand for "not seen".
 ARRAYS: _Table = {
     "control.npy": (("frame", "control", 3), _F, False),
+    "held_point.npy": (("frame", 3), _F, False),
     "marker.npy": (("frame", "marker", 3), _F, True),
     "marker_node.npy": (("marker",), _I, False),
     "marker_motion_valid.npy": (("frame", "marker"), _B, False),
@@ -204,6 +205,10 @@ def _check_markers(folder: Path, meta: SequenceMeta, axes: dict[str, int]) -> No
     for file in ("rest_node.npy", "marker_node.npy"):
         if (folder / file).is_file() and not (folder / "object_node.npy").is_file():
             _fail(meta.name, file, "is about nodes, but object_node.npy is missing", "add it")
+    for file in ("object_node.npy", "control.npy"):
+        if (folder / "held_point.npy").is_file() and not (folder / file).is_file():
+            reason = f"says how a rope is held, but {file} is missing"
+            _fail(meta.name, "held_point.npy", reason, "add it, or remove this one")
     path = folder / "marker_node.npy"
     nodes = read_array(path) if path.is_file() else np.zeros(0, int)
     node_count = axes.get("node", 0)
@@ -461,6 +466,15 @@ class Sequence:
         return self._array("control.npy", np.float32)
 
     @cached_property
+    def held_point(self) -> Float[ndarray, "frame 3"] | None:
+        """Point beside a rope's first node that turns with what holds the rope there [m].
+
+        It says how a rope is twisted about itself, which points along it leave open. The object
+        nodes are in their order along the rope then.
+        """
+        return self._array("held_point.npy", np.float32)
+
+    @cached_property
     def marker(self) -> Float[ndarray, "frame marker 3"] | None:
         """Identified observed points [m]; NaN where not seen."""
         return self._array("marker.npy", np.float32)
@@ -505,8 +519,8 @@ class Sequence:
         """Tell which of the named parts the sequence lacks.
 
         Args:
-            parts: Of ``views hands color depth mask keypoint track control marker marker_node
-                marker_motion_valid validation_track object_node rest_node``. A part
+            parts: Of ``views hands color depth mask keypoint track control held_point marker
+                marker_node marker_motion_valid validation_track object_node rest_node``. A part
                 of views counts as there if one view has it. ``object`` stands for what an object
                 can be observed by (markers, or depth with masks) and moved by (hands or control).
 

@@ -270,6 +270,11 @@ class ObjectFitConfig(Settings, frozen=True, kw_only=True):
     bends_into_place: bool = False
     """Whether an object that is simulated in another recording is bent into the shape in which
     frame 0 shows it there, and is at rest in that, instead of keeping the shape of the fit."""
+    bends_ropes: bool = False
+    """Whether a rope whose recordings say how it is held (held_point.npy) bends as an elastic rod,
+    whose numbers are fitted in the place of the springs'."""
+    rope_steps: Count = 6
+    """Most steps of that fit: over windows of a second, and again over whole rollouts."""
     starts_at_rest: bool = False
     """Take the object to rest at frame 0 instead of estimating its velocity (PhysTwin)."""
     contact_over_time: bool = False

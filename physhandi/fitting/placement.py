@@ -25,6 +25,7 @@ from physhandi.fitting.hand_reconstruction import HandFit, keypoint_target, reco
 from physhandi.fitting.hand_refinement import RefinedHands, RefinementProblem, refine_hands
 from physhandi.fitting.object_problem import ObjectProblem, initial_velocity
 from physhandi.fitting.rest_state import hold_still, rest_in_place, resting_clearance
+from physhandi.fitting.rope.bending import gripped
 from physhandi.hand.loading import load_hand_model
 from physhandi.hand.model import HandModel
 from physhandi.hand.motion import HandMotion, control_trajectory
@@ -95,7 +96,7 @@ def place_object(
         kind, thickness = artefacts.load_shape(run.out)
         clearance = resting_clearance(node, sequence.ground_height, kind, thickness=thickness)
     motions = () if hands is None else hands.motions
-    control = control_trajectory_of(sequence, motions, config)
+    control = control_trajectory_of(sequence, motions, config, is_rod=known.rod is not None)
     world = parameters.in_world(
         frame_rate=sequence.frame_rate,
         ground_height=sequence.ground_height,
@@ -103,6 +104,7 @@ def place_object(
     )
     laid = replace(known, object_node=node, initial_velocity=velocity, clearance=clearance)
     model = retopologize(laid, world, control[0], fitted=parameters, rest_node=rest_node)
+    model = gripped(model)
     if is_bent and np.array_equal(rest_node, known.object_node):
         # The shape at frame 0 was its rest shape, in which springs carried it; so here.
         model = rest_in_place(model, world)
@@ -169,13 +171,32 @@ def _first_cloud(sequence: Sequence, observation: ObjectObservation) -> Float[nd
 
 
 def control_trajectory_of(
-    sequence: Sequence, motions: tuple[HandMotion, ...], config: PipelineConfig
+    sequence: Sequence,
+    motions: tuple[HandMotion, ...],
+    config: PipelineConfig,
+    *,
+    is_rod: bool = False,
 ) -> Float[ndarray, "frame control 3"]:
     """Compute the control nodes of a sequence over all frames [m].
 
+    Args:
+        sequence: The recording.
+        motions: Its hands.
+        config: Which vertices of the hands are control nodes.
+        is_rod: Whether the object is a rope that bends; its held point is the last control node.
+
     Raises:
-        MissingInputError: If the sequence has neither hands nor point controllers.
+        MissingInputError: If the sequence has neither hands nor point controllers, or a rope that
+            bends has no held point.
     """
+    if is_rod:
+        if sequence.held_point is None or sequence.control is None:
+            raise MissingInputError(
+                f"Sequence '{sequence.name}' has no held_point.npy, which says how the rope is "
+                "turned in its grip; the rope was fitted with it. Import the recording again."
+            )
+        held = np.asarray(sequence.held_point, np.float32)[:, None]
+        return np.concatenate([np.asarray(sequence.control, np.float32), held], axis=1)
     if sequence.control is not None:
         return np.asarray(sequence.control, np.float32)
     if not motions:
@@ -187,6 +208,21 @@ def control_trajectory_of(
     vertex = control_trajectory(motions, models)
     chosen = _chosen_vertices(sequence, vertex[0], models, config)
     return vertex if chosen is None else vertex[:, chosen]
+
+
+def bends_as_rod(sequences: Listing[Sequence], config: PipelineConfig) -> bool:
+    """Tell whether the object is a rope that is fitted as an elastic rod (`fitting.rope`).
+
+    Its recordings say how it is held, and every node is a marker: a rod with more nodes than that
+    would need many more substeps, and its curvature at rest could not be seen.
+    """
+    return config.object_.bends_ropes and all(_shows_bending(each) for each in sequences)
+
+
+def _shows_bending(sequence: Sequence) -> bool:
+    node, marker = sequence.object_node, sequence.marker_node
+    is_complete = node is not None and marker is not None and len(node) == len(np.unique(marker))
+    return is_complete and sequence.held_point is not None
 
 
 def _hand_models(motions: tuple[HandMotion, ...]) -> tuple[HandModel, ...]:

@@ -17,6 +17,7 @@ from jaxtyping import Float, Int32
 from numpy import ndarray
 from torch import Tensor
 
+from physhandi.errors import SimulationError
 from physhandi.simulation.engines.cpu import CpuAdjoint
 from physhandi.simulation.engines.cuda import CudaAdjoint
 from physhandi.simulation.engines.frame_sums import SCALARS
@@ -84,7 +85,8 @@ def rollout(
 
     Raises:
         SimulationDivergedError: If a node is not finite or too fast.
-        SimulationError: If there are too many candidates for self-collision.
+        SimulationError: If there are too many candidates for self-collision, or a gradient is asked
+            for through a rope that bends.
         ValueError: If a tensor does not fit the model, or the window is not positive.
     """
     if window is not None and window < 1:
@@ -178,6 +180,11 @@ class _DifferentiableSimulator:
     def adjoint(self) -> GraphAdjoint | CudaAdjoint | CpuAdjoint:
         """The adjoint of one frame; built on first use, since many rollouts have no backward."""
         simulator = self.simulator
+        if simulator.rod is not None:
+            raise SimulationError(
+                "The rollout of a rope that bends has no gradient. Call it under torch.no_grad(), "
+                "or leave out the model's rod."
+            )
         if simulator.collision is not None:
             return GraphAdjoint(simulator)
         engine = simulator.engine
@@ -227,6 +234,8 @@ class _DifferentiableSimulator:
         simulator = self.simulator
         _copy_in(simulator.position, position)
         _copy_in(simulator.velocity, velocity)
+        if simulator.rod is not None:
+            simulator.rod.reset()
         simulator.first_divergence.fill_(NO_DIVERGENCE)
         positions, velocities = [position], [velocity]
         # A GPU is asked once, at the end: a question after every frame would leave it idle.

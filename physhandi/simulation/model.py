@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float32, Int32
 from numpy import ndarray
 
 from physhandi.simulation.contact_intervals import acts_in, always
+from physhandi.simulation.rod import Rod
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -40,6 +41,8 @@ class SpringMassModel:
     attached: Int32[ndarray, "#virtual 2"] = field(default_factory=lambda: always(1))
     """Frame in whose state each virtual spring is attached, and the last one before it lets go: it
     acts on the way from the first to the last; one pair for all, or each."""
+    rod: Rod | None = None
+    """How the object bends, if it is a rope; None if springs alone hold its shape."""
 
     def __post_init__(self) -> None:
         self._spread()
@@ -76,6 +79,8 @@ class SpringMassModel:
                 f"attached has shape {self.attached.shape}; "
                 f"expected ({self.virtual_spring_count}, 2), two frames a virtual spring."
             )
+        if self.rod is not None:
+            self.rod.check(self.node_count, self.control_count)
 
     def _spread(self) -> None:
         """Give each node and spring its own value where one is given for all."""
@@ -133,29 +138,39 @@ class SpringMassModel:
 
     def to_tensors(self) -> dict[str, ndarray]:
         """Return every field as an array, ready for safetensors."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {
+        names = [field.name for field in fields(self) if field.name != "rod"]
+        values = {name: getattr(self, name) for name in names}
+        tensors = {
             name: value if isinstance(value, np.ndarray) else np.array([value], dtype=np.int32)
             for name, value in values.items()
         }
+        return tensors if self.rod is None else tensors | self.rod.to_tensors()
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, ndarray]) -> "SpringMassModel":
         """Rebuild a model from the arrays of `to_tensors`.
 
         Models that were stored before nodes had a clearance have none; the virtual springs of those
-        that were stored before springs could be attached later are always attached.
+        that were stored before springs could be attached later are always attached. Objects that
+        are no ropes, and those that were stored before ropes could bend, have no rod.
 
         Raises:
             ValueError: If an array is missing, unknown or inconsistent.
         """
-        names = {field.name for field in fields(cls)}
+        names = {field.name for field in fields(cls) if field.name != "rod"}
+        rod = None
+        if any(name in tensors for name in Rod.names()):
+            names |= Rod.names()
+            rod = Rod.from_tensors(tensors) if Rod.names() <= set(tensors) else None
         if set(tensors) | {"clearance", "attached"} != names:
             raise ValueError(
                 f"A spring-mass model needs the arrays {', '.join(sorted(names))}; "
                 f"got {', '.join(sorted(tensors))}."
             )
-        values: dict[str, Any] = {name: np.asarray(tensors[name]) for name in tensors}
+        own = set(tensors) - Rod.names()
+        values: dict[str, Any] = {
+            name: np.asarray(tensors[name]) for name in tensors if name in own
+        }
         for name in ("object_spring_count", "control_count"):
             values[name] = int(values[name][0])
-        return cls(**values)
+        return cls(**values, rod=rod)

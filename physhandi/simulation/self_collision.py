@@ -8,8 +8,8 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 from physhandi.errors import SimulationError
-from physhandi.simulation.kernels.collision_candidates import count_candidates, list_candidates
-from physhandi.simulation.kernels.self_collision import collide_nodes, free_nodes
+from physhandi.simulation.kernels.self_collision.candidates import count_candidates, list_candidates
+from physhandi.simulation.kernels.self_collision.collide import collide_nodes, free_nodes
 
 FIRST_CAPACITY = 32
 """Initial capacity: candidates of a node on average."""

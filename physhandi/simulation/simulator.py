@@ -15,12 +15,14 @@ from physhandi.errors import SimulationDivergedError
 from physhandi.simulation.engines.cpu import CpuEngine
 from physhandi.simulation.engines.cuda import CudaEngine
 from physhandi.simulation.engines.graph import LaunchGraph, SpringSums
+from physhandi.simulation.engines.rod_force import RodForce
 from physhandi.simulation.kernels.integration import integrate_nodes
 from physhandi.simulation.kernels.springs import pull_springs
 from physhandi.simulation.kernels.world import World
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.restart import Restart
+from physhandi.simulation.rod import Rod
 from physhandi.simulation.self_collision import SelfCollision
 from physhandi.simulation.stability import explain_divergence
 
@@ -44,9 +46,10 @@ class Rollout:
 class Simulator:
     """Simulates one model; holds model and state on a device.
 
-    An engine advances a frame in one launch; with self-collision, or where the engine does not fit,
-    a frame is captured as a graph of two or three kernels a substep. Everything tunable lives in
-    device arrays, so that both see changes. The same input gives the same bits, run after run.
+    An engine advances a frame in one launch; with self-collision, for a rope that bends, or where
+    the engine does not fit, a frame is captured as a graph of two to four kernels a substep.
+    Everything tunable lives in device arrays, so that both see changes. The same input gives the
+    same bits, run after run.
     """
 
     def __init__(
@@ -128,6 +131,13 @@ class Simulator:
             self._held = None
             self.model = replace(self.model, **{name: np.asarray(value, dtype=np.float32)})
 
+    def set_rod(self, rod: Rod) -> None:
+        """Change how a rope bends: its stiffness, its damping and its natural curvature."""
+        if self.rod is None:
+            raise ValueError("The model has no rod.")
+        self.model = replace(self.model, rod=rod)
+        self.rod.assign(rod)
+
     def reset(
         self,
         position: Float[ndarray, "node 3"] | None = None,
@@ -141,6 +151,8 @@ class Simulator:
         self.rest_length.assign(self.model.rest_length)
         self.clearance.assign(self.model.clearance)
         self.first_divergence.fill_(NO_DIVERGENCE)
+        if self.rod is not None:
+            self.rod.reset()
 
     def continue_from(
         self, restart: Restart, control: Float[ndarray, "control 3"]
@@ -254,19 +266,26 @@ class Simulator:
             self.engine.advance(state, state)
             return
         # Arrays of the launches cannot be allocated during capture.
-        _ = self.sums
+        _ = self.sums, self.rod
         version = self.find_candidates(self.position)
         self._recordings[self.parameters.self_collision].replay(version)
 
     @cached_property
     def engine(self) -> CudaEngine | CpuEngine | None:
         """Engine for frames without self-collision, if one fits; built on first use."""
+        if self.model.rod is not None:
+            return None
         return CudaEngine.of(self) or CpuEngine.of(self)
 
     @cached_property
     def sums(self) -> SpringSums:
         """Springs as the captured kernels read them; built on first use."""
         return SpringSums(self.model, self.device)
+
+    @cached_property
+    def rod(self) -> RodForce | None:
+        """What bends the object, if it is a rope; built on first use."""
+        return None if self.model.rod is None else RodForce(self.model, self.device)
 
     @property
     def material(self) -> tuple[wp.array, wp.array, wp.array]:
@@ -332,6 +351,8 @@ class Simulator:
             outputs=[self.sums.pull],
             device=self.device,
         )
+        if self.rod is not None:
+            self.rod.launch(fraction, self.world, [*before, *self.controls], self.sums.pull)
         start, entry, value = self.sums.of(self.sums.pull, self.sums.row_pull)
         collision = self.collision
         if collision is not None:

@@ -7,10 +7,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 from scipy.linalg import eigh_tridiagonal
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, vstack
 
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
+from physhandi.simulation.rod import Rod
 
 SAFETY = 1.25
 """Factor on the number of substeps that is just stable, for motion away from frame 0."""
@@ -238,7 +239,14 @@ class _SpringOperator:
             for each in rate.values():
                 each[late] = 0.0
         shape = (len(row_end) - 1, 3 * count)
-        return cls(csr_array((value, column, row_end), shape=shape), rate, anchor)
+        stretch = csr_array((value, column, row_end), shape=shape)
+        if model.rod is not None:
+            bends, load = _bends(model.rod, node), model.rod.stiffness / model.rod.length[1:-1]
+            stretch = csr_array(vstack([stretch, bends]))
+            scale = {"stiffness": parameters.stiffness_scale, "damping": model.rod.damping}
+            for name, own_rate in rate.items():
+                rate[name] = np.concatenate([own_rate, np.repeat(scale[name] * load, 3)])
+        return cls(stretch, rate, anchor)
 
     def of_mode(self, mode: ndarray) -> tuple[float, float]:
         """Return stiffness and damping of a mode of length 1."""
@@ -252,6 +260,21 @@ class _SpringOperator:
     def highest_load(self, name: str) -> float:
         """Return the largest sum at one coordinate: the scale of the highest eigenvalue."""
         return float(np.max(abs(self.stretch).T @ self.rate[name] + self.anchor[name], initial=0.0))
+
+
+def _bends(rod: Rod, node: Float[ndarray, "node 3"]) -> csr_array:
+    """Map node motion to the change of direction at each vertex of a rope, in all directions.
+
+    That along the rope is no bending, but springs are stiffer there anyway.
+    """
+    step = np.linalg.norm(np.diff(node[rod.node], axis=0), axis=1)
+    before, behind = 1.0 / step[:-1], 1.0 / step[1:]
+    value = np.stack([before, -before - behind, behind], axis=1)
+    column = _coordinates(np.stack([rod.node[:-2], rod.node[1:-1], rod.node[2:]], axis=1))
+    column = column.reshape(-1, 3, 3).swapaxes(1, 2)
+    rows = 3 * len(value)
+    entries = np.repeat(value, 3, axis=0).ravel(), column.ravel(), 3 * np.arange(rows + 1)
+    return csr_array(entries, shape=(rows, 3 * len(node)))
 
 
 def _stiffest_mode(springs: _SpringOperator, step: float, start: ndarray) -> ndarray:

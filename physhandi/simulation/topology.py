@@ -10,6 +10,7 @@ from scipy.spatial import KDTree
 from physhandi.simulation.contact_intervals import ContactIntervals, always
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
+from physhandi.simulation.rod import Rod
 
 MINIMUM_LENGTH = 1e-4
 """Object nodes that are no farther apart than this are not joined [m]."""
@@ -59,6 +60,13 @@ def object_springs(
     return springs, np.linalg.norm(node[springs[:, 1]] - node[springs[:, 0]], axis=1)
 
 
+def chain_springs(node: Float[ndarray, "node 3"], order: Int32[ndarray, " vertex"]) -> SpringList:
+    """Join the nodes of a rope to their neighbors along it; see `object_springs`."""
+    springs = np.sort(np.stack([order[:-1], order[1:]], axis=1), axis=1)
+    springs = springs[np.lexsort(springs.T[::-1])].astype(np.int32)
+    return springs, np.linalg.norm(node[springs[:, 1]] - node[springs[:, 0]], axis=1)
+
+
 def virtual_springs(
     control: Float[ndarray, "control 3"],
     node: Float[ndarray, "node 3"],
@@ -92,12 +100,13 @@ def virtual_springs(
     return springs.astype(np.int32), distance[is_kept][order]
 
 
-def build_model(
+def build_model(  # noqa: PLR0917  (nodes, what holds them, then what is known of the object)
     object_node: Float[ndarray, "node 3"],
     control_0: Float[ndarray, "control 3"],
     parameters: SimulationParameters,
     rest_node: Float[ndarray, "node 3"] | None = None,
     contacts: ContactIntervals | None = None,
+    rod: Rod | None = None,
 ) -> SpringMassModel:
     """Build the springs of an object and of the control nodes that touch it.
 
@@ -109,6 +118,8 @@ def build_model(
             object springs and their rest lengths.
         contacts: Pairs that are joined for an interval of frames; if left out, control nodes are
             joined for all frames to what is near them at frame 0.
+        rod: How the object bends, if it is a rope: then springs join neighbors along it, whatever
+            the radius.
 
     Returns:
         The model, at rest. A spring without stiffness is off, its dashpot included (physics.md
@@ -118,7 +129,11 @@ def build_model(
     if rest.shape != object_node.shape:
         raise ValueError(f"rest_node has shape {rest.shape}; expected {object_node.shape}.")
     node = np.asarray(object_node, dtype=np.float64)
-    springs, length = object_springs(rest, parameters.connection_radius, parameters.max_neighbors)
+    if rod is None:
+        reach = parameters.connection_radius, parameters.max_neighbors
+        springs, length = object_springs(rest, *reach)
+    else:
+        springs, length = chain_springs(rest, rod.node)
     reach = parameters.virtual_connection_radius, parameters.virtual_max_neighbors
     if contacts is None:
         virtual, virtual_length = virtual_springs(
@@ -149,6 +164,7 @@ def build_model(
         object_spring_count=len(springs),
         control_count=len(control_0),
         attached=attached,
+        rod=rod,
     )
 
 
@@ -178,7 +194,7 @@ def retopologize(
     Returns:
         The new model, with the initial velocity and the clearance of the old one.
     """
-    built = build_model(model.object_node, control_0, parameters, rest_node, contacts)
+    built = build_model(model.object_node, control_0, parameters, rest_node, contacts, model.rod)
     key, fitted_key = _spring_keys(built), _spring_keys(model)
     _, index, fitted_index = np.intersect1d(key, fitted_key, return_indices=True)
     is_object = fitted_index < model.object_spring_count

@@ -19,9 +19,7 @@ def test_a_rope_predicts_trajectories_it_was_not_fitted_on(tmp_path: Path) -> No
     for number in (48, 49, 52, 53):
         import_mocap(folder / f"trajectory_{number:03d}.npy", tmp_path / "sequences")
     config = load_profile("default")
-    search = config.object_.search.replace(generations=5, population=8, widening_generations=0)
-    first_order = config.object_.first_order.replace(iterations=0)
-    config = config.replace(object_=config.object_.replace(search=search, first_order=first_order))
+    config = config.replace(object_=config.object_.replace(rope_steps=1))
     run = Run.create(
         tmp_path / "fit",
         name="rope",
@@ -43,9 +41,10 @@ def test_a_rope_predicts_trajectories_it_was_not_fitted_on(tmp_path: Path) -> No
         pipeline.run_job(prediction)
         scores = prediction.json("metrics.json")[name]["reconstruction"]
         marker = np.load(tmp_path / "sequences" / name / "marker.npy")[:, 2:11]
-        rollout = prediction.array(f"sequences/{name}/rollout.npy")[:, 8:41:4]
+        rollout = prediction.array(f"sequences/{name}/rollout.npy")[:, 2:11]
         recount = np.linalg.norm(rollout - marker, axis=2)[1:].mean()
         assert scores["rollout"]["marker_error"] == pytest.approx(recount, rel=1e-5)
         assert scores["static"]["marker_error"] > 0.1
         errors.append(recount)
-    assert np.mean(errors) < 0.06
+    # Without natural curvature, and without clamped ends, it is 22 and 35 mm.
+    assert np.mean(errors) < 0.02

@@ -32,6 +32,10 @@ LARGEST_SEGMENT_RATIO = 10.0
 """Longest over shortest segment; more is a jump between branches."""
 LONGEST_CHAIN = 10.0
 """Chains longer than this were not given in the unit that they are read in [m]."""
+UPRIGHT = 0.99
+"""Sine of the slope from which on a line counts as upright."""
+LEAST_BENDING = 4
+"""Markers of the shortest rope that can be seen to bend."""
 _FEWEST_FRAMES = 8
 _SAMPLES_PER_SEGMENT = 64
 
@@ -44,7 +48,7 @@ def import_mocap(
     controlled_markers: tuple[int, ...] = (0, 1, 11, 12),
     recording_rate: float = 100.0,
     frame_rate: float = 30.0,
-    nodes_per_segment: int = 4,
+    nodes_per_segment: int = 1,
     node_spacing: float | None = None,
     rest_shape: RestShape = "straight",
     up: Axis = "z",
@@ -63,7 +67,8 @@ def import_mocap(
         controlled_markers: Markers that sit on the grippers; they become the controls.
         recording_rate: Frames per second of the recording [Hz].
         frame_rate: Frames per second of the sequence [Hz].
-        nodes_per_segment: Object nodes from one marker to the next.
+        nodes_per_segment: Object nodes from one marker to the next; fits let ropes bend as elastic
+            rods with 1.
         node_spacing: Distance between nodes [m]; replaces `nodes_per_segment` by what the median
             segment needs.
         rest_shape: ``straight``, each segment as long as its median, or as in the ``first_frame``.
@@ -109,6 +114,7 @@ def import_mocap(
             # Other recordings of the same rope are what a fit is tested on.
             reconstruction=len(resampled),
             controlled_markers=controlled_markers,
+            shape="rope",
             provenance={
                 "importer": "mocap",
                 "file": path.name,
@@ -120,6 +126,7 @@ def import_mocap(
                 "unit": unit,
             },
         )
+        held = held_point(marker, controlled_markers)
         arrays = {
             "control.npy": resampled[:, list(controlled_markers)],
             "marker.npy": resampled,
@@ -127,9 +134,50 @@ def import_mocap(
             "object_node.npy": node.astype(np.float32),
             "rest_node.npy": rest.astype(np.float32),
         }
+        if held is not None:
+            at_frames = resample(held[:, None], recording_rate, frame_rate)[:, 0]
+            arrays["held_point.npy"] = at_frames.astype(np.float32)
         sequences.append(write_sequence(Path(out) / meta.name, meta, arrays, overwrite=overwrite))
         watched.report(_STAGE, number + 1, len(paths), message=meta.name)
     return sequences
+
+
+def held_point(
+    marker: Float[ndarray, "sample marker 3"], controlled_markers: tuple[int, ...]
+) -> Float[ndarray, "sample 3"] | None:
+    """Lay a point beside the first marker that turns with the gripper that holds the rope there.
+
+    At first the way from the marker to it is as steep as it can be across the line from the first
+    to the second marker, so that it is the same in all recordings of a rope. With this line it then
+    turns on the shortest way, as a gripper does that does not spin about the rope.
+
+    Args:
+        marker: Positions [m].
+        controlled_markers: Markers that sit on the grippers.
+
+    Returns:
+        The points, half a segment away from the first marker [m]; None if the first two markers are
+        not both on a gripper, which then may hold the rope in any direction.
+    """
+    if not {0, 1} <= set(controlled_markers) or marker.shape[1] < LEAST_BENDING:
+        return None
+    segment = marker[:, 1] - marker[:, 0]
+    tangent = segment / np.linalg.norm(segment, axis=1, keepdims=True)
+    # Of a rope that is held upright, x takes the place of the vertical.
+    steep = np.eye(3)[2 if abs(tangent[0, 2]) < UPRIGHT else 0]
+    axis = np.empty_like(tangent)
+    axis[0] = _across(steep, tangent[0])
+    for sample in range(1, len(tangent)):
+        before, now = tangent[sample - 1], tangent[sample]
+        turned = axis[sample - 1] - (axis[sample - 1] @ now) / (1.0 + before @ now) * (before + now)
+        axis[sample] = _across(turned, now)
+    return marker[:, 0] + 0.5 * float(np.median(np.linalg.norm(segment, axis=1))) * axis
+
+
+def _across(axis: ndarray, tangent: ndarray) -> Float[ndarray, " 3"]:
+    """Return the unit vector across a tangent that is nearest to an axis."""
+    across = axis - (axis @ tangent) * tangent
+    return across / np.linalg.norm(across)
 
 
 def resample(

@@ -49,6 +49,7 @@ ROW_LENGTH = 8
 class SpringSums:
     """Sums over the springs of each node: directly on a CPU, in two levels of rows on a GPU.
 
+    The bending force on a vertex of a rope counts as one more spring of that node.
     A GPU thread waits for each value that it adds, so long sums are split into rows that many
     threads sum. The order of additions is fixed in both cases.
     """
@@ -57,9 +58,15 @@ class SpringSums:
         self._device = device
         self.spring_nodes = wp.array(model.spring_nodes, dtype=wp.vec2i, device=device)
         """Both ends of each spring."""
-        self.pull = wp.zeros(len(model.spring_nodes), dtype=wp.vec3, device=device)
-        """Force of each spring [N]."""
-        start, entry = half_edges(model.spring_nodes, model.node_count + model.control_count)
+        count = model.node_count + model.control_count
+        vertex = np.zeros(0, np.int32) if model.rod is None else model.rod.node
+        # What bends a rope has no other end; the row of a node that is not there takes it.
+        ends = np.stack([vertex, np.full_like(vertex, count)], axis=1)
+        ends = np.concatenate([model.spring_nodes, ends])
+        self.pull = wp.zeros(len(ends), dtype=wp.vec3, device=device)
+        """Force of each spring [N], then the bending force on each vertex of a rope."""
+        start, entry = half_edges(ends, count + 1)
+        start = start[:-1]
         self._half_edge = wp.array(entry, dtype=wp.int32, device=device)
         self._row_start: wp.array | None = None
         if device.is_cuda:

@@ -8,7 +8,7 @@ from physhandi.simulation.engines.frame_sums import FrameSums
 from physhandi.simulation.engines.graph import LaunchGraph
 from physhandi.simulation.engines.tape import Tape, TapeLayout
 from physhandi.simulation.kernels.adjoint import gather_nodes, nodes_adjoint, springs_adjoint
-from physhandi.simulation.kernels.self_collision_adjoint import collisions_adjoint, ground_adjoint
+from physhandi.simulation.kernels.self_collision.adjoint import collisions_adjoint, ground_adjoint
 from physhandi.simulation.self_collision import SelfCollision
 from physhandi.simulation.simulator import Simulator
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from physhandi.data.importers.mocap import (
+    held_point,
     import_mocap,
     refine,
     resample,
@@ -37,7 +38,8 @@ def test_a_trajectory_becomes_a_sequence(tmp_path: Path) -> None:
     assert (sequence.frame_count, sequence.frame_rate) == (150, 30.0)
     assert (sequence.ground_height, sequence.gravity, sequence.metric) == (None, 9.81, True)
     assert sequence.controlled_markers == (0, 1, 11, 12)
-    assert sequence.missing("object", "control", "marker_node", "rest_node") == []
+    assert sequence.shape == "rope"
+    assert sequence.missing("object", "control", "held_point", "marker_node", "rest_node") == []
     marker, control, node = sequence.marker, sequence.control, sequence.object_node
     assert marker is not None
     assert control is not None
@@ -47,12 +49,40 @@ def test_a_trajectory_becomes_a_sequence(tmp_path: Path) -> None:
     np.testing.assert_array_equal(control, marker[:, [0, 1, 11, 12]])
     # Frames 0, 3, 6, … of 30 Hz fall on samples 0, 10, 20, … of 100 Hz.
     np.testing.assert_allclose(marker[::3], rope[::10], atol=1e-6)
-    assert node.shape == (49, 3)
-    np.testing.assert_array_equal(sequence.marker_node, np.arange(13) * 4)
+    assert node.shape == (13, 3)
+    np.testing.assert_array_equal(sequence.marker_node, np.arange(13))
     np.testing.assert_allclose(node[sequence.marker_node], marker[0], atol=1e-6)
     assert sequence.rest_node is not None
-    assert np.diff(sequence.rest_node[:, 0]) == pytest.approx(SEGMENT / 4, abs=1e-6)
+    assert np.diff(sequence.rest_node[:, 0]) == pytest.approx(SEGMENT, abs=1e-6)
     assert sequence.rest_node[-1] == pytest.approx([12 * SEGMENT, 0, 0], abs=1e-5)
+
+
+def test_the_held_point_stands_across_the_rope_as_steeply_as_it_can(tmp_path: Path) -> None:
+    np.save(tmp_path / "swing.npy", make_rope(60, markers=5))
+    (sequence,) = import_mocap(
+        tmp_path / "swing.npy", tmp_path / "out", controlled_markers=(0, 1, 4)
+    )
+    assert sequence.marker is not None
+    # The half circle leaves its end downwards, and inwards by half the angle of a segment.
+    arm = SEGMENT / 2 * np.array([-np.cos(np.pi / 8), 0.0, np.sin(np.pi / 8)])
+    assert sequence.held_point is not None
+    offset = sequence.held_point - sequence.marker[:, 0]
+    np.testing.assert_allclose(offset, np.repeat(arm[None], len(offset), axis=0), atol=1e-5)
+
+
+def test_the_held_point_turns_with_the_gripper_but_not_about_the_rope() -> None:
+    turn = np.linspace(0.0, 3.0, 200)
+    along = np.stack([np.cos(turn), 0 * turn, np.sin(turn)], axis=1)
+    marker = 0.1 * np.arange(4)[None, :, None] * along[:, None]
+    held = held_point(marker, (0, 1, 3))
+    assert held is not None
+    across = np.stack([-np.sin(turn), 0 * turn, np.cos(turn)], axis=1)
+    np.testing.assert_allclose(held, 0.05 * across, atol=1e-12)
+    assert held_point(marker, (0, 3)) is None
+    assert held_point(marker[:, :3], (0, 1)) is None
+    upright = held_point(marker[..., [1, 2, 0]], (0, 1))
+    assert upright is not None
+    np.testing.assert_allclose(upright[0], [0.05, 0.0, 0.0], atol=1e-12)
 
 
 def test_resampling_is_exact_for_cubic_motion() -> None:

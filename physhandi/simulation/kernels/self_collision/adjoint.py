@@ -8,7 +8,7 @@ import warp as wp
 
 from physhandi.simulation.kernels.adjoint import before_drag, node_adjoint
 from physhandi.simulation.kernels.contacts import SLIDING_SPEED, Motion
-from physhandi.simulation.kernels.self_collision import collision_count, is_colliding
+from physhandi.simulation.kernels.self_collision.collide import collision_count, is_colliding
 from physhandi.simulation.kernels.world import World
 
 wp.set_module_options({"enable_backward": False})
