@@ -134,17 +134,27 @@
     row.firstElementChild.style.width = "calc(100% - 1.5em)";
   }
 
+  /* Names beside controls in a gray that can be read, unlike viser's (contrast of 4.5). */
+  const DRESS = ":root { --mantine-color-dimmed: #5f6770 !important; --mantine-color-gray-filled: #5f6770 !important; } :root[data-mantine-color-scheme=dark] { --mantine-color-dimmed: #a0a7b0 !important; }";
+
+  function dress(root) {
+    const style = root.ownerDocument.createElement("style");
+    style.textContent = DRESS;
+    root.ownerDocument.head.append(style);
+  }
+
   const ICONS = { "list-search": "All commands", adjustments: "Connection and camera", "arrow-back": "Back to the panel" };
 
   /* viser writes names beside its sliders and fields, and draws icons, but tells eyes alone. */
   function name(root) {
+    for (const button of root.querySelectorAll(".mantine-Notification-closeButton:not([aria-label])")) button.ariaLabel = "Close";
     for (const [icon, text] of Object.entries(ICONS)) {
       root.querySelector(`button .tabler-icon-${icon}`)?.closest("button").setAttribute("aria-label", text);
     }
     for (const label of root.querySelectorAll("label[for]")) {
       const row = label.closest(".mantine-Flex-root");
       const text = label.textContent.replace(/^● (.*)$/, "$1, changed");
-      for (const part of row?.querySelectorAll("[role=slider], .mantine-NumberInput-input") ?? []) {
+      for (const part of row?.querySelectorAll("[role=slider], .mantine-NumberInput-input, .mantine-TextInput-input") ?? []) {
         if (part.ariaLabel !== text) part.ariaLabel = text;
       }
       if (row?.querySelector("input[type=checkbox]")) halve(row);
@@ -196,6 +206,7 @@
     const root = inside.document.documentElement;
     let start = 0;
     keepSigns(root);
+    dress(root);
     tellGestures(inside, root);
     keepKeys(inside, root);
     keepNamed(inside, root);

@@ -6,10 +6,11 @@ import time
 from pathlib import Path
 
 import pytest
+from accessibility import violations
 from clicked_disc import write_disc
 from playwright.sync_api import Page, expect
 from raw_capture import RawCapture
-from scene_page import TIMEOUT_MS
+from scene_page import TIMEOUT_MS, ScenePage
 
 pytestmark = pytest.mark.e2e
 BUNDLED = Path(__file__).parents[2] / "sequences"
@@ -128,6 +129,40 @@ def test_lists_work_without_scripts_and_on_a_phone(home: Page, base: str, browse
             assert page.locator("main").bounding_box()["width"] <= width <= 390
     finally:
         plain.close()
+
+
+def test_no_page_keeps_anybody_out(home: Page, base: str) -> None:
+    """Not by names that are missing, nor by colors that cannot be told apart."""
+    paths = (
+        "/",
+        "/runs",
+        "/runs/copy1",
+        "/sequences",
+        "/sequences/towel_fold/check",
+        "/suites",
+        "/diff?run=copy1&run=copy0",
+        "/compare?a=towel_fold_quick&b=copy0",
+        "/import",
+        "/system",
+        "/runs/copy0/view",
+    )
+    home.emulate_media(reduced_motion="reduce")  # Or colors are looked at while they change.
+    for path in paths:
+        home.emulate_media(color_scheme="light")
+        home.goto(f"{base}{path}")
+        assert violations(home) == [], path
+        home.emulate_media(color_scheme="dark")
+        assert violations(home, "color-contrast") == [], f"{path} in the dark"
+
+    scene = ScenePage(home)  # It is dark by now, or will be.
+    scene.until(lambda: scene.has("object springs"), "the panel appears")
+    frame = next(frame for frame in home.frames if "/viewer/" in frame.url)
+    for scheme in ("dark", "light"):
+        home.emulate_media(color_scheme=scheme)
+        frame.locator(f"html[data-mantine-color-scheme={scheme}]").wait_for(state="attached")
+        for tab in ("Physics", "Look", "Play", "Export"):
+            scene.tab(tab)
+            assert violations(frame) == [], f"{tab}, {scheme}"
 
 
 def test_a_recording_is_checked_frame_by_frame(home: Page, base: str) -> None:

@@ -19,11 +19,14 @@ from app.viewer.ui.guard import Guard
 from app.viewer.ui.keyboard import bind
 from physhandi.data.view import View
 
+_BRAND = {False: (28, 80, 165), True: (36, 99, 203)}
+"""Color of buttons on light and dark panels; both can be read (contrast of 4.5)."""
+
 
 def set_theme(server: viser.ViserServer, *, dark: bool) -> None:
     """Dress the page."""
     server.gui.configure_theme(
-        dark_mode=dark, show_logo=False, show_share_button=False, brand_color=(36, 99, 203)
+        dark_mode=dark, show_logo=False, show_share_button=False, brand_color=_BRAND[dark]
     )
 
 
