@@ -25,6 +25,7 @@ from app.viewer.scene.object_drawing import RGB, ObjectDrawing, Style, share_byt
 from app.viewer.scene.scene import FRAME_BYTES, add_ground
 from physhandi.data.object_mass import given_mass
 from physhandi.object_rollout import ObjectRollout
+from physhandi.simulation.object_surface import ObjectSurface
 
 MODES: Mapping[Mode, str] = {"side": "side by side", "overlay": "overlay", "wipe": "wipe"}
 """Ways of placing A and B, as the panel names them."""
@@ -90,6 +91,8 @@ _LONGEST_ARROW = 0.22
 _LONGEST_ARROW_OF_FIGURE = 0.3
 _HAND_OPACITY = 0.35
 _SAME_HAND = 1e-5
+_TINT = 0.55
+"""How much of a surface's color is that of its side."""
 
 
 @dataclass(kw_only=True)
@@ -251,14 +254,17 @@ class CompareDrawing:
             self._place()
             for key, side in sides.items():
                 is_shown = look.strength(key) > 0.0 and not (has_one_hand and key == "b")
-                self._draw_hands(key, side, is_visible=layers.hands and is_shown)
+                self._draw_hands(key, side, layers, is_visible=layers.hands and is_shown)
                 is_observed = layers.observed and is_shown and not look.is_figure
                 self._nodes.plane = self._plane(key)
                 self._draw_observed(key, side, is_playing=is_playing, is_visible=is_observed)
                 self._draw_object(key, layers, is_playing=is_playing)
                 self._nodes.plane = None
 
-    def _draw_hands(self, key: str, side: ComparedSide, *, is_visible: bool) -> None:
+    def _draw_hands(
+        self, key: str, side: ComparedSide, layers: Layers, *, is_visible: bool
+    ) -> None:
+        opacity = _HAND_OPACITY if self._surface_of(side, layers) is None else None
         for hand in side.content.hands:
             path, color = f"{_ROOT}/{key}/hand/{hand.side}", SKIN[hand.side]
             frame = min(side.content_frame, len(hand.vertex) - 1)
@@ -268,7 +274,7 @@ class CompareDrawing:
                 self._nodes.points(path, vertex, color, size, is_visible=is_visible)
             else:
                 self._nodes.mesh(
-                    path, vertex, hand.face, color, is_visible=is_visible, opacity=_HAND_OPACITY
+                    path, vertex, hand.face, color, is_visible=is_visible, opacity=opacity
                 )
 
     def _draw_observed(
@@ -296,10 +302,13 @@ class CompareDrawing:
             return
         # Springs would hide the other side long before they have faded.
         is_strong = strength > 0.5 and not look.is_ghost(key)
-        # Two objects are told apart by nodes and springs, also where one is shown by its surface.
-        has_object = layers.nodes or layers.surface
+        surface = self._surface_of(side, layers)
+        # Figures are of nodes and springs; in one place two objects are told apart by them.
+        has_object = layers.nodes or (layers.surface and surface is None)
         has_parts = look.is_figure and layers.surface
-        has_springs = layers.object_springs or (layers.surface and has_few_springs(rollout))
+        has_springs = layers.object_springs or (
+            layers.surface and surface is None and has_few_springs(rollout)
+        )
         shown = replace(
             layers,
             nodes=has_object and look.is_figure,
@@ -314,6 +323,7 @@ class CompareDrawing:
         hands = sum(hand.vertex.shape[1] for hand in side.content.hands) if layers.hands else 0
         observed = PLAYING_OBSERVED if layers.observed and not look.is_figure else 0
         points = rollout.model.node_count + len(used.attached(rollout)) + hands + observed
+        points += 0 if surface is None else surface.vertex_count
         point_bytes = 12 if look.is_figure else 15
         budget = share_bytes(FRAME_BYTES // 2 - point_bytes * points, rollout, shown, ARROWS)
         if not is_playing:
@@ -329,6 +339,7 @@ class CompareDrawing:
             longest=longest * self._framing.extent,
             painted=painted,
         )
+        self._draw_surface(key, rollout, surface, painted)
         if look.is_figure:
             return
         point = np.asarray(rollout.position[side.frame], dtype=np.float32)
@@ -336,6 +347,31 @@ class CompareDrawing:
         size = look.node_size(key) * self._framing.spacing
         is_visible = has_object and strength > 0.0
         self._nodes.points(colored_path, point, color, size, is_visible=is_visible)
+
+    def _surface_of(self, side: ComparedSide, layers: Layers) -> ObjectSurface | None:
+        """Find the surface by which a side is shown, if it is: beside the other one, alone."""
+        look, surface, rollout = self._look, side.content.surface, side.rollout
+        if surface is None or rollout is None or look.mode != "side" or look.is_figure:
+            return None
+        has_its_nodes = surface.node_count == rollout.model.node_count
+        return surface if layers.surface and has_its_nodes else None
+
+    def _draw_surface(
+        self,
+        key: str,
+        rollout: ObjectRollout,
+        surface: ObjectSurface | None,
+        painted: Painted | None,
+    ) -> None:
+        path = f"{_ROOT}/{key}/object/surface"
+        if surface is None:
+            self._nodes.show(path, is_visible=False)
+            return
+        color = tinted(surface.color, STYLES[key].node)
+        if painted is not None:
+            color = painted.vertices(surface)
+        vertex = surface.place(rollout.position[self._sides[key].frame])
+        self._nodes.mesh(path, vertex, surface.face, color, is_visible=True, opacity=None)
 
     def _painted(self, key: str, side: ComparedSide, other: ComparedSide) -> Painted | None:
         """Choose the colors of the difference; None for those of the side."""
@@ -526,6 +562,13 @@ def written_newtons(sides: Sides, kilograms: float | None) -> dict[str, float]:
         if side.rollout is not None:
             newtons[key] = mass.force_factor(side.rollout.model.node_count)
     return newtons
+
+
+def tinted(color: UInt8[ndarray, "vertex 3"] | None, side: RGB) -> Any:
+    """Give a surface the color of its side, in which its own pattern is still seen."""
+    if color is None:
+        return side
+    return np.round((1 - _TINT) * color + _TINT * np.array(side)).astype(np.uint8)
 
 
 def difference_scale(end: float, length_unit: str) -> ColorScale:

@@ -235,8 +235,9 @@ def _side(key: str, content: Content, frame: int) -> ComparedSide:
 
 def _first_layers(content: Content) -> Layers:
     """Show objects and hands; what holds the object would hide how two of them differ."""
-    first = default_layers(replace(content, surface=None))
-    return replace(first, controls=False, virtual_springs=False, forces=False, cameras=False)
+    return replace(
+        default_layers(content), controls=False, virtual_springs=False, forces=False, cameras=False
+    )
 
 
 def _place_first(server: viser.ViserServer, framing: Framing) -> None:

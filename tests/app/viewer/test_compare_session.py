@@ -16,7 +16,9 @@ from app.viewer.compare.sides import ComparedSide, compared_rollouts
 from app.viewer.export.snapshot import snapshot_npz
 from app.viewer.sessions import Sessions
 from physhandi.errors import MissingInputError, PhysHandiError, UsageError
+from physhandi.object_rollout import load_fitted, load_surface
 from physhandi.run import Run
+from physhandi.simulation.object_surface import ObjectSurface
 
 OFFSET = np.array([0.0, 0.003, 0.004])
 """By how much B's nodes are elsewhere: 5 mm."""
@@ -128,10 +130,12 @@ def curves(client: ViewerClient) -> list[np.ndarray]:
     return [np.asarray(column) for column in next(found, ())]
 
 
-def is_drawn(client: ViewerClient, side: str, position: np.ndarray) -> bool:
-    path = f"/compare/{side}/object/compared"
-    there = client.nodes.get(path, {}).get("points", np.zeros(0))
-    return there.size == position.size and np.allclose(nodes(client, side), position, atol=1e-6)
+def is_laid(client: ViewerClient, surface: ObjectSurface, side: str, position: np.ndarray) -> bool:
+    """Whether a side's surface is where its nodes are: all sides beside another one have one."""
+    path, expected = f"/compare/{side}/object/surface", surface.place(position)
+    there = client.nodes.get(path, {}).get("vertices", np.zeros(0))
+    is_there = there.size == expected.size
+    return is_there and np.allclose(client.array(path, "vertices"), expected, atol=1e-6)
 
 
 def is_aimed(client: ViewerClient) -> bool:
@@ -155,12 +159,14 @@ def is_aimed(client: ViewerClient) -> bool:
 def test_both_sides_follow_one_clock_beside_each_other(
     sessions: Sessions, catalog: FolderCatalog
 ) -> None:
-    rollout = catalog.run("sheet").array("sequences/lift/rollout.npy")
+    run = catalog.run("sheet")
+    rollout = run.array("sequences/lift/rollout.npy")
+    surface = load_surface(run, load_fitted(run, "lift"), ())
     with watch(sessions, "a=sheet&b=moved&f=11") as client:
         client.until(lambda: "mean 55 mm" in said(client))
         client.until(lambda: "Each node of A from the same node of B" in said(client))
-        client.until(lambda: is_drawn(client, "a", rollout[11]))
-        client.until(lambda: is_drawn(client, "b", rollout[11] + 11 * OFFSET))
+        client.until(lambda: is_laid(client, surface, "a", rollout[11]))
+        client.until(lambda: is_laid(client, surface, "b", rollout[11] + 11 * OFFSET))
         # B stands to the right of the camera, wherever it looks, and the button exchanges them.
         client.until(lambda: is_aimed(client))
         client.until(lambda: stand_along(client, (0.0, 1.0, 0.0)))
@@ -169,8 +175,8 @@ def test_both_sides_follow_one_clock_beside_each_other(
         # One clock: another frame moves both.
         client.set("Frame", 4)
         client.until(lambda: "mean 20 mm" in said(client))
-        client.until(lambda: is_drawn(client, "a", rollout[4]))
-        client.until(lambda: is_drawn(client, "b", rollout[4] + 4 * OFFSET))
+        client.until(lambda: is_laid(client, surface, "a", rollout[4]))
+        client.until(lambda: is_laid(client, surface, "b", rollout[4] + 4 * OFFSET))
         # The curves grow while they are measured; the mark is drawn with them.
         client.until(lambda: len(curves(client)[0]) == FRAMES)
         client.until(lambda: np.flatnonzero(curves(client)[3]).tolist() == [4])
