@@ -22,7 +22,7 @@ from app.viewer.physics.keep_panel import UserStorage
 from app.viewer.physics.object_session import FrameStrip, ObjectSession
 from app.viewer.restoring import complete_state
 from app.viewer.scene.framing import frame_content
-from app.viewer.scene.layers_panel import LayersPanel, add_legend, set_theme
+from app.viewer.scene.layers_panel import LayersPanel, legend_of, set_theme
 from app.viewer.scene.scene import SceneDrawing
 from app.viewer.scene.scene_server import SceneServer
 from app.viewer.ui.keyboard import bind
@@ -177,7 +177,7 @@ class Session(SceneServer):
         simulated: tuple[TabName, ...] = ("Physics",) if self.kind == "run" else ()
         tabs = self._tabs = Tabs(server.gui, "Play", "Look", *simulated, "Inspect", "Export")
         with tabs["Play"]:
-            self._legend = add_legend(server, self._content)
+            self._legend = server.gui.add_html("")
         if len(self._names) > 1:
             now = self._content.sequence_name
             choice = server.gui.add_dropdown("Sequence", self._names, initial_value=now)
@@ -303,6 +303,9 @@ class Session(SceneServer):
             is_hidden = self._comparison.is_on and rollout is not None
             if self._legend.visible == is_hidden:
                 self._legend.visible = not is_hidden
+            written = legend_of(self._content, self._view.scene.layers)
+            if self._legend.content != written:
+                self._legend.content = written
             self._colors.show(is_playing=is_playing, is_hidden=is_hidden)
             self._inspector.show(
                 rollout, frame, rollout_frame, is_playing=is_playing, is_hidden=is_hidden

@@ -100,6 +100,6 @@ def colored(page: Page, color: str) -> np.ndarray:
     assert image is not None
     image = image[:, NOTICE:-PANEL]
     hue, saturation, value = np.moveaxis(cv2.cvtColor(image, cv2.COLOR_BGR2HSV), -1, 0)
-    low, high = {"blue": (106, 112), "orange": (11, 15)}[color]
-    found = (hue >= low) & (hue <= high) & (saturation > 190) & (value > 150)
+    low, high = {"blue": (104, 114), "orange": (9, 17)}[color]
+    found = (hue >= low) & (hue <= high) & (saturation > 170) & (value > 150)
     return np.flatnonzero(found.sum(axis=0) > 1)

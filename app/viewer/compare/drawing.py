@@ -91,8 +91,8 @@ _LONGEST_ARROW = 0.22
 _LONGEST_ARROW_OF_FIGURE = 0.3
 _HAND_OPACITY = 0.35
 _SAME_HAND = 1e-5
-_TINT = 0.55
-"""How much of a surface's color is that of its side."""
+_LIGHTNESS = np.array([0.299, 0.587, 0.114])
+"""How much red, green and blue contribute to how light a color is."""
 
 
 @dataclass(kw_only=True)
@@ -565,10 +565,14 @@ def written_newtons(sides: Sides, kilograms: float | None) -> dict[str, float]:
 
 
 def tinted(color: UInt8[ndarray, "vertex 3"] | None, side: RGB) -> Any:
-    """Give a surface the color of its side, in which its own pattern is still seen."""
+    """Give a surface the color of its side; its own pattern is seen as lighter and darker parts."""
     if color is None:
         return side
-    return np.round((1 - _TINT) * color + _TINT * np.array(side)).astype(np.uint8)
+    light = color @ _LIGHTNESS
+    middle = float(np.clip(np.median(light), 1.0, 254.0))
+    dark = np.minimum(light / middle, 1.0)[:, None]
+    bright = np.maximum((light - middle) / (255.0 - middle), 0.0)[:, None]
+    return np.round((1.0 - bright) * dark * np.array(side) + 255.0 * bright).astype(np.uint8)
 
 
 def difference_scale(end: float, length_unit: str) -> ColorScale:

@@ -11,9 +11,12 @@ from app.previews.links import MOST_MARKERS, marker_links
 from physhandi.data.camera import triangulate
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
+from physhandi.errors import SequenceError
 from physhandi.metrics.photometric import seen_colors
 
 _POINTS = 5_000
+_MOST_FRAMES = 400
+"""Frames of which the colors of points are kept."""
 _GREEN = np.array([46, 160, 67], dtype=np.uint8)
 
 
@@ -38,6 +41,11 @@ class PointSet:
     def colors(self) -> UInt8[ndarray, " 3"]:
         """All points are green."""
         return _GREEN
+
+    @property
+    def is_colored(self) -> bool:
+        """Whether points have the colors of what they were seen on."""
+        return False
 
 
 class CloudSet:
@@ -77,9 +85,23 @@ class CloudSet:
         if not self._views or frame >= self._views[0].frame_count:
             return _GREEN
         if frame not in self._known:
-            color = seen_colors(self._views, self.points(frame).astype(np.float64), frame=frame)
-            self._known[frame] = _GREEN if color is None else color
+            if len(self._known) >= _MOST_FRAMES:
+                self._known.clear()
+            self._known[frame] = self._seen(frame)
         return self._known[frame]
+
+    @property
+    def is_colored(self) -> bool:
+        """Whether points have the colors of what they were seen on."""
+        return bool(self._views)
+
+    def _seen(self, frame: int) -> UInt8[ndarray, "*point 3"]:
+        """Ask the views; a frame that is damaged is green."""
+        try:
+            color = seen_colors(self._views, self.points(frame).astype(np.float64), frame=frame)
+        except SequenceError:
+            return _GREEN
+        return _GREEN if color is None else color
 
 
 class DepthCloud:
@@ -111,6 +133,11 @@ class DepthCloud:
     def colors(self) -> UInt8[ndarray, "point 3"]:
         """Give the pixels' colors."""
         return self._colors
+
+    @property
+    def is_colored(self) -> bool:
+        """Whether points have the colors of what they were seen on."""
+        return True
 
 
 Observed = PointSet | CloudSet | DepthCloud

@@ -11,7 +11,6 @@ from app.keys import LAYER_KEYS
 from app.viewer.color.legend import swatches_html
 from app.viewer.content.content import Content
 from app.viewer.content.layers import BLUE, GREEN, GREY, RED, SKIN, THEMES, YELLOW, Layers, Theme
-from app.viewer.content.observed import DepthCloud
 from app.viewer.scene.cameras import pose_of_view
 from app.viewer.scene.framing import Framing
 from app.viewer.scene.scene import grid_cell
@@ -30,24 +29,31 @@ def set_theme(server: viser.ViserServer, *, dark: bool) -> None:
     )
 
 
-def add_legend(server: viser.ViserServer, content: Content) -> viser.GuiHtmlHandle:
-    """Add the legend of the parts that a content has."""
-    entries: list[tuple[tuple[int, int, int], str]] = []
-    if content.hands or content.skeletons:
-        entries.append((SKIN["right"], "hand"))
+def legend_of(content: Content, layers: Layers) -> str:
+    """Say as HTML what the colors of the parts mean that are shown.
+
+    What has the colors of the recording, as surfaces and clouds can, is not among them.
+    """
+    has_object, is_colored = content.fitted is not None, layers.color != "plain"
+    is_marked = content.markers is not None or (
+        content.tracks is not None and content.tracks.node is not None
+    )
     controls = "control points" if content.hands or content.markers is None else "grippers"
-    if content.fitted is not None:
-        entries += [(BLUE, "object"), (RED, "controls, forces"), (YELLOW, "virtual springs")]
-    elif content.control is not None:
-        entries.append((RED, controls))
-    if content.observed is not None and not isinstance(content.observed, DepthCloud):
-        is_marked = content.markers is not None or (
-            content.tracks is not None and content.tracks.node is not None
-        )
-        entries.append((GREEN, "markers" if is_marked else "observed"))
-    if content.views:
-        entries.append((GREY, "cameras"))
-    return server.gui.add_html(swatches_html(entries, is_list=False))
+    holds = (layers.controls or layers.all_controls) and content.control is not None
+    forces = layers.forces and has_object
+    red = [name for name, is_shown in (("controls", holds), ("forces", forces)) if is_shown]
+    observed = content.observed
+    is_green = observed is not None and not observed.is_colored
+    entries = (
+        (SKIN["right"], "hand", layers.hands and bool(content.hands or content.skeletons)),
+        (BLUE, "object nodes", layers.nodes and has_object and not is_colored),
+        (RED, ", ".join(red) if has_object else controls, bool(red)),
+        (YELLOW, "virtual springs", layers.virtual_springs and has_object and not is_colored),
+        (GREEN, "markers" if is_marked else "observed", layers.observed and is_green),
+        (GREY, "cameras", layers.cameras and bool(content.views)),
+    )
+    shown = [(color, text) for color, text, is_shown in entries if is_shown]
+    return swatches_html(shown, is_list=False)
 
 
 _OVERVIEW = "Overview"
