@@ -119,8 +119,8 @@ def test_a_scene_opens_plays_and_saves_what_it_shows(home, fitted, tmp_path, pic
     assert inside.get_by_text("Opening the scene").count() == 0
     if home.locator("[data-first-hint]").is_visible():  # A picture was taken without it.
         home.get_by_role("button", name="Got it").click()
-    home.reload()
-    scene.until(lambda: scene.has("object springs"), "the scene again")
+    home.reload(wait_until="load")
+    assert home.evaluate("localStorage.getItem('physhandi.first-hint')") == "seen"
     expect(home.locator("[data-first-hint]")).to_be_hidden()
 
 

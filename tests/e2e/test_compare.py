@@ -100,6 +100,7 @@ def colored(page: Page, color: str) -> np.ndarray:
     assert image is not None
     image = image[:, NOTICE:-PANEL]
     hue, saturation, value = np.moveaxis(cv2.cvtColor(image, cv2.COLOR_BGR2HSV), -1, 0)
-    low, high = {"blue": (104, 114), "orange": (9, 17)}[color]
-    found = (hue >= low) & (hue <= high) & (saturation > 170) & (value > 150)
+    # Surfaces are paler where light falls on them; hands have a hue of up to 12.
+    low, high, least = {"blue": (104, 112, 100), "orange": (13, 20, 150)}[color]
+    found = (hue >= low) & (hue <= high) & (saturation > least) & (value > 150)
     return np.flatnonzero(found.sum(axis=0) > 1)
