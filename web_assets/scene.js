@@ -134,8 +134,19 @@
     row.firstElementChild.style.width = "calc(100% - 1.5em)";
   }
 
-  /* Names beside controls in a gray that can be read, unlike viser's (contrast of 4.5). */
-  const DRESS = ":root { --mantine-color-dimmed: #5f6770 !important; --mantine-color-gray-filled: #5f6770 !important; } :root[data-mantine-color-scheme=dark] { --mantine-color-dimmed: #a0a7b0 !important; }";
+  /* Names beside controls in a gray that can be read, unlike viser's (contrast of 4.5). On phones viser's panel
+     lies over the scene; here it is a sheet below it, and the scene has the rest: all of it, once the sheet is
+     folded by a tap on its head. */
+  const SHEET = '.mantine-Paper-root[style*="position: fixed"][style*="min-height: 3.5em"]';
+  const DRESS = `
+    :root { --mantine-color-dimmed: #5f6770 !important; --mantine-color-gray-filled: #5f6770 !important; }
+    :root[data-mantine-color-scheme=dark] { --mantine-color-dimmed: #a0a7b0 !important; }
+    @media (max-width: 36em) {
+      :has(> ${SHEET}) { flex-direction: column; }
+      ${SHEET} { position: relative !important; flex: none; width: 100% !important; max-height: 45% !important; border-radius: .8em .8em 0 0; }
+      ${SHEET} .mantine-ScrollArea-content > div { width: 100% !important; }
+      ${SHEET} .mantine-ScrollArea-content > div > div:first-child::before { content: ""; position: absolute; top: .4em; left: calc(50% - 1.2em); width: 2.4em; height: .25em; border-radius: 1em; background: var(--mantine-color-dimmed); opacity: .6; }
+    }`;
 
   function dress(root) {
     const style = root.ownerDocument.createElement("style");

@@ -112,6 +112,25 @@ def test_every_tab_fits_its_window_and_is_reached_by_keys(shared_scene):
     page.keyboard.press("v")
     scene.tab("Physics")
     scene.press("Reset")
+
+
+def test_on_a_phone_the_panel_is_a_sheet_below_the_scene(shared_scene):
+    scene, page, height = shared_scene, shared_scene.page, 844
+    page.set_viewport_size({"width": 390, "height": height})
+    head = scene.panel.get_by_text("Towel fold, fitted", exact=True)
+    sheet = scene.panel.locator(".mantine-Paper-root", has=head)
+
+    def parts() -> tuple[float, float, float]:
+        """Height of the scene, of the sheet, and where it begins below the scene."""
+        measure = "e => e.getBoundingClientRect().toJSON()"
+        canvas = scene.panel.locator("canvas").first.evaluate(measure)
+        panel = sheet.evaluate(measure)
+        return canvas["height"], panel["height"], panel["top"] - canvas["top"] - canvas["height"]
+
+    scene.until(lambda: abs(parts()[2]) <= 1 and parts()[0] > 0.4 * height, "scene above sheet")
+    assert 0.3 * height < parts()[1] <= 0.45 * height
+    head.click()
+    scene.until(lambda: parts()[1] < 60 and parts()[0] > 0.8 * height, "a folded sheet")
     page.set_viewport_size({"width": 1280, "height": 800})
 
 
