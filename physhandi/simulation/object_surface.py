@@ -15,9 +15,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
+from scipy.interpolate import CubicSpline  # pyright: ignore[reportMissingTypeStubs]  # it has none
 from scipy.sparse import coo_array, csr_array, vstack
-from scipy.sparse.csgraph import dijkstra
+from scipy.sparse.csgraph import dijkstra, minimum_spanning_tree
 from scipy.spatial import KDTree
+from scipy.spatial.distance import pdist, squareform
 
 from physhandi.simulation.surface import is_line, triangulate_nodes, typical_distance
 
@@ -33,6 +35,8 @@ _STATION = 0.7
 """Distance of the rings of a tube, in its radii."""
 _SIDES = 12
 """Vertices of a ring."""
+_SPARSE = 0.5
+"""Nodes of a rope that is thinner than this part of their distance are on its middle."""
 _THINNEST, _THICKEST = 0.2, 1.5
 """Least and largest radius of a tube, in typical distances of nodes."""
 _ROUND_END = np.array([[0.87, 0.5], [0.5, 0.87]])
@@ -267,6 +271,10 @@ def _lay_tube(
 ) -> ObjectSurface | None:
     """Lay a tube round nodes that follow one open curve; None if they do not."""
     pitch = typical_distance(point)
+    if thickness is not None and thickness < pitch:
+        thin = _lay_thin_tube(point, 0.5 * thickness, most_vertices)
+        if thin is not None:
+            return thin
     place = _places_along(point, _TOUCHING * pitch)
     if place is None:
         return None
@@ -277,10 +285,42 @@ def _lay_tube(
         return None
     radius = 0.5 * thickness if thickness is not None else float(np.sqrt(2 * np.mean(aside**2)))
     radius = float(np.clip(radius, _THINNEST * pitch, _THICKEST * pitch))
-    ends = len(_ROUND_END) + 1
-    most = max(most_vertices // _SIDES - 2 * ends, 4)
+    at = _stations(place, radius, most_vertices)
+    return _tube_round(_kernel(at, place, width), point, radius)
+
+
+def _lay_thin_tube(
+    point: Float[ndarray, "node 3"], radius: float, most_vertices: int
+) -> ObjectSurface | None:
+    """Lay a tube round the spline through nodes that are farther apart than a rope is thick.
+
+    They are on its middle, and an average over neighbors would cut every bend. None if they are no
+    chain of such nodes.
+    """
+    tree = minimum_spanning_tree(squareform(pdist(point)))
+    joints = np.bincount(np.concatenate(tree.nonzero()), minlength=len(point))
+    if joints.max() > 2 or 2.0 * radius > _SPARSE * np.median(tree.data):
+        return None
+    place = np.asarray(dijkstra(tree, directed=False, indices=int(np.argmin(joints))))
+    order = np.argsort(place)
+    spline = CubicSpline(place[order], np.eye(len(place))[order])
+    return _tube_round(spline(_stations(place, radius, most_vertices)), point, radius)
+
+
+def _stations(
+    place: Float[ndarray, " node"], radius: float, most_vertices: int
+) -> Float[ndarray, " station"]:
+    """Place the rings of a tube along a rope [m]."""
+    most = max(most_vertices // _SIDES - 2 * (len(_ROUND_END) + 1), 4)
     count = int(np.clip(place.max() / (_STATION * radius), 4, most))
-    station = _kernel(np.linspace(0.0, place.max(), count), place, width)
+    return np.linspace(0.0, place.max(), count)
+
+
+def _tube_round(
+    station: Float[ndarray, "station node"], point: Float[ndarray, "node 3"], radius: float
+) -> ObjectSurface:
+    """Lay rings round the points of a rope's middle, and a round end at both of its ends."""
+    ends, count = len(_ROUND_END) + 1, len(station)
     ring = np.concatenate([np.zeros(ends, int), np.arange(count), np.full(ends, count - 1)])
     beyond, wide = np.concatenate([[[1.0, 0.0]], _ROUND_END]).T
     along = np.concatenate([-beyond, np.zeros(count), beyond[::-1]])

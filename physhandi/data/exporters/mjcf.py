@@ -87,8 +87,14 @@ def mjcf_files(scene: SceneData) -> Iterator[tuple[str, bytes]]:
         our rollout; ``play.py``, which simulates the one along the other.
 
     Raises:
-        UsageError: If there is no object to simulate.
+        UsageError: If there is no object to simulate, or it bends as an elastic rod.
     """
+    if "rod_node" in scene.model:
+        raise UsageError(
+            f"The rope of sequence '{scene.sequence}' bends as an elastic rod, which tendons of a "
+            "MuJoCo scene do not. Export its motion (gltf, usd, npz), or fit it with springs "
+            "alone (object_.bends_ropes: false)."
+        )
     if not scene.model or not scene.parameters:
         raise UsageError(f"Sequence '{scene.sequence}' has no object that MuJoCo could simulate.")
     twin = _Twin(scene)

@@ -122,6 +122,9 @@ def test_what_cannot_be_simulated_is_refused_and_the_server_offers_the_rest(
     bare = replace(scene_of(pendulum()), model={})
     with pytest.raises(UsageError, match="made' has no object"):
         list(mjcf_files(bare))
+    rope = scene_of(pendulum())
+    with pytest.raises(UsageError, match="made' bends as an elastic rod"):
+        list(mjcf_files(replace(rope, model=rope.model | {"rod_node": np.arange(2)})))
     answer = world.script().get("/api/v1/runs/fitted/export?format=mjcf&mass=0.5")
     assert answer.headers["content-disposition"] == 'attachment; filename="fitted_mjcf.zip"'
     with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:

@@ -146,3 +146,17 @@ def test_a_shell_of_scattered_nodes_is_closed_and_keeps_its_inside_empty():
 )
 def test_what_has_no_surface_gets_none(node, kind):
     assert lay_surface(node, kind=kind) is None
+
+
+def test_a_thin_rope_of_few_nodes_is_a_tube_round_each_of_them():
+    """Nodes at the markers of motion capture: 10 cm apart, two of them near in a grip."""
+    angle = np.concatenate([[0.0, 0.08], np.linspace(0.4, 2.8, 7), [3.1]])
+    node = 0.3 * np.stack([np.cos(angle), 0.0 * angle, np.sin(angle)], axis=1)
+    surface = lay_surface(node, kind="rope", thickness=0.012)
+    assert surface is not None
+    swung = node + np.stack([0.0 * angle, 0.04 * angle**2, 0.0 * angle], axis=1)
+    for moved in (node, swung):
+        vertex = surface.place(moved).astype(float)
+        nearest = np.linalg.norm(vertex[:, None] - moved, axis=2).min(axis=0)
+        np.testing.assert_allclose(nearest, 0.006, atol=0.001)
+    assert euler(surface.face) == 2
