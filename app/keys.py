@@ -14,6 +14,8 @@ Action = Literal[
     "slower",
     "pause",
     "faster",
+    "part_begin",
+    "part_end",
     "layer",
     "color",
     "color_back",
@@ -101,6 +103,13 @@ KEYS: tuple[KeyGroup, ...] = (
             Key(shown=("J",), about="play slower", action="slower", hotkeys=("J",)),
             Key(shown=("K",), about="pause", action="pause", hotkeys=("K",)),
             Key(shown=("L",), about="play faster", action="faster", hotkeys=("L",)),
+            Key(
+                shown=("I",),
+                about="play from this frame on",
+                action="part_begin",
+                hotkeys=("I",),
+            ),
+            Key(shown=("O",), about="play up to this frame", action="part_end", hotkeys=("O",)),
         ),
     ),
     KeyGroup(

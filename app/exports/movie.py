@@ -38,7 +38,7 @@ def film_scene(
     size: tuple[int, int],
     turn: float = 0.0,
 ) -> None:
-    """Film all frames of a sequence, in one step or not at all.
+    """Film the frames of a sequence that are played, in one step or not at all.
 
     MP4 is encoded as VP9, which needs no licence; browsers and players of today show it. It has an
     even number of columns and rows, so of an odd size the last is left out.
@@ -46,7 +46,7 @@ def film_scene(
     Args:
         content: What can be shown.
         take: The object's rollout; None without an object.
-        state: Layers, camera, theme and speed, as `complete_state` returns them.
+        state: Layers, camera, theme, speed and part, as `complete_state` returns them.
         report: Told how many frames are filmed, and of how many.
         out: File to write.
         as_gif: Whether to write a GIF instead of an MP4.
@@ -57,13 +57,15 @@ def film_scene(
     Raises:
         UsageError: If the film would be too long for its size, or cannot be encoded.
     """
-    count, pixels = content.frame_count, size[0] * size[1]
+    first, last = state.part or (0, content.frame_count - 1)
+    frames, pixels = range(first, last + 1), size[0] * size[1]
+    count = len(frames)
     if count * pixels > MOST_FILMED_PIXELS:
         raise UsageError(
-            f"'{content.sequence_name}' has {count} frames; choose a picture of at most "
+            f"'{content.sequence_name}' plays {count} frames; choose a picture of at most "
             f"{MOST_FILMED_PIXELS // count:,} pixels instead of {size[0]} x {size[1]}."
         )
-    pictures = _pictures(content, take, state, report, size=size, turn=turn)
+    pictures = _pictures(content, take, state, report, frames=frames, size=size, turn=turn)
     rate = content.frame_rate * state.speed
     suffix = "gif" if as_gif else "mp4"  # Tells OpenCV the format.
     temporary = out.with_name(f"{temporary_name(out.stem)}.{suffix}")
@@ -83,21 +85,22 @@ def _pictures(
     state: SessionState,
     report: Callable[[int, int], None],
     *,
+    frames: range,
     size: tuple[int, int],
     turn: float,
 ) -> Iterator[UInt8[ndarray, "row column 3"]]:
     """Draw frame after frame (red, green, blue)."""
-    count = content.frame_count
+    count = len(frames)
     with Offscreen(content, take, state) as scene:
-        for frame in range(count):
+        for done, frame in enumerate(frames):
             scene.recorded = frame / content.frame_rate
             scene.draw(frame, is_playing=False)
-            pose = turned_pose(scene.pose, np.radians(turn) * frame / count)
+            pose = turned_pose(scene.pose, np.radians(turn) * done / count)
             image = draw_scene(scene.server, pose, *size, is_dark=scene.is_dark)
             if scene.legend is not None:
                 image = draw_legend(image, scene.legend, is_dark=scene.is_dark)
             yield np.ascontiguousarray(image)
-            report(frame + 1, count)
+            report(done + 1, count)
 
 
 def turned_pose(pose: Pose, angle: float) -> Pose:

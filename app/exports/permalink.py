@@ -17,6 +17,7 @@
 ``fig``             1 for the figure that compares with PhysTwin
 ``play``            1 if the clock runs
 ``speed``, ``loop`` how it runs
+``part``            first and last frame of what is played
 a parameter         its name and value, if it is not as fitted; ``substeps_per_frame=auto``
 ==================  ===============================================================================
 """
@@ -42,7 +43,7 @@ _SCALES, _SPEEDS, _FOVS = (0.1, 5.0), (0.1, 2.0), (1.0, 170.0)
 _UP = (0.0, 0.0, 1.0)
 _KEYS = (
     *("f", "sequence", "cam", "up", "fov", "show", "range", "scale", "from"),
-    *("theme", "fig", "play", "speed", "loop", "mass"),
+    *("theme", "fig", "play", "speed", "loop", "part", "mass"),
 )
 _NUMBERS = {"scale": ("force_scale", _SCALES), "mass": ("mass", (LIGHTEST, HEAVIEST))}
 _LAYER_TYPES: dict[str, Any] = get_type_hints(Layers)
@@ -74,6 +75,7 @@ def state_to_query(state: SessionState) -> dict[str, str]:
         "play": (state.is_playing, "1"),
         "speed": (state.speed != 1.0, _number(state.speed)),
         "loop": (not state.does_loop, "0"),
+        "part": (state.part is not None, ",".join(map(str, state.part or ()))),
     }
     query |= {name: text for name, (is_given, text) in rest.items() if is_given}
     for name, value in state.parameter_changes.items():
@@ -117,6 +119,7 @@ def state_from_query(query: Mapping[str, str]) -> SessionState:
         is_playing=_switch(query, "play", usual=False),
         speed=_real(query, "speed", _SPEEDS, 1.0),
         does_loop=_switch(query, "loop", usual=True),
+        part=_part_from_query(query),
         layers=None,
         layer_changes=_layers_from_query(query),
         theme=theme,
@@ -249,6 +252,16 @@ def _switch(query: Mapping[str, str], name: str, *, usual: bool) -> bool:
     if text not in {None, "0", "1"}:
         raise UsageError(f"{name}: {text[:40]!r} is neither 0 nor 1." if text else f"{name}: empty")
     return usual if text is None else text == "1"
+
+
+def _part_from_query(query: Mapping[str, str]) -> tuple[int, int] | None:
+    if "part" not in query:
+        return None
+    first, _, last = query["part"].partition(",")
+    ends = [_integer({"part": text}, "part", _LAST_FRAME) for text in (first, last or "0")]
+    if ends[0] >= ends[1]:
+        raise UsageError(f"part: {query['part'][:40]!r} is not a first and a later last frame.")
+    return ends[0], ends[1]
 
 
 def _parameter(name: str, text: str) -> Any:

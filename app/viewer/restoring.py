@@ -22,7 +22,7 @@ def complete_state(state: SessionState, content: Content) -> SessionState:
         view the pose of that.
 
     Raises:
-        UsageError: If the content has no such frame, view, object or figure; names the field.
+        UsageError: If the content has no such frame, part, view, object or figure; names the field.
     """
     if state.sequence_name not in {None, content.sequence_name}:
         raise UsageError(f"sequence: '{content.sequence_name}' is shown, nothing else is there.")
@@ -30,6 +30,11 @@ def complete_state(state: SessionState, content: Content) -> SessionState:
         raise UsageError(
             f"f: '{content.sequence_name}' has frames 0 to {content.frame_count - 1}, "
             f"not {state.frame}."
+        )
+    if state.part is not None and state.part[1] >= content.frame_count:
+        raise UsageError(
+            f"part: '{content.sequence_name}' has frames 0 to {content.frame_count - 1}, "
+            f"not {state.part[1]}."
         )
     layers = state.layers or replace(default_layers(content), **state.layer_changes)
     views = [view.name for view in content.views]

@@ -105,6 +105,7 @@ class Session(SceneServer):
                 is_playing=self._playback.is_playing,
                 speed=self._playback.speed,
                 does_loop=self._playback.does_loop,
+                part=self._playback.part,
                 layers=replace(self._view.scene.layers),
                 theme=theme,
                 prefers_dark=prefers_dark,
@@ -244,7 +245,7 @@ class Session(SceneServer):
     def _restore(self, state: SessionState) -> None:
         """Go on where another session stands."""
         self._has_played = True
-        self._timeline.restore(state.speed, does_loop=state.does_loop)
+        self._timeline.restore(state.speed, does_loop=state.does_loop, part=state.part)
         if state.layers is not None:
             self._layers.restore(state.layers, state.theme, prefers_dark=state.prefers_dark)
             self._colors.restore()

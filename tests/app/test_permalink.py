@@ -19,6 +19,7 @@ def state(**changes: object) -> SessionState:
         is_playing=False,
         speed=1.0,
         does_loop=True,
+        part=None,
         layers=Layers(
             hands=False,
             cameras=False,
@@ -65,6 +66,7 @@ def test_what_was_written_is_read_again() -> None:
     before = state(
         is_playing=True,
         speed=0.3,
+        part=(4, 20),
         does_loop=False,
         is_figure=True,
         automatic_substeps=True,
@@ -72,7 +74,7 @@ def test_what_was_written_is_read_again() -> None:
         parameter_changes={"damping": 1.0 / 3, "self_collision": True, "ground_height": None},
     )
     after = state_from_query(state_to_query(before))
-    for name in ("sequence_name", "frame", "is_playing", "speed", "does_loop", "theme"):
+    for name in ("sequence_name", "frame", "is_playing", "speed", "does_loop", "part", "theme"):
         assert getattr(after, name) == getattr(before, name), name
     assert (after.is_figure, after.automatic_substeps) == (True, True)
     assert after.parameter_changes == before.parameter_changes
@@ -115,6 +117,8 @@ def test_an_empty_query_leaves_everything_to_the_content() -> None:
         ({"theme": "<script>"}, "theme"),
         ({"play": "yes"}, "play"),
         ({"speed": "0"}, "speed"),
+        ({"part": "20,4"}, "part"),
+        ({"part": "4,"}, "part"),
         ({"drag": "-1"}, "drag"),
         ({"drag": "nan"}, "drag"),
         ({"drag": "none"}, "drag"),

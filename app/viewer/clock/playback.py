@@ -42,6 +42,7 @@ class Playback:
         self._condition = threading.Condition()
         self._position = 0.0
         self._limit = frame_count
+        self._part: tuple[int, int] | None = None
         self._speed = 1.0
         self._is_playing = False
         self._is_held = False
@@ -74,6 +75,12 @@ class Playback:
         with self._condition:
             return self._does_loop
 
+    @property
+    def part(self) -> tuple[int, int] | None:
+        """First and last frame of the part that is played; None for all."""
+        with self._condition:
+            return self._part
+
     def start(self) -> None:
         """Start the thread."""
         self._thread.start()
@@ -91,10 +98,15 @@ class Playback:
         self._change()
 
     def play(self, *, on: bool = True) -> None:
-        """Start or stop the clock; starting at the end goes back to the beginning."""
+        """Start or stop the clock; starting outside of the part, or at its end, goes to its begin.
+
+        If playing starts over at the end, it may start at the end as well.
+        """
         with self._condition:
-            if on and not self._does_loop and int(self._position) >= self.frame_count - 1:
-                self._position = 0.0
+            begin, end = self._ends()
+            last = end if self._does_loop else end - 1
+            if on and not begin <= int(self._position) < last:
+                self._position = float(begin)
         self._change(_is_playing=on)
 
     def hold(self) -> None:
@@ -132,6 +144,20 @@ class Playback:
         """Set whether playing starts over at the end."""
         self._change(_does_loop=on)
 
+    def set_part(self, first: int, last: int) -> None:
+        """Set which frames are played; any other can still be gone to.
+
+        Args:
+            first: First frame of the part.
+            last: Last one, not before the first. Numbers outside the sequence mean its ends.
+        """
+        last = min(max(last, 0), self.frame_count - 1)
+        first = min(max(first, 0), last)
+        is_all = (first, last) == (0, self.frame_count - 1)
+        with self._condition:
+            self._part = None if is_all else (first, last)
+        self._change()
+
     def limit(self, frame_count: int) -> None:
         """Keep the running clock inside the first frames, while later ones are being computed.
 
@@ -149,6 +175,7 @@ class Playback:
         """Start over with another sequence."""
         with self._condition:
             self.frame_count, self.frame_rate = frame_count, frame_rate
+            self._part = None
         self._change(_position=0.0, _limit=frame_count)
 
     def _change(self, **values: float | bool) -> None:
@@ -200,9 +227,13 @@ class Playback:
         """Return whether frames pass."""
         return self._is_playing and not self._is_held
 
+    def _ends(self) -> tuple[int, int]:
+        """Give the first frame that is played, and the one after the last."""
+        return (0, self.frame_count) if self._part is None else (self._part[0], self._part[1] + 1)
+
     def _is_starved(self) -> bool:
         """Return whether the clock waits for a frame that is still being computed."""
-        is_limited = self._limit < self.frame_count
+        is_limited = self._limit < self._ends()[1]
         return is_limited and self._position >= self._limit - _SHORT_OF
 
     def _advance(self, elapsed: float) -> bool:
@@ -211,13 +242,14 @@ class Playback:
             return False
         before = int(self._position)
         position = self._position + min(elapsed, 0.5) * self._speed * self.frame_rate
-        if self._limit < self.frame_count:
+        begin, end = self._ends()
+        if self._limit < end:
             position = min(position, self._limit - _SHORT_OF)
-        elif position >= self.frame_count:
+        elif position >= end:
             if self._does_loop:
-                position %= self.frame_count
+                position = begin + (position - end) % (end - begin)
             else:
-                position, self._is_playing = float(self.frame_count - 1), False
+                position, self._is_playing = float(end - 1), False
                 self._needs_drawing = True
         self._position = position
         return int(position) != before

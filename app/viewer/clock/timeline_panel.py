@@ -50,6 +50,16 @@ class TimelinePanel:
             step = gui.add_button_group("Step", ("◀ 1", "1 ▶"), hint="Left and right arrow keys")
             speed = gui.add_slider("Speed", *_SPEEDS, 0.1, 1.0, hint="Sequence seconds per second")
             loop = gui.add_checkbox("Loop", initial_value=True)
+            last = max(playback.frame_count - 1, 1)
+            self._part = gui.add_multi_slider(
+                "Part",
+                0,
+                last,
+                1,
+                (0, last),
+                min_range=1,
+                hint="Frames that are played; keys I and O set its ends to the frame that is shown",
+            )
         self._speed, self._loop = speed, loop
 
         self._play.on_click(guard(lambda _: playback.toggle()))
@@ -57,6 +67,7 @@ class TimelinePanel:
         step.on_click(guard(lambda event: playback.step(1 if event.target.value == "1 ▶" else -1)))
         speed.on_update(guard.by_user(lambda _: playback.set_speed(speed.value)))
         loop.on_update(guard.by_user(lambda _: playback.set_loop(on=loop.value)))
+        self._part.on_update(guard.by_user(lambda _: playback.set_part(*self._part.value)))
         actions: dict[Action, Callable[[], None]] = {
             "play": playback.toggle,
             "next": lambda: playback.step(1),
@@ -68,6 +79,8 @@ class TimelinePanel:
             "slower": lambda: self._hurry(-1),
             "pause": lambda: playback.play(on=False),
             "faster": lambda: self._hurry(1),
+            "part_begin": lambda: self._cut(begins=True),
+            "part_end": lambda: self._cut(begins=False),
         }
         for action, act in actions.items():
             bind(server, guard, action, lambda _, __, act=act: act())
@@ -88,18 +101,39 @@ class TimelinePanel:
     def replace(self, frame_count: int) -> None:
         """Fit the slider to another sequence."""
         self._frame.value = 0
-        self._frame.max = max(frame_count - 1, 1)
+        self._frame.max = self._part.max = max(frame_count - 1, 1)
+        self._show_part()
 
-    def restore(self, speed: float, *, does_loop: bool) -> None:
+    def restore(self, speed: float, *, does_loop: bool, part: tuple[int, int] | None) -> None:
         """Run the clock as it ran in another session."""
         self._speed.value, self._loop.value = speed, does_loop
         self._playback.set_speed(speed)
         self._playback.set_loop(on=does_loop)
+        if part is not None:
+            self._playback.set_part(*part)
+            self._show_part()
 
     def go(self, frame: int) -> None:
         """Stop at a frame."""
         self._playback.play(on=False)
         self._playback.seek(frame)
+
+    def _cut(self, *, begins: bool) -> None:
+        """Let the part that is played begin or end at this frame, two frames long at least."""
+        frame, last = self._playback.frame, self._playback.frame_count - 1
+        first, end = self._playback.part or (0, last)
+        if begins:
+            first = min(frame, last - 1)
+            end = end if end > first else last
+        else:
+            end = max(frame, 1)
+            first = first if first < end else 0
+        self._playback.set_part(first, end)
+        self._show_part()
+
+    def _show_part(self) -> None:
+        """Show what is played."""
+        self._part.value = self._playback.part or (0, max(self._playback.frame_count - 1, 1))
 
     def _follow(self) -> None:
         """Move the slider to where the clock is.

@@ -89,6 +89,7 @@ class CompareSession(SceneServer):
             is_playing=self._playback.is_playing,
             speed=self._playback.speed,
             does_loop=self._playback.does_loop,
+            part=self._playback.part,
             layers=replace(self._layers),
             theme=theme,
             prefers_dark=prefers_dark,
@@ -181,7 +182,7 @@ class CompareSession(SceneServer):
         if state is None:
             return
         self._has_played = True
-        self._timeline.restore(state.speed, does_loop=state.does_loop)
+        self._timeline.restore(state.speed, does_loop=state.does_loop, part=state.part)
         if state.layers is not None:
             self._layers_panel.restore(state.layers, state.theme, prefers_dark=state.prefers_dark)
         if state.pose is not None:

@@ -115,6 +115,8 @@ class SessionState:
     """Whether the figure is shown instead of the scene."""
     pose: Pose | None
     """Camera of the first client; None if nobody looked."""
+    part: tuple[int, int] | None = None
+    """First and last frame of the part that is played; None for all."""
     layer_changes: Mapping[str, Any] = field(default_factory=dict[str, Any])
     """Without `layers`: fields of `Layers` that differ from what suits the content."""
     parameter_changes: Mapping[str, Any] = field(default_factory=dict[str, Any])

@@ -60,6 +60,20 @@ def test_a_film_shows_every_frame_at_its_time(
         np.testing.assert_allclose(middle(seen), exact, atol=1.0)
 
 
+def test_a_film_shows_the_part_that_is_played(
+    world: World, made: list[FileRequest], tmp_path: Path
+) -> None:
+    film = world.script().get(f"{RUN}?format=mp4&{LOOK}&part=4,6&speed=0.5")
+    (tmp_path / "a.mp4").write_bytes(film.content)
+    rate, frames = frames_of(tmp_path / "a.mp4")
+    assert (rate, len(frames)) == (15.0, 3)
+    for frame, seen in zip((4, 5, 6), frames, strict=True):
+        np.testing.assert_allclose(middle(seen), middle(picture(world, frame)), atol=1.0)
+    for bad, word in (("4", "later last"), ("6,4", "later last"), ("4,10", "frames 0 to 9")):
+        refused = world.script().get(f"{RUN}?format=mp4&{LOOK}&part={bad}")
+        assert (refused.status_code, word in refused.text) == (422, True), refused.text
+
+
 def test_the_progress_of_a_film_is_told_until_it_can_be_fetched(
     world: World, made: list[FileRequest]
 ) -> None:

@@ -182,6 +182,7 @@ def has_heard_all(state: SessionState) -> bool:
     assert state.pose is not None
     return (
         (state.speed, state.theme, state.layers.dark) == (0.5, "dark", True)
+        and state.part == (1, 3)
         and state.layers.nodes
         and state.pose.position.tolist() == [0.3, 0.2, 0.1]
         and (state.frame, state.is_playing) == (7, False)
@@ -202,6 +203,7 @@ def test_a_second_tab_gets_a_copy_with_the_same_state(address, sessions) -> None
         hear_all(sessions.get(session)._server, client)
         rest_at(client, 7)
         client.set("Speed", 0.5)
+        client.set("Part", [1, 3])
         client.set("Object nodes", True)
         client.set("Background", "dark")
         client.set("stiffness", -1.0)
@@ -214,7 +216,7 @@ def test_a_second_tab_gets_a_copy_with_the_same_state(address, sessions) -> None
         assert (own.id, copied.owner) == (session, "me")
         state = copied.state
         assert (state.sequence_name, state.frame, state.is_playing) == ("drag", 7, False)
-        assert (state.speed, state.theme) == (0.5, "dark")
+        assert (state.speed, state.part, state.theme) == (0.5, (1, 3), "dark")
         assert state.parameters.stiffness_scale == pytest.approx(0.1)
         assert (state.layers.nodes, state.layers.dark) == (True, True)
         with ViewerClient(f"ws://{address}/viewer/{copied.id}") as second:
@@ -222,9 +224,16 @@ def test_a_second_tab_gets_a_copy_with_the_same_state(address, sessions) -> None
             second.until(lambda: " from the fitted rollout" in second.texts())
             second.until(lambda: {"/object/nodes", "/forces"} <= set(second.nodes))
             second.until(lambda: first_positions(second)[-1:] == [pytest.approx((0.3, 0.2, 0.1))])
-            names = ("Sequence", "Frame", "Speed", "stiffness", "Object nodes", "Background")
-            wanted = ["drag", 7, 0.5, -1.0, True, "dark"]
-            second.until(lambda: [second.value(name) for name in names] == wanted)
+            wanted = {
+                "Sequence": "drag",
+                "Frame": 7,
+                "Speed": 0.5,
+                "Part": [1, 3],
+                "stiffness": -1.0,
+                "Object nodes": True,
+                "Background": "dark",
+            }
+            second.until(lambda: {name: second.value(name) for name in wanted} == wanted)
             assert "/springs/virtual" not in second.nodes
             fitted = own._content.fitted.position[7]
             second.until(

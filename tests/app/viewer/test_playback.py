@@ -117,6 +117,48 @@ def test_without_loop_it_stops_at_the_end_and_starts_over(film: Film) -> None:
     assert (film.playback.frame, film.playback.is_playing) == (0, True)
 
 
+def test_only_a_part_is_played_but_every_frame_can_be_gone_to(film: Film) -> None:
+    film.playback.set_speed(0.2)
+    film.playback.set_part(3, 6)
+    film.playback.play()
+    film.clock.at(1.0, lambda: film.playback.play(on=False))
+    film.clock.at(1.1, lambda: film.playback.seek(9))
+    film.clock.at(1.5, film.playback.play)
+    film.run(2.0)
+    # It begins with the part, goes around in it, and returns to it from behind it.
+    assert film.frames[:9] == [3, 4, 5, 6, 3, 4, 5, 6, 3]
+    after = film.frames[film.frames.index(9) + 1 :]
+    assert len(after) > 5
+    assert set(after) == {3, 4, 5, 6}
+
+
+def test_a_part_without_loop_ends_at_its_last_frame_and_starts_over(film: Film) -> None:
+    film.playback.set_loop(on=False)
+    film.playback.set_part(3, 6)
+    film.playback.play()
+    film.run(1.0)
+    assert (film.playback.frame, film.playback.is_playing) == (6, False)
+    film.playback.play()
+    assert film.playback.frame == 3
+    film.playback.set_part(0, 99)
+    assert film.playback.part is None
+    film.playback.set_part(4, 2)
+    assert film.playback.part == (2, 2)
+    film.playback.replace(20, 30.0)
+    assert film.playback.part is None
+
+
+def test_a_part_whose_last_frames_are_being_computed_waits_for_them(film: Film) -> None:
+    film.playback.set_speed(0.2)
+    film.playback.limit(4)
+    film.playback.set_part(1, 5)
+    film.playback.play()
+    film.clock.at(1.0, lambda: film.playback.limit(6))
+    film.run(2.0)
+    assert film.moment_of(4) >= 1.0
+    assert set(film.frames) == {1, 2, 3, 4, 5}
+
+
 def test_the_running_clock_waits_for_frames_that_are_being_computed(film: Film) -> None:
     film.playback.limit(4)
     film.playback.play()
