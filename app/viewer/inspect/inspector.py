@@ -263,7 +263,7 @@ class Inspector:
                     quantity=kind,
                     mark_color=_NOW,
                     starts_at_zero=False,
-                    height=130,
+                    height=90,
                     order=self._kind.order + 0.1,
                 )
         self._plot.show((self._curve,), frame)
@@ -284,7 +284,7 @@ def _table(title: str, rows: Rows) -> str:
     )
     color = "rgb({},{},{})".format(*MARK)
     return (
-        '<div style="font-size:0.8em;line-height:1.35;padding:0 0.9em 0.4em" data-reading>'
+        '<div style="font-size:0.8em;line-height:1.25;padding:0 0.9em 0.4em" data-reading>'
         f'<b><span style="color:{color}">●</span> {html.escape(title)}</b>'
         f"<table>{lines}</table></div>"
     )

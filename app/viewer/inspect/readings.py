@@ -198,7 +198,7 @@ def hand_load(
     )
 
 
-_NAMED = 6
+_NAMED = 3
 Rows = list[tuple[str, str]]
 
 

@@ -104,6 +104,7 @@ class ErrorPanel:
                 [*fit, PlotCurve(label="re-simulated", color=_AGAIN)],
                 frame_count=count,
                 unit=self._unit,
+                height=85,
             )
         self._write(at_once=True)
 
