@@ -30,7 +30,7 @@ _PLAYING_ARROWS = 400
 _PLAYING_OBSERVED = 2_000
 _LEAST_BYTES = 12_000
 """Springs and arrows get at least this much of a playing frame."""
-_OBSERVED = 0.16
+_OBSERVED = 0.1
 """Diameter of other observed points, in distances between nodes: through them all is seen."""
 _SEE_THROUGH = 0.62
 """Opacity of hands through which nodes and springs are seen."""

@@ -6,6 +6,7 @@ import pytest
 from app.viewer.content.content import Content, open_run, open_sequence
 from app.viewer.content.layers import default_layers
 from app.viewer.scene.framing import frame_content
+from app.viewer.scene.layers_panel import legend_of
 
 
 def in_view(framing, point) -> bool:
@@ -54,3 +55,18 @@ def test_a_run_hides_the_recording_at_first_and_a_recording_shows_it(catalog, re
     bare = default_layers(replace(open_run(catalog, "sheet"), surface=None))
     assert (bare.surface, bare.nodes, bare.object_springs) == (False, True, True)
     assert (of_recording.observed, of_recording.cameras) == (True, True)
+
+
+def test_the_legend_of_parts_names_what_is_shown_alone(catalog) -> None:
+    content = open_run(catalog, "sheet")
+    layers = default_layers(content)
+
+    def said() -> list[str]:
+        names = ("hand", "object nodes", "controls", "forces", "virtual springs", "observed")
+        return [name for name in names if name in legend_of(content, layers)]
+
+    assert said() == ["forces"]  # Of this run there is no hand.
+    layers.nodes = layers.controls = layers.virtual_springs = layers.observed = True
+    assert said() == ["object nodes", "controls", "forces", "virtual springs", "observed"]
+    layers.color = "speed"  # Nodes and springs have other colors now.
+    assert said() == ["controls", "forces", "observed"]

@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+from viewer_world import FolderCatalog
 
 from app.previews.links import marker_links
+from app.settings import BUNDLED
 from app.viewer.color.coloring import Painter
-from app.viewer.content.content import Content
+from app.viewer.content.content import Content, open_run
 from app.viewer.content.layers import Layers
-from app.viewer.content.observed import BONES, DepthCloud, Markers, lift_keypoints
+from app.viewer.content.observed import BONES, CloudSet, DepthCloud, Markers, lift_keypoints
 from app.viewer.inspect.inspector import clickable
 from app.viewer.inspect.picking import Pick, Ray, Target, pick
 from app.viewer.inspect.readings import Readings
@@ -91,3 +93,21 @@ def test_depth_becomes_points_in_front_of_the_camera(recording) -> None:
     depth = views[0].camera.camera_depth(point[:32].astype(float))
     np.testing.assert_allclose(depth, 0.42, atol=1e-6)
     assert (cloud.colors() == 80).all()
+
+
+def test_observed_points_have_the_colors_of_the_video_in_their_own_frame():
+    observed = open_run(FolderCatalog(BUNDLED), "towel_fold_quick").observed
+    assert observed.is_colored
+    for frame in (0, 40):
+        point = observed.points(frame)
+        color = observed.colors().astype(float)
+        assert color.shape == point.shape
+        # A teal towel in light and shadow, of which a part is white.
+        is_teal = (color[:, 2] > 1.5 * color[:, 0]) & (color[:, 1] > 1.3 * color[:, 0])
+        is_white = (color > 150).all(axis=1)
+        assert 0.5 < is_teal.mean() < 0.95
+        assert is_white.mean() > 0.03
+    # Without views all are green.
+    plain = CloudSet(observed._point, observed._end)
+    assert len(plain.points(0)) > 100
+    assert plain.colors().tolist() == [46, 160, 67]
