@@ -206,7 +206,7 @@ def _press(page: "Page", scene: "Frame", slider: MeasuredSlider, move: Move) -> 
         raise ServerFailedError(f"The slider '{knob.label}' is not on the page.")
     part = (move.value - knob.low) / (knob.high - knob.low)
     page.mouse.click(box["x"] + part * box["width"], box["y"] + 0.5 * box["height"])
-    field = row.locator("input.mantine-NumberInput-input")
+    field = row.locator("input.mantine-NumberInput-input").first  # Factors have one more.
     end = time.monotonic() + _NOTICED_S
     while abs((shown := float(field.input_value())) - move.value) > 0.01 * knob.step:
         if time.monotonic() > end:
