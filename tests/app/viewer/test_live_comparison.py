@@ -109,7 +109,8 @@ def test_a_key_compares_with_what_was_kept_last_or_with_the_fit(
     client.set("stiffness", -1.5)
     client.until(lambda: is_done(client))
     press(client, "V")
-    client.until(lambda: client.find("Colors of A and B") != "")
+    drawn = {f"/compare/{side}/object/compared" for side in "ab"}
+    client.until(lambda: drawn <= set(client.nodes))
     client.until(lambda: mean_difference(client) > 0.1)
     client.until(lambda: is_fitted(client, "a", fitted))
     changed = nodes(client, "b").copy()
