@@ -90,7 +90,7 @@ class ComparePanel:
                 "Swap sides", icon=viser.Icon.ARROWS_LEFT_RIGHT, color="gray", hint="X"
             )
             self._text = gui.add_html("")
-            self._plot = FramePlot(gui, _CURVES, frame_count=1, unit="", mark_color=_NOW)
+            self._plot = FramePlot(gui, _CURVES, frame_count=1, unit="", mark_color=_NOW, height=96)
         self._mode.on_update(guard.by_user(lambda _: self._choose()))
         self._tint.on_update(guard.by_user(lambda _: self._choose()))
         self._fade.on_update(guard.by_user(lambda _: self._choose()))
