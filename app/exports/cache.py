@@ -32,7 +32,7 @@ MOST_BYTES = 2**30
 """Bytes that the cache may hold."""
 MOST_SECONDS = 300.0
 """Time that making one file may take [s]."""
-_VERSION = 1
+_VERSION = 2
 
 
 class TooManyFilesError(errors.PhysHandiError):
