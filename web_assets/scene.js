@@ -141,6 +141,7 @@
   const DRESS = `
     :root { --mantine-color-dimmed: #5f6770 !important; --mantine-color-gray-filled: #5f6770 !important; }
     :root[data-mantine-color-scheme=dark] { --mantine-color-dimmed: #a0a7b0 !important; }
+    .multi-slider-mark-label { color: var(--mantine-color-dimmed) !important; }
     @media (max-width: 36em) {
       :has(> ${SHEET}) { flex-direction: column; }
       ${SHEET} { position: relative !important; flex: none; width: 100% !important; max-height: 45% !important; border-radius: .8em .8em 0 0; }

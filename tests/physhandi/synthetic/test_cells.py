@@ -160,10 +160,11 @@ def needed(start: tuple[str, ...], without: tuple[str, ...]) -> set[str]:
     return found
 
 
-# Words and looks, and the metrics that a run notes of itself, which no table takes.
+# Words, looks (the colors of an object's surface are seen as photometric metrics see them), and the
+# metrics that a run notes of itself, which no table takes.
 NO_MATTER = (
     *("errors.py", "progress.py", "child.py", "devices.py", "synthetic/code_version.py"),
-    "metrics/report.py",
+    *("metrics/report.py", "metrics/photometric.py"),
 )
 
 
@@ -171,7 +172,7 @@ NO_MATTER = (
     ("parts", "start", "without"),
     [
         (PREDICTIONS, ("synthetic/suite/methods.py",), NO_MATTER),
-        (SCORES, ("metrics/report.py", "metrics/photometric.py"), NO_MATTER[:-1]),
+        (SCORES, ("metrics/report.py", "metrics/photometric.py"), NO_MATTER[:-2]),
         (PREDICTIONS, INPUTS, NO_MATTER),
     ],
     ids=["predictions", "scores", "inputs"],
