@@ -10,7 +10,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from physhandi.data.exporters.export import export_scene
-from physhandi.data.exporters.scene_data import MovingSurface, SceneData
+from physhandi.data.exporters.scene_data import SceneData
 from physhandi.data.files import named_fields
 from physhandi.data.layout import PARAMETERS_FILE, SHAPE_FILE, SequenceFiles
 from physhandi.data.run import RunFolder
@@ -218,7 +218,7 @@ class ObjectRollout:
             "object_spring_count": self.model.object_spring_count,
             "model": self.model.to_tensors() | self.restart_arrays(),
             "parameters": self.parameters.to_dict(),
-            "surface": None if self.surface is None else self.moved_surface(self.surface()),
+            "lay_surface": self.surface,
         }
         if self.scene is None:
             rate = self.parameters.frame_rate
@@ -233,13 +233,6 @@ class ObjectRollout:
             joints={side: joint[:count] for side, joint in scene.joints.items()},
             **motion,
         )
-
-    def moved_surface(self, surface: ObjectSurface | None) -> MovingSurface | None:
-        """Let a surface move with the nodes in the frames that are ready."""
-        if surface is None or self.ready == 0:
-            return None
-        vertex = np.stack([surface.place(np.asarray(node)) for node in self.position[: self.ready]])
-        return MovingSurface(vertex=vertex, face=surface.face, color=surface.color)
 
     def frame_distance(self, other: "ObjectRollout", frame: int) -> float:
         """Measure how far the nodes of a frame are from another rollout's, on average [m]."""

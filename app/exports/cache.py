@@ -15,7 +15,7 @@ from typing import Literal
 
 import viser
 
-from app.exports.request import SUFFIXES, FileRequest
+from app.exports.request import FileRequest
 from physhandi import __version__, errors
 from physhandi.child import Child, ChildEndedError
 from physhandi.data.files import sweep_temporary, temporary_name
@@ -101,7 +101,7 @@ class FileCache:
             TooManyFilesError: If too many files are being made already.
         """
         order.check()
-        path = self._folder / f"{_key(order)}.{SUFFIXES.get(order.format, order.format)}"
+        path = self._folder / f"{_key(order)}.{order.suffix}"
         with self._lock:
             job = self._jobs.get(path.name)
             if job is not None and job.state == "failed":
@@ -138,7 +138,7 @@ class FileCache:
             prepare(folder)
             whole = replace(order, take=str(folder))
             whole.check()
-            out = folder / f"file.{SUFFIXES.get(order.format, order.format)}"
+            out = folder / f"file.{order.suffix}"
             with self._lock:
                 job = self._put_in_line(whole, FileJob(out), out.parent.name)
             yield job.future.result()

@@ -5,7 +5,7 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import FileResponse, Response
@@ -15,10 +15,10 @@ from starlette.exceptions import HTTPException
 
 from app.exports.cache import FileCache, FileJob
 from app.exports.links import CLOSED, address, read_query
-from app.exports.making import store_take, surface_of
+from app.exports.making import store_take
 from app.exports.permalink import state_from_query, state_to_query
-from app.exports.request import LARGEST, LARGEST_TURN, SMALLEST, SUFFIXES, FileRequest
-from app.exports.schema import MEDIA_TYPES, RunFormat, SlowFormat, errors, files
+from app.exports.request import LARGEST, LARGEST_TURN, SMALLEST, FileRequest, Format
+from app.exports.schema import MEDIA_TYPES, SlowFormat, errors, files
 from app.ids import ItemId
 from app.jobs.catalog import Catalog
 from app.viewer.export.snapshot import snapshot_yaml
@@ -31,7 +31,8 @@ from physhandi.run import Run
 
 _OWN_FIELDS = ("format", "width", "height", "turn", "download")
 _SIDE = "Of PNG, ZIP and films [px]."
-_SIMPLE = ("ply", "gltf", "usd", "npz", "csv", "yaml")
+_STORED = ("npz", "csv", "yaml")
+"""Formats of what a run holds, which is written sooner than a process is started."""
 PictureSide = Annotated[int, Field(ge=SMALLEST, le=LARGEST)]
 Turn = Annotated[
     float,
@@ -101,7 +102,7 @@ def create_files(catalog: Catalog, sessions: Sessions, file_cache: FileCache) ->
         *,
         request: Request,
         run_id: ItemId,
-        kind: Annotated[RunFormat, Query(alias="format")],
+        kind: Annotated[Format, Query(alias="format")],
         sequence: Annotated[str | None, Query(max_length=200)] = None,
         f: Annotated[int | None, Query(ge=0, description="Frame of PNG, ZIP and PLY.")] = None,
         width: Annotated[PictureSide, Query(description=_SIDE)] = 1280,
@@ -123,16 +124,13 @@ def create_files(catalog: Catalog, sessions: Sessions, file_cache: FileCache) ->
         `drag=4`, has the object simulated anew before it is written.
         """
         del sequence, cam, fov, show, color, scale, theme  # Read with the rest of the link.
-        query = read_query(request, without=_OWN_FIELDS)
-        state = state_from_query(query)
-        is_changed = bool(state.parameter_changes) or state.automatic_substeps
-        if kind in _SIMPLE and not is_changed:
-            return _simple(catalog, catalog.run(run_id), kind, query, f)
-        if kind == "yaml":
-            raise UsageError("format: yaml describes the run itself; leave changed parameters out.")
-        order = request_of(catalog, catalog.run(run_id), kind, query)
-        path = file_cache.make(replace(order, width=width, height=height, turn=turn))
-        return _answer(path, run_id, kind, query)
+        run, query = catalog.run(run_id), read_query(request, without=_OWN_FIELDS)
+        order = request_of(catalog, run, kind, query)
+        frame = f if kind == "ply" else None
+        order = replace(order, frame=frame, width=width, height=height, turn=turn)
+        if kind in _STORED and not state_from_query(query).is_changed:
+            return _answer_stored(run, order)
+        return _answer(file_cache.make(order), run_id, order)
 
     @router.post("/runs/{run_id}/export", responses=errors(404, 409, 422, 429))
     def prepare(
@@ -162,7 +160,7 @@ def create_files(catalog: Catalog, sessions: Sessions, file_cache: FileCache) ->
         *,
         request: Request,
         session_id: ItemId,
-        kind: Annotated[RunFormat, Query(alias="format")],
+        kind: Annotated[Format, Query(alias="format")],
         width: Annotated[PictureSide, Query(description=_SIDE)] = 1280,
         height: Annotated[PictureSide, Query(description=_SIDE)] = 720,
         turn: Turn = 0.0,
@@ -181,9 +179,9 @@ def create_files(catalog: Catalog, sessions: Sessions, file_cache: FileCache) ->
         order = replace(order, width=width, height=height, turn=turn, link=snapshot.link)
         take = snapshot.rollout
         if take is None:
-            return _answer(file_cache.make(order), session.target, kind, query)
+            return _answer(file_cache.make(order), session.target, order)
         with file_cache.once(order, lambda folder: store_take(folder, take)) as path:
-            return _attached(path.read_bytes(), _name(session.target, kind, query), kind)
+            return _attached(path.read_bytes(), _name(session.target, order), kind)
 
     return router
 
@@ -191,7 +189,7 @@ def create_files(catalog: Catalog, sessions: Sessions, file_cache: FileCache) ->
 def request_of(
     catalog: Catalog,
     run: Run,
-    format: Any,  # noqa: A002
+    format: Format,  # noqa: A002
     query: Mapping[str, str],
 ) -> FileRequest:
     """Describe a file of a run.
@@ -228,7 +226,7 @@ def request_of(
 def _order_of_scene(
     catalog: Catalog,
     session: Session,
-    format: Any,  # noqa: A002
+    format: Format,  # noqa: A002
     query: Mapping[str, str],
 ) -> FileRequest:
     if session.kind == "run":
@@ -250,14 +248,18 @@ def _check_frame(run: Run, query: Mapping[str, str]) -> None:
         raise UsageError(f"f: '{name}' has frames 0 to {count - 1}, not {frame}.")
 
 
-def _name(target: str, kind: str, query: Mapping[str, str]) -> str:
-    frame = f"_{int(query.get('f', '0')):05d}" if kind in {"png", "zip"} else ""
-    suffix = SUFFIXES.get(kind, kind)
-    return f"{target}{frame}{f'_{kind}' if kind in {'ply', 'mjcf'} else ''}.{suffix}"
+def _name(target: str, order: FileRequest) -> str:
+    has_frame = order.frame is not None or order.format in {"png", "zip"}
+    frame = f"_{int(order.query.get('f', '0')):05d}" if has_frame else ""
+    kind = f"_{order.format}" if order.suffix == "zip" != order.format else ""
+    return f"{target}{frame}{kind}.{order.suffix}"
 
 
-def _answer(path: Path, target: str, kind: str, query: Mapping[str, str]) -> FileResponse:
-    return FileResponse(path, filename=_name(target, kind, query), media_type=MEDIA_TYPES[kind])
+def _answer(
+    path: Path, target: str, order: FileRequest, clean_up: BackgroundTask | None = None
+) -> FileResponse:
+    media = "application/octet-stream" if order.suffix == "ply" else MEDIA_TYPES[order.format]
+    return FileResponse(path, filename=_name(target, order), media_type=media, background=clean_up)
 
 
 def _attached(content: bytes, name: str, kind: str) -> Response:
@@ -265,30 +267,14 @@ def _attached(content: bytes, name: str, kind: str) -> Response:
     return Response(content, media_type=MEDIA_TYPES[kind], headers=headers)
 
 
-def _simple(
-    catalog: Catalog, run: Run, kind: str, query: Mapping[str, str], frame: int | None
-) -> FileResponse:
-    """Write what needs no scene to be drawn."""
-    run_id = run.id
-    if not run.is_published:
-        raise RunError(f"Run '{run_id}' is {run.state}: there is nothing to export yet.")
+def _answer_stored(run: Run, order: FileRequest) -> FileResponse:
+    """Write what a run holds; the file is gone once it was sent."""
     run.verify(allows_more=True)
     folder = Path(tempfile.mkdtemp(prefix="physhandi-export-"))
-    is_one = kind == "ply" and frame is not None
     try:
-        name = f"{run_id}_{frame:05d}.ply" if is_one else f"{run_id}.{SUFFIXES.get(kind, kind)}"
-        name = f"{run_id}_ply.zip" if kind == "ply" and not is_one else name
-        path = export_run(
-            run,
-            kind,
-            folder / name,
-            sequence=query.get("sequence"),
-            frame=frame if is_one else None,
-            surface=surface_of(request_of(catalog, run, kind, query)),
-        )
+        path = folder / f"file.{order.suffix}"
+        export_run(run, order.format, path, sequence=order.query.get("sequence"))
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise
-    clean_up = BackgroundTask(shutil.rmtree, folder, ignore_errors=True)
-    media = "application/octet-stream" if is_one else MEDIA_TYPES[kind]
-    return FileResponse(path, filename=path.name, media_type=media, background=clean_up)
+    return _answer(path, run.id, order, BackgroundTask(shutil.rmtree, folder, ignore_errors=True))

@@ -22,13 +22,13 @@ from app.viewer.export.snapshot import Snapshot, scene_data
 from app.viewer.restoring import complete_state
 from physhandi.child import Channel, run_child
 from physhandi.data.exporters import export_scene
-from physhandi.data.exporters.scene_data import MovingSurface
 from physhandi.data.files import write_atomically, write_bytes, write_json
 from physhandi.data.sequence import Sequence
 from physhandi.errors import UsageError
 from physhandi.object_rollout import ObjectRollout
 from physhandi.run import Run
 from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.object_surface import ObjectSurface
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.restart import Restart
 
@@ -129,16 +129,12 @@ def make(order: FileRequest, out: Path, report: Report = lambda _done, _of: None
         content_ = picture.content if order.format == "png" else bundle(snapshot, picture)
         write_bytes(out, content_)
     else:
-        export_scene(scene_data(snapshot), order.format, out, overwrite=True)
+        export_scene(scene_data(snapshot), order.format, out, frame=order.frame, overwrite=True)
 
 
-def surface_of(order: FileRequest) -> MovingSurface | None:
-    """Lay the surface of a run's object over the frames of its fitted rollout, if it is shown."""
-    if order.format not in {"ply", "gltf", "usd"}:
-        return None
-    content, _ = _open(order, order.check())
-    fitted = content.fitted
-    return None if fitted is None else fitted.moved_surface(content.surface)
+def surface_of(order: FileRequest) -> ObjectSurface | None:
+    """Lay the surface of a run's object, if it is shown."""
+    return _open(order, order.check())[0].surface
 
 
 class _Places:

@@ -3,17 +3,16 @@
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Literal, get_args
+from typing import Literal
 
 from app.exports.permalink import state_from_query
 from app.viewer.content.session_state import SessionState
 from physhandi.errors import UsageError
 
 Format = Literal[
-    "png", "mp4", "gif", "viser", "html", "zip", "ply", "gltf", "npz", "csv", "usd", "mjcf"
+    "ply", "gltf", "npz", "csv", "yaml", "png", "mp4", "gif", "zip", "viser", "html", "usd", "mjcf"
 ]
-FORMATS: tuple[Format, ...] = get_args(Format)
-SUFFIXES: dict[str, str] = {"gltf": "glb", "ply": "zip", "mjcf": "zip"}
+_SUFFIXES = {"gltf": "glb", "ply": "zip", "mjcf": "zip"}
 """How the files of formats end, if not like the format."""
 SMALLEST, LARGEST = 16, 4_096
 """Shortest and longest side of a picture [px]."""
@@ -33,6 +32,8 @@ class FileRequest:
     """Which kind of file."""
     query: Mapping[str, str] = field(default_factory=dict[str, str])
     """What a link would say of it; see `app.exports.permalink`."""
+    frame: int | None = None
+    """Only this frame, as one file (PLY); None for all."""
     recordings: Mapping[str, str] = field(default_factory=dict[str, str])
     """Folders of recordings by name, for runs whose recording has moved."""
     take: str = ""
@@ -47,6 +48,12 @@ class FileRequest:
     """Warp device, if parameters were changed."""
     link: str = ""
     """Address that shows the same, for people."""
+
+    @property
+    def suffix(self) -> str:
+        """How the file ends, without the dot."""
+        is_one = self.format == "ply" and self.frame is not None
+        return "ply" if is_one else _SUFFIXES.get(self.format, self.format)
 
     def check(self) -> SessionState:
         """Find out early what cannot work.
@@ -65,6 +72,10 @@ class FileRequest:
                 f"turn: {self.turn} is not between -{LARGEST_TURN:g} and {LARGEST_TURN:g} degrees."
             )
         state = state_from_query(self.query)
+        if self.format == "yaml" and state.is_changed:
+            raise UsageError(
+                "format: yaml describes the run itself; leave changed parameters out of the link."
+            )
         if state.is_figure:
             raise UsageError(
                 "fig: the comparison with PhysTwin is saved from a live scene, where it is shown."

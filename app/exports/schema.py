@@ -4,9 +4,6 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, Field
 
-RunFormat = Literal[
-    "ply", "gltf", "npz", "csv", "yaml", "png", "mp4", "gif", "zip", "viser", "html", "usd", "mjcf"
-]
 SlowFormat = Literal["mp4", "gif", "viser", "html"]
 """Formats for which every frame is drawn."""
 MEDIA_TYPES: dict[str, str] = {

@@ -1,7 +1,8 @@
 """Exports from the command line."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl, urlsplit
@@ -9,7 +10,6 @@ from urllib.parse import parse_qsl, urlsplit
 from app.exports.files import request_of
 from app.exports.making import Report, make, surface_of
 from app.exports.permalink import state_from_query
-from app.exports.request import SUFFIXES, FileRequest
 from app.jobs.catalog import Catalog
 from physhandi.data.exporters import FORMATS, export_run
 from physhandi.errors import UsageError
@@ -66,9 +66,19 @@ def export(
     query = dict(read_link(options.link))
     if options.sequence is not None:
         query["sequence"] = options.sequence
+    if options.frame is not None and options.format in {"png", "zip"}:
+        query["f"] = str(options.frame)
     state = state_from_query(query)
-    is_changed = bool(state.parameter_changes) or state.automatic_substeps
-    if options.format in FORMATS and not is_changed:
+    order = replace(
+        request_of(catalog, run, options.format, query),
+        folder=str(run.folder.resolve()),
+        frame=options.frame if options.format == "ply" else None,
+        width=options.width,
+        height=options.height,
+        turn=options.turn,
+        device=options.device,
+    )
+    if options.format in FORMATS and not state.is_changed:
         return export_run(
             run,
             options.format,
@@ -76,20 +86,15 @@ def export(
             sequence=state.sequence_name,
             frame=options.frame,
             overwrite=options.overwrite,
-            surface=surface_of(_order(run, options, query, catalog)),
+            surface=partial(surface_of, order),
         )
-    if options.format == "yaml":
-        raise UsageError("yaml describes the run itself; leave changed parameters out of the link.")
-    if options.frame is not None and options.format not in {"png", "zip"}:
+    if options.frame is not None and options.format not in {"ply", "png", "zip"}:
         raise UsageError(
             f"A single frame can be exported as ply, png or zip, not as {options.format}."
         )
-    if options.frame is not None:
-        query["f"] = str(options.frame)
-    order = _order(run, options, query, catalog)
     order.check()
     out = options.out
-    suffix = f".{SUFFIXES.get(options.format, options.format)}"
+    suffix = f".{order.suffix}"
     if out.suffix != suffix:
         raise UsageError(f"{out} does not end in '{suffix}', as a file of {options.format} does.")
     if out.is_dir() or (out.exists() and not options.overwrite):
@@ -113,21 +118,3 @@ def read_link(text: str) -> Mapping[str, str]:
         if name != "token":
             fields[name] = value
     return fields
-
-
-def _order(
-    run: Run, options: ExportOptions, query: Mapping[str, str], catalog: Catalog
-) -> FileRequest:
-    whole = request_of(catalog, run, options.format, query)
-    return FileRequest(
-        kind="run",
-        folder=str(run.folder.resolve()),
-        format=options.format,
-        query=query,
-        recordings=whole.recordings,
-        width=options.width,
-        height=options.height,
-        turn=options.turn,
-        device=options.device,
-        link=whole.link,
-    )

@@ -43,7 +43,7 @@ def complete_state(state: SessionState, content: Content) -> SessionState:
             f"from: '{content.sequence_name}' has no view {layers.looks_from!r}. "
             f"It has: {', '.join(views) or 'none'}."
         )
-    has_wish = bool(state.parameter_changes) or state.automatic_substeps or state.is_figure
+    has_wish = state.is_changed or state.is_figure
     if content.fitted is None and has_wish:
         name = next(iter(state.parameter_changes), "fig" if state.is_figure else "substeps")
         raise UsageError(f"{name}: nothing is simulated here, since no object was fitted.")

@@ -121,3 +121,8 @@ class SessionState:
     """Without `layers`: fields of `Layers` that differ from what suits the content."""
     parameter_changes: Mapping[str, Any] = field(default_factory=dict[str, Any])
     """Parameters that differ from the fitted ones; they count if there are no `parameters`."""
+
+    @property
+    def is_changed(self) -> bool:
+        """Whether the object of a run is to be simulated anew."""
+        return bool(self.parameter_changes) or self.automatic_substeps

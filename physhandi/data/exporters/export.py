@@ -8,7 +8,7 @@ from pathlib import Path
 from physhandi.data.exporters.gltf import scene_to_gltf
 from physhandi.data.exporters.mesh import frame_files
 from physhandi.data.exporters.mjcf import mjcf_files
-from physhandi.data.exporters.scene_data import MovingSurface, SceneData, read_scene
+from physhandi.data.exporters.scene_data import LaySurface, SceneData, read_scene
 from physhandi.data.exporters.table import (
     write_npz,
     write_summary,
@@ -32,7 +32,7 @@ def export_run(
     sequence: str | None = None,
     frame: int | None = None,
     overwrite: bool = False,
-    surface: MovingSurface | None = None,
+    surface: LaySurface | None = None,
 ) -> Path:
     """Write a run, or one sequence of it, in another format.
 
@@ -48,8 +48,8 @@ def export_run(
         sequence: Which sequence; None takes the first.
         frame: Only this frame (PLY); None takes all, which needs a folder.
         overwrite: Whether to replace an export that is there.
-        surface: Smooth surface of the object over all frames (PLY, glTF), which a run does not
-            hold; see `load_surface`.
+        surface: Lays the smooth surface of the object (PLY, glTF, USD), which a run does not hold;
+            see `load_surface`.
 
     Returns:
         The file or folder written.
@@ -67,7 +67,7 @@ def export_run(
     _check_target(out, format, is_folder=is_folder, overwrite=overwrite)
     if format == "yaml":
         return _publish(out, lambda path: write_summary(path, run), is_folder=False)
-    scene = replace(read_scene(run, sequence), surface=surface)
+    scene = replace(read_scene(run, sequence), lay_surface=surface)
     if format == "csv" and is_folder:
         return _publish(out, lambda path: write_tables(path, run, scene), is_folder=True)
     return _write_scene(scene, format, out, frame, is_folder=is_folder)

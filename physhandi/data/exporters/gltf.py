@@ -193,8 +193,9 @@ def scene_to_gltf(scene: SceneData) -> bytes:
             _add_moving_surface(document, side, hand, scene.frame_count)
     if scene.rollout.shape[1]:
         _add_object(document, scene)
-    if scene.surface is not None and scene.surface.face is not None:
-        _add_object_surface(document, scene.surface, scene.surface.face)
+    surface = scene.object_surface()
+    if surface is not None and surface.face is not None:
+        _add_object_surface(document, surface, surface.face)
     return document.to_bytes()
 
 

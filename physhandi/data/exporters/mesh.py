@@ -39,9 +39,9 @@ def frame_to_ply(scene: SceneData, frame: int) -> bytes:
         if hand.face is not None:
             faces.append(np.asarray(hand.face) + offset)
         offset += hand.vertex.shape[1]
-    surface = scene.surface
+    surface = scene.object_surface(slice(frame, frame + 1))
     if surface is not None and surface.face is not None:
-        parts.append(surface.vertex[frame])
+        parts.append(surface.vertex[0])
         colors.append(_OBJECT if surface.color is None else surface.color)
         faces.append(surface.face + offset)
     vertex = np.concatenate(parts).astype(np.float32)

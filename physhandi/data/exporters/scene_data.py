@@ -1,8 +1,9 @@
 """The motion of one sequence of a run, as the exporters read it."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from functools import cached_property
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -27,6 +28,29 @@ class MovingSurface:
     """Colors (sRGB); None if they are not known."""
 
 
+@runtime_checkable
+class BoundSurface(Protocol):
+    """A surface whose vertices follow the nodes of the object."""
+
+    @property
+    def face(self) -> Int[ndarray, "face 3"]:
+        """Triangles."""
+        ...
+
+    @property
+    def color(self) -> UInt8[ndarray, "vertex 3"] | None:
+        """Colors (sRGB); None if they are not known."""
+        ...
+
+    def place(self, node: Float[ndarray, "node 3"]) -> Float[ndarray, "vertex 3"]:
+        """Find where the vertices are when the nodes are somewhere [m]."""
+        ...
+
+
+LaySurface = Callable[[], BoundSurface | None]
+"""Lays the smooth surface of an object; None if it has none."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SceneData:
     """Object, controls and hands of one sequence of a run, over all frames."""
@@ -47,8 +71,8 @@ class SceneData:
     """Number of leading springs that join two object nodes; the others are virtual springs."""
     hands: dict[str, MovingSurface]
     """Surface of each hand by its side."""
-    surface: MovingSurface | None = None
-    """Smooth surface of the object; None if it has none or it was not laid."""
+    lay_surface: LaySurface | None = None
+    """Lays the surface that `object_surface` moves; None if nobody can."""
     run: str = ""
     """Id of the run."""
     joints: Mapping[str, ndarray] = field(default_factory=dict[str, ndarray])
@@ -68,6 +92,24 @@ class SceneData:
     def frame_count(self) -> int:
         """Number of frames."""
         return len(self.rollout)
+
+    @cached_property
+    def _bound_surface(self) -> BoundSurface | None:
+        return None if self.lay_surface is None else self.lay_surface()
+
+    def object_surface(self, frames: slice = slice(None)) -> MovingSurface | None:
+        """Move the smooth surface of the object with its nodes, in all frames or in some.
+
+        It is laid when it is first asked for, which not every format does.
+
+        Returns:
+            None if the object has no surface.
+        """
+        bound = self._bound_surface
+        if bound is None:
+            return None
+        vertex = np.stack([bound.place(np.asarray(node)) for node in self.rollout[frames]])
+        return MovingSurface(vertex=vertex, face=bound.face, color=bound.color)
 
     def virtual_springs_in(self, frame: int) -> Int[ndarray, "spring 2"]:
         """Get the springs between control and object nodes that are attached in a frame."""

@@ -70,19 +70,20 @@ class _Stage:
                 self._add_skinned_hand(side, scene.skins[side])
             else:
                 self._add_surface(f"{side}_hand", hand, _HAND)
+        surface = scene.object_surface()
         if scene.rollout.shape[1]:
-            self._add_nodes()
-        if scene.surface is not None:
-            self._add_surface("object_surface", scene.surface, _OBJECT)
+            self._add_nodes(is_hidden=surface is not None)
+        if surface is not None:
+            self._add_surface("object_surface", surface, _OBJECT)
 
-    def _add_nodes(self) -> None:
+    def _add_nodes(self, *, is_hidden: bool) -> None:
         points = self._geom.Points.Define(self._stage, "/World/object_nodes")
         self._animate_points(points, self._scene.rollout)
         points.CreateWidthsAttr(_vt("Float", np.full(1, _NODE_WIDTH, np.float32)))
         points.SetWidthsInterpolation(self._geom.Tokens.constant)
         points.CreateDisplayColorAttr([_OBJECT])
         # Where there is a surface, balls would stick out of it.
-        if self._scene.surface is not None:
+        if is_hidden:
             points.CreatePurposeAttr(self._geom.Tokens.guide)
 
     def _add_surface(self, name: str, surface: MovingSurface, plain: tuple[float, ...]) -> None:

@@ -37,7 +37,9 @@ def rollout(run: Run) -> np.ndarray:
     return np.asarray(run.array("sequences/sheet/rollout.npy"))
 
 
-def test_motion_of_a_run_is_what_its_arrays_hold(world: World, run: Run, tmp_path: Path) -> None:
+def test_motion_of_a_run_is_what_its_arrays_hold(
+    world: World, run: Run, made: list[FileRequest], tmp_path: Path
+) -> None:
     truth = rollout(run)
     with np.load(io.BytesIO(fetch(world, "npz"))) as arrays:
         np.testing.assert_array_equal(arrays["rollout"], truth)
@@ -52,6 +54,9 @@ def test_motion_of_a_run_is_what_its_arrays_hold(world: World, run: Run, tmp_pat
     assert fetch(world, "usd").startswith(b"PXR-USDC")
     one = world.script().get(f"{RUN}?format=ply&f=4")
     np.testing.assert_array_equal(read_ply(one.content, tmp_path), vertex)
+    assert one.headers["content-disposition"] == 'attachment; filename="fitted_00004.ply"'
+    # What needs the object's surface is made in a child process, as all that is heavy.
+    assert [order.format for order in made] == ["gltf", "ply", "usd", "ply"]
 
 
 def read_ply(content: bytes, folder: Path) -> np.ndarray:
@@ -80,10 +85,12 @@ def test_a_changed_parameter_is_simulated_before_it_is_written(
     with zipfile.ZipFile(io.BytesIO(fetch(world, "ply&drag=9"))) as archive:
         vertex = read_ply(archive.read(f"frame_{len(expected) - 1:05d}.ply"), tmp_path)
     np.testing.assert_allclose(vertex[: expected.shape[1]], expected[-1], atol=1e-6)
+    one = world.script().get(f"{RUN}?format=ply&drag=9&f={len(expected) - 1}")
+    np.testing.assert_array_equal(read_ply(one.content, tmp_path), vertex)
     csv = fetch(world, "csv&drag=9").decode().splitlines()
     last = next(row.split(",") for row in csv if row.startswith("sheet,9,") and ",object,7," in row)
     np.testing.assert_allclose([float(v) for v in last[-3:]], expected[9, 7], atol=1e-6)
-    assert [order.format for order in made] == ["npz", "gltf", "ply", "csv"]
+    assert [order.format for order in made] == ["npz", "gltf", "ply", "ply", "csv"]
 
 
 def test_pictures_have_the_size_and_the_view_that_were_asked_for(

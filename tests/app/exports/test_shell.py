@@ -41,6 +41,9 @@ def test_a_link_that_changes_parameters_is_simulated(
         fitted = arrays["rollout"]
     np.testing.assert_array_equal(fitted, run.array("sequences/sheet/rollout.npy"))
     assert np.abs(changed - fitted).max() > 1e-3
+    one = replace(options, format="ply", out=tmp_path / "a.ply", frame=9)
+    body = export(run, one, world.catalog).read_bytes().partition(b"end_header\n")[2]
+    assert body.startswith(changed[9, 0].astype("<f4").tobytes())
     replay = replace(options, format="viser", out=tmp_path / "a.viser")
     recording = Recording.read(export(run, replay, world.catalog).read_bytes())
     shown = recording.at(9)["/object/nodes"]["points"].reshape(-1, 3)

@@ -2,6 +2,7 @@
 
 import csv
 import zipfile
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 import yaml
 
 from physhandi.data.exporters import export_run
-from physhandi.data.exporters.scene_data import MovingSurface, SceneData
+from physhandi.data.exporters.scene_data import SceneData
 from physhandi.data.exporters.table import flat, safe_cell, write_csv, write_trajectories
 from physhandi.errors import RunError, UsageError
 from physhandi.run import Run
@@ -95,18 +96,53 @@ def test_a_frame_can_be_read_by_trimesh(tmp_path: Path) -> None:
     assert b"comment world z-up, lengths in m\n" in path.read_bytes()
 
 
+@dataclass
+class Triangle:
+    """A surface that follows the first three nodes, and remembers where it was placed."""
+
+    face = np.array([[0, 2, 1]], np.int32)
+    color = np.array([[1, 2, 3], [4, 5, 6], [7, 8, 9]], np.uint8)
+    seen: list[np.ndarray] = field(default_factory=list)
+
+    def place(self, node: np.ndarray) -> np.ndarray:
+        self.seen.append(node)
+        return node[:3] + np.float32(0.5)
+
+
+def test_a_surface_is_laid_for_formats_that_hold_it_and_placed_in_frames_that_are_written(
+    tmp_path: Path,
+) -> None:
+    run, laid = make_run(tmp_path / "fit"), list[Triangle]()
+
+    def lay() -> Triangle:
+        laid.append(Triangle())
+        return laid[-1]
+
+    for name in ("npz", "csv", "yaml"):
+        export_run(run, name, tmp_path / f"x.{name}", surface=lay)
+    assert laid == []
+    rollout = run.array("sequences/lift/rollout.npy")
+    written: list[tuple[str, dict[str, Any], list[int]]] = [
+        ("one.ply", {"format": "ply", "frame": 2}, [2]),
+        ("all.zip", {"format": "ply"}, [0, 1, 2]),
+        ("all.glb", {"format": "gltf"}, [0, 1, 2]),
+    ]
+    for name, options, frames in written:
+        export_run(run, out_path=tmp_path / name, surface=lay, **options)
+        np.testing.assert_array_equal(laid[-1].seen, rollout[frames])
+    assert len(laid) == len(written)
+
+
 @pytest.mark.parametrize("controls", ["hand", "sparse"])
 def test_the_surface_of_the_object_comes_after_all_else(tmp_path: Path, controls: str) -> None:
     run = make_run(tmp_path / "fit", controls=controls)
     plain = load_mesh(export_run(run, "ply", tmp_path / "plain.ply", frame=2))
-    vertex = np.random.default_rng(8).normal(size=(FRAMES, 3, 3)).astype(np.float32)
-    color = np.array([[1, 2, 3], [4, 5, 6], [7, 8, 9]], np.uint8)
-    surface = MovingSurface(vertex=vertex, face=np.array([[0, 2, 1]], np.int32), color=color)
-    path = export_run(run, "ply", tmp_path / "f.ply", frame=2, surface=surface)
+    path = export_run(run, "ply", tmp_path / "f.ply", frame=2, surface=Triangle)
     mesh, count = load_mesh(path), len(plain.vertices)
     np.testing.assert_array_equal(mesh.vertices[:count], plain.vertices)
-    np.testing.assert_array_equal(mesh.vertices[count:], vertex[2])
-    np.testing.assert_array_equal(mesh.visual.vertex_colors[count:, :3], color)
+    vertex = run.array("sequences/lift/rollout.npy")[2, :3] + np.float32(0.5)
+    np.testing.assert_array_equal(mesh.vertices[count:], vertex)
+    np.testing.assert_array_equal(mesh.visual.vertex_colors[count:, :3], Triangle.color)
     np.testing.assert_array_equal(mesh.faces, [*plain.faces, [count, count + 2, count + 1]])
 
 

@@ -15,7 +15,8 @@ from physhandi.errors import UsageError
 
 def test_the_object_has_triangles_that_move_in_its_own_colors(tmp_path: Path) -> None:
     surface = pyramid()
-    path = export_run(write_run(tmp_path / "fit"), "gltf", tmp_path / "fit.glb", surface=surface)
+    run = write_run(tmp_path / "fit")
+    path = export_run(run, "gltf", tmp_path / "fit.glb", surface=lambda: surface)
     player = Player(path)
     node = player.gltf.nodes[player.node("object_surface")]
     (primitive,) = player.gltf.meshes[node.mesh].primitives
