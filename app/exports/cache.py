@@ -30,7 +30,7 @@ MOST_WAITING = 16
 """Files that may be made or wait."""
 MOST_BYTES = 2**30
 """Bytes that the cache may hold."""
-MOST_SECONDS = 300.0
+MOST_SECONDS = 600.0
 """Time that making one file may take [s]."""
 _VERSION = 2
 
@@ -199,7 +199,11 @@ class FileCache:
             if self._is_closed:
                 raise errors.RunError("The server is being stopped.")
             child = Child(
-                "app.exports.making", str(job.path), threads=1, time_limit_s=self._seconds
+                "app.exports.making",
+                str(job.path),
+                str(self._seconds),
+                threads=1,
+                time_limit_s=self._seconds,
             )
             self._children.add(child)
         try:
@@ -216,7 +220,7 @@ class FileCache:
         finally:
             with self._lock:
                 self._children.discard(child)
-            sweep_temporary(job.path.parent.glob(".*.tmp"))
+            sweep_temporary(job.path.parent.glob(".*.tmp*"))
 
     def _make_room(self, newest: Path) -> None:
         """Remove the files that were not used for longest."""

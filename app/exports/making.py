@@ -1,6 +1,7 @@
 """Making the file of an order: the same for the server's child process and for the shell."""
 
 import json
+import math
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -13,8 +14,6 @@ from app.exports.movie import film_scene
 from app.exports.offscreen import Offscreen
 from app.exports.recording import record_scene
 from app.exports.request import FileRequest
-from app.exports.scene_picture import draw_scene
-from app.viewer.color.legend import draw_legend
 from app.viewer.content.content import Content, open_run, open_sequence
 from app.viewer.content.session_state import Pose, SessionState
 from app.viewer.export.bundle import Screenshot, bundle
@@ -83,13 +82,20 @@ def load_take(folder: Path) -> ObjectRollout:
 Report = Callable[[int, int], None]
 
 
-def make(order: FileRequest, out: Path, report: Report = lambda _done, _of: None) -> None:
+def make(
+    order: FileRequest,
+    out: Path,
+    report: Report = lambda _done, _of: None,
+    *,
+    time_limit_s: float = math.inf,
+) -> None:
     """Make a file, in one step or not at all.
 
     Args:
         order: What is to be made.
         out: File to write.
         report: Told how much is done, and of how much.
+        time_limit_s: Time that there is; films that take longer are refused at once [s].
 
     Raises:
         PhysHandiError: If something that is asked for does not exist, or the object's motion runs
@@ -113,6 +119,7 @@ def make(order: FileRequest, out: Path, report: Report = lambda _done, _of: None
             as_gif=order.format == "gif",
             size=(order.width, order.height),
             turn=order.turn,
+            time_limit_s=time_limit_s,
         )
         return
     snapshot = Snapshot(
@@ -194,10 +201,7 @@ def _picture(order: FileRequest, snapshot: Snapshot, state: SessionState) -> Scr
     with Offscreen(snapshot.content, snapshot.rollout, state) as scene:
         scene.draw(snapshot.frame, is_playing=False)
         pose: Pose = scene.pose
-        size = (order.width, order.height)
-        image = draw_scene(scene.server, pose, *size, is_dark=scene.is_dark)
-        if scene.legend is not None:
-            image = draw_legend(image, scene.legend, is_dark=scene.is_dark)
+        image = scene.picture((order.width, order.height))
     is_written, content = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))
     if not is_written:
         raise UsageError("The picture could not be encoded; choose a smaller size.")
@@ -208,11 +212,15 @@ _NICENESS = 5
 
 
 def _work(channel: Channel) -> None:
-    """Make the file that the only request describes, at the path that is the only argument."""
+    """Make the file that the only request describes; arguments are its path and the time limit."""
     os.nice(_NICENESS)  # Live scenes go first.
     (order,) = channel.requests()
-    out = Path(channel.arguments[0])
-    make(FileRequest(**order), out, lambda done, of: channel.tell(done=done, of=of))
+    out, seconds = channel.arguments
+
+    def report(done: int, of: int) -> None:
+        channel.tell(done=done, of=of)
+
+    make(FileRequest(**order), Path(out), report, time_limit_s=float(seconds))
 
 
 if __name__ == "__main__":

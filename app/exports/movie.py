@@ -1,5 +1,6 @@
 """Films of a scene, drawn frame by frame: MP4 and GIF."""
 
+import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -10,16 +11,14 @@ from jaxtyping import UInt8
 from numpy import ndarray
 
 from app.exports.offscreen import Offscreen
-from app.exports.scene_picture import draw_scene
-from app.viewer.color.legend import draw_legend
 from app.viewer.content.content import Content
 from app.viewer.content.session_state import Pose, SessionState
-from physhandi.data.files import temporary_name
+from physhandi.data.files import replacing
 from physhandi.errors import UsageError
 from physhandi.object_rollout import ObjectRollout
 
-MOST_FILMED_PIXELS = 4_000_000_000
-"""Longer or larger films are refused: drawing so many pixels takes about ten minutes."""
+FILMED_PIXELS_PER_SECOND = 2_500_000
+"""What a busy core draws; an idle one draws 4 million (the bundled run, 1280 x 720 pixels)."""
 _GIF_STEP_MS = 10
 """Pictures of a GIF are shown for a multiple of this time [ms]."""
 _GIF_COLORS = 256
@@ -37,6 +36,7 @@ def film_scene(
     as_gif: bool,
     size: tuple[int, int],
     turn: float = 0.0,
+    time_limit_s: float = math.inf,
 ) -> None:
     """Film the frames of a sequence that are played, in one step or not at all.
 
@@ -53,30 +53,28 @@ def film_scene(
         size: Columns and rows [px].
         turn: Angle by which the camera goes round what it looks at, from the first frame to one
             after the last, so that a whole turn repeats without a jump [degrees].
+        time_limit_s: Time that there is [s].
 
     Raises:
-        UsageError: If the film would be too long for its size, or cannot be encoded.
+        UsageError: If the film would take longer than there is time, or cannot be encoded.
     """
     first, last = state.part or (0, content.frame_count - 1)
-    frames, pixels = range(first, last + 1), size[0] * size[1]
-    count = len(frames)
-    if count * pixels > MOST_FILMED_PIXELS:
+    frames = range(first, last + 1)
+    most_pixels = time_limit_s * FILMED_PIXELS_PER_SECOND / len(frames)
+    if size[0] * size[1] > most_pixels:
         raise UsageError(
-            f"'{content.sequence_name}' plays {count} frames; choose a picture of at most "
-            f"{MOST_FILMED_PIXELS // count:,} pixels instead of {size[0]} x {size[1]}."
+            f"width, height: {len(frames)} frames of '{content.sequence_name}' with {size[0]} x "
+            f"{size[1]} pixels cannot be drawn in {time_limit_s:g} s, the most that this server "
+            f"takes for a file. Choose at most {int(most_pixels):,} pixels or a shorter part "
+            "(part=FIRST,LAST), or film it with 'physhandi export', which takes its time."
         )
     pictures = _pictures(content, take, state, report, frames=frames, size=size, turn=turn)
     rate = content.frame_rate * state.speed
-    suffix = "gif" if as_gif else "mp4"  # Tells OpenCV the format.
-    temporary = out.with_name(f"{temporary_name(out.stem)}.{suffix}")
-    try:
+    with replacing(out) as temporary:
         if as_gif:
             _write_gif(temporary, pictures, rate)
         else:
             _write_mp4(temporary, pictures, rate, size)
-        temporary.replace(out)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _pictures(
@@ -96,10 +94,7 @@ def _pictures(
             scene.recorded = frame / content.frame_rate
             scene.draw(frame, is_playing=False)
             pose = turned_pose(scene.pose, np.radians(turn) * done / count)
-            image = draw_scene(scene.server, pose, *size, is_dark=scene.is_dark)
-            if scene.legend is not None:
-                image = draw_legend(image, scene.legend, is_dark=scene.is_dark)
-            yield np.ascontiguousarray(image)
+            yield np.ascontiguousarray(scene.picture(size, pose))
             report(done + 1, count)
 
 

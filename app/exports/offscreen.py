@@ -6,10 +6,11 @@ from typing import Self
 
 import numpy as np
 import viser
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from numpy import ndarray
 
-from app.viewer.color.legend import Legend
+from app.exports.scene_picture import draw_scene
+from app.viewer.color.legend import draw_legend
 from app.viewer.content.content import Content
 from app.viewer.content.session_state import Pose, SessionState
 from app.viewer.scene.framing import frame_content
@@ -93,11 +94,6 @@ class Offscreen:
         return self._scene.layers.dark
 
     @property
-    def legend(self) -> Legend | None:
-        """What colors tell in the frame that was drawn; None if they are plain."""
-        return self._scene.painter.legend
-
-    @property
     def pose(self) -> Pose:
         """Where the camera stands."""
         return Pose.first(self.server.initial_camera)
@@ -112,6 +108,22 @@ class Offscreen:
         take = self._take
         at = 0 if take is None else min(frame, take.ready - 1)
         self._scene.draw(frame, take, at, is_playing=is_playing)
+
+    def picture(
+        self, size: tuple[int, int], pose: Pose | None = None
+    ) -> UInt8[ndarray, "row column 3"]:
+        """Take a picture of the frame that was drawn, with what its colors tell.
+
+        Args:
+            size: Columns and rows [px].
+            pose: Where the camera stands; None for `pose`.
+
+        Returns:
+            Red, green, blue.
+        """
+        legend = self._scene.painter.legend
+        image = draw_scene(self.server, pose or self.pose, *size, is_dark=self.is_dark)
+        return image if legend is None else draw_legend(image, legend, is_dark=self.is_dark)
 
 
 @dataclass(eq=False, kw_only=True)

@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from app.previews.draw import HEIGHT, WIDTH, Motion, draw_motion
 from app.previews.links import marker_links
-from physhandi.data.files import named_fields, temporary_name
+from physhandi.data.files import named_fields, replacing
 from physhandi.data.layout import SequenceFiles
 from physhandi.data.sequence import Sequence as Recording
 from physhandi.data.view import View
@@ -46,7 +46,7 @@ class Clip:
         animation.frames = [_blue_first(frame) for frame in self.frames]
         animation.durations = [self.frame_ms] * len(self.frames)
         quality = [cv2.IMWRITE_WEBP_QUALITY, _MOVING_QUALITY]
-        _replace(path, lambda name: cv2.imwriteanimation(name, animation, quality))
+        _write(path, lambda name: cv2.imwriteanimation(name, animation, quality))
 
     def write_still(self, path: Path) -> None:
         """Write the picture in the middle as WebP.
@@ -56,7 +56,7 @@ class Clip:
         """
         middle = _blue_first(self.frames[len(self.frames) // 2])
         quality = [cv2.IMWRITE_WEBP_QUALITY, _STILL_QUALITY]
-        _replace(path, lambda name: cv2.imwrite(name, middle, quality))
+        _write(path, lambda name: cv2.imwrite(name, middle, quality))
 
 
 def clip_of_sequence(folder: Path, *, is_still: bool = False) -> Clip | None:
@@ -197,12 +197,7 @@ def _blue_first(frame: UInt8[ndarray, "row column channel"]) -> UInt8[ndarray, "
     return np.ascontiguousarray(frame[..., order])
 
 
-def _replace(path: Path, write: Callable[[str], bool]) -> None:
-    """Write a picture beside its place, then move it there."""
-    temporary = path.with_name(f"{temporary_name(path.stem)}.webp")  # Tells OpenCV the format.
-    try:
+def _write(path: Path, write: Callable[[str], bool]) -> None:
+    with replacing(path) as temporary:
         if not write(str(temporary)):
             raise OSError(f"{path} cannot be written as WebP.")
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)

@@ -9,7 +9,8 @@ import shutil
 import socket
 import tokenize
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path, PurePath
 from typing import Any, BinaryIO, cast
 
@@ -38,7 +39,8 @@ def stopped_name(name: str) -> str:
 
 def is_abandoned(path: Path) -> bool:
     """Tell whether a temporary file or folder was left by a process of this host that is gone."""
-    parts = path.name.split(".")
+    name = path.name if path.suffix == ".tmp" else path.stem  # See `replacing`.
+    parts = name.split(".")
     if len(parts) < 4 or parts[0] or parts[-1] != "tmp":
         return False
     fields = parts[-2].split("-")
@@ -101,6 +103,26 @@ def write_atomically(
         raise
     if is_durable:
         sync_folder(path.parent)
+
+
+@contextmanager
+def replacing(path: Path) -> Generator[Path]:
+    """Let a writer that tells the format by the suffix of a file write beside it, then move it.
+
+    After an error what was there stays. For all other writers there is `write_atomically`.
+
+    Args:
+        path: File to replace; its folder must exist.
+
+    Yields:
+        The file to write.
+    """
+    temporary = path.with_name(temporary_name(path.stem) + path.suffix)
+    try:
+        yield temporary
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def write_bytes(path: Path, content: bytes) -> None:

@@ -42,7 +42,7 @@ def pretend(
 
 
 def test_a_process_makes_the_file_and_tells_how_far_it_is(
-    file_cache: FileCache, order: FileRequest, monkeypatch: pytest.MonkeyPatch
+    file_cache: FileCache, order: FileRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     go, run = threading.Event(), FileCache._run
 
@@ -53,7 +53,8 @@ def test_a_process_makes_the_file_and_tells_how_far_it_is(
     monkeypatch.setattr(FileCache, "_run", run_when_told)
     picture = file_cache.begin(replace(order, width=64, height=48))
     recording = file_cache.begin(replace(order, format="viser"))
-    wrong = file_cache.begin(replace(order, query={"f": "77"}))
+    hasty = FileCache(tmp_path / "hasty", seconds=60.0)
+    wrong = hasty.begin(replace(order, format="mp4", width=4096, height=4096))
     assert recording.state == "making"
     go.set()
     image = cv2.imread(str(picture.future.result()))
@@ -61,8 +62,9 @@ def test_a_process_makes_the_file_and_tells_how_far_it_is(
     assert image.shape == (48, 64, 3)
     recording.future.result()
     assert (recording.state, recording.done, recording.of) == ("ready", 10, 10)
-    with pytest.raises(UsageError, match="f: 'sheet' has frames 0 to 9, not 77"):
+    with pytest.raises(UsageError, match=r"10 frames of 'sheet' .* cannot be drawn in 60 s"):
         wrong.future.result()
+    hasty.close()
     left = []
     for process in psutil.Process().children():
         with suppress(psutil.Error):  # Of other tests, and ending at this moment.

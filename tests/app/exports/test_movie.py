@@ -1,5 +1,6 @@
 """Films, read back by a decoder and compared with pictures of single frames."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,13 @@ import pytest
 from server_world import World
 
 from app.cli import main
-from app.exports.movie import gif_durations, turned_pose
+from app.exports.files import request_of
+from app.exports.making import make
+from app.exports.movie import FILMED_PIXELS_PER_SECOND, gif_durations, turned_pose
 from app.exports.request import FileRequest
 from app.viewer.content.session_state import Pose
+from physhandi.errors import UsageError
+from physhandi.run import Run
 
 RUN = "/api/v1/runs/fitted/export"
 LOOK = "show=nodes&width=160&height=120"
@@ -92,9 +97,7 @@ def test_the_progress_of_a_film_is_told_until_it_can_be_fetched(
         assert world.script().post(f"{RUN}?{bad}").status_code == 422
 
 
-def test_the_command_films_and_says_what_is_too_long(
-    world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any
-) -> None:
+def test_the_command_films(world: World, tmp_path: Path) -> None:
     out, data = tmp_path / "a.mp4", str(world.settings.data_dir)
     order = ["export", "fitted", "--format", "mp4", "--out", str(out), "--data-dir", data]
     with pytest.raises(SystemExit) as end:
@@ -102,13 +105,19 @@ def test_the_command_films_and_says_what_is_too_long(
     assert end.value.code in {0, None}
     _, frames = frames_of(out)
     assert frames[0].shape == (64, 96, 3)
-    monkeypatch.setattr("app.exports.movie.MOST_FILMED_PIXELS", 90_000)
-    with pytest.raises(SystemExit) as end:
-        main([*order, "--overwrite"])
-    assert end.value.code
-    assert "choose a picture of at most 9,000 pixels" in capsys.readouterr().err
-    assert sorted(path.name for path in tmp_path.glob("*.mp4")) == ["a.mp4"]
-    assert frames_of(out)[1]
+
+
+def test_a_film_that_takes_longer_than_there_is_time_is_refused_at_once(
+    world: World, run: Run, tmp_path: Path
+) -> None:
+    order = replace(request_of(world.catalog, run, "mp4", {"part": "3,6"}), width=100, height=50)
+    out, seconds = tmp_path / "a.mp4", 4 * 100 * 50 / FILMED_PIXELS_PER_SECOND
+    make(order, out, time_limit_s=seconds)
+    film = out.read_bytes()
+    with pytest.raises(UsageError, match=r"4 frames of 'sheet' with 102 x 50 .* most 5,000 pixels"):
+        make(replace(order, width=102), out, time_limit_s=seconds)
+    assert out.read_bytes() == film
+    assert list(tmp_path.glob("*.mp4")) == [out]
 
 
 def test_the_camera_goes_round_the_upward_axis() -> None:

@@ -13,6 +13,7 @@ from physhandi.data.files import (
     json_line,
     plain,
     read_array,
+    replacing,
     sweep_temporary,
     temporary_name,
     write_array,
@@ -43,21 +44,42 @@ def test_only_files_of_dead_processes_are_swept(tmp_path: Path) -> None:
     own = tmp_path / temporary_name("x.npy")
     dead = tmp_path / own.name.replace(f"-{os.getpid()}-", f"-{pid_of_a_dead_process()}-")
     folder = tmp_path / dead.name.replace(".x.npy.", ".run.")
+    film = dead.with_name(f"{dead.name}.mp4")
     foreign = tmp_path / ".x.npy.elsewhere-1-abc.tmp"
     plain_file = tmp_path / "notes.tmp"
-    for path in (own, dead, foreign, plain_file):
+    for path in (own, dead, film, foreign, plain_file):
         path.write_text("x")
     folder.mkdir()
     (folder / "inside.txt").write_text("x")
-    assert [is_abandoned(p) for p in (own, dead, folder, foreign, plain_file)] == [
+    assert [is_abandoned(p) for p in (own, dead, film, folder, foreign, plain_file)] == [
         False,
+        True,
         True,
         True,
         False,
         False,
     ]
-    assert sweep_temporary(tmp_path.iterdir()) == 2
+    assert sweep_temporary(tmp_path.iterdir()) == 3
     assert sorted(tmp_path.iterdir()) == sorted([own, foreign, plain_file])
+
+
+def test_a_file_is_replaced_when_it_is_whole_and_keeps_its_suffix(tmp_path: Path) -> None:
+    path = tmp_path / "a.webp"
+    path.write_text("old")
+
+    def fail() -> None:
+        with replacing(path) as beside:
+            beside.write_text("half")
+            raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        fail()
+    assert (path.read_text(), list(tmp_path.iterdir())) == ("old", [path])
+    with replacing(path) as beside:
+        beside.write_text("new")
+        assert (beside.parent, beside.suffix, path.read_text()) == (tmp_path, ".webp", "old")
+        assert beside.name.startswith(".")
+    assert (path.read_text(), list(tmp_path.iterdir())) == ("new", [path])
 
 
 def test_plain_data() -> None:
