@@ -17,7 +17,7 @@ from physhandi.data.layout import MATERIAL_FILE, SequenceFiles
 from physhandi.data.run import RunFolder
 from physhandi.data.run_folder import reading
 from physhandi.data.sequence import Sequence as Recording
-from physhandi.errors import MissingInputError, RunError, SequenceError, UsageError
+from physhandi.errors import MissingInputError, RunError, UsageError
 from physhandi.object_rollout import ObjectRollout, load_fitted, load_surface
 from physhandi.progress import Progress, Watcher, watched
 from physhandi.settings import changes as changed_settings
@@ -376,12 +376,8 @@ class FittedObject:
         run = self.run
         if run is None:
             return None
-        place = run.sequences[run.sequence_names.index(self.sequence)]
-        try:
-            views = Recording.load(place).views
-        except SequenceError:
-            views = ()  # A run can be used without its recording.
-        return load_surface(run, self.fitted, views)
+        recording = Path(run.sequences[run.sequence_names.index(self.sequence)])
+        return load_surface(run, self.fitted, recording)
 
     def _choose_controls(self, chosen: Sequence[int] | None) -> None:
         wanted = None if chosen is None else tuple(chosen)

@@ -15,8 +15,9 @@ from physhandi.data.files import named_fields
 from physhandi.data.layout import PARAMETERS_FILE, SHAPE_FILE, SequenceFiles
 from physhandi.data.run import RunFolder
 from physhandi.data.run_folder import reading
+from physhandi.data.sequence import Sequence as Recording
 from physhandi.data.view import View
-from physhandi.errors import SequenceError, UsageError
+from physhandi.errors import PhysHandiError, UsageError
 from physhandi.metrics.photometric import seen_colors
 from physhandi.simulation.forces import (
     spring_strains,
@@ -218,6 +219,7 @@ class ObjectRollout:
             "object_spring_count": self.model.object_spring_count,
             "model": self.model.to_tensors() | self.restart_arrays(),
             "parameters": self.parameters.to_dict(),
+            "dt": self.parameters.dt,
             "lay_surface": self.surface,
         }
         if self.scene is None:
@@ -282,14 +284,15 @@ def load_fitted(run: RunFolder, sequence_name: str) -> ObjectRollout | None:
 
 
 def load_surface(
-    run: RunFolder, fitted: ObjectRollout, views: Sequence[View]
+    run: RunFolder, fitted: ObjectRollout, views: Sequence[View] | Path
 ) -> ObjectSurface | None:
     """Lay the smooth surface of a run's object through its nodes, in the colors of frame 0.
 
     Args:
         run: Says what kind of object it is; without that the nodes tell.
         fitted: Rollout of its nodes.
-        views: Views of the recording; those with color and masks lend their colors.
+        views: Views of the recording, or its folder, which may be gone; those with color and masks
+            lend their colors.
 
     Returns:
         The surface, without colors if no view has any; None if the nodes have no surface.
@@ -305,8 +308,9 @@ def load_surface(
         return None
     vertex = surface.place(fitted.position[0]).astype(np.float64)
     try:
-        color = seen_colors(views, vertex, vertex_normals(vertex, surface.face))
-    except SequenceError as error:  # What can be told of the object does not need a recording.
+        seen = Recording.load(views).views if isinstance(views, Path) else views
+        color = seen_colors(seen, vertex, vertex_normals(vertex, surface.face))
+    except PhysHandiError as error:  # What can be told of the object does not need a recording.
         logger.info("the surface of the object has no colors: %s", error)
         return surface
     return replace(surface, color=color)

@@ -29,6 +29,14 @@ def vertex_normals(
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
 
 
+def unit_normals(
+    vertex: Float[ndarray, "vertex 3"], faces: Int[ndarray, "face 3"]
+) -> Float[ndarray, "vertex 3"]:
+    """Give each vertex a normal of length 1, as files want it: upwards where there is none else."""
+    normal = vertex_normals(vertex, faces)
+    return np.where(normal.any(axis=1, keepdims=True), normal, [0, 0, 1.0]).astype(np.float32)
+
+
 def triangle_areas(
     vertex: Float[ndarray, "vertex 3"], faces: Int[ndarray, "face 3"]
 ) -> Float[ndarray, " face"]:

@@ -45,7 +45,10 @@ def write_run(folder: Path, *, has_object: bool = True) -> Run:
 
 @dataclass(frozen=True)
 class Pyramid:
-    """A pyramid over the x-y plane whose top rises as the nodes move on, in four gray levels."""
+    """A pyramid over the x-y plane whose top rises as the nodes move on, in four gray levels.
+
+    The fifth vertex is in no triangle.
+    """
 
     vertex: np.ndarray
     face: np.ndarray
@@ -57,8 +60,9 @@ class Pyramid:
 
 
 def pyramid() -> Pyramid:
-    vertex = np.tile(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32), (4, 1, 1))
+    corner = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 0]], np.float32)
+    vertex = np.tile(corner, (FRAMES, 1, 1))
     vertex[:, 3, 2] += np.arange(FRAMES)
     face = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], np.int32)
-    color = np.repeat(np.array([[0], [10], [128], [255]], np.uint8), 3, axis=1)
+    color = np.repeat(np.array([[0], [10], [128], [255], [255]], np.uint8), 3, axis=1)
     return Pyramid(vertex, face, color)

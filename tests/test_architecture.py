@@ -25,7 +25,7 @@ READABLE = 20
 ANYWHERE = {"logger", "main"}
 """Public names that mean the same in every module."""
 AMBIGUOUS = """
-Catalog FORMATS Motion PARTS Part Raster Setting open_run plain rasterize reconstruct simulate
+Catalog Motion PARTS Part Raster Setting open_run plain rasterize reconstruct simulate
 triangle_areas vertex_normals
 """
 """Names that still have more than one meaning; the list only shrinks."""

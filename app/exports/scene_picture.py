@@ -15,6 +15,7 @@ from app.viewer.content.session_state import Pose
 from physhandi.data.camera import PinholeCamera
 from physhandi.rendering.renderer import render
 from physhandi.rendering.shapes import Balls, Image, Segments, Shape, Surface, arrows, facets
+from physhandi.srgb import to_srgb
 
 BACKGROUND = {False: (255, 255, 255), True: (20, 21, 23)}
 """Behind everything, on light and dark pages."""
@@ -135,9 +136,7 @@ class _View:
         color = _colors(node.colors)
         if np.ndim(node.colors) > 1:
             # viser takes colors of single line ends for amounts of light.
-            light = color / 255
-            bright = 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055
-            color = 255 * np.where(light <= 0.0031308, 12.92 * light, bright)
+            color = 255 * to_srgb(color / 255)
         ends = _in_world(node.points, rotation, position)
         yield Segments(ends=ends, width=self._wide(float(node.thickness)), color=color)
 

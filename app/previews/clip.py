@@ -1,6 +1,6 @@
 """The moving picture of one sequence or run: what it shows, and its two files."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +15,6 @@ from physhandi.data.files import named_fields, replacing
 from physhandi.data.layout import SequenceFiles
 from physhandi.data.sequence import Sequence as Recording
 from physhandi.data.view import View
-from physhandi.errors import PhysHandiError
 from physhandi.object_rollout import load_fitted, load_surface
 from physhandi.run import Run
 
@@ -142,16 +141,8 @@ def _found_motion(run: Run, name: str, recording: Path) -> Motion:
         node=node,
         control=run.array(files.control) if not hands and run.has(files.control) else None,
         spring=_springs(run, files.model, node.shape[1]),
-        surface=None if fitted is None else load_surface(run, fitted, _views(recording)),
+        surface=None if fitted is None else load_surface(run, fitted, recording),
     )
-
-
-def _views(recording: Path) -> Sequence[View]:
-    """Open the views that lend the object its colors; none if the recording is not there."""
-    try:
-        return Recording.load(recording).views
-    except PhysHandiError:
-        return ()
 
 
 def _springs(run: Run, rel: str, node_count: int) -> Int[ndarray, "spring 2"]:

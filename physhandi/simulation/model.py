@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float32, Int32
 from numpy import ndarray
 
 from physhandi.simulation.contact_intervals import acts_in, always
-from physhandi.simulation.rod import Rod
+from physhandi.simulation.rod import PREFIX, Rod
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -158,19 +158,14 @@ class SpringMassModel:
             ValueError: If an array is missing, unknown or inconsistent.
         """
         names = {field.name for field in fields(cls) if field.name != "rod"}
-        rod = None
-        if any(name in tensors for name in Rod.names()):
-            names |= Rod.names()
-            rod = Rod.from_tensors(tensors) if Rod.names() <= set(tensors) else None
-        if set(tensors) | {"clearance", "attached"} != names:
+        values: dict[str, Any] = {
+            name: np.asarray(a) for name, a in tensors.items() if not name.startswith(PREFIX)
+        }
+        if set(values) | {"clearance", "attached"} != names:
             raise ValueError(
                 f"A spring-mass model needs the arrays {', '.join(sorted(names))}; "
-                f"got {', '.join(sorted(tensors))}."
+                f"got {', '.join(sorted(values))}."
             )
-        own = set(tensors) - Rod.names()
-        values: dict[str, Any] = {
-            name: np.asarray(tensors[name]) for name in tensors if name in own
-        }
         for name in ("object_spring_count", "control_count"):
             values[name] = int(values[name][0])
-        return cls(**values, rod=rod)
+        return cls(**values, rod=Rod.from_tensors(tensors))

@@ -21,6 +21,7 @@ from scipy.sparse.csgraph import dijkstra, minimum_spanning_tree
 from scipy.spatial import KDTree
 from scipy.spatial.distance import pdist, squareform
 
+from physhandi.parallel_transport import parallel_transport, rotations
 from physhandi.simulation.surface import is_line, triangulate_nodes, typical_distance
 
 MOST_VERTICES = 4_500
@@ -104,13 +105,7 @@ class Tube:
         """Place the vertices round the middles of their rings [m]."""
         curve = middle.astype(np.float64)
         ahead = self._directions(curve)
-        across = _turned(self.start[0], ahead[0]) @ self.start[1]
-        turn = np.concatenate([np.eye(3)[None], _turned(ahead[:-1], ahead[1:])])
-        step = 1
-        while step < len(turn):  # All products from the start on, in logarithmically many steps.
-            turn[step:] = turn[step:] @ turn[:-step]
-            step *= 2
-        across = turn @ across
+        across = parallel_transport(rotations(self.start[0], ahead[0]) @ self.start[1], ahead)
         other = np.cross(ahead, across)
         angle = 2 * np.pi * np.arange(_SIDES) / _SIDES
         around = across[:, None] * np.cos(angle)[:, None] + other[:, None] * np.sin(angle)[:, None]
@@ -374,17 +369,3 @@ def _tube_faces(rings: int) -> Int[ndarray, "face 3"]:
         np.stack([end, last + side, last + after], axis=1),
     ]
     return np.concatenate(parts).astype(np.int32)
-
-
-def _turned(
-    start: Float[ndarray, "*batch 3"], end: Float[ndarray, "*batch 3"]
-) -> Float[ndarray, "*batch 3 3"]:
-    """Give the smallest rotations that turn unit vectors into others."""
-    axis = np.cross(start, end)
-    cosine = np.sum(start * end, axis=-1)[..., None, None]
-    x, y, z = np.moveaxis(axis, -1, 0)
-    zero = np.zeros_like(x)
-    skew = np.stack(
-        [np.stack(row, axis=-1) for row in ([zero, -z, y], [z, zero, -x], [-y, x, zero])], axis=-2
-    )
-    return np.eye(3) + skew + skew @ skew / np.maximum(1.0 + cosine, 1e-6)

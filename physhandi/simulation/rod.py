@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Int32
@@ -77,20 +78,23 @@ class Rod:
         }
 
     @classmethod
-    def from_tensors(cls, tensors: Mapping[str, ndarray]) -> "Rod":
-        """Rebuild a rod from the arrays of `to_tensors`."""
-        values = {field.name: np.asarray(tensors[PREFIX + field.name]) for field in fields(cls)}
-        return cls(
-            node=values["node"],
-            held_by=int(values["held_by"][0]),
-            length=values["length"],
-            natural_curvature=values["natural_curvature"],
-            stiffness=float(values["stiffness"][0]),
-            damping=float(values["damping"][0]),
-            twist_stiffness=float(values["twist_stiffness"][0]),
-        )
+    def from_tensors(cls, tensors: Mapping[str, ndarray]) -> "Rod | None":
+        """Rebuild a rod from the arrays of `to_tensors`; None if there are none of a rod.
 
-    @classmethod
-    def names(cls) -> set[str]:
-        """Name the arrays of `to_tensors`."""
-        return {PREFIX + field.name for field in fields(cls)}
+        Raises:
+            ValueError: If an array is missing or unknown.
+        """
+        stored = {name: np.asarray(a) for name, a in tensors.items() if name.startswith(PREFIX)}
+        names = {PREFIX + field.name for field in fields(cls)}
+        if not stored:
+            return None
+        if set(stored) != names:
+            raise ValueError(
+                f"A rod needs the arrays {', '.join(sorted(names))}; "
+                f"got {', '.join(sorted(stored))}."
+            )
+        values: dict[str, Any] = {
+            name.removeprefix(PREFIX): array.item() if array.size == 1 else array
+            for name, array in stored.items()
+        }
+        return cls(**values)

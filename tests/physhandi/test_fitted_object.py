@@ -8,7 +8,6 @@ from viewer_world import PARAMETERS, make_run
 
 from app.settings import BUNDLED
 from physhandi.data.layout import SequenceFiles
-from physhandi.data.sequence import Sequence
 from physhandi.errors import RunError
 from physhandi.fitted_object import FittedObject
 from physhandi.object_rollout import load_fitted, load_surface
@@ -166,11 +165,11 @@ def test_a_damaged_restart_is_named(restarted, tmp_path: Path) -> None:
         FittedObject.of(run, "lift")
 
 
-def test_the_surface_has_the_colors_of_the_first_frame() -> None:
+def test_the_surface_has_the_colors_of_the_first_frame(tmp_path: Path) -> None:
     """A teal towel of 18 by 13 cm; its free end has a wide and a narrow white stripe."""
     run = Run.open(BUNDLED / "runs" / "towel_fold_quick")
     fitted = load_fitted(run, "towel_fold")
-    surface = load_surface(run, fitted, Sequence.load(BUNDLED / "towel_fold").views)
+    surface = load_surface(run, fitted, BUNDLED / "towel_fold")
     vertex = surface.place(fitted.position[0])
     far = vertex[:, 0].max() - vertex[:, 0]
     for low, high, color in (
@@ -181,7 +180,7 @@ def test_the_surface_has_the_colors_of_the_first_frame() -> None:
         found = surface.color[(far >= low) & (far <= high)]
         np.testing.assert_allclose(np.median(found, axis=0), color, atol=6)
     # Without the recording it is the same surface in no color.
-    plain = load_surface(run, fitted, ())
+    plain = load_surface(run, fitted, tmp_path / "gone")
     assert plain.color is None
     np.testing.assert_array_equal(
         plain.place(fitted.position[9]), surface.place(fitted.position[9])

@@ -12,6 +12,7 @@ from physhandi.triangles import (
     segment_distance,
     triangle_areas,
     triangle_distance,
+    unit_normals,
     vertex_normals,
 )
 
@@ -29,6 +30,9 @@ def test_a_larger_triangle_counts_more() -> None:
     normal = vertex_normals(vertex.astype(np.float32), faces)
     np.testing.assert_allclose(normal[0], np.array([1, 0, 3]) / np.sqrt(10), atol=1e-7)
     np.testing.assert_array_equal(normal[4], 0)
+    unit = unit_normals(vertex, faces)
+    np.testing.assert_allclose(unit[:4], normal[:4], atol=1e-7)
+    np.testing.assert_array_equal(unit[4], [0, 0, 1])
 
 
 def test_areas_are_half_of_base_times_height() -> None:

@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
+from physhandi.srgb import to_srgb
+
 Scale = Literal["sequential", "diverging"]
 """Whether a value counts from one end, or away from zero in both directions."""
 
@@ -83,6 +85,4 @@ def table(scale: Scale) -> UInt8[ndarray, "step 3"]:
     stops = np.array([_BELOW, _ZERO, _ABOVE])
     lab = np.stack([np.interp(place, [0.0, 0.5, 1.0], stops[:, i]) for i in range(3)], axis=1)
     linear = np.clip((lab @ _TO_CONE.T) ** 3 @ _TO_LINEAR.T, 0.0, 1.0)
-    is_dark = linear <= 0.0031308
-    shown = np.where(is_dark, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
-    return np.round(255 * shown).astype(np.uint8)
+    return np.round(255 * to_srgb(linear)).astype(np.uint8)

@@ -8,6 +8,8 @@ import viser
 from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
+from physhandi.srgb import to_linear
+
 _GRID = {
     False: ((214, 219, 226), (182, 190, 201)),
     True: ((42, 45, 50), (62, 67, 75)),
@@ -16,14 +18,7 @@ _GRID = {
 
 _DARKEST = 32
 """Least brightness of a mesh's own color, by which those of its vertices are divided."""
-_LINEAR = np.round(
-    255
-    * np.where(
-        np.arange(256) < 11,
-        np.arange(256) / 3294.6,
-        ((np.arange(256) / 255 + 0.055) / 1.055) ** 2.4,
-    )
-).astype(np.uint8)
+_LINEAR = np.round(255 * to_linear(np.arange(256) / 255)).astype(np.uint8)
 """Brightness of each color value: the viewer takes colors of single line ends for brightness."""
 
 

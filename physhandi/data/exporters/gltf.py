@@ -12,11 +12,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from physhandi.data.exporters.scene_data import MovingSurface, SceneData
-from physhandi.triangles import vertex_normals
+from physhandi.srgb import to_linear
+from physhandi.triangles import unit_normals
 
 POINTS, LINES, TRIANGLES = 0, 1, 4
 """How a primitive's vertices are joined."""
@@ -218,7 +219,7 @@ def _add_skinned_hand(
             document.animate(bones[-1], "translation", translation)
     attributes = {
         "POSITION": document.add_positions(skin["vertex"]),
-        "NORMAL": document.add_attribute(_normals(skin["vertex"], skin["faces"])),
+        "NORMAL": document.add_attribute(unit_normals(skin["vertex"], skin["faces"])),
         "JOINTS_0": document.add_attribute(skin["vertex_bone"].astype(np.uint8)),
         "WEIGHTS_0": document.add_attribute(skin["vertex_weight"].astype(np.float32)),
     }
@@ -269,13 +270,15 @@ def _add_object(document: GltfDocument, scene: SceneData) -> None:
 def _add_object_surface(
     document: GltfDocument, surface: MovingSurface, face: Int[ndarray, "face 3"]
 ) -> None:
-    normal = np.stack([_normals(vertex, face) for vertex in surface.vertex])
+    normal = np.stack([unit_normals(vertex, face) for vertex in surface.vertex])
     attributes = {
         "POSITION": document.add_positions(surface.vertex[0]),
         "NORMAL": document.add_attribute(normal[0]),
     }
     if surface.color is not None:
-        attributes["COLOR_0"] = document.add_attribute(_linear(surface.color))
+        # Vertices of glTF speak of amounts of light.
+        light = to_linear(surface.color.astype(np.float32) / 255)
+        attributes["COLOR_0"] = document.add_attribute(light)
     material = document.add_material(
         "object_surface", _OBJECT if surface.color is None else (1.0, 1.0, 1.0)
     )
@@ -288,16 +291,3 @@ def _add_object_surface(
     }
     mesh = document.add_mesh("object_surface", [primitive])
     document.animate_morph(document.add_node("object_surface", document.world, mesh=mesh))
-
-
-def _linear(color: UInt8[ndarray, "vertex 3"]) -> Float[ndarray, "vertex 3"]:
-    """Turn colors (sRGB, IEC 61966-2-1) into amounts of light, of which glTF's vertices speak."""
-    value = color.astype(np.float32) / 255
-    light = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-    return light.astype(np.float32)
-
-
-def _normals(vertex: ndarray, faces: ndarray) -> ndarray:
-    """Give unit normals of vertices; one without a triangle has none, but glTF wants some."""
-    normal = vertex_normals(vertex, faces)
-    return np.where(normal.any(axis=1, keepdims=True), normal, [0, 0, 1.0]).astype(np.float32)

@@ -33,7 +33,7 @@ import mujoco
 import numpy as np
 
 
-def play(folder=Path(__file__).parent, watch=lambda model, data: None):
+def play(folder=Path(__file__).parent):
     """Yield the object's nodes (node 3) [m] of frame after frame."""
     model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
     motion = np.load(folder / "motion.npz")
@@ -59,7 +59,6 @@ def play(folder=Path(__file__).parent, watch=lambda model, data: None):
             part = step / motion["substeps"]
             data.mocap_pos[:] = (1 - part) * before + part * control[frame]
             mujoco.mj_step(model, data)
-        watch(model, data)
         yield node + moved
 
 
@@ -147,7 +146,7 @@ class _Twin:
         # Nodes may be lighter than what MuJoCo takes for the least sensible mass.
         SubElement(root, "compiler", boundmass="0", boundinertia="0")
         gravity = f"0 0 {-parameters['gravity']:.9g}"
-        SubElement(root, "option", timestep=_number(self._dt()), gravity=gravity)
+        SubElement(root, "option", timestep=_number(self._scene.dt), gravity=gravity)
         default = SubElement(root, "default")
         friction = f"{parameters['friction']:.9g} 0.005 0.0001"
         SubElement(default, "geom", contype="0", conaffinity="1", mass="0", friction=friction)
@@ -170,10 +169,6 @@ class _Twin:
         )
         run = f" of run {scene.run}" if scene.run else ""
         return f" Sequence {scene.sequence}{run}, in metres, z up: {weight}. "
-
-    def _dt(self) -> float:
-        duration = self._parameters["frame_duration"] or 1.0 / self._parameters["frame_rate"]
-        return float(duration / self._parameters["substeps_per_frame"])
 
     def _add_ground(self, world: Element) -> None:
         height = self._parameters["ground_height"]

@@ -81,6 +81,8 @@ class SceneData:
     """The springs' tensors, as a run stores them; none without an object."""
     parameters: Mapping[str, Any] = field(default_factory=dict[str, Any])
     """What the object was simulated with, by name; none if that is not known."""
+    dt: float = 0.0
+    """Length of one substep [s]; 0 if that is not known."""
     mass: ObjectMass | None = None
     """What the object weighs; None if nobody knows."""
     skins: Mapping[str, Mapping[str, ndarray]] = field(

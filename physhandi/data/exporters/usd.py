@@ -16,7 +16,7 @@ from numpy import ndarray
 
 from physhandi.data.exporters.scene_data import MovingSurface, SceneData
 from physhandi.errors import UsageError
-from physhandi.triangles import vertex_normals
+from physhandi.triangles import unit_normals
 
 _OBJECT, _HAND = (0.24, 0.43, 0.86), (0.88, 0.71, 0.61)
 _NODE_WIDTH = 0.004
@@ -95,7 +95,7 @@ class _Stage:
         normals = mesh.CreateNormalsAttr()
         mesh.SetNormalsInterpolation(self._geom.Tokens.vertex)
         for frame, point in enumerate(vertex):
-            normals.Set(_vectors(vertex_normals(point, surface.face)), frame)
+            normals.Set(_vectors(unit_normals(point, surface.face)), frame)
 
     def _mesh(
         self, path: str, face: ndarray, plain: tuple[float, ...], color: ndarray | None

@@ -16,6 +16,7 @@ from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import write_sequence
 from physhandi.errors import ImportFailedError, UsageError
+from physhandi.parallel_transport import parallel_transport, unit_across
 from physhandi.progress import NullProgress, Progress
 
 _STAGE = "import"
@@ -165,19 +166,8 @@ def held_point(
     tangent = segment / np.linalg.norm(segment, axis=1, keepdims=True)
     # Of a rope that is held upright, x takes the place of the vertical.
     steep = np.eye(3)[2 if abs(tangent[0, 2]) < UPRIGHT else 0]
-    axis = np.empty_like(tangent)
-    axis[0] = _across(steep, tangent[0])
-    for sample in range(1, len(tangent)):
-        before, now = tangent[sample - 1], tangent[sample]
-        turned = axis[sample - 1] - (axis[sample - 1] @ now) / (1.0 + before @ now) * (before + now)
-        axis[sample] = _across(turned, now)
+    axis = parallel_transport(unit_across(steep, tangent[0]), tangent)
     return marker[:, 0] + 0.5 * float(np.median(np.linalg.norm(segment, axis=1))) * axis
-
-
-def _across(axis: ndarray, tangent: ndarray) -> Float[ndarray, " 3"]:
-    """Return the unit vector across a tangent that is nearest to an axis."""
-    across = axis - (axis @ tangent) * tangent
-    return across / np.linalg.norm(across)
 
 
 def resample(

@@ -9,6 +9,7 @@ from scipy.interpolate import make_interp_spline
 
 from physhandi.fitting.object_problem import ObjectProblem
 from physhandi.fitting.rope.bending import Bending, rope_model
+from physhandi.parallel_transport import parallel_transport, unit_across
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 
@@ -133,12 +134,7 @@ def _curved(
     """
     edge = np.diff(node, axis=1)
     tangent = edge / np.linalg.norm(edge, axis=2, keepdims=True)
-    axis = np.empty_like(tangent)
-    axis[:, 0] = _across(held - node[:, 0], tangent[:, 0])
-    for index in range(1, tangent.shape[1]):
-        before, now = tangent[:, index - 1], tangent[:, index]
-        share = _dot(axis[:, index - 1], now) / (1.0 + _dot(before, now))
-        axis[:, index] = _across(axis[:, index - 1] - share * (before + now), now)
+    axis = parallel_transport(unit_across(held - node[:, 0], tangent[:, 0]), tangent)
     other = np.cross(tangent, axis)
     before, behind = tangent[:, :-1], tangent[:, 1:]
     chi = 1.0 + _dot(before, behind)
@@ -161,8 +157,3 @@ def _curved(
 
 def _dot(first: ndarray, second: ndarray) -> ndarray:
     return (first * second).sum(axis=-1, keepdims=True)
-
-
-def _across(axis: ndarray, tangent: ndarray) -> ndarray:
-    across = axis - _dot(axis, tangent) * tangent
-    return across / np.linalg.norm(across, axis=-1, keepdims=True)

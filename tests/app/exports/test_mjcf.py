@@ -24,10 +24,10 @@ from physhandi.simulation.parameters import SimulationParameters
 mujoco: Any = pytest.importorskip("mujoco")
 
 
-def played(folder: Path, **options: Any) -> np.ndarray:
+def played(folder: Path) -> np.ndarray:
     """Simulate an unpacked export with the script that is in it."""
     play = runpy.run_path(str(folder / "play.py"))["play"]
-    return np.stack([position.copy() for position in play(folder, **options)])
+    return np.stack([position.copy() for position in play(folder)])
 
 
 def unpacked(scene: SceneData, folder: Path) -> Path:

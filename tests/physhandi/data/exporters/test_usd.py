@@ -48,6 +48,7 @@ def test_surface_and_nodes_move_as_in_the_run(tmp_path: Path) -> None:
     assert np.array(mesh.GetExtentAttr().Get(2))[1].tolist() == [1.0, 1.0, 3.0]
     normal = np.array(mesh.GetNormalsAttr().Get(1))
     np.testing.assert_allclose(normal[0], -np.array([2, 2, 1]) / 3, atol=1e-6)
+    np.testing.assert_array_equal(normal[4], [0, 0, 1])
 
 
 def test_skinned_hands_move_as_in_the_run(tmp_path: Path) -> None:
