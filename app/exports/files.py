@@ -3,13 +3,13 @@
 import shutil
 import tempfile
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import FileResponse, Response
-from pydantic import BaseModel, Field
+from pydantic import BaseModel
 from starlette.background import BackgroundTask
 from starlette.exceptions import HTTPException
 
@@ -30,10 +30,11 @@ from physhandi.errors import PhysHandiError, RunError, UsageError, describe
 from physhandi.run import Run
 
 _OWN_FIELDS = ("format", "width", "height", "turn", "download")
-_SIDE = "Of PNG, ZIP and films [px]."
 _STORED = ("npz", "csv", "yaml")
 """Formats of what a run holds, which is written sooner than a process is started."""
-PictureSide = Annotated[int, Field(ge=SMALLEST, le=LARGEST)]
+PictureSide = Annotated[
+    int, Query(ge=SMALLEST, le=LARGEST, description="Of PNG, ZIP and films [px].")
+]
 Turn = Annotated[
     float,
     Query(
@@ -47,6 +48,18 @@ LinkField = Annotated[
     str | None,
     Query(max_length=600, description="As in a link of the viewer; see the page's “Copy link”."),
 ]
+
+
+@dataclass(frozen=True)
+class PictureOptions:
+    """Size of a picture or film, and how its camera moves: fields of the query."""
+
+    width: PictureSide = 1280
+    """Columns [px]."""
+    height: PictureSide = 720
+    """Rows [px]."""
+    turn: Turn = 0.0
+    """Angle by which the camera goes round [degrees]."""
 
 
 class FileProgress(BaseModel):
@@ -105,9 +118,7 @@ def create_files(catalog: Catalog, sessions: Sessions, file_cache: FileCache) ->
         kind: Annotated[Format, Query(alias="format")],
         sequence: Annotated[str | None, Query(max_length=200)] = None,
         f: Annotated[int | None, Query(ge=0, description="Frame of PNG, ZIP and PLY.")] = None,
-        width: Annotated[PictureSide, Query(description=_SIDE)] = 1280,
-        height: Annotated[PictureSide, Query(description=_SIDE)] = 720,
-        turn: Turn = 0.0,
+        picture: Annotated[PictureOptions, Depends()],
         cam: LinkField = None,
         fov: LinkField = None,
         show: LinkField = None,
@@ -127,7 +138,7 @@ def create_files(catalog: Catalog, sessions: Sessions, file_cache: FileCache) ->
         run, query = catalog.run(run_id), read_query(request, without=_OWN_FIELDS)
         order = request_of(catalog, run, kind, query)
         frame = f if kind == "ply" else None
-        order = replace(order, frame=frame, width=width, height=height, turn=turn)
+        order = replace(order, frame=frame, **asdict(picture))
         if kind in _STORED and not state_from_query(query).is_changed:
             return _answer_stored(run, order)
         return _answer(file_cache.make(order), run_id, order)
@@ -138,9 +149,7 @@ def create_files(catalog: Catalog, sessions: Sessions, file_cache: FileCache) ->
         request: Request,
         run_id: ItemId,
         kind: Annotated[SlowFormat, Query(alias="format")],
-        width: Annotated[PictureSide, Query(description=_SIDE)] = 1280,
-        height: Annotated[PictureSide, Query(description=_SIDE)] = 720,
-        turn: Turn = 0.0,
+        picture: Annotated[PictureOptions, Depends()],
     ) -> FileProgress:
         """Have a file made that takes a while, unless it is there, and tell how far it is.
 
@@ -148,7 +157,7 @@ def create_files(catalog: Catalog, sessions: Sessions, file_cache: FileCache) ->
         """
         query = read_query(request, without=_OWN_FIELDS)
         order = request_of(catalog, catalog.run(run_id), kind, query)
-        work = file_cache.begin(replace(order, width=width, height=height, turn=turn))
+        work = file_cache.begin(replace(order, **asdict(picture)))
         return describe_progress(work, f"/api/v1/runs/{run_id}/export?{request.url.query}")
 
     @router.get(
@@ -161,9 +170,7 @@ def create_files(catalog: Catalog, sessions: Sessions, file_cache: FileCache) ->
         request: Request,
         session_id: ItemId,
         kind: Annotated[Format, Query(alias="format")],
-        width: Annotated[PictureSide, Query(description=_SIDE)] = 1280,
-        height: Annotated[PictureSide, Query(description=_SIDE)] = 720,
-        turn: Turn = 0.0,
+        picture: Annotated[PictureOptions, Depends()],
     ) -> Response:
         """Write what a live scene shows: the rollout that its sliders asked for, as it looks."""
         session = sessions.find(session_id, request.state.owner)
@@ -176,7 +183,7 @@ def create_files(catalog: Catalog, sessions: Sessions, file_cache: FileCache) ->
         if "theme" not in query and state.prefers_dark:
             query["theme"] = "dark"
         order = _order_of_scene(catalog, session, kind, query)
-        order = replace(order, width=width, height=height, turn=turn, link=snapshot.link)
+        order = replace(order, link=snapshot.link, **asdict(picture))
         take = snapshot.rollout
         if take is None:
             return _answer(file_cache.make(order), session.target, order)

@@ -7,6 +7,7 @@ float32 in metres and, from LiDAR, how sure it is, both compressed by Apple's LZ
 import json
 import re
 import zipfile
+import zlib
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -61,7 +62,9 @@ def unpack_record3d(path: Path, view: Path, progress: Progress) -> None:
                 progress.check_cancelled()
                 _unpack_frame(path, archive, number, view, (table["dh"], table["dw"]))
                 progress.report(_STAGE, place + 1, len(frames), None, f"frame {number}")
-    except (zipfile.BadZipFile, EOFError, RuntimeError, NotImplementedError) as error:
+    # zipfile's RuntimeError: a member is encrypted or, as NotImplementedError, packed in a way that
+    # it cannot unpack. What was packed damaged is zlib's error.
+    except (zipfile.BadZipFile, EOFError, RuntimeError, zlib.error) as error:
         fail(path, f"is no whole .r3d recording ({error}); export it from Record3D again")
     _write_tables(path, view, table, frames)
 

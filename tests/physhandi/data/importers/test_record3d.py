@@ -104,6 +104,27 @@ def test_a_wrong_recording_is_refused_by_part_and_frame(tmp_path, damage, told):
     assert told in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("offset", "change", "told"),
+    [
+        (8, 1, "password required"),
+        (10, 99, "compression method is not supported"),
+        (None, 0xFF, "Error -3 while decompressing"),
+    ],
+)
+def test_members_that_cannot_be_unpacked_are_refused(tmp_path, offset, change, told):
+    path = tmp_path / "take.r3d"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("metadata", "{}" * 99)
+        start = archive.fp.tell() - archive.getinfo("metadata").compress_size
+    content = bytearray(path.read_bytes())
+    # Flags and method of a member stand in its entry of the list at the end.
+    content[start if offset is None else content.index(b"PK\1\2") + offset] = change
+    path.write_bytes(content)
+    with pytest.raises(ImportFailedError, match=rf"no whole \.r3d recording \(.*{told}"):
+        unpack_record3d(path, tmp_path / "view0", Progress())
+
+
 def test_a_file_that_was_cut_off_is_refused(tmp_path):
     path = write(tmp_path / "take.r3d")
     path.write_bytes(path.read_bytes()[:-300])
