@@ -2,7 +2,8 @@
 
 from dataclasses import dataclass
 
-from jaxtyping import Bool, Float, Int
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray
 
 
@@ -44,3 +45,14 @@ class ObjectObservation:
     def track_count(self) -> int:
         """Number of tracks."""
         return self.point.shape[1]
+
+
+def evenly(count: int, most: int | None) -> Int[ndarray, " kept"]:
+    """Choose so many of `count` things at most, evenly spread, first and last included."""
+    kept = count if most is None else min(most, count)
+    return np.linspace(0, count - 1, kept).round().astype(int)
+
+
+def thinned(cloud: Float[ndarray, "point 3"], most: int | None) -> Float32[ndarray, "kept 3"]:
+    """Keep so many points of a cloud at most; see `evenly`."""
+    return np.asarray(cloud, np.float32).reshape(-1, 3)[evenly(len(cloud), most)]

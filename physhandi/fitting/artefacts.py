@@ -14,7 +14,7 @@ from safetensors.numpy import load_file
 from physhandi.data.attempt import Attempt
 from physhandi.data.files import named_fields, parse_yaml, read_array
 from physhandi.data.layout import MATERIAL_FILE, PARAMETERS_FILE, SHAPE_FILE, SequenceFiles
-from physhandi.data.observation import ObjectObservation
+from physhandi.data.observation import ObjectObservation, thinned
 from physhandi.data.run import RunFolder
 from physhandi.data.run_folder import reading
 from physhandi.data.sequence import Sequence
@@ -74,15 +74,10 @@ def save_observation(output: Attempt, name: str, observation: ObjectObservation)
         # Losses and metrics are defined on all points of a cloud of markers.
         identified = 0 if observation.node_of_track is None else observation.track_count
         most = max(STORED_CLOUD, identified)
-        clouds = [_thinned(cloud, most) for cloud in observation.cloud]
+        clouds = [thinned(cloud, most) for cloud in observation.cloud]
         end = np.cumsum([len(cloud) for cloud in clouds]).astype(np.int64)
         output.save_array(file_of("cloud"), np.concatenate(clouds))
         output.save_array(file_of("cloud_end"), end)
-
-
-def _thinned(cloud: Float[ndarray, "point 3"], most: int) -> Float[ndarray, "kept 3"]:
-    index = np.linspace(0, len(cloud) - 1, min(most, len(cloud))).round().astype(int)
-    return np.asarray(cloud, np.float32).reshape(-1, 3)[index]
 
 
 def load_array(path: Path) -> ndarray:
@@ -129,7 +124,7 @@ def lifted_hand_points(
     if not sequence.hands or not any(view.has_depth and view.has_mask for view in sequence.views):
         return None
     points = [
-        [_thinned(cloud, STORED_HAND) for cloud in frames]
+        [thinned(cloud, STORED_HAND) for cloud in frames]
         for frames in hand_points(sequence, progress)
     ]
     count = np.array([[len(cloud) for cloud in frames] for frames in points], dtype=np.int64)

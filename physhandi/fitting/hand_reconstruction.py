@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
 from physhandi.data.camera import PinholeCamera, triangulate
+from physhandi.data.observation import evenly
 from physhandi.data.sequence import Sequence
 from physhandi.errors import FitError, MissingInputError
 from physhandi.fitting.adam import Adam
@@ -827,7 +828,7 @@ def depth_target(
             measured = surface_points(view, depth, is_hand)
             point = np.concatenate([point, measured])
             camera = np.concatenate([camera, view.camera.T_world_camera[:3, 3] - measured])
-        chosen = np.linspace(0, len(point) - 1, min(point_count, len(point))).round().astype(int)
+        chosen = evenly(len(point), point_count)
         frames.append((point[chosen], camera[chosen]))
     if not any(len(point) for point, _ in frames):
         return None

@@ -17,7 +17,7 @@ from numpy import ndarray
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from physhandi.data.observation import ObjectObservation
+from physhandi.data.observation import ObjectObservation, thinned
 from physhandi.errors import FitError, SimulationDivergedError
 from physhandi.fitting.config import ObjectFitConfig
 from physhandi.simulation.contact_intervals import ContactIntervals
@@ -233,11 +233,7 @@ def build_problem(
 def _pad_clouds(
     clouds: tuple[ndarray, ...], frame_count: int, most: int | None
 ) -> tuple[Float[Tensor, "frame point 3"], Bool[Tensor, "frame point"]]:
-    picked = []
-    for cloud in clouds[:frame_count]:
-        count = len(cloud) if most is None else min(most, len(cloud))
-        keep = np.linspace(0, len(cloud) - 1, count).round().astype(int)
-        picked.append(np.asarray(cloud, np.float32).reshape(-1, 3)[keep])
+    picked = [thinned(cloud, most) for cloud in clouds[:frame_count]]
     width = max((len(points) for points in picked), default=0)
     padded = np.zeros((frame_count, width, 3), np.float32)
     real = np.zeros((frame_count, width), bool)
@@ -467,23 +463,16 @@ def settle_substeps(
     config: ObjectFitConfig,
     *,
     safety: float = SUBSTEP_SAFETY,
+    is_quick: bool = False,
 ) -> SimulationParameters:
     """Choose substeps that keep all models stable, if the configuration sets them automatically.
 
     Near the limit a simulation may stay bounded and still be noise: without the margin a search
-    finds parameters whose gradients are useless.
+    finds parameters whose gradients are useless. Quickly chosen ones are no fewer, at a tenth of
+    the cost.
     """
     if not config.automatic_substeps:
         return parameters
-    needed = max(stable_substeps(model, parameters, safety=safety) for model in models)
-    return parameters.replace(substeps_per_frame=10 * math.ceil(needed / 10))
-
-
-def bound_substeps_of(
-    models: Many[SpringMassModel], parameters: SimulationParameters, config: ObjectFitConfig
-) -> SimulationParameters:
-    """Choose no fewer substeps than `settle_substeps`, at a tenth of its cost."""
-    if not config.automatic_substeps:
-        return parameters
-    needed = max(bound_substeps(model, parameters, safety=SUBSTEP_SAFETY) for model in models)
+    measure = bound_substeps if is_quick else stable_substeps
+    needed = max(measure(model, parameters, safety=safety) for model in models)
     return parameters.replace(substeps_per_frame=10 * math.ceil(needed / 10))

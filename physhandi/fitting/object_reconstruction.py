@@ -18,7 +18,6 @@ from physhandi.errors import FitError, SimulationDivergedError, UsageError
 from physhandi.fitting.config import ObjectFitConfig, SearchConfig
 from physhandi.fitting.object_problem import (
     ObjectProblem,
-    bound_substeps_of,
     build_problem_model,
     mean_loss,
     problem_parameters,
@@ -224,11 +223,11 @@ class CandidateEvaluator:
             for problem in self._problems
         ]
         is_batched = wp.get_device(self._device).is_cuda
-        choose = bound_substeps_of if is_batched else settle_substeps
         settled, possible = [], []
         for index, parameters in enumerate(candidates):
             models = [master.model(parameters) for master in masters]
-            settled.append(choose(models, parameters, self._config))
+            chosen = settle_substeps(models, parameters, self._config, is_quick=is_batched)
+            settled.append(chosen)
             if self._is_possible(models, settled[-1]):
                 possible.append(index)
         if is_batched:
