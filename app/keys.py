@@ -31,6 +31,7 @@ Action = Literal[
     "pin",
     "compare_mode",
     "swap",
+    "steer",
 ]
 """What a key does in the live scene."""
 
@@ -173,6 +174,30 @@ KEYS: tuple[KeyGroup, ...] = (
                 hotkeys=("M",),
             ),
             Key(shown=("X",), about="swap the sides of A and B", action="swap", hotkeys=("X",)),
+        ),
+    ),
+    KeyGroup(
+        title="Steer",
+        keys=(
+            Key(
+                shown=("G",),
+                about="steer the hand from this frame on; again to return to playback",
+                action="steer",
+                hotkeys=("G",),
+            ),
+            Key(
+                shown=("W", "S", "A", "D", "Q", "E"),
+                about="while steering: move the hand ahead, back, left, right, down, up",
+            ),
+            Key(
+                shown=("I", "K", "J", "L", "U", "O"),
+                about="while steering: tip it ahead and back, turn and roll it left and right; "
+                "none of these twelve keys means anything else then",
+            ),
+            Key(
+                shown=("ctrl", "Z"),
+                about="while steering: back to before the last drag or held key",
+            ),
         ),
     ),
     KeyGroup(

@@ -178,7 +178,10 @@ class FittedObject:
         model = self._model(parameters)
         if automatic_substeps:
             parameters = with_stable_substeps(parameters, model, self._control[0])
-        rollout = ObjectRollout.empty(model, parameters, self._control, self.fitted.restart)
+        fitted = self.fitted
+        rollout = ObjectRollout.empty(
+            model, parameters, self._control, fitted.restart, fitted.start
+        )
         rollout.scene, rollout.surface = self.fitted.scene, self.fitted.surface
         return rollout
 
@@ -429,7 +432,9 @@ class FittedObject:
 
 
 def _filled(rollout: ObjectRollout, simulator: Simulator) -> Iterator[Frame]:
-    for frame, position, velocity in simulator.frames(rollout.control, rollout.restart):
+    for frame, position, velocity in simulator.frames(
+        rollout.control, rollout.restart, rollout.start
+    ):
         rollout.position[frame] = position
         if rollout.velocity is not None:
             rollout.velocity[frame] = velocity

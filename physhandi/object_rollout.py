@@ -28,7 +28,7 @@ from physhandi.simulation.forces import (
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.object_surface import ObjectSurface, lay_surface
 from physhandi.simulation.parameters import SimulationParameters
-from physhandi.simulation.restart import Restart
+from physhandi.simulation.restart import NodeState, Restart, start_from_tensors
 from physhandi.triangles import vertex_normals
 
 logger = logging.getLogger(__name__)
@@ -54,6 +54,8 @@ class ObjectRollout:
     """Number of frames that have been simulated."""
     error: str | None = None
     """Why the simulation ended early, if it did."""
+    start: NodeState | None = None
+    """Positions and velocities in frame 0 [m, m/s], if they are not those of the model."""
     restart: Restart | None = None
     """State from which the frames after `restart.frame` start, in place of the rollout's own."""
     hand_shift: Float[ndarray, "control 3"] | None = None
@@ -71,6 +73,7 @@ class ObjectRollout:
         parameters: SimulationParameters,
         control: Float[ndarray, "frame control 3"],
         restart: Restart | None = None,
+        start: NodeState | None = None,
     ) -> "ObjectRollout":
         """Make room for a rollout of which no frame is ready."""
         shape = (len(control), model.node_count, 3)
@@ -80,6 +83,7 @@ class ObjectRollout:
             control=control,
             position=np.zeros(shape, np.float32),
             velocity=np.zeros(shape, np.float32),
+            start=start,
             restart=restart,
         )
 
@@ -107,6 +111,27 @@ class ObjectRollout:
                 self.model, self.parameters, np.asarray(own), np.asarray(control)
             )
         return self._continued.held_in(frame)
+
+    def going_on(self, frame: int) -> tuple[SpringMassModel, NodeState]:
+        """Get what is needed to go on from a frame in another way.
+
+        Returns:
+            The model, whose springs are at rest as in the frame, and those that are attached on the
+            way to the next frame for good; positions and velocities of the nodes [m, m/s]. Where
+            velocities are not known, they are differences of positions.
+        """
+        restart = self.restart
+        is_own = restart is None or frame <= restart.frame
+        if not is_own and self._continued is None:
+            self.model_in(frame)  # Finds it out.
+        whole = self.model if is_own or self._continued is None else self._continued
+        position, velocity, _, _ = self.state(frame)
+        if frame == 0:
+            velocity = self.model.initial_velocity if self.start is None else self.start[1]
+        return whole.held_in(frame + 1), (
+            np.array(position, np.float32),
+            np.array(velocity, np.float32),
+        )
 
     def held_control(self, frame: int) -> Float[ndarray, "control 3"]:
         """Give where virtual springs end: after a restart that moves hands not where these are."""
@@ -268,7 +293,10 @@ def load_fitted(run: RunFolder, sequence_name: str) -> ObjectRollout | None:
         )
     with reading(run.out / files.model):
         model = SpringMassModel.from_tensors(run.tensors(files.model))
-    restart = None
+    start, restart = None, None
+    if run.has(files.start):
+        with reading(run.out / files.start):
+            start = start_from_tensors(run.tensors(files.start), model.node_count)
     if run.has(files.restart):
         with reading(run.out / files.restart):
             restart = Restart.from_tensors(run.tensors(files.restart))
@@ -279,6 +307,7 @@ def load_fitted(run: RunFolder, sequence_name: str) -> ObjectRollout | None:
         control=run.array(files.control)[: len(position)],
         position=position,
         ready=len(position),
+        start=start,
         restart=restart,
     )
 

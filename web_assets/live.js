@@ -29,6 +29,7 @@
     }
     scene.contentWindow.addEventListener("keydown", onKey);
     wireScene(scene, seek);
+    if (scene.dataset.offers.split(" ").includes("object")) wireSteering(scene, session);
     wish();
     scene.contentWindow.focus();
   }

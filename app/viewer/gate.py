@@ -2,6 +2,7 @@
 
 import asyncio
 import gzip
+import json
 import logging
 from collections import Counter
 from collections.abc import Coroutine
@@ -14,8 +15,10 @@ from starlette.websockets import WebSocketDisconnect, WebSocketState
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
-from app.viewer.sessions import Sessions
+from app.viewer.sessions import Session, Sessions
+from app.viewer.steer.key_channel import KeyChannel
 from app.viewer.ui.scene_frame import scene_page
+from physhandi.errors import UsageError
 
 logger = logging.getLogger(__name__)
 
@@ -24,6 +27,8 @@ _GONE = (
     "This live scene does not exist, was closed, or belongs to another browser. "
     "Open your own from the home page."
 )
+_MOST_REFUSED = 20
+"""So many messages that are none, and the page that sends them is hung up on."""
 _LEAVING_S = 1.2
 """How long the page that a tab has left may take to hang up."""
 
@@ -32,7 +37,8 @@ def create_gate(sessions: Sessions) -> APIRouter:
     """Make the routes of the live sessions.
 
     ``GET /viewer/{session_id}/`` answers with viser's one page and nothing else; no path is passed
-    on. ``/viewer/{session_id}`` with or without the slash is the websocket, passed on unchanged.
+    on. ``/viewer/{session_id}`` with or without the slash is the websocket, passed on unchanged;
+    ``/viewer/{session_id}/keys`` is another one, for keys that are held while hands are steered.
     Who may come in is decided before the gate; that a session is one's own, here. Each tab has a
     session of its own: a page that is opened while another tab watches the session is sent on to a
     copy, which begins with the same state. A tab that is reloaded has hung up before.
@@ -81,7 +87,56 @@ def create_gate(sessions: Sessions) -> APIRouter:
             if upstream is not None:
                 await upstream.close()
 
+    _add_keys(router, sessions)
     return router
+
+
+def _add_keys(router: APIRouter, sessions: Sessions) -> None:
+    """Let pages tell which keys are held while hands are steered."""
+
+    @router.websocket("/viewer/{session_id}/keys")
+    async def hear_keys(websocket: WebSocket, session_id: str) -> None:
+        session = sessions.find(session_id, websocket.state.owner)
+        if not isinstance(session, Session):
+            await _refuse(websocket, 404, _GONE)
+            return
+        await websocket.accept()
+        await _hear(websocket, session.keys)
+
+
+async def _hear(websocket: WebSocket, keys: KeyChannel) -> None:
+    """Take the keys that a page holds, and tell it what is going on; of that, the newest counts."""
+    loop = asyncio.get_running_loop()
+    newest: asyncio.Queue[str | None] = asyncio.Queue()
+
+    def put(text: str | None) -> None:
+        while not newest.empty():
+            newest.get_nowait()
+        newest.put_nowait(text)
+
+    def listener(text: str | None) -> None:
+        loop.call_soon_threadsafe(put, text)
+
+    async def tell() -> None:
+        while (text := await newest.get()) is not None:
+            await websocket.send_text(text)
+
+    async def hear() -> None:
+        refused = 0
+        # One after the other: keys that are let go must not be overtaken by those that were held.
+        while refused < _MOST_REFUSED:
+            text = await websocket.receive_text()
+            try:
+                await asyncio.to_thread(keys.hear, text)
+            except UsageError as error:
+                refused += 1
+                await websocket.send_text(json.dumps({"error": str(error)}))
+
+    keys.listen(listener)
+    try:
+        await _first_of(websocket, tell(), hear())
+    finally:
+        await asyncio.to_thread(keys.leave, listener)
 
 
 async def _connect(websocket: WebSocket, port: int) -> ClientConnection | None:
@@ -130,10 +185,11 @@ async def _refuse(websocket: WebSocket, status: int, reason: str) -> None:
 
 async def _exchange(websocket: WebSocket, upstream: ClientConnection) -> None:
     """Copy messages both ways until one side is gone; each send waits for the receiver."""
-    directions: list[Coroutine[Any, Any, None]] = [
-        _to_server(websocket, upstream),
-        _to_client(websocket, upstream),
-    ]
+    await _first_of(websocket, _to_server(websocket, upstream), _to_client(websocket, upstream))
+
+
+async def _first_of(websocket: WebSocket, *directions: Coroutine[Any, Any, None]) -> None:
+    """Work in all directions until one has ended, and hang up."""
     tasks = [asyncio.create_task(direction) for direction in directions]
     try:
         await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -141,7 +197,7 @@ async def _exchange(websocket: WebSocket, upstream: ClientConnection) -> None:
         for task in tasks:
             task.cancel()
         for result in await asyncio.gather(*tasks, return_exceptions=True):
-            if isinstance(result, Exception):
+            if isinstance(result, Exception) and not isinstance(result, WebSocketDisconnect):
                 logger.error("passing messages on failed", exc_info=result)
     if websocket.application_state is WebSocketState.CONNECTED:
         try:

@@ -1,11 +1,13 @@
 """One live session: a viser server with scene, panel and clock."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
 import viser
+from jaxtyping import Float
+from numpy import ndarray
 
 from app.viewer.clock.playback import TURN, Playback
 from app.viewer.clock.restart_mark import RestartMark
@@ -25,6 +27,8 @@ from app.viewer.scene.framing import frame_content
 from app.viewer.scene.layers_panel import LayersPanel, legend_of, set_theme
 from app.viewer.scene.scene import SceneDrawing
 from app.viewer.scene.scene_server import SceneServer
+from app.viewer.steer.key_channel import KeyChannel
+from app.viewer.steer.steer_panel import SteerPanel
 from app.viewer.ui.keyboard import bind
 from app.viewer.ui.tabs import TabName, Tabs
 from physhandi.object_rollout import ObjectRollout
@@ -65,6 +69,8 @@ class Session(SceneServer):
         self._live = live
         self._storage = storage
         self._has_played = False
+        self.keys = KeyChannel()
+        """Tells which keys are held on the page."""
         self._names: tuple[str, ...] = ()
         if kind == "run":
             self._names = tuple(catalog.run(target).sequence_names)
@@ -73,6 +79,7 @@ class Session(SceneServer):
         super().__init__(session_id, owner=owner, title=self._content.title)
         self._playback = Playback(self._content.frame_count, self._content.frame_rate, self._draw)
         self._object: ObjectSession | None = None
+        self._steer: SteerPanel | None = None
         try:
             self._build()
             if state is not None:
@@ -161,6 +168,8 @@ class Session(SceneServer):
         """Stop clock, simulation and server."""
         self._is_closed = True
         self._playback.close()
+        if self._steer is not None:
+            self._steer.close()
         if self._object is not None:
             self._object.close()
         self._comparison.close()
@@ -175,7 +184,7 @@ class Session(SceneServer):
     def _build(self) -> None:
         server, guard = self._server, self._guard
         set_theme(server, dark=False)
-        simulated: tuple[TabName, ...] = ("Physics",) if self.kind == "run" else ()
+        simulated: tuple[TabName, ...] = ("Physics", "Steer") if self.kind == "run" else ()
         tabs = self._tabs = Tabs(server.gui, "Play", "Look", *simulated, "Inspect", "Export")
         with tabs["Play"]:
             self._legend = server.gui.add_html("")
@@ -241,6 +250,19 @@ class Session(SceneServer):
             strip=self._strip,
             storage=self._storage,
         )
+        self._steer = SteerPanel(
+            self._server,
+            self._guard,
+            self._playback,
+            tabs=self._tabs,
+            live=self._live,
+            session=self.id,
+            content=content,
+            framing=framing,
+            channel=self.keys,
+            rollout_at=self._object.at,
+            stop_comparing=self._comparison.stop,
+        )
 
     def _restore(self, state: SessionState) -> None:
         """Go on where another session stands."""
@@ -268,6 +290,9 @@ class Session(SceneServer):
                 content.close()
                 return
             self._playback.play(on=False)
+            if self._steer is not None:
+                self._steer.remove()
+                self._steer = None
             if self._object is not None:
                 self._object.remove()
                 self._object = None
@@ -294,12 +319,21 @@ class Session(SceneServer):
             self._layers.reset_view(event)
 
     def _forget(self, client: viser.ClientHandle) -> Pose:
+        if self._steer is not None and not self._server.get_clients():
+            self._steer.leave()  # Nobody is left to steer.
         return self._comparison.part(client)
 
     def _draw(self, frame: int, is_playing: bool) -> None:
         with self._lock, TURN:
-            rollout, rollout_frame = self._rollout_at(frame)
-            self._view.draw(frame, rollout, rollout_frame, is_playing=is_playing)
+            if self._steer is not None and self._comparison.is_on:
+                self._steer.leave()  # Two rollouts are shown on the clock.
+            steered = None if self._steer is None else self._steer.shown()
+            if steered is None:
+                rollout, rollout_frame = self._rollout_at(frame)
+                self._view.draw(frame, rollout, rollout_frame, is_playing=is_playing)
+            else:
+                rollout, rollout_frame, hands = steered
+                self._view.draw(frame, rollout, rollout_frame, is_playing=True, hands=hands)
             self._timeline.show(is_playing=is_playing)
             is_hidden = self._comparison.is_on and rollout is not None
             if self._legend.visible == is_hidden:
@@ -308,9 +342,12 @@ class Session(SceneServer):
             if self._legend.content != written:
                 self._legend.content = written
             self._colors.show(is_playing=is_playing, is_hidden=is_hidden)
-            self._inspector.show(
-                rollout, frame, rollout_frame, is_playing=is_playing, is_hidden=is_hidden
-            )
+            if steered is None:
+                self._inspector.show(
+                    rollout, frame, rollout_frame, is_playing=is_playing, is_hidden=is_hidden
+                )
+            else:
+                self._inspector.rest()
             if self._object is not None:
                 self._object.show(frame, is_playing=is_playing)
         self._server.flush()  # viser would wait for more, up to 17 ms.
@@ -336,7 +373,13 @@ class ViewSwitch:
         self._shown: SceneDrawing | LiveComparison = scene
 
     def draw(
-        self, frame: int, rollout: ObjectRollout | None, rollout_frame: int, *, is_playing: bool
+        self,
+        frame: int,
+        rollout: ObjectRollout | None,
+        rollout_frame: int,
+        *,
+        is_playing: bool,
+        hands: Mapping[str, Float[ndarray, "vertex 3"]] | None = None,
     ) -> None:
         """Bring what is seen to a frame.
 
@@ -345,13 +388,14 @@ class ViewSwitch:
             rollout: The object's rollout; None without an object.
             rollout_frame: Frame of the rollout, which may lag behind while it is being computed.
             is_playing: Whether the clock is running.
+            hands: Where hands are that are steered [m]; see `SceneDrawing.draw`.
         """
         shown = self._comparison if self._comparison.is_on and rollout is not None else self.scene
         if shown is not self._shown:
             self._shown.hide()
             self._shown = shown
         if isinstance(shown, SceneDrawing):
-            shown.draw(frame, rollout, rollout_frame, is_playing=is_playing)
+            shown.draw(frame, rollout, rollout_frame, is_playing=is_playing, hands=hands)
         elif rollout is not None:
             layers = self.scene.layers
             shown.draw(rollout, rollout_frame, frame, layers, is_playing=is_playing)

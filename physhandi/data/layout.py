@@ -56,6 +56,11 @@ class SequenceFiles:
         return f"{self.folder}/contacts.safetensors"
 
     @property
+    def start(self) -> str:
+        """Positions and velocities of the nodes in frame 0, if they are not those of the model."""
+        return f"{self.folder}/start.safetensors"
+
+    @property
     def restart(self) -> str:
         """The observed state from which the predicted frames were simulated, if they were."""
         return f"{self.folder}/restart.safetensors"

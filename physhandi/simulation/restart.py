@@ -30,6 +30,32 @@ COINCIDENT = 1e-6
 """Nodes nearer to each other than this have no strain that could be kept [m]."""
 
 
+NodeState = tuple[Float32[ndarray, "node 3"], Float32[ndarray, "node 3"]]
+"""Positions [m] and velocities [m/s] of the object nodes."""
+
+
+def start_from_tensors(tensors: Mapping[str, ndarray], node_count: int) -> NodeState:
+    """Read the state of frame 0 that a rollout has in place of its model's.
+
+    Args:
+        tensors: Arrays ``position`` [m] and ``velocity`` [m/s].
+        node_count: Number of nodes that they must have.
+
+    Raises:
+        ValueError: If an array is missing, unknown or inconsistent.
+    """
+    if set(tensors) != {"position", "velocity"}:
+        raise ValueError(
+            f"A state needs the arrays position and velocity; got {', '.join(sorted(tensors))}."
+        )
+    position, velocity = (
+        np.asarray(tensors[name], np.float32) for name in ("position", "velocity")
+    )
+    first = Restart(frame=0, position=position, velocity=velocity)
+    first.check_nodes(node_count)
+    return first.position, first.velocity
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Restart:
     """The state from which a rollout continues after a frame."""

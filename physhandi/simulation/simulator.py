@@ -21,7 +21,7 @@ from physhandi.simulation.kernels.springs import pull_springs
 from physhandi.simulation.kernels.world import World
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
-from physhandi.simulation.restart import Restart
+from physhandi.simulation.restart import NodeState, Restart
 from physhandi.simulation.rod import Rod
 from physhandi.simulation.self_collision import SelfCollision
 from physhandi.simulation.stability import explain_divergence
@@ -212,7 +212,10 @@ class Simulator:
             self.damping.assign(self.model.damping * acts)
 
     def frames(
-        self, control: Float[ndarray, "frame control 3"], restart: Restart | None = None
+        self,
+        control: Float[ndarray, "frame control 3"],
+        restart: Restart | None = None,
+        start: NodeState | None = None,
     ) -> Iterator[tuple[int, Float32[ndarray, "node 3"], Float32[ndarray, "node 3"]]]:
         """Simulate frame by frame from the initial state.
 
@@ -221,6 +224,7 @@ class Simulator:
                 many frames there are, also when there are no control nodes.
             restart: State from which the frames after its own are simulated; see `continue_from`.
                 Without one they follow from the initial state, as those up to it always do.
+            start: The initial state, if it is not the model's.
 
         Yields:
             Frame, positions [m] and velocities [m/s]; frame 0 is the initial state.
@@ -232,7 +236,7 @@ class Simulator:
         control = self.checked_control(control)
         if restart is not None:
             restart.check_nodes(self.model.node_count)
-        self.reset()
+        self.reset(*(start or ()))
         shift: ndarray | None = None
         for frame in range(len(control)):
             if frame > 0:
@@ -337,7 +341,7 @@ class Simulator:
 
         Args:
             substep: Its number in the frame.
-            before: State at its start.
+            before: NodeState at its start.
             after: Receives the state at its end; with self-collision, in another position array.
             free_velocity: Receives the velocity before all contacts, for the adjoint.
             contact_velocity: Receives the velocity after self-collision and before the ground;

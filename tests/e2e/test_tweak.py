@@ -114,6 +114,71 @@ def test_every_tab_fits_its_window_and_is_reached_by_keys(shared_scene):
     scene.press("Reset")
 
 
+_STEERED = """() => {
+  const { nodeRefFromName, nodePoseData, camera, canvas } = __viserMutable;
+  const vertices = window.__viserSceneTree.getState()["/object/surface"].message.props.vertices;
+  const object = [0, 0, 0];
+  vertices.forEach((value, place) => (object[place % 3] += (3 * value) / vertices.length));
+  const wrist = nodePoseData["/steer/wrist"]?.position;
+  if (!wrist) return { object };
+  const Point = camera.position.constructor;
+  const box = canvas.getBoundingClientRect();
+  const pixel = (x, y, z) => {
+    const place = nodeRefFromName["/steer"].localToWorld(new Point(x, y, z)).project(camera);
+    return [box.left + (place.x + 1) / 2 * box.width, box.top + (1 - place.y) / 2 * box.height];
+  };
+  const { scale } = window.__viserSceneTree.getState()["/steer/wrist"].message.props;
+  const arrow = [0.5, 1.5].map((part) => pixel(wrist[0], wrist[1], wrist[2] + part * scale));
+  return { object, wrist: [...wrist], arrow };
+}"""
+"""Middle of the object, the wrist [m], and the ends of a drag along its upward arrow [px]."""
+
+
+def test_a_held_key_and_the_dragged_gizmo_move_hand_and_object(shared_scene):
+    scene, page = shared_scene, shared_scene.page
+    keyboard, mouse = page.keyboard, page.mouse
+
+    def look() -> dict:
+        return scene.panel.locator("body").evaluate(_STEERED)
+
+    scene.go(12)
+    scene.tab("Physics")
+    before = look()["object"]
+    keyboard.press("g")
+    sign = scene.panel.get_by_role("status").filter(has_text="Steering the right hand")
+    expect(sign).to_be_visible()
+    scene.until(lambda: "wrist" in look(), "the gizmo")
+    start = look()
+
+    keyboard.down("e")
+    scene.until(lambda: look()["wrist"][2] > start["wrist"][2] + 0.05, "the hand rises")
+    keyboard.up("e")
+    scene.until(lambda: look()["object"][2] > before[2] + 0.02, "the object rises with it")
+    keyboard.press("Control+z")
+    scene.until(lambda: np.allclose(look()["wrist"], start["wrist"], atol=1e-6), "it is back")
+    # Keys that mean something else while nothing is steered do not now.
+    keyboard.press("l")
+    keyboard.press("s")
+    assert scene.value("Frame") == 12
+
+    frame = page.locator("#scene").bounding_box()
+    held = look()
+    (x, y), (to_x, to_y) = ((frame["x"] + u, frame["y"] + v) for u, v in held["arrow"])
+    mouse.move(x, y)
+    mouse.down()
+    for part in (0.3, 0.6, 1.0):
+        mouse.move(x + part * (to_x - x), y + part * (to_y - y))
+    scene.until(lambda: look()["wrist"][2] > held["wrist"][2] + 0.03, "the gizmo is dragged up")
+    mouse.up()
+    scene.until(lambda: look()["object"][2] > before[2] + 0.01, "the object follows")
+
+    keyboard.press("g")
+    expect(sign).to_be_hidden()
+    scene.until(lambda: np.allclose(look()["object"], before, atol=1e-6), "playback again")
+    assert scene.value("Frame") == 12
+    scene.tab("Physics")
+
+
 def test_on_a_phone_the_panel_is_a_sheet_below_the_scene(shared_scene):
     scene, page, height = shared_scene, shared_scene.page, 844
     page.set_viewport_size({"width": 390, "height": height})

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -113,6 +114,33 @@ def test_every_simulation_of_the_sequence_restarts_with_the_strain_it_had(
     expected = spring_strains(later, rollout.position[AT + 1], rollout.control[AT + 1])
     np.testing.assert_array_equal(rollout.strains(AT + 1), expected)
     assert np.abs(plain.tensions(AT + 1) - rollout.tensions(AT + 1)).max() > 1e-3
+
+
+@pytest.mark.parametrize("frame", [0, 5, AT, AT + 1, 17])
+def test_a_rollout_goes_on_from_any_frame_as_it_went_on(restarted, frame: int) -> None:
+    rollout = FittedObject.of(restarted, "lift").simulate()
+    model, state = rollout.going_on(frame)
+    simulator = Simulator(model, rollout.parameters)
+    simulator.reset(*state)
+    np.testing.assert_array_equal(simulator.position.numpy(), rollout.position[frame])
+    simulator.step_frame(1, rollout.control[frame], rollout.control[frame + 1])
+    is_same = np.array_equal(simulator.position.numpy(), rollout.position[frame + 1])
+    # After the restart's own frame the rollout goes on from what was observed, not from itself.
+    assert is_same == (frame != AT)
+
+
+def test_a_rollout_goes_on_with_the_springs_that_are_attached(run) -> None:
+    rollout = FittedObject.of(run, "lift").simulate()
+    attached = rollout.model.attached.copy()
+    attached[:10], attached[10:20], attached[20:] = [0, 3], [3, 9], [9, 99]
+    late = replace(rollout, model=replace(rollout.model, attached=attached))
+    own = rollout.model.object_spring_count
+    for frame, held in ((2, slice(0, 10)), (3, slice(10, 20)), (9, slice(20, None))):
+        model, _ = late.going_on(frame)
+        expected = np.zeros_like(rollout.model.stiffness[own:])
+        expected[held] = rollout.model.stiffness[own:][held]
+        np.testing.assert_array_equal(model.stiffness[own:], expected)
+        assert model.is_always_attached
 
 
 def test_some_of_the_controls_restart_too(restarted) -> None:

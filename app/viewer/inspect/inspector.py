@@ -71,7 +71,7 @@ class Inspector:
         self._readings: Readings | None = None
         self._framing: Framing | None = None
         self._pick: Pick | None = None
-        self._shown: tuple[ObjectRollout | None, int, int] = (None, 0, 0)
+        self._shown: tuple[ObjectRollout | None, int, int] | None = (None, 0, 0)
         self._measured: tuple[Any, ...] | None = None
         self._curve: Float[ndarray, " frame"] = np.zeros(0)
         self._refreshed = 0.0
@@ -114,6 +114,13 @@ class Inspector:
             self._text.content = self._invitation
             self._kind.visible = self._clear.visible = False
             self._remove_plot()
+
+    def rest(self) -> None:
+        """Read nothing until the clock shows a frame again, because hands are being steered."""
+        with self._lock:
+            if self._pick is not None:
+                self.clear()
+            self._shown = None
 
     def look_at(self, found: Pick | None) -> None:
         """Read a thing, or nothing."""
@@ -172,7 +179,7 @@ class Inspector:
     def _click(self, event: viser.SceneClickEvent, *, prefers_hand: bool) -> None:
         with self._lock:
             content, scene, framing = self._content, self._scene, self._framing
-            if content is None or scene is None or framing is None:
+            if content is None or scene is None or framing is None or self._shown is None:
                 return
             rollout, frame, rollout_frame = self._shown
             camera = event.client.camera

@@ -1,12 +1,13 @@
 """The server's side of the live simulation: its one process, and the rollouts of each session."""
 
 import logging
+import math
 import socket
 import subprocess
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
@@ -14,11 +15,23 @@ from typing import Any
 
 import numpy as np
 
-from app.viewer.live.wire import PAUSE, RESUME, STEP, Message, WireError, receive, send
+from app.viewer.live.drive import HandOrder
+from app.viewer.live.wire import (
+    DRIVE,
+    PAUSE,
+    RESUME,
+    STEER,
+    STEP,
+    Message,
+    WireError,
+    receive,
+    send,
+)
 from physhandi.child import start_module
 from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
+from physhandi.simulation.steering import Take
 
 logger = logging.getLogger(__name__)
 
@@ -27,6 +40,8 @@ Listener = Callable[[Message], None]
 STARTING = "**The simulation is starting …** The first time on a machine this takes a while."
 """Shown until the process has loaded or compiled what every simulation needs."""
 
+_FASTEST = 1e6
+"""As good as no limit of speed, which JSON has no number for [m/s]."""
 _MAX_CRASHES = 5
 _CRASH_WINDOW = 60.0
 
@@ -151,6 +166,51 @@ class SimulationClient:
             self._write(message)
         return number
 
+    def steer(
+        self,
+        session: str,
+        take: Take,
+        *,
+        replays: bool = False,
+        is_paced: bool = True,
+        top_speed: float = math.inf,
+    ) -> int:
+        """Simulate what is steered, without end; a crash of the process ends it.
+
+        Frames come as messages ``frame`` with the arrays ``position``, ``velocity`` and ``pose``.
+
+        Args:
+            session: A session with a listener; what it asked for before is dropped.
+            take: The state to begin in, and the hands; poses after the first are not used.
+            replays: Whether to simulate the poses of the take instead, and then to end.
+            is_paced: Whether to wait until a frame is due, as far as it is not late.
+            top_speed: A wrist that is steered moves no faster than this [m/s].
+
+        Returns:
+            Number of the request, which its frames carry.
+        """
+        fields = {
+            "session": session,
+            "parameters": take.parameters.to_dict(),
+            "replays": replays,
+            "period": 1.0 / take.parameters.frame_rate if is_paced else 0.0,
+            "top_speed": min(top_speed, _FASTEST),
+        }
+        with self._lock:
+            number = next(self._numbers)
+            message = Message(STEER, fields | {"request": number}, take.to_tensors())
+            self._unfinished.pop(session, None)
+            if self._connection is None:
+                self._unfinished[session] = _Unfinished(message)
+            self._write(message)
+        return number
+
+    def drive(self, session: str, orders: Sequence[HandOrder]) -> None:
+        """Tell where the steered hands of a session shall go from now on, one order a hand."""
+        told = [order.to_dict() for order in orders]
+        with self._lock:
+            self._write(Message(DRIVE, {"session": session, "orders": told}))
+
     def hold(self, session: str, *, on: bool) -> None:
         """Hold the session's simulation, this one and those to come, or let it go on."""
         with self._lock:
@@ -228,7 +288,7 @@ class SimulationClient:
             self._connection = connection
             for session, item in list(self._unfinished.items()):
                 self._write(item.message)
-                if item.message.kind == "prepare":
+                if item.message.kind in {"prepare", STEER}:
                     del self._unfinished[session]
             if self._is_closed:
                 _shut(connection)

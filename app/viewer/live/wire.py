@@ -13,6 +13,8 @@ from numpy import ndarray
 
 PAUSE, RESUME, STEP = "pause", "resume", "step"
 """Messages that change the pace of a simulation and leave what is simulated alone."""
+STEER, DRIVE = "steer", "drive"
+"""Messages that begin to simulate what somebody steers, and that tell where its hands shall go."""
 
 _LENGTH = struct.Struct("<I")
 _MAX_HEADER = 1 << 20

@@ -6,30 +6,37 @@ thread simulates one frame of each active session in turn. The process ends when
 """
 
 import logging
+import math
 import signal
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
+from typing import Any
 
 import numpy as np
 import warp as wp
 
-from app.viewer.live.wire import PAUSE, RESUME, STEP, Message, receive, send
+from app.viewer.live.drive import Drives
+from app.viewer.live.wire import DRIVE, PAUSE, RESUME, STEER, STEP, Message, receive, send
 from physhandi.child import Channel, run_child
 from physhandi.errors import PhysHandiError, SimulationDivergedError
 from physhandi.fitted_object import FittedObject
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.stability import stable_substeps
+from physhandi.simulation.steering import SteeredSimulation, Take
 from physhandi.simulation.topology import build_model
 
 logger = logging.getLogger(__name__)
 
 
 class Mailbox:
-    """What is to be done next for each session: its newest request, then changes of its pace."""
+    """What is to be done next for each session: its newest request, then changes of its pace.
+
+    Of what steers a session's hands only the newest is kept, however often that is told.
+    """
 
     def __init__(self) -> None:
         self._condition = threading.Condition()
@@ -39,24 +46,31 @@ class Mailbox:
     def put(self, message: Message) -> None:
         """Add a message; a request replaces everything that the session has asked for before."""
         with self._condition:
-            if message.kind in {PAUSE, RESUME, STEP}:
-                self._messages.setdefault(message["session"], []).append(message)
+            if message.kind in {PAUSE, RESUME, STEP, DRIVE}:
+                waiting = self._messages.setdefault(message["session"], [])
+                if message.kind == DRIVE:
+                    waiting[:] = [other for other in waiting if other.kind != DRIVE]
+                waiting.append(message)
             else:
                 self._messages[message["session"]] = [message]
             self._condition.notify()
 
-    def take(self, *, wait: bool) -> list[Message] | None:
+    def take(self, *, wait: bool, until: float = math.inf) -> list[Message] | None:
         """Empty the mailbox.
 
         Args:
             wait: Whether to wait for a message if there is none.
+            until: When to stop waiting [s, clock of `time.monotonic`].
 
         Returns:
             The messages, those of one session in their order, or None after `close`.
         """
         with self._condition:
             while wait and not (self._messages or self._is_closed):
-                self._condition.wait()
+                left = until - time.monotonic()
+                if left <= 0.0:
+                    break
+                self._condition.wait(None if math.isinf(left) else left)
             if self._is_closed:
                 return None
             messages = [message for of_session in self._messages.values() for message in of_session]
@@ -73,24 +87,35 @@ class Mailbox:
 class PacedFrames:
     """The simulation of one session, frame by frame, and whether the next one may be computed.
 
-    A held one computes its first frame, the state it starts from, and then one frame a step.
+    A held one computes its first frame, the state it starts from, and then one frame a step. One
+    that is watched while somebody steers it computes its frames when they are due.
     """
 
-    def __init__(self, counts: Iterator[int], *, is_held: bool = False) -> None:
+    def __init__(
+        self, counts: Iterator[int], *, is_held: bool = False, period: float = 0.0
+    ) -> None:
         """Prepare.
 
         Args:
             counts: Computes a frame at a time and gives the number of frames computed so far.
             is_held: Whether to wait for steps.
+            period: Time from one frame to the next [s]; 0 for as fast as possible.
         """
         self._counts = counts
         self._computed = 0
         self._steps: int | None = 0 if is_held else None
+        self._period = period
+        self._due = -math.inf
 
     @property
     def may_advance(self) -> bool:
         """Whether the next frame may be computed."""
         return self._steps is None or self._steps > 0 or self._computed == 0
+
+    @property
+    def due(self) -> float:
+        """When the next frame may be computed [s, clock of `time.monotonic`]."""
+        return self._due if self.may_advance else math.inf
 
     def set_pace(self, kind: str) -> None:
         """Wait (`PAUSE`), run (`RESUME`) or compute one more frame (`STEP`)."""
@@ -101,6 +126,9 @@ class PacedFrames:
 
     def advance(self) -> bool:
         """Compute the next frame; returns whether there was one."""
+        if self._period > 0.0:
+            # One that is late by more than a frame has lost its turn: nothing is made up for.
+            self._due = max(self._due, time.monotonic() - self._period) + self._period
         count = next(self._counts, None)
         if count is None:
             return False
@@ -119,6 +147,7 @@ class SimulationWorker:
         self._mailbox = Mailbox()
         self._objects: dict[str, tuple[tuple[str, str], FittedObject]] = {}
         self._active: dict[str, PacedFrames] = {}
+        self._orders: dict[str, list[dict[str, Any]]] = {}
 
     def run(self) -> None:
         """Work until the parent closes the connection."""
@@ -130,21 +159,21 @@ class SimulationWorker:
         warm_up(self._device)
         send(self._connection, Message("ready", {"session": "", "request": 0}))
         while True:
-            is_idle = not any(frames.may_advance for frames in self._active.values())
-            messages = self._mailbox.take(wait=is_idle)
+            due = min((frames.due for frames in self._active.values()), default=math.inf)
+            messages = self._mailbox.take(wait=due > time.monotonic(), until=due)
             if messages is None:
                 return
             for message in messages:
                 self._handle(message)
             for session, frames in list(self._active.items()):
-                if frames.may_advance and not frames.advance():
+                if frames.due <= time.monotonic() and not frames.advance():
                     del self._active[session]
 
     def _read(self) -> None:
         try:
             while (message := receive(self._connection)) is not None:
                 arrived = {**message.fields, "arrived": time.perf_counter()}
-                self._mailbox.put(Message(message.kind, arrived))
+                self._mailbox.put(Message(message.kind, arrived, message.arrays))
         finally:
             self._mailbox.close()
 
@@ -154,20 +183,32 @@ class SimulationWorker:
             if session in self._active:
                 self._active[session].set_pace(message.kind)
             return
+        if message.kind == DRIVE:
+            if session in self._active:
+                self._orders[session] = message["orders"]
+            return
         self._active.pop(session, None)
+        self._orders.pop(session, None)
         if message.kind == "simulate":
             is_held = bool(message["is_held"])
-            self._active[session] = PacedFrames(self._answer(message), is_held=is_held)
+            frames = self._answer(message, self._simulate)
+            self._active[session] = PacedFrames(frames, is_held=is_held)
+        elif message.kind == STEER:
+            period = float(message["period"])
+            frames = self._answer(message, self._steer)
+            self._active[session] = PacedFrames(frames, period=period)
         elif message.kind == "prepare":
             self._active[session] = PacedFrames(self._prepare(message))
         elif message.kind == "close":
             self._objects.pop(session, None)
 
-    def _answer(self, request: Message) -> Iterator[int]:
+    def _answer(
+        self, request: Message, simulate: Callable[[Message, dict[str, object]], Iterator[int]]
+    ) -> Iterator[int]:
         """Simulate one request; pauses after each frame and gives the number of frames."""
         about = {"session": request["session"], "request": request["request"]}
         try:
-            yield from self._simulate(request, about)
+            yield from simulate(request, about)
         except SimulationDivergedError as error:
             send(
                 self._connection,
@@ -241,6 +282,36 @@ class SimulationWorker:
             if frame == 0:
                 self._send_stability(about, fitted.needed_substeps(rollout))
             raise
+        send(self._connection, Message("finished", about))
+
+    def _steer(self, request: Message, about: dict[str, object]) -> Iterator[int]:
+        """Simulate the frames of a take, or without end what is steered from its first frame on."""
+        take = Take.from_tensors(
+            request.arrays, SimulationParameters.from_dict(request["parameters"])
+        )
+        drives = Drives(
+            take.pose[0],
+            frame_rate=take.parameters.frame_rate,
+            top_speed=float(request["top_speed"]),
+        )
+        steered = SteeredSimulation(take, self._device)
+        state, pose, duration = steered.state, take.pose[0], 0.0
+        while True:
+            frame = steered.frame
+            fields = {**about, "frame": frame, "duration": duration}
+            arrays = {"position": state[0], "velocity": state[1], "pose": pose}
+            send(self._connection, Message("frame", fields, arrays))
+            yield frame + 1
+            if not request["replays"]:
+                drives.obey(self._orders.get(request["session"], ()))
+                pose = drives.next()
+            elif frame + 1 < take.frame_count:
+                pose = take.pose[frame + 1]
+            else:
+                break
+            clock = time.perf_counter()
+            state = steered.step(pose)
+            duration = time.perf_counter() - clock
         send(self._connection, Message("finished", about))
 
     def _send_stability(self, about: dict[str, object], substeps: int) -> None:

@@ -1,16 +1,18 @@
 """The nodes of one session's scene and how they follow the frames."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
 import viser
+from jaxtyping import Float
+from numpy import ndarray
 
 from app.viewer.color.coloring import Painted, Painter
 from app.viewer.color.hand_coloring import HandPainter
 from app.viewer.content.content import Content
-from app.viewer.content.layers import GREEN, GREY, SKIN, default_layers
+from app.viewer.content.layers import GREEN, GREY, SKIN, Layers, default_layers
 from app.viewer.content.observed import BONES
 from app.viewer.scene.cameras import CameraNodes
 from app.viewer.scene.framing import Framing
@@ -79,7 +81,13 @@ class SceneDrawing:
         self._cameras.remove()
 
     def draw(
-        self, frame: int, rollout: ObjectRollout | None, rollout_frame: int, *, is_playing: bool
+        self,
+        frame: int,
+        rollout: ObjectRollout | None,
+        rollout_frame: int,
+        *,
+        is_playing: bool,
+        hands: Mapping[str, Float[ndarray, "vertex 3"]] | None = None,
     ) -> None:
         """Bring the scene to a frame.
 
@@ -88,20 +96,24 @@ class SceneDrawing:
             rollout: The object's rollout; None without an object.
             rollout_frame: Frame of the rollout, which may lag behind while it is being computed.
             is_playing: Whether the clock is running, so that less may be sent.
+            hands: Where hands are that are steered, by their sides [m]; what was observed is not
+                shown beside them, since nobody has seen that.
         """
         rollout = rollout if rollout is not None and rollout.ready > 0 else None
         self.painter.weigh(self.layers.mass)
-        painted = (
-            None if rollout is None else self.painter.paint(rollout, rollout_frame, self.layers)
-        )
+        layers = self.layers if hands is None else _without_observed(self.layers)
+        painted = None if rollout is None else self.painter.paint(rollout, rollout_frame, layers)
         with self._server.atomic():
-            self._draw_hands(frame)
-            self._draw_observed(frame, is_playing, painted, rollout, rollout_frame)
+            self._draw_hands(frame, hands)
+            if layers.observed:
+                self._draw_observed(frame, is_playing, painted, rollout, rollout_frame)
+            else:
+                self._nodes.hide("/observed", "/markers")
             if rollout is not None:
                 self._object.draw(
                     rollout,
                     rollout_frame,
-                    self.layers,
+                    layers,
                     self._budget(rollout) if is_playing else Budget(arrows=_ARROWS),
                     force_unit=self._force_unit,
                     longest=0.22 * self._framing.extent,
@@ -143,11 +155,16 @@ class SceneDrawing:
             self._nodes.lift("/ground", height - 0.001 * self._framing.extent)
         self._nodes.show("/ground", is_visible=self.layers.ground and is_there)
 
-    def _draw_hands(self, frame: int) -> None:
+    def _draw_hands(
+        self, frame: int, steered: Mapping[str, Float[ndarray, "vertex 3"]] | None
+    ) -> None:
         is_visible = self.layers.hands
         painted = self.hand_painter.paint(frame, self.layers)
         for hand in self._content.hands:
-            vertex = np.asarray(hand.vertex[min(frame, len(hand.vertex) - 1)], dtype=np.float32)
+            recorded = hand.vertex[min(frame, len(hand.vertex) - 1)]
+            vertex = np.asarray(
+                recorded if steered is None else steered[hand.side], dtype=np.float32
+            )
             name, color = f"/hand/{hand.side}", SKIN[hand.side]
             if hand.face is None:
                 size = 0.006 * self._framing.extent
@@ -189,8 +206,7 @@ class SceneDrawing:
         """Draw what was seen; colored by error, its points tell their own."""
         observed = self._content.observed
         self._draw_lines_of_markers(frame, rollout, rollout_frame)
-        if observed is None or not self.layers.observed:
-            self._nodes.show("/observed", is_visible=False)
+        if observed is None:
             return
         point = observed.points(frame)
         color = observed.colors()
@@ -242,6 +258,12 @@ class SceneDrawing:
         # Nodes on a surface are seen by its color anyway.
         most = max(rollout.model.node_count - (_LEAST_BYTES - left) // 12, 1)
         return replace(budget, nodes=most)
+
+
+def _without_observed(layers: Layers) -> Layers:
+    """Leave out what was observed, and colors that compare with it or with what was fitted."""
+    is_compared = layers.color in {"error", "difference"}
+    return replace(layers, observed=False, color="plain" if is_compared else layers.color)
 
 
 def grid_cell(extent: float) -> float:

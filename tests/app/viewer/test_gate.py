@@ -1,5 +1,7 @@
 import asyncio
 import gzip
+import json
+import queue
 import threading
 import urllib.error
 import urllib.request
@@ -82,6 +84,35 @@ def test_an_unknown_session_is_not_found(address) -> None:
     with pytest.raises(InvalidStatus) as refused:
         connect(f"ws://{address}/viewer/AAAA", subprotocols=[PROTOCOL], proxy=None)
     assert refused.value.response.status_code == 404
+
+
+def test_keys_come_by_a_websocket_of_their_own_and_are_let_go_with_it(address, sessions) -> None:
+    name = sessions.open("run", "sheet", "me")
+    held: queue.Queue[frozenset[str]] = queue.Queue()
+    keys = sessions.get(name).keys
+    keys.attach(held.put, lambda _: None)
+    url = f"ws://{address}/viewer/{name}/keys"
+    with pytest.raises(InvalidStatus) as refused:
+        connect(url, additional_headers={"X-Owner": "somebody else"}, proxy=None)
+    assert refused.value.response.status_code == 404
+    with connect(url, proxy=None) as page:
+        assert json.loads(page.recv(timeout=LIMIT_S)) == {"steering": False}
+        assert held.get(timeout=LIMIT_S) == frozenset()
+        page.send('{"held": ["KeyW", "KeyL"]}')
+        assert held.get(timeout=LIMIT_S) == {"KeyW", "KeyL"}
+        page.send('{"held": ["F1"]}')
+        assert "Invalid enum value 'F1'" in json.loads(page.recv(timeout=LIMIT_S))["error"]
+        keys.tell({"steering": True})
+        assert json.loads(page.recv(timeout=LIMIT_S)) == {"steering": True}
+    assert held.get(timeout=LIMIT_S) == frozenset()
+    with connect(url, proxy=None) as page:
+        page.recv(timeout=LIMIT_S)
+        for _ in range(20):
+            page.send("[]")
+        assert all("error" in json.loads(page.recv(timeout=LIMIT_S)) for _ in range(20))
+        with pytest.raises(ConnectionClosed):
+            page.recv(timeout=LIMIT_S)
+    assert held.get(timeout=LIMIT_S) == frozenset()
 
 
 @pytest.mark.parametrize("slash", ["", "/"])

@@ -16,8 +16,11 @@ from viewer_world import FRAMES, PARAMETERS, controls, sheet
 from waiting import until
 
 from app.viewer.live.client import LiveRequest, SimulationClient
+from app.viewer.live.drive import HandOrder
 from app.viewer.live.wire import Message
+from physhandi.fitted_object import FittedObject
 from physhandi.run import Run
+from physhandi.simulation.steering import SteeredHand, Take
 
 SECONDS = 60.0
 TESTS = Path(__file__).parents[2]
@@ -130,6 +133,59 @@ def test_sessions_take_turns(live, mailbox, run) -> None:
     shared = sequence[sequence.index("b", 2) : sequence.rindex("a") + 1]
     assert len(shared) > 5
     assert all(x != y for x, y in pairwise(shared))
+
+
+def steered(run: Run) -> Take:
+    """The sheet in its first frame, whose controls are one hand."""
+    rollout = FittedObject.of(run.folder, "lift").fitted
+    control = np.array(rollout.control[0])
+    hand = SteeredHand(name="controls", control=np.arange(30), wrist=control.mean(axis=0))
+    model, start = rollout.going_on(0)
+    return Take(model=model, start=start, parameters=PARAMETERS, control=control, hands=(hand,))
+
+
+def test_steering_as_was_recorded_gives_the_recorded_rollout(live, mailbox, run) -> None:
+    control = run.array("sequences/lift/control.npy").astype(np.float64)
+    pose = np.zeros((FRAMES, 1, 6))
+    pose[:, 0, :3] = (control - control[0]).mean(axis=1)
+    live.steer("a", replace(steered(run), pose=pose), replays=True, is_paced=False)
+    messages = mailbox.until("finished")
+    recorded = run.array("sequences/lift/rollout.npy")
+    assert np.abs(recorded[-1] - recorded[0]).max() > 0.05
+    np.testing.assert_allclose(frames(messages), recorded, atol=2e-6)
+    told = np.stack([m.arrays["pose"] for m in messages if m.kind == "frame"])
+    np.testing.assert_array_equal(told, pose)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_driven_wrist_takes_what_it_holds_along(live, mailbox, run, axis: int) -> None:
+    take, goal = steered(run), np.zeros(6)
+    goal[axis] = 0.03
+    number = live.steer("a", take, is_paced=False, top_speed=0.5)
+    live.drive("a", [HandOrder(goal=tuple(goal))])
+    seen = []
+    while len(seen) < 90:
+        message = mailbox.until("frame")[-1]
+        seen += [message] if message["request"] == number else []
+    live.cancel("a")
+    assert [m["frame"] for m in seen] == list(range(90))
+    np.testing.assert_allclose(seen[-1].arrays["pose"], [goal], atol=1e-6)
+    held = np.unique(take.model.spring_nodes[take.model.object_spring_count :, 0])
+    moved = (seen[-1].arrays["position"] - take.start[0])[held].mean(axis=0)
+    # The sheet hangs a little lower than it lay.
+    np.testing.assert_allclose(moved, goal[:3], atol=0.004)
+    assert moved[axis] > 0.025
+
+
+def test_what_cannot_be_steered_is_told_and_the_process_lives_on(live, mailbox, run) -> None:
+    process, take = live.process_id, steered(run)
+    live.steer("a", take, is_paced=False)
+    live.drive("a", [HandOrder(), HandOrder()])
+    assert mailbox.until("failed")[-1]["request"] > 0
+    wild = replace(take, parameters=PARAMETERS.replace(stiffness_scale=1e6))
+    live.steer("a", wild, is_paced=False)
+    assert "Simulation diverged at frame 1" in mailbox.until("diverged")[-1]["error"]
+    assert live.process_id == process
 
 
 def test_divergence_is_told_with_the_frame_and_the_process_lives_on(live, mailbox, run) -> None:

@@ -1,8 +1,10 @@
 """What the live simulation process does next, without simulating anything."""
 
+import math
 import socket
+import time
 
-from app.viewer.live.wire import PAUSE, RESUME, STEP, Message, send
+from app.viewer.live.wire import DRIVE, PAUSE, RESUME, STEER, STEP, Message, send
 from app.viewer.live.worker import Mailbox, PacedFrames, SimulationWorker
 
 
@@ -27,6 +29,23 @@ def test_a_request_replaces_all_that_its_session_asked_for_before() -> None:
     assert contents(*messages) == [simulate(2), of_session(PAUSE), other]
     assert contents(simulate(1), of_session("cancel")) == [of_session("cancel")]
     assert contents() == []
+
+
+def test_of_what_steers_hands_only_the_newest_waits() -> None:
+    def drive(number: int) -> Message:
+        return Message(DRIVE, {"session": "a", "orders": [number]})
+
+    steer, step = of_session(STEER), of_session(STEP)
+    told = (drive(0), steer, *(drive(number) for number in range(1, 500)), step, drive(500))
+    assert contents(*told) == [steer, step, drive(500)]
+    assert contents(drive(1), of_session("close")) == [of_session("close")]
+
+
+def test_a_mailbox_waits_no_longer_than_until_the_next_frame_is_due() -> None:
+    mailbox = Mailbox()
+    assert mailbox.take(wait=True, until=time.monotonic() + 1e-3) == []
+    mailbox.put(simulate(1))
+    assert mailbox.take(wait=True, until=0.0) == [simulate(1)]
 
 
 def test_a_closed_mailbox_is_empty_for_good() -> None:
@@ -91,6 +110,26 @@ def test_a_pause_takes_back_the_steps_that_were_asked_for() -> None:
     for pace in (STEP, STEP, PAUSE):
         paced.set_pace(pace)
     assert not paced.may_advance
+
+
+def test_a_paced_simulation_waits_for_its_time_and_makes_up_for_nothing(monkeypatch) -> None:
+    now = 100.0
+    monkeypatch.setattr("app.viewer.live.worker.time.monotonic", lambda: now)
+    paced = PacedFrames(iter(range(50)), period=0.5)
+    assert paced.due == -math.inf
+    paced.advance()
+    assert paced.due == 100.0
+    paced.advance()
+    assert paced.due == 100.5
+    now = 100.6  # A little late: the next one comes the earlier.
+    paced.advance()
+    assert paced.due == 101.0
+    now = 110.0  # Much too late.
+    paced.advance()
+    assert paced.due == 110.0
+    paced.set_pace(PAUSE)
+    assert paced.due == math.inf
+    assert frames(is_held=False).due == -math.inf
 
 
 def test_a_parent_that_closes_without_listening_ends_the_worker_without_a_word(caplog) -> None:

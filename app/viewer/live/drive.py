@@ -1,0 +1,108 @@
+"""How a steered hand follows what it is told: smoothly, and with a top speed."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from physhandi.simulation.steering import turn_between, turn_on
+
+LAG = 0.1
+"""Time in which a hand takes up most of a change of its speed [s]."""
+TOP_TURN = 2.0 * math.pi
+"""A hand turns no faster than this [rad/s]."""
+_THERE = 1e-6
+"""A hand that is so near to its goal is there [length unit, rad]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class HandOrder:
+    """Where a hand shall go; the newest order holds until the next."""
+
+    velocity: tuple[float, ...] = (0.0,) * 6
+    """Speed of the wrist [m/s] and its turning about the world's axes [rad/s], without a goal."""
+    goal: tuple[float, ...] | None = None
+    """Pose to go to: offset of the wrist [m] and rotation vector [rad]; None to move freely."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Describe it in plain data."""
+        return {"velocity": self.velocity, "goal": self.goal}
+
+    @classmethod
+    def from_dict(cls, fields: Mapping[str, Any]) -> "HandOrder":
+        """Rebuild it from plain data."""
+        goal = fields["goal"]
+        return cls(velocity=tuple(fields["velocity"]), goal=None if goal is None else tuple(goal))
+
+
+class HandDrive:
+    """Moves one hand a frame at a time as its newest order says."""
+
+    def __init__(self, pose: Float[ndarray, " 6"], *, frame_rate: float, top_speed: float) -> None:
+        """Begin at rest.
+
+        Args:
+            pose: Where the hand is: offset of the wrist [m] and rotation vector [rad].
+            frame_rate: Frames per second [Hz].
+            top_speed: A wrist moves no faster than this [m/s].
+        """
+        self.order = HandOrder()
+        """What the hand follows."""
+        self.pose = np.array(pose, np.float64)
+        """Where the hand is."""
+        self._step = 1.0 / frame_rate
+        self._top = np.array([top_speed, TOP_TURN])
+        self._velocity = np.zeros(6)
+
+    def next(self) -> Float[ndarray, " 6"]:
+        """Move on by a frame; returns the new pose."""
+        goal = self.order.goal
+        if goal is None:
+            self._velocity += self._share * (np.array(self.order.velocity) - self._velocity)
+            self._limit()
+        else:
+            offset = np.array(goal[:3]) - self.pose[:3]
+            away = np.concatenate([offset, turn_between(self.pose[3:], np.array(goal[3:]))])
+            self._velocity = away * (self._share / self._step)
+            self._limit()
+            if np.abs(away).max() < _THERE:
+                self._velocity = away / self._step
+        move = self._velocity * self._step
+        self.pose[:3] += move[:3]
+        self.pose[3:] = turn_on(self.pose[3:], move[3:])
+        return self.pose.copy()
+
+    @property
+    def _share(self) -> float:
+        """Part of a change that is taken up in a frame."""
+        return 1.0 - math.exp(-self._step / LAG)
+
+    def _limit(self) -> None:
+        """Slow down to the top speeds."""
+        for part, top in zip((slice(0, 3), slice(3, 6)), self._top, strict=True):
+            speed = float(np.linalg.norm(self._velocity[part]))
+            if speed > top:
+                self._velocity[part] *= top / speed
+
+
+class Drives:
+    """The hands of one steered object."""
+
+    def __init__(
+        self, pose: Float[ndarray, "hand 6"], *, frame_rate: float, top_speed: float
+    ) -> None:
+        """Begin at rest; see `HandDrive`."""
+        self._drives = [HandDrive(its, frame_rate=frame_rate, top_speed=top_speed) for its in pose]
+
+    def obey(self, orders: Sequence[Mapping[str, Any]]) -> None:
+        """Follow new orders, one a hand, as `HandOrder.to_dict` gives them, or go on."""
+        for drive, order in zip(self._drives, orders, strict=bool(orders)):
+            drive.order = HandOrder.from_dict(order)
+
+    def next(self) -> Float[ndarray, "hand 6"]:
+        """Move all hands on by a frame; returns their poses."""
+        return np.stack([drive.next() for drive in self._drives])

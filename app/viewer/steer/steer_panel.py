@@ -1,0 +1,386 @@
+"""Steering: the mode that a key switches, the gizmo on the wrist, and the panel's tab."""
+
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import viser
+from jaxtyping import Float
+from numpy import ndarray
+
+from app.viewer.clock.playback import Playback
+from app.viewer.content.content import Content
+from app.viewer.content.session_state import Pose
+from app.viewer.live.client import STARTING, SimulationClient
+from app.viewer.live.drive import HandOrder
+from app.viewer.scene.framing import Framing
+from app.viewer.steer.key_channel import KeyChannel, Press, velocity_of, view_axes
+from app.viewer.steer.steered import TOP_SPEED, SteeredObject, begin_take
+from app.viewer.ui.guard import Guard, notify
+from app.viewer.ui.keyboard import bind
+from app.viewer.ui.tabs import Tabs
+from physhandi.errors import PhysHandiError, UsageError
+from physhandi.object_rollout import ObjectRollout
+from physhandi.simulation.steering import SteeredHand, from_quaternion, to_quaternion
+
+GIZMO = "/steer/wrist"
+"""Path of the gizmo in the scene."""
+_START, _STOP = "Steer (G)", "Back to playback (G)"
+_GIZMO_SIZE = 0.22
+"""Length of the gizmo's axes, as a part of the scene's extent."""
+_SPEED = 0.5
+"""Speed of a wrist at first, in extents of the scene a second."""
+_TURN_SPEED = 90.0
+"""Turning of a hand at first [°/s]."""
+_REFRESH = 0.25
+_COUNTED = 1.0
+"""Time over which frames are counted [s]."""
+_STYLE = "font-size:0.85em;line-height:1.5;padding:0.2em 0.9em 0.5em"
+_HOW = (
+    "The object is simulated on from the frame that is shown while you move the hand: by the "
+    "arrows and rings on its wrist, or by keys that you hold. <b>W S A D Q E</b> move it as you "
+    "see it, "
+    "<b>I K J L U O</b> turn it. Ctrl Z goes back to before the last drag or key."
+)
+
+Shown = tuple[ObjectRollout, int, Mapping[str, Float[ndarray, "vertex 3"]]]
+"""Rollout, its frame, and the vertices of each hand [m]."""
+
+
+class SteerPanel:
+    """Steers the hands of one content; controls, keys and the clock come in different threads."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        guard: Guard,
+        playback: Playback,
+        *,
+        tabs: Tabs,
+        live: SimulationClient,
+        session: str,
+        content: Content,
+        framing: Framing,
+        channel: KeyChannel,
+        rollout_at: Callable[[int], tuple[ObjectRollout, int]],
+        stop_comparing: Callable[[], None],
+    ) -> None:
+        """Add the tab's controls.
+
+        Args:
+            server: Where to.
+            guard: Wraps the callbacks.
+            playback: The session's clock.
+            tabs: Where the controls go.
+            live: The process that simulates.
+            session: Id of the session.
+            content: What is shown.
+            framing: Sizes.
+            channel: Tells held keys.
+            rollout_at: Finds the rollout of a frame, and which of its frames.
+            stop_comparing: Ends a comparison, which shows two objects.
+        """
+        self._server = server
+        self._guard = guard
+        self._playback = playback
+        self._tabs = tabs
+        self._live = live
+        self._mailbox = f"{session}/steer"
+        self._content = content
+        self._extent = framing.extent
+        self._channel = channel
+        self._rollout_at = rollout_at
+        self._stop_comparing = stop_comparing
+        self._lock = threading.RLock()
+        self._object: SteeredObject | None = None
+        self._hand = 0
+        self._frame = 0
+        self._was_playing = False
+        self._vertices: dict[str, ndarray] = {}
+        self._held: frozenset[str] = frozenset()
+        self._gizmo: viser.TransformControlsHandle | None = None
+        self._is_dragged = False
+        self._refused = ""
+        self._arrivals: deque[float] = deque(maxlen=200)
+        self._written = -math.inf
+        gui, unit = server.gui, content.length_unit
+        with tabs["Steer"]:
+            self._folder = gui.add_folder(None)
+        with self._folder:
+            self._button = gui.add_button(_START, hint="G")
+            self._status = gui.add_html("")
+            names = tuple(hand.side for hand in content.hands)
+            self._choice: Any = gui.add_dropdown(
+                "Hand", names or ("controls",), visible=len(names) > 1, hint="Which one is moved"
+            )
+            speed = _rounded(_SPEED * framing.extent)
+            self._speed: Any = gui.add_slider(
+                f"Speed [{unit}/s]",
+                0.1 * speed,
+                4.0 * speed,
+                0.1 * speed,
+                speed,
+                hint="Of a hand that keys move",
+            )
+            self._turn_speed: Any = gui.add_slider(
+                "Turning [°/s]", 10.0, 360.0, 10.0, _TURN_SPEED, hint="Of a hand that keys turn"
+            )
+        self._button.on_click(guard(lambda _: self.toggle()))
+        self._choice.on_update(guard.by_user(lambda _: self._choose(names)))
+        self._commands = bind(server, guard, "steer", lambda _, __: self.toggle())
+        channel.attach(self._hold, self._press)
+        self._write(at_once=True)
+
+    @property
+    def is_on(self) -> bool:
+        """Whether hands are steered now."""
+        return self._object is not None
+
+    def toggle(self) -> None:
+        """Steer from the frame on the screen on, or return to playback."""
+        with self._lock:
+            if self.is_on:
+                self.leave()
+            else:
+                self._enter()
+
+    def leave(self) -> None:
+        """Return to playback, where it was left."""
+        with self._lock:
+            steered, self._object = self._object, None
+            if steered is None:
+                return
+            steered.close()
+            self._held = frozenset()
+            if self._gizmo is not None:
+                self._gizmo.remove()
+                self._gizmo = None
+            self._is_dragged = False
+            self._tell()
+            self._write(at_once=True)
+        if self._was_playing:
+            self._playback.play()
+        self._playback.redraw()
+
+    def shown(self) -> Shown | None:
+        """Give what is to be drawn in place of the frame on the clock; None for nothing.
+
+        A clock that was started or moved ends the mode. Called by the thread that draws.
+        """
+        with self._lock:
+            steered, playback = self._object, self._playback
+            if steered is None:
+                return None
+            if playback.is_playing or playback.frame != self._frame:
+                self._was_playing = False
+                self.leave()
+                return None
+            if self._held:
+                self._drive(steered)  # The camera may have turned.
+            rollout, frame, newest = steered.shown()
+            self._follow(steered, newest.pose[self._hand])
+            self._write()
+            vertices = {
+                hand.name: hand.moved(self._vertices[hand.name], pose)
+                for hand, pose in zip(steered.take.hands, newest.pose, strict=True)
+                if hand.name in self._vertices
+            }
+        return rollout, frame, vertices
+
+    def remove(self) -> None:
+        """Take the tab's controls away."""
+        self.close()
+        for command in self._commands:
+            command.remove()
+        self._folder.remove()
+
+    def close(self) -> None:
+        """Stop steering and listening."""
+        self._was_playing = False
+        self.leave()
+        self._channel.detach()
+
+    def _enter(self) -> None:
+        """Begin in the frame that is shown; called under the lock."""
+        playback = self._playback
+        self._was_playing = playback.is_playing
+        playback.play(on=False)
+        self._stop_comparing()
+        self._frame = playback.frame
+        rollout, frame = self._rollout_at(self._frame)
+        take = begin_take(self._content, rollout, frame, self._frame)
+        self._vertices = {
+            hand.side: np.asarray(hand.vertex[min(self._frame, len(hand.vertex) - 1)], np.float64)
+            for hand in self._content.hands
+        }
+        self._hand = min(self._hand, len(take.hands) - 1)
+        self._object = SteeredObject(
+            self._mailbox,
+            self._live,
+            take,
+            top_speed=TOP_SPEED * self._extent,
+            on_change=self._hear,
+        )
+        self._arrivals.clear()
+        self._add_gizmo(take.hands[self._hand])
+        self._tabs.open("Steer")
+        self._tell()
+        self._write(at_once=True)
+        playback.redraw()
+
+    def _add_gizmo(self, hand: SteeredHand) -> None:
+        gizmo = self._gizmo = self._server.scene.add_transform_controls(
+            GIZMO,
+            scale=_GIZMO_SIZE * self._extent,
+            depth_test=False,
+            position=hand.wrist,
+        )
+
+        # In the order in which the browser has sent them, which threads would not keep.
+        async def moved(event: viser.TransformControlsEvent) -> None:
+            self._drag(event)
+
+        gizmo.on_update(moved)
+
+    def _drag(self, event: viser.TransformControlsEvent) -> None:
+        """Let the hand follow the gizmo."""
+        with self._lock:
+            steered = self._object
+            if steered is None or event.target is not self._gizmo:
+                return
+            if event.phase == "start":
+                self._is_dragged, self._refused = True, ""
+                steered.begin_gesture()
+                return
+            if event.phase == "end":
+                self._is_dragged = False
+            hand = steered.take.hands[self._hand]
+            try:
+                goal = _goal(hand, event.target.position, event.target.wxyz)
+                steered.order(self._hand, HandOrder(goal=goal))
+            except PhysHandiError as error:
+                if str(error) != self._refused:
+                    self._refused = str(error)
+                    notify(event.client, "Not possible", self._refused)
+
+    def _follow(self, steered: SteeredObject, pose: Float[ndarray, " 6"]) -> None:
+        """Put the gizmo where the hand is, unless it is being dragged."""
+        gizmo = self._gizmo
+        if gizmo is None or self._is_dragged:
+            return
+        position = steered.take.hands[self._hand].wrist + pose[:3]
+        wxyz = to_quaternion(pose[3:])
+        if not np.allclose(gizmo.position, position, atol=1e-6 * self._extent):
+            gizmo.position = position
+        if not np.allclose(gizmo.wxyz, wxyz, atol=1e-6):
+            gizmo.wxyz = wxyz
+
+    def _choose(self, names: tuple[str, ...]) -> None:
+        """Move another hand; the one before stays where it is."""
+        with self._lock:
+            steered, self._hand = self._object, names.index(self._choice.value)
+            if steered is None:
+                return
+            for hand in range(len(steered.take.hands)):
+                if hand != self._hand:
+                    steered.order(hand, HandOrder())
+            self._is_dragged = False
+            self._tell()
+            self._write(at_once=True)
+        self._playback.redraw()
+
+    def _hold(self, held: frozenset[str]) -> None:
+        """Move the hand while keys are held."""
+        with self._lock:
+            before, self._held = self._held, held
+            steered = self._object
+            if steered is None:
+                return
+            if held and not before:
+                steered.begin_gesture()
+            if held or before:
+                self._drive(steered)
+
+    def _drive(self, steered: SteeredObject) -> None:
+        turn_speed = math.radians(self._turn_speed.value)
+        velocity = velocity_of(self._held, self._axes(), self._speed.value, turn_speed)
+        steered.order(self._hand, HandOrder(velocity=velocity))
+
+    def _axes(self) -> Float[ndarray, "3 3"]:
+        """Find out how the newest client looks at the scene."""
+        clients = self._server.get_clients()
+        if not clients:
+            return view_axes(Pose.first(self._server.initial_camera))
+        return view_axes(Pose.of(clients[max(clients)].camera))
+
+    def _press(self, press: Press) -> None:
+        steered = self._object
+        if press == "undo" and steered is not None and not steered.undo():
+            notify(self._server, "Nothing to take back", "The hand has not been moved.", seconds=3)
+
+    def _hear(self, kind: str, error: str) -> None:
+        """Follow the simulation; runs in its thread."""
+        if kind == "frame":
+            self._arrivals.append(time.monotonic())
+            self._playback.redraw()
+            return
+        titles = {"diverged": "The object has run away; it is back where it was recorded"}
+        notify(self._server, titles.get(kind, "Steering has stopped"), error, seconds=12.0)
+        self.leave()
+
+    def _tell(self) -> None:
+        """Tell the page whether keys steer."""
+        names = ["the controls"] if not self._content.hands else []
+        names = names or [f"the {hand.side} hand" for hand in self._content.hands]
+        state: dict[str, Any] = {"steering": self.is_on}
+        if self.is_on:
+            state["what"] = names[self._hand]
+        self._channel.tell(state)
+
+    def _write(self, *, at_once: bool = False) -> None:
+        """Say what is going on, not more often than people read."""
+        now = time.monotonic()
+        if not at_once and now - self._written < _REFRESH:
+            return
+        self._written = now
+        steered = self._object
+        label = _START if steered is None else _STOP
+        if self._button.label != label:
+            self._button.label = label
+        text = _HOW
+        if steered is not None:
+            recent = sum(now - at < _COUNTED for at in tuple(self._arrivals))
+            duration = steered.duration
+            pace = f"{recent / _COUNTED:.0f} frames/s"
+            if math.isfinite(duration):
+                pace += f" · {1e3 * duration:.3g} ms to simulate one"
+            elif not self._live.is_ready:
+                pace = STARTING.replace("*", "")
+            text = f"<b>Steering from frame {self._frame}</b><br>{pace}"
+        self._status.content = f"<div style='{_STYLE}' data-steering>{text}</div>"
+
+
+def _goal(
+    hand: SteeredHand, position: Float[ndarray, " 3"], wxyz: Float[ndarray, " 4"]
+) -> tuple[float, ...]:
+    """Give the pose of a hand whose wrist is at a place.
+
+    Raises:
+        UsageError: If a number is not finite, or the quaternion is zero.
+    """
+    place, turn = np.asarray(position, np.float64), np.asarray(wxyz, np.float64)
+    is_finite = bool(np.isfinite(place).all() and np.isfinite(turn).all())
+    if not is_finite or float(np.linalg.norm(turn)) < 1e-6:
+        raise UsageError("A hand needs a place and a direction of finite numbers.")
+    goal = np.concatenate([place - hand.wrist, from_quaternion(turn)])
+    return tuple(float(value) for value in goal)
+
+
+def _rounded(value: float) -> float:
+    """Round to one digit that counts."""
+    power = 10.0 ** math.floor(math.log10(value))
+    return round(value / power) * power

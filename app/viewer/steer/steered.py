@@ -1,0 +1,231 @@
+"""The object of a session while somebody steers its hands."""
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Float32
+from numpy import ndarray
+
+from app.viewer.content.content import Content, ShownHand
+from app.viewer.live.client import SimulationClient
+from app.viewer.live.drive import HandOrder
+from app.viewer.live.wire import Message
+from physhandi.errors import UsageError
+from physhandi.object_rollout import ObjectRollout
+from physhandi.simulation.steering import SteeredHand, Take, nearest_surface
+
+TOP_SPEED = 3.0
+"""A wrist moves no faster than this many extents of the scene in a second."""
+FARTHEST_REACH = 5.0
+"""A wrist goes no farther than this many extents from where it was."""
+MOST_UNDONE = 50
+"""Gestures that can be taken back."""
+
+
+@dataclass(frozen=True, eq=False)
+class SteeredFrame:
+    """One simulated frame."""
+
+    position: Float32[ndarray, "node 3"]
+    """Object nodes [m]."""
+    velocity: Float32[ndarray, "node 3"]
+    """Their velocities [m/s]."""
+    pose: Float[ndarray, "hand 6"]
+    """Poses of the hands; see `Take`."""
+
+
+def begin_take(content: Content, rollout: ObjectRollout, frame: int, shown: int) -> Take:
+    """Let hands be steered from a frame of a rollout on.
+
+    Control nodes belong to the hand whose surface is nearest; without hands, to one body.
+
+    Args:
+        content: The hands.
+        rollout: The object's motion.
+        frame: Frame of the rollout.
+        shown: Frame of the hands.
+
+    Raises:
+        UsageError: If nothing moves the object.
+    """
+    control = np.asarray(rollout.held_control(frame), np.float32)
+    if not len(control):
+        raise UsageError("Nothing holds this object, so there is no hand to steer.")
+    recorded = np.asarray(rollout.control[frame], np.float64)
+    surfaces = [np.asarray(hand.vertex[_within(shown, hand)], float) for hand in content.hands]
+    if surfaces:
+        owner = nearest_surface(recorded, surfaces)
+        hands = tuple(
+            SteeredHand(
+                name=hand.side,
+                control=np.flatnonzero(owner == number),
+                wrist=surfaces[number].mean(axis=0)
+                if hand.joint is None
+                else np.array(hand.joint[_within(shown, hand)][0], np.float64),
+            )
+            for number, hand in enumerate(content.hands)
+        )
+    else:
+        every = np.arange(len(control))
+        hands = (SteeredHand(name="controls", control=every, wrist=recorded.mean(axis=0)),)
+    model, start = rollout.going_on(frame)
+    return Take(
+        model=model,
+        start=start,
+        parameters=rollout.parameters,
+        control=control,
+        hands=hands,
+        pose=np.zeros((1, len(hands), 6)),
+    )
+
+
+def _within(frame: int, hand: ShownHand) -> int:
+    """Give the frame, or the last one that the hand has."""
+    return min(frame, len(hand.vertex) - 1)
+
+
+class SteeredObject:
+    """Has the live simulation process simulate what is steered, and keeps its newest frame.
+
+    Orders come from the page, frames from the process, and the clock draws, each in threads of
+    their own.
+    """
+
+    def __init__(
+        self,
+        mailbox: str,
+        live: SimulationClient,
+        take: Take,
+        *,
+        top_speed: float,
+        on_change: Callable[[str, str], None],
+    ) -> None:
+        """Begin to simulate.
+
+        Args:
+            mailbox: Name of the listener, which no other has.
+            live: The process.
+            take: The state to begin in, and the hands.
+            top_speed: A wrist moves no faster than this [m/s].
+            on_change: Called with the kind of each message of the process, and why it ended.
+        """
+        self.take = take
+        self._mailbox = mailbox
+        self._live = live
+        self._top_speed = top_speed
+        self._on_change = on_change
+        self._lock = threading.Lock()
+        self._number = 0
+        self._orders = [HandOrder() for _ in take.hands]
+        start = SteeredFrame(*take.start, take.pose[0])
+        self._before = self._newest = start
+        self._durations: deque[float] = deque(maxlen=30)
+        self._undone: deque[SteeredFrame] = deque(maxlen=MOST_UNDONE)
+        control = np.repeat(take.control_at(take.pose[0])[None], 2, axis=0)
+        self._rollout = ObjectRollout(
+            model=take.model,
+            parameters=take.parameters,
+            control=control,
+            position=np.repeat(start.position[None], 2, axis=0),
+            velocity=np.repeat(start.velocity[None], 2, axis=0),
+            ready=2,
+        )
+        live.subscribe(mailbox, self._receive)
+        self._simulate(start)
+
+    @property
+    def newest(self) -> SteeredFrame:
+        """The newest frame."""
+        with self._lock:
+            return self._newest
+
+    @property
+    def duration(self) -> float:
+        """Time that a frame of late has taken to simulate, the median [s]; NaN before the first."""
+        with self._lock:
+            return float(np.median(self._durations)) if self._durations else float("nan")
+
+    def close(self) -> None:
+        """Stop simulating."""
+        with self._lock:
+            self._number = 0
+        self._live.unsubscribe(self._mailbox)
+
+    def order(self, hand: int, order: HandOrder) -> None:
+        """Tell a hand where to go, from now on.
+
+        Raises:
+            UsageError: If a number is not finite, or the goal is out of reach.
+        """
+        for name, values in (("velocity", order.velocity), ("goal", order.goal or ())):
+            if not np.all(np.isfinite(values)):
+                raise UsageError(f"The {name} of a hand must be finite numbers, not {values}.")
+        reach = self._top_speed * FARTHEST_REACH / TOP_SPEED
+        if order.goal is not None and float(np.linalg.norm(order.goal[:3])) > reach:
+            raise UsageError(f"The hand can go {reach:.3g} from where it was, and no farther.")
+        with self._lock:
+            if order == self._orders[hand]:
+                return
+            self._orders[hand] = order
+            self._live.drive(self._mailbox, self._orders)
+
+    def order_of(self, hand: int) -> HandOrder:
+        """Give what a hand follows."""
+        with self._lock:
+            return self._orders[hand]
+
+    def begin_gesture(self) -> None:
+        """Remember the state to which `undo` returns."""
+        with self._lock:
+            self._undone.append(self._newest)
+
+    def undo(self) -> bool:
+        """Return to where the last gesture began; returns whether there was one."""
+        with self._lock:
+            if not self._undone:
+                return False
+            state = self._undone.pop()
+            self._orders = [HandOrder() for _ in self._orders]
+            self._before = self._newest = state
+            # Of the gesture, no frame may come after this.
+            self._simulate(state)
+        return True
+
+    def shown(self) -> tuple[ObjectRollout, int, SteeredFrame]:
+        """Give what to draw: a rollout, its frame, and that frame; called by one thread."""
+        with self._lock:
+            before, newest = self._before, self._newest
+        rollout, take = self._rollout, self.take
+        for place, frame in enumerate((before, newest)):
+            rollout.position[place] = frame.position
+            if rollout.velocity is not None:
+                rollout.velocity[place] = frame.velocity
+            rollout.control[place] = take.control_at(frame.pose)
+        return rollout, 1, newest
+
+    def _simulate(self, start: SteeredFrame) -> None:
+        """Go on from a state."""
+        state = start.position, start.velocity
+        begun = replace(self.take, start=state, pose=start.pose[None])
+        self._number = self._live.steer(self._mailbox, begun, top_speed=self._top_speed)
+
+    def _receive(self, message: Message) -> None:
+        if message.kind == "ready":
+            return
+        with self._lock:
+            is_ours = message.kind == "crashed" or message["request"] == self._number
+            if not is_ours or self._number == 0:
+                return
+            if message.kind == "frame":
+                arrays = message.arrays
+                self._before = self._newest
+                self._newest = SteeredFrame(arrays["position"], arrays["velocity"], arrays["pose"])
+                if message["frame"] > 0:
+                    self._durations.append(float(message["duration"]))
+            else:
+                self._number = 0
+        told = message.fields.get("error", "The live simulation stopped and is started anew.")
+        self._on_change(message.kind, "" if message.kind == "frame" else str(told))

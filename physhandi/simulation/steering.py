@@ -1,0 +1,275 @@
+"""An object whose hands somebody steers: frame by frame, from any state on, and as takes of it.
+
+A steered hand keeps the shape that it had and moves as a rigid body; what it holds at the start it
+holds throughout. A take is the poses of its hands over the frames beside the state that it begins
+in, so that simulating it again gives the same bits.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Float32, Int
+from numpy import ndarray
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from physhandi.simulation.model import SpringMassModel
+from physhandi.simulation.parameters import SimulationParameters
+from physhandi.simulation.restart import NodeState, start_from_tensors
+from physhandi.simulation.simulator import Simulator, checked_control
+
+
+def turn_on(rotation: Float[ndarray, " 3"], by: Float[ndarray, " 3"]) -> Float[ndarray, " 3"]:
+    """Turn what is turned already by another rotation vector, about the world's axes [rad]."""
+    return (Rotation.from_rotvec(by) * Rotation.from_rotvec(rotation)).as_rotvec()
+
+
+def turn_between(start: Float[ndarray, " 3"], end: Float[ndarray, " 3"]) -> Float[ndarray, " 3"]:
+    """Give the rotation vector by which one rotation becomes another [rad]."""
+    return (Rotation.from_rotvec(end) * Rotation.from_rotvec(start).inv()).as_rotvec()
+
+
+def to_quaternion(rotation: Float[ndarray, " 3"]) -> Float[ndarray, " 4"]:
+    """Convert a rotation vector [rad] to a quaternion w, x, y, z."""
+    return Rotation.from_rotvec(rotation).as_quat()[[3, 0, 1, 2]]
+
+
+def from_quaternion(wxyz: Float[ndarray, " 4"]) -> Float[ndarray, " 3"]:
+    """Convert a quaternion w, x, y, z of any length but zero to a rotation vector [rad]."""
+    return Rotation.from_quat(np.asarray(wxyz)[[1, 2, 3, 0]]).as_rotvec()
+
+
+def nearest_surface(
+    point: Float[ndarray, "point 3"], surfaces: Sequence[Float[ndarray, "_ 3"]]
+) -> Int[ndarray, " point"]:
+    """Tell for each point which of some surfaces has the nearest vertex."""
+    distance = [KDTree(vertex).query(point)[0] for vertex in surfaces]
+    return np.argmin(distance, axis=0)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SteeredHand:
+    """Control nodes that move as one rigid body."""
+
+    name: str
+    """What it is called: ``right``, ``left``, or ``controls`` where there are no hands."""
+    control: Int[ndarray, " own"]
+    """Numbers of its control nodes."""
+    wrist: Float[ndarray, " 3"]
+    """Point about which it turns, in its pose of zero [m]."""
+
+    def moved(
+        self, point: Float[ndarray, "point 3"], pose: Float[ndarray, " 6"]
+    ) -> Float[ndarray, "point 3"]:
+        """Move points with the hand.
+
+        Args:
+            point: Points in the hand's pose of zero [m].
+            pose: How far the wrist has moved [m], then the rotation vector about it [rad].
+        """
+        turn = Rotation.from_rotvec(pose[3:]).as_matrix()
+        return (np.asarray(point, np.float64) - self.wrist) @ turn.T + (self.wrist + pose[:3])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Take:
+    """Poses of hands over some frames, and the state of the object that they begin with."""
+
+    model: SpringMassModel
+    """The object, its springs and what is held."""
+    start: NodeState
+    """Positions and velocities of the nodes in the first frame [m, m/s]."""
+    parameters: SimulationParameters
+    """What it is simulated with."""
+    control: Float32[ndarray, "control 3"]
+    """Control nodes where all poses are zero [m]."""
+    hands: tuple[SteeredHand, ...]
+    """The hands; control nodes of none of them stay where they are."""
+    pose: Float[ndarray, "frame hand 6"] = field(default_factory=lambda: np.zeros((1, 1, 6)))
+    """How far each wrist has moved from where it is in `control` [m], and the rotation vector about
+    it [rad]."""
+
+    def __post_init__(self) -> None:
+        checked_control(self.control[None], self.model.control_count)
+        expected = (len(self.pose), len(self.hands), 6)
+        if self.pose.shape != expected or not len(self.pose) or not len(self.hands):
+            raise ValueError(
+                f"pose has shape {self.pose.shape}; expected at least one frame, "
+                f"{len(self.hands)} hands and 6 numbers."
+            )
+        wrong = np.argwhere(~np.isfinite(self.pose))
+        if len(wrong):
+            frame, hand = (int(index) for index in wrong[0][:2])
+            raise ValueError(f"pose is not finite at frame {frame}, hand {hand}.")
+        number = np.concatenate([hand.control for hand in self.hands])
+        if len(np.unique(number)) != len(number) or np.any(
+            (number < 0) | (number >= self.model.control_count)
+        ):
+            raise ValueError("hands must name different control nodes that there are.")
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames."""
+        return len(self.pose)
+
+    def control_at(self, pose: Float[ndarray, "hand 6"]) -> Float32[ndarray, "control 3"]:
+        """Give the control nodes while the hands have these poses [m]."""
+        moved = np.array(self.control, np.float32)
+        for hand, its in zip(self.hands, pose, strict=True):
+            moved[hand.control] = hand.moved(self.control[hand.control], its)
+        return moved
+
+    def controls(self) -> Float32[ndarray, "frame control 3"]:
+        """Give the control nodes of all frames [m]."""
+        return np.stack([self.control_at(pose) for pose in self.pose])
+
+    def simulate(self, device: str = "cpu") -> Iterator[NodeState]:
+        """Simulate the frames one after the other; the first is the state that the take begins in.
+
+        Args:
+            device: Warp device.
+
+        Raises:
+            SimulationDivergedError: If the motion runs away.
+        """
+        steered = SteeredSimulation(self, device)
+        yield steered.state
+        for pose in self.pose[1:]:
+            yield steered.step(pose)
+
+    def part(self, first: int, last: int, state: NodeState) -> "Take":
+        """Keep some frames.
+
+        Args:
+            first: First frame that is kept.
+            last: Last one.
+            state: NodeState of the object in the first one.
+        """
+        if not 0 <= first <= last < self.frame_count:
+            raise ValueError(f"frames {first} to {last} are not among the {self.frame_count}.")
+        return replace(self, start=state, pose=self.pose[first : last + 1].copy())
+
+    def smoothed(self, seconds: float) -> "Take":
+        """Take jitter out of the poses; the first one, to which the object's state belongs, stays.
+
+        Args:
+            seconds: Standard deviation of the Gaussian that poses are averaged with over time [s].
+        """
+        if seconds <= 0.0:
+            return self
+        width = seconds * self.parameters.frame_rate
+        count, hands = self.pose.shape[:2]
+        turn = Rotation.from_rotvec(self.pose[..., 3:].reshape(-1, 3)).as_quat()
+        # Of q and -q, which are the same rotation, the one nearer to the frame before.
+        turn = turn.reshape(count, hands, 4)
+        flips = np.where((turn[1:] * turn[:-1]).sum(axis=-1) < 0.0, -1.0, 1.0)
+        turn[1:] *= np.cumprod(flips, axis=0)[..., None]
+        values = np.concatenate([self.pose[..., :3], turn], axis=-1)
+        # Reflected about the first frame, whose pose is a point of symmetry and stays.
+        before = 2.0 * values[:1] - values[:0:-1]
+        both: ndarray = np.concatenate([before, values])
+        smooth = gaussian_filter1d(both, width, axis=0, mode="nearest")[count - 1 :]
+        rotation = Rotation.from_quat(smooth[..., 3:].reshape(-1, 4)).as_rotvec()
+        pose = np.concatenate([smooth[..., :3], rotation.reshape(count, hands, 3)], axis=-1)
+        pose[0] = self.pose[0]
+        return replace(self, pose=pose)
+
+    def to_tensors(self) -> dict[str, ndarray]:
+        """Return model, controls, hands and poses as arrays; parameters are not among them."""
+        owner = np.full(self.model.control_count, -1, np.int32)
+        for number, hand in enumerate(self.hands):
+            owner[hand.control] = number
+        names = "\n".join(hand.name for hand in self.hands).encode()
+        return {
+            **{f"model_{name}": value for name, value in self.model.to_tensors().items()},
+            "start_position": self.start[0],
+            "start_velocity": self.start[1],
+            "control": self.control,
+            "hand_of_control": owner,
+            "hand_name": np.frombuffer(names, np.uint8),
+            "wrist": np.stack([np.asarray(hand.wrist, np.float64) for hand in self.hands]),
+            "pose": np.asarray(self.pose, np.float64),
+        }
+
+    @classmethod
+    def from_tensors(
+        cls, tensors: Mapping[str, ndarray], parameters: SimulationParameters
+    ) -> "Take":
+        """Rebuild it from the arrays of `to_tensors`.
+
+        Raises:
+            ValueError: If an array is missing, unknown or inconsistent.
+        """
+        model, start, rest = (_named(tensors, prefix) for prefix in ("model_", "start_", ""))
+        if set(rest) != {"control", "hand_of_control", "hand_name", "wrist", "pose"}:
+            raise ValueError(
+                "A take needs the arrays control, hand_of_control, hand_name, wrist, pose, a start "
+                f"and a model; got {', '.join(sorted(tensors))}."
+            )
+        springs = SpringMassModel.from_tensors(model)
+        names = bytes(np.asarray(rest["hand_name"], np.uint8)).decode().split("\n")
+        owner = np.asarray(rest["hand_of_control"])
+        wrist: Any = np.asarray(rest["wrist"], np.float64)
+        if wrist.shape != (len(names), 3) or not np.all(np.isfinite(wrist)):
+            raise ValueError(f"wrist has shape {wrist.shape}; expected ({len(names)}, 3).")
+        hands = tuple(
+            SteeredHand(name=name, control=np.flatnonzero(owner == number), wrist=wrist[number])
+            for number, name in enumerate(names)
+        )
+        return cls(
+            model=springs,
+            start=start_from_tensors(start, springs.node_count),
+            parameters=parameters,
+            control=np.asarray(rest["control"], np.float32),
+            hands=hands,
+            pose=np.asarray(rest["pose"], np.float64),
+        )
+
+
+def _named(tensors: Mapping[str, ndarray], prefix: str) -> dict[str, ndarray]:
+    """Give the arrays of a part by their own names; those of no part without a prefix."""
+    parts = ("model_", "start_")
+    return {
+        name.removeprefix(prefix): value
+        for name, value in tensors.items()
+        if (name.startswith(prefix) if prefix else not name.startswith(parts))
+    }
+
+
+class SteeredSimulation:
+    """An object that goes on from the state of a take, a frame for each pose that it is given."""
+
+    def __init__(self, take: Take, device: str = "cpu") -> None:
+        """Place the object on a device, in the first frame of a take.
+
+        Args:
+            take: Its model, control nodes and first poses.
+            device: Warp device.
+        """
+        self._take = take
+        self._simulator = Simulator(take.model, take.parameters, device=device)
+        self._simulator.reset(*take.start)
+        self._control = take.control_at(take.pose[0])
+        self.frame = 0
+        """Frames that have been simulated."""
+
+    @property
+    def state(self) -> NodeState:
+        """Positions [m] and velocities [m/s] of the object nodes now."""
+        simulator = self._simulator
+        return simulator.position.numpy().copy(), simulator.velocity.numpy().copy()
+
+    def step(self, pose: Float[ndarray, "hand 6"]) -> NodeState:
+        """Simulate a frame while the hands move to their next poses.
+
+        Raises:
+            SimulationDivergedError: If a node is not finite or too fast.
+        """
+        control = self._take.control_at(pose)
+        self.frame += 1
+        self._simulator.step_frame(self.frame, self._control, control)
+        self._control = control
+        return self.state

@@ -1,0 +1,163 @@
+"""Steered hands: what they move where, against the oracle in float64, closed forms and bits."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from reference.scenes import as_model, cube_scene
+from reference.spring_mass import simulate
+
+from physhandi.simulation.steering import (
+    SteeredHand,
+    SteeredSimulation,
+    Take,
+    from_quaternion,
+    nearest_surface,
+    to_quaternion,
+    turn_between,
+    turn_on,
+)
+
+FRAMES = 6
+
+
+def rotation(axis: int, angle: float) -> np.ndarray:
+    """Turn about an axis as textbooks write it."""
+    c, s = np.cos(angle), np.sin(angle)
+    return {
+        0: np.array([[1, 0, 0], [0, c, -s], [0, s, c]]),
+        1: np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]),
+        2: np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]),
+    }[axis]
+
+
+def steered_cube(frames: int = FRAMES) -> Take:
+    """The cube whose controls 0 to 2 follow one hand, and control 3 another one that rests."""
+    scene = cube_scene()
+    model, parameters = as_model(scene)
+    way = np.linspace(0, 1, frames)[:, None]
+    pose = np.zeros((frames, 2, 6))
+    pose[:, 0, :3] = way * [0.004, -0.002, 0.006]
+    pose[:, 0, 3:] = way * [0.0, 0.0, 0.3]
+    hands = (
+        SteeredHand(name="right", control=np.array([0, 1, 2]), wrist=np.array([0.02, 0.0, 0.03])),
+        SteeredHand(name="left", control=np.array([3]), wrist=np.zeros(3)),
+    )
+    control = scene.control[0].astype(np.float32)
+    return Take(
+        model=model,
+        start=(model.object_node, model.initial_velocity),
+        parameters=parameters,
+        control=control,
+        hands=hands,
+        pose=pose,
+    )
+
+
+def test_a_steered_hand_moves_the_object_as_the_oracle_says(device: str) -> None:
+    take, scene = steered_cube(), cube_scene()
+    control = np.repeat(scene.control[:1], FRAMES, axis=0)
+    for frame in range(FRAMES):
+        part = frame / (FRAMES - 1)
+        turn, wrist = rotation(2, 0.3 * part), take.hands[0].wrist
+        at = wrist + part * np.array([0.004, -0.002, 0.006])
+        control[frame, :3] = [turn @ (point - wrist) + at for point in scene.control[0, :3]]
+    np.testing.assert_allclose(take.controls(), control, atol=1e-8)
+    expected = simulate(replace(scene, control=control))[0]
+    found = np.stack([position for position, _ in take.simulate(device)])
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert (
+        np.abs(found - simulate(replace(scene, control=control[:1].repeat(6, 0)))[0]).max() > 1e-3
+    )
+
+
+def test_the_same_take_gives_the_same_bits_from_any_of_its_frames_on() -> None:
+    take = steered_cube()
+    frames = list(take.simulate())
+    for first, last in ((0, 5), (2, 5), (3, 4)):
+        part = take.part(first, last, frames[first])
+        again = list(part.simulate())
+        assert len(again) == last - first + 1
+        for old, new in zip(frames[first:], again, strict=False):
+            np.testing.assert_array_equal(old, new)
+    steered = SteeredSimulation(take)
+    for pose, expected in zip(take.pose[1:], frames[1:], strict=True):
+        np.testing.assert_array_equal(steered.step(pose), expected)
+    assert steered.frame == 5
+
+
+def test_a_take_is_stored_with_every_bit() -> None:
+    take = steered_cube()
+    again = Take.from_tensors(take.to_tensors(), take.parameters)
+    np.testing.assert_array_equal(again.controls(), take.controls())
+    assert [hand.name for hand in again.hands] == ["right", "left"]
+    assert [hand.control.tolist() for hand in again.hands] == [[0, 1, 2], [3]]
+    for old, new in zip(take.simulate(), again.simulate(), strict=True):
+        np.testing.assert_array_equal(old, new)
+
+
+def test_smoothing_takes_jitter_out_and_leaves_straight_ways_and_the_start() -> None:
+    take = steered_cube(60)
+    rng = np.random.default_rng(2)
+    jitter = take.pose + rng.normal(0.0, 0.002, take.pose.shape)
+    smooth = replace(take, pose=jitter).smoothed(0.1).pose
+    np.testing.assert_array_equal(smooth[0], jitter[0])
+    middle = slice(12, 48)  # At the last frame there is nothing to average with.
+    left = np.abs(smooth - take.pose)[middle].std() / np.abs(jitter - take.pose)[middle].std()
+    assert 0.2 < left < 0.6  # A Gaussian of three frames keeps 0.31 of white noise.
+    np.testing.assert_allclose(take.smoothed(0.1).pose[middle], take.pose[middle], atol=2e-5)
+    assert take.smoothed(0.0) is take
+    # A hand that turns beyond half a turn does not spin back.
+    pose = np.zeros((60, 2, 6))
+    pose[:, 0, 5] = (np.linspace(0, 1.5 * np.pi, 60) + np.pi) % (2 * np.pi) - np.pi
+    steps = np.diff(np.unwrap(replace(take, pose=pose).smoothed(0.1).pose[:, 0, 5]))
+    assert 0.0 < steps.min() <= steps.max() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"pose": np.full((2, 2, 6), np.nan)}, "pose is not finite at frame 0, hand 0"),
+        ({"pose": np.zeros((2, 1, 6))}, "at least one frame, 2 hands and 6 numbers"),
+        ({"pose": np.zeros((0, 2, 6))}, "at least one frame"),
+        ({"control": np.zeros((3, 3), np.float32)}, r"expected \(frames, 4, 3\)"),
+    ],
+)
+def test_what_does_not_fit_is_refused(change, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        replace(steered_cube(), **change)
+
+
+def test_hands_of_the_same_or_unknown_control_nodes_are_refused() -> None:
+    take = steered_cube()
+    for numbers in ([0, 0], [4], [-1]):
+        hand = SteeredHand(name="right", control=np.array(numbers), wrist=np.zeros(3))
+        with pytest.raises(ValueError, match="must name different control nodes"):
+            replace(take, hands=(hand,), pose=np.zeros((1, 1, 6)))
+    with pytest.raises(ValueError, match="frames 3 to 6 are not among the 6"):
+        take.part(3, 6, next(take.simulate()))
+    tensors = take.to_tensors()
+    del tensors["wrist"]
+    with pytest.raises(ValueError, match="A take needs the arrays"):
+        Take.from_tensors(tensors, take.parameters)
+
+
+def test_rotations_follow_one_another_about_the_axes_of_the_world() -> None:
+    quarter = np.pi / 2
+    both = turn_on(np.array([quarter, 0.0, 0.0]), np.array([0.0, 0.0, quarter]))
+    expected = rotation(2, quarter) @ rotation(0, quarter)
+    hand = SteeredHand(name="right", control=np.array([0]), wrist=np.zeros(3))
+    moved = hand.moved(np.eye(3), np.concatenate([np.zeros(3), both]))
+    np.testing.assert_allclose(moved, expected.T, atol=1e-12)
+    start = np.array([0.3, -0.2, 0.1])
+    np.testing.assert_allclose(turn_on(start, turn_between(start, both)), both, atol=1e-12)
+    np.testing.assert_allclose(
+        to_quaternion(np.array([0.0, 0.6, 0.0])), [np.cos(0.3), 0, np.sin(0.3), 0]
+    )
+    np.testing.assert_allclose(from_quaternion(3.0 * to_quaternion(both)), both)
+
+
+def test_points_belong_to_the_surface_whose_vertex_is_nearest() -> None:
+    surfaces = [np.array([[0.0, 0, 0], [5, 0, 0]]), np.array([[2.0, 0, 0]])]
+    point = np.array([[0.9, 0, 0], [1.1, 0, 0], [4, 0, 0], [2, 3, 0]])
+    assert nearest_surface(point, surfaces).tolist() == [0, 1, 0, 1]
