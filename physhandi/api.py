@@ -12,8 +12,8 @@ from physhandi.progress import Watcher, watched
 from physhandi.run import Run
 
 if TYPE_CHECKING:
+    from physhandi.fitting.checks.recording_check import RecordingCheck
     from physhandi.fitting.config import PipelineConfig
-    from physhandi.fitting.recording_check import RecordingCheck
 
 
 def load(folder: Path | str) -> Sequence:
@@ -39,7 +39,7 @@ def check(recording: Sequence | Path | str, *, progress: Watcher = None) -> "Rec
         ``stages`` by their names, each with ``is_ready``, ``missing``, ``why`` and ``remedy``, and
         ``problems``, each with ``level``, ``file``, ``frame``, ``field``, ``message``, ``remedy``.
     """
-    from physhandi.fitting.recording_check import check_recording
+    from physhandi.fitting.checks.recording_check import check_recording
 
     with watched(progress) as watch:
         return check_recording(recording, watch)

@@ -32,6 +32,13 @@ from physhandi.devices import describe_device
 from physhandi.errors import MissingInputError, RunError
 from physhandi.fitted_object import ROLLOUT, FittedObject
 from physhandi.fitting import artefacts
+from physhandi.fitting.checks.fit_warnings import with_warnings
+from physhandi.fitting.checks.readiness import (
+    is_moved_by_hands,
+    missing_for_hands,
+    nothing_to_fit,
+    readiness,
+)
 from physhandi.fitting.config import (
     EVALUATION,
     HANDS,
@@ -46,7 +53,6 @@ from physhandi.fitting.config import (
 )
 from physhandi.fitting.config import STAGES as STAGES
 from physhandi.fitting.contact_detection import find_contacts
-from physhandi.fitting.fit_warnings import with_warnings
 from physhandi.fitting.hand_reconstruction import reconstruct_hands
 from physhandi.fitting.object_problem import ObjectProblem, build_problem
 from physhandi.fitting.object_reconstruction import search_object
@@ -56,12 +62,6 @@ from physhandi.fitting.placement import (
     object_nodes_of,
     refine_sequence,
     store_refined,
-)
-from physhandi.fitting.readiness import (
-    is_moved_by_hands,
-    missing_for_hands,
-    nothing_to_fit,
-    readiness,
 )
 from physhandi.fitting.rest_state import resting_clearance
 from physhandi.fitting.rope.fit import fit_rope, start_rope

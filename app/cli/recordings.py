@@ -12,9 +12,9 @@ from app.cli.output import AsJson, DataDir, Device, show
 from physhandi.data.sequence import Sequence
 from physhandi.devices import pick_device
 from physhandi.errors import PhysHandiError, RunError, UsageError
+from physhandi.fitting.checks.readiness import StageReadiness
+from physhandi.fitting.checks.recording_check import RecordingCheck, check_recording
 from physhandi.fitting.config import HANDS, OBSERVATION
-from physhandi.fitting.readiness import StageReadiness
-from physhandi.fitting.recording_check import RecordingCheck, check_recording
 from physhandi.progress import watched
 
 

@@ -23,11 +23,11 @@ from physhandi.data.run_folder import new_run_id
 from physhandi.data.sequence import Sequence
 from physhandi.devices import pick_device
 from physhandi.errors import RunError, UsageError
+from physhandi.fitting.checks.readiness import skipped_object
 from physhandi.fitting.config import (
     load_profile,
     parse_override,
 )
-from physhandi.fitting.readiness import skipped_object
 from physhandi.progress import watched
 from physhandi.run import Run
 from physhandi.simulation.parameters import PARAMETERS, SimulationParameters, changed_parameters

@@ -4,7 +4,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from app.jobs.catalog import SequenceItem
-from physhandi.fitting.recording_check import RecordingCheck, check_recording
+from physhandi.fitting.checks.recording_check import RecordingCheck, check_recording
 
 
 def check_item(item: SequenceItem) -> RecordingCheck:

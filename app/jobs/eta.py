@@ -18,6 +18,7 @@ from physhandi.data.environment import ENVIRONMENT, processor_name
 from physhandi.data.files import named_fields
 from physhandi.data.run_folder import CURRENT, EXIT, read_mapping
 from physhandi.errors import PhysHandiError, UsageError
+from physhandi.fitting.checks.readiness import missing_for_hands, missing_for_object
 from physhandi.fitting.config import (
     EVALUATION,
     HANDS,
@@ -28,7 +29,6 @@ from physhandi.fitting.config import (
     STAGES,
     PipelineConfig,
 )
-from physhandi.fitting.readiness import missing_for_hands, missing_for_object
 from physhandi.run import Run
 
 _MOST_FITS = 5

@@ -10,6 +10,7 @@ from app.jobs.eta import Forecast
 from physhandi.data.files import named_fields
 from physhandi.data.sequence import Sequence as Recording
 from physhandi.errors import MissingInputError, SettingsError, UsageError
+from physhandi.fitting.checks.readiness import nothing_to_fit, readiness, skipped_object
 from physhandi.fitting.config import (
     EVALUATION,
     GROUPS,
@@ -22,7 +23,6 @@ from physhandi.fitting.config import (
     profile_names,
     values_of,
 )
-from physhandi.fitting.readiness import nothing_to_fit, readiness, skipped_object
 from physhandi.run import Run
 
 

@@ -17,7 +17,7 @@ from app.previews.overlay import LAYERS, draw_frame
 from physhandi.data.files import named_fields
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
-from physhandi.fitting.readiness import ABOUT, readiness
+from physhandi.fitting.checks.readiness import ABOUT, readiness
 from physhandi.perception.lifting import HAND_LABEL, OBJECT_LABEL
 
 _KEPT = {"Cache-Control": "private, max-age=3600"}

@@ -25,9 +25,9 @@ from physhandi.data.observation import evenly
 from physhandi.data.sequence import Sequence
 from physhandi.errors import FitError, MissingInputError
 from physhandi.fitting.adam import Adam
+from physhandi.fitting.checks.readiness import LEAST_PALM_POINTS, PALM, REMEDIES, missing_for_hands
 from physhandi.fitting.config import HandFitConfig
 from physhandi.fitting.one_thread import one_thread
-from physhandi.fitting.readiness import LEAST_PALM_POINTS, PALM, REMEDIES, missing_for_hands
 from physhandi.hand.loading import load_hand_model
 from physhandi.hand.model import HandModel, HandSide
 from physhandi.hand.motion import HandMotion

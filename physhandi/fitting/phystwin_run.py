@@ -27,8 +27,8 @@ from physhandi.data.sequence import Sequence
 from physhandi.devices import describe_device
 from physhandi.errors import ImportFailedError
 from physhandi.fitting import artefacts
+from physhandi.fitting.checks.fit_warnings import with_warnings
 from physhandi.fitting.config import load_profile
-from physhandi.fitting.fit_warnings import with_warnings
 from physhandi.metrics.report import measure_run
 from physhandi.perception.lifting import observe_object
 from physhandi.progress import NullProgress, Progress

@@ -13,7 +13,7 @@ from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import SequenceMeta, ViewMeta
 from physhandi.data.sequence_writer import write_sequence
-from physhandi.fitting.fit_warnings import fit_warnings, with_warnings
+from physhandi.fitting.checks.fit_warnings import fit_warnings, with_warnings
 from physhandi.metrics.report import score_run
 from physhandi.run import warnings_in
 from physhandi.simulation.model import SpringMassModel

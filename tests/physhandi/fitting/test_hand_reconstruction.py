@@ -16,6 +16,7 @@ import physhandi as ph
 from physhandi.data.importers.stereo import import_stereo
 from physhandi.data.sequence import Sequence
 from physhandi.errors import CancelledError, FitError, MissingInputError, SettingsError
+from physhandi.fitting.checks.readiness import PALM
 from physhandi.fitting.hand_reconstruction import (
     DepthTarget,
     HandFit,
@@ -28,7 +29,6 @@ from physhandi.fitting.hand_reconstruction import (
     reconstruct_hands,
     way_to_depth,
 )
-from physhandi.fitting.readiness import PALM
 from physhandi.hand.loading import load_hand_model
 from physhandi.hand.motion import HandMotion
 from physhandi.metrics.hands import evaluate_hands

@@ -11,6 +11,7 @@ from bad_input_world import FILMED_FRAMES, write_filmed
 from sheet_sequence import write_sheet
 
 from physhandi.data.sequence import Sequence
+from physhandi.fitting.checks.readiness import nothing_to_fit, readiness, shows_palm, skipped_object
 from physhandi.fitting.config import (
     EVALUATION,
     HANDS,
@@ -21,7 +22,6 @@ from physhandi.fitting.config import (
     STAGES,
     load_profile,
 )
-from physhandi.fitting.readiness import nothing_to_fit, readiness, shows_palm, skipped_object
 
 OF_OBJECT = (OBSERVATION, SEARCH, SPRINGS, REFINEMENT)
 

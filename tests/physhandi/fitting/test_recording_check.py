@@ -13,8 +13,8 @@ from sheet_sequence import write_sheet
 
 import physhandi as ph
 from physhandi.errors import CancelledError
+from physhandi.fitting.checks.recording_check import MOST_PROBLEMS, check_recording
 from physhandi.fitting.config import HANDS, OBSERVATION, STAGES
-from physhandi.fitting.recording_check import MOST_PROBLEMS, check_recording
 from physhandi.progress import Progress
 
 MASK, DEPTH = "views/front/mask/{:05d}.png", "views/front/depth/{:05d}.png"
@@ -140,7 +140,7 @@ def test_tracks_must_begin_in_frame_0(filmed: Path) -> None:
 def test_a_check_lists_no_endless_number_of_problems_and_can_be_stopped(
     filmed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("physhandi.fitting.recording_check.MOST_PROBLEMS", 2)
+    monkeypatch.setattr("physhandi.fitting.checks.recording_check.MOST_PROBLEMS", 2)
     both(*[truncated(DEPTH.format(frame)) for frame in range(FILMED_FRAMES)])(filmed)
     found = check_recording(filmed)
     assert len(found.problems) == 3

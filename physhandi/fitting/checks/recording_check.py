@@ -16,8 +16,7 @@ from numpy import ndarray
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
 from physhandi.errors import SequenceError
-from physhandi.fitting.config import HANDS, OBSERVATION, STAGES
-from physhandi.fitting.readiness import (
+from physhandi.fitting.checks.readiness import (
     READABLE,
     SEEN_HAND,
     SEEN_OBJECT,
@@ -25,6 +24,7 @@ from physhandi.fitting.readiness import (
     readiness,
     shows_palm,
 )
+from physhandi.fitting.config import HANDS, OBSERVATION, STAGES
 from physhandi.perception.lifting import (
     HAND_LABEL,
     OBJECT_LABEL,

@@ -20,8 +20,8 @@ from physhandi.data.layout import SEARCH_FILE, SHAPE_FILE, SequenceFiles
 from physhandi.data.run_folder import read_yaml
 from physhandi.data.sequence import Sequence
 from physhandi.fitting import artefacts
+from physhandi.fitting.checks.readiness import LEAST_PALM_POINTS, shows_palm, skipped_object
 from physhandi.fitting.config import INTERVALS, SearchVariable
-from physhandi.fitting.readiness import LEAST_PALM_POINTS, shows_palm, skipped_object
 from physhandi.fitting.search_bounds import bounds_met, interval_text
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import PARAMETERS
