@@ -19,6 +19,8 @@ STEP = np.array([0.006, 0.002])
 """Motion of the disc from frame to frame [m]."""
 HAND_TOP = 0.07
 """Height of the flat hand [m]."""
+ABOVE_HAND = 0.12
+"""Height of the disc's face where it is held over the hand [m]."""
 FINGERS = 0.008
 """Radius of its fingers [m]."""
 _WAVES = np.random.default_rng(3).uniform(-1, 1, (12, 3))
@@ -75,8 +77,10 @@ def _paint(place: np.ndarray, low: tuple[int, ...], high: tuple[int, ...]) -> np
     return np.asarray(low) * (1 - share) + np.asarray(high) * share
 
 
-def picture(camera: PinholeCamera, frame: int, *, hand: bool) -> tuple[np.ndarray, ...]:
-    """Draw color, depth [mm] and labels of a frame."""
+def picture(
+    camera: PinholeCamera, frame: int, *, hand: bool, top: float = TOP
+) -> tuple[np.ndarray, ...]:
+    """Draw color, depth [mm] and labels of a frame; the disc's face is at the height `top`."""
     row, column = np.mgrid[:HEIGHT, :WIDTH].astype(float)
     pixel = np.stack([column, row], axis=-1)
     eye = camera.T_world_camera[:3, 3]
@@ -89,27 +93,32 @@ def picture(camera: PinholeCamera, frame: int, *, hand: bool) -> tuple[np.ndarra
     place, depth = plane(0.0)
     color = _paint(place, (176, 168, 150), (206, 198, 182))
     label = np.zeros(row.shape, dtype=np.uint8)
-    face, far = plane(TOP)
+    face, far = plane(top)
     on_disc = np.linalg.norm(face - center(frame), axis=-1) < RADIUS
     color[on_disc] = _paint(face - center(frame), (30, 60, 150), (90, 170, 90))[on_disc]
     depth, label[on_disc] = np.where(on_disc, far, depth), 1
     if hand:
         face, far = plane(HAND_TOP)
-        is_hand = _hand(face, frame)
+        is_hand = _hand(face, frame) & (far < depth)
         color[is_hand], label[is_hand] = (214, 150, 128), 2
         depth = np.where(is_hand, far, depth)
     return color.round().astype(np.uint8), (1000 * depth).round().astype(np.uint16), label
 
 
 def write_disc(
-    folder: Path, *, hand: bool = False, masks: bool = False, frames: int = FRAMES
+    folder: Path,
+    *,
+    hand: bool = False,
+    masks: bool = False,
+    frames: int = FRAMES,
+    top: float = TOP,
 ) -> tuple[Sequence, dict[str, np.ndarray]]:
     """Write the recording; gives the true labels of each view, too."""
     images: dict[str, np.ndarray] = {}
     arrays: dict[str, np.ndarray] = {}
     labels: dict[str, np.ndarray] = {}
     for name, camera in cameras().items():
-        drawn = [picture(camera, frame, hand=hand) for frame in range(frames)]
+        drawn = [picture(camera, frame, hand=hand, top=top) for frame in range(frames)]
         labels[name] = np.stack([label for _, _, label in drawn])
         for frame, (color, depth, label) in enumerate(drawn):
             images[f"views/{name}/color/{frame:05d}.png"] = color
@@ -131,8 +140,10 @@ def write_disc(
     return write_sequence(folder, meta, arrays, images=images), labels
 
 
-def disc_click(view: str = "top", frame: int = 0) -> tuple[str, int, float, float]:
+def disc_click(
+    view: str = "top", frame: int = 0, top: float = TOP
+) -> tuple[str, int, float, float]:
     """Give a place on the disc, left of its middle, as a click names it."""
-    place = np.append(center(frame) - [0.025, 0.0], TOP)
+    place = np.append(center(frame) - [0.025, 0.0], top)
     x, y = cameras()[view].project(place)
     return view, frame, round(float(x)), round(float(y))

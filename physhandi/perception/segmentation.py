@@ -6,8 +6,9 @@ height above what carries the object, by the label that dense optical flow (DIS,
 nothing are dropped, and GrabCut (Rother et al. 2004) draws the outline of what is thick enough.
 Labels travel forwards and backwards from the frame of a click. A view without a click begins in the
 frame in which depth and calibration show it most of the object; hands begin, in every frame, at
-their keypoints. No network takes part, unless the user has one (`MaskModel`): it is then told the
-same places, and does the rest.
+their keypoints. Where several views agree about these, what is far from the bones in space is no
+hand, though a finger behind it be drawn there. No network takes part, unless the user has one
+(`MaskModel`): it is then told the same places, and does the rest.
 """
 
 import dataclasses
@@ -25,6 +26,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from physhandi.data.camera import triangulate
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
 from physhandi.errors import MissingInputError, UsageError
@@ -105,6 +107,11 @@ _HAND_DEPTH = 0.09
 """Distance of a hand's pixels from its middle, along the view [m]."""
 _HAND_HEIGHT = 0.008
 """Height above the support from which a pixel can be a hand's [m]."""
+_FLESH = 0.025
+"""Distance of a hand's skin from its bones that costs nothing, where these are known in space [m]:
+half of a palm's thickness, and what depth and keypoints err by."""
+_AGREEMENT = 0.18
+"""Views agree about a keypoint that all see within this share of the hand's size in the image."""
 _ROUNDS = 4
 """Times that colors and labels of a view's first frame are found from each other."""
 _CLICK_RADIUS = 0.012
@@ -129,6 +136,8 @@ _BONES = (
     (17, 18, 19, 20),
 )
 _PALM = (0, 1, 5, 9, 13, 17)
+_PALM_BONES = ((0, 5), (0, 9), (0, 13), (0, 17), (1, 5), (5, 9), (9, 13), (13, 17))
+"""Lines that a palm lies around in space, besides those of the fingers."""
 _PALM_SIDES = ((0, 5), (0, 9), (0, 13), (0, 17), (5, 17))
 _LONGEST = 480
 """Longer side of the images in which views without depth are judged [px]."""
@@ -145,8 +154,22 @@ _ARM = 0.6
 width]."""
 
 _Window = tuple[slice, slice]
-_Anchors = dict[int, tuple[Bool[ndarray, "row column"], Bool[ndarray, "row column"]]]
-"""By a hand's label: what of it is surely there, and from where its distance is counted."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Anchor:
+    """Where a hand is expected in an image."""
+
+    core: Bool[ndarray, "row column"]
+    """What of it is surely there."""
+    wide: Bool[ndarray, "row column"]
+    """From where its distance is counted."""
+    off_bones: Float[ndarray, "row column"] | None = None
+    """What it costs to be far from its bones in space; None if it is not known where these are."""
+
+
+_Anchors = dict[int, _Anchor]
+"""By a hand's label, where it is."""
 
 
 @dataclass(frozen=True)
@@ -215,6 +238,7 @@ def segment(
             found.append(_Seen(view, sequence, keypoint))
     for seen in found:
         seen.others = [other for other in found if other is not seen and other.view.has_depth]
+    _place_hands(sequence, found)
     clicked = [seen for seen in found if any(click.view == seen.view.name for click in clicks)]
     done, total = 0, len(found) * sequence.frame_count
     for seen in [*clicked, *(seen for seen in found if seen not in clicked)]:
@@ -263,8 +287,9 @@ def carry_on(
     progress = progress or NullProgress()
     views = [view for view in sequence.views if view.name in right]
     result: dict[str, ndarray] = {}
-    for number, view in enumerate(views):
-        seen = _Seen(view, sequence, _keypoints(view, sequence, progress))
+    found = [_Seen(view, sequence, _keypoints(view, sequence, progress)) for view in views]
+    _place_hands(sequence, found)
+    for number, (view, seen) in enumerate(zip(views, found, strict=True)):
         seen.label[:] = masks[view.name]
         count, starts = view.frame_count, sorted(set(right[view.name]))
         ends = [(start, 0) for start in starts] + [(f, 1) for f in fixed.get(view.name, ())]
@@ -437,6 +462,9 @@ class _Seen:
         self.keypoint = keypoint
         self.others: list[_Seen] = []
         """Other views with depth, which may show hands that this one's detector did not find."""
+        self.joint: dict[int, ndarray] = {}
+        """By a hand's label, its 21 keypoints in each frame, where several views agree about them;
+        else NaN [m]."""
         self.whole: _Window = (slice(0, camera.height), slice(0, camera.width))
         self.label = np.zeros((view.frame_count, camera.height, camera.width), dtype=np.uint8)
         self.background = _Colors(_NEW_ON_BACKGROUND)
@@ -874,18 +902,78 @@ def _hand_anchors(
         cores |= dict(_borrowed_cores(seen, frame, missing))
     for value, core in cores.items():
         inside = _is_raised_hand(core[patch.window] > 0, patch.depth, patch.height)
+        off_bones = _off_bones(seen, patch, frame, value)
+        if off_bones is not None:
+            inside &= off_bones == 0
         wide = inside
         if carried is not None and inside.any():
             reach = max(2, round(_WIDER * float(np.sqrt(core.sum()))))
             near = cv2.dilate(inside.astype(np.uint8), _disc(reach)) > 0
             wide = inside | (near & (carried == value))
         if inside.any():
-            anchors[value] = inside, wide
+            anchors[value] = _Anchor(inside, wide, off_bones)
     if carried is not None:
         for value in missing - set(anchors):
             if (carried == value).sum() >= _LEAST_OBJECT:
-                anchors[value] = np.zeros(carried.shape, dtype=bool), carried == value
+                anchors[value] = _Anchor(np.zeros(carried.shape, dtype=bool), carried == value)
     return anchors
+
+
+def _place_hands(sequence: Sequence, found: Many[_Seen]) -> None:
+    """Triangulate the keypoints of each hand, in the frames in which views agree about all."""
+    known = [(seen, seen.keypoint) for seen in found if seen.keypoint is not None]
+    cameras = [seen.view.camera for seen, _ in known]
+    if len(known) < 2:
+        return
+    for number, side in enumerate(sequence.hands):
+        keypoint = np.stack([part[:, number] for _, part in known]).astype(np.float64)
+        is_whole = np.isfinite(keypoint).all(axis=(2, 3))
+        if not is_whole.any():
+            continue
+        pixel = keypoint[is_whole][..., :2]
+        size = float(np.median(np.linalg.norm(np.ptp(pixel, axis=1), axis=1)))
+        flat = keypoint.reshape(len(known), -1, 3)
+        weight = np.nan_to_num(flat[..., 2])
+        joint = triangulate(cameras, flat[..., :2], weight, _AGREEMENT * size).reshape(-1, 21, 3)
+        joint[~np.isfinite(joint).all(axis=(1, 2))] = np.nan
+        for seen in found:
+            seen.joint[HAND_LABEL[side]] = joint
+
+
+def _off_bones(
+    seen: _Seen, patch: _Patch, frame: int, value: int
+) -> Float[ndarray, "row column"] | None:
+    """Compute what being a hand costs by the distance in space from its bones.
+
+    A finger that is behind something is drawn there, too; depth tells them apart. Pixels without
+    depth cost nothing.
+    """
+    joint = seen.joint.get(value)
+    if joint is None or not np.isfinite(joint[frame]).all():
+        return None
+    cost = np.where(patch.has_depth, np.float32(_FARTHEST), np.float32(0.0))
+    reach = _FLESH + _FARTHEST * _SLACK
+    depth = seen.view.camera.camera_depth(joint[frame])
+    pixel = seen.view.camera.project(joint[frame])
+    if not np.isfinite(pixel).all() or depth.min() < 2 * reach:
+        return None
+    around = reach * seen.focal / (depth.min() - reach)
+    # Nothing outside of this box is near enough.
+    start = np.array([side.start for side in patch.window])
+    low = np.maximum(np.floor(pixel[:, ::-1].min(axis=0) - around) - start, 0).astype(int)
+    high = np.maximum(np.ceil(pixel[:, ::-1].max(axis=0) + around) + 1 - start, low).astype(int)
+    box = np.s_[low[0] : high[0], low[1] : high[1]]
+    at = patch.has_depth[box]
+    point = (seen.origin + seen.ray[patch.window][box][at] * patch.depth[box][at][:, None]).T
+    nearest = np.full(point.shape[1], np.inf)
+    pairs = [pair for bone in _BONES for pair in itertools.pairwise(bone)]
+    for first, last in (*pairs, *_PALM_BONES):
+        begin, bone = joint[frame, first], joint[frame, last] - joint[frame, first]
+        offset = point - begin[:, None]
+        share = np.clip(bone @ offset / max(float(bone @ bone), 1e-9), 0.0, 1.0)
+        nearest = np.minimum(nearest, ((offset - share * bone[:, None]) ** 2).sum(axis=0))
+    cost[box][at] = np.clip((np.sqrt(nearest) - _FLESH) / _SLACK, 0.0, _FARTHEST)
+    return cost
 
 
 def _disc(radius: int) -> UInt8[ndarray, "row column"]:
@@ -955,10 +1043,13 @@ def _judge(
             background -= _RAISED * ((farness < 0.5) & (patch.height > 4 * seen.noise))
         labels.append(OBJECT_LABEL)
         scores.append(score)
-    for value, (core, wide) in hands.items():
+    for value, anchor in hands.items():
         score = hand + seen.things[value].log_density(patch.code)
+        cost = _farness(seen, patch, anchor.wide)
+        if anchor.off_bones is not None:
+            cost = np.maximum(cost, anchor.off_bones)
         labels.append(value)
-        scores.append(score - _farness(seen, patch, wide) + _CORE * core)
+        scores.append(score - cost + _CORE * anchor.core)
     if carried is not None:
         for index, value in enumerate(labels):
             share = cv2.GaussianBlur((carried == value).astype(np.float32), (0, 0), _SOFT)
@@ -999,9 +1090,9 @@ def _begin(
     for code in shadowed:
         seen.background.add(code.reshape(-1), 1 / len(_SHADOWS))
     colors = seen.things[OBJECT_LABEL]
-    for value, (core, _) in hands.items():
-        seen.things[value].add(patch.code[core])
-        seed = seed & ~core
+    for value, hand in hands.items():
+        seen.things[value].add(patch.code[hand.core])
+        seed = seed & ~hand.core
     if colors.is_known() and seed.any():
         seed = _own_seed(seen, patch, seed, list(hands))
     has_object = int(seed.sum()) > 0
@@ -1018,8 +1109,8 @@ def _begin(
             label[(label == OBJECT_LABEL) & ~kept] = _BACKGROUND
             _learn_object(colors, shadowed, kept)
             farness = _farness(seen, patch, kept)
-        for value, (core, _) in hands.items():
-            seen.things[value].replace(patch.code[core & (label == value)])
+        for value, hand in hands.items():
+            seen.things[value].replace(patch.code[hand.core & (label == value)])
         _learn_background(seen, patch, shadowed, label)
     return _outlined(patch, label)
 
@@ -1088,9 +1179,9 @@ def _advance(
     hands = _hand_anchors(seen, patch, now.frame, carried)
     anchor = carried == OBJECT_LABEL
     has_object = bool(anchor.any())
-    for value, (core, _) in hands.items():
+    for value, hand in hands.items():
         if not seen.things[value].is_known():
-            seen.things[value].add(patch.code[core])
+            seen.things[value].add(patch.code[hand.core])
     farness = _farness(seen, patch, anchor) if has_object else None
     labels, score = _judge(seen, patch, hands, farness, carried, has_object=has_object)
     inner = np.array(labels, dtype=np.uint8)[score.argmax(axis=0)]

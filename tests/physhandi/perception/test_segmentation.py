@@ -3,7 +3,7 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from clicked_disc import FRAMES, HEIGHT, WIDTH, cameras, disc_click, write_disc
+from clicked_disc import ABOVE_HAND, FRAMES, HEIGHT, WIDTH, cameras, disc_click, write_disc
 
 from physhandi.errors import CancelledError, MissingInputError, UsageError
 from physhandi.perception import segmentation
@@ -56,6 +56,15 @@ def test_hands_are_found_from_keypoints_and_are_never_the_object(held_disc):
         taken = (label == 1) & (true[view] == 2)
         assert taken.sum() < 0.05 * (true[view] == 2).sum()
         assert (label != 3).all()
+
+
+def test_the_object_is_not_the_fingers_behind_it(tmp_path):
+    sequence, true = write_disc(tmp_path / "over", hand=True, top=ABOVE_HAND)
+    found = segment(sequence, [Click(*disc_click(top=ABOVE_HAND))])
+    for view, label in found.items():
+        assert ((label > 1) & (true[view] == 1)).sum() < 0.02 * (true[view] == 1).sum()
+        assert agreement(label, true[view], 1).mean() > 0.95
+        assert agreement(label, true[view], 2).mean() > 0.7
 
 
 def test_a_hand_that_one_view_does_not_detect_is_shown_to_it_by_the_other(tmp_path):
