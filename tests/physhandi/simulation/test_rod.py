@@ -60,10 +60,12 @@ def crooked_rope() -> tuple[SpringMassModel, Rod, np.ndarray]:
     return model, rod, arm
 
 
-def bending_forces(model: SpringMassModel, control: np.ndarray, rounds: int) -> np.ndarray:
+def bending_forces(
+    model: SpringMassModel, control: np.ndarray, rounds: int, device: str = "cpu"
+) -> np.ndarray:
     """Force on each vertex after so many substeps in which no node moves [N]."""
     parameters = SimulationParameters(gravity=0.0, ground_height=None, substeps_per_frame=100)
-    simulator = Simulator(model, parameters)
+    simulator = Simulator(model, parameters, device=device)
     simulator.control_start.assign(control.astype(np.float32))
     simulator.control_end.assign(control.astype(np.float32))
     state = [simulator.position, simulator.velocity, *simulator.controls]
@@ -74,20 +76,20 @@ def bending_forces(model: SpringMassModel, control: np.ndarray, rounds: int) -> 
     return simulator.sums.pull.numpy()[len(model.spring_nodes) :]
 
 
-def test_forces_are_differences_of_the_energy_when_the_twist_has_settled():
+def test_forces_are_differences_of_the_energy_when_the_twist_has_settled(device):
     model, rod, arm = crooked_rope()
     node = model.object_node.astype(np.float64)
     natural = rod.natural_curvature[1:-1].astype(np.float64)
     reference = ElasticRod(rod.length[1:-1].astype(np.float64), natural, 0.3, 0.2)
     expected = reference.force(node, arm)
     assert np.abs(reference.balanced(node, arm)).max() > 0.3
-    force = bending_forces(model, (node[0] + arm)[None], rounds=60)
+    force = bending_forces(model, (node[0] + arm)[None], rounds=60, device=device)
     assert np.abs(expected).max() > 50.0
     np.testing.assert_allclose(force, expected, atol=2e-3)
     np.testing.assert_allclose(force.sum(axis=0), 0.0, atol=1e-4)
 
 
-def test_damping_is_the_rate_at_which_curvature_changes():
+def test_damping_is_the_rate_at_which_curvature_changes(device):
     """A straight rope of which one node moves across: κ grows by 2v/h there, -v/h beside it."""
     node = np.zeros((7, 3), np.float32)
     node[:, 0] = STEP * np.arange(7)
@@ -98,7 +100,7 @@ def test_damping_is_the_rate_at_which_curvature_changes():
     model = replace(
         model, object_node=node, initial_velocity=velocity, rod=rod, clearance=node[:, 0]
     )
-    force = bending_forces(model, np.array([[0.0, 0.0, 0.05]]), rounds=1)
+    force = bending_forces(model, np.array([[0.0, 0.0, 0.05]]), rounds=1, device=device)
     share = 0.3 * 0.02 / STEP * (0.4 / STEP) / STEP
     expected = np.zeros((7, 3))
     expected[1:6, 1] = share * np.array([-1.0, 4.0, -6.0, 4.0, -1.0])
@@ -122,17 +124,19 @@ def clamped_rope(count: int = 11, **values) -> tuple[SpringMassModel, np.ndarray
     return build_model(node.astype(np.float32), control, parameters, rod=rod), control
 
 
-def settled(model: SpringMassModel, control: np.ndarray, **values) -> np.ndarray:
+def settled(
+    model: SpringMassModel, control: np.ndarray, device: str = "cpu", **values
+) -> np.ndarray:
     """Where the nodes are after two seconds, with much drag."""
     parameters = SimulationParameters(ground_height=None, drag=8.0, substeps_per_frame=80, **values)
     still = np.repeat(control[None].astype(np.float32), 61, axis=0)
-    return Simulator(model, parameters).rollout(still).position[-1]
+    return Simulator(model, parameters, device=device).rollout(still).position[-1]
 
 
-def test_a_cantilever_hangs_down_as_beams_do():
+def test_a_cantilever_hangs_down_as_beams_do(device):
     """Each vertex turns by what hangs beyond it, M h / B; of a stiff rope the angles add up."""
     model, control = clamped_rope(stiffness=100.0, damping=0.001)
-    node = settled(model, control, gravity=5.0)
+    node = settled(model, control, device, gravity=5.0)
     moment = 5.0 * STEP * np.array([sum(range(1, 11 - vertex)) for vertex in range(1, 10)])
     tip = STEP * np.cumsum(moment * STEP / 100.0).sum()
     assert tip > 0.03
@@ -171,7 +175,7 @@ def test_the_axes_turn_with_the_gripper():
     assert np.abs(node[:, 1]).max() < 1e-3
 
 
-def test_a_bending_mode_dies_out_as_its_damping_says():
+def test_a_bending_mode_dies_out_as_its_damping_says(device):
     """A free rope bent in its first mode: with ω² = λ B and damping ω² τ, ζ = ω τ / 2."""
     count, stiffness, tau = 9, 4.0, 0.01
     node = np.zeros((count, 3), np.float32)
@@ -190,7 +194,9 @@ def test_a_bending_mode_dies_out_as_its_damping_says():
         gravity=0.0, ground_height=None, drag=0.0, frame_rate=100.0, substeps_per_frame=40
     )
     far = np.repeat(np.array([[[0.0, 0.0, 0.05]]], np.float32), 41, axis=0)
-    rollout = Simulator(model, parameters).rollout(far).position[:, :, 1] @ mode[:, 2]
+    rollout = (
+        Simulator(model, parameters, device=device).rollout(far).position[:, :, 1] @ mode[:, 2]
+    )
     time, ratio = 0.01 * np.arange(41), 0.5 * omega * tau
     slowed = omega * np.sqrt(1.0 - ratio**2)
     expected = 0.05 / slowed * np.exp(-ratio * omega * time) * np.sin(slowed * time)
@@ -198,11 +204,11 @@ def test_a_bending_mode_dies_out_as_its_damping_says():
     np.testing.assert_allclose(rollout, expected, atol=0.02 * np.abs(expected).max())
 
 
-def test_a_rope_is_simulated_the_same_way_twice_and_twist_does_not_stay():
+def test_a_rope_is_simulated_the_same_way_twice_and_twist_does_not_stay(device):
     model, rod, arm = crooked_rope()
     parameters = SimulationParameters(ground_height=None, substeps_per_frame=200)
     control = np.repeat((model.object_node[0] + arm)[None, None].astype(np.float32), 6, axis=0)
-    simulator = Simulator(model, parameters)
+    simulator = Simulator(model, parameters, device=device)
     first = simulator.rollout(control).position
     assert np.abs(first[5] - first[0]).max() > 0.01
     np.testing.assert_array_equal(simulator.rollout(control).position, first)
@@ -210,7 +216,8 @@ def test_a_rope_is_simulated_the_same_way_twice_and_twist_does_not_stay():
     simulator.set_rod(stiffer)
     changed = simulator.rollout(control).position
     np.testing.assert_array_equal(
-        changed, Simulator(replace(model, rod=stiffer), parameters).rollout(control).position
+        changed,
+        Simulator(replace(model, rod=stiffer), parameters, device=device).rollout(control).position,
     )
     assert np.abs(changed - first).max() > 1e-3
 
