@@ -15,6 +15,7 @@ TIMEOUT_MS = 120_000
 """How long browsers wait for what must come; a busy machine can be ten times as slow as others."""
 _SENT = "() => new Promise((done) => setTimeout(done, 60))"
 """viser's browser sends at once or 50 ms later, and of what waits until then only the last."""
+_PICTURE = "() => new Promise((done) => requestAnimationFrame(done))"
 _SESSION = "document.getElementById('scene').contentWindow.location.pathname.split('/')[2]"
 
 
@@ -147,6 +148,8 @@ class ScenePage:
         tab = self.panel.get_by_role("tab", name=name, exact=True)
         tab.click()
         expect(tab).to_have_attribute("aria-selected", "true")
+        # Controls that appear get their names before the next picture.
+        self.panel.locator("body").evaluate(_PICTURE)
 
     def download(self, name: str, path: Path) -> Path:
         """Press a button of the export panel and keep the file that the browser gets."""

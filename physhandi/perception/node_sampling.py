@@ -17,7 +17,6 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
-from scipy.interpolate import griddata
 from scipy.ndimage import binary_closing, binary_fill_holes
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, Delaunay, KDTree, QhullError
@@ -125,6 +124,8 @@ def _heights(local: Float[ndarray, "point 3"], grid: Float[ndarray, "cell 2"]) -
     Each point first takes the median height of those around it: beside a hand, masks let some of
     the hand's points through.
     """
+    from scipy.interpolate import griddata
+
     around = KDTree(local[:, :2]).query(local[:, :2], k=min(_SMOOTHED, len(local)))[1]
     smooth = np.median(local[around.reshape(len(local), -1), 2], axis=1)
     nearest = griddata(local[:, :2], smooth, grid, method="nearest")

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
-from scipy.interpolate import CubicSpline  # pyright: ignore[reportMissingTypeStubs]  # it has none
 from scipy.sparse import coo_array, csr_array, vstack
 from scipy.sparse.csgraph import dijkstra, minimum_spanning_tree
 from scipy.spatial import KDTree
@@ -292,6 +291,8 @@ def _lay_thin_tube(
     They are on its middle, and an average over neighbors would cut every bend. None if they are no
     chain of such nodes.
     """
+    from scipy.interpolate import CubicSpline  # pyright: ignore[reportMissingTypeStubs]  # none
+
     tree = minimum_spanning_tree(squareform(pdist(point)))
     joints = np.bincount(np.concatenate(tree.nonzero()), minlength=len(point))
     if joints.max() > 2 or 2.0 * radius > _SPARSE * np.median(tree.data):
