@@ -10,9 +10,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from app.exports.movie import film_scene
-from app.exports.offscreen import Offscreen
-from app.exports.recording import record_scene
 from app.exports.request import FileRequest
 from app.viewer.content.content import Content, open_run, open_sequence
 from app.viewer.content.session_state import Pose, SessionState
@@ -105,11 +102,16 @@ def make(
     content, run = _open(order, state)
     state = complete_state(state, content)
     take = _take(order, state, content, report)
+    # What draws takes as long to load as most files that are not drawn.
     if order.format in {"viser", "html"}:
+        from app.exports.recording import record_scene
+
         as_html = order.format == "html"
         write_bytes(out, record_scene(content, take, state, report, as_html=as_html))
         return
     if order.format in {"mp4", "gif"}:
+        from app.exports.movie import film_scene
+
         film_scene(
             content,
             take,
@@ -198,6 +200,8 @@ def _simulate(
 
 
 def _picture(order: FileRequest, snapshot: Snapshot, state: SessionState) -> Screenshot:
+    from app.exports.offscreen import Offscreen
+
     with Offscreen(snapshot.content, snapshot.rollout, state) as scene:
         scene.draw(snapshot.frame, is_playing=False)
         pose: Pose = scene.pose
