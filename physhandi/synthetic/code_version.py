@@ -14,7 +14,7 @@ INPUTS = ("synthetic/suite/variants.py", "data/sequence_writer.py", "data/truth.
 """Code that makes the inputs of methods."""
 PREDICTIONS = (
     *("pipeline.py", "fitted_object.py", "object_rollout.py", "settings.py", "triangles.py"),
-    *("data", "hand", "perception", "simulation", "fitting"),
+    *("parallel_transport.py", "data", "hand", "perception", "simulation", "fitting"),
     *("metrics/baselines.py", "metrics/alignment.py", "metrics/geometry.py"),
     "metrics/truth_metrics.py",
     *("synthetic/suite/methods.py", "synthetic/suite/cells.py"),

@@ -42,7 +42,7 @@ def test_nothing_is_told_to_anybody_without_the_token(world: World) -> None:
         " ".join(pair) for pair in known
     }
     assert sum(path.startswith("/api/v1/") for _, path in known) >= 14
-    assert sum(method == "WEBSOCKET" for method, _ in known) == 2
+    assert sum(method == "WEBSOCKET" for method, _ in known) == 3
     for method, path in known:
         if method == "WEBSOCKET":
             with (

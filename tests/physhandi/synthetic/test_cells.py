@@ -164,7 +164,7 @@ def needed(start: tuple[str, ...], without: tuple[str, ...]) -> set[str]:
 # metrics that a run notes of itself, which no table takes.
 NO_MATTER = (
     *("errors.py", "progress.py", "child.py", "devices.py", "synthetic/code_version.py"),
-    *("metrics/report.py", "metrics/photometric.py"),
+    *("srgb.py", "metrics/report.py", "metrics/photometric.py"),
 )
 
 
