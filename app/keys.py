@@ -195,6 +195,10 @@ KEYS: tuple[KeyGroup, ...] = (
                 "none of these twelve keys means anything else then",
             ),
             Key(
+                shown=("space",),
+                about="while steering: begin or end to record what you do",
+            ),
+            Key(
                 shown=("ctrl", "Z"),
                 about="while steering: back to before the last drag or held key",
             ),

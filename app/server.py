@@ -93,7 +93,7 @@ def create_app(
     scheduler = scheduler or Scheduler(settings, catalog)
     storage = UserStorage(
         PresetStore(settings.data_dir / "presets"),
-        RunSaver(catalog, settings.run_dir, scheduler.start_now),
+        RunSaver(catalog, settings.run_dir, scheduler.start_now, settings.sequence_dir),
     )
     sessions = sessions or Sessions(settings, catalog, storage)
     machine = Machine(settings.data_dir)

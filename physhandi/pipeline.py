@@ -67,6 +67,8 @@ from physhandi.fitting.rest_state import resting_clearance
 from physhandi.fitting.rope.fit import fit_rope, start_rope
 from physhandi.fitting.spring_optimisation import optimise_springs
 from physhandi.fitting.state_estimate import observed_state
+from physhandi.fitting.steered_run import contacts_from, record_take, store_hands
+from physhandi.fitting.stored_take import StoredTake
 from physhandi.metrics.report import measure_run, score_run
 from physhandi.object_rollout import ObjectRollout
 from physhandi.perception.lifting import observe_object
@@ -165,6 +167,7 @@ def simulate(
     progress: Progress,
     *,
     device: str = "cpu",
+    stored: StoredTake | None = None,
 ) -> dict[str, Any]:
     """Simulate a fitted object with changed parameters, or in other recordings, and measure it.
 
@@ -179,6 +182,7 @@ def simulate(
         attempt: Where results go; what is chosen is stored with the other parameters.
         progress: Told about every frame.
         device: Warp device.
+        stored: A take that the one recording was made of, which says everything else.
 
     Returns:
         The measures of each sequence by its name, as ``metrics.json`` holds them.
@@ -190,7 +194,10 @@ def simulate(
         SimulationDivergedError: If the motion runs away.
     """
     if not attempt.stage_done(SIMULATION):
-        _stage_simulation(source, sequences, changes, attempt, progress, device=device)
+        if stored is None:
+            _stage_simulation(source, sequences, changes, attempt, progress, device=device)
+        else:
+            _stage_take(source, sequences[0], stored, attempt, progress, device=device)
     metrics = {sequence.name: _measure(sequence, attempt) for sequence in sequences}
     attempt.save_json(METRICS_FILE, metrics)
     return metrics
@@ -230,6 +237,40 @@ def _stage_simulation(
     _finish(attempt, SIMULATION, [], [], [])
 
 
+def _stage_take(
+    source: RunFolder,
+    sequence: Sequence,
+    stored: StoredTake,
+    attempt: Attempt,
+    progress: Progress,
+    *,
+    device: str,
+) -> None:
+    """Simulate what somebody has steered, and store it as any other simulation."""
+    name, take, files = sequence.name, stored.take, SequenceFiles(sequence.name)
+    fitted = FittedObject.of(source, stored.sequence)
+    rest_node = artefacts.load_rest_node(source.out)
+    contacts = contacts_from(fitted.contacts, stored.frame)
+    attachment = artefacts.load_attachment(source.out, stored.sequence)
+    artefacts.save_sequence_meta(attempt, sequence)
+    artefacts.save_observation(attempt, name, observe_object(sequence, progress))
+    artefacts.save_object(attempt, take.parameters, take.model, rest_node)
+    artefacts.save_model(attempt, name, take.model)
+    store_hands(source, stored, name, attempt)
+    if source.has(SHAPE_FILE):
+        attempt.save_yaml(SHAPE_FILE, source.yaml(SHAPE_FILE))
+    if contacts is not None:
+        attempt.save_tensors(files.contacts, contacts.to_tensors())
+    attempt.save_array(files.attachment, attachment)
+    attempt.save_array(files.control, take.controls())
+    position, velocity = take.start
+    attempt.save_tensors(files.start, {"position": position, "velocity": velocity})
+    empty = ObjectRollout.empty(take.model, take.parameters, take.controls(), start=take.start)
+    steered = FittedObject(empty, sequence=name)
+    _store_rollout(attempt, steered, steered.begin(take.parameters), device, progress)
+    _finish(attempt, SIMULATION, [], [], [])
+
+
 def _object_in(
     source: RunFolder, sequence: Sequence, attempt: Attempt, progress: Progress
 ) -> FittedObject:
@@ -247,6 +288,9 @@ def _object_in(
             attempt.save_array(files.attachment, artefacts.load_attachment(source.out, name))
         if object_.contacts is not None:
             attempt.save_tensors(files.contacts, object_.contacts.to_tensors())
+        if object_.fitted.start is not None:
+            position, velocity = object_.fitted.start
+            attempt.save_tensors(files.start, {"position": position, "velocity": velocity})
         if object_.fitted.restart is not None:
             attempt.save_tensors(files.restart, object_.fitted.restart.to_tensors())
     else:
@@ -607,13 +651,17 @@ def run_job(run: RunFolder, progress: Progress | None = None, *, device: str = "
         watched = attempt.progress(progress)
         environment = describe_environment(device, describe_device(device))
         attempt.save_json(ENVIRONMENT, environment)
+        stored = StoredTake.load(run)
+        if stored is not None:
+            source = RunFolder.open(Path(run.config["source"]))
+            record_take(source, stored, Path(run.sequences[0]), watched, device=device)
         sequences = [Sequence.load(Path(path)) for path in run.sequences]
         for sequence in sequences:
             sequence.validate(reads_color=False)
         if run.kind == "simulation":
             source = RunFolder.open(Path(run.config["source"]))
             changes = run.config["parameters"]
-            simulate(source, sequences, changes, attempt, watched, device=device)
+            simulate(source, sequences, changes, attempt, watched, device=device, stored=stored)
         else:
             config = PipelineConfig.from_dict(run.config["profile"])
             reconstruct(sequences, config, attempt, watched, device=device)

@@ -9,6 +9,7 @@
   /* On phones the panel is below the scene. */
   const SIGN = `
     [data-sign=steer] { position: fixed; left: 1em; bottom: 1em; z-index: 50; max-width: calc(100% - 2em); padding: .5em .9em; border-radius: .5em; background: #1c50a5; color: #fff; font: 14px/1.5 system-ui, sans-serif; pointer-events: none; }
+    [data-sign=steer][data-recording=yes] { background: #a61e1e; }
     [data-sign=steer][hidden] { display: none; }
     @media (max-width: 36em) { [data-sign=steer] { inset: .6em .6em auto; max-width: none; } }`;
 
@@ -40,7 +41,9 @@
 
     function show() {
       sign.hidden = !state.steering;
-      sign.textContent = state.steering ? `Steering ${state.what}: hold W S A D Q E to move it, I K J L U O to turn it, ctrl Z takes back, G returns to playback` : "";
+      sign.textContent = state.steering ? `Steering ${state.what}: hold W S A D Q E to move it, I K J L U O to turn it, space records, ctrl Z takes back, G returns to playback` : "";
+      if (state.recording) sign.textContent = `● Recording. ${sign.textContent}`;
+      sign.dataset.recording = state.recording ? "yes" : "";
     }
 
     function connect() {
@@ -72,11 +75,12 @@
       }
       if (!state.steering || isTyping(event) || document.querySelector("dialog[open]")) return;
       const isUndo = (event.ctrlKey || event.metaKey) && !event.altKey && !event.shiftKey && event.code === "KeyZ";
-      if (!isUndo && (!isHeld || isCombined(event))) return;
+      const isRecord = event.code === "Space" && !isCombined(event) && !event.target.closest?.("button, summary, a, [role=tab], [role=option], input");
+      if (!isUndo && !isRecord && (!isHeld || isCombined(event))) return;
       event.preventDefault();
       event.stopImmediatePropagation();
       if (event.repeat) return;
-      if (isUndo) say({ press: "undo" });
+      if (isUndo || isRecord) say({ press: isUndo ? "undo" : "record" });
       else {
         held.add(event.code);
         tell();

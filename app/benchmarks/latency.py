@@ -10,17 +10,21 @@ from typing import Any
 import numpy as np
 
 from app.viewer.live.client import LiveRequest, SimulationClient
+from app.viewer.live.drive import HandOrder
 from app.viewer.live.wire import Message
 from physhandi.benchmarks.timing import describe_machine
 from physhandi.devices import start_warp
 from physhandi.errors import MissingInputError, SimulationError
 from physhandi.object_rollout import ObjectRollout, load_fitted
 from physhandi.run import Run
+from physhandi.simulation.steering import SteeredHand, Take
 
 _SESSION = "latency"
 _PATIENCE = 120.0
 _INTERRUPTED_AFTER = 3
 _FARTHEST = 0.12
+_STEERED, _TURNS_AFTER = 240, 20
+"""Frames that are steered, and after how many the hand turns round."""
 MOVES = 12
 """Slider positions of each kind that are asked for."""
 
@@ -74,18 +78,63 @@ class _Slider:
             ),
         )
         answer = _Answer([], [])
-        for moment, message in self._heard():
-            if message.kind in {"crashed", "failed", "diverged"}:
-                reason = message.fields.get("error", f"code {message.fields.get('code')}")
-                raise SimulationError(f"The live simulation {message.kind}: {reason}")
-            if message.kind == "ready" or message["request"] != number:
-                continue
+        for moment, message in self._answers(number):
             answer.seconds.append(moment - start)
             answer.messages.append(message)
             is_cut = message.kind == "frame" and message["frame"] == _INTERRUPTED_AFTER
             if message.kind == "finished" or (is_cut and not to_the_end):
                 break
         return answer
+
+    def steer(self, rollout: ObjectRollout, count: int) -> tuple[list[float], list[float]]:
+        """Let the hand go up and down from frame 0 on, as fast as frames can be simulated.
+
+        Args:
+            rollout: The object, which all its control nodes move as one body.
+            count: Frames that are waited for.
+
+        Returns:
+            When each frame was heard of, and how long the process took to simulate it [s].
+        """
+        control = np.asarray(rollout.held_control(0), np.float32)
+        every = np.arange(len(control))
+        hand = SteeredHand(name="hand", control=every, wrist=control.mean(axis=0))
+        model, start = rollout.going_on(0)
+        begun = Take(
+            model=model,
+            start=start,
+            parameters=rollout.parameters,
+            control=control,
+            hands=(hand,),
+        )
+        speed = float(np.ptp(np.asarray(rollout.control[0]), axis=0).max())
+        number = self._live.steer(_SESSION, begun, is_paced=False)
+        moments: list[float] = []
+        durations: list[float] = []
+        for moment, message in self._answers(number):
+            if message["frame"] % _TURNS_AFTER == 0:
+                up = speed if message["frame"] % (2 * _TURNS_AFTER) == 0 else -speed
+                velocity = (0.0, 0.0, up, 0.0, 0.0, 0.0)
+                self._live.drive(_SESSION, [HandOrder(velocity=velocity)])
+            moments.append(moment)
+            durations.append(float(message["duration"]))
+            if len(moments) == count:
+                break
+        self._live.cancel(_SESSION)
+        return moments, durations
+
+    def _answers(self, number: int) -> Iterator[tuple[float, Message]]:
+        """Give what is said to one request, and when.
+
+        Raises:
+            SimulationError: If the process cannot simulate it, dies, or says nothing.
+        """
+        for moment, message in self._heard():
+            if message.kind in {"crashed", "failed", "diverged"}:
+                reason = message.fields.get("error", f"code {message.fields.get('code')}")
+                raise SimulationError(f"The live simulation {message.kind}: {reason}")
+            if message.kind != "ready" and message["request"] == number:
+                yield moment, message
 
     def _heard(self) -> Iterator[tuple[float, Message]]:
         while True:
@@ -117,7 +166,8 @@ def measure_latency(
         ``in_process_ms`` inside of the simulation process, from the arrival of the request to the
         frame that is about to be sent. Then median and 95th percentile of the time of a frame in
         an undisturbed rollout (``ms_per_frame``, ``p95_ms_per_frame``) and its ``frames_per_s``,
-        beside the sequence's (``sequence_frames_per_s``).
+        beside the sequence's (``sequence_frames_per_s``). ``steered`` has the same of a hand that
+        is steered; its ``frames_per_s`` counts all of a frame, until the server has it.
 
     Raises:
         MissingInputError: If the run has no object in this sequence.
@@ -139,6 +189,7 @@ def measure_latency(
             for automatic in (False, True)
             for name, field in (("stiffness", "stiffness_scale"), ("radius", "connection_radius"))
         }
+        steered = _steered(*slider.steer(take, _STEERED))
     finally:
         live.close()
     heard = [seconds for kind in kinds.values() for seconds in kind.pop("heard")]
@@ -154,6 +205,18 @@ def measure_latency(
         "start_ms": 1e3 * started.first("frame", 1),
         **_to_first_frame(heard, computed),
         "kinds": kinds,
+        "steered": steered,
+    }
+
+
+def _steered(moments: Sequence[float], durations: Sequence[float]) -> dict[str, float]:
+    """Say how fast frames came while hands were steered, the first ones left out."""
+    kept = slice(_STEERED // 4, None)
+    came, took = moments[kept], durations[kept]
+    return {
+        "ms_per_frame": 1e3 * median(took),
+        "p95_ms_per_frame": 1e3 * float(np.quantile(took, 0.95)),
+        "frames_per_s": (len(came) - 1) / (came[-1] - came[0]),
     }
 
 

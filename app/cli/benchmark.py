@@ -186,7 +186,8 @@ def viewer(
     bytes: size of a playing frame of 2 hands, 3,000 nodes and 300 arrows (frame_bytes);
     sessions: ten such scenes at once (worst_frames_per_s, worst_skipped_per_s, server_cpu_share);
     runs: home page and list of 1,000 runs;
-    live: frames simulated in a second with automatic substeps (frames_per_s).
+    live: frames simulated in a second with automatic substeps (frames_per_s), and while a hand is
+    steered (steered).
 
     Args:
         parts: What to measure; none measures everything.

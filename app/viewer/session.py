@@ -1,5 +1,6 @@
 """One live session: a viser server with scene, panel and clock."""
 
+import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -20,7 +21,7 @@ from app.viewer.export.export_panel import ExportPanel
 from app.viewer.export.snapshot import Snapshot
 from app.viewer.inspect.inspector import Inspector
 from app.viewer.live.client import SimulationClient
-from app.viewer.physics.keep_panel import UserStorage
+from app.viewer.physics.keep_panel import SavedRun, UserStorage, run_changes
 from app.viewer.physics.object_session import FrameStrip, ObjectSession
 from app.viewer.restoring import complete_state
 from app.viewer.scene.framing import frame_content
@@ -31,8 +32,10 @@ from app.viewer.steer.key_channel import KeyChannel
 from app.viewer.steer.steer_panel import SteerPanel
 from app.viewer.ui.keyboard import bind
 from app.viewer.ui.tabs import TabName, Tabs
+from physhandi.fitting.stored_take import StoredTake
 from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.parameters import parameter_changes
+from physhandi.simulation.steering import Take
 
 
 class Session(SceneServer):
@@ -69,6 +72,7 @@ class Session(SceneServer):
         self._live = live
         self._storage = storage
         self._has_played = False
+        self._gone = threading.Event()
         self.keys = KeyChannel()
         """Tells which keys are held on the page."""
         self._names: tuple[str, ...] = ()
@@ -167,6 +171,7 @@ class Session(SceneServer):
     def close(self) -> None:
         """Stop clock, simulation and server."""
         self._is_closed = True
+        self._gone.set()
         self._playback.close()
         if self._steer is not None:
             self._steer.close()
@@ -262,7 +267,21 @@ class Session(SceneServer):
             channel=self.keys,
             rollout_at=self._object.at,
             stop_comparing=self._comparison.stop,
+            keep=None if self._storage is None else self._keep_take,
         )
+
+    def _keep_take(
+        self, take: Take, frame: int, name: str, report: Callable[[SavedRun], None]
+    ) -> None:
+        """Have a run and a recording made of what was steered."""
+        storage, fitted = self._storage, self._content.fitted
+        if storage is None or fitted is None:
+            return
+        source = self._catalog.run(self._target)
+        changes = run_changes(source, fitted.parameters, take.parameters, is_automatic=False)
+        stored = StoredTake(take=take, sequence=self._content.sequence_name, frame=frame)
+        run = storage.saver.save_take(self._target, stored, name, changes)
+        storage.saver.follow(run, report, self._gone)
 
     def _restore(self, state: SessionState) -> None:
         """Go on where another session stands."""

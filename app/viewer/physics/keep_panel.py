@@ -1,6 +1,7 @@
 """Choosing a preset, and keeping what sliders have found as a preset or as a run."""
 
 import html
+import re
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from typing import Any
 import viser
 
 from app.jobs.catalog import Catalog
+from app.settings import BUNDLED
 from app.viewer.content.content import Content
 from app.viewer.live.client import LiveRollouts
 from app.viewer.physics.history import History
@@ -24,12 +26,16 @@ from app.viewer.ui.followed import FollowedChoice
 from app.viewer.ui.guard import Guard, notify
 from physhandi.data.layout import PARAMETERS_FILE
 from physhandi.data.run_folder import new_run_id
+from physhandi.data.sequence_meta import SAFE_NAME
 from physhandi.errors import UsageError
+from physhandi.fitting.stored_take import StoredTake
 from physhandi.run import Run
 from physhandi.simulation.parameters import SimulationParameters, parameter_changes
 
 _POLL_S = 0.3
 _MOST_LETTERS = 80
+_MOST_OF_FOLDER = 64
+_UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,17 +64,25 @@ class RunSaver:
     parameters give the same motion.
     """
 
-    def __init__(self, catalog: Catalog, folder: Path, start: Callable[[Run], None]) -> None:
+    def __init__(
+        self,
+        catalog: Catalog,
+        folder: Path,
+        start: Callable[[Run], None],
+        sequences: Path | None = None,
+    ) -> None:
         """Prepare.
 
         Args:
             catalog: Finds the run that was shown, and its recordings.
             folder: Where runs are made.
             start: Has a worker begin with a run at once.
+            sequences: Where recordings are made; None for ``sequences`` beside the runs.
         """
         self._catalog = catalog
         self._folder = folder
         self._start = start
+        self._sequences = folder.parent / "sequences" if sequences is None else sequences
 
     def save(self, source_id: str, sequence: str, name: str, changes: Mapping[str, Any]) -> Run:
         """Make a run and have it worked on.
@@ -84,9 +98,7 @@ class RunSaver:
             SequenceError: If the recording is gone, without which nothing can be measured.
             OSError: If the run cannot be written.
         """
-        name = " ".join(name.split())
-        if not name or len(name) > _MOST_LETTERS:
-            raise UsageError(f"Type a name of 1 to {_MOST_LETTERS} letters for the run first.")
+        name = _checked_name(name)
         source = self._catalog.run(source_id)
         recordings = self._catalog.sequences_of(source)
         recording = recordings[source.sequence_names.index(sequence)]
@@ -97,6 +109,45 @@ class RunSaver:
             sequences=[str(recording.folder)],
             config={"source": str(source.folder.resolve()), "parameters": dict(changes)},
         )
+        self._start(run)
+        return run
+
+    def save_take(
+        self, source_id: str, stored: StoredTake, name: str, changes: Mapping[str, Any]
+    ) -> Run:
+        """Make a run that simulates what was steered, and have it worked on.
+
+        The worker makes a recording of it first, called as the run, in letters that a folder has.
+
+        Args:
+            source_id: Id of the run whose object was steered.
+            stored: What was steered.
+            name: What the user calls the new run.
+            changes: Parameters that differ from the source's; see `run_changes`.
+
+        Raises:
+            UsageError: If the name is empty, too long, or that of a recording.
+            OSError: If the run cannot be written.
+        """
+        name = _checked_name(name)
+        folder = self._sequences / _UNSAFE.sub("_", name).strip("_")[:_MOST_OF_FOLDER]
+        if not SAFE_NAME.fullmatch(folder.name) or folder == self._sequences:
+            raise UsageError("Type a name with letters or digits for the recording.")
+        if folder.exists() or (BUNDLED / folder.name).exists():
+            raise UsageError(f"There is a recording '{folder.name}' already. Type another name.")
+        source = self._catalog.run(source_id)
+        run = Run.create(
+            self._folder / new_run_id(),
+            name=name,
+            kind="simulation",
+            sequences=[str(folder)],
+            config={
+                "source": str(source.folder.resolve()),
+                "parameters": dict(changes),
+                "take": stored.to_dict(),
+            },
+        )
+        stored.save(run.folder)
         self._start(run)
         return run
 
@@ -125,6 +176,28 @@ class RunSaver:
         thread = threading.Thread(target=watch, name=f"saving-{run.id}", daemon=True)
         thread.start()
         return thread
+
+
+def _checked_name(name: str) -> str:
+    """Give a name without surplus blanks, or say what is wrong with it."""
+    name = " ".join(name.split())
+    if not name or len(name) > _MOST_LETTERS:
+        raise UsageError(f"Type a name of 1 to {_MOST_LETTERS} letters for the run first.")
+    return name
+
+
+def saved_html(run: SavedRun) -> str:
+    """Say how far a saved run is, with a link to it."""
+    name = html.escape(run.name)
+    link = f"<a href='/runs/{run.id}' target='_blank' rel='noopener'>{name}</a>"
+    texts = {
+        "queued": f"Saving run {link}…",
+        "running": f"Simulating and measuring run {link}…",
+        "succeeded": f"✓ Saved as run {link}",
+        "cancelled": f"Run {link} was cancelled.",
+    }
+    error = html.escape(run.error or "See its page.")
+    return texts.get(run.state, f"✗ Run {link} failed: {error}")
 
 
 def run_changes(
@@ -301,7 +374,7 @@ class KeepPanel:
         lines = [f"⚠ {html.escape(problem)}" for problem in problems[:_PROBLEMS]]
         if len(problems) > _PROBLEMS:
             lines.append(f"… and {len(problems) - _PROBLEMS} more")
-        _write(self._problems, "<br/>".join(lines))
+        write_small(self._problems, "<br/>".join(lines))
         self.show()
 
     def show(self) -> None:
@@ -315,16 +388,7 @@ class KeepPanel:
 
     def show_run(self, run: SavedRun) -> None:
         """Write how far a saved run is, with a link to it."""
-        name = html.escape(run.name)
-        link = f"<a href='/runs/{run.id}' target='_blank' rel='noopener'>{name}</a>"
-        texts = {
-            "queued": f"Saving run {link}…",
-            "running": f"Simulating and measuring run {link}…",
-            "succeeded": f"✓ Saved as run {link}",
-            "cancelled": f"Run {link} was cancelled.",
-        }
-        error = html.escape(run.error or "See its page.")
-        _write(self._progress, texts.get(run.state, f"✗ Run {link} failed: {error}"))
+        write_small(self._progress, saved_html(run))
 
     def remove(self) -> None:
         """Take the folder away."""
@@ -376,7 +440,7 @@ class KeepPanel:
         notify(event.client, "Preset deleted", chosen.name, color="blue")
 
 
-def _write(place: Any, content: str) -> None:
+def write_small(place: Any, content: str) -> None:
     """Write small print; without content it takes no room."""
     style = "font-size:0.8em;line-height:1.4;padding:0 0.5em"
     place.content = f"<div style='{style}'>{content}</div>"

@@ -5,6 +5,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,19 +18,22 @@ from app.viewer.content.content import Content
 from app.viewer.content.session_state import Pose
 from app.viewer.live.client import STARTING, SimulationClient
 from app.viewer.live.drive import HandOrder
+from app.viewer.physics.keep_panel import SavedRun, saved_html, write_small
 from app.viewer.scene.framing import Framing
 from app.viewer.steer.key_channel import KeyChannel, Press, velocity_of, view_axes
-from app.viewer.steer.steered import TOP_SPEED, SteeredObject, begin_take
+from app.viewer.steer.steered import TOP_SPEED, SteeredFrame, SteeredObject, begin_take
 from app.viewer.ui.guard import Guard, notify
 from app.viewer.ui.keyboard import bind
 from app.viewer.ui.tabs import Tabs
 from physhandi.errors import PhysHandiError, UsageError
 from physhandi.object_rollout import ObjectRollout
-from physhandi.simulation.steering import SteeredHand, from_quaternion, to_quaternion
+from physhandi.simulation.steering import SteeredHand, Take, from_quaternion, to_quaternion
 
 GIZMO = "/steer/wrist"
 """Path of the gizmo in the scene."""
 _START, _STOP = "Steer (G)", "Back to playback (G)"
+_RECORD, _END_RECORDING = "Record (space)", "End recording (space)"
+_PLAY, _DISCARD = "Play", "Discard"
 _GIZMO_SIZE = 0.22
 """Length of the gizmo's axes, as a part of the scene's extent."""
 _SPEED = 0.5
@@ -47,6 +51,34 @@ _HOW = (
     "<b>I K J L U O</b> turn it. Ctrl Z goes back to before the last drag or key."
 )
 
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Recorded:
+    """A recording of what somebody steered, and how to show it again."""
+
+    take: Take
+    """Its poses, and the state that they begin with."""
+    frames: tuple[SteeredFrame, ...]
+    """All its frames."""
+    vertices: Mapping[str, Float[ndarray, "vertex 3"]]
+    """Vertices of each hand in its pose of zero [m]."""
+    frame: int
+    """Frame of the sequence from which the hands were steered."""
+
+    def part(self, first: int, last: int, seconds: float) -> Take:
+        """Give the take of some of its frames, smoothed.
+
+        Args:
+            first: First frame that is kept.
+            last: Last one.
+            seconds: See `Take.smoothed`.
+        """
+        start = self.frames[first].position, self.frames[first].velocity
+        return self.take.part(first, last, start).smoothed(seconds)
+
+
+KeepTake = Callable[[Take, int, str, Callable[[SavedRun], None]], None]
+"""Keeps a take that was steered from a frame on, under a name, and reports how far that is."""
 Shown = tuple[ObjectRollout, int, Mapping[str, Float[ndarray, "vertex 3"]]]
 """Rollout, its frame, and the vertices of each hand [m]."""
 
@@ -68,6 +100,7 @@ class SteerPanel:
         channel: KeyChannel,
         rollout_at: Callable[[int], tuple[ObjectRollout, int]],
         stop_comparing: Callable[[], None],
+        keep: KeepTake | None = None,
     ) -> None:
         """Add the tab's controls.
 
@@ -83,6 +116,7 @@ class SteerPanel:
             channel: Tells held keys.
             rollout_at: Finds the rollout of a frame, and which of its frames.
             stop_comparing: Ends a comparison, which shows two objects.
+            keep: Makes a run and a recording of a take; None where nothing can be kept.
         """
         self._server = server
         self._guard = guard
@@ -95,6 +129,9 @@ class SteerPanel:
         self._channel = channel
         self._rollout_at = rollout_at
         self._stop_comparing = stop_comparing
+        self._keep = keep
+        self._recorded: Recorded | None = None
+        self._take_folder: TakeFolder | None = None
         self._lock = threading.RLock()
         self._object: SteeredObject | None = None
         self._hand = 0
@@ -107,8 +144,14 @@ class SteerPanel:
         self._refused = ""
         self._arrivals: deque[float] = deque(maxlen=200)
         self._written = -math.inf
-        gui, unit = server.gui, content.length_unit
-        with tabs["Steer"]:
+        self._add_controls(server.gui)
+        self._commands = bind(server, guard, "steer", lambda _, __: self.toggle())
+        channel.attach(self._hold, self._press)
+        self._write(at_once=True)
+
+    def _add_controls(self, gui: viser.GuiApi) -> None:
+        content, guard = self._content, self._guard
+        with self._tabs["Steer"]:
             self._folder = gui.add_folder(None)
         with self._folder:
             self._button = gui.add_button(_START, hint="G")
@@ -117,9 +160,9 @@ class SteerPanel:
             self._choice: Any = gui.add_dropdown(
                 "Hand", names or ("controls",), visible=len(names) > 1, hint="Which one is moved"
             )
-            speed = _rounded(_SPEED * framing.extent)
+            speed = _rounded(_SPEED * self._extent)
             self._speed: Any = gui.add_slider(
-                f"Speed [{unit}/s]",
+                f"Speed [{content.length_unit}/s]",
                 0.1 * speed,
                 4.0 * speed,
                 0.1 * speed,
@@ -129,11 +172,12 @@ class SteerPanel:
             self._turn_speed: Any = gui.add_slider(
                 "Turning [°/s]", 10.0, 360.0, 10.0, _TURN_SPEED, hint="Of a hand that keys turn"
             )
+            self._record = gui.add_button(
+                _RECORD, color="red", visible=False, hint="Space; at most a minute"
+            )
         self._button.on_click(guard(lambda _: self.toggle()))
+        self._record.on_click(guard(lambda _: self._toggle_recording()))
         self._choice.on_update(guard.by_user(lambda _: self._choose(names)))
-        self._commands = bind(server, guard, "steer", lambda _, __: self.toggle())
-        channel.attach(self._hold, self._press)
-        self._write(at_once=True)
 
     @property
     def is_on(self) -> bool:
@@ -154,6 +198,7 @@ class SteerPanel:
             steered, self._object = self._object, None
             if steered is None:
                 return
+            self._end_recording(steered)
             steered.close()
             self._held = frozenset()
             if self._gizmo is not None:
@@ -183,6 +228,9 @@ class SteerPanel:
                 self._drive(steered)  # The camera may have turned.
             rollout, frame, newest = steered.shown()
             self._follow(steered, newest.pose[self._hand])
+            if steered.is_full:
+                self._end_recording(steered)
+                self._tell()
             self._write()
             vertices = {
                 hand.name: hand.moved(self._vertices[hand.name], pose)
@@ -194,6 +242,7 @@ class SteerPanel:
     def remove(self) -> None:
         """Take the tab's controls away."""
         self.close()
+        self._show_take(None)
         for command in self._commands:
             command.remove()
         self._folder.remove()
@@ -212,11 +261,15 @@ class SteerPanel:
         self._stop_comparing()
         self._frame = playback.frame
         rollout, frame = self._rollout_at(self._frame)
-        take = begin_take(self._content, rollout, frame, self._frame)
-        self._vertices = {
+        vertices = {
             hand.side: np.asarray(hand.vertex[min(self._frame, len(hand.vertex) - 1)], np.float64)
             for hand in self._content.hands
         }
+        self._begin(begin_take(self._content, rollout, frame, self._frame), vertices)
+
+    def _begin(self, take: Take, vertices: Mapping[str, Float[ndarray, "vertex 3"]]) -> None:
+        """Simulate on from the state of a take; called under the lock."""
+        self._vertices = dict(vertices)
         self._hand = min(self._hand, len(take.hands) - 1)
         self._object = SteeredObject(
             self._mailbox,
@@ -230,7 +283,71 @@ class SteerPanel:
         self._tabs.open("Steer")
         self._tell()
         self._write(at_once=True)
-        playback.redraw()
+        self._playback.redraw()
+
+    def _toggle_recording(self) -> None:
+        """Begin or end to record."""
+        with self._lock:
+            steered = self._object
+            if steered is None or steered.is_replaying:
+                return
+            if steered.is_recording:
+                self._end_recording(steered)
+            else:
+                self._show_take(None)
+                steered.record(on=True)
+            self._tell()
+            self._write(at_once=True)
+
+    def _end_recording(self, steered: SteeredObject) -> None:
+        """Offer what was recorded, if more than its start was; called under the lock."""
+        frames = steered.recorded
+        steered.record(on=False)
+        if len(frames) < 2:
+            return
+        first = frames[0]
+        take = replace(
+            steered.take,
+            start=(first.position, first.velocity),
+            pose=np.stack([frame.pose for frame in frames]),
+        )
+        self._show_take(
+            Recorded(take=take, frames=frames, vertices=self._vertices, frame=self._frame)
+        )
+
+    def _show_take(self, recorded: Recorded | None) -> None:
+        """Offer a recording to be trimmed, smoothed, simulated and kept, or nothing."""
+        if self._take_folder is not None:
+            self._take_folder.remove()
+        self._recorded, self._take_folder = recorded, None
+        if recorded is not None:
+            with self._folder:
+                self._take_folder = TakeFolder(
+                    self._server.gui,
+                    self._guard,
+                    recorded,
+                    play=self._play,
+                    discard=lambda: self._show_take(None),
+                    keep=self._keep,
+                )
+
+    def _play(self, take: Take) -> None:
+        """Simulate a take again and show it."""
+        with self._lock:
+            recorded = self._recorded
+            if recorded is None:
+                return
+            if self._object is not None and self._object.take.control is not take.control:
+                self.leave()  # It was recorded from another frame on.
+            if self._object is None:
+                self._playback.play(on=False)
+                self._playback.seek(recorded.frame)
+                self._was_playing, self._frame = False, recorded.frame
+                self._stop_comparing()
+                self._begin(replace(take, pose=take.pose[:1]), recorded.vertices)
+            if self._object is not None:
+                self._object.replay(take)
+            self._tell()
 
     def _add_gizmo(self, hand: SteeredHand) -> None:
         gizmo = self._gizmo = self._server.scene.add_transform_controls(
@@ -250,7 +367,7 @@ class SteerPanel:
         """Let the hand follow the gizmo."""
         with self._lock:
             steered = self._object
-            if steered is None or event.target is not self._gizmo:
+            if steered is None or event.target is not self._gizmo or steered.is_replaying:
                 return
             if event.phase == "start":
                 self._is_dragged, self._refused = True, ""
@@ -319,12 +436,14 @@ class SteerPanel:
 
     def _press(self, press: Press) -> None:
         steered = self._object
-        if press == "undo" and steered is not None and not steered.undo():
+        if press == "record":
+            self._toggle_recording()
+        elif press == "undo" and steered is not None and not steered.undo():
             notify(self._server, "Nothing to take back", "The hand has not been moved.", seconds=3)
 
     def _hear(self, kind: str, error: str) -> None:
         """Follow the simulation; runs in its thread."""
-        if kind == "frame":
+        if kind in {"frame", "finished"}:
             self._arrivals.append(time.monotonic())
             self._playback.redraw()
             return
@@ -339,6 +458,7 @@ class SteerPanel:
         state: dict[str, Any] = {"steering": self.is_on}
         if self.is_on:
             state["what"] = names[self._hand]
+            state["recording"] = self._object is not None and self._object.is_recording
         self._channel.tell(state)
 
     def _write(self, *, at_once: bool = False) -> None:
@@ -351,6 +471,11 @@ class SteerPanel:
         label = _START if steered is None else _STOP
         if self._button.label != label:
             self._button.label = label
+        if self._record.visible != (steered is not None):
+            self._record.visible = steered is not None
+        record = _RECORD if steered is None or not steered.is_recording else _END_RECORDING
+        if self._record.label != record:
+            self._record.label = record
         text = _HOW
         if steered is not None:
             recent = sum(now - at < _COUNTED for at in tuple(self._arrivals))
@@ -360,8 +485,92 @@ class SteerPanel:
                 pace += f" · {1e3 * duration:.3g} ms to simulate one"
             elif not self._live.is_ready:
                 pace = STARTING.replace("*", "")
-            text = f"<b>Steering from frame {self._frame}</b><br>{pace}"
+            doing = "Playing the take" if steered.is_replaying else "Steering"
+            text = f"<b>{doing} from frame {self._frame}</b><br>{pace}"
+            if steered.is_recording:
+                seconds = (len(steered.recorded) - 1) / steered.take.parameters.frame_rate
+                text += f"<br>● Recording, {seconds:.1f} s"
         self._status.content = f"<div style='{_STYLE}' data-steering>{text}</div>"
+
+
+class TakeFolder:
+    """What can be done with a recording: trim and smooth it, simulate it again, keep it."""
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        guard: Guard,
+        recorded: Recorded,
+        *,
+        play: Callable[[Take], None],
+        discard: Callable[[], None],
+        keep: KeepTake | None,
+    ) -> None:
+        """Add the folder where the caller stands.
+
+        Args:
+            gui: Where to.
+            guard: Wraps the callbacks.
+            recorded: The recording.
+            play: Simulates a take and shows it.
+            discard: Takes the recording away.
+            keep: Makes a run and a recording of a take; None where nothing can be kept.
+        """
+        self._recorded = recorded
+        self._keep = keep
+        last = len(recorded.frames) - 1
+        seconds = last / recorded.take.parameters.frame_rate
+        self._folder = gui.add_folder(f"Take of {seconds:.1f} s")
+        with self._folder:
+            self._part: Any = gui.add_multi_slider(
+                "Keep",
+                0,
+                last,
+                1,
+                (0, last),
+                min_range=1,
+                hint="First and last frame that are kept",
+            )
+            self._smooth: Any = gui.add_slider(
+                "Smooth [s]",
+                0.0,
+                0.5,
+                0.02,
+                0.0,
+                hint="Averages the hands' way over so much time before and after each frame",
+            )
+            buttons = gui.add_button_group(
+                "Take", (_PLAY, _DISCARD), hint="Playing simulates what is kept from its start"
+            )
+            buttons.on_click(
+                guard(lambda event: play(self.take) if event.target.value == _PLAY else discard())
+            )
+            if keep is not None:
+                self._name: Any = gui.add_text("take name", "", hint="Of the run and the recording")
+                save = gui.add_button(
+                    "Save as run and recording", hint="Both open like any other from the home page"
+                )
+                save.on_click(guard(lambda _: self._save()))
+            self._progress: Any = gui.add_html("", visible=False)
+
+    @property
+    def take(self) -> Take:
+        """What is kept, smoothed."""
+        first, last = (int(value) for value in self._part.value)
+        return self._recorded.part(first, last, float(self._smooth.value))
+
+    def remove(self) -> None:
+        """Take the folder away."""
+        self._folder.remove()
+
+    def _save(self) -> None:
+        """Have a run and a recording made."""
+        if self._keep is None:
+            return
+        self._keep(self.take, self._recorded.frame, self._name.value, self._report)
+
+    def _report(self, run: SavedRun) -> None:
+        write_small(self._progress, saved_html(run))
 
 
 def _goal(

@@ -23,6 +23,10 @@ FARTHEST_REACH = 5.0
 """A wrist goes no farther than this many extents from where it was."""
 MOST_UNDONE = 50
 """Gestures that can be taken back."""
+LONGEST_TAKE = 60.0
+"""A take is no longer than this [s]."""
+_MOST_BYTES = 256 << 20
+"""States of the object that a take may keep, whatever their number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +128,11 @@ class SteeredObject:
         self._before = self._newest = start
         self._durations: deque[float] = deque(maxlen=30)
         self._undone: deque[SteeredFrame] = deque(maxlen=MOST_UNDONE)
+        self._recorded: list[SteeredFrame] = []
+        self._is_recording = self._is_replaying = False
+        rate, size = take.parameters.frame_rate, 24 * max(take.model.node_count, 1)
+        self.most_frames = max(2, min(int(LONGEST_TAKE * rate), _MOST_BYTES // size))
+        """Frames of the longest take; then recording ends by itself."""
         control = np.repeat(take.control_at(take.pose[0])[None], 2, axis=0)
         self._rollout = ObjectRollout(
             model=take.model,
@@ -182,14 +191,66 @@ class SteeredObject:
         with self._lock:
             self._undone.append(self._newest)
 
+    @property
+    def is_recording(self) -> bool:
+        """Whether frames are recorded."""
+        with self._lock:
+            return self._is_recording
+
+    @property
+    def is_full(self) -> bool:
+        """Whether a recording has ended by itself, since it is as long as one may be."""
+        with self._lock:
+            return not self._is_recording and len(self._recorded) >= self.most_frames
+
+    @property
+    def is_replaying(self) -> bool:
+        """Whether a take is simulated again, so that orders are not followed."""
+        with self._lock:
+            return self._is_replaying
+
+    @property
+    def recorded(self) -> tuple[SteeredFrame, ...]:
+        """The frames that were recorded last, or are being recorded."""
+        with self._lock:
+            return tuple(self._recorded)
+
+    def record(self, *, on: bool) -> None:
+        """Begin a recording with the newest frame, in the place of the last one, or end it."""
+        with self._lock:
+            if on:
+                self._recorded = [self._newest]
+            self._is_recording = on
+            if not on:
+                self._recorded = []
+
+    def replay(self, take: Take) -> None:
+        """Simulate a take; hands are steered on from its end.
+
+        Args:
+            take: Of the same hands and object.
+        """
+        with self._lock:
+            self._undone.append(self._newest)
+            self._orders = [HandOrder() for _ in self._orders]
+            self._is_recording, self._is_replaying = False, True
+            self._number = self._live.steer(self._mailbox, take, replays=True)
+
     def undo(self) -> bool:
-        """Return to where the last gesture began; returns whether there was one."""
+        """Return to where the last gesture began; returns whether there was one.
+
+        What was recorded since is not recorded any more.
+        """
         with self._lock:
             if not self._undone:
                 return False
             state = self._undone.pop()
             self._orders = [HandOrder() for _ in self._orders]
             self._before = self._newest = state
+            if self._is_recording:
+                places = [frame is state for frame in self._recorded]
+                kept = places.index(True) + 1 if True in places else 0
+                self._recorded = self._recorded[:kept] or [state]
             # Of the gesture, no frame may come after this.
             self._simulate(state)
         return True
@@ -210,7 +271,9 @@ class SteeredObject:
         """Go on from a state."""
         state = start.position, start.velocity
         begun = replace(self.take, start=state, pose=start.pose[None])
+        self._is_replaying = False
         self._number = self._live.steer(self._mailbox, begun, top_speed=self._top_speed)
+        self._live.drive(self._mailbox, self._orders)
 
     def _receive(self, message: Message) -> None:
         if message.kind == "ready":
@@ -222,10 +285,24 @@ class SteeredObject:
             if message.kind == "frame":
                 arrays = message.arrays
                 self._before = self._newest
-                self._newest = SteeredFrame(arrays["position"], arrays["velocity"], arrays["pose"])
+                # The first one is the state that it goes on from, which is known unless it is that
+                # of a take.
+                if message["frame"] > 0 or self._is_replaying:
+                    self._newest = SteeredFrame(
+                        arrays["position"], arrays["velocity"], arrays["pose"]
+                    )
                 if message["frame"] > 0:
                     self._durations.append(float(message["duration"]))
+                    self._keep(self._newest)
+            elif message.kind == "finished":
+                self._simulate(self._newest)
             else:
                 self._number = 0
         told = message.fields.get("error", "The live simulation stopped and is started anew.")
         self._on_change(message.kind, "" if message.kind == "frame" else str(told))
+
+    def _keep(self, frame: SteeredFrame) -> None:
+        """Record a frame, if frames are recorded and there is room."""
+        if self._is_recording:
+            self._recorded.append(frame)
+            self._is_recording = len(self._recorded) < self.most_frames

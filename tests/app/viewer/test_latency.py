@@ -41,6 +41,9 @@ def test_sliders_are_answered_and_timed(run: Run) -> None:
         assert kind["ms_per_frame"] <= kind["p95_ms_per_frame"]
         mean = 1e3 / kind["frames_per_s"]
         assert 0.2 * kind["ms_per_frame"] < mean < 20.0 * kind["p95_ms_per_frame"]
+    steered = result["steered"]
+    assert 0.0 < steered["ms_per_frame"] <= steered["p95_ms_per_frame"]
+    assert 0.0 < steered["frames_per_s"] < 1e3 / min(steered["ms_per_frame"], 1.0)
     assert result["sequence_frames_per_s"] == 30.0
     assert result["start_ms"] > result["first_new_frame_ms"]
     worst = max(kind["worst_first_new_frame_ms"] for kind in result["kinds"].values())

@@ -1,21 +1,43 @@
 """Steering in a live scene: the mode, held keys, the gizmo, and the way back to playback."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 from viewer_client import ViewerClient
-from viewer_world import rest_at
-from waiting import until
+from viewer_world import FakeSettings, rest_at
+from waiting import LIMIT_S, until
 
+from app.viewer.physics.keep_panel import RunSaver, UserStorage
+from app.viewer.physics.presets import PresetStore
 from app.viewer.session import Session
 from app.viewer.sessions import Sessions
-from app.viewer.steer.steer_panel import GIZMO
+from app.viewer.steer.steer_panel import GIZMO, Recorded
+from physhandi.data.sequence import Sequence
+from physhandi.fitted_object import FittedObject
+from physhandi.pipeline import run_job
+from physhandi.run import Run
 
 AT = 8
 STEER, BACK = "Steer (G)", "Back to playback (G)"
 NODES = "/object/nodes"
+
+
+@pytest.fixture
+def begun() -> list[Run]:
+    """Runs that a worker would work on."""
+    return []
+
+
+@pytest.fixture
+def sessions(catalog, tmp_path: Path, begun: list[Run]) -> Iterator[Sessions]:
+    saver = RunSaver(catalog, tmp_path / "runs", begun.append)
+    storage = UserStorage(PresetStore(tmp_path / "presets"), saver)
+    sessions = Sessions(FakeSettings(), catalog, storage)
+    yield sessions
+    sessions.shutdown()
 
 
 @pytest.fixture
@@ -24,12 +46,17 @@ def scene(sessions: Sessions) -> Iterator[tuple[Session, ViewerClient]]:
     session = sessions.get(sessions.open("run", "sheet", "me"))
     with ViewerClient(f"ws://127.0.0.1:{session.port}") as client:
         client.tell_camera(position=(0.0, -1.0, 0.5), look_at=(0.0, 0.0, 0.0))
-        client.until(lambda: "simulated" in client.texts())
+        wait(client, lambda: "simulated" in client.texts())
         client.set("Surface", False)
         client.set("Object nodes", True)
         rest_at(client, AT)
-        client.until(lambda: session._playback.frame == AT and NODES in client.nodes)
+        wait(client, lambda: session._playback.frame == AT and NODES in client.nodes)
         yield session, client
+
+
+def wait(client: ViewerClient, condition: Callable[[], object]) -> None:
+    """Take in messages until a condition holds, however busy the machine is."""
+    client.until(condition, LIMIT_S)
 
 
 def hold(session: Session, *keys: str) -> None:
@@ -44,7 +71,7 @@ def nodes(client: ViewerClient) -> np.ndarray:
 def steer(client: ViewerClient) -> np.ndarray:
     """Begin to steer; returns where the gizmo is."""
     client.set(STEER, True)
-    client.until(lambda: GIZMO in client.nodes and client.find(BACK))
+    wait(client, lambda: GIZMO in client.nodes and client.find(BACK))
     return np.array(client.positions[GIZMO])
 
 
@@ -55,23 +82,24 @@ def test_a_held_key_moves_hand_gizmo_and_object_until_it_is_let_go(scene, run) -
     control = run.array("sequences/lift/control.npy")[AT]
     start = steer(client)
     np.testing.assert_allclose(start, control.mean(axis=0), atol=1e-6)
-    assert json.loads(told[-1]) == {"steering": True, "what": "the controls"}
+    says = {"steering": True, "what": "the controls", "recording": False}
+    assert json.loads(told[-1]) == says
     first = nodes(client)
     hold(session, "KeyD")  # To the right of somebody who looks along y.
-    client.until(lambda: client.positions[GIZMO][0] > start[0] + 0.03)
+    wait(client, lambda: client.positions[GIZMO][0] > start[0] + 0.03)
     hold(session)
-    client.until(lambda: nodes(client)[0] - first[0] > 0.02)
+    wait(client, lambda: nodes(client)[0] - first[0] > 0.02)
     place = np.array(client.positions[GIZMO]) - start
     np.testing.assert_allclose(place[1:], 0.0, atol=1e-6)
     assert session._playback.frame == AT
 
     session.keys.hear('{"press": "undo"}')
-    client.until(lambda: np.allclose(client.positions[GIZMO], start, atol=1e-9))
-    client.until(lambda: abs(nodes(client)[0] - first[0]) < 0.005)
+    wait(client, lambda: np.allclose(client.positions[GIZMO], start, atol=1e-9))
+    wait(client, lambda: abs(nodes(client)[0] - first[0]) < 0.005)
     client.set(BACK, True)
-    client.until(lambda: client.find(STEER))
+    wait(client, lambda: client.find(STEER))
     assert json.loads(told[-1]) == {"steering": False}
-    client.until(lambda: np.allclose(nodes(client), run_nodes(run)[AT], atol=1e-6))
+    wait(client, lambda: np.allclose(nodes(client), run_nodes(run)[AT], atol=1e-6))
     hold(session, "KeyD")  # Nobody is steered.
 
 
@@ -93,17 +121,106 @@ def test_the_hand_follows_the_gizmo_and_no_farther_than_it_reaches(scene) -> Non
     half = 0.5**0.5
     drag([float(v) for v in start + np.array([0.0, 0.02, 0.03])], (half, 0.0, 0.0, half))
     goal = [0.0, 0.02, 0.03, 0.0, 0.0, np.pi / 2]
-    client.until(lambda: np.allclose(object_.newest.pose[0], goal, atol=1e-5))
+    wait(client, lambda: np.allclose(object_.newest.pose[0], goal, atol=1e-5))
     for place, why in (((np.nan,) * 3, "finite numbers"), ((1e9, 0.0, 0.0), "no farther")):
         drag(place)
-        client.until(
+        wait(
+            client,
             lambda why=why: any(
                 why in json.dumps(message, default=str)
                 for message in client.messages
                 if "Notification" in message["type"]
-            )
+            ),
         )
     assert object_.order_of(0).goal == pytest.approx(goal, abs=1e-6)
+
+
+def press(session: Session, name: str) -> None:
+    session.keys.hear(json.dumps({"press": name}))
+
+
+def record(session: Session, client: ViewerClient) -> Recorded:
+    """Record how the hand goes up and turns; what is taken back before is not recorded."""
+    object_ = session._steer._object
+    press(session, "record")
+    hold(session, "KeyE", "KeyJ")
+    wait(client, lambda: object_.newest.pose[0, 2] > 0.02)
+    hold(session)
+    wait(client, lambda: len(object_.recorded) > 12)
+    press(session, "undo")
+    wait(client, lambda: len(object_.recorded) > 5)
+    assert max(frame.pose[0, 2] for frame in object_.recorded) == 0.0
+    hold(session, "KeyE", "KeyJ")
+    wait(client, lambda: object_.newest.pose[0, 2] > 0.02)
+    press(session, "record")
+    wait(client, lambda: client.find("Keep"))
+    hold(session)
+    recorded = session._steer._recorded
+    np.testing.assert_array_equal(recorded.take.pose, [frame.pose for frame in recorded.frames])
+    return recorded
+
+
+def test_a_recording_is_trimmed_and_played_whenever_that_is_wanted(scene) -> None:
+    session, client = scene
+    steer(client)
+    recorded = record(session, client)
+    last = len(recorded.frames) - 1
+
+    def plays() -> None:
+        client.set("Take", "Play")
+        wait(client, lambda: session._steer.is_on and session._steer._object.is_replaying)
+        wait(client, lambda: not session._steer._object.is_replaying)
+        # The hand is steered on from where the take has brought it.
+        np.testing.assert_array_equal(session._steer._object.newest.pose, recorded.frames[-1].pose)
+
+    client.set("Keep", (3, last))
+    wait(client, lambda: session._steer._take_folder.take.frame_count == last - 2)
+    plays()
+    client.set(BACK, True)
+    wait(client, lambda: client.find(STEER))
+    client.set("Frame", AT + 4)
+    wait(client, lambda: session._playback.frame == AT + 4)
+    plays()
+    assert session._playback.frame == AT
+    client.set("Take", "Discard")
+    wait(client, lambda: not client.find("Keep"))
+
+
+def test_a_recording_is_kept_as_a_run_and_a_recording(
+    scene, begun: list[Run], tmp_path: Path
+) -> None:
+    session, client = scene
+    steer(client)
+    recorded = record(session, client)
+    last = len(recorded.frames) - 1
+    client.set("Keep", (3, last))
+    wait(client, lambda: session._steer._take_folder.take.frame_count == last - 2)
+    client.set("take name", "Up & round")
+    wait(client, lambda: session._steer._take_folder._name.value == "Up & round")
+    client.set("Save as run and recording", True)
+    wait(client, lambda: begun)
+    run_job(begun[0])
+    wait(client, lambda: "Saved as run" in session._steer._take_folder._progress.content)
+    run = Run.open(begun[0].folder)
+    rollout = run.array("sequences/Up_round/rollout.npy")
+    np.testing.assert_array_equal(rollout, [frame.position for frame in recorded.frames[3:]])
+    np.testing.assert_array_equal(FittedObject.of(run).simulate().position, rollout)
+    sequence = Sequence.load(tmp_path / "sequences" / "Up_round")
+    sequence.validate()
+    np.testing.assert_array_equal(sequence.marker, rollout)
+    np.testing.assert_array_equal(sequence.control, recorded.take.controls()[3:])
+    assert sequence.meta.provenance == {
+        "origin": "steered by hand in the viewer",
+        "run": "sheet",
+        "sequence": "lift",
+        "frame": AT,
+        "hands": ["controls"],
+    }
+    scores = run.json("metrics.json")["Up_round"]["future"]
+    assert scores["rollout"]["track_error"] == 0.0 < scores["static"]["track_error"]
+    client.set("Save as run and recording", True)
+    wait(client, lambda: any("There is a recording 'Up_round'" in str(m) for m in client.messages))
+    assert len(begun) == 1
 
 
 def test_the_clock_and_a_user_who_leaves_end_it(scene) -> None:
@@ -112,12 +229,12 @@ def test_the_clock_and_a_user_who_leaves_end_it(scene) -> None:
         steer(client)
         hold(session, "KeyW")
         client.set(label, value)
-        client.until(lambda: client.find(STEER))
+        wait(client, lambda: client.find(STEER))
         assert not session._steer.is_on
     assert session._playback.is_playing
     steer(client)
     client.set(BACK, True)  # What was playing before plays on.
-    client.until(lambda: client.find(STEER) and session._playback.is_playing)
+    wait(client, lambda: client.find(STEER) and session._playback.is_playing)
     steer(client)
     client.connection.close()
     until(lambda: not session._steer.is_on)

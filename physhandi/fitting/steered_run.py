@@ -1,0 +1,175 @@
+"""What a run and a recording hold of a take of steered hands.
+
+A run of kind ``simulation`` that holds a take simulates that in the place of a recording, which is
+made of it first: control points and markers, one at each object node, with its provenance.
+"""
+
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+from numpy import ndarray
+from scipy.spatial.transform import Rotation
+
+from physhandi.data.attempt import Attempt
+from physhandi.data.layout import SequenceFiles
+from physhandi.data.run import RunFolder
+from physhandi.data.sequence import Sequence
+from physhandi.data.sequence_meta import SequenceMeta, Side
+from physhandi.data.sequence_writer import write_sequence
+from physhandi.fitting import artefacts
+from physhandi.fitting.stored_take import StoredTake
+from physhandi.hand.motion import HandMotion
+from physhandi.progress import Progress
+from physhandi.simulation.contact_intervals import ContactIntervals, acts_in, always
+from physhandi.simulation.steering import SteeredHand, turn_on
+
+
+def record_take(
+    source: RunFolder, stored: StoredTake, folder: Path, progress: Progress, *, device: str
+) -> None:
+    """Simulate a take and write it as a recording, unless it is there already.
+
+    Args:
+        source: Run whose object was steered.
+        stored: The take.
+        folder: Where the recording shall appear.
+        progress: Told about every frame.
+        device: Warp device.
+
+    Raises:
+        SimulationDivergedError: If the motion runs away.
+        SequenceError: If the folder is in use by something else.
+    """
+    take = stored.take
+    provenance = {
+        "origin": "steered by hand in the viewer",
+        "run": source.id,
+        "sequence": stored.sequence,
+        "frame": stored.frame,
+        "hands": [hand.name for hand in take.hands],
+    }
+    if folder.is_dir() and Sequence.load(folder).meta.provenance == provenance:
+        return
+    position: list[ndarray] = []
+    for node, _ in take.simulate(device):
+        progress.check_cancelled()
+        position.append(node)
+        progress.report("recording", len(position), take.frame_count)
+    about = source.yaml(SequenceFiles(stored.sequence).meta)
+    parameters = take.parameters
+    meta = SequenceMeta(
+        name=folder.name,
+        description=f"Steered by hand from frame {stored.frame} of '{stored.sequence}' on, with "
+        f"the object of the run '{source.name}'.",
+        frame_rate=parameters.frame_rate,
+        frame_count=take.frame_count,
+        metric=bool(about.get("metric", True)),
+        length_unit=str(about.get("length_unit", "m")),
+        ground_height=parameters.ground_height,
+        gravity=parameters.gravity,
+        mass=about.get("mass"),
+        provenance=provenance,
+    )
+    arrays = {
+        "control.npy": take.controls(),
+        "marker.npy": np.stack(position),
+        "marker_node.npy": np.arange(take.model.node_count, dtype=np.int32),
+        "object_node.npy": take.start[0],
+        "rest_node.npy": artefacts.load_rest_node(source.out),
+    }
+    write_sequence(folder, meta, arrays)
+
+
+def contacts_from(contacts: ContactIntervals | None, frame: int) -> ContactIntervals | None:
+    """Keep the contacts that hold when hands begin to be steered, for good.
+
+    Args:
+        contacts: What was found over time; None if contact was not looked for.
+        frame: Last frame before.
+    """
+    if contacts is None:
+        return None
+    kept = acts_in(contacts.interval, frame + 1)
+    part = {field.name: getattr(contacts, field.name)[kept] for field in fields(contacts)}
+    return ContactIntervals(**part | {"interval": always(int(kept.sum()))})
+
+
+def store_hands(source: RunFolder, stored: StoredTake, name: str, attempt: Attempt) -> None:
+    """Store the steered hands: surfaces, joints, skins and motions, moved as rigid bodies.
+
+    Args:
+        source: Run whose hands were steered.
+        stored: The take.
+        name: Name of its recording.
+        attempt: Where they go.
+    """
+    sides: tuple[Side, Side] = ("right", "left")
+    for number, hand in enumerate(stored.take.hands):
+        if hand.name in sides:
+            _store_hand(source, stored, (name, hand.name), (number, hand), attempt)
+
+
+def _store_hand(
+    source: RunFolder,
+    stored: StoredTake,
+    place: tuple[str, str],
+    which: tuple[int, SteeredHand],
+    attempt: Attempt,
+) -> None:
+    (name, side), (number, hand) = place, which
+    was, now = SequenceFiles(stored.sequence), SequenceFiles(name)
+    pose = stored.take.pose[:, number]
+    for old, new in (
+        (was.hand_vertex(side), now.hand_vertex(side)),
+        (was.hand_keypoint(side), now.hand_keypoint(side)),
+    ):
+        if source.has(old):
+            point = _in_frame(source.array(old), stored.frame)
+            moved = np.stack([hand.moved(point, its) for its in pose])
+            attempt.save_array(new, moved.astype(np.float32))
+    if source.has(was.hand_face(side)):
+        attempt.save_array(now.hand_face(side), source.array(was.hand_face(side)))
+    if source.has(was.hand_skin(side)):
+        skin = source.tensors(was.hand_skin(side))
+        attempt.save_tensors(now.hand_skin(side), _moved_skin(skin, stored.frame, hand, pose))
+    if source.has(was.hand_motion(side)):
+        motion = HandMotion.from_tensors(source.tensors(was.hand_motion(side)))
+        moved = _moved_motion(motion, stored.frame, hand, pose)
+        attempt.save_tensors(now.hand_motion(side), moved.to_tensors())
+
+
+def _in_frame(array: ndarray, frame: int) -> ndarray:
+    """Give the value of a frame, or of the last one that there is."""
+    return np.array(array[min(frame, len(array) - 1)], np.float64)
+
+
+def _moved_skin(
+    skin: Mapping[str, ndarray], frame: int, hand: SteeredHand, pose: ndarray
+) -> dict[str, ndarray]:
+    """Let the bones of a skin stay as they are in a frame, but for the wrist, which moves."""
+    translation = np.repeat(_in_frame(skin["translation"], frame)[None], len(pose), axis=0)
+    rotation = np.repeat(_in_frame(skin["rotation"], frame)[None], len(pose), axis=0)
+    wrist = Rotation.from_quat(rotation[0, 0])
+    for number, its in enumerate(pose):
+        translation[number, 0] = hand.moved(translation[number, :1], its)[0]
+        turned = (Rotation.from_rotvec(its[3:]) * wrist).as_quat()
+        nearer = rotation[max(number - 1, 0), 0]
+        rotation[number, 0] = turned if float(turned @ nearer) >= 0.0 else -turned
+    moved = {"translation": translation, "rotation": rotation}
+    return {**skin, **{name: value.astype(np.float32) for name, value in moved.items()}}
+
+
+def _moved_motion(motion: HandMotion, frame: int, hand: SteeredHand, pose: ndarray) -> HandMotion:
+    """Let a hand keep the articulation of a frame while its wrist moves."""
+    turn, place = (
+        _in_frame(value, frame) for value in (motion.wrist_rotation, motion.wrist_translation)
+    )
+    wrist = motion.scale * place[None]
+    return replace(
+        motion,
+        articulation=np.repeat(_in_frame(motion.articulation, frame)[None], len(pose), axis=0),
+        wrist_rotation=np.stack([turn_on(turn, its[3:]) for its in pose]),
+        wrist_translation=np.stack([hand.moved(wrist, its)[0] / motion.scale for its in pose]),
+    )

@@ -1,0 +1,129 @@
+"""A take of a hand as a run: the hand that is stored, and what it holds."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.settings import BUNDLED
+from physhandi.data.layout import SequenceFiles
+from physhandi.errors import RunError
+from physhandi.fitted_object import FittedObject
+from physhandi.fitting.steered_run import contacts_from
+from physhandi.fitting.stored_take import TAKE_FILE, StoredTake
+from physhandi.hand.loading import load_hand_model
+from physhandi.hand.motion import HandMotion
+from physhandi.pipeline import run_job
+from physhandi.run import Run
+from physhandi.simulation.contact_intervals import NEVER, ContactIntervals
+from physhandi.simulation.steering import SteeredHand, Take
+
+AT, FRAMES = 20, 4
+TOWEL = BUNDLED / "runs" / "towel_fold_quick"
+
+
+@pytest.fixture(scope="module")
+def steered(tmp_path_factory) -> Run:
+    """The bundled towel, whose hand goes up and turns by 0.6 rad in three frames."""
+    folder = tmp_path_factory.mktemp("steered")
+    rollout = FittedObject.of(TOWEL).fitted
+    model, start = rollout.going_on(AT)
+    control = np.array(rollout.control[AT], np.float32)
+    joints = Run.open(TOWEL).array("sequences/towel_fold/hand_right_keypoint.npy")
+    hand = SteeredHand(
+        name="right", control=np.arange(len(control)), wrist=joints[AT, 0].astype(np.float64)
+    )
+    pose = np.linspace(0, 1, FRAMES)[:, None, None] * [[0.0, 0.0, 0.02, 0.6, 0.0, 0.0]]
+    take = Take(
+        model=model,
+        start=start,
+        parameters=rollout.parameters,
+        control=control,
+        hands=(hand,),
+        pose=pose,
+    )
+    stored = StoredTake(take=take, sequence="towel_fold", frame=AT)
+    run = Run.create(
+        folder / "runs" / "steered",
+        name="Steered",
+        kind="simulation",
+        sequences=[str(folder / "sequences" / "up")],
+        config={"source": str(TOWEL), "parameters": {}, "take": stored.to_dict()},
+    )
+    stored.save(run.folder)
+    run_job(run)
+    return Run.open(run.folder)
+
+
+def test_the_hand_is_stored_as_it_was_steered(steered: Run) -> None:
+    files, was = SequenceFiles("up"), SequenceFiles("towel_fold")
+    source = Run.open(TOWEL)
+    vertex = steered.array(files.hand_vertex("right"))
+    before = source.array(was.hand_vertex("right"))[AT].astype(np.float64)
+    np.testing.assert_allclose(vertex[0], before, atol=1e-7)
+    wrist = source.array(was.hand_keypoint("right"))[AT, 0].astype(np.float64)
+    c, s = np.cos(0.6), np.sin(0.6)
+    turn = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+    expected = (before - wrist) @ turn.T + wrist + [0.0, 0.0, 0.02]
+    np.testing.assert_allclose(vertex[-1], expected, atol=1e-6)
+    joint = steered.array(files.hand_keypoint("right"))
+    np.testing.assert_allclose(joint[-1, 0], wrist + np.array([0, 0, 0.02]), atol=1e-7)
+    # The articulated hand and its skin say the same as the stored surface.
+    motion = HandMotion.from_tensors(steered.tensors(files.hand_motion("right")))
+    model = load_hand_model("right")
+    offset = motion.vertices(model) - vertex
+    np.testing.assert_allclose(offset, offset[:1].repeat(FRAMES, axis=0), atol=0.002)
+    np.testing.assert_allclose(motion.keypoints(model), joint, atol=1e-5)
+    skin = steered.tensors(files.hand_skin("right"))
+    np.testing.assert_allclose(
+        skin["translation"][:, 0], motion.scale * motion.wrist_translation, atol=1e-6
+    )
+    assert (np.sum(skin["rotation"][1:] * skin["rotation"][:-1], axis=-1) > 0).all()
+    np.testing.assert_array_equal(
+        steered.array(files.hand_face("right")), source.array(was.hand_face("right"))
+    )
+
+
+def test_the_run_is_simulated_again_with_the_same_bits(steered: Run) -> None:
+    stored = StoredTake.load(steered)
+    assert stored is not None
+    rollout = steered.array(SequenceFiles("up").rollout)
+    frames = np.stack([position for position, _ in stored.take.simulate()])
+    np.testing.assert_array_equal(rollout, frames)
+    np.testing.assert_array_equal(FittedObject.of(steered).simulate().position, rollout)
+    assert np.abs(rollout[-1] - rollout[0]).max() > 0.01
+    surface = FittedObject.of(steered).surface()
+    assert surface is not None
+    assert surface.vertex_count == FittedObject.of(TOWEL).surface().vertex_count
+
+
+def test_a_damaged_take_is_named(steered: Run, tmp_path: Path) -> None:
+    assert StoredTake.load(Run.open(TOWEL)) is None
+    path = steered.folder / TAKE_FILE
+    content = path.read_bytes()
+    try:
+        path.write_bytes(content[:-8])
+        with pytest.raises(RunError, match=TAKE_FILE):
+            StoredTake.load(steered)
+    finally:
+        path.write_bytes(content)
+
+
+def test_contacts_that_hold_at_the_start_hold_for_good() -> None:
+    contacts = ContactIntervals(
+        node=np.arange(4, dtype=np.int32),
+        control=np.int32([9, 8, 7, 6]),
+        distance=np.float32([0.1, 0.2, 0.3, 0.4]),
+        rank=np.int32([0, 1, 2, 3]),
+        interval=np.int32([[0, 5], [5, 9], [6, NEVER], [0, 6]]),
+    )
+    kept = contacts_from(contacts, 5)
+    assert kept is not None
+    assert kept.node.tolist() == [1, 3]
+    assert kept.control.tolist() == [8, 6]
+    assert kept.interval.tolist() == [[0, NEVER]] * 2
+    assert contacts_from(None, 5) is None
+    nothing = contacts_from(replace(contacts, interval=contacts.interval + 50), 5)
+    assert nothing is not None
+    assert len(nothing.node) == 0
