@@ -34,6 +34,8 @@ GIZMO = "/steer/wrist"
 _START, _STOP = "Steer (G)", "Back to playback (G)"
 _RECORD, _END_RECORDING = "Record (space)", "End recording (space)"
 _PLAY, _DISCARD = "Play", "Discard"
+_RED = (166, 30, 30)
+"""Color of what records; white on it can be read (contrast of 7)."""
 _GIZMO_SIZE = 0.22
 """Length of the gizmo's axes, as a part of the scene's extent."""
 _SPEED = 0.5
@@ -173,7 +175,7 @@ class SteerPanel:
                 "Turning [°/s]", 10.0, 360.0, 10.0, _TURN_SPEED, hint="Of a hand that keys turn"
             )
             self._record = gui.add_button(
-                _RECORD, color="red", visible=False, hint="Space; at most a minute"
+                _RECORD, color=_RED, visible=False, hint="Space; at most a minute"
             )
         self._button.on_click(guard(lambda _: self.toggle()))
         self._record.on_click(guard(lambda _: self._toggle_recording()))
