@@ -150,12 +150,18 @@ class SimulationWorker:
         self._orders: dict[str, list[dict[str, Any]]] = {}
 
     def run(self) -> None:
-        """Work until the parent closes the connection."""
-        with suppress(ConnectionError):  # It may do so while it is being written to.
-            self._serve()
+        """Work until the parent closes the connection; nobody reads it afterwards."""
+        reader = threading.Thread(target=self._read, name="live-requests", daemon=True)
+        reader.start()
+        try:
+            with suppress(ConnectionError):  # It may do so while it is being written to.
+                self._serve()
+        finally:
+            with suppress(OSError):  # Closed by the other side already.
+                self._connection.shutdown(socket.SHUT_RDWR)
+            reader.join()
 
     def _serve(self) -> None:
-        threading.Thread(target=self._read, name="live-requests", daemon=True).start()
         warm_up(self._device)
         send(self._connection, Message("ready", {"session": "", "request": 0}))
         while True:

@@ -2,6 +2,7 @@
 
 import math
 import socket
+import threading
 import time
 
 from app.viewer.live.wire import DRIVE, PAUSE, RESUME, STEER, STEP, Message, send
@@ -138,4 +139,6 @@ def test_a_parent_that_closes_without_listening_ends_the_worker_without_a_word(c
         send(ours, simulate(1))
         ours.close()
         SimulationWorker(theirs, "cpu").run()
+        # Or it would read a socket that is closed, and perhaps somebody else's by then.
+        assert "live-requests" not in {thread.name for thread in threading.enumerate()}
     assert caplog.records == []
