@@ -41,6 +41,8 @@
 
     function show() {
       sign.hidden = !state.steering;
+      /* The hint of a first visit would lie over the sign. */
+      document.body.toggleAttribute("data-steering", Boolean(state.steering));
       sign.textContent = state.steering ? `Steering ${state.what}: hold W S A D Q E to move it, I K J L U O to turn it, space records, ctrl Z takes back, G returns to playback` : "";
       if (state.recording) sign.textContent = `● Recording. ${sign.textContent}`;
       sign.dataset.recording = state.recording ? "yes" : "";

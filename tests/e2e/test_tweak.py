@@ -144,9 +144,12 @@ def test_a_held_key_and_the_dragged_gizmo_move_hand_and_object(shared_scene):
     scene.go(12)
     scene.tab("Physics")
     before = look()["object"]
+    hint = page.locator("[data-first-hint]")
+    expect(hint).to_be_visible()
     keyboard.press("g")
     sign = scene.panel.get_by_role("status").filter(has_text="Steering the right hand")
     expect(sign).to_be_visible()
+    expect(hint).to_be_hidden()  # It would lie over the sign.
     scene.until(lambda: "wrist" in look(), "the gizmo")
     start = look()
 

@@ -38,7 +38,7 @@ _RED = (166, 30, 30)
 """Color of what records; white on it can be read (contrast of 7)."""
 _GIZMO_SIZE = 0.22
 """Length of the gizmo's axes, as a part of the scene's extent."""
-_SPEED = 0.5
+_SPEED = 0.25
 """Speed of a wrist at first, in extents of the scene a second."""
 _TURN_SPEED = 90.0
 """Turning of a hand at first [°/s]."""
@@ -166,7 +166,7 @@ class SteerPanel:
             self._speed: Any = gui.add_slider(
                 f"Speed [{content.length_unit}/s]",
                 0.1 * speed,
-                4.0 * speed,
+                8.0 * speed,
                 0.1 * speed,
                 speed,
                 hint="Of a hand that keys move",
