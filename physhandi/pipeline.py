@@ -74,6 +74,7 @@ from physhandi.object_rollout import ObjectRollout
 from physhandi.perception.lifting import observe_object
 from physhandi.progress import Progress
 from physhandi.simulation.parameters import changed_parameters
+from physhandi.simulation.restart import start_to_tensors
 
 Rule = Callable[
     [Float[ndarray, "node 3"], Float[ndarray, "frame control 3"]], Float[ndarray, "frame node 3"]
@@ -197,7 +198,7 @@ def simulate(
         if stored is None:
             _stage_simulation(source, sequences, changes, attempt, progress, device=device)
         else:
-            _stage_take(source, sequences[0], stored, attempt, progress, device=device)
+            _stage_take(source, sequences[0], stored, attempt, progress)
     metrics = {sequence.name: _measure(sequence, attempt) for sequence in sequences}
     attempt.save_json(METRICS_FILE, metrics)
     return metrics
@@ -243,11 +244,15 @@ def _stage_take(
     stored: StoredTake,
     attempt: Attempt,
     progress: Progress,
-    *,
-    device: str,
 ) -> None:
-    """Simulate what somebody has steered, and store it as any other simulation."""
+    """Store what somebody has steered, and its recording shows, as any other simulation."""
     name, take, files = sequence.name, stored.take, SequenceFiles(sequence.name)
+    marker = sequence.marker
+    if marker is None or marker.shape[:2] != (take.frame_count, take.model.node_count):
+        raise MissingInputError(
+            f"Sequence '{name}' does not have a marker at every node of what was steered; remove "
+            "it, and it is made anew."
+        )
     fitted = FittedObject.of(source, stored.sequence)
     rest_node = artefacts.load_rest_node(source.out)
     contacts = contacts_from(fitted.contacts, stored.frame)
@@ -263,11 +268,9 @@ def _stage_take(
         attempt.save_tensors(files.contacts, contacts.to_tensors())
     attempt.save_array(files.attachment, attachment)
     attempt.save_array(files.control, take.controls())
-    position, velocity = take.start
-    attempt.save_tensors(files.start, {"position": position, "velocity": velocity})
-    empty = ObjectRollout.empty(take.model, take.parameters, take.controls(), start=take.start)
-    steered = FittedObject(empty, sequence=name)
-    _store_rollout(attempt, steered, steered.begin(take.parameters), device, progress)
+    attempt.save_tensors(files.start, start_to_tensors(take.start))
+    # Its markers are the object's nodes, simulated when it was made.
+    attempt.save_array(files.rollout, marker)
     _finish(attempt, SIMULATION, [], [], [])
 
 
@@ -289,8 +292,7 @@ def _object_in(
         if object_.contacts is not None:
             attempt.save_tensors(files.contacts, object_.contacts.to_tensors())
         if object_.fitted.start is not None:
-            position, velocity = object_.fitted.start
-            attempt.save_tensors(files.start, {"position": position, "velocity": velocity})
+            attempt.save_tensors(files.start, start_to_tensors(object_.fitted.start))
         if object_.fitted.restart is not None:
             attempt.save_tensors(files.restart, object_.fitted.restart.to_tensors())
     else:

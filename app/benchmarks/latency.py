@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from app.viewer.live.client import LiveRequest, SimulationClient
-from app.viewer.live.drive import HandOrder
+from app.viewer.live.drive import HandLimits, HandOrder
 from app.viewer.live.wire import Message
 from physhandi.benchmarks.timing import describe_machine
 from physhandi.devices import start_warp
@@ -25,6 +25,8 @@ _INTERRUPTED_AFTER = 3
 _FARTHEST = 0.12
 _STEERED, _TURNS_AFTER = 240, 20
 """Frames that are steered, and after how many the hand turns round."""
+_LIFT = 0.5
+"""How far the hand goes up, in extents of what holds the object."""
 MOVES = 12
 """Slider positions of each kind that are asked for."""
 
@@ -89,6 +91,8 @@ class _Slider:
     def steer(self, rollout: ObjectRollout, count: int) -> tuple[list[float], list[float]]:
         """Let the hand go up and down from frame 0 on, as fast as frames can be simulated.
 
+        It is told places, between which it stays however late it hears of the next.
+
         Args:
             rollout: The object, which all its control nodes move as one body.
             count: Frames that are waited for.
@@ -107,15 +111,15 @@ class _Slider:
             control=control,
             hands=(hand,),
         )
-        speed = float(np.ptp(np.asarray(rollout.control[0]), axis=0).max())
-        number = self._live.steer(_SESSION, begun, is_paced=False)
+        lift = _LIFT * float(np.ptp(control, axis=0).max())
+        limits = HandLimits(top_speed=lift * rollout.parameters.frame_rate, reach=lift)
+        number = self._live.steer(_SESSION, begun, limits, is_paced=False)
         moments: list[float] = []
         durations: list[float] = []
         for moment, message in self._answers(number):
             if message["frame"] % _TURNS_AFTER == 0:
-                up = speed if message["frame"] % (2 * _TURNS_AFTER) == 0 else -speed
-                velocity = (0.0, 0.0, up, 0.0, 0.0, 0.0)
-                self._live.drive(_SESSION, [HandOrder(velocity=velocity)])
+                up = lift if message["frame"] % (2 * _TURNS_AFTER) == 0 else 0.0
+                self._live.drive(_SESSION, [HandOrder(goal=(0.0, 0.0, up, 0.0, 0.0, 0.0))])
             moments.append(moment)
             durations.append(float(message["duration"]))
             if len(moments) == count:

@@ -28,23 +28,15 @@ class StoredTake:
     frame: int
     """Frame of that sequence from which the hands were steered."""
 
-    def save(self, folder: Path) -> dict[str, Any]:
-        """Store it in a run's folder.
-
-        Args:
-            folder: The run's folder.
-
-        Returns:
-            What the run's configuration must say of it, under ``take``.
-        """
+    def save(self, folder: Path) -> None:
+        """Store its arrays in a run's folder."""
         tensors = {
             name: np.ascontiguousarray(value) for name, value in self.take.to_tensors().items()
         }
         write_bytes(folder / TAKE_FILE, save(tensors))
-        return self.to_dict()
 
     def to_dict(self) -> dict[str, Any]:
-        """Describe it in plain data, but for its arrays."""
+        """Describe it in plain data, but for its arrays, for ``take`` of a run's configuration."""
         parameters = self.take.parameters.to_dict()
         return {"sequence": self.sequence, "frame": self.frame, "parameters": parameters}
 

@@ -34,6 +34,12 @@ NodeState = tuple[Float32[ndarray, "node 3"], Float32[ndarray, "node 3"]]
 """Positions [m] and velocities [m/s] of the object nodes."""
 
 
+def start_to_tensors(start: NodeState) -> dict[str, ndarray]:
+    """Give the arrays that `start_from_tensors` reads."""
+    position, velocity = start
+    return {"position": position, "velocity": velocity}
+
+
 def start_from_tensors(tensors: Mapping[str, ndarray], node_count: int) -> NodeState:
     """Read the state of frame 0 that a rollout has in place of its model's.
 

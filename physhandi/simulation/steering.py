@@ -5,6 +5,7 @@ holds throughout. A take is the poses of its hands over the frames beside the st
 in, so that simulating it again gives the same bits.
 """
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -18,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
-from physhandi.simulation.restart import NodeState, start_from_tensors
+from physhandi.simulation.restart import NodeState, start_from_tensors, start_to_tensors
 from physhandi.simulation.simulator import Simulator, checked_control
 
 
@@ -126,6 +127,23 @@ class Take:
         """Give the control nodes of all frames [m]."""
         return np.stack([self.control_at(pose) for pose in self.pose])
 
+    def depth_below_ground(self, hand: int, pose: Float[ndarray, " 6"]) -> float:
+        """Tell how much too low a hand would be.
+
+        Args:
+            hand: Number of the hand.
+            pose: Its pose.
+
+        Returns:
+            How far its lowest control node is below the ground, or below where the lowest one is
+            in the pose of zero if that is lower [m]; negative above, and for no ground.
+        """
+        ground, its = self.parameters.ground_height, self.hands[hand]
+        if ground is None or not len(its.control):
+            return -math.inf
+        own = self.control[its.control]
+        return float(min(ground, own[:, 2].min()) - its.moved(own, pose)[:, 2].min())
+
     def simulate(self, device: str = "cpu") -> Iterator[NodeState]:
         """Simulate the frames one after the other; the first is the state that the take begins in.
 
@@ -185,8 +203,7 @@ class Take:
         names = "\n".join(hand.name for hand in self.hands).encode()
         return {
             **{f"model_{name}": value for name, value in self.model.to_tensors().items()},
-            "start_position": self.start[0],
-            "start_velocity": self.start[1],
+            **{f"start_{name}": value for name, value in start_to_tensors(self.start).items()},
             "control": self.control,
             "hand_of_control": owner,
             "hand_name": np.frombuffer(names, np.uint8),

@@ -1,21 +1,20 @@
 """The server's side of the live simulation: its one process, and the rollouts of each session."""
 
 import logging
-import math
 import socket
 import subprocess
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from app.viewer.live.drive import HandOrder
+from app.viewer.live.drive import HandLimits, HandOrder
 from app.viewer.live.wire import (
     DRIVE,
     PAUSE,
@@ -40,7 +39,6 @@ Listener = Callable[[Message], None]
 STARTING = "**The simulation is starting …** The first time on a machine this takes a while."
 """Shown until the process has loaded or compiled what every simulation needs."""
 
-_FASTEST = 1e6
 """As good as no limit of speed, which JSON has no number for [m/s]."""
 _MAX_CRASHES = 5
 _CRASH_WINDOW = 60.0
@@ -170,10 +168,10 @@ class SimulationClient:
         self,
         session: str,
         take: Take,
+        limits: HandLimits,
         *,
         replays: bool = False,
         is_paced: bool = True,
-        top_speed: float = math.inf,
     ) -> int:
         """Simulate what is steered, without end; a crash of the process ends it.
 
@@ -182,9 +180,9 @@ class SimulationClient:
         Args:
             session: A session with a listener; what it asked for before is dropped.
             take: The state to begin in, and the hands; poses after the first are not used.
+            limits: What no hand that is steered can do.
             replays: Whether to simulate the poses of the take instead, and then to end.
             is_paced: Whether to wait until a frame is due, as far as it is not late.
-            top_speed: A wrist that is steered moves no faster than this [m/s].
 
         Returns:
             Number of the request, which its frames carry.
@@ -194,7 +192,7 @@ class SimulationClient:
             "parameters": take.parameters.to_dict(),
             "replays": replays,
             "period": 1.0 / take.parameters.frame_rate if is_paced else 0.0,
-            "top_speed": min(top_speed, _FASTEST),
+            "limits": asdict(limits),
         }
         with self._lock:
             number = next(self._numbers)

@@ -1,15 +1,16 @@
-"""How a steered hand follows what it is told: smoothly, and with a top speed."""
+"""How a steered hand follows what it is told: smoothly, and within its limits."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from physhandi.simulation.steering import turn_between, turn_on
+from physhandi.simulation.steering import Take, turn_between, turn_on
 
 LAG = 0.1
 """Time in which a hand takes up most of a change of its speed [s]."""
@@ -39,23 +40,44 @@ class HandOrder:
         return cls(velocity=tuple(fields["velocity"]), goal=None if goal is None else tuple(goal))
 
 
+@dataclass(frozen=True, kw_only=True)
+class HandLimits:
+    """What a steered hand cannot do, whatever it is told."""
+
+    top_speed: float
+    """Its wrist moves no faster than this [m/s]."""
+    reach: float
+    """Its wrist goes no farther than this from where it is in the pose of zero [m]."""
+
+
 class HandDrive:
     """Moves one hand a frame at a time as its newest order says."""
 
-    def __init__(self, pose: Float[ndarray, " 6"], *, frame_rate: float, top_speed: float) -> None:
+    def __init__(
+        self,
+        pose: Float[ndarray, " 6"],
+        *,
+        frame_rate: float,
+        limits: HandLimits,
+        depth: Callable[[Float[ndarray, " 6"]], float],
+    ) -> None:
         """Begin at rest.
 
         Args:
             pose: Where the hand is: offset of the wrist [m] and rotation vector [rad].
             frame_rate: Frames per second [Hz].
-            top_speed: A wrist moves no faster than this [m/s].
+            limits: How fast and how far it goes.
+            depth: Tells how far a pose is too low [m]; the hand is lifted by so much. Negative for
+                a pose that is higher than it must be.
         """
         self.order = HandOrder()
         """What the hand follows."""
         self.pose = np.array(pose, np.float64)
         """Where the hand is."""
         self._step = 1.0 / frame_rate
-        self._top = np.array([top_speed, TOP_TURN])
+        self._top = np.array([limits.top_speed, TOP_TURN])
+        self._reach = limits.reach
+        self._depth = depth
         self._velocity = np.zeros(6)
 
     def next(self) -> Float[ndarray, " 6"]:
@@ -71,9 +93,11 @@ class HandDrive:
             self._limit()
             if np.abs(away).max() < _THERE:
                 self._velocity = away / self._step
+        before = self.pose[:3].copy()
         move = self._velocity * self._step
         self.pose[:3] += move[:3]
         self.pose[3:] = turn_on(self.pose[3:], move[3:])
+        self._stop_at_bounds(before)
         return self.pose.copy()
 
     @property
@@ -88,15 +112,41 @@ class HandDrive:
             if speed > top:
                 self._velocity[part] *= top / speed
 
+    def _stop_at_bounds(self, before: Float[ndarray, " 3"]) -> None:
+        """Hold the wrist within reach and above the ground; it slides along both.
+
+        Args:
+            before: Where the wrist was in the frame before [m].
+        """
+        distance = float(np.linalg.norm(self.pose[:3]))
+        depth = self._depth(self.pose)
+        if distance <= self._reach and depth <= 0.0:
+            return
+        if distance > self._reach:
+            self.pose[:3] *= self._reach / distance
+            depth = self._depth(self.pose)
+        self.pose[2] += max(depth, 0.0)
+        self._velocity[:3] = (self.pose[:3] - before) / self._step
+
 
 class Drives:
     """The hands of one steered object."""
 
-    def __init__(
-        self, pose: Float[ndarray, "hand 6"], *, frame_rate: float, top_speed: float
-    ) -> None:
-        """Begin at rest; see `HandDrive`."""
-        self._drives = [HandDrive(its, frame_rate=frame_rate, top_speed=top_speed) for its in pose]
+    def __init__(self, take: Take, limits: HandLimits) -> None:
+        """Begin at rest in the first frame of a take; see `HandDrive`.
+
+        No control node goes lower than the ground, or than where the lowest one of its hand was
+        recorded if that is lower: what is pressed through a table is thrown about.
+        """
+        self._drives = [
+            HandDrive(
+                pose,
+                frame_rate=take.parameters.frame_rate,
+                limits=limits,
+                depth=partial(take.depth_below_ground, number),
+            )
+            for number, pose in enumerate(take.pose[0])
+        ]
 
     def obey(self, orders: Sequence[Mapping[str, Any]]) -> None:
         """Follow new orders, one a hand, as `HandOrder.to_dict` gives them, or go on."""

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from app.viewer.live.drive import Drives
+from app.viewer.live.drive import Drives, HandLimits
 from app.viewer.live.wire import DRIVE, PAUSE, RESUME, STEER, STEP, Message, receive, send
 from physhandi.child import Channel, run_child
 from physhandi.errors import PhysHandiError, SimulationDivergedError
@@ -295,11 +295,7 @@ class SimulationWorker:
         take = Take.from_tensors(
             request.arrays, SimulationParameters.from_dict(request["parameters"])
         )
-        drives = Drives(
-            take.pose[0],
-            frame_rate=take.parameters.frame_rate,
-            top_speed=float(request["top_speed"]),
-        )
+        drives = Drives(take, HandLimits(**request["limits"]))
         steered = SteeredSimulation(take, self._device)
         state, pose, duration = steered.state, take.pose[0], 0.0
         while True:

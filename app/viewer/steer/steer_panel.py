@@ -21,7 +21,7 @@ from app.viewer.live.drive import HandOrder
 from app.viewer.physics.keep_panel import SavedRun, saved_html, write_small
 from app.viewer.scene.framing import Framing
 from app.viewer.steer.key_channel import KeyChannel, Press, velocity_of, view_axes
-from app.viewer.steer.steered import TOP_SPEED, SteeredFrame, SteeredObject, begin_take
+from app.viewer.steer.steered import SteeredFrame, SteeredObject, begin_take
 from app.viewer.ui.guard import Guard, notify
 from app.viewer.ui.keyboard import bind
 from app.viewer.ui.tabs import Tabs
@@ -277,7 +277,7 @@ class SteerPanel:
             self._mailbox,
             self._live,
             take,
-            top_speed=TOP_SPEED * self._extent,
+            extent=self._extent,
             on_change=self._hear,
         )
         self._arrivals.clear()

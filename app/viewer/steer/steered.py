@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from app.viewer.content.content import Content, ShownHand
 from app.viewer.live.client import SimulationClient
-from app.viewer.live.drive import HandOrder
+from app.viewer.live.drive import HandLimits, HandOrder
 from app.viewer.live.wire import Message
 from physhandi.errors import UsageError
 from physhandi.object_rollout import ObjectRollout
@@ -104,7 +104,7 @@ class SteeredObject:
         live: SimulationClient,
         take: Take,
         *,
-        top_speed: float,
+        extent: float,
         on_change: Callable[[str, str], None],
     ) -> None:
         """Begin to simulate.
@@ -113,13 +113,13 @@ class SteeredObject:
             mailbox: Name of the listener, which no other has.
             live: The process.
             take: The state to begin in, and the hands.
-            top_speed: A wrist moves no faster than this [m/s].
+            extent: Size of the scene, which bounds how fast and how far a wrist moves [m].
             on_change: Called with the kind of each message of the process, and why it ended.
         """
         self.take = take
         self._mailbox = mailbox
         self._live = live
-        self._top_speed = top_speed
+        self._limits = HandLimits(top_speed=TOP_SPEED * extent, reach=FARTHEST_REACH * extent)
         self._on_change = on_change
         self._lock = threading.Lock()
         self._number = 0
@@ -172,7 +172,7 @@ class SteeredObject:
         for name, values in (("velocity", order.velocity), ("goal", order.goal or ())):
             if not np.all(np.isfinite(values)):
                 raise UsageError(f"The {name} of a hand must be finite numbers, not {values}.")
-        reach = self._top_speed * FARTHEST_REACH / TOP_SPEED
+        reach = self._limits.reach
         if order.goal is not None and float(np.linalg.norm(order.goal[:3])) > reach:
             raise UsageError(f"The hand can go {reach:.3g} from where it was, and no farther.")
         with self._lock:
@@ -180,11 +180,6 @@ class SteeredObject:
                 return
             self._orders[hand] = order
             self._live.drive(self._mailbox, self._orders)
-
-    def order_of(self, hand: int) -> HandOrder:
-        """Give what a hand follows."""
-        with self._lock:
-            return self._orders[hand]
 
     def begin_gesture(self) -> None:
         """Remember the state to which `undo` returns."""
@@ -234,7 +229,7 @@ class SteeredObject:
             self._undone.append(self._newest)
             self._orders = [HandOrder() for _ in self._orders]
             self._is_recording, self._is_replaying = False, True
-            self._number = self._live.steer(self._mailbox, take, replays=True)
+            self._number = self._live.steer(self._mailbox, take, self._limits, replays=True)
 
     def undo(self) -> bool:
         """Return to where the last gesture began; returns whether there was one.
@@ -272,7 +267,7 @@ class SteeredObject:
         state = start.position, start.velocity
         begun = replace(self.take, start=state, pose=start.pose[None])
         self._is_replaying = False
-        self._number = self._live.steer(self._mailbox, begun, top_speed=self._top_speed)
+        self._number = self._live.steer(self._mailbox, begun, self._limits)
         self._live.drive(self._mailbox, self._orders)
 
     def _receive(self, message: Message) -> None:

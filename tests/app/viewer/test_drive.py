@@ -1,17 +1,49 @@
 """How a steered hand follows held keys and the gizmo."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
-from app.viewer.live.drive import LAG, TOP_TURN, Drives, HandDrive, HandOrder
+from app.viewer.live.drive import LAG, TOP_TURN, Drives, HandDrive, HandLimits, HandOrder
+from physhandi.simulation.parameters import SimulationParameters
+from physhandi.simulation.steering import SteeredHand, Take
+from physhandi.simulation.topology import build_model
 
 RATE = 30.0
+GROUND = 0.01
 
 
-def drive(top_speed: float = 10.0) -> HandDrive:
-    return HandDrive(np.zeros(6), frame_rate=RATE, top_speed=top_speed)
+def drive(
+    top_speed: float = 10.0,
+    reach: float = 100.0,
+    depth: Callable[[np.ndarray], float] = lambda _: -math.inf,
+) -> HandDrive:
+    limits = HandLimits(top_speed=top_speed, reach=reach)
+    return HandDrive(np.zeros(6), frame_rate=RATE, limits=limits, depth=depth)
+
+
+def two_hands(**changes: object) -> Take:
+    """Two hands above the ground, one of which was recorded with a node 2 mm in it."""
+    control = np.array(
+        [[0.0, 0.0, 0.05], [0.04, 0.0, 0.05], [0.5, 0.0, 0.008], [0.54, 0.0, 0.1]], np.float32
+    )
+    parameters = SimulationParameters(ground_height=GROUND, frame_rate=RATE).replace(**changes)
+    model = build_model(control, control, parameters)
+    hands = tuple(
+        SteeredHand(name=name, control=own, wrist=control[own[0]].astype(float))
+        for name, own in (("right", np.array([0, 1])), ("left", np.array([2, 3])))
+    )
+    start = (control, np.zeros_like(control))
+    return Take(
+        model=model,
+        start=start,
+        parameters=parameters,
+        control=control,
+        hands=hands,
+        pose=np.zeros((1, 2, 6)),
+    )
 
 
 def poses(hand: HandDrive, count: int) -> np.ndarray:
@@ -59,7 +91,7 @@ def test_no_hand_is_faster_than_its_top_speeds() -> None:
 
 
 def test_each_hand_follows_its_own_order_until_the_next() -> None:
-    drives = Drives(np.zeros((2, 6)), frame_rate=RATE, top_speed=1.0)
+    drives = Drives(two_hands(), HandLimits(top_speed=1.0, reach=1.0))
     orders = [
         HandOrder(velocity=(0.0, 0.1, 0.0, 0.0, 0.0, 0.0)),
         HandOrder(goal=(0.2,) + (0.0,) * 5),
@@ -71,3 +103,40 @@ def test_each_hand_follows_its_own_order_until_the_next() -> None:
     assert pose[0, 1] == pytest.approx(0.1 * (40 / RATE - LAG), abs=0.003)
     np.testing.assert_allclose(pose[1], [0.2, 0, 0, 0, 0, 0], atol=1e-5)
     np.testing.assert_array_equal(pose[0, [0, 2, 3, 4, 5]], 0.0)
+
+
+def test_a_hand_goes_as_far_as_it_reaches_and_turns_round_at_once() -> None:
+    hand = drive(reach=0.2)
+    hand.order = HandOrder(velocity=(0.3, 0.4, 0.0, 0.0, 0.0, 0.0))
+    np.testing.assert_allclose(poses(hand, 60)[-1], [0.12, 0.16, 0, 0, 0, 0], atol=1e-12)
+    hand.order = HandOrder(velocity=(-0.3, -0.4, 0.0, 0.0, 0.0, 0.0))
+    # It has not gathered speed at its bound.
+    first = 0.5 * (1.0 - math.exp(-1.0 / (RATE * LAG))) / RATE
+    np.testing.assert_allclose(0.2 - np.linalg.norm(hand.next()[:3]), first, rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["goal", "velocity"])
+def test_no_hand_goes_through_the_ground(kind: str) -> None:
+    take = two_hands()
+    drives = Drives(take, HandLimits(top_speed=1.0, reach=1.0))
+    down = (0.1, 0.0, -0.5, 0.0, 0.0, 0.0)
+    drives.obey([HandOrder(**{kind: down}).to_dict()] * 2)
+    height = np.stack([take.control_at(drives.next())[:, 2] for _ in range(60)])
+    # The lowest node of a hand lies on the ground, or where it was recorded below it.
+    np.testing.assert_allclose(height[-1], [GROUND, GROUND, 0.008, 0.1], atol=1e-7)
+    assert height[:, :2].min() >= GROUND - 1e-7
+    # Along the ground it goes on.
+    assert drives.next()[0, 0] > 0.095
+    # A hand that tips forward is lifted by its own length: its node stays above the ground.
+    drives.obey([HandOrder(goal=(0.0, 0.0, -0.5, 0.0, np.pi / 2, 0.0)).to_dict()] * 2)
+    for _ in range(90):
+        pose = drives.next()
+    np.testing.assert_allclose(take.control_at(pose)[:2, 2], [GROUND + 0.04, GROUND], atol=1e-6)
+
+
+def test_without_ground_a_hand_goes_down() -> None:
+    drives = Drives(two_hands(ground_height=None), HandLimits(top_speed=1.0, reach=1.0))
+    drives.obey([HandOrder(goal=(0.0, 0.0, -0.5, 0.0, 0.0, 0.0)).to_dict()] * 2)
+    for _ in range(90):
+        pose = drives.next()
+    np.testing.assert_allclose(pose[:, 2], -0.5, atol=1e-5)
