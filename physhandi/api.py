@@ -14,6 +14,7 @@ from physhandi.run import Run
 if TYPE_CHECKING:
     from physhandi.fitting.checks.recording_check import RecordingCheck
     from physhandi.fitting.config import PipelineConfig
+    from physhandi.simulation.edits import Edit, Edits
 
 
 def load(folder: Path | str) -> Sequence:
@@ -113,6 +114,7 @@ def simulate(
     out: Path | str | None = None,
     progress: Watcher = None,
     device: str = "cpu",
+    edits: "Many[Edit] | None" = None,
     **changes: Any,
 ) -> Run:
     """Simulate a fitted object with other parameters or in other recordings, and store a run.
@@ -125,14 +127,18 @@ def simulate(
         out: Folder of the new run; ``runs/<run>_simulated`` if left out.
         progress: True shows a bar, a callable is given stage, iteration, total, loss and message.
         device: Warp device, such as ``"cuda:0"``.
+        edits: What is done to single springs and nodes (`physhandi.simulation.edits`), in the place
+            of the run's own edits; left out, it is these.
         changes: New values of simulation parameters, such as ``stiffness_scale=0.3``.
 
     Raises:
-        UsageError: If a parameter is unknown or out of bounds, leaves no spring, or `out` holds
-            something else.
+        UsageError: If a parameter is unknown or out of bounds, leaves no spring, an edit cannot be
+            made, or `out` holds something else.
         RunError: If the run is not finished or is damaged.
         SimulationDivergedError: If the motion runs away.
     """
+    from physhandi.fitting.stored_edits import describe_edits
+    from physhandi.simulation.edits import checked_edits
     from physhandi.simulation.parameters import SimulationParameters, changed_parameters
 
     source = run if isinstance(run, RunFolder) else RunFolder.open(run)
@@ -144,8 +150,22 @@ def simulate(
         else _listed(sequences)
     )
     folder = out or Path("runs") / f"{source.id}_simulated"
-    settings = {"source": str(source.folder.resolve()), "parameters": dict(changes)}
-    return _execute(folder, "simulation", recordings, settings, progress=progress, device=device)
+    settings: dict[str, Any] = {
+        "source": str(source.folder.resolve()),
+        "parameters": dict(changes),
+    }
+    checked = None if edits is None else checked_edits(edits)
+    if checked is not None:
+        settings["edits"] = describe_edits(checked)
+    return _execute(
+        folder,
+        "simulation",
+        recordings,
+        settings,
+        edits=checked,
+        progress=progress,
+        device=device,
+    )
 
 
 def prepare_run(
@@ -198,10 +218,12 @@ def _execute(
     recordings: Many[Sequence],
     settings: Mapping[str, Any],
     *,
+    edits: "Edits | None" = None,
     progress: Watcher,
     device: str,
 ) -> Run:
     from physhandi import pipeline
+    from physhandi.fitting.stored_edits import store_edits
 
     for recording in recordings:
         recording.validate(reads_color=False)  # Tells wrong data before a run is made.
@@ -209,6 +231,8 @@ def _execute(
     if run.is_published:
         run.verify(allows_more=True)
         return run
+    if edits is not None:
+        store_edits(run.folder, edits)
     with watched(progress) as watch:
         pipeline.run_job(run, watch, device=device)
     return Run.open(run.folder)

@@ -22,6 +22,13 @@ from physhandi.object_rollout import ObjectRollout, load_fitted, load_surface
 from physhandi.progress import Progress, Watcher, watched
 from physhandi.settings import changes as changed_settings
 from physhandi.simulation.contact_intervals import ContactIntervals, always
+from physhandi.simulation.edits import (
+    Edit,
+    Edits,
+    apply_edits,
+    checked_edits,
+    keeps_what_is_joined,
+)
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.object_surface import ObjectSurface
 from physhandi.simulation.parameters import (
@@ -90,12 +97,15 @@ class FittedObject:
         self.contacts = contacts
         self.placement: PlacedObject | None = None
         """What was found out to lay the object into a recording that it was not fitted in."""
-        self._all_controls = np.ascontiguousarray(fitted.control, dtype=np.float32)
+        self._unedited = fitted.model if fitted.unedited is None else fitted.unedited
+        everything = np.ascontiguousarray(fitted.control, dtype=np.float32)
+        self._all_controls = np.ascontiguousarray(everything[:, : self._unedited.control_count])
         self._control = self._all_controls
         self._all_attached = self._all_controls[0] if attachment is None else attachment
         self._attached = self._all_attached
         self._chosen: tuple[int, ...] | None = None
         self._latest: tuple[tuple[float, ...], SpringMassModel] | None = None
+        self._edited: tuple[SpringMassModel, Edits, SpringMassModel] | None = None
         self._simulator: Simulator | None = None
         self._limit: tuple[SpringMassModel, float, float] | None = None
 
@@ -155,12 +165,18 @@ class FittedObject:
         """The fitted nodes and springs; each spring has a stiffness and a damping of its own."""
         return self.fitted.model
 
+    @property
+    def edits(self) -> Edits:
+        """What was done to single springs and nodes of the model, in this order."""
+        return self.fitted.edits
+
     def begin(
         self,
         parameters: SimulationParameters,
         *,
         controls: Sequence[int] | None = None,
         automatic_substeps: bool = False,
+        edits: Edits | None = None,
     ) -> ObjectRollout:
         """Prepare a rollout with other parameters: springs are built anew, scaled, or kept.
 
@@ -169,19 +185,29 @@ class FittedObject:
             controls: Numbers of the control nodes that hold the object; none for all. With some
                 of them the object's own springs stay as fitted, whatever the parameters say.
             automatic_substeps: Whether to choose as few substeps as are stable and fine enough.
+            edits: All that is done to single springs and nodes, in the place of the object's own
+                edits; left out, it is these.
 
         Returns:
             A rollout of which no frame is ready; see `fill`. It restarts where the fitted one
-            does: in the same observed state, with rest lengths that keep its own strain.
+            does: in the same observed state, with rest lengths that keep its own strain. It does
+            not if edits change what is joined or held.
+
+        Raises:
+            UsageError: If an edit cannot be made; says which.
         """
         self._choose_controls(controls)
-        model = self._model(parameters)
+        edits = self.edits if edits is None else edits
+        unedited = self._model(parameters)
+        model = self._with_edits(unedited, parameters, edits)
+        control = model.with_pins(self._control)
         if automatic_substeps:
-            parameters = with_stable_substeps(parameters, model, self._control[0])
+            parameters = with_stable_substeps(parameters, model, control[0])
         fitted = self.fitted
-        rollout = ObjectRollout.empty(
-            model, parameters, self._control, fitted.restart, fitted.start
-        )
+        restart = fitted.restart if keeps_what_is_joined(edits) else None
+        rollout = ObjectRollout.empty(model, parameters, control, restart, fitted.start)
+        if edits:
+            rollout.edits, rollout.unedited = edits, unedited
         rollout.scene, rollout.surface = self.fitted.scene, self.fitted.surface
         return rollout
 
@@ -216,6 +242,7 @@ class FittedObject:
         sequence: Recording | None = None,
         device: str = "cpu",
         progress: Watcher = None,
+        edits: Sequence[Edit] | None = None,
         **changes: Any,
     ) -> ObjectRollout:
         """Simulate all frames, with some parameters changed or in another recording.
@@ -227,6 +254,8 @@ class FittedObject:
             device: Warp device, such as ``"cuda:0"``.
             progress: True shows a bar, a callable is given stage, iteration, total, loss and
                 message.
+            edits: What is done to single springs and nodes (`physhandi.simulation.edits`), in the
+                place of the object's own edits; left out, it is these.
             changes: New values of simulation parameters (`SimulationParameters`), such as
                 ``stiffness_scale=0.3``; ``substeps_per_frame="auto"`` chooses as few as are stable.
 
@@ -240,24 +269,31 @@ class FittedObject:
         """
         with watched(progress) as watch:
             target = self if sequence is None else self.placed_in(sequence, watch)
-            rollout = target.changed(changes)
+            rollout = target.changed(changes, edits)
             for frame, _, _ in target.fill(rollout, device):
                 watch.check_cancelled()
                 watch.report(ROLLOUT, frame + 1, rollout.frame_count)
         return rollout
 
-    def changed(self, changes: Mapping[str, Any]) -> ObjectRollout:
+    def changed(
+        self, changes: Mapping[str, Any], edits: Sequence[Edit] | None = None
+    ) -> ObjectRollout:
         """Prepare a rollout with some parameters changed; see `simulate`.
 
         Raises:
-            UsageError: If a parameter is unknown or out of bounds, or leaves no spring.
+            UsageError: If a parameter is unknown or out of bounds, or leaves no spring, or an edit
+                cannot be made.
         """
         from physhandi.fitting.object_reconstruction import check_springs
 
         parameters, is_automatic = changed_parameters(self.parameters, changes)
-        rollout = self.begin(parameters, automatic_substeps=is_automatic)
+        wanted = self.edits if edits is None else checked_edits(edits)
+        if self.placement is not None:
+            self._refuse_of_recording(wanted)
+        rollout = self.begin(parameters, automatic_substeps=is_automatic, edits=wanted)
         rest = self.model.object_node if self.rest_node is None else self.rest_node
-        check_springs(self.sequence, rollout.model, parameters, self._attached, rest, self.contacts)
+        laid = rollout.model if rollout.unedited is None else rollout.unedited
+        check_springs(self.sequence, laid, parameters, self._attached, rest, self.contacts)
         if self.placement is not None and "substeps_per_frame" not in changes:
             needed = stable_substeps(rollout.model, parameters, rollout.control[0])
             count = max(needed, parameters.substeps_per_frame)
@@ -276,11 +312,12 @@ class FittedObject:
         if self.run.holds(sequence):
             return self if sequence.name == self.sequence else self.of(self.run, sequence.name)
         rest = self.model.object_node if self.rest_node is None else self.rest_node
-        fitted = self.model, self.parameters, rest
+        fitted = self._unedited, self.parameters, rest
         placed = place_object(self.run, sequence, fitted, progress)
         empty = ObjectRollout.empty(placed.model, placed.parameters, placed.control)
         empty.scene = partial(_scene_of, sequence, placed, empty)
         empty.surface = self.fitted.surface
+        empty.edits, empty.unedited = self.edits, placed.model
         other = FittedObject(empty, rest_node=rest, run=self.run, sequence=sequence.name)
         other.placement = placed
         return other
@@ -350,7 +387,7 @@ class FittedObject:
             position, _ = differentiable.rollout(
                 model,
                 parameters,
-                torch.tensor(self._all_controls) if control is None else control,
+                torch.tensor(model.with_pins(self._all_controls)) if control is None else control,
                 log_stiffness=stiffness,
                 damping=None if damping is None else damping.exp(),
                 device=device,
@@ -382,6 +419,30 @@ class FittedObject:
         recording = Path(run.sequences[run.sequence_names.index(self.sequence)])
         return load_surface(run, self.fitted, recording)
 
+    def _refuse_of_recording(self, edits: Edits) -> None:
+        """Refuse edits that belong to the recording in which they were made."""
+        for number, edit in enumerate(edits, start=1):
+            if edit.is_of_recording:
+                raise UsageError(
+                    f"Edit {number} ({edit.title}) belongs to the recording in which it was made, "
+                    f"and '{self.sequence}' is another one. Leave it out."
+                )
+
+    def _with_edits(
+        self, model: SpringMassModel, parameters: SimulationParameters, edits: Edits
+    ) -> SpringMassModel:
+        """Apply edits to a model, unless that was done just now; stored ones are applied once."""
+        fitted = self.fitted
+        if not edits:
+            return model
+        if model is self._unedited and edits == fitted.edits and self.placement is None:
+            return fitted.model
+        latest = self._edited
+        if latest is None or latest[0] is not model or latest[1] != edits:
+            edited = apply_edits(model, edits, parameters, self.rest_node)
+            latest = self._edited = (model, edits, edited)
+        return latest[2]
+
     def _choose_controls(self, chosen: Sequence[int] | None) -> None:
         wanted = None if chosen is None else tuple(chosen)
         if wanted != self._chosen:
@@ -399,7 +460,7 @@ class FittedObject:
         return self._latest[1]
 
     def _build(self, parameters: SimulationParameters) -> SpringMassModel:
-        fitted, model = self.parameters, self.model
+        fitted, model = self.parameters, self._unedited
         if self._chosen is not None:
             return _hold_anew(model, parameters, self._attached, self._chosen)
         is_changed = set(_BUILT_IN) & set(changed_settings(fitted, parameters))

@@ -18,7 +18,9 @@ from physhandi.data.run_folder import reading
 from physhandi.data.sequence import Sequence as Recording
 from physhandi.data.view import View
 from physhandi.errors import PhysHandiError, UsageError
+from physhandi.fitting.stored_edits import read_edits
 from physhandi.metrics.photometric import seen_colors
+from physhandi.simulation.edits import Edits
 from physhandi.simulation.forces import (
     spring_strains,
     spring_tensions,
@@ -60,6 +62,10 @@ class ObjectRollout:
     """State from which the frames after `restart.frame` start, in place of the rollout's own."""
     hand_shift: Float[ndarray, "control 3"] | None = None
     """What a restart that moves hands adds to control nodes [m]; found out when it is needed."""
+    edits: Edits = ()
+    """What was done to single springs and nodes of the model."""
+    unedited: SpringMassModel | None = None
+    """The model without its edits; None if it has none."""
     scene: Callable[[], SceneData] | None = None
     """Reads the hands and names that `export` writes beside the motion, if they are known."""
     surface: Callable[[], ObjectSurface | None] | None = None
@@ -301,6 +307,12 @@ def load_fitted(run: RunFolder, sequence_name: str) -> ObjectRollout | None:
         with reading(run.out / files.restart):
             restart = Restart.from_tensors(run.tensors(files.restart))
             restart.check_nodes(model.node_count)
+    edits, unedited = (), None
+    if run.has(files.edits):
+        with reading(run.out / files.edits):
+            edits = read_edits(run.out / files.edits)
+        with reading(run.out / files.unedited):
+            unedited = SpringMassModel.from_tensors(run.tensors(files.unedited))
     return ObjectRollout(
         model=model,
         parameters=parameters,
@@ -309,6 +321,8 @@ def load_fitted(run: RunFolder, sequence_name: str) -> ObjectRollout | None:
         ready=len(position),
         start=start,
         restart=restart,
+        edits=edits,
+        unedited=unedited,
     )
 
 

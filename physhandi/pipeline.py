@@ -68,11 +68,13 @@ from physhandi.fitting.rope.fit import fit_rope, start_rope
 from physhandi.fitting.spring_optimisation import optimise_springs
 from physhandi.fitting.state_estimate import observed_state
 from physhandi.fitting.steered_run import contacts_from, record_take, store_hands
+from physhandi.fitting.stored_edits import EDITS_FILE, read_edits
 from physhandi.fitting.stored_take import StoredTake
 from physhandi.metrics.report import measure_run, score_run
 from physhandi.object_rollout import ObjectRollout
 from physhandi.perception.lifting import observe_object
 from physhandi.progress import Progress
+from physhandi.simulation.edits import Edits
 from physhandi.simulation.parameters import changed_parameters
 from physhandi.simulation.restart import start_to_tensors
 
@@ -169,6 +171,7 @@ def simulate(
     *,
     device: str = "cpu",
     stored: StoredTake | None = None,
+    edits: Edits | None = None,
 ) -> dict[str, Any]:
     """Simulate a fitted object with changed parameters, or in other recordings, and measure it.
 
@@ -184,6 +187,8 @@ def simulate(
         progress: Told about every frame.
         device: Warp device.
         stored: A take that the one recording was made of, which says everything else.
+        edits: What is done to single springs and nodes, in the place of the run's own edits; None
+            for these.
 
     Returns:
         The measures of each sequence by its name, as ``metrics.json`` holds them.
@@ -191,12 +196,13 @@ def simulate(
     Raises:
         RunError: If the run is not finished or damaged.
         MissingInputError: If it holds no fitted object, or a recording lacks what moves it.
-        UsageError: If a parameter is unknown or out of bounds, or leaves no spring.
+        UsageError: If a parameter is unknown or out of bounds, or leaves no spring, or an edit
+            cannot be made.
         SimulationDivergedError: If the motion runs away.
     """
     if not attempt.stage_done(SIMULATION):
         if stored is None:
-            _stage_simulation(source, sequences, changes, attempt, progress, device=device)
+            _stage_simulation(source, sequences, (changes, edits), attempt, progress, device=device)
         else:
             _stage_take(source, sequences[0], stored, attempt, progress)
     metrics = {sequence.name: _measure(sequence, attempt) for sequence in sequences}
@@ -207,12 +213,13 @@ def simulate(
 def _stage_simulation(
     source: RunFolder,
     sequences: Many[Sequence],
-    changes: Mapping[str, Any],
+    wanted: tuple[Mapping[str, Any], Edits | None],
     attempt: Attempt,
     progress: Progress,
     *,
     device: str,
 ) -> None:
+    changes, edits = wanted
     source.verify(allows_more=True)
     if not source.has(MATERIAL_FILE):
         raise RunError(
@@ -221,7 +228,7 @@ def _stage_simulation(
     fitted = artefacts.load_parameters(source.out)
     parameters, _ = changed_parameters(fitted, changes)
     objects = [_object_in(source, sequence, attempt, progress) for sequence in sequences]
-    rollouts = [object_.changed(changes) for object_ in objects]
+    rollouts = [object_.changed(changes, edits) for object_ in objects]
     substeps = max(rollout.parameters.substeps_per_frame for rollout in rollouts)
     parameters = parameters.replace(substeps_per_frame=substeps)
     if substeps != fitted.substeps_per_frame:
@@ -234,6 +241,12 @@ def _stage_simulation(
     for object_, rollout in zip(objects, rollouts, strict=True):
         rollout.parameters = rollout.parameters.replace(substeps_per_frame=substeps)
         artefacts.save_model(attempt, object_.sequence, rollout.model)
+        files = SequenceFiles(object_.sequence)
+        attempt.save_array(files.control, np.asarray(rollout.control))
+        if rollout.restart is not None:
+            attempt.save_tensors(files.restart, rollout.restart.to_tensors())
+        if rollout.unedited is not None:
+            artefacts.save_edits(attempt, object_.sequence, rollout.edits, rollout.unedited)
         _store_rollout(attempt, object_, rollout, device, progress)
     _finish(attempt, SIMULATION, [], [], [])
 
@@ -293,8 +306,6 @@ def _object_in(
             attempt.save_tensors(files.contacts, object_.contacts.to_tensors())
         if object_.fitted.start is not None:
             attempt.save_tensors(files.start, start_to_tensors(object_.fitted.start))
-        if object_.fitted.restart is not None:
-            attempt.save_tensors(files.restart, object_.fitted.restart.to_tensors())
     else:
         object_ = FittedObject.of(source).placed_in(sequence, progress)
         placed = object_.placement
@@ -306,7 +317,6 @@ def _object_in(
             artefacts.save_hand_vertices(attempt, name)
             artefacts.save_hand_observation(attempt, name, placed.hands.keypoint)
             artefacts.save_hand_points(attempt, sequence, progress)
-    attempt.save_array(files.control, np.asarray(object_.fitted.control))
     return object_
 
 
@@ -663,7 +673,17 @@ def run_job(run: RunFolder, progress: Progress | None = None, *, device: str = "
         if run.kind == "simulation":
             source = RunFolder.open(Path(run.config["source"]))
             changes = run.config["parameters"]
-            simulate(source, sequences, changes, attempt, watched, device=device, stored=stored)
+            edits = read_edits(run.folder / EDITS_FILE) if "edits" in run.config else None
+            simulate(
+                source,
+                sequences,
+                changes,
+                attempt,
+                watched,
+                device=device,
+                stored=stored,
+                edits=edits,
+            )
         else:
             config = PipelineConfig.from_dict(run.config["profile"])
             reconstruct(sequences, config, attempt, watched, device=device)

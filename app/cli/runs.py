@@ -28,6 +28,7 @@ from physhandi.fitting.config import (
     load_profile,
     parse_override,
 )
+from physhandi.fitting.stored_edits import describe_edits, read_edits, store_edits
 from physhandi.progress import watched
 from physhandi.run import Run
 from physhandi.simulation.parameters import PARAMETERS, SimulationParameters, changed_parameters
@@ -119,6 +120,7 @@ def simulate(
     *,
     out: Path | None = None,
     sequence: tuple[str, ...] = (),
+    edits: Path | None = None,
     device: Device = "auto",
     data_dir: DataDir = None,
 ) -> None:
@@ -130,6 +132,8 @@ def simulate(
         out: Run folder to fill. None makes one in `runs/` of the data folder, and prints it.
         sequence: Other sequences of the same object; none takes the run's first one. Substeps are
             chosen anew where the fitted ones would not be stable.
+        edits: JSON file with what is done to single springs and nodes (docs/formats.md), in the
+            place of the run's own edits; None for these.
     """
     source = find_result(run, data_dir)
     device = pick_device(device)
@@ -139,12 +143,17 @@ def simulate(
         recordings = [find_sequence(name, data_dir) for name in sequence]
     else:
         recordings = open_catalog(data_dir).sequences_of(source)[:1]
-    config = {"source": str(source.folder.resolve()), "parameters": changed}
+    config: dict[str, Any] = {"source": str(source.folder.resolve()), "parameters": changed}
+    wanted = None if edits is None else read_edits(edits)
+    if wanted is not None:
+        config["edits"] = describe_edits(wanted)
     if out is None:
         name = f"{source.name}, simulated"
         target = _run_at(_new_folder(data_dir), "simulation", recordings, config, name)
     else:
         target = _run_at(out, "simulation", recordings, config)
+    if wanted is not None:
+        store_edits(target.folder, wanted)
     result = _execute(target, device)
     chosen = Run.open(target.folder).yaml(PARAMETERS_FILE)
     show({"substeps_per_frame": chosen["substeps_per_frame"], **result})

@@ -76,6 +76,16 @@ class SequenceFiles:
         return f"{self.folder}/model.safetensors"
 
     @property
+    def edits(self) -> str:
+        """What was done to single springs and nodes, if anything was."""
+        return f"{self.folder}/edits.json"
+
+    @property
+    def unedited(self) -> str:
+        """The springs without those edits."""
+        return f"{self.folder}/unedited.safetensors"
+
+    @property
     def keypoint(self) -> str:
         """Keypoints that the hands were fitted to."""
         return f"{self.folder}/keypoint.npy"

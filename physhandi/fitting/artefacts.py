@@ -6,6 +6,7 @@ Paths are relative to the output folder of one attempt; docs/formats.md lists th
 from pathlib import Path
 from typing import get_args
 
+import msgspec
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
@@ -25,6 +26,7 @@ from physhandi.hand.motion import HandMotion
 from physhandi.hand.skin import hand_skin
 from physhandi.perception.lifting import hand_points
 from physhandi.progress import Progress
+from physhandi.simulation.edits import Edits
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.restart import Restart
@@ -254,6 +256,14 @@ def save_model(output: Attempt, name: str, model: SpringMassModel) -> None:
     """Store the springs of one sequence, object springs and virtual springs."""
     tensors = {key: np.ascontiguousarray(value) for key, value in model.to_tensors().items()}
     output.save_tensors(SequenceFiles(name).model, tensors)
+
+
+def save_edits(output: Attempt, name: str, edits: Edits, unedited: SpringMassModel) -> None:
+    """Store what was done to single springs and nodes of one sequence, and its springs without."""
+    files = SequenceFiles(name)
+    output.save_json(files.edits, msgspec.to_builtins(edits))
+    tensors = {key: np.ascontiguousarray(value) for key, value in unedited.to_tensors().items()}
+    output.save_tensors(files.unedited, tensors)
 
 
 def load_model(out: Path, name: str) -> SpringMassModel:

@@ -41,6 +41,10 @@ class SpringMassModel:
     attached: Int32[ndarray, "#virtual 2"] = field(default_factory=lambda: always(1))
     """Frame in whose state each virtual spring is attached, and the last one before it lets go: it
     acts on the way from the first to the last; one pair for all, or each."""
+    pin_place: Float32[ndarray, "pin 3"] = field(
+        default_factory=lambda: np.zeros((0, 3), np.float32)
+    )
+    """Where the last control nodes are that never move because nodes are pinned to them [m]."""
     rod: Rod | None = None
     """How the object bends, if it is a rope; None if springs alone hold its shape."""
 
@@ -79,6 +83,7 @@ class SpringMassModel:
                 f"attached has shape {self.attached.shape}; "
                 f"expected ({self.virtual_spring_count}, 2), two frames a virtual spring."
             )
+        self._check_pins()
         if self.rod is not None:
             self.rod.check(self.node_count, self.control_count)
 
@@ -103,10 +108,37 @@ class SpringMassModel:
         if np.any(is_control[self.object_spring_count :].sum(axis=1) != 1):
             raise ValueError("A virtual spring must join one object node and one control node.")
 
+    def _check_pins(self) -> None:
+        place, count = self.pin_place, self.pin_count
+        if place.shape != (count, 3) or count > self.control_count or not np.isfinite(place).all():
+            raise ValueError(
+                f"pin_place has shape {place.shape} or values that are not finite; expected three "
+                f"numbers for each of at most {self.control_count} control nodes."
+            )
+
     @property
     def node_count(self) -> int:
         """Number of object nodes."""
         return len(self.object_node)
+
+    @property
+    def pin_count(self) -> int:
+        """Number of control nodes, the last ones, that never move."""
+        return len(self.pin_place)
+
+    def with_pins(
+        self, control: Float32[ndarray, "frame some 3"]
+    ) -> Float32[ndarray, "frame control 3"]:
+        """Give the motion of all control nodes.
+
+        Args:
+            control: That of the control nodes that move, with or without any pins behind them [m].
+        """
+        moving = self.control_count - self.pin_count
+        if control.shape[1] == moving and not self.pin_count:
+            return control
+        pin = np.broadcast_to(self.pin_place, (len(control), self.pin_count, 3))
+        return np.concatenate([control[:, :moving], pin.astype(control.dtype)], axis=1)
 
     @property
     def virtual_spring_count(self) -> int:
@@ -137,12 +169,13 @@ class SpringMassModel:
         )
 
     def to_tensors(self) -> dict[str, ndarray]:
-        """Return every field as an array, ready for safetensors."""
+        """Return every field as an array, ready for safetensors; no pins if there are none."""
         names = [field.name for field in fields(self) if field.name != "rod"]
         values = {name: getattr(self, name) for name in names}
         tensors = {
             name: value if isinstance(value, np.ndarray) else np.array([value], dtype=np.int32)
             for name, value in values.items()
+            if name != "pin_place" or self.pin_count
         }
         return tensors if self.rod is None else tensors | self.rod.to_tensors()
 
@@ -152,7 +185,8 @@ class SpringMassModel:
 
         Models that were stored before nodes had a clearance have none; the virtual springs of those
         that were stored before springs could be attached later are always attached. Objects that
-        are no ropes, and those that were stored before ropes could bend, have no rod.
+        are no ropes, and those that were stored before ropes could bend, have no rod. Without pins
+        none are stored.
 
         Raises:
             ValueError: If an array is missing, unknown or inconsistent.
@@ -161,7 +195,7 @@ class SpringMassModel:
         values: dict[str, Any] = {
             name: np.asarray(a) for name, a in tensors.items() if not name.startswith(PREFIX)
         }
-        if set(values) | {"clearance", "attached"} != names:
+        if set(values) | {"clearance", "attached", "pin_place"} != names:
             raise ValueError(
                 f"A spring-mass model needs the arrays {', '.join(sorted(names))}; "
                 f"got {', '.join(sorted(values))}."

@@ -88,7 +88,8 @@ class Take:
     control: Float32[ndarray, "control 3"]
     """Control nodes where all poses are zero [m]."""
     hands: tuple[SteeredHand, ...]
-    """The hands; control nodes of none of them stay where they are."""
+    """The hands; control nodes of none of them, and those that nodes are pinned to, stay where they
+    are."""
     pose: Float[ndarray, "frame hand 6"] = field(default_factory=lambda: np.zeros((1, 1, 6)))
     """How far each wrist has moved from where it is in `control` [m], and the rotation vector about
     it [rad]."""
@@ -121,6 +122,8 @@ class Take:
         moved = np.array(self.control, np.float32)
         for hand, its in zip(self.hands, pose, strict=True):
             moved[hand.control] = hand.moved(self.control[hand.control], its)
+        moving = self.model.control_count - self.model.pin_count
+        moved[moving:] = self.control[moving:]  # Whichever hand they are nearest to.
         return moved
 
     def controls(self) -> Float32[ndarray, "frame control 3"]:

@@ -240,6 +240,20 @@ def test_a_run_is_simulated_again_with_other_parameters(terminal: Terminal) -> N
     assert np.abs(run.array("sequences/sheet/rollout.npy") - fitted).max() > 1e-5
 
 
+def test_a_run_is_simulated_again_with_edits_of_a_file(terminal: Terminal, tmp_path) -> None:
+    file = tmp_path / "edits.json"
+    file.write_text('[{"kind": "cut", "springs": [[0, 1], [1, 2]]}]')
+    order = ("simulate", "fitted", "--device", "cpu", "--edits", str(file))
+    assert terminal(*order, "--out", "cut") == 0
+    run = Run.open("cut")
+    assert run.config["edits"]["steps"] == ["Cut 2 springs"]
+    assert len(run.object.edits[0].springs) == 2
+    file.write_text('[{"kind": "melt"}]')
+    assert "edits.json holds no edits" in terminal.refused(2, *order, "--out", "x")
+    assert "cannot be read" in terminal.refused(2, *order[:-1], "nothing.json", "--out", "x")
+    assert not Path("x").exists()
+
+
 def test_nodes_collide_when_a_simulation_is_told_so(terminal: Terminal) -> None:
     order = ("simulate", "fitted", "--device", "cpu", "--collides-rest-neighbors", "True")
     assert terminal(*order, "--out", "no") == 2

@@ -15,10 +15,12 @@ from reference.scenes import as_model, cube_scene
 from sheet_sequence import FITTED, FRAMES, NODE, sheet_config, write_sheet
 
 import physhandi as ph
+from physhandi.data.layout import SequenceFiles
 from physhandi.errors import MissingInputError, RunError, SequenceError, UsageError
 from physhandi.fitted_object import FittedObject
 from physhandi.object_rollout import ObjectRollout
 from physhandi.progress import NullProgress, PrintedProgress, watched
+from physhandi.simulation.edits import Cut, Pin, Release, ScaleMaterial, checked_edits
 
 SMALL = sheet_config(generations=3, population=6, iterations=3)
 
@@ -151,6 +153,76 @@ def test_a_stored_simulation_covers_several_recordings_and_is_what_the_object_gi
     )
     with pytest.raises(UsageError, match="already holds another run"):
         ph.simulate(run, both, out=tmp_path / "soft", stiffness_scale=0.6)
+
+
+def test_an_edited_object_is_stored_with_its_edits_and_changed_again(
+    run: ph.Run, recordings: Path, tmp_path: Path
+) -> None:
+    fold = ph.load(recordings / "towel_fold")
+    obj = run.object
+    pairs = [tuple(map(int, ends)) for ends in obj.model.spring_nodes[:3]]
+    corner = obj.model.object_node[24]
+    edits = [
+        Cut(springs=pairs),
+        Pin(nodes=[24], places=[[float(x) for x in corner]]),
+        ScaleMaterial(quantity="stiffness", factor=0.5, springs=[(20, 21)]),
+    ]
+    rollout = obj.simulate(edits=edits)
+    away = np.linalg.norm(rollout.position - obj.fitted.position, axis=2).mean(axis=1)
+    assert away[-1] > 0.01
+    assert np.linalg.norm(rollout.position[:, 24] - corner, axis=1).max() < 0.02
+    assert rollout.restart is None
+    assert obj.simulate(edits=edits[2:]).restart is obj.fitted.restart
+    np.testing.assert_array_equal(obj.simulate(edits=[]).position, obj.simulate().position)
+
+    out = tmp_path / "edited"
+    stored = ph.simulate(run, fold, out=out, edits=edits)
+    assert stored.config["edits"]["steps"] == [
+        "Cut 3 springs",
+        "Pin 1 node",
+        "Stiffness ×0.5 of 1 spring",
+    ]
+    again = stored.object
+    np.testing.assert_array_equal(again.fitted.position, rollout.position)
+    np.testing.assert_array_equal(again.simulate().position, rollout.position)
+    assert again.edits == checked_edits(edits)
+    assert again.fitted.control.shape[1] == obj.fitted.control.shape[1] + 1
+    assert ph.simulate(run, fold, out=out, edits=edits).folder == stored.folder
+    with pytest.raises(UsageError, match="already holds another run"):
+        ph.simulate(run, fold, out=out, edits=edits[:1])
+    # Other springs are laid as without edits, which are made again; and they can be taken back.
+    wider = {"connection_radius": 0.15, "max_neighbors": 20, "stiffness": 300.0}
+    expected = obj.simulate(edits=edits, **wider)
+    assert expected.model.object_spring_count > rollout.model.object_spring_count
+    np.testing.assert_array_equal(again.simulate(**wider).position, expected.position)
+    np.testing.assert_array_equal(
+        again.simulate(edits=[]).position[:FITTED], obj.simulate().position[:FITTED]
+    )
+    twice = ph.simulate(stored, fold, out=tmp_path / "twice", stiffness=300.0)
+    np.testing.assert_array_equal(
+        twice.object.fitted.position, obj.simulate(edits=edits, stiffness=300.0).position
+    )
+    # Where control nodes and frames are others only what is the object's own is done again.
+    pull = ph.load(recordings / "towel_pull")
+    with pytest.raises(UsageError, match=r"Edit 2 \(Pin 1 node\) belongs to the recording"):
+        again.simulate(sequence=pull)
+    cut = obj.simulate(sequence=pull, edits=edits[:1])
+    uncut = obj.simulate(sequence=pull)
+    assert cut.model.object_spring_count == uncut.model.object_spring_count - 3
+    assert np.abs(cut.position - uncut.position).max() > 1e-4
+
+
+def test_damaged_edits_of_a_run_are_named(run: ph.Run, recordings: Path, tmp_path: Path) -> None:
+    fold = ph.load(recordings / "towel_fold")
+    stored = ph.simulate(run, fold, out=tmp_path / "cut", edits=[Cut(springs=[(0, 1)])])
+    file = stored.out / SequenceFiles("towel_fold").edits
+    file.write_text('[{"kind": "cut", "springs": [[0]]}]')
+    with pytest.raises(RunError, match=r"edits.json .*\$\[0\].springs"):
+        _ = ph.open_run(stored.folder).object
+    with pytest.raises(UsageError, match=r"Edit 1 \(Release 1 node\): there is no object node 99"):
+        run.object.simulate(edits=[Release(nodes=[99])])
+    with pytest.raises(UsageError, match="These are no edits"):
+        run.object.simulate(edits=[ScaleMaterial(quantity="stiffness", factor=-1.0)])
 
 
 def test_substeps_that_are_too_few_for_another_recording_are_raised(

@@ -28,6 +28,7 @@ from app.viewer.live.wire import (
 )
 from physhandi.child import start_module
 from physhandi.object_rollout import ObjectRollout
+from physhandi.simulation.edits import Edits, encode_edits, keeps_what_is_joined
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.steering import Take
@@ -58,6 +59,8 @@ class LiveRequest:
     """Whether to use as few substeps as are stable, instead of the parameters' number."""
     controls: tuple[int, ...] | None = None
     """Which of the run's control nodes may hold the object; None for all."""
+    edits: Edits = ()
+    """What is done to single springs and nodes."""
 
 
 @dataclass(frozen=True)
@@ -137,7 +140,7 @@ class SimulationClient:
 
     def prepare(self, session: str, request: LiveRequest) -> None:
         """Load what a session's first request will need."""
-        message = Message("prepare", {"session": session, **_to_fields(request)})
+        message = _message("prepare", {"session": session}, request)
         with self._lock:
             if self._connection is None:
                 self._unfinished[session] = _Unfinished(message)
@@ -156,7 +159,7 @@ class SimulationClient:
         with self._lock:
             number = next(self._numbers)
             about = {"session": session, "request": number, "is_held": session in self._held}
-            message = Message("simulate", about | _to_fields(request))
+            message = _message("simulate", about, request)
             self._unfinished[session] = _Unfinished(message)
             if self._connection is None:
                 self._crashes.clear()
@@ -215,7 +218,8 @@ class SimulationClient:
             (self._held.add if on else self._held.discard)(session)
             if session in self._unfinished:  # It may be sent again, to another process.
                 item = self._unfinished[session]
-                message = Message(item.message.kind, {**item.message.fields, "is_held": on})
+                fields = {**item.message.fields, "is_held": on}
+                message = replace(item.message, fields=fields)
                 self._unfinished[session] = replace(item, message=message)
             self._write(Message(PAUSE if on else RESUME, {"session": session}))
 
@@ -425,7 +429,11 @@ class LiveRollouts:
         self._on_change = on_change
         self._lock = threading.Lock()
         self._wanted = LiveRequest(
-            run=run, sequence=sequence, parameters=fitted.parameters, controls=controls
+            run=run,
+            sequence=sequence,
+            parameters=fitted.parameters,
+            controls=controls,
+            edits=fitted.edits if controls is None else (),
         )
         self._number = 0
         self._shown = fitted
@@ -438,14 +446,31 @@ class LiveRollouts:
         if controls is None:
             live.prepare(session, self._wanted)
 
-    def request(self, parameters: SimulationParameters, *, automatic_substeps: bool) -> None:
-        """Ask for the rollout of other parameters; the fitted one is there already."""
+    def request(
+        self,
+        parameters: SimulationParameters,
+        *,
+        automatic_substeps: bool,
+        edits: Edits | None = None,
+    ) -> None:
+        """Ask for a rollout; the fitted one is there already.
+
+        Args:
+            parameters: What to simulate with.
+            automatic_substeps: Whether to use as few substeps as are stable.
+            edits: What is done to single springs and nodes; None for what was last.
+        """
         with self._lock:
+            edits = self._wanted.edits if edits is None else edits
             self._wanted = replace(
-                self._wanted, parameters=parameters, automatic_substeps=automatic_substeps
+                self._wanted,
+                parameters=parameters,
+                automatic_substeps=automatic_substeps,
+                edits=edits,
             )
             is_fitted = (
                 parameters == self.fitted.parameters
+                and edits == self.fitted.edits
                 and not automatic_substeps
                 and self._wanted.controls is None
             )
@@ -556,8 +581,11 @@ class LiveRollouts:
             parameters = self._wanted.parameters.replace(
                 substeps_per_frame=message["substeps_per_frame"]
             )
-            fitted = self.fitted
-            self._incoming = ObjectRollout.empty(model, parameters, fitted.control, fitted.restart)
+            fitted, edits = self.fitted, self._wanted.edits
+            control = model.with_pins(fitted.control)
+            restart = fitted.restart if keeps_what_is_joined(edits) else None
+            self._incoming = ObjectRollout.empty(model, parameters, control, restart)
+            self._incoming.edits = edits
             self._durations = []
         elif message.kind == "frame" and self._incoming is not None:
             frame = int(message["frame"])
@@ -583,15 +611,18 @@ class LiveRollouts:
             self._is_busy = self._is_busy and bool(message["is_retried"])
 
 
-def _to_fields(request: LiveRequest) -> dict[str, Any]:
-    """Write a request as plain fields of a message."""
-    return {
+def _message(kind: str, about: dict[str, Any], request: LiveRequest) -> Message:
+    """Write a request as a message; edits, which may name every spring, as bytes beside it."""
+    fields = about | {
         "run": str(request.run),
         "sequence": request.sequence,
         "parameters": request.parameters.to_dict(),
         "automatic_substeps": request.automatic_substeps,
         "controls": None if request.controls is None else list(request.controls),
     }
+    if not request.edits:
+        return Message(kind, fields)
+    return Message(kind, fields, {"edits": np.frombuffer(encode_edits(request.edits), np.uint8)})
 
 
 def _notify(listener: Listener, message: Message) -> None:

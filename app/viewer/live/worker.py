@@ -23,6 +23,7 @@ from app.viewer.live.wire import DRIVE, PAUSE, RESUME, STEER, STEP, Message, rec
 from physhandi.child import Channel, run_child
 from physhandi.errors import PhysHandiError, SimulationDivergedError
 from physhandi.fitted_object import FittedObject
+from physhandi.simulation.edits import Edits, decode_edits
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import Simulator
 from physhandi.simulation.stability import stable_substeps
@@ -233,7 +234,7 @@ class SimulationWorker:
         try:
             fitted = self._object(request)
             parameters = SimulationParameters.from_dict(request["parameters"])
-            rollout = fitted.begin(parameters)
+            rollout = fitted.begin(parameters, edits=_edits_of(request))
             yield 0
             for frame, _, _ in fitted.fill(rollout, self._device):
                 yield frame + 1
@@ -249,6 +250,7 @@ class SimulationWorker:
             parameters,
             controls=request["controls"],
             automatic_substeps=bool(request["automatic_substeps"]),
+            edits=_edits_of(request),
         )
         send(
             self._connection,
@@ -326,6 +328,12 @@ class SimulationWorker:
             loaded = (key, FittedObject.of(*key))
             self._objects[request["session"]] = loaded
         return loaded[1]
+
+
+def _edits_of(request: Message) -> Edits:
+    """Read what a request does to single springs and nodes."""
+    content = request.arrays.get("edits")
+    return () if content is None else decode_edits(content.tobytes(), "the request")
 
 
 _CUBE = SimulationParameters(

@@ -20,6 +20,7 @@ from app.viewer.live.drive import HandLimits, HandOrder
 from app.viewer.live.wire import Message
 from physhandi.fitted_object import FittedObject
 from physhandi.run import Run
+from physhandi.simulation.edits import Cut, Pin, Release
 from physhandi.simulation.steering import SteeredHand, Take
 
 SECONDS = 60.0
@@ -97,6 +98,30 @@ def test_a_larger_radius_gives_the_springs_that_an_independent_count_gives(
     moved = frames(messages) - run.array("sequences/lift/rollout.npy")
     assert np.abs(moved[0]).max() == 0
     assert np.abs(moved[-1]).max() > 1e-4
+
+
+def test_an_edited_object_is_simulated_and_goes_back_when_it_is_not_edited(
+    live, mailbox, run
+) -> None:
+    model = FittedObject.of(run, "lift").model
+    place = tuple(float(x) for x in model.object_node[80])
+    edits = (
+        Cut(springs=tuple((int(a), int(b)) for a, b in model.spring_nodes[:40])),
+        Pin(nodes=(80,), places=(place,)),
+    )
+    live.request("a", replace(ask(run), edits=edits))
+    messages = mailbox.until("finished")
+    expected = FittedObject.of(run, "lift").simulate(edits=edits)
+    np.testing.assert_array_equal(frames(messages), expected.position)
+    started = next(m for m in messages if m.kind == "started").arrays
+    np.testing.assert_array_equal(started["pin_place"], expected.control[0, -1:])
+    assert int(started["object_spring_count"][0]) == model.object_spring_count - 40
+    live.request("a", ask(run))
+    messages = mailbox.until("finished")
+    np.testing.assert_array_equal(frames(messages), run.array("sequences/lift/rollout.npy"))
+    live.request("a", replace(ask(run), edits=(Release(nodes=(81,)),)))
+    (failed,) = (m for m in mailbox.until("failed") if m.kind == "failed")
+    assert "there is no object node 81" in failed["error"]
 
 
 def test_the_latest_request_wins(live, mailbox, run) -> None:

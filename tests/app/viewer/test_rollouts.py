@@ -5,6 +5,7 @@ from viewer_world import FRAMES, PARAMETERS
 from app.viewer.live.client import LiveRequest, LiveRollouts
 from app.viewer.live.wire import Message
 from physhandi.object_rollout import load_fitted
+from physhandi.simulation.edits import Pin, apply_edits
 
 
 class FakeLive:
@@ -89,6 +90,26 @@ def test_frames_that_are_not_simulated_yet_show_the_rollout_before(rollouts, liv
     readout = rollouts.readout
     assert (readout.simulated_count, readout.frame_count, readout.is_busy) == (3, FRAMES, True)
     assert readout.frame_duration == pytest.approx(0.25)
+
+
+def test_edits_are_asked_for_until_they_are_taken_back(rollouts, live) -> None:
+    edits = (Pin(nodes=(3,), places=((0.1, 0.2, 0.3),)),)
+    rollouts.request(PARAMETERS, automatic_substeps=False, edits=edits)
+    assert live.requests[-1].edits == edits
+    model = apply_edits(rollouts.fitted.model, edits, PARAMETERS)
+    live.say("started", 1, model.to_tensors(), substeps_per_frame=30)
+    node = np.ones((81, 3), np.float32)
+    live.say("frame", 1, {"position": node, "velocity": node}, frame=0, duration=0.1)
+    take, _ = rollouts.at(0)
+    assert take.edits == edits
+    assert take.control.shape == (FRAMES, 31, 3)
+    np.testing.assert_allclose(take.control[:, 30, :2], np.tile([[0.1, 0.2]], (FRAMES, 1)))
+    # A slider leaves them in force.
+    rollouts.request(PARAMETERS.replace(drag=7.0), automatic_substeps=False)
+    assert live.requests[-1].edits == edits
+    rollouts.request(PARAMETERS, automatic_substeps=False, edits=())
+    assert live.cancelled == 1
+    assert rollouts.at(0)[0] is rollouts.fitted
 
 
 def test_answers_to_an_older_request_are_refused(rollouts, live, changes) -> None:
