@@ -13,6 +13,14 @@ from scipy.spatial.distance import cdist
 _NUMBER = r"([\d.]+(?:e[+-]?\d+)?)"
 TIMEOUT_MS = 120_000
 """How long browsers wait for what must come; a busy machine can be ten times as slow as others."""
+FEWER_PICTURES = """
+window.requestAnimationFrame = (draw) => setTimeout(() => draw(performance.now()), 200);
+window.cancelAnimationFrame = (number) => clearTimeout(number);
+"""
+"""Five pictures a second in the place of sixty: tests wait for what is in them, not for how many.
+
+Software draws them, which is much of what these tests cost. `physhandi benchmark viewer` measures
+how many a browser gets."""
 _SENT = "() => new Promise((done) => setTimeout(done, 60))"
 """viser's browser sends at once or 50 ms later, and of what waits until then only the last."""
 _PICTURE = "() => new Promise((done) => requestAnimationFrame(done))"

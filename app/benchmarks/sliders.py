@@ -142,11 +142,10 @@ def measure_slider(
     before = slider.fitted
     with served.watch(session) as client:
         screen = Screen(client)
-        screen.play(on=True)
-        client.listen(0.5)
-        if not is_playing:
-            client.set("Frame", len(before) // 2)
-            client.until(lambda: not screen.is_playing)
+        if is_playing:
+            client.listen(0.5)
+        else:
+            screen.rest_at(len(before) // 2, before[len(before) // 2])
             client.listen(0.3)
         for number, move in enumerate(moves):
             start = time.perf_counter()

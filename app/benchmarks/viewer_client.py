@@ -12,6 +12,8 @@ from numpy import ndarray
 from websockets.sync.client import connect
 
 PROTOCOL = f"viser-v{viser.__version__}"
+PATIENCE_S = 120.0
+"""So long a busy machine may take for what has to come; what takes longer does not come [s]."""
 
 
 def read_messages(raw: bytes) -> list[dict[str, Any]]:
@@ -121,7 +123,7 @@ class ViewerClient:
         self.camera |= changes
         self.send("ViewerCameraMessage", **self.camera)
 
-    def until(self, condition: Callable[[], Any], seconds: float = 30.0) -> None:
+    def until(self, condition: Callable[[], Any], seconds: float = PATIENCE_S) -> None:
         """Take in messages until a condition holds.
 
         Raises:

@@ -25,7 +25,6 @@ from physhandi.synthetic.suite import cells
 from physhandi.synthetic.suite.evaluation import Order, evaluate_suite, filler, list_tasks
 from physhandi.synthetic.suite.methods import parse_method
 
-pytestmark = pytest.mark.timeout(900)
 METHODS = ("static", "quick", "quick+last_residual")
 CELLS = 10
 """Three methods and two recordings; two of the methods once more where nothing was fitted."""

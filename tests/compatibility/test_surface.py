@@ -140,7 +140,7 @@ def test_controls_of_live_scenes(then: dict[str, Any], old: OldFolder, server: F
     def wait(scene: str, client: ViewerClient) -> None:
         kept = {name for name in wanted[scene] if not _is_told(name, told)}
         try:
-            client.until(lambda: kept <= set(surface.controls(client)[0]), seconds=10.0)
+            client.until(lambda: kept <= set(surface.controls(client)[0]))
         except TimeoutError:
             return  # What is missing is told below.
 

@@ -20,7 +20,7 @@ from playwright.sync_api import (
     expect,
     sync_playwright,
 )
-from scene_page import TIMEOUT_MS, ScenePage
+from scene_page import FEWER_PICTURES, TIMEOUT_MS, ScenePage
 from waiting import until
 
 from app.jobs.processes import end_processes
@@ -35,9 +35,6 @@ _CHROMIUM = [
     "--disable-gpu-compositing",
     "--webgl-msaa-sample-count=0",
 ]
-_START_SECONDS = 180.0
-_WHOLE_TEST_SECONDS = 900
-"""Starting server and browser belongs to the first test of a file."""
 _PICTURES = "PHYSHANDI_PICTURES"
 """Names the folder of the README's pictures, which are made anew if it is set (`make pictures`)."""
 _SETTLE_MS = 2_000
@@ -46,15 +43,6 @@ _REPORT_VIOLATIONS = (
     "document.addEventListener('securitypolicyviolation', (event) => console.error("
     "'policy violated', event.violatedDirective, event.blockedURI));"
 )
-
-_FEWER_PICTURES = """
-window.requestAnimationFrame = (draw) => setTimeout(() => draw(performance.now()), 200);
-window.cancelAnimationFrame = (number) => clearTimeout(number);
-"""
-"""Five pictures a second in the place of sixty: tests wait for what is in them, not for how many.
-
-Software draws them, which is much of what these tests cost. `physhandi benchmark viewer` measures
-how many a browser gets."""
 
 _HARMLESS = "Tried to update non-existent component"
 """viser's browser says so where a change of a control and its removal arrive for one picture: it
@@ -72,15 +60,11 @@ class Served:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Give tests that drive a browser time; what they wait for has limits of its own.
-
-    No line is counted while the program runs in a process of its own, where none would be found.
-    """
+    """Count no line while the program runs in a process of its own, where none would be found."""
     for item in items:
-        if item.path.parent == Path(__file__).parent:
-            item.add_marker(pytest.mark.timeout(_WHOLE_TEST_SECONDS))
-            if "served" in getattr(item, "fixturenames", ()):
-                item.add_marker(pytest.mark.no_cover)
+        is_served = "served" in getattr(item, "fixturenames", ())
+        if is_served and item.path.parent == Path(__file__).parent:
+            item.add_marker(pytest.mark.no_cover)
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +123,7 @@ def quiet_context(browser: Browser) -> Iterator[BrowserContext]:
     complaints: list[str] = []
     context = browser.new_context(viewport={"width": 1280, "height": 800})
     context.set_default_timeout(TIMEOUT_MS)
-    context.add_init_script(_REPORT_VIOLATIONS + _FEWER_PICTURES)
+    context.add_init_script(_REPORT_VIOLATIONS + FEWER_PICTURES)
     context.on(
         "console",
         lambda m: m.type == "error" and _HARMLESS not in m.text and complaints.append(m.text),

@@ -126,8 +126,8 @@ def test_there_is_an_end_to_files_that_wait(
 
 
 def test_a_process_that_takes_too_long_is_ended(tmp_path: Path, order: FileRequest) -> None:
-    file_cache = FileCache(tmp_path / "cache", seconds=0.05)
-    with pytest.raises(RunError, match=r"took longer than 0.05 s"):
+    file_cache = FileCache(tmp_path / "cache", seconds=0.001)
+    with pytest.raises(RunError, match=r"took longer than 0.001 s"):
         file_cache.make(order)
     assert list((tmp_path / "cache").iterdir()) == []
     file_cache.close()

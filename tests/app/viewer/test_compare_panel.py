@@ -4,6 +4,7 @@ import threading
 
 import numpy as np
 import viser
+from waiting import LIMIT_S
 
 from app.viewer.color.difference import FrameDifference, Way
 from app.viewer.compare.curve import DifferenceCurve
@@ -53,7 +54,7 @@ class MeasuredMeanwhile(DifferenceCurve):
             return FrameDifference(mean=0.04, strong=0.055, largest=0.055)
         self.is_measured = True
         self.was_asked.set()
-        assert self.has_gone_on.wait(10.0)
+        assert self.has_gone_on.wait(LIMIT_S)
         return None
 
 
@@ -70,14 +71,14 @@ def test_what_was_measured_is_not_overwritten_by_what_was_known_before(
     lock.is_awaited = curve.has_gone_on
 
     def measure() -> None:
-        assert curve.was_asked.wait(10.0)
+        assert curve.was_asked.wait(LIMIT_S)
         panel.follow()
         curve.has_gone_on.set()
 
     measuring = threading.Thread(target=measure)
     measuring.start()
     panel.show(3, is_playing=False)
-    measuring.join(10.0)
+    measuring.join(LIMIT_S)
     said = panel._text.content
     assert "mean 40" in said
     assert "measuring" not in said

@@ -140,7 +140,7 @@ def test_closing_a_session_hangs_up(address, sessions) -> None:
         client.until(lambda: client.nodes)
         sessions.close(session)
         with pytest.raises(ConnectionClosed):
-            client.until(lambda: False, seconds=60)
+            client.until(lambda: False)
     assert fetch(f"http://{address}/viewer/{session}/")[0] == 404
 
 

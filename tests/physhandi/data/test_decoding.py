@@ -1,6 +1,7 @@
 import cv2
 import numpy as np
 import pytest
+from waiting import LIMIT_S
 
 from physhandi.data.decoding import MediaDecoder, media_decoder
 from physhandi.errors import ImportFailedError
@@ -54,7 +55,7 @@ def test_frames_of_several_videos_are_given_in_any_order(tmp_path):
 def hostile(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", __file__.rpartition("/tests/")[0] + "/tests")
-        decoder = MediaDecoder(worker="hostile_decoder", longest_s=20.0)
+        decoder = MediaDecoder(worker="hostile_decoder", longest_s=LIMIT_S)
         folder = tmp_path_factory.mktemp("media")
         for name in ("crash", "hang", "greedy", "once", "good"):
             write_png(folder / f"{name}.png")
