@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from viewer_world import FRAMES, PARAMETERS, controls, sheet
 from waiting import LIMIT_S, until
 
-from app.viewer.live.client import LiveRequest, SimulationClient, _to_fields
+from app.viewer.live.client import LiveRequest, SimulationClient, _message
 from app.viewer.live.drive import HandLimits, HandOrder
 from app.viewer.live.wire import Message, receive
 from app.viewer.live.worker import SimulationWorker
@@ -146,7 +146,7 @@ def test_sessions_take_turns(run) -> None:
         worker = SimulationWorker(theirs, "cpu")
         for number, session in enumerate("ab"):  # Both before the process computes a frame.
             about = {"session": session, "request": number, "is_held": False, "arrived": 0.0}
-            worker._handle(Message("simulate", about | _to_fields(ask(run))))
+            worker._handle(_message("simulate", about, ask(run)))
         thread = threading.Thread(target=worker.run)
         thread.start()
         order = ""
