@@ -195,12 +195,21 @@ KEYS: tuple[KeyGroup, ...] = (
                 "none of these twelve keys means anything else then",
             ),
             Key(
+                shown=("X",),
+                about="while steering: let go of the object, or grip what is near the hand; "
+                "a point is held no more",
+            ),
+            Key(
+                shown=("click",),
+                about="while steering: hold a point of the object and move that",
+            ),
+            Key(
                 shown=("space",),
                 about="while steering: begin or end to record what you do",
             ),
             Key(
                 shown=("ctrl", "Z"),
-                about="while steering: back to before the last drag or held key",
+                about="while steering: back to before the last drag, held key or grip",
             ),
         ),
     ),

@@ -67,7 +67,13 @@ from physhandi.fitting.rest_state import resting_clearance
 from physhandi.fitting.rope.fit import fit_rope, start_rope
 from physhandi.fitting.spring_optimisation import optimise_springs
 from physhandi.fitting.state_estimate import observed_state
-from physhandi.fitting.steered_run import contacts_from, record_take, store_hands
+from physhandi.fitting.steered_run import (
+    contacts_from,
+    contacts_in,
+    record_take,
+    store_hands,
+    with_points,
+)
 from physhandi.fitting.stored_edits import EDITS_FILE, read_edits
 from physhandi.fitting.stored_take import StoredTake
 from physhandi.metrics.report import measure_run, score_run
@@ -268,8 +274,9 @@ def _stage_take(
         )
     fitted = FittedObject.of(source, stored.sequence)
     rest_node = artefacts.load_rest_node(source.out)
-    contacts = contacts_from(fitted.contacts, stored.frame)
-    attachment = artefacts.load_attachment(source.out, stored.sequence)
+    kept = contacts_from(fitted.contacts, stored.frame)
+    contacts = contacts_in(take.model) if take.is_regripped else kept
+    attachment = with_points(artefacts.load_attachment(source.out, stored.sequence), take.model)
     artefacts.save_sequence_meta(attempt, sequence)
     artefacts.save_observation(attempt, name, observe_object(sequence, progress))
     artefacts.save_object(attempt, take.parameters, take.model, rest_node)

@@ -43,7 +43,8 @@
       sign.hidden = !state.steering;
       /* The hint of a first visit would lie over the sign. */
       document.body.toggleAttribute("data-steering", Boolean(state.steering));
-      sign.textContent = state.steering ? `Steering ${state.what}: hold W S A D Q E to move it, I K J L U O to turn it, space records, ctrl Z takes back, G returns to playback` : "";
+      const turn = state.turns ? ", I K J L U O to turn it, X lets go and grips" : ", X lets go of it";
+      sign.textContent = state.steering ? `Steering ${state.what}: hold W S A D Q E to move it${turn}, click a point of the object to pull it, space records, ctrl Z takes back, G returns to playback` : "";
       if (state.recording) sign.textContent = `● Recording. ${sign.textContent}`;
       sign.dataset.recording = state.recording ? "yes" : "";
     }
@@ -78,11 +79,12 @@
       if (!state.steering || isTyping(event) || document.querySelector("dialog[open]")) return;
       const isUndo = (event.ctrlKey || event.metaKey) && !event.altKey && !event.shiftKey && event.code === "KeyZ";
       const isRecord = event.code === "Space" && !isCombined(event) && !event.target.closest?.("button, summary, a, [role=tab], [role=option], input");
-      if (!isUndo && !isRecord && (!isHeld || isCombined(event))) return;
+      const isGrip = event.code === "KeyX" && !isCombined(event);
+      if (!isUndo && !isRecord && !isGrip && (!isHeld || isCombined(event))) return;
       event.preventDefault();
       event.stopImmediatePropagation();
       if (event.repeat) return;
-      if (isUndo || isRecord) say({ press: isUndo ? "undo" : "record" });
+      if (isUndo || isRecord || isGrip) say({ press: isUndo ? "undo" : isRecord ? "record" : "grip" });
       else {
         held.add(event.code);
         tell();

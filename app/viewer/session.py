@@ -365,8 +365,8 @@ class Session(SceneServer):
                 self._inspector.show(
                     rollout, frame, rollout_frame, is_playing=is_playing, is_hidden=is_hidden
                 )
-            else:
-                self._inspector.rest()
+            elif self._steer is not None and rollout is not None:
+                self._inspector.rest(rollout, rollout_frame, self._steer.grab)
             if self._object is not None:
                 self._object.show(frame, is_playing=is_playing)
         self._server.flush()  # viser would wait for more, up to 17 ms.

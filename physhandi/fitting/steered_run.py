@@ -9,6 +9,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float, Float32
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
@@ -23,6 +24,7 @@ from physhandi.fitting.stored_take import StoredTake
 from physhandi.hand.motion import HandMotion
 from physhandi.progress import Progress
 from physhandi.simulation.contact_intervals import ContactIntervals, acts_in, always
+from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.steering import SteeredHand, turn_on
 
 
@@ -94,6 +96,49 @@ def contacts_from(contacts: ContactIntervals | None, frame: int) -> ContactInter
     kept = acts_in(contacts.interval, frame + 1)
     part = {field.name: getattr(contacts, field.name)[kept] for field in fields(contacts)}
     return ContactIntervals(**part | {"interval": always(int(kept.sum()))})
+
+
+def contacts_in(model: SpringMassModel) -> ContactIntervals:
+    """Write down what control nodes hold in a model: the pairs that virtual springs join, for good.
+
+    Args:
+        model: Springs of a take in which something was gripped or let go.
+    """
+    virtual = np.arange(model.object_spring_count, len(model.spring_nodes))
+    virtual = virtual[model.stiffness[virtual] > 0.0]
+    ends = np.sort(model.spring_nodes[virtual], axis=1)
+    control, distance = ends[:, 1] - model.node_count, model.rest_length[virtual]
+    order = np.lexsort((distance, control))
+    first = np.searchsorted(control[order], control[order], side="left")
+    rank = np.empty(len(order), np.int32)
+    rank[order] = np.arange(len(order)) - first
+    return ContactIntervals(
+        node=ends[:, 0].astype(np.int32),
+        control=control.astype(np.int32),
+        distance=distance.astype(np.float32),
+        rank=rank,
+        interval=always(len(virtual)),
+    )
+
+
+def with_points(
+    attachment: Float[ndarray, "attached 3"], model: SpringMassModel
+) -> Float32[ndarray, "control 3"]:
+    """Add to where control nodes are attached in frame 0 the points that are held by themselves.
+
+    Args:
+        attachment: Where those of hands are attached [m].
+        model: Springs of the take; the control nodes after those of hands are points.
+    """
+    points = np.arange(len(attachment), model.control_count)
+    contacts = contacts_in(model)
+    above = np.zeros((len(points), 3), np.float32)
+    for row, point in enumerate(points):
+        nearest = np.flatnonzero((contacts.control == point) & (contacts.rank == 0))
+        if len(nearest):
+            above[row] = model.object_node[contacts.node[nearest[0]]]
+            above[row, 2] += contacts.distance[nearest[0]]
+    return np.concatenate([np.asarray(attachment, np.float32), above])
 
 
 def store_hands(source: RunFolder, stored: StoredTake, name: str, attempt: Attempt) -> None:

@@ -1,8 +1,9 @@
 """An object whose hands somebody steers: frame by frame, from any state on, and as takes of it.
 
-A steered hand keeps the shape that it had and moves as a rigid body; what it holds at the start it
-holds throughout. A take is the poses of its hands over the frames beside the state that it begins
-in, so that simulating it again gives the same bits.
+A steered hand keeps the shape that it had and moves as a rigid body; what it holds at the start of
+a take it holds throughout. A hand that lets go or grips anew, and a point of the object that is
+held by itself, begin another take. A take is the poses of its hands over the frames beside the
+state that it begins in, so that simulating it again gives the same bits.
 """
 
 import math
@@ -11,16 +12,22 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from physhandi.simulation.contact_intervals import always
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.restart import NodeState, start_from_tensors, start_to_tensors
 from physhandi.simulation.simulator import Simulator, checked_control
+from physhandi.simulation.stability import stable_substeps
+from physhandi.simulation.topology import MINIMUM_VIRTUAL_REST_LENGTH, virtual_springs
+
+_ARRAYS = {"control", "hand_of_control", "hand_name", "wrist", "pose", "is_regripped"}
+"""Arrays of a stored take besides those of its model and its start."""
 
 
 def turn_on(rotation: Float[ndarray, " 3"], by: Float[ndarray, " 3"]) -> Float[ndarray, " 3"]:
@@ -93,6 +100,9 @@ class Take:
     pose: Float[ndarray, "frame hand 6"] = field(default_factory=lambda: np.zeros((1, 1, 6)))
     """How far each wrist has moved from where it is in `control` [m], and the rotation vector about
     it [rad]."""
+    is_regripped: bool = False
+    """Whether something was gripped or let go since the rollout from which the hands are steered,
+    so that what they hold is written in `model` alone."""
 
     def __post_init__(self) -> None:
         checked_control(self.control[None], self.model.control_count)
@@ -161,6 +171,149 @@ class Take:
         for pose in self.pose[1:]:
             yield steered.step(pose)
 
+    def holds(self, hand: int) -> bool:
+        """Whether a virtual spring joins a hand to the object."""
+        return bool(self._springs_of(hand).any())
+
+    def let_go(self, hand: int, state: NodeState, pose: Float[ndarray, "hand 6"]) -> "Take":
+        """Begin another take, in which a hand holds nothing.
+
+        Args:
+            hand: Number of the hand.
+            state: Where the object is then, and how fast [m, m/s].
+            pose: Poses of the hands then.
+        """
+        return self._rejoined(~self._springs_of(hand), state, pose)
+
+    def grip(self, hand: int, state: NodeState, pose: Float[ndarray, "hand 6"]) -> "Take":
+        """Begin another take, in which a hand holds what is near its control nodes.
+
+        The arguments are those of `let_go`. Nodes are near that are nearer than
+        ``virtual_connection_radius``, at most ``virtual_max_neighbors`` for each control node.
+
+        Returns:
+            The take; in it the hand holds nothing if nothing is near.
+        """
+        own, parameters = self.hands[hand].control, self.parameters
+        control = self.control_at(pose)
+        springs, length = virtual_springs(
+            control[own].astype(np.float64),
+            np.asarray(state[0], np.float64),
+            parameters.virtual_connection_radius,
+            parameters.virtual_max_neighbors,
+        )
+        first = self.model.node_count
+        springs[:, 1] = first + own[springs[:, 1] - first]
+        return self._rejoined(~self._springs_of(hand), state, pose, (springs, length))
+
+    def hold_point(
+        self, node: int, state: NodeState, pose: Float[ndarray, "hand 6"], name: str
+    ) -> "Take":
+        """Begin another take, in which the object is held at one more point, by a hand of its own.
+
+        The hand is one control node a little above the object node, joined to that and to what is
+        near it, as control nodes of real hands are.
+
+        Args:
+            node: Object node.
+            state: Where the object is then, and how fast [m, m/s].
+            pose: Poses of the other hands then.
+            name: What the hand is called.
+
+        Returns:
+            The take; its last hand is the new one, in the pose of zero.
+        """
+        parameters, count = self.parameters, self.model.control_count
+        position = np.asarray(state[0], np.float64)
+        radius = parameters.virtual_connection_radius
+        springs, _ = virtual_springs(
+            position[node][None], position, radius, max(parameters.virtual_max_neighbors, 1)
+        )
+        point = position[node] + [0.0, 0.0, 0.5 * radius]
+        springs[:, 1] += count
+        control = np.concatenate([self.control, point[None].astype(np.float32)])
+        hand = SteeredHand(name=name, control=np.array([count]), wrist=point)
+        more = replace(
+            self,
+            model=replace(self.model, control_count=count + 1),
+            control=control,
+            hands=(*self.hands, hand),
+            pose=np.zeros((1, len(self.hands) + 1, 6)),
+        )
+        length = np.linalg.norm(position[springs[:, 0]] - control[-1], axis=1)
+        every = np.ones(len(self.model.spring_nodes), bool)
+        held = np.concatenate([pose, np.zeros((1, 6))])
+        return more._rejoined(every, state, held, (springs, length))
+
+    def without_point(self, hand: int, state: NodeState, pose: Float[ndarray, "hand 6"]) -> "Take":
+        """Begin another take, in which a point is held no more; the arguments are `let_go`'s."""
+        free = self.let_go(hand, state, pose)
+        gone, model = self.hands[hand].control, free.model
+        kept = np.setdiff1d(np.arange(model.control_count), gone)
+        place = np.zeros(model.node_count + model.control_count, np.int32)
+        place[: model.node_count] = np.arange(model.node_count)
+        place[model.node_count + kept] = model.node_count + np.arange(len(kept))
+        others = [number for number in range(len(self.hands)) if number != hand]
+        return replace(
+            free,
+            model=replace(model, spring_nodes=place[model.spring_nodes], control_count=len(kept)),
+            control=self.control[kept],
+            hands=tuple(
+                replace(its, control=place[model.node_count + its.control] - model.node_count)
+                for its in (self.hands[number] for number in others)
+            ),
+            pose=free.pose[:, others],
+        )
+
+    def _springs_of(self, hand: int) -> Bool[ndarray, " spring"]:
+        """Mark the virtual springs of a hand that act."""
+        model = self.model
+        control = model.spring_nodes.max(axis=1) - model.node_count
+        return np.isin(control, self.hands[hand].control) & (model.stiffness > 0.0)
+
+    def _rejoined(
+        self,
+        kept: Bool[ndarray, " spring"],
+        state: NodeState,
+        pose: Float[ndarray, "hand 6"],
+        joined: tuple[Int[ndarray, "new 2"], Float[ndarray, " new"]] | None = None,
+    ) -> "Take":
+        """Begin another take with other virtual springs, and with more substeps if they need it.
+
+        Args:
+            kept: Springs that stay.
+            state: Where the object is then, and how fast [m, m/s].
+            pose: Poses of the hands then.
+            joined: Nodes and lengths of new virtual springs [m].
+        """
+        model, parameters = self.model, self.parameters
+        ends, length = (np.zeros((0, 2), np.int32), np.zeros(0)) if joined is None else joined
+        floor = max(parameters.virtual_rest_length_floor, MINIMUM_VIRTUAL_REST_LENGTH)
+
+        def spread(old: ndarray, new: ndarray | float) -> ndarray:
+            return np.concatenate([old[kept], np.broadcast_to(new, len(ends)).astype(old.dtype)])
+
+        damping = parameters.damping if parameters.virtual_stiffness > 0.0 else 0.0
+        model = replace(
+            model,
+            spring_nodes=np.concatenate([model.spring_nodes[kept], ends]).astype(np.int32),
+            rest_length=spread(model.rest_length, np.maximum(length, floor)),
+            stiffness=spread(model.stiffness, parameters.virtual_stiffness),
+            damping=spread(model.damping, damping),
+            attached=np.concatenate(
+                [model.attached[kept[model.object_spring_count :]], always(len(ends))]
+            ),
+        )
+        taken = replace(
+            self, model=model, start=state, pose=np.array(pose)[None], is_regripped=True
+        )
+        if len(ends):
+            moved = replace(model, object_node=np.asarray(state[0], np.float32))
+            needed = stable_substeps(moved, parameters, taken.control_at(pose))
+            if needed > parameters.substeps_per_frame:
+                taken = replace(taken, parameters=parameters.replace(substeps_per_frame=needed))
+        return taken
+
     def part(self, first: int, last: int, state: NodeState) -> "Take":
         """Keep some frames.
 
@@ -212,6 +365,7 @@ class Take:
             "hand_name": np.frombuffer(names, np.uint8),
             "wrist": np.stack([np.asarray(hand.wrist, np.float64) for hand in self.hands]),
             "pose": np.asarray(self.pose, np.float64),
+            "is_regripped": np.array([self.is_regripped], np.uint8),
         }
 
     @classmethod
@@ -224,10 +378,10 @@ class Take:
             ValueError: If an array is missing, unknown or inconsistent.
         """
         model, start, rest = (_named(tensors, prefix) for prefix in ("model_", "start_", ""))
-        if set(rest) != {"control", "hand_of_control", "hand_name", "wrist", "pose"}:
+        if set(rest) != _ARRAYS:
             raise ValueError(
-                "A take needs the arrays control, hand_of_control, hand_name, wrist, pose, a start "
-                f"and a model; got {', '.join(sorted(tensors))}."
+                f"A take needs the arrays {', '.join(sorted(_ARRAYS))}, a start and a model; "
+                f"got {', '.join(sorted(tensors))}."
             )
         springs = SpringMassModel.from_tensors(model)
         names = bytes(np.asarray(rest["hand_name"], np.uint8)).decode().split("\n")
@@ -246,6 +400,7 @@ class Take:
             control=np.asarray(rest["control"], np.float32),
             hands=hands,
             pose=np.asarray(rest["pose"], np.float64),
+            is_regripped=bool(np.any(rest["is_regripped"])),
         )
 
 

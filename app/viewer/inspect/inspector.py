@@ -1,5 +1,6 @@
 """Reads what was clicked: its values now, one of them over all frames, and a mark in the scene."""
 
+import dataclasses
 import html
 import threading
 import time
@@ -71,7 +72,8 @@ class Inspector:
         self._readings: Readings | None = None
         self._framing: Framing | None = None
         self._pick: Pick | None = None
-        self._shown: tuple[ObjectRollout | None, int, int] | None = (None, 0, 0)
+        self._shown: tuple[ObjectRollout | None, int, int] = (None, 0, 0)
+        self._grab: Callable[[Pick, ObjectRollout], None] | None = None
         self._measured: tuple[Any, ...] | None = None
         self._curve: Float[ndarray, " frame"] = np.zeros(0)
         self._refreshed = 0.0
@@ -115,12 +117,23 @@ class Inspector:
             self._kind.visible = self._clear.visible = False
             self._remove_plot()
 
-    def rest(self) -> None:
-        """Read nothing until the clock shows a frame again, because hands are being steered."""
+    def rest(
+        self,
+        rollout: ObjectRollout,
+        rollout_frame: int,
+        grab: Callable[[Pick, ObjectRollout], None],
+    ) -> None:
+        """Read nothing until the clock shows a frame again, because hands are being steered.
+
+        Args:
+            rollout: The object that is drawn.
+            rollout_frame: Which of its frames.
+            grab: Called with a part of it that is clicked, in the place of reading that.
+        """
         with self._lock:
             if self._pick is not None:
                 self.clear()
-            self._shown = None
+            self._shown, self._grab = (rollout, 0, rollout_frame), grab
 
     def look_at(self, found: Pick | None) -> None:
         """Read a thing, or nothing."""
@@ -159,7 +172,7 @@ class Inspector:
             is_hidden: Whether something else is shown instead of the scene.
         """
         with self._lock:
-            self._shown = (rollout, frame, rollout_frame)
+            self._shown, self._grab = (rollout, frame, rollout_frame), None
             chosen, readings = self._pick, self._readings
             if chosen is None or readings is None:
                 return
@@ -179,9 +192,12 @@ class Inspector:
     def _click(self, event: viser.SceneClickEvent, *, prefers_hand: bool) -> None:
         with self._lock:
             content, scene, framing = self._content, self._scene, self._framing
-            if content is None or scene is None or framing is None or self._shown is None:
+            if content is None or scene is None or framing is None:
                 return
             rollout, frame, rollout_frame = self._shown
+            grab = self._grab
+            if grab is not None:
+                content = dataclasses.replace(content, hands=())  # They are not where they were.
             camera = event.client.camera
             ray = Ray(
                 origin=np.asarray(event.ray_origin, dtype=np.float64),
@@ -197,7 +213,9 @@ class Inspector:
                 spacing=framing.spacing,
             )
             found = pick(ray, target, prefers_hand=prefers_hand)
-        if found is not None:
+        if found is not None and grab is not None and rollout is not None:
+            grab(found, rollout)
+        elif found is not None:
             self.look_at(found)
             self._open_tab()
 

@@ -24,7 +24,7 @@ HeldKey = Literal[
     "KeyW", "KeyS", "KeyA", "KeyD", "KeyE", "KeyQ", "KeyI", "KeyK", "KeyJ", "KeyL", "KeyU", "KeyO"
 ]
 """Places of keys on a keyboard, by their names in browsers."""
-Press = Literal["undo", "record"]
+Press = Literal["undo", "record", "grip"]
 """What a key does once when it goes down."""
 
 _MOVES: dict[str, tuple[int, int]] = {

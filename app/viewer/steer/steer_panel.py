@@ -6,6 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -16,10 +17,12 @@ from numpy import ndarray
 from app.viewer.clock.playback import Playback
 from app.viewer.content.content import Content
 from app.viewer.content.session_state import Pose
+from app.viewer.inspect.picking import Pick
 from app.viewer.live.client import STARTING, SimulationClient
 from app.viewer.live.drive import HandOrder
 from app.viewer.physics.keep_panel import SavedRun, saved_html, write_small
 from app.viewer.scene.framing import Framing
+from app.viewer.scene.nodes import SceneNodes
 from app.viewer.steer.key_channel import KeyChannel, Press, velocity_of, view_axes
 from app.viewer.steer.steered import SteeredFrame, SteeredObject, begin_take
 from app.viewer.ui.guard import Guard, notify
@@ -27,6 +30,7 @@ from app.viewer.ui.keyboard import bind
 from app.viewer.ui.tabs import Tabs
 from physhandi.errors import PhysHandiError, UsageError
 from physhandi.object_rollout import ObjectRollout
+from physhandi.simulation.restart import NodeState
 from physhandi.simulation.steering import SteeredHand, Take, from_quaternion, to_quaternion
 
 GIZMO = "/steer/wrist"
@@ -34,10 +38,14 @@ GIZMO = "/steer/wrist"
 _START, _STOP = "Steer (G)", "Back to playback (G)"
 _RECORD, _END_RECORDING = "Record (space)", "End recording (space)"
 _PLAY, _DISCARD = "Play", "Discard"
+_LET_GO, _GRIP = "Let go (X)", "Grip (X)"
+_POINT_COLOR = (233, 30, 180)
 _RED = (166, 30, 30)
 """Color of what records; white on it can be read (contrast of 7)."""
 _GIZMO_SIZE = 0.22
 """Length of the gizmo's axes, as a part of the scene's extent."""
+_POINT_SIZE = 0.02
+"""Size of a point that is held, likewise."""
 _SPEED = 0.25
 """Speed of a wrist at first, in extents of the scene a second."""
 _TURN_SPEED = 90.0
@@ -50,7 +58,8 @@ _HOW = (
     "The object is simulated on from the frame that is shown while you move the hand: by the "
     "arrows and rings on its wrist, or by keys that you hold. <b>W S A D Q E</b> move it as you "
     "see it, "
-    "<b>I K J L U O</b> turn it. Ctrl Z goes back to before the last drag or key."
+    "<b>I K J L U O</b> turn it. <b>X</b> lets go of the object, and grips what is near. Click a "
+    "point of the object to hold it there and pull. Ctrl Z takes back."
 )
 
 
@@ -142,6 +151,8 @@ class SteerPanel:
         self._vertices: dict[str, ndarray] = {}
         self._held: frozenset[str] = frozenset()
         self._gizmo: viser.TransformControlsHandle | None = None
+        self._take: Take | None = None
+        self._nodes = SceneNodes(server)
         self._is_dragged = False
         self._refused = ""
         self._arrivals: deque[float] = deque(maxlen=200)
@@ -158,9 +169,13 @@ class SteerPanel:
         with self._folder:
             self._button = gui.add_button(_START, hint="G")
             self._status = gui.add_html("")
-            names = tuple(hand.side for hand in content.hands)
             self._choice: Any = gui.add_dropdown(
-                "Hand", names or ("controls",), visible=len(names) > 1, hint="Which one is moved"
+                "Move", ("controls",), visible=False, hint="Hand, or point of the object"
+            )
+            self._grip_button = gui.add_button(
+                _LET_GO,
+                visible=False,
+                hint="A hand holds nothing then, or what is near it; a point is held no more",
             )
             speed = _rounded(_SPEED * self._extent)
             self._speed: Any = gui.add_slider(
@@ -179,7 +194,8 @@ class SteerPanel:
             )
         self._button.on_click(guard(lambda _: self.toggle()))
         self._record.on_click(guard(lambda _: self._toggle_recording()))
-        self._choice.on_update(guard.by_user(lambda _: self._choose(names)))
+        self._grip_button.on_click(guard(lambda _: self._toggle_grip()))
+        self._choice.on_update(guard.by_user(lambda _: self._choose(self._choice.value)))
 
     @property
     def is_on(self) -> bool:
@@ -203,10 +219,9 @@ class SteerPanel:
             self._end_recording(steered)
             steered.close()
             self._held = frozenset()
-            if self._gizmo is not None:
-                self._gizmo.remove()
-                self._gizmo = None
-            self._is_dragged = False
+            self._remove_gizmo()
+            self._nodes.clear()
+            self._take = None
             self._tell()
             self._write(at_once=True)
         if self._was_playing:
@@ -229,14 +244,15 @@ class SteerPanel:
             if self._held:
                 self._drive(steered)  # The camera may have turned.
             rollout, frame, newest = steered.shown()
-            self._follow(steered, newest.pose[self._hand])
+            self._offer(newest.take)
+            self._follow(newest)
             if steered.is_full:
                 self._end_recording(steered)
                 self._tell()
             self._write()
             vertices = {
                 hand.name: hand.moved(self._vertices[hand.name], pose)
-                for hand, pose in zip(steered.take.hands, newest.pose, strict=True)
+                for hand, pose in zip(newest.take.hands, newest.pose, strict=True)
                 if hand.name in self._vertices
             }
         return rollout, frame, vertices
@@ -272,7 +288,6 @@ class SteerPanel:
     def _begin(self, take: Take, vertices: Mapping[str, Float[ndarray, "vertex 3"]]) -> None:
         """Simulate on from the state of a take; called under the lock."""
         self._vertices = dict(vertices)
-        self._hand = min(self._hand, len(take.hands) - 1)
         self._object = SteeredObject(
             self._mailbox,
             self._live,
@@ -281,7 +296,7 @@ class SteerPanel:
             on_change=self._hear,
         )
         self._arrivals.clear()
-        self._add_gizmo(take.hands[self._hand])
+        self._offer(take)
         self._tabs.open("Steer")
         self._tell()
         self._write(at_once=True)
@@ -309,7 +324,7 @@ class SteerPanel:
             return
         first = frames[0]
         take = replace(
-            steered.take,
+            first.take,
             start=(first.position, first.velocity),
             pose=np.stack([frame.pose for frame in frames]),
         )
@@ -339,8 +354,8 @@ class SteerPanel:
             recorded = self._recorded
             if recorded is None:
                 return
-            if self._object is not None and self._object.take.control is not take.control:
-                self.leave()  # It was recorded from another frame on.
+            if self._object is not None and self._object.take.model is not take.model:
+                self.leave()  # It was recorded from another frame on, or with other grips.
             if self._object is None:
                 self._playback.play(on=False)
                 self._playback.seek(recorded.frame)
@@ -351,10 +366,98 @@ class SteerPanel:
                 self._object.replay(take)
             self._tell()
 
-    def _add_gizmo(self, hand: SteeredHand) -> None:
+    def grab(self, found: Pick, rollout: ObjectRollout) -> None:
+        """Hold a point of the object, and move that from now on.
+
+        Args:
+            found: What was clicked; what is no node or spring of the object is left alone.
+            rollout: The object that was seen.
+        """
+        if found.kind not in {"node", "spring"}:
+            return
+        ends = rollout.model.spring_nodes
+        node = found.index if found.kind == "node" else int(ends[found.index].min())
+        with self._lock:
+            steered = self._object
+            if steered is None or steered.is_replaying:
+                return
+            self._end_recording(steered)
+            take = steered.regrip(
+                lambda take, state, pose: take.hold_point(node, state, pose, _unused_name(take))
+            )
+            self._offer(take)
+            self._select(len(take.hands) - 1)
+
+    def _toggle_grip(self) -> None:
+        """Let the chosen hand go, or grip what is near; a point is held no more."""
+        with self._lock:
+            steered = self._object
+            if steered is None or steered.is_replaying:
+                return
+            hand, is_point = self._hand, self._is_point(steered.take, self._hand)
+
+            def change(take: Take, state: NodeState, pose: Float[ndarray, "hand 6"]) -> Take:
+                if is_point:
+                    return take.without_point(hand, state, pose)
+                if take.holds(hand):
+                    return take.let_go(hand, state, pose)
+                gripping = take.grip(hand, state, pose)
+                if not gripping.holds(hand):
+                    raise UsageError("Nothing of the object is near the hand. Move it nearer.")
+                return gripping
+
+            self._end_recording(steered)
+            try:
+                self._offer(steered.regrip(change))
+            except UsageError as error:
+                notify(self._server, "Nothing to grip", str(error), seconds=4.0)
+            if is_point:
+                self._select(0)
+            self._write(at_once=True)
+
+    def _is_point(self, take: Take, hand: int) -> bool:
+        """Whether a hand is a point of the object that is held by itself."""
+        return hand >= max(len(self._content.hands), 1) and hand < len(take.hands)
+
+    def _offer(self, take: Take) -> None:
+        """Let the hands of a take be chosen, if they are others than before."""
+        if self._take is take:
+            return
+        before, self._take = self._take, take
+        names = tuple(hand.name for hand in take.hands)
+        if before is None or names != tuple(hand.name for hand in before.hands):
+            self._choice.options = names
+            self._choice.visible = len(names) > 1
+            self._select(min(self._hand, len(names) - 1))
+
+    def _select(self, hand: int) -> None:
+        """Move another hand from now on; the others stay where they are."""
+        steered, take = self._object, self._take
+        if steered is None or take is None:
+            return
+        self._hand = hand
+        for other in range(len(take.hands)):
+            if other != hand:
+                steered.order(other, HandOrder())
+        self._remove_gizmo()
+        self._add_gizmo(take.hands[hand], turns=not self._is_point(take, hand))
+        name = take.hands[hand].name
+        if self._choice.value != name:
+            self._choice.value = name
+        self._tell()
+        self._write(at_once=True)
+        self._playback.redraw()
+
+    def _remove_gizmo(self) -> None:
+        if self._gizmo is not None:
+            self._gizmo.remove()
+        self._gizmo, self._is_dragged = None, False
+
+    def _add_gizmo(self, hand: SteeredHand, *, turns: bool) -> None:
         gizmo = self._gizmo = self._server.scene.add_transform_controls(
             GIZMO,
             scale=_GIZMO_SIZE * self._extent,
+            disable_rotations=not turns,
             depth_test=False,
             position=hand.wrist,
         )
@@ -377,7 +480,10 @@ class SteerPanel:
                 return
             if event.phase == "end":
                 self._is_dragged = False
-            hand = steered.take.hands[self._hand]
+            hands = steered.take.hands
+            if self._hand >= len(hands):
+                return
+            hand = hands[self._hand]
             try:
                 goal = _goal(hand, event.target.position, event.target.wxyz)
                 steered.order(self._hand, HandOrder(goal=goal))
@@ -386,31 +492,38 @@ class SteerPanel:
                     self._refused = str(error)
                     notify(event.client, "Not possible", self._refused)
 
-    def _follow(self, steered: SteeredObject, pose: Float[ndarray, " 6"]) -> None:
-        """Put the gizmo where the hand is, unless it is being dragged."""
+    def _follow(self, frame: SteeredFrame) -> None:
+        """Put the gizmo where the hand is, unless it is being dragged, and draw held points."""
+        hands = frame.take.hands
+        points = [
+            hand.wrist + pose[:3]
+            for number, (hand, pose) in enumerate(zip(hands, frame.pose, strict=True))
+            if self._is_point(frame.take, number)
+        ]
+        self._nodes.points(
+            "/steer/points",
+            np.reshape(points, (-1, 3)),
+            _POINT_COLOR,
+            _POINT_SIZE * self._extent,
+            is_visible=True,
+        )
         gizmo = self._gizmo
         if gizmo is None or self._is_dragged:
             return
-        position = steered.take.hands[self._hand].wrist + pose[:3]
+        pose = frame.pose[self._hand]
+        position = hands[self._hand].wrist + pose[:3]
         wxyz = to_quaternion(pose[3:])
         if not np.allclose(gizmo.position, position, atol=1e-6 * self._extent):
             gizmo.position = position
         if not np.allclose(gizmo.wxyz, wxyz, atol=1e-6):
             gizmo.wxyz = wxyz
 
-    def _choose(self, names: tuple[str, ...]) -> None:
+    def _choose(self, name: str) -> None:
         """Move another hand; the one before stays where it is."""
         with self._lock:
-            steered, self._hand = self._object, names.index(self._choice.value)
-            if steered is None:
-                return
-            for hand in range(len(steered.take.hands)):
-                if hand != self._hand:
-                    steered.order(hand, HandOrder())
-            self._is_dragged = False
-            self._tell()
-            self._write(at_once=True)
-        self._playback.redraw()
+            names = [] if self._take is None else [hand.name for hand in self._take.hands]
+            if name in names:
+                self._select(names.index(name))
 
     def _hold(self, held: frozenset[str]) -> None:
         """Move the hand while keys are held."""
@@ -440,6 +553,8 @@ class SteerPanel:
         steered = self._object
         if press == "record":
             self._toggle_recording()
+        elif press == "grip":
+            self._toggle_grip()
         elif press == "undo" and steered is not None and not steered.undo():
             notify(self._server, "Nothing to take back", "The hand has not been moved.", seconds=3)
 
@@ -455,11 +570,13 @@ class SteerPanel:
 
     def _tell(self) -> None:
         """Tell the page whether keys steer."""
-        names = ["the controls"] if not self._content.hands else []
-        names = names or [f"the {hand.side} hand" for hand in self._content.hands]
         state: dict[str, Any] = {"steering": self.is_on}
-        if self.is_on:
-            state["what"] = names[self._hand]
+        if self.is_on and self._take is not None:
+            name = self._take.hands[self._hand].name
+            hand = " hand" if self._content.hands else ""
+            is_point = self._is_point(self._take, self._hand)
+            state["what"] = name if is_point else f"the {name}{hand}"
+            state["turns"] = not is_point
             state["recording"] = self._object is not None and self._object.is_recording
         self._channel.tell(state)
 
@@ -470,14 +587,7 @@ class SteerPanel:
             return
         self._written = now
         steered = self._object
-        label = _START if steered is None else _STOP
-        if self._button.label != label:
-            self._button.label = label
-        if self._record.visible != (steered is not None):
-            self._record.visible = steered is not None
-        record = _RECORD if steered is None or not steered.is_recording else _END_RECORDING
-        if self._record.label != record:
-            self._record.label = record
+        self._show_buttons(steered)
         text = _HOW
         if steered is not None:
             recent = sum(now - at < _COUNTED for at in tuple(self._arrivals))
@@ -493,6 +603,21 @@ class SteerPanel:
                 seconds = (len(steered.recorded) - 1) / steered.take.parameters.frame_rate
                 text += f"<br>● Recording, {seconds:.1f} s"
         self._status.content = f"<div style='{_STYLE}' data-steering>{text}</div>"
+
+    def _show_buttons(self, steered: SteeredObject | None) -> None:
+        """Say on the buttons what they would do now; those that do nothing are hidden."""
+        is_on, take = steered is not None, self._take
+        holds = take is not None and take.holds(self._hand)
+        is_recording = steered is not None and steered.is_recording
+        for button, is_visible, label in (
+            (self._button, True, _STOP if is_on else _START),
+            (self._grip_button, is_on, _LET_GO if holds else _GRIP),
+            (self._record, is_on, _END_RECORDING if is_recording else _RECORD),
+        ):
+            if button.visible != is_visible:
+                button.visible = is_visible
+            if button.label != label:
+                button.label = label
 
 
 class TakeFolder:
@@ -573,6 +698,12 @@ class TakeFolder:
 
     def _report(self, run: SavedRun) -> None:
         write_small(self._progress, saved_html(run))
+
+
+def _unused_name(take: Take) -> str:
+    """Name a new point."""
+    names = {hand.name for hand in take.hands}
+    return next(name for number in count(1) if (name := f"point {number}") not in names)
 
 
 def _goal(

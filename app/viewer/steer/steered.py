@@ -15,6 +15,7 @@ from app.viewer.live.drive import HandLimits, HandOrder
 from app.viewer.live.wire import Message
 from physhandi.errors import UsageError
 from physhandi.object_rollout import ObjectRollout
+from physhandi.simulation.restart import NodeState
 from physhandi.simulation.steering import SteeredHand, Take, nearest_surface
 
 TOP_SPEED = 3.0
@@ -33,6 +34,8 @@ _MOST_BYTES = 256 << 20
 class SteeredFrame:
     """One simulated frame."""
 
+    take: Take
+    """The hands, and what they hold."""
     position: Float32[ndarray, "node 3"]
     """Object nodes [m]."""
     velocity: Float32[ndarray, "node 3"]
@@ -116,7 +119,6 @@ class SteeredObject:
             extent: Size of the scene, which bounds how fast and how far a wrist moves [m].
             on_change: Called with the kind of each message of the process, and why it ended.
         """
-        self.take = take
         self._mailbox = mailbox
         self._live = live
         self._limits = HandLimits(top_speed=TOP_SPEED * extent, reach=FARTHEST_REACH * extent)
@@ -124,24 +126,17 @@ class SteeredObject:
         self._lock = threading.Lock()
         self._number = 0
         self._orders = [HandOrder() for _ in take.hands]
-        start = SteeredFrame(*take.start, take.pose[0])
+        start = SteeredFrame(take, *take.start, take.pose[0])
         self._before = self._newest = start
         self._durations: deque[float] = deque(maxlen=30)
         self._undone: deque[SteeredFrame] = deque(maxlen=MOST_UNDONE)
         self._recorded: list[SteeredFrame] = []
         self._is_recording = self._is_replaying = False
+        self._replayed = take
         rate, size = take.parameters.frame_rate, 24 * max(take.model.node_count, 1)
         self.most_frames = max(2, min(int(LONGEST_TAKE * rate), _MOST_BYTES // size))
         """Frames of the longest take; then recording ends by itself."""
-        control = np.repeat(take.control_at(take.pose[0])[None], 2, axis=0)
-        self._rollout = ObjectRollout(
-            model=take.model,
-            parameters=take.parameters,
-            control=control,
-            position=np.repeat(start.position[None], 2, axis=0),
-            velocity=np.repeat(start.velocity[None], 2, axis=0),
-            ready=2,
-        )
+        self._rollout = _of_two_frames(start)
         live.subscribe(mailbox, self._receive)
         self._simulate(start)
 
@@ -156,6 +151,11 @@ class SteeredObject:
         """Time that a frame of late has taken to simulate, the median [s]; NaN before the first."""
         with self._lock:
             return float(np.median(self._durations)) if self._durations else float("nan")
+
+    @property
+    def take(self) -> Take:
+        """The hands now, and what they hold."""
+        return self.newest.take
 
     def close(self) -> None:
         """Stop simulating."""
@@ -176,7 +176,7 @@ class SteeredObject:
         if order.goal is not None and float(np.linalg.norm(order.goal[:3])) > reach:
             raise UsageError(f"The hand can go {reach:.3g} from where it was, and no farther.")
         with self._lock:
-            if order == self._orders[hand]:
+            if hand >= len(self._orders) or order == self._orders[hand]:
                 return
             self._orders[hand] = order
             self._live.drive(self._mailbox, self._orders)
@@ -185,6 +185,28 @@ class SteeredObject:
         """Remember the state to which `undo` returns."""
         with self._lock:
             self._undone.append(self._newest)
+
+    def regrip(self, change: Callable[[Take, NodeState, Float[ndarray, "hand 6"]], Take]) -> Take:
+        """Change what the hands hold; what was recorded is not recorded any more.
+
+        Args:
+            change: Gives the take that begins then, of the one before, the state of the object and
+                the poses of the hands, as `Take.grip` does.
+
+        Returns:
+            The take that has begun.
+        """
+        with self._lock:
+            before = self._newest
+            take = change(before.take, (before.position, before.velocity), before.pose)
+            self._undone.append(before)
+            orders = {
+                hand.name: order
+                for hand, order in zip(before.take.hands, self._orders, strict=True)
+            }
+            self._orders = [orders.get(hand.name, HandOrder()) for hand in take.hands]
+            self._go_on(SteeredFrame(take, before.position, before.velocity, take.pose[0]))
+            return take
 
     @property
     def is_recording(self) -> bool:
@@ -227,8 +249,9 @@ class SteeredObject:
         """
         with self._lock:
             self._undone.append(self._newest)
-            self._orders = [HandOrder() for _ in self._orders]
+            self._orders = [HandOrder() for _ in take.hands]
             self._is_recording, self._is_replaying = False, True
+            self._replayed = take
             self._number = self._live.steer(self._mailbox, take, self._limits, replays=True)
 
     def undo(self) -> bool:
@@ -239,22 +262,31 @@ class SteeredObject:
         with self._lock:
             if not self._undone:
                 return False
-            state = self._undone.pop()
-            self._orders = [HandOrder() for _ in self._orders]
-            self._before = self._newest = state
-            if self._is_recording:
-                places = [frame is state for frame in self._recorded]
-                kept = places.index(True) + 1 if True in places else 0
-                self._recorded = self._recorded[:kept] or [state]
-            # Of the gesture, no frame may come after this.
-            self._simulate(state)
+            state, was_recording = self._undone.pop(), self._is_recording
+            places = [frame is state for frame in self._recorded]
+            kept = places.index(True) + 1 if True in places else 0
+            kept_frames = self._recorded[:kept] or [state]
+            self._orders = [HandOrder() for _ in state.take.hands]
+            self._go_on(state)
+            if was_recording:
+                self._is_recording, self._recorded = True, kept_frames
         return True
+
+    def _go_on(self, start: SteeredFrame) -> None:
+        """Let no frame of before come any more; called under the lock."""
+        self._before = self._newest = start
+        self._is_recording, self._recorded = False, []
+        self._simulate(start)
 
     def shown(self) -> tuple[ObjectRollout, int, SteeredFrame]:
         """Give what to draw: a rollout, its frame, and that frame; called by one thread."""
         with self._lock:
             before, newest = self._before, self._newest
-        rollout, take = self._rollout, self.take
+        rollout, take = self._rollout, newest.take
+        if before.take.model is not take.model:
+            before = newest
+        if rollout.model is not take.model:
+            rollout = self._rollout = _of_two_frames(newest)
         for place, frame in enumerate((before, newest)):
             rollout.position[place] = frame.position
             if rollout.velocity is not None:
@@ -265,7 +297,7 @@ class SteeredObject:
     def _simulate(self, start: SteeredFrame) -> None:
         """Go on from a state."""
         state = start.position, start.velocity
-        begun = replace(self.take, start=state, pose=start.pose[None])
+        begun = replace(start.take, start=state, pose=start.pose[None])
         self._is_replaying = False
         self._number = self._live.steer(self._mailbox, begun, self._limits)
         self._live.drive(self._mailbox, self._orders)
@@ -283,8 +315,9 @@ class SteeredObject:
                 # The first one is the state that it goes on from, which is known unless it is that
                 # of a take.
                 if message["frame"] > 0 or self._is_replaying:
+                    take = self._replayed if self._is_replaying else self._newest.take
                     self._newest = SteeredFrame(
-                        arrays["position"], arrays["velocity"], arrays["pose"]
+                        take, arrays["position"], arrays["velocity"], arrays["pose"]
                     )
                 if message["frame"] > 0:
                     self._durations.append(float(message["duration"]))
@@ -301,3 +334,15 @@ class SteeredObject:
         if self._is_recording:
             self._recorded.append(frame)
             self._is_recording = len(self._recorded) < self.most_frames
+
+
+def _of_two_frames(frame: SteeredFrame) -> ObjectRollout:
+    """Make a rollout of a frame and the one before it, which is the same at first."""
+    return ObjectRollout(
+        model=frame.take.model,
+        parameters=frame.take.parameters,
+        control=np.repeat(frame.take.control_at(frame.pose)[None], 2, axis=0),
+        position=np.repeat(frame.position[None], 2, axis=0),
+        velocity=np.repeat(frame.velocity[None], 2, axis=0),
+        ready=2,
+    )

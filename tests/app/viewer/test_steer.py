@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -82,7 +83,7 @@ def test_a_held_key_moves_hand_gizmo_and_object_until_it_is_let_go(scene, run) -
     control = run.array("sequences/lift/control.npy")[AT]
     start = steer(client)
     np.testing.assert_allclose(start, control.mean(axis=0), atol=1e-6)
-    says = {"steering": True, "what": "the controls", "recording": False}
+    says = {"steering": True, "what": "the controls", "turns": True, "recording": False}
     assert json.loads(told[-1]) == says
     first = nodes(client)
     hold(session, "KeyD")  # To the right of somebody who looks along y.
@@ -221,6 +222,57 @@ def test_a_recording_is_kept_as_a_run_and_a_recording(
     client.set("Save as run and recording", True)
     wait(client, lambda: any("There is a recording 'Up_round'" in str(m) for m in client.messages))
     assert len(begun) == 1
+
+
+def test_a_point_that_is_clicked_is_held_and_pulled_until_it_is_let_go(scene) -> None:
+    session, client = scene
+    start = steer(client)
+    object_ = session._steer._object
+    # Nothing of the sheet is above it.
+    corner = int(np.argmax(object_.newest.position[:, :2].sum(axis=1)))
+    place = object_.newest.position[corner]
+    session._inspector._click(looking_down_at(place), prefers_hand=False)
+    wait(client, lambda: client.value("Move") == "point 1")
+    wait(client, lambda: np.linalg.norm(client.positions[GIZMO] - place) < 0.02)
+    assert {hand.name for hand in object_.take.hands} == {"controls", "point 1"}
+    hold(session, "KeyE")
+    wait(client, lambda: object_.newest.position[corner, 2] > place[2] + 0.03)
+    hold(session)
+    np.testing.assert_array_equal(object_.newest.pose[0], 0.0)
+    press(session, "grip")
+    wait(client, lambda: np.allclose(client.positions[GIZMO], start, atol=1e-6))
+    wait(client, lambda: object_.newest.position[corner, 2] < place[2] + 0.02)
+    assert [hand.name for hand in object_.take.hands] == ["controls"]
+    for count in (2, 2, 1):  # Before it was let go, pulled, and held.
+        press(session, "undo")
+        wait(client, lambda count=count: len(object_.take.hands) == count)
+
+
+def looking_down_at(place: np.ndarray) -> SimpleNamespace:
+    """A click of somebody above a point."""
+    return SimpleNamespace(
+        client=SimpleNamespace(camera=SimpleNamespace(fov=0.8, image_height=800)),
+        ray_origin=(*place[:2], 2.0),
+        ray_direction=(0.0, 0.0, -1.0),
+    )
+
+
+def test_a_hand_lets_go_and_grips_what_is_near_it(scene) -> None:
+    session, client = scene
+    steer(client)
+    object_ = session._steer._object
+    height = object_.newest.position[:, 2].max()
+    press(session, "record")
+    wait(client, lambda: len(object_.recorded) > 2)
+    press(session, "grip")
+    wait(client, lambda: client.find("Grip (X)"))
+    wait(client, lambda: client.find("Keep"))  # What was recorded before it let go.
+    wait(client, lambda: object_.newest.position[:, 2].max() < height - 0.03)
+    told = len(client.messages)
+    press(session, "grip")
+    wait(client, lambda: any("Nothing to grip" in str(m) for m in client.messages[told:]))
+    press(session, "undo")
+    wait(client, lambda: object_.take.holds(0) and client.find("Let go (X)"))
 
 
 def test_the_clock_and_a_user_who_leaves_end_it(scene) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from app.settings import BUNDLED
 from physhandi.data.layout import SequenceFiles
-from physhandi.errors import RunError
+from physhandi.errors import RunError, UsageError
 from physhandi.fitted_object import FittedObject
 from physhandi.fitting.steered_run import contacts_from
 from physhandi.fitting.stored_take import TAKE_FILE, StoredTake
@@ -23,10 +23,8 @@ AT, FRAMES = 20, 4
 TOWEL = BUNDLED / "runs" / "towel_fold_quick"
 
 
-@pytest.fixture(scope="module")
-def steered(tmp_path_factory) -> Run:
+def taken() -> Take:
     """The bundled towel, whose hand goes up and turns by 0.6 rad in three frames."""
-    folder = tmp_path_factory.mktemp("steered")
     rollout = FittedObject.of(TOWEL).fitted
     model, start = rollout.going_on(AT)
     control = np.array(rollout.control[AT], np.float32)
@@ -35,7 +33,7 @@ def steered(tmp_path_factory) -> Run:
         name="right", control=np.arange(len(control)), wrist=joints[AT, 0].astype(np.float64)
     )
     pose = np.linspace(0, 1, FRAMES)[:, None, None] * [[0.0, 0.0, 0.02, 0.6, 0.0, 0.0]]
-    take = Take(
+    return Take(
         model=model,
         start=start,
         parameters=rollout.parameters,
@@ -43,6 +41,10 @@ def steered(tmp_path_factory) -> Run:
         hands=(hand,),
         pose=pose,
     )
+
+
+def run_of(take: Take, folder: Path) -> Run:
+    """Run what was steered as a user's worker does."""
     stored = StoredTake(take=take, sequence="towel_fold", frame=AT)
     run = Run.create(
         folder / "runs" / "steered",
@@ -54,6 +56,11 @@ def steered(tmp_path_factory) -> Run:
     stored.save(run.folder)
     run_job(run)
     return Run.open(run.folder)
+
+
+@pytest.fixture(scope="module")
+def steered(tmp_path_factory) -> Run:
+    return run_of(taken(), tmp_path_factory.mktemp("steered"))
 
 
 def test_the_hand_is_stored_as_it_was_steered(steered: Run) -> None:
@@ -127,3 +134,28 @@ def test_contacts_that_hold_at_the_start_hold_for_good() -> None:
     nothing = contacts_from(replace(contacts, interval=contacts.interval + 50), 5)
     assert nothing is not None
     assert len(nothing.node) == 0
+
+
+def test_what_was_gripped_by_hand_is_stored_and_built_again(tmp_path: Path) -> None:
+    take = taken()
+    node = int(np.argmin(take.start[0][:, 0]))
+    held = take.hold_point(node, take.start, take.pose[0], "point 1")
+    free = held.let_go(0, take.start, held.pose[0])
+    pose = np.zeros((FRAMES, 2, 6))
+    pose[:, 1, 2] = np.linspace(0, 0.02, FRAMES)
+    run = run_of(replace(free, pose=pose), tmp_path)
+    object_ = FittedObject.of(run)
+    rollout = run.array(SequenceFiles("up").rollout)
+    np.testing.assert_array_equal(object_.simulate().position, rollout)
+    assert rollout[-1, node, 2] > rollout[0, node, 2] + 0.01
+    # With a smaller radius springs are built anew: those of the point, none of the hand.
+    radius = take.parameters.virtual_connection_radius
+    built = object_.changed({"virtual_connection_radius": 0.8 * radius}).model
+    virtual = built.spring_nodes[built.object_spring_count :] - [0, built.node_count]
+    assert virtual.tolist() == [[node, len(take.control)]]
+    with pytest.raises(UsageError, match="virtual_connection_radius"):
+        object_.changed({"virtual_connection_radius": 0.4 * radius})
+    attached = run.array(SequenceFiles("up").attachment)
+    above = take.model.object_node[node] + [0.0, 0.0, 0.5 * radius]
+    np.testing.assert_allclose(attached[-1], above, atol=1e-6)
+    assert len(attached) == len(take.control) + 1
