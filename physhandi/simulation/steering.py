@@ -95,8 +95,8 @@ class Take:
     control: Float32[ndarray, "control 3"]
     """Control nodes where all poses are zero [m]."""
     hands: tuple[SteeredHand, ...]
-    """The hands; control nodes of none of them, and those that nodes are pinned to, stay where they
-    are."""
+    """The hands; control nodes of none of them, such as those that nodes are pinned to, stay where
+    they are."""
     pose: Float[ndarray, "frame hand 6"] = field(default_factory=lambda: np.zeros((1, 1, 6)))
     """How far each wrist has moved from where it is in `control` [m], and the rotation vector about
     it [rad]."""
@@ -117,10 +117,9 @@ class Take:
             frame, hand = (int(index) for index in wrong[0][:2])
             raise ValueError(f"pose is not finite at frame {frame}, hand {hand}.")
         number = np.concatenate([hand.control for hand in self.hands])
-        if len(np.unique(number)) != len(number) or np.any(
-            (number < 0) | (number >= self.model.control_count)
-        ):
-            raise ValueError("hands must name different control nodes that there are.")
+        moving = self.model.control_count - self.model.pin_count
+        if len(np.unique(number)) != len(number) or np.any((number < 0) | (number >= moving)):
+            raise ValueError("hands must name different control nodes that there are and can move.")
 
     @property
     def frame_count(self) -> int:
@@ -132,8 +131,6 @@ class Take:
         moved = np.array(self.control, np.float32)
         for hand, its in zip(self.hands, pose, strict=True):
             moved[hand.control] = hand.moved(self.control[hand.control], its)
-        moving = self.model.control_count - self.model.pin_count
-        moved[moving:] = self.control[moving:]  # Whichever hand they are nearest to.
         return moved
 
     def controls(self) -> Float32[ndarray, "frame control 3"]:
@@ -223,25 +220,31 @@ class Take:
         Returns:
             The take; its last hand is the new one, in the pose of zero.
         """
-        parameters, count = self.parameters, self.model.control_count
+        model, parameters = self.model, self.parameters
+        own = model.control_count - model.pin_count  # Control nodes that never move are the last.
         position = np.asarray(state[0], np.float64)
         radius = parameters.virtual_connection_radius
         springs, _ = virtual_springs(
             position[node][None], position, radius, max(parameters.virtual_max_neighbors, 1)
         )
         point = position[node] + [0.0, 0.0, 0.5 * radius]
-        springs[:, 1] += count
-        control = np.concatenate([self.control, point[None].astype(np.float32)])
-        hand = SteeredHand(name=name, control=np.array([count]), wrist=point)
+        springs[:, 1] += own
+        control = np.insert(self.control, own, point.astype(np.float32), axis=0)
+        hand = SteeredHand(name=name, control=np.array([own]), wrist=point)
+        ends = model.spring_nodes
         more = replace(
             self,
-            model=replace(self.model, control_count=count + 1),
+            model=replace(
+                model,
+                control_count=model.control_count + 1,
+                spring_nodes=ends + np.int32(ends >= model.node_count + own),
+            ),
             control=control,
             hands=(*self.hands, hand),
             pose=np.zeros((1, len(self.hands) + 1, 6)),
         )
-        length = np.linalg.norm(position[springs[:, 0]] - control[-1], axis=1)
-        every = np.ones(len(self.model.spring_nodes), bool)
+        length = np.linalg.norm(position[springs[:, 0]] - control[own], axis=1)
+        every = np.ones(len(ends), bool)
         held = np.concatenate([pose, np.zeros((1, 6))])
         return more._rejoined(every, state, held, (springs, length))
 

@@ -58,13 +58,15 @@ def begin_take(content: Content, rollout: ObjectRollout, frame: int, shown: int)
     Raises:
         UsageError: If nothing moves the object.
     """
+    model, start = rollout.going_on(frame)
     control = np.asarray(rollout.held_control(frame), np.float32)
-    if not len(control):
+    moving = len(control) - model.pin_count
+    if not moving:
         raise UsageError("Nothing holds this object, so there is no hand to steer.")
     recorded = np.asarray(rollout.control[frame], np.float64)
     surfaces = [np.asarray(hand.vertex[_within(shown, hand)], float) for hand in content.hands]
     if surfaces:
-        owner = nearest_surface(recorded, surfaces)
+        owner = nearest_surface(recorded[:moving], surfaces)
         hands = tuple(
             SteeredHand(
                 name=hand.side,
@@ -76,9 +78,9 @@ def begin_take(content: Content, rollout: ObjectRollout, frame: int, shown: int)
             for number, hand in enumerate(content.hands)
         )
     else:
-        every = np.arange(len(control))
-        hands = (SteeredHand(name="controls", control=every, wrist=recorded.mean(axis=0)),)
-    model, start = rollout.going_on(frame)
+        every = np.arange(moving)
+        wrist = recorded[:moving].mean(axis=0)
+        hands = (SteeredHand(name="controls", control=every, wrist=wrist),)
     return Take(
         model=model,
         start=start,

@@ -188,7 +188,8 @@ def test_pins_stay_where_they_are_whatever_hand_is_steered() -> None:
     scene = cube_scene()
     _, after, parameters = edited(scene)
     control = after.with_pins(scene.control.astype(np.float32))[0]
-    hand = SteeredHand(name="right", control=np.arange(after.control_count), wrist=np.zeros(3))
+    moving = np.arange(after.control_count - after.pin_count)
+    hand = SteeredHand(name="right", control=moving, wrist=np.zeros(3))
     take = Take(
         model=after,
         start=(after.object_node, after.initial_velocity),

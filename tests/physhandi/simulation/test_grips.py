@@ -129,6 +129,33 @@ def test_a_point_that_is_held_takes_its_node_along() -> None:
     assert np.linalg.norm(pulled[0]) < 0.003
 
 
+def test_pins_stay_where_they_are_beside_points_and_hands() -> None:
+    take = sheet()
+    pinned = replace(take.model, control_count=4, pin_place=take.start[0][[4]])
+    ends = np.int32([[4, 28]])
+    pinned = replace(
+        pinned,
+        spring_nodes=np.concatenate([pinned.spring_nodes, ends]),
+        rest_length=np.append(pinned.rest_length, np.float32(1e-3)),
+        stiffness=np.append(pinned.stiffness, np.float32(600.0)),
+        damping=np.append(pinned.damping, np.float32(3.0)),
+        attached=np.concatenate([pinned.attached, pinned.attached[:1]]),
+    )
+    control = np.concatenate([take.control, take.start[0][[4]]])
+    with_pin = replace(take, model=pinned, control=control)
+    held = with_pin.hold_point(24, take.start, take.pose[0], "point 1")
+    assert pairs(held) - {(24, 3), (19, 3), (23, 3)} == pairs(take) | {(4, 4)}
+    pose = np.full((3, 6), 0.01)
+    np.testing.assert_array_equal(held.control_at(pose)[4], take.start[0][4])
+    free = held.let_go(0, held.start, pose).let_go(1, held.start, pose)
+    assert {control for _, control in pairs(free)} == {3, 4}
+    back = held.without_point(2, held.start, held.pose[0])
+    assert pairs(back) == pairs(with_pin)
+    np.testing.assert_array_equal(back.control, control)
+    with pytest.raises(ValueError, match="can move"):
+        replace(with_pin, hands=(replace(take.hands[0], control=np.array([3])), take.hands[1]))
+
+
 def test_a_point_that_is_held_no_more_leaves_all_as_it_was() -> None:
     take = sheet()
     pose = take.pose[0] + 0.001
