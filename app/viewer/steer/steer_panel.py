@@ -17,7 +17,6 @@ from numpy import ndarray
 from app.viewer.clock.playback import Playback
 from app.viewer.content.content import Content
 from app.viewer.content.session_state import Pose
-from app.viewer.inspect.picking import Pick
 from app.viewer.live.client import STARTING, SimulationClient
 from app.viewer.live.drive import HandOrder
 from app.viewer.physics.keep_panel import SavedRun, saved_html, write_small
@@ -366,17 +365,8 @@ class SteerPanel:
                 self._object.replay(take)
             self._tell()
 
-    def grab(self, found: Pick, rollout: ObjectRollout) -> None:
-        """Hold a point of the object, and move that from now on.
-
-        Args:
-            found: What was clicked; what is no node or spring of the object is left alone.
-            rollout: The object that was seen.
-        """
-        if found.kind not in {"node", "spring"}:
-            return
-        ends = rollout.model.spring_nodes
-        node = found.index if found.kind == "node" else int(ends[found.index].min())
+    def grab(self, node: int) -> None:
+        """Hold an object node, and move that from now on."""
         with self._lock:
             steered = self._object
             if steered is None or steered.is_replaying:
