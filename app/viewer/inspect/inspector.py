@@ -73,7 +73,7 @@ class Inspector:
         self._framing: Framing | None = None
         self._pick: Pick | None = None
         self._shown: tuple[ObjectRollout | None, int, int] = (None, 0, 0)
-        self._grab: Callable[[Pick, ObjectRollout], None] | None = None
+        self._grab: Callable[[int], None] | None = None
         self._measured: tuple[Any, ...] | None = None
         self._curve: Float[ndarray, " frame"] = np.zeros(0)
         self._refreshed = 0.0
@@ -121,14 +121,14 @@ class Inspector:
         self,
         rollout: ObjectRollout,
         rollout_frame: int,
-        grab: Callable[[Pick, ObjectRollout], None],
+        grab: Callable[[int], None],
     ) -> None:
         """Read nothing until the clock shows a frame again, because hands are being steered.
 
         Args:
             rollout: The object that is drawn.
             rollout_frame: Which of its frames.
-            grab: Called with a part of it that is clicked, in the place of reading that.
+            grab: Called with a node of it that is clicked, in the place of reading that.
         """
         with self._lock:
             if self._pick is not None:
@@ -214,7 +214,10 @@ class Inspector:
             )
             found = pick(ray, target, prefers_hand=prefers_hand)
         if found is not None and grab is not None and rollout is not None:
-            grab(found, rollout)
+            if found.kind == "node":
+                grab(found.index)
+            elif found.kind == "spring":  # An end that is a control node has the higher number.
+                grab(int(rollout.model.spring_nodes[found.index].min()))
         elif found is not None:
             self.look_at(found)
             self._open_tab()
