@@ -23,7 +23,12 @@ from app.jobs.log import open_log
 from app.jobs.machine import Machine
 from app.jobs.order import check_order, describe_order, describe_settings
 from app.jobs.overview import Overview
-from app.jobs.recordings.annotations import Annotations, ClickedPlace, PaintedMask
+from app.jobs.recordings.annotations import (
+    Annotations,
+    ChosenModels,
+    ClickedPlace,
+    PaintedMask,
+)
 from app.jobs.recordings.background import BackgroundTasks
 from app.jobs.recordings.imports import ImportOrder, Imports
 from app.jobs.scheduler import Scheduler
@@ -84,6 +89,9 @@ class NewClick(BaseModel):
     height: Annotated[float, Field(ge=0, le=100_000, allow_inf_nan=False)] = 0.0
 
 
+ModelName = Annotated[str, Field(max_length=255)]
+
+
 class NewAnnotation(BaseModel):
     """Masks and tracks to find."""
 
@@ -93,6 +101,12 @@ class NewAnnotation(BaseModel):
     """Places on the object; none finds hands alone."""
     overwrite: bool = False
     """Whether masks and tracks may be replaced that came from elsewhere."""
+    mask_model: ModelName = ""
+    """Network that finds masks, as `GET /api/v1/models` names it; empty for what is built in."""
+    track_model: ModelName = ""
+    """Network that finds tracks, named alike."""
+    trusts_model_code: bool = False
+    """Whether the code of `track_model` may be executed, which can do what the server can do."""
 
 
 class NewMask(BaseModel):
@@ -270,7 +284,16 @@ def _add_annotations(router: APIRouter, annotations: Annotations) -> None:
     def annotate(sequence_id: ItemId, new: NewAnnotation) -> dict[str, Any]:
         """Find masks and tracks of a recording from places on its object."""
         clicks = [ClickedPlace(**click.model_dump()) for click in new.clicks]
-        return asdict(annotations.start(sequence_id, clicks, overwrite=new.overwrite))
+        chosen = ChosenModels(
+            masks=new.mask_model, tracks=new.track_model, trusts_code=new.trusts_model_code
+        )
+        job = annotations.start(sequence_id, clicks, overwrite=new.overwrite, chosen=chosen)
+        return asdict(job)
+
+    @router.get("/models")
+    def list_models() -> dict[str, Any]:
+        """List the networks of the data folder that can find masks and tracks."""
+        return {"models": [asdict(model) for model in annotations.models()]}
 
     @router.get("/sequences/{sequence_id}/views/{view_name}/frames/{frame}/mask")
     def show_mask(sequence_id: ItemId, view_name: ItemId, frame: int) -> dict[str, Any]:

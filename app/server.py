@@ -27,6 +27,7 @@ from app.jobs.overview import Overview
 from app.jobs.recordings.annotations import Annotations
 from app.jobs.recordings.background import BackgroundTasks
 from app.jobs.recordings.imports import Imports
+from app.jobs.recordings.models import ModelFolders
 from app.jobs.scheduler import QueueFullError, Scheduler
 from app.jobs.views import describe_run
 from app.jobs.watch import Feed
@@ -128,6 +129,7 @@ def create_app(
     app.state.scheduler = scheduler
     app.state.sessions = sessions
     app.state.security = security
+    models = ModelFolders(settings)
     overview = Overview(settings, catalog, scheduler, machine)
     app.include_router(
         create_api(
@@ -138,7 +140,7 @@ def create_app(
             machine=machine,
             overview=overview,
             tasks=tasks,
-            annotations=Annotations(catalog, tasks),
+            annotations=Annotations(catalog, tasks, models),
             imports=imports,
         )
     )
@@ -152,6 +154,7 @@ def create_app(
             overview=overview,
             previews=previews,
             imports=imports,
+            models=models,
             suites=settings.suite_dir,
         )
     )

@@ -113,6 +113,11 @@ class ServerSettings(BaseSettings):
         return self.data_dir / "captures"
 
     @property
+    def model_dir(self) -> Path:
+        """Folder of networks that users have; whoever may write to it decides what is executed."""
+        return self.data_dir / "models"
+
+    @property
     def suite_dir(self) -> Path:
         """Folder of suites; the runs of their cells are found by id, but not listed."""
         return self.data_dir / "suites"

@@ -1,5 +1,6 @@
 """A process in the place of the one that annotates, which does what its first click says."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ def work(channel: Channel) -> None:
     if not order["overwrite"]:
         raise UsageError("It has masks that were not made here.")
     (Path(order["folder"]) / "found.txt").write_text(str(order["clicks"]))
+    (Path(order["folder"]) / "models.json").write_text(json.dumps(order["models"]))
 
 
 if __name__ == "__main__":

@@ -175,6 +175,9 @@ function showPicks(shown = picks) {
   part("annotate").disabled = !picks.length;
 }
 
+/** The network that finds masks or tracks in the place of what is built in; empty for none. */
+const chosen = (finds) => annotation.querySelector(`[data-model=${finds}]`)?.value ?? "";
+
 const own = () => `/api/v1/sequences/${annotation.dataset.sequence}/annotation`;
 
 /** Follow the work until it ends; what was found is then shown by the page itself. */
@@ -200,9 +203,15 @@ if (annotation) {
   });
   part("annotate").addEventListener("click", ({ target }) => busy(target, async () => {
     if (frames.classList.contains("is-picking")) part("pick").click();
-    followAnnotation(await send("POST", own(), { clicks: picks, overwrite: Boolean(part("overwrite")?.checked) }));
+    const order = { clicks: picks, overwrite: Boolean(part("overwrite")?.checked), mask_model: chosen("masks"), track_model: chosen("tracks"), trusts_model_code: Boolean(part("trusts")?.checked) };
+    followAnnotation(await send("POST", own(), order));
   }));
   part("stop").addEventListener("click", ({ target }) => busy(target, () => send("DELETE", own())));
+  annotation.querySelector("[data-model=tracks]")?.addEventListener("change", () => {
+    // Trust is in one folder: another one is looked at anew.
+    part("trust").hidden = !chosen("tracks");
+    part("trusts").checked = false;
+  });
   addEventListener("resize", () => showPicks());
   document.addEventListener("DOMContentLoaded", async () => followAnnotation(await send("GET", own())));
 }

@@ -12,6 +12,7 @@ from starlette.exceptions import HTTPException
 from app.ids import ItemId
 from app.jobs.catalog import Catalog, SequenceItem
 from app.jobs.checks import check_item
+from app.jobs.recordings.models import ModelFolders
 from app.pages.render import Pages
 from app.previews.overlay import LAYERS, draw_frame
 from physhandi.data.files import named_fields
@@ -37,12 +38,13 @@ class FrameQuery(BaseModel):
     """State of the recording's files."""
 
 
-def add_checks(router: APIRouter, catalog: Catalog, pages: Pages) -> None:
+def add_checks(router: APIRouter, catalog: Catalog, models: ModelFolders, pages: Pages) -> None:
     """Add the pages that check recordings to the routes.
 
     Args:
         router: Gets the routes.
         catalog: Finds sequences.
+        models: Finds networks of the user.
         pages: Renders.
     """
 
@@ -62,6 +64,8 @@ def add_checks(router: APIRouter, catalog: Catalog, pages: Pages) -> None:
             layers=_layers_of(sequence) if sequence is not None else [],
             labels=_labels_of(sequence) if sequence is not None else [],
             can_annotate=sequence is not None and _can_annotate(item, sequence),
+            models=models.list(),
+            model_folder=models.folder,
             is_annotated=sequence is not None and len(sequence.missing("mask", "track")) < 2,
             version=_version(item.folder),
             imported=_imported(sequence) if sequence is not None else None,

@@ -15,6 +15,7 @@ from app.jobs.log import read_log
 from app.jobs.order import describe_settings, order_of
 from app.jobs.overview import Overview
 from app.jobs.recordings.imports import Imports
+from app.jobs.recordings.models import ModelFolders
 from app.jobs.scheduler import ENDED, Scheduler
 from app.jobs.views import describe_results, describe_run, describe_sequence, follow_run
 from app.jobs.watch import Feed
@@ -47,6 +48,7 @@ def create_pages(
     overview: Overview,
     previews: Previews,
     imports: Imports,
+    models: ModelFolders,
     suites: Path,
 ) -> APIRouter:
     """Make the routes of the pages.
@@ -60,12 +62,13 @@ def create_pages(
         overview: Describes machine, queue and program.
         previews: Keeps small pictures.
         imports: Finds recordings.
+        models: Finds networks of the user.
         suites: Folder of suites.
     """
     router = APIRouter(include_in_schema=False)
     add_lists(router, catalog, feed, pages, previews=previews)
     add_pictures(router, previews)
-    add_checks(router, catalog, pages)
+    add_checks(router, catalog, models, pages)
     add_imports(router, catalog, imports, pages)
     add_suites(router, suites, pages)
     _add_launch(router, catalog, overview, pages)

@@ -329,7 +329,7 @@ class Session(SceneServer):
         # At once: a user who is quick may have stopped the clock before the rest is done.
         if not self._has_played:
             self._has_played = True
-            self._playback.play()
+            self._playback.play(on=self._content.plays_at_once)
         self._playback.release()
         self._let_in(client, self._comparison)
 

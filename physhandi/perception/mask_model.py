@@ -217,6 +217,15 @@ class _Frames:
         return torch.from_numpy(np.ascontiguousarray(color.transpose(2, 0, 1)))
 
 
+def mask_model_kind(folder: Path) -> str:
+    """Tell which network a folder holds, as provenance calls it, without reading its weights.
+
+    Raises:
+        UsageError: If it holds no mask model, or no weights that are read.
+    """
+    return _ARCHITECTURES[_described(folder)[0]][0]
+
+
 def _described(folder: Path) -> tuple[str, list[Path]]:
     """Read what a folder says of itself: kind of network and files of weights."""
     try:

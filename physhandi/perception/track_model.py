@@ -170,6 +170,17 @@ class TrackModel:
         return np.where(is_placed[..., None], np.clip(pixel, -1e6, 1e6), 0), visible & is_placed
 
 
+def track_model_kind(folder: Path) -> str:
+    """Tell which tracker a folder holds, as provenance calls it; nothing of it is executed.
+
+    Raises:
+        UsageError: If it holds no tracker, or no weights.
+    """
+    kind = _kind(folder)
+    _checkpoint(folder, kind)
+    return kind
+
+
 def _kind(folder: Path) -> str:
     hub = folder / "hubconf.py"
     if hub.is_file() and _ENTRY in hub.read_text(encoding="utf-8", errors="replace"):

@@ -1,5 +1,7 @@
 """Masks and tracks from clicks in the browser: started, followed, cancelled, and really found."""
 
+import json
+import os
 import shutil
 import threading
 from collections.abc import Iterator
@@ -9,13 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 from clicked_disc import disc_click, write_disc
+from made_models import write_cotracker
 from server_world import ORIGIN, TOKEN, World, make_world
 from starlette.testclient import TestClient
 from waiting import until
 
 from app.jobs.catalog import Catalog
-from app.jobs.recordings.annotations import Annotations, ClickedPlace
+from app.jobs.recordings.annotations import Annotations, ChosenModels, ClickedPlace
 from app.jobs.recordings.background import BackgroundTasks
+from app.jobs.recordings.models import ModelFolders
 from app.server import create_app
 from app.settings import ServerSettings
 from physhandi.data.lease import Lease
@@ -32,7 +36,8 @@ def annotations(
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent.parent))
     catalog = Catalog(ServerSettings(data_dir=data_dir), bundled=tmp_path / "none")
     tasks = BackgroundTasks()
-    yield Annotations(catalog, tasks, worker="annotation_worker")
+    models = ModelFolders(ServerSettings(data_dir=data_dir))
+    yield Annotations(catalog, tasks, models, worker="annotation_worker")
     tasks.shutdown()
 
 
@@ -44,9 +49,16 @@ def test_the_order_reaches_the_process_and_its_end_is_told(
     annotations: Annotations, data_dir: Path
 ) -> None:
     assert annotations.job("sheet").state == "none"
-    job = annotations.start("sheet", click(), overwrite=True)
+    masker = data_dir / "models/masker"
+    masker.mkdir(parents=True)
+    (masker / "config.json").write_text('{"model_type": "sam2_video"}')
+    (masker / "model.safetensors").touch()
+    chosen = ChosenModels(masks="masker", trusts_code=True)
+    job = annotations.start("sheet", click(), overwrite=True, chosen=chosen)
     until(lambda: job.state != "running")
     assert (job.state, job.reason) == ("done", "")
+    models = json.loads((data_dir / "sequences/sheet/models.json").read_text())
+    assert models == {"mask_model": str(masker), "track_model": None, "trusts_model_code": True}
     assert job.progress["stage"] == "segmentation"
     assert annotations.job("sheet") is job
     told = (data_dir / "sequences/sheet/found.txt").read_text()
@@ -215,5 +227,47 @@ def test_orders_that_make_no_sense_are_refused(world: World) -> None:
     assert "came with the program" in bundled.json()["error"]["message"]
     assert post(client, "/api/v1/sequences/nowhere/annotation").status_code == 404
     assert 'id="annotation"' not in world.browser().get("/sequences/towel_fold/check").text
+    own = Annotations(world.catalog, BackgroundTasks(), ModelFolders(world.settings))
     with pytest.raises(UsageError, match="came with the program"):
-        Annotations(world.catalog, BackgroundTasks()).start("towel_fold", [], overwrite=True)
+        own.start("towel_fold", [], overwrite=True)
+
+
+def test_a_network_of_the_data_folder_is_chosen_and_its_code_only_runs_if_trusted(
+    world: World,
+) -> None:
+    client = world.script()
+    folder = world.settings.model_dir
+    assert client.get("/api/v1/models").json() == {"models": []}
+    assert "put the folder of each" in world.browser().get("/sequences/disc/check").text
+    folder.mkdir()
+    write_cotracker(folder / "follower")
+    (folder / "notes").mkdir()
+    (folder / "masker").mkdir()
+    (folder / "masker/config.json").write_text('{"model_type": "sam2_video"}')
+    tracker = {"name": "follower", "finds": "tracks", "kind": "cotracker3"}
+    assert client.get("/api/v1/models").json() == {"models": [tracker]}  # Nothing without weights.
+    (folder / "masker/model.safetensors").touch()
+    masker = {"name": "masker", "finds": "masks", "kind": "sam2"}
+    assert client.get("/api/v1/models").json() == {"models": [tracker, masker]}
+    page = world.browser().get("/sequences/disc/check").text
+    assert '<option value="follower">follower (cotracker3)</option>' in page
+    assert '<option value="masker">masker (sam2)</option>' in page
+
+    view, frame, x, y = disc_click()
+    clicks = [{"view": view, "frame": frame, "x": x, "y": y}]
+    for wrong in ("masker", "nothing", "../models/follower", str(folder / "follower")):
+        refused = post(client, clicks=clicks, track_model=wrong, trusts_model_code=True)
+        assert refused.status_code == 422, wrong
+        assert "holds no network" in refused.json()["error"]["message"]
+    refused = post(client, clicks=clicks, track_model="follower")
+    assert refused.status_code == 422
+    assert "'follower' is Python code of others" in refused.json()["error"]["message"]
+    assert not (folder / "follower/ran.txt").exists()
+    answer = post(client, clicks=clicks, track_model="follower", trusts_model_code=True)
+    assert answer.status_code == 202, answer.text
+    job = until(lambda: (j := client.get(ADDRESS).json())["state"] != "running" and j)
+    assert (job["state"], job["reason"]) == ("done", "")
+    assert int((folder / "follower/ran.txt").read_text()) != os.getpid()
+    provenance = Sequence.load(world.settings.sequence_dir / "disc").provenance
+    assert provenance["tracks"]["source"] == "cotracker3"
+    assert provenance["masks"]["source"] == "built-in"

@@ -5,12 +5,15 @@ import shutil
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from accessibility import violations
-from clicked_disc import write_disc
+from clicked_disc import HEIGHT, TOP, WIDTH, cameras, center, write_disc
 from playwright.sync_api import Page, expect
 from raw_capture import RawCapture
 from scene_page import TIMEOUT_MS, ScenePage
+
+from physhandi.data.sequence import Sequence
 
 pytestmark = pytest.mark.e2e
 BUNDLED = Path(__file__).parents[2] / "sequences"
@@ -183,15 +186,74 @@ def test_a_recording_is_checked_frame_by_frame(home: Page, base: str) -> None:
     expect(home.locator("[data-readiness]")).to_contain_text("All stages will run.")
 
 
+def find_in_a_box(page: Page) -> dict[str, float | str]:
+    """Draw a box around the disc, from its lower right to its upper left corner, and find it."""
+    x, y = cameras()["top"].project(np.append(center(0), TOP))
+    x, y = round(float(x)), round(float(y))
+    box = {"view": "top", "frame": 0, "x": x, "y": y, "width": 44, "height": 40}
+    picks = page.locator("[data-picks]")
+    image = page.locator("[data-view=top] img")
+    expect(image).to_be_visible()
+    page.get_by_role("button", name="Pick the object").click()
+    image.scroll_into_view_if_needed()
+    at = image.bounding_box()
+
+    def move(column: float, row: float) -> None:
+        share = (column + 0.5) / WIDTH, (row + 0.5) / HEIGHT
+        page.mouse.move(at["x"] + share[0] * at["width"], at["y"] + share[1] * at["height"])
+
+    def draw(width: float, height: float) -> None:
+        move(x + width / 2, y + height / 2)
+        page.mouse.down()
+        move(x, y)
+        move(x - width / 2, y - height / 2)
+        page.mouse.up()
+
+    draw(30, 20)
+    expect(picks).to_have_text(re.compile(rf"top, frame 0: {x}, {y}, box 30 × 20"))
+    expect(page.locator(".pick.box")).to_have_count(1)
+    page.get_by_role("button", name="Take back the click in top").click()
+    expect(page.locator(".pick")).to_have_count(0)
+    expect(page.get_by_role("button", name="Find masks and tracks")).to_be_disabled()
+    draw(box["width"], box["height"])
+    drawn = page.locator(".pick.box").bounding_box()
+    assert drawn["width"] / at["width"] == pytest.approx(box["width"] / WIDTH, abs=0.02)
+    assert drawn["x"] + drawn["width"] / 2 == pytest.approx(
+        at["x"] + (x + 0.5) / WIDTH * at["width"], abs=2
+    )
+    page.get_by_label("Replace those that are there").check()
+    # A tracker of the user is code, so that it is executed is asked, for each anew.
+    page.get_by_text("With networks that you have").click()
+    trust = page.get_by_label("I looked at its folder")
+    expect(trust).to_be_hidden()
+    page.get_by_label("Tracks by").select_option("follower")
+    trust.check()
+    page.get_by_label("Tracks by").select_option("what is built in")
+    expect(trust).to_be_hidden()
+    expect(trust).not_to_be_checked()
+    with page.expect_navigation(timeout=5 * TIMEOUT_MS):  # The page shows what was found.
+        page.get_by_role("button", name="Find masks and tracks").click()
+    return box
+
+
 def test_a_recording_is_imported_and_its_masks_are_painted(home: Page, base: str, served) -> None:
     RawCapture(served.data_dir / "captures/ball").write()
-    write_disc(served.data_dir / "sequences/disc", masks=True, frames=2)
+    _, true = write_disc(served.data_dir / "sequences/disc", masks=True, frames=2)
     home.get_by_role("button", name="Import a recording").click()
     home.get_by_role("link", name="ball").click()
     expect(home.locator("#survey")).to_contain_text("2 cameras, 6 frames")
     home.get_by_role("button", name="Import", exact=True).click()
     expect(home).to_have_url(f"{base}/sequences/ball/check?frame=0")
+    follower = served.data_dir / "models/follower"
+    follower.mkdir(parents=True)
+    (follower / "hubconf.py").write_text("def cotracker3_offline(): ...")
+    (follower / "scaled_offline.pth").touch()
     home.goto(f"{base}/sequences/disc/check")
+    box = find_in_a_box(home)
+    found = Sequence.load(served.data_dir / "sequences/disc")
+    assert found.provenance["masks"]["clicks"] == [box]
+    is_object, is_disc = found.views[0].mask(0) == 1, true["top"][0] == 1
+    assert (is_object & is_disc).sum() > 0.9 * (is_object | is_disc).sum()
     home.get_by_role("button", name="Correct masks").click()
     canvas = home.locator("[data-view=top] canvas")
     expect(canvas).to_be_visible()

@@ -7,6 +7,7 @@ import numpy as np
 
 from app.jobs.catalog import Catalog, NotFoundError, SequenceItem
 from app.jobs.recordings.background import BackgroundTask, BackgroundTasks, Work
+from app.jobs.recordings.models import ModelEntry, ModelFolders
 from app.jobs.scheduler import require_unread
 from physhandi.errors import UsageError
 
@@ -31,6 +32,18 @@ class ClickedPlace:
     """Height of the box; 0 if only the place is known [px]."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class ChosenModels:
+    """Networks of the user that take the place of what is built in."""
+
+    masks: str = ""
+    """Name of what finds masks; empty for what is built in."""
+    tracks: str = ""
+    """Name of what finds tracks; empty for what is built in."""
+    trusts_code: bool = False
+    """Whether the user agreed that the code of what finds tracks is executed."""
+
+
 @dataclass(frozen=True)
 class PaintedMask:
     """A mask that somebody painted."""
@@ -43,24 +56,41 @@ class PaintedMask:
     """Labels row by row, each with the number of pixels that have it: ``label, count, …``."""
 
 
+_NONE = ChosenModels()
+
+
 class Annotations:
     """Has masks and tracks found for recordings of the data folder."""
 
-    def __init__(self, catalog: Catalog, tasks: BackgroundTasks, *, worker: str = _WORKER) -> None:
+    def __init__(
+        self,
+        catalog: Catalog,
+        tasks: BackgroundTasks,
+        models: ModelFolders,
+        *,
+        worker: str = _WORKER,
+    ) -> None:
         """Prepare.
 
         Args:
             catalog: Finds sequences and the runs that read them.
             tasks: Has the work done, one piece at a time.
+            models: Finds networks of the user.
             worker: Module of the process.
         """
         self._catalog = catalog
+        self._models = models
         self.tasks = tasks
         """Has the work done."""
         self._worker = worker
 
     def start(
-        self, sequence_id: str, clicks: Sequence[ClickedPlace], *, overwrite: bool
+        self,
+        sequence_id: str,
+        clicks: Sequence[ClickedPlace],
+        *,
+        overwrite: bool,
+        chosen: ChosenModels = _NONE,
     ) -> BackgroundTask:
         """Begin to find masks and tracks of a recording.
 
@@ -68,10 +98,12 @@ class Annotations:
             sequence_id: The recording.
             clicks: Places on its object; none finds hands alone.
             overwrite: Whether masks and tracks may be replaced that came from elsewhere.
+            chosen: Networks of the user; none takes what is built in.
 
         Raises:
             SequenceError: If there is no such recording, or it is damaged.
-            UsageError: If it came with the program.
+            UsageError: If it came with the program, there is no such network, or the user did not
+                agree that code is executed.
             RunError: If something is worked on already, or a fit reads this one.
         """
         self._require_own(sequence_id)
@@ -81,11 +113,16 @@ class Annotations:
             "folder": str(sequence.folder),
             "clicks": [asdict(click) for click in clicks],
             "overwrite": overwrite,
+            "models": self._folders(chosen),
         }
         work = Work(
             "annotation", sequence_id, f"Masks and tracks of '{sequence_id}' are being found."
         )
         return self.tasks.start(work, self._worker, order)
+
+    def models(self) -> list[ModelEntry]:
+        """List the networks that can be chosen."""
+        return self._models.list()
 
     def correct(
         self, sequence_id: str, masks: Sequence[PaintedMask], *, carries_on: bool
@@ -156,6 +193,22 @@ class Annotations:
         """
         self._catalog.sequence_item(sequence_id)
         self.tasks.cancel("annotation", sequence_id)
+
+    def _folders(self, chosen: ChosenModels) -> dict[str, str | bool | None]:
+        """Find the networks that were chosen, as `annotate` is told them."""
+        folders = {
+            "mask_model": str(self._models.find(chosen.masks, "masks")) if chosen.masks else None,
+            "track_model": str(self._models.find(chosen.tracks, "tracks"))
+            if chosen.tracks
+            else None,
+        }
+        if chosen.tracks and not chosen.trusts_code:
+            raise UsageError(
+                f"'{chosen.tracks}' is Python code of others, which can do what this server can "
+                "do. Look at its folder; if you trust it, say so, and it is executed in a process "
+                "of its own."
+            )
+        return {**folders, "trusts_model_code": chosen.trusts_code}
 
     def _require_own(self, sequence_id: str) -> SequenceItem:
         item = self._catalog.sequence_item(sequence_id)

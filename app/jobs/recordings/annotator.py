@@ -1,5 +1,6 @@
 """The process that finds masks and tracks of a recording."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,21 @@ def annotate_order(order: dict[str, Any], progress: Progress) -> dict[str, Any]:
         correct_masks(order["folder"], corrections, progress, carries_on=order["carries_on"])
         return {}
     clicks = [Click(**click) for click in order["clicks"]]
-    annotate(order["folder"], clicks, progress, overwrite=order["overwrite"])
+    models = order["models"]
+    annotate(
+        order["folder"],
+        clicks,
+        progress,
+        overwrite=order["overwrite"],
+        mask_model=_folder(models["mask_model"]),
+        track_model=_folder(models["track_model"]),
+        trusts_model_code=models["trusts_model_code"],
+    )
     return {}
+
+
+def _folder(path: str | None) -> Path | None:
+    return None if path is None else Path(path)
 
 
 def _correction(view: str, frame: int, width: int, runs: list[int]) -> Correction:

@@ -104,6 +104,15 @@ class Content:
         """Whether lengths are metres."""
         return self.length_unit == "m"
 
+    @property
+    def plays_at_once(self) -> bool:
+        """Whether anything in it was followed through more than one frame, fitted or tracked.
+
+        A bare cloud is looked at frame by frame, and costs a read of all depth images to play.
+        """
+        is_bare = isinstance(self.observed, DepthCloud) and not self.hands and not self.skeletons
+        return self.frame_count > 1 and (self.fitted is not None or not is_bare)
+
     def close(self) -> None:
         """Release the video decoders; a view that is asked again opens its own anew."""
         for view in self.views:

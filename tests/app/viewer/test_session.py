@@ -1,6 +1,7 @@
 import json
 import math
 import re
+import shutil
 from typing import Any
 
 import numpy as np
@@ -141,6 +142,23 @@ def test_a_recording_shows_keypoints_depth_and_cameras(sessions, recording) -> N
         client.until(lambda: "/hand/skeleton_0" in client.nodes)
         assert not any(name.startswith("/object") for name in client.nodes)
         assert not any(p.get("label") == "Preset" for p in client.gui.values())
+
+
+def test_a_bare_cloud_stands_still_where_a_tracked_hand_plays(
+    sessions, catalog, recording, monkeypatch
+) -> None:
+    bare = catalog.root / "sequences" / "bare"
+    shutil.copytree(recording.sequence.folder, bare)
+    for found in bare.rglob("keypoint.npy"):
+        found.unlink()
+    for name, plays in ((recording.sequence.name, True), ("bare", False)):
+        session = sessions.get(sessions.open("sequence", name, "me"))
+        asked: list[bool] = []
+        monkeypatch.setattr(session._playback, "play", lambda *, on=True, to=asked: to.append(on))
+        with ViewerClient(f"ws://127.0.0.1:{session.port}") as client:
+            client.until(lambda asked=asked: asked)
+        assert asked == [plays]
+    shutil.rmtree(bare)  # The folder is every test's.
 
 
 def test_a_run_without_an_object_shows_hands_and_cameras(sessions, catalog, recording) -> None:
