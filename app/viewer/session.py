@@ -267,6 +267,7 @@ class Session(SceneServer):
             channel=self.keys,
             rollout_at=self._object.at,
             stop_comparing=self._comparison.stop,
+            newtons=lambda: scene.painter.force_factor,
             keep=None if self._storage is None else self._keep_take,
         )
 

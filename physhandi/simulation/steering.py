@@ -19,6 +19,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from physhandi.simulation.contact_intervals import always
+from physhandi.simulation.forces import virtual_spring_forces
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.restart import NodeState, start_from_tensors, start_to_tensors
@@ -431,6 +432,7 @@ class SteeredSimulation:
         self._simulator = Simulator(take.model, take.parameters, device=device)
         self._simulator.reset(*take.start)
         self._control = take.control_at(take.pose[0])
+        self._control_velocity = np.zeros_like(self._control)
         self.frame = 0
         """Frames that have been simulated."""
 
@@ -449,5 +451,20 @@ class SteeredSimulation:
         control = self._take.control_at(pose)
         self.frame += 1
         self._simulator.step_frame(self.frame, self._control, control)
+        rate = self._take.parameters.simulated_frame_rate
+        self._control_velocity = rate * (control - self._control)
         self._control = control
         return self.state
+
+    def pulls(self, state: NodeState) -> Float[ndarray, "hand 3"]:
+        """Compute how the object pulls at each hand: the sum of its virtual springs' forces [N].
+
+        Args:
+            state: The newest state, as `step` gives it.
+        """
+        take = self._take
+        model = take.model
+        moved = self._control_velocity
+        force = virtual_spring_forces(model, take.parameters, *state, self._control, moved)
+        control = model.spring_nodes[model.object_spring_count :].max(axis=1) - model.node_count
+        return np.stack([-force[np.isin(control, hand.control)].sum(axis=0) for hand in take.hands])

@@ -178,7 +178,8 @@ class SimulationClient:
     ) -> int:
         """Simulate what is steered, without end; a crash of the process ends it.
 
-        Frames come as messages ``frame`` with the arrays ``position``, ``velocity`` and ``pose``.
+        Frames come as messages ``frame`` with the arrays ``position``, ``velocity``, ``pose`` and
+        ``pull``, which is how the object pulls at each hand [N].
 
         Args:
             session: A session with a listener; what it asked for before is dropped.
@@ -206,11 +207,20 @@ class SimulationClient:
             self._write(message)
         return number
 
-    def drive(self, session: str, orders: Sequence[HandOrder]) -> None:
-        """Tell where the steered hands of a session shall go from now on, one order a hand."""
+    def drive(
+        self, session: str, orders: Sequence[HandOrder], most_force: float | None = None
+    ) -> None:
+        """Tell where the steered hands of a session shall go from now on.
+
+        Args:
+            session: The session.
+            orders: One a hand.
+            most_force: A hand that the object pulls at harder gives way [N]; None for no limit.
+        """
         told = [order.to_dict() for order in orders]
+        fields = {"session": session, "orders": told, "most_force": most_force}
         with self._lock:
-            self._write(Message(DRIVE, {"session": session, "orders": told}))
+            self._write(Message(DRIVE, fields))
 
     def hold(self, session: str, *, on: bool) -> None:
         """Hold the session's simulation, this one and those to come, or let it go on."""

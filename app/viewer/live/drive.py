@@ -16,6 +16,8 @@ LAG = 0.1
 """Time in which a hand takes up most of a change of its speed [s]."""
 TOP_TURN = 2.0 * math.pi
 """A hand turns no faster than this [rad/s]."""
+_YIELDING = 0.2
+"""Part of its top speed with which a hand gives way that is pulled at twice as hard as allowed."""
 _THERE = 1e-6
 """A hand that is so near to its goal is there [length unit, rad]."""
 
@@ -72,16 +74,26 @@ class HandDrive:
         """
         self.order = HandOrder()
         """What the hand follows."""
+        self.most_force = math.inf
+        """Pulled at harder than this, the hand gives way [N]."""
         self.pose = np.array(pose, np.float64)
         """Where the hand is."""
         self._step = 1.0 / frame_rate
         self._top = np.array([limits.top_speed, TOP_TURN])
+        self._yielding = _YIELDING * limits.top_speed
         self._reach = limits.reach
         self._depth = depth
         self._velocity = np.zeros(6)
 
-    def next(self) -> Float[ndarray, " 6"]:
-        """Move on by a frame; returns the new pose."""
+    def next(self, pull: Float[ndarray, " 3"]) -> Float[ndarray, " 6"]:
+        """Move on by a frame.
+
+        Args:
+            pull: How the object pulls at the hand [N].
+
+        Returns:
+            The new pose.
+        """
         goal = self.order.goal
         if goal is None:
             self._velocity += self._share * (np.array(self.order.velocity) - self._velocity)
@@ -93,6 +105,7 @@ class HandDrive:
             self._limit()
             if np.abs(away).max() < _THERE:
                 self._velocity = away / self._step
+        self._give_way(pull)
         before = self.pose[:3].copy()
         move = self._velocity * self._step
         self.pose[:3] += move[:3]
@@ -111,6 +124,18 @@ class HandDrive:
             speed = float(np.linalg.norm(self._velocity[part]))
             if speed > top:
                 self._velocity[part] *= top / speed
+
+    def _give_way(self, pull: Float[ndarray, " 3"]) -> None:
+        """Go no farther against a pull that is too strong, but along it, the faster the stronger.
+
+        The speed grows with what the pull has too much, up to twice the greatest force.
+        """
+        force = float(np.linalg.norm(pull))
+        if force <= self.most_force:
+            return
+        along = pull / force
+        wanted = self._yielding * min(force / self.most_force - 1.0, 1.0)
+        self._velocity[:3] += along * max(wanted - float(along @ self._velocity[:3]), 0.0)
 
     def _stop_at_bounds(self, before: Float[ndarray, " 3"]) -> None:
         """Hold the wrist within reach and above the ground; it slides along both.
@@ -148,11 +173,24 @@ class Drives:
             for number, pose in enumerate(take.pose[0])
         ]
 
-    def obey(self, orders: Sequence[Mapping[str, Any]]) -> None:
-        """Follow new orders, one a hand, as `HandOrder.to_dict` gives them, or go on."""
-        for drive, order in zip(self._drives, orders, strict=bool(orders)):
-            drive.order = HandOrder.from_dict(order)
+    def obey(self, orders: Sequence[Mapping[str, Any]], most_force: float | None) -> None:
+        """Follow new orders.
 
-    def next(self) -> Float[ndarray, "hand 6"]:
-        """Move all hands on by a frame; returns their poses."""
-        return np.stack([drive.next() for drive in self._drives])
+        Args:
+            orders: One a hand, as `HandOrder.to_dict` gives them.
+            most_force: A hand that is pulled at harder gives way [N]; None for no limit.
+        """
+        for drive, order in zip(self._drives, orders, strict=True):
+            drive.order = HandOrder.from_dict(order)
+            drive.most_force = math.inf if most_force is None else most_force
+
+    def next(self, pull: Float[ndarray, "hand 3"]) -> Float[ndarray, "hand 6"]:
+        """Move all hands on by a frame.
+
+        Args:
+            pull: How the object pulls at each of them [N].
+
+        Returns:
+            Their poses.
+        """
+        return np.stack([drive.next(its) for drive, its in zip(self._drives, pull, strict=True)])

@@ -13,7 +13,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -148,7 +147,7 @@ class SimulationWorker:
         self._mailbox = Mailbox()
         self._objects: dict[str, tuple[tuple[str, str], FittedObject]] = {}
         self._active: dict[str, PacedFrames] = {}
-        self._orders: dict[str, list[dict[str, Any]]] = {}
+        self._orders: dict[str, Message] = {}
 
     def run(self) -> None:
         """Work until the parent closes the connection; nobody reads it afterwards."""
@@ -192,7 +191,7 @@ class SimulationWorker:
             return
         if message.kind == DRIVE:
             if session in self._active:
-                self._orders[session] = message["orders"]
+                self._orders[session] = message
             return
         self._active.pop(session, None)
         self._orders.pop(session, None)
@@ -300,21 +299,25 @@ class SimulationWorker:
         drives = Drives(take, HandLimits(**request["limits"]))
         steered = SteeredSimulation(take, self._device)
         state, pose, duration = steered.state, take.pose[0], 0.0
+        pull = steered.pulls(state)
         while True:
             frame = steered.frame
             fields = {**about, "frame": frame, "duration": duration}
-            arrays = {"position": state[0], "velocity": state[1], "pose": pose}
+            arrays = {"position": state[0], "velocity": state[1], "pose": pose, "pull": pull}
             send(self._connection, Message("frame", fields, arrays))
             yield frame + 1
             if not request["replays"]:
-                drives.obey(self._orders.get(request["session"], ()))
-                pose = drives.next()
+                told = self._orders.pop(request["session"], None)
+                if told is not None:
+                    drives.obey(told["orders"], told["most_force"])
+                pose = drives.next(pull)
             elif frame + 1 < take.frame_count:
                 pose = take.pose[frame + 1]
             else:
                 break
             clock = time.perf_counter()
             state = steered.step(pose)
+            pull = steered.pulls(state)
             duration = time.perf_counter() - clock
         send(self._connection, Message("finished", about))
 

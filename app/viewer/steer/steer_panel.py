@@ -49,6 +49,8 @@ _SPEED = 0.25
 """Speed of a wrist at first, in extents of the scene a second."""
 _TURN_SPEED = 90.0
 """Turning of a hand at first [°/s]."""
+_GRAVITY = 9.81
+"""What a weight is compared with where nothing falls [m/s²]."""
 _REFRESH = 0.25
 _COUNTED = 1.0
 """Time over which frames are counted [s]."""
@@ -110,6 +112,7 @@ class SteerPanel:
         channel: KeyChannel,
         rollout_at: Callable[[int], tuple[ObjectRollout, int]],
         stop_comparing: Callable[[], None],
+        newtons: Callable[[], float],
         keep: KeepTake | None = None,
     ) -> None:
         """Add the tab's controls.
@@ -126,6 +129,7 @@ class SteerPanel:
             channel: Tells held keys.
             rollout_at: Finds the rollout of a frame, and which of its frames.
             stop_comparing: Ends a comparison, which shows two objects.
+            newtons: Tells the force on the object for one newton of its model.
             keep: Makes a run and a recording of a take; None where nothing can be kept.
         """
         self._server = server
@@ -139,6 +143,7 @@ class SteerPanel:
         self._channel = channel
         self._rollout_at = rollout_at
         self._stop_comparing = stop_comparing
+        self._newtons = newtons
         self._keep = keep
         self._recorded: Recorded | None = None
         self._take_folder: TakeFolder | None = None
@@ -188,12 +193,27 @@ class SteerPanel:
             self._turn_speed: Any = gui.add_slider(
                 "Turning [°/s]", 10.0, 360.0, 10.0, _TURN_SPEED, hint="Of a hand that keys turn"
             )
+            self._limits_force: Any = gui.add_checkbox(
+                "Limit force", False, hint="Hands give way where the object pulls at them harder"
+            )
+            weight = self._weight()
+            self._most_force: Any = gui.add_slider(
+                "Force [N]",
+                _rounded(0.5 * weight),
+                _rounded(50.0 * weight),
+                _rounded(0.1 * weight),
+                _rounded(3.0 * weight),
+                visible=False,
+                hint="At first three times what the object weighs",
+            )
             self._record = gui.add_button(
                 _RECORD, color=_RED, visible=False, hint="Space; at most a minute"
             )
         self._button.on_click(guard(lambda _: self.toggle()))
         self._record.on_click(guard(lambda _: self._toggle_recording()))
         self._grip_button.on_click(guard(lambda _: self._toggle_grip()))
+        self._limits_force.on_update(guard(lambda _: self._limit_force()))
+        self._most_force.on_update(guard(lambda _: self._limit_force()))
         self._choice.on_update(guard.by_user(lambda _: self._choose(self._choice.value)))
 
     @property
@@ -294,6 +314,7 @@ class SteerPanel:
             extent=self._extent,
             on_change=self._hear,
         )
+        self._limit_force()
         self._arrivals.clear()
         self._offer(take)
         self._tabs.open("Steer")
@@ -532,6 +553,23 @@ class SteerPanel:
         velocity = velocity_of(self._held, self._axes(), self._speed.value, turn_speed)
         steered.order(self._hand, HandOrder(velocity=velocity))
 
+    def _weight(self) -> float:
+        """Tell what the object weighs, as forces are shown [N]."""
+        fitted = self._content.fitted
+        if fitted is None:
+            return 1.0
+        gravity = abs(fitted.parameters.gravity) or _GRAVITY
+        return self._newtons() * fitted.model.node_count * gravity
+
+    def _limit_force(self) -> None:
+        """Bound how hard hands pull, or not."""
+        with self._lock:
+            is_limited = bool(self._limits_force.value)
+            self._most_force.visible = is_limited
+            if self._object is not None:
+                most = float(self._most_force.value) / self._newtons()
+                self._object.limit_force(most if is_limited else None)
+
     def _axes(self) -> Float[ndarray, "3 3"]:
         """Find out how the newest client looks at the scene."""
         clients = self._server.get_clients()
@@ -588,11 +626,18 @@ class SteerPanel:
             elif not self._live.is_ready:
                 pace = STARTING.replace("*", "")
             doing = "Playing the take" if steered.is_replaying else "Steering"
-            text = f"<b>{doing} from frame {self._frame}</b><br>{pace}"
+            text = f"<b>{doing} from frame {self._frame}</b><br>{pace}{self._pull(steered.newest)}"
             if steered.is_recording:
                 seconds = (len(steered.recorded) - 1) / steered.take.parameters.frame_rate
                 text += f"<br>● Recording, {seconds:.1f} s"
         self._status.content = f"<div style='{_STYLE}' data-steering>{text}</div>"
+
+    def _pull(self, frame: SteeredFrame) -> str:
+        """Say how hard the object pulls at what is moved."""
+        if frame.pull is None or self._hand >= len(frame.pull):
+            return ""
+        force = self._newtons() * float(np.linalg.norm(frame.pull[self._hand]))
+        return f"<br>the object pulls with {force:.2g} N"
 
     def _show_buttons(self, steered: SteeredObject | None) -> None:
         """Say on the buttons what they would do now; those that do nothing are hidden."""

@@ -42,6 +42,8 @@ class SteeredFrame:
     """Their velocities [m/s]."""
     pose: Float[ndarray, "hand 6"]
     """Poses of the hands; see `Take`."""
+    pull: Float[ndarray, "hand 3"] | None = None
+    """How the object pulls at each hand [N]; None before the first frame was simulated."""
 
 
 def begin_take(content: Content, rollout: ObjectRollout, frame: int, shown: int) -> Take:
@@ -128,6 +130,7 @@ class SteeredObject:
         self._lock = threading.Lock()
         self._number = 0
         self._orders = [HandOrder() for _ in take.hands]
+        self._most_force: float | None = None
         start = SteeredFrame(take, *take.start, take.pose[0])
         self._before = self._newest = start
         self._durations: deque[float] = deque(maxlen=30)
@@ -181,7 +184,21 @@ class SteeredObject:
             if hand >= len(self._orders) or order == self._orders[hand]:
                 return
             self._orders[hand] = order
-            self._live.drive(self._mailbox, self._orders)
+            self._drive()
+
+    def limit_force(self, most: float | None) -> None:
+        """Let hands give way that the object pulls at harder than this, from now on.
+
+        Args:
+            most: The greatest force, of the model [N]; None for no limit.
+        """
+        with self._lock:
+            if most != self._most_force:
+                self._most_force = most
+                self._drive()
+
+    def _drive(self) -> None:
+        self._live.drive(self._mailbox, self._orders, self._most_force)
 
     def begin_gesture(self) -> None:
         """Remember the state to which `undo` returns."""
@@ -302,7 +319,7 @@ class SteeredObject:
         begun = replace(start.take, start=state, pose=start.pose[None])
         self._is_replaying = False
         self._number = self._live.steer(self._mailbox, begun, self._limits)
-        self._live.drive(self._mailbox, self._orders)
+        self._drive()
 
     def _receive(self, message: Message) -> None:
         if message.kind == "ready":
@@ -319,7 +336,11 @@ class SteeredObject:
                 if message["frame"] > 0 or self._is_replaying:
                     take = self._replayed if self._is_replaying else self._newest.take
                     self._newest = SteeredFrame(
-                        take, arrays["position"], arrays["velocity"], arrays["pose"]
+                        take,
+                        arrays["position"],
+                        arrays["velocity"],
+                        arrays["pose"],
+                        arrays["pull"],
                     )
                 if message["frame"] > 0:
                     self._durations.append(float(message["duration"]))

@@ -13,6 +13,7 @@ from physhandi.simulation.topology import build_model
 
 RATE = 30.0
 GROUND = 0.01
+NO_PULL = np.zeros(3)
 
 
 def drive(
@@ -47,7 +48,7 @@ def two_hands(**changes: object) -> Take:
 
 
 def poses(hand: HandDrive, count: int) -> np.ndarray:
-    return np.stack([hand.next() for _ in range(count)])
+    return np.stack([hand.next(NO_PULL) for _ in range(count)])
 
 
 def test_a_hand_takes_up_its_speed_smoothly_keeps_it_and_stops_smoothly() -> None:
@@ -96,10 +97,9 @@ def test_each_hand_follows_its_own_order_until_the_next() -> None:
         HandOrder(velocity=(0.0, 0.1, 0.0, 0.0, 0.0, 0.0)),
         HandOrder(goal=(0.2,) + (0.0,) * 5),
     ]
-    drives.obey([order.to_dict() for order in orders])
+    drives.obey([order.to_dict() for order in orders], None)
     for _ in range(40):
-        drives.obey(())
-        pose = drives.next()
+        pose = drives.next(np.zeros((2, 3)))
     assert pose[0, 1] == pytest.approx(0.1 * (40 / RATE - LAG), abs=0.003)
     np.testing.assert_allclose(pose[1], [0.2, 0, 0, 0, 0, 0], atol=1e-5)
     np.testing.assert_array_equal(pose[0, [0, 2, 3, 4, 5]], 0.0)
@@ -112,7 +112,7 @@ def test_a_hand_goes_as_far_as_it_reaches_and_turns_round_at_once() -> None:
     hand.order = HandOrder(velocity=(-0.3, -0.4, 0.0, 0.0, 0.0, 0.0))
     # It has not gathered speed at its bound.
     first = 0.5 * (1.0 - math.exp(-1.0 / (RATE * LAG))) / RATE
-    np.testing.assert_allclose(0.2 - np.linalg.norm(hand.next()[:3]), first, rtol=1e-6)
+    np.testing.assert_allclose(0.2 - np.linalg.norm(hand.next(NO_PULL)[:3]), first, rtol=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["goal", "velocity"])
@@ -120,23 +120,38 @@ def test_no_hand_goes_through_the_ground(kind: str) -> None:
     take = two_hands()
     drives = Drives(take, HandLimits(top_speed=1.0, reach=1.0))
     down = (0.1, 0.0, -0.5, 0.0, 0.0, 0.0)
-    drives.obey([HandOrder(**{kind: down}).to_dict()] * 2)
-    height = np.stack([take.control_at(drives.next())[:, 2] for _ in range(60)])
+    drives.obey([HandOrder(**{kind: down}).to_dict()] * 2, None)
+    height = np.stack([take.control_at(drives.next(np.zeros((2, 3))))[:, 2] for _ in range(60)])
     # The lowest node of a hand lies on the ground, or where it was recorded below it.
     np.testing.assert_allclose(height[-1], [GROUND, GROUND, 0.008, 0.1], atol=1e-7)
     assert height[:, :2].min() >= GROUND - 1e-7
     # Along the ground it goes on.
-    assert drives.next()[0, 0] > 0.095
+    assert drives.next(np.zeros((2, 3)))[0, 0] > 0.095
     # A hand that tips forward is lifted by its own length: its node stays above the ground.
-    drives.obey([HandOrder(goal=(0.0, 0.0, -0.5, 0.0, np.pi / 2, 0.0)).to_dict()] * 2)
+    drives.obey([HandOrder(goal=(0.0, 0.0, -0.5, 0.0, np.pi / 2, 0.0)).to_dict()] * 2, None)
     for _ in range(90):
-        pose = drives.next()
+        pose = drives.next(np.zeros((2, 3)))
     np.testing.assert_allclose(take.control_at(pose)[:2, 2], [GROUND + 0.04, GROUND], atol=1e-6)
 
 
 def test_without_ground_a_hand_goes_down() -> None:
     drives = Drives(two_hands(ground_height=None), HandLimits(top_speed=1.0, reach=1.0))
-    drives.obey([HandOrder(goal=(0.0, 0.0, -0.5, 0.0, 0.0, 0.0)).to_dict()] * 2)
+    drives.obey([HandOrder(goal=(0.0, 0.0, -0.5, 0.0, 0.0, 0.0)).to_dict()] * 2, None)
     for _ in range(90):
-        pose = drives.next()
+        pose = drives.next(np.zeros((2, 3)))
     np.testing.assert_allclose(pose[:, 2], -0.5, atol=1e-5)
+
+
+def test_a_hand_gives_way_along_a_pull_that_is_too_strong() -> None:
+    top = 1.5
+    for force, speed in ((9.9, 0.6), (12.5, -0.2 * top * 0.25), (50.0, -0.2 * top)):
+        hand = drive(top_speed=top)
+        hand.most_force = 10.0
+        hand.order = HandOrder(velocity=(0.3, 0.0, 0.6, 0.0, 0.0, 0.0))
+        way = np.stack([hand.next(np.array([0.0, 0.0, -force])) for _ in range(60)])
+        last = RATE * (way[-1] - way[-2])
+        np.testing.assert_allclose(last, [0.3, 0, speed, 0, 0, 0], rtol=1e-6, atol=1e-12)
+    # One that is told to go along the pull, and faster, does so.
+    hand.order = HandOrder(velocity=(0.0, 0.0, -1.0, 0.0, 0.0, 0.0))
+    way = np.stack([hand.next(np.array([0.0, 0.0, -12.5])) for _ in range(60)])
+    np.testing.assert_allclose(RATE * (way[-1] - way[-2])[2], -1.0, rtol=1e-6)

@@ -219,6 +219,31 @@ def test_a_hand_that_is_pressed_into_the_table_stays_on_it(live, mailbox, run) -
     assert np.ptp(position, axis=0)[:2] == pytest.approx(np.ptp(take.start[0], axis=0)[:2], rel=0.2)
 
 
+@pytest.mark.parametrize("most", [None, 1500.0])
+def test_a_hand_pulls_no_harder_than_it_may(live, mailbox, run, most: float | None) -> None:
+    take = steered(run)
+    far = take.hold_point(0, take.start, take.pose[0], "point 1")
+    number = live.steer("a", replace(far, pose=np.zeros((1, 2, 6))), LIMITS, is_paced=False)
+    goal = (0.0, 0.0, 0.3, 0.0, 0.0, 0.0)
+    live.drive("a", [HandOrder(goal=goal), HandOrder()], most)
+    height, driven = 0.0, 0
+    while driven < 240:  # So many frames after it has heard of its goal the pull is steady.
+        message = mailbox.until("frame", "diverged")[-1]
+        assert message.kind == "frame", message["error"]
+        if message["request"] == number:
+            pull, height = message.arrays["pull"][0], message.arrays["pose"][0, 2]
+            driven += height > 0.0
+    live.cancel("a")
+    # A corner is held on the table, so that going up stretches the sheet.
+    force = float(np.linalg.norm(pull))
+    if most is None:
+        assert height == pytest.approx(0.3)
+        assert force > 2500.0
+    else:
+        assert force == pytest.approx(most, rel=0.03)
+        assert 0.1 < height < 0.25
+
+
 def test_what_cannot_be_steered_is_told_and_the_process_lives_on(live, mailbox, run) -> None:
     process, take = live.process_id, steered(run)
     live.steer("a", take, LIMITS, is_paced=False)

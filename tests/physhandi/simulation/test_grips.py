@@ -7,7 +7,7 @@ import pytest
 
 from physhandi.simulation.forces import spring_strains
 from physhandi.simulation.parameters import SimulationParameters
-from physhandi.simulation.steering import SteeredHand, Take
+from physhandi.simulation.steering import SteeredHand, SteeredSimulation, Take
 from physhandi.simulation.topology import build_model
 
 SPACING, RATE, GRAVITY = 0.02, 30.0, 9.81
@@ -174,6 +174,22 @@ def test_a_point_that_is_held_no_more_leaves_all_as_it_was() -> None:
     for name, value in take.model.to_tensors().items():
         np.testing.assert_array_equal(back.model.to_tensors()[name], value, err_msg=name)
     np.testing.assert_array_equal(back.control, take.control)
+
+
+def test_the_object_pulls_at_its_hands_with_its_weight() -> None:
+    take = replace(sheet(), parameters=PARAMETERS.replace(drag=5.0))
+    held = take.hold_point(24, take.start, take.pose[0], "point 1")
+    steered = SteeredSimulation(replace(held, pose=np.zeros((1, 3, 6))))
+    for _ in range(150):
+        state = steered.step(np.zeros((3, 6)))
+    pull = steered.pulls(state)
+    # 25 nodes of 1 kg; what stretches it between the corners adds up to nothing.
+    np.testing.assert_allclose(pull.sum(axis=0), [0, 0, -25 * GRAVITY], atol=0.5)
+    assert (pull[:, 2] < -20).all()
+    # A hand that is moving is pulled back by the dashpots, too: where it goes up, harder.
+    up = np.zeros((3, 6))
+    up[2, 2] = 0.002
+    assert steered.pulls(steered.step(up))[2, 2] < pull[2, 2] - 5
 
 
 @pytest.mark.parametrize("stiffness", [600.0, 2e5])
