@@ -225,4 +225,4 @@ def test_vendored_and_bundled_data_stay_small() -> None:
     files = listed.stdout.split() or [
         str(p) for p in (ROOT / "sequences").rglob("*") if p.is_file()
     ]
-    assert 0 < sum((ROOT / name).stat().st_size for name in files) <= 5_250_000
+    assert 0 < sum((ROOT / name).stat().st_size for name in files) <= 6_600_000

@@ -12,7 +12,7 @@
 ``range``           values at the ends of the color scale, in SI units
 ``scale``           length of the force arrows
 ``mass``            what the object weighs [kg], if somebody said so on the screen
-``from``            view whose image is the backdrop
+``from``            view whose image is the backdrop; none with ``show`` or ``cam`` but without this
 ``theme``           ``light`` or ``dark``
 ``fig``             1 for the figure that compares with PhysTwin
 ``play``            1 if the clock runs
@@ -184,8 +184,8 @@ def _layers_from_query(query: Mapping[str, str]) -> dict[str, Any]:
         if ends[0] >= ends[1]:
             raise UsageError("range: the first value is not smaller than the second one.")
         layers["color_range"] = ends
-    if query.get("from"):
-        layers["looks_from"] = query["from"]
+    if {"from", "show", "cam"} & set(query):  # Who says what is seen, says it without a backdrop.
+        layers["looks_from"] = query.get("from") or None
     return layers
 
 

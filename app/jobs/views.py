@@ -46,6 +46,8 @@ def describe_sequence(item: SequenceItem) -> dict[str, Any]:
         "name": sequence.name,
         "description": sequence.description,
         "label": sequence.label,
+        "origin": _told(sequence.provenance, "origin"),
+        "licence": _told(sequence.provenance, "licence", "license"),
         "frame_count": sequence.frame_count,
         "frame_rate": sequence.frame_rate,
         "duration_s": sequence.frame_count / sequence.frame_rate,
@@ -57,6 +59,12 @@ def describe_sequence(item: SequenceItem) -> dict[str, Any]:
         "length_unit": sequence.length_unit,
         "reconstruction_frames": len(sequence.reconstruction_frames),
     }
+
+
+def _told(provenance: Mapping[str, Any], *names: str) -> str:
+    """Give the first of these fields that is text, which whoever made the sequence wrote."""
+    found = (provenance.get(name) for name in names)
+    return next((text for text in found if isinstance(text, str)), "")
 
 
 def describe_run(item: RunItem, scheduler: Scheduler) -> dict[str, Any]:
@@ -341,6 +349,8 @@ class RunSummary:
     """Track error of the rollout in the frames that were not fitted [m]."""
     reprojection: float | None = None
     """Median distance of the hands' joints from their keypoints in the images [px]."""
+    has_object: bool = False
+    """Whether there is an object that can be simulated."""
 
 
 def summarize_run(run: Run) -> RunSummary:
@@ -354,7 +364,9 @@ def summarize_run(run: Run) -> RunSummary:
         reprojection = _reprojection(run)
     except (PhysHandiError, OSError):
         fitted = predicted = reprojection = None
-    return RunSummary(_duration(run), fitted, predicted, reprojection)
+    return RunSummary(
+        _duration(run), fitted, predicted, reprojection, has_object=run.has(PARAMETERS_FILE)
+    )
 
 
 def _duration(run: Run) -> float | None:

@@ -169,10 +169,15 @@ def _is_kept(run: Mapping[str, Any]) -> bool:
     return run["is_bundled"] or run["state"] not in ENDED
 
 
-def _featured(runs: list[dict[str, Any]]) -> dict[str, Any] | None:
-    """Choose the finished run that the home page offers first: a bundled one, else the newest."""
+def _featured(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Choose the finished runs that the home page offers: the bundled ones, else the newest.
+
+    One with an object comes first, since its physics can be changed.
+    """
     finished = [run for run in runs if run["is_published"] and run["kind"] == "reconstruction"]
-    return min(finished, key=lambda run: not run["is_bundled"], default=None)
+    bundled = [run for run in finished if run["is_bundled"]]
+    bundled.sort(key=lambda run: not run["has_object"])
+    return bundled or finished[:1]
 
 
 def _chosen(

@@ -16,6 +16,7 @@ from app.viewer.clock.timeline_panel import TimelinePanel
 from app.viewer.color.color_panel import ColorPanel
 from app.viewer.compare.live import LiveComparison
 from app.viewer.content.content import Catalog, Content, open_run, open_sequence
+from app.viewer.content.layers import default_layers
 from app.viewer.content.session_state import Kind, Pose, SessionState
 from app.viewer.export.export_panel import ExportPanel
 from app.viewer.export.snapshot import Snapshot
@@ -136,6 +137,7 @@ class Session(SceneServer):
             "object": self._content.fitted is not None,
             "colors": self._colors.is_there,
             "figure": self._comparison.offers_figure,
+            "video": default_layers(self._content).looks_from is not None,
         }
         return tuple(name for name, is_there in features.items() if is_there)
 
@@ -189,7 +191,8 @@ class Session(SceneServer):
     def _build(self) -> None:
         server, guard = self._server, self._guard
         set_theme(server, dark=False)
-        simulated: tuple[TabName, ...] = ("Physics", "Steer") if self.kind == "run" else ()
+        has_object = self._content.fitted is not None
+        simulated: tuple[TabName, ...] = ("Physics", "Steer") if has_object else ()
         tabs = self._tabs = Tabs(server.gui, "Play", "Look", *simulated, "Inspect", "Export")
         with tabs["Play"]:
             self._legend = server.gui.add_html("")
@@ -322,6 +325,9 @@ class Session(SceneServer):
             self._playback.replace(content.frame_count, content.frame_rate)
             self._timeline.replace(content.frame_count)
             self._fill()
+            if self._view.scene.layers.looks_from is not None:
+                for client in self._server.get_clients().values():
+                    self._layers.place(client)
         self._playback.play()
 
     def _welcome(self, client: viser.ClientHandle) -> None:

@@ -138,12 +138,37 @@ def test_the_list_says_what_it_shows_and_every_column_sorts_by_a_link(world: Wor
         again = client.get(address.replace("&amp;", "&"))
         assert again.status_code == 200
         assert 'data-run="fitted"' in again.text
-    assert 'value="succeeded" >succeeded (2)' in page
+    finished = [run for run in world.catalog.runs() if world.scheduler.view(run).is_published]
+    assert f'value="succeeded" >succeeded ({len(finished)})' in page
     headers = client.get("/runs?q=&state=&sort=name", headers={"HX-Trigger": "filter"}).headers
     assert headers["HX-Replace-Url"] == "/runs?sort=name"
     assert "HX-Push-Url" in client.get("/runs?q=a").headers
     quiet = client.get("/runs?q=a", headers={"HX-Trigger": "runs"}).headers
     assert not {"hx-push-url", "hx-replace-url"} & set(quiet)
+
+
+def test_the_home_page_opens_what_came_with_it_and_says_whose_it_is(world: World) -> None:
+    page = world.browser().get("/").text
+    opened = re.findall(r'<button class="([^"]+)" data-open="run" data-id="([^"]+)"', page)
+    hero = [(name, run) for name, run in opened if run != "fitted"][:2]
+    # Physics can be changed where there is an object, so that one comes first.
+    assert hero == [("big", "towel_fold_quick"), ("secondary outline", "stereo_hand_default")]
+    card = page.partition('data-sequence="stereo_hand"')[2].partition("</article>")[0]
+    assert "TemugeB/handpose3d" in card
+    assert "MIT" in card
+    told = world.script().get("/api/v1/sequences").json()["sequences"]
+    licences = {entry["id"]: entry["licence"] for entry in told if entry["is_bundled"]}
+    assert licences == {"stereo_hand": "MIT, see LICENSE", "towel_fold": "Apache-2.0"}
+    runs = world.script().get("/api/v1/runs").json()["runs"]
+    assert {run["id"]: run["has_object"] for run in runs} == {
+        "fitted": True,
+        "stereo_hand_default": False,
+        "towel_fold_quick": True,
+    }
+    of_hand = world.browser().get("/runs/stereo_hand_default").text
+    assert "<dd>1.52 px</dd>" in of_hand
+    assert "format=mjcf" not in of_hand
+    assert "format=mjcf" in world.browser().get("/runs/towel_fold_quick").text
 
 
 @pytest.mark.parametrize(

@@ -15,12 +15,16 @@ from sheet_sequence import FRAMES, NODE
 
 from app import cli
 from app.cli import runs
+from app.settings import BUNDLED
 from physhandi import pipeline
 from physhandi.data.run import RunFolder
 from physhandi.fitting.artefacts import load_model, load_parameters
 from physhandi.fitting.config import PipelineConfig
 from physhandi.run import Run
 from physhandi.simulation.stability import LONGEST_STEP, SAFETY, largest_stable_step
+
+SHIPPED = ", ".join(sorted(path.parent.name for path in BUNDLED.glob("*/sequence.yaml")))
+"""Names of the sequences that came with the program."""
 
 
 class Terminal:
@@ -197,7 +201,7 @@ def test_an_error_stands_on_a_line_of_its_own_below_the_progress(
 @pytest.mark.parametrize(
     ("arguments", "code", "reason"),
     [
-        (["reconstruct", "nowhere", "--out", "x"], 2, "Known are: sheet, towel_fold"),
+        (["reconstruct", "nowhere", "--out", "x"], 2, f"Known are: sheet, {SHIPPED}"),
         (["reconstruct", "--out", "x"], 2, "at least one sequence"),
         (["reconstruct", "sheet", "--out", "x", "--profile", "fastest"], 2, "Choose one of"),
         (["reconstruct", "sheet", "--out", "x", "--device", "abacus"], 2, "no device 'abacus'"),
@@ -345,7 +349,7 @@ def test_the_environment_speaks_where_the_arguments_are_silent(
     assert [settings.device for settings in seen] == ["cpu", "cpu"]
     assert seen[0].data_dir == tmp_path / "elsewhere"
     assert seen[1].data_dir == Path("here").resolve()
-    assert "Known are: towel_fold" in terminal.refused(2, "reconstruct", "sheet", "--out", "x")
+    assert f"Known are: {SHIPPED}" in terminal.refused(2, "reconstruct", "sheet", "--out", "x")
     monkeypatch.setenv("PHYSHANDI_PORT", "many")
     assert "port" in terminal.refused(2, "serve")
     monkeypatch.delenv("PHYSHANDI_PORT")

@@ -237,7 +237,12 @@ def _side(key: str, content: Content, frame: int) -> ComparedSide:
 def _first_layers(content: Content) -> Layers:
     """Show objects and hands; what holds the object would hide how two of them differ."""
     return replace(
-        default_layers(content), controls=False, virtual_springs=False, forces=False, cameras=False
+        default_layers(content),
+        controls=False,
+        virtual_springs=False,
+        forces=False,
+        cameras=False,
+        looks_from=None,
     )
 
 

@@ -71,8 +71,11 @@ def default_layers(content: Content) -> Layers:
     """Choose what is shown at first: the result if there is one, else the recording.
 
     Nodes and springs would hide the surface of an object, and come in its place if it has none.
+    Hands without an object are seen as the first camera with a picture saw them, before it.
     """
     has_object, has_surface = content.fitted is not None, content.surface is not None
+    seen_from = [view.name for view in content.views if view.has_color]
+    is_before_video = bool(content.hands and seen_from) and not has_object
     return Layers(
         surface=has_surface,
         nodes=not has_surface,
@@ -83,6 +86,7 @@ def default_layers(content: Content) -> Layers:
         object_springs=content.fitted is not None
         and not has_surface
         and has_few_springs(content.fitted),
+        looks_from=seen_from[0] if is_before_video else None,
     )
 
 

@@ -50,7 +50,7 @@ def legend_of(content: Content, layers: Layers) -> str:
         (RED, ", ".join(red) if has_object else controls, bool(red)),
         (YELLOW, "virtual springs", layers.virtual_springs and has_object and not is_colored),
         (GREEN, "markers" if is_marked else "observed", layers.observed and is_green),
-        (GREY, "cameras", layers.cameras and bool(content.views)),
+        (GREY, "cameras", layers.cameras and bool(content.views) and layers.looks_from is None),
     )
     shown = [(color, text) for color, text, is_shown in entries if is_shown]
     return swatches_html(shown, is_list=False)
@@ -140,6 +140,7 @@ class LayersPanel:
         self._scale.visible = has_object
         self._views = {view.name: view for view in content.views}
         self._place.options = (_OVERVIEW, *self._views)
+        self._place.value = layers.looks_from or _OVERVIEW
         self._place.visible = bool(self._views)
 
     @property
@@ -204,13 +205,18 @@ class LayersPanel:
         self._redraw()
 
     def _look(self, event: Any) -> None:
-        framing, eye = self._framing, event.client.camera
-        if framing is None:
-            return
         view = self._views.get(self._place.value)
         self._layers.looks_from = view.name if view is not None else None
         self._redraw()
-        with event.client.atomic():
+        self.place(event.client)
+
+    def place(self, client: viser.ClientHandle) -> None:
+        """Put the camera of a client where the view is that is looked from, or to the overview."""
+        framing, eye = self._framing, client.camera
+        if framing is None:
+            return
+        view = self._views.get(self._place.value)
+        with client.atomic():
             if view is None:
                 eye.up_direction = (0.0, 0.0, 1.0)
                 eye.fov = framing.fov

@@ -14,7 +14,7 @@ from app.viewer.color.hand_coloring import HandPainter
 from app.viewer.content.content import Content
 from app.viewer.content.layers import GREEN, GREY, SKIN, Layers, default_layers
 from app.viewer.content.observed import BONES
-from app.viewer.scene.cameras import CameraNodes
+from app.viewer.scene.cameras import BACKDROP_BYTES, CameraNodes, pose_of_view
 from app.viewer.scene.framing import Framing
 from app.viewer.scene.nodes import SceneNodes
 from app.viewer.scene.object_drawing import (
@@ -145,15 +145,22 @@ class SceneDrawing:
         camera.far = 200.0 * self._framing.extent
         camera.look_at = self._framing.look_at
         camera.position = self._framing.camera
+        for view in self._content.views:
+            if view.name == self.layers.looks_from:
+                pose_of_view(view, self._framing).give_first(camera)
 
     def _draw_ground(self, rollout: ObjectRollout | None) -> None:
-        """Lay the grid where the rollout's ground is; a grid that is mere decoration stays."""
+        """Lay the grid where the rollout's ground is; a grid that is mere decoration stays.
+
+        Before a picture of the scene there is none: that shows what the hands are above.
+        """
         recorded = self._content.ground_height
         height = recorded if rollout is None else rollout.parameters.ground_height
         is_there = height is not None or recorded is None
         if height is not None:
             self._nodes.lift("/ground", height - 0.001 * self._framing.extent)
-        self._nodes.show("/ground", is_visible=self.layers.ground and is_there)
+        is_visible = self.layers.ground and is_there and self.layers.looks_from is None
+        self._nodes.show("/ground", is_visible=is_visible)
 
     def _draw_hands(
         self, frame: int, steered: Mapping[str, Float[ndarray, "vertex 3"]] | None
@@ -190,10 +197,11 @@ class SceneDrawing:
 
     @property
     def _hand_opacity(self) -> float | None:
-        """How much hands hide: all where there is no overlay that is to be seen through them."""
+        """How much hands hide: all where nothing, overlay or video, is to be seen through them."""
         layers = self.layers
         has_overlay = layers.nodes or layers.controls or layers.virtual_springs
-        return _SEE_THROUGH if has_overlay or layers.all_controls else None
+        is_over = has_overlay or layers.all_controls or layers.looks_from is not None
+        return _SEE_THROUGH if is_over else None
 
     def _draw_observed(
         self,
@@ -252,6 +260,7 @@ class SceneDrawing:
             point_count += surface.vertex_count
             point_count += 0 if layers.color == "plain" else surface.vertex_count // 4
         left = self._frame_bytes - 12 * point_count
+        left -= BACKDROP_BYTES if layers.looks_from is not None else 0
         budget = share_bytes(left, rollout, layers, _PLAYING_ARROWS)
         if left >= _LEAST_BYTES or not layers.surface:
             return budget

@@ -9,8 +9,12 @@ import pytest
 from viewer_client import ViewerClient
 from viewer_world import FRAMES, FakeSettings
 
+from app.exports.permalink import state_from_query
 from app.viewer.compare.live import LiveComparison
+from app.viewer.content.content import open_run
+from app.viewer.content.session_state import Pose
 from app.viewer.export.snapshot import snapshot_csv, snapshot_npz, snapshot_ply, snapshot_yaml
+from app.viewer.restoring import complete_state
 from app.viewer.sessions import Sessions, TooManySessionsError
 from physhandi.errors import MissingInputError, PhysHandiError, RunError, UsageError
 from physhandi.run import Run
@@ -161,7 +165,9 @@ def test_a_bare_cloud_stands_still_where_a_tracked_hand_plays(
     shutil.rmtree(bare)  # The folder is every test's.
 
 
-def test_a_run_without_an_object_shows_hands_and_cameras(sessions, catalog, recording) -> None:
+def test_hands_without_an_object_are_seen_before_the_first_video(
+    sessions, catalog, recording
+) -> None:
     name = recording.sequence.name
     run = Run.create(
         catalog.root / "runs" / "hands",
@@ -179,8 +185,29 @@ def test_a_run_without_an_object_shows_hands_and_cameras(sessions, catalog, reco
     with watch(sessions, "run", "hands") as client:
         client.until(lambda: {"/hand/right", "/cameras/view1"} <= set(client.nodes))
         assert not any(p.get("label") == "Preset" for p in client.gui.values())
-        client.set("View from", "view0")
+        session = sessions.get(sessions.list()[0].id)
+        assert session.offers == ("video",)
+        assert set(session._tabs._tabs) == {"Play", "Look", "Inspect", "Export"}
+        pose = Pose.first(session._server.initial_camera)
+        camera = recording.sequence.views[0].camera
+        np.testing.assert_allclose(pose.position, camera.T_world_camera[:3, 3], atol=1e-6)
         client.until(lambda: client.nodes["/cameras/view0"]["scale"] > 0.2)
+        ground = session._server.scene._handle_from_node_name["/ground"]
+        assert not ground.visible
+        client.set("View from", "view1")
+        client.until(lambda: client.nodes["/cameras/view1"]["scale"] > 0.2)
+        client.set("View from", "Overview")
+        client.until(lambda: client.nodes["/cameras/view1"]["scale"] < 0.2)
+        assert ground.visible
+    for query, looks_from in (
+        ({"f": "2"}, "view0"),
+        ({"f": "2", "cam": "1,1,1,0,0,0"}, None),
+        ({"f": "2", "show": "hands"}, None),
+        ({"f": "2", "show": "hands", "from": "view1"}, "view1"),
+    ):
+        content = open_run(catalog, "hands")
+        state = complete_state(state_from_query(query), content)
+        assert state.layers.looks_from == looks_from, query
 
 
 def test_downloads_hold_what_is_on_the_screen(sessions, run) -> None:
