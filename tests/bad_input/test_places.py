@@ -204,7 +204,7 @@ def in_a_process(folder: Path, *order: str, setup: str = "") -> tuple[int, str]:
         text=True,
         timeout=170,
         check=False,
-        env=os.environ | {"PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1"},
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
     )
     return done.returncode, done.stderr
 

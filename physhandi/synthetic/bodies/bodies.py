@@ -98,7 +98,7 @@ def make_body(name: BodyName, random: Generator, *, resolution: Resolution = "fi
         raise UsageError(f"There is no resolution named {resolution!r}. Choose fine or tiny.")
     is_fine = resolution == "fine"
     if name == "cloth":
-        return _make_cloth(random, 29 if is_fine else 14)
+        return _make_cloth(random, 29 if is_fine else 10)
     if name == "towel":
         return _make_towel(random, 27 if is_fine else 18)
     if name == "rope":

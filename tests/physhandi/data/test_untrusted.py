@@ -92,9 +92,13 @@ def test_sparse_matrices_of_today_become_dense(tmp_path: Path, kind: str) -> Non
 
 def test_torch_checkpoints_become_arrays(tmp_path: Path) -> None:
     stiffness = torch.nn.Parameter(torch.linspace(1, 9, 12))
-    optimizer = torch.optim.Adam([stiffness], lr=1e-3, betas=(0.9, 0.99))
-    (stiffness**2).sum().backward()
-    optimizer.step()
+    # As `torch.optim.Adam` tells it, which imports PyTorch's compiler for seconds.
+    moments = {"exp_avg": torch.linspace(0.2, 1.8, 12), "exp_avg_sq": torch.linspace(0.04, 3.2, 12)}
+    group = {"lr": 1e-3, "betas": (0.9, 0.99), "eps": 1e-8, "amsgrad": False, "foreach": None}
+    optimizer = {
+        "state": {0: {"step": torch.tensor(1.0), **moments}},
+        "param_groups": [{**group, "params": [0]}],
+    }
     base = torch.arange(24, dtype=torch.float64).reshape(2, 3, 4)
     kinds = (torch.float16, torch.bfloat16, torch.int64, torch.int16, torch.uint8, torch.bool)
     saved = {
@@ -108,7 +112,7 @@ def test_torch_checkpoints_become_arrays(tmp_path: Path) -> None:
         "kinds": [torch.tensor([0, 1, 3]).to(kind) for kind in kinds],
         "module": torch.nn.Linear(3, 2).state_dict(),
         "size": base.size(),
-        "optimizer_state_dict": optimizer.state_dict(),
+        "optimizer_state_dict": optimizer,
     }
     path = tmp_path / "best_7.pth"
     torch.save(saved, path)
@@ -122,9 +126,8 @@ def test_torch_checkpoints_become_arrays(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read["module"]["weight"], saved["module"]["weight"].numpy())
     assert list(read["size"]) == [2, 3, 4]
     state = read["optimizer_state_dict"]
-    expected = optimizer.state_dict()
-    assert state["param_groups"] == expected["param_groups"]
-    for name, value in expected["state"][0].items():
+    assert state["param_groups"] == optimizer["param_groups"]
+    for name, value in optimizer["state"][0].items():
         np.testing.assert_array_equal(state["state"][0][name], value.numpy(), strict=True)
         assert np.any(state["state"][0][name]), name
 
@@ -159,7 +162,7 @@ def test_the_canaries_would_sing(tmp_path: Path) -> None:
 def test_broken_and_exploding_files_are_refused(tmp_path: Path, case: str) -> None:
     path = _store(tmp_path, BROKEN[case]())
     with pytest.raises(ImportFailedError, match=r"foreign\.pkl: refused, because"):
-        read_untrusted(path, time_limit_s=60.0, memory_limit=3 << 30)
+        read_untrusted(path, time_limit_s=600.0, memory_limit=3 << 30)
 
 
 def test_memory_and_time_are_limited(tmp_path: Path) -> None:

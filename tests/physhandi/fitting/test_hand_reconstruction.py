@@ -36,6 +36,8 @@ from physhandi.perception.keypoints import detect_sequence
 from physhandi.progress import NullProgress, Progress
 
 QUICK = HandFitConfig(iterations=250)
+RECORDED = 120
+"""Frames of the real recording that are used."""
 
 
 CAMERAS = [scene.looking_at_hand(angle) for angle in (0.0, 1.2, 2.6)]
@@ -121,14 +123,14 @@ def test_depth_corrects_a_hand_that_one_view_cannot_place(tmp_path: Path) -> Non
     truth = scene.grasping(frames=6)
     keypoint = scene.seen_keypoints([truth], CAMERAS[:1])
     sequence = scene.write_scene(tmp_path / "a", [truth], CAMERAS[:1], keypoint, depth=True)
-    config = HandFitConfig(iterations=200, depth_iterations=0)
+    config = HandFitConfig(iterations=120, depth_iterations=0)
     without = _vertex_error(reconstruct_hands(sequence, config), truth).mean()
     assert without > 0.015
     for is_new in (True, False):
         config = HandFitConfig(
-            iterations=200, depth_iterations=120, starts_at_depth=is_new, fixed_normals=is_new
+            iterations=120, depth_iterations=60, starts_at_depth=is_new, fixed_normals=is_new
         )
-        assert _vertex_error(reconstruct_hands(sequence, config), truth).mean() < 0.5 * without
+        assert _vertex_error(reconstruct_hands(sequence, config), truth).mean() < 0.3 * without
 
 
 def test_without_masks_a_hand_is_measured_at_its_keypoints(tmp_path: Path) -> None:
@@ -186,9 +188,9 @@ def test_depth_places_a_hand_of_unknown_size_that_one_view_takes_for_a_nearer_on
     truth = replace(scene.grasping(frames=4), scale=1.15)
     keypoint = scene.seen_keypoints([truth], CAMERAS[:1])
     sequence = scene.write_scene(tmp_path / "a", [truth], CAMERAS[:1], keypoint, depth=True)
-    config = HandFitConfig(iterations=200, depth_iterations=0)
+    config = HandFitConfig(iterations=120, depth_iterations=0)
     assert _vertex_error(reconstruct_hands(sequence, config), truth).mean() > 0.05
-    config = HandFitConfig(iterations=200, depth_iterations=120)
+    config = HandFitConfig(iterations=120, depth_iterations=60)
     assert _vertex_error(reconstruct_hands(sequence, config), truth).mean() < 0.012
 
 
@@ -306,7 +308,9 @@ def test_the_fit_reports_and_stops_when_asked(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.no_cover  # Made-up hands go through the same lines.
 def test_the_recorded_hand_is_reconstructed(tmp_path: Path) -> None:
-    sequence = import_stereo(recording("stereo_hand"), tmp_path / "hand")
+    whole = import_stereo(recording("stereo_hand"), tmp_path / "hand")
+    # The first of its 378 frames: to find keypoints in all of them takes longer than to fit them.
+    sequence = Sequence(whole.folder, replace(whole.meta, frame_count=RECORDED))
     keypoint = detect_sequence(sequence)
     # A tenth of what was seen is kept from the fit, to score it.
     is_drawn = np.random.default_rng(0).random(keypoint.shape[:4]) < 0.1
@@ -314,12 +318,12 @@ def test_the_recorded_hand_is_reconstructed(tmp_path: Path) -> None:
     given = np.where(hidden[..., None], np.nan, keypoint).astype(np.float32)
     fit = reconstruct_hands(sequence, keypoint=given)
     joint = fit.motions[0].keypoints(load_hand_model("right"))
-    assert joint.shape == (378, 21, 3)
+    assert joint.shape == (RECORDED, 21, 3)
     assert np.isfinite(joint).all()
     cameras = [view.camera for view in sequence.views]
     (score,) = evaluate_hands(cameras, [joint], keypoint, hidden, least_views=2)
-    assert score.frame_count >= 360
+    assert score.frame_count >= 0.9 * RECORDED
     assert score.fitted.median <= 4
     assert score.hidden.median <= 6
-    assert score.hidden.keypoint_count > 1400
+    assert score.hidden.keypoint_count > 3.7 * RECORDED
     assert max(score.joint_median) < 8

@@ -67,6 +67,7 @@ def test_a_whole_run_uses_mano_and_outlives_it(
     first_order = config.object_.first_order.replace(iterations=1)
     config = config.replace(
         hand=config.hand.replace(model="mano", iterations=60, depth_iterations=0),
+        refinement=config.refinement.replace(iterations=2),
         object_=config.object_.replace(search=search, first_order=first_order),
     )
     run = Run.create(
