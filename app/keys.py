@@ -32,6 +32,7 @@ Action = Literal[
     "compare_mode",
     "swap",
     "steer",
+    "edit",
 ]
 """What a key does in the live scene."""
 
@@ -210,6 +211,26 @@ KEYS: tuple[KeyGroup, ...] = (
             Key(
                 shown=("ctrl", "Z"),
                 about="while steering: back to before the last drag, held key or grip",
+            ),
+        ),
+    ),
+    KeyGroup(
+        title="Edit",
+        keys=(
+            Key(
+                shown=("B",),
+                about="edit: select nodes or springs and change them; again to end it",
+                action="edit",
+                hotkeys=("B",),
+            ),
+            Key(
+                shown=("drag",),
+                about="while editing: select what is within a rectangle; with shift add it, with "
+                "ctrl take it out; the right button still moves the camera",
+            ),
+            Key(
+                shown=("click",),
+                about="while editing: select one node or spring; with shift add it or take it out",
             ),
         ),
     ),

@@ -141,7 +141,7 @@
   const DRESS = `
     :root { --mantine-color-dimmed: #5f6770 !important; --mantine-color-gray-filled: #5f6770 !important; }
     :root[data-mantine-color-scheme=dark] { --mantine-color-dimmed: #a0a7b0 !important; }
-    [data-dock-tab] { padding-inline: .45em !important; }
+    [data-dock-tab] { padding-inline: .3em !important; }
     .multi-slider-mark-label { color: var(--mantine-color-dimmed) !important; }
     @media (max-width: 36em) {
       :has(> ${SHEET}) { flex-direction: column; }

@@ -63,6 +63,11 @@ def create_links(sessions: Sessions) -> APIRouter:
         session = sessions.find(session_id, request.state.owner)
         if session is None:
             raise HTTPException(404, CLOSED)
+        if isinstance(session, Session) and session.state.edits is not None:
+            raise UsageError(
+                "Springs or nodes were edited here, which no link holds. Save it as a run "
+                "(Export) and share that."
+            )
         link = link_of(session) if isinstance(session, Session) else session.link
         return Link(url=link, query=link.partition("?")[2])
 

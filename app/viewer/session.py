@@ -18,9 +18,10 @@ from app.viewer.compare.live import LiveComparison
 from app.viewer.content.content import Catalog, Content, open_run, open_sequence
 from app.viewer.content.layers import default_layers
 from app.viewer.content.session_state import Kind, Pose, SessionState
+from app.viewer.edit.edit_panel import EditPanel
 from app.viewer.export.export_panel import ExportPanel
 from app.viewer.export.snapshot import Snapshot
-from app.viewer.inspect.inspector import Inspector
+from app.viewer.inspect.inspector import Inspector, TakeClick
 from app.viewer.live.client import SimulationClient
 from app.viewer.physics.keep_panel import SavedRun, UserStorage, run_changes
 from app.viewer.physics.object_session import FrameStrip, ObjectSession
@@ -85,6 +86,7 @@ class Session(SceneServer):
         self._playback = Playback(self._content.frame_count, self._content.frame_rate, self._draw)
         self._object: ObjectSession | None = None
         self._steer: SteerPanel | None = None
+        self._edit: EditPanel | None = None
         try:
             self._build()
             if state is not None:
@@ -128,6 +130,11 @@ class Session(SceneServer):
                 parameter_changes=parameter_changes(history.start, setting.parameters)
                 if history is not None and setting is not None
                 else {},
+                edits=setting.edits
+                if history is not None
+                and setting is not None
+                and setting.edits != history.begin.edits
+                else None,
             )
 
     @property
@@ -159,7 +166,7 @@ class Session(SceneServer):
                 picture=self._comparison.framed_picture,
                 run=run,
                 layers=replace(self._view.scene.layers),
-                link=self.link_of(self),
+                link="" if self.state.edits is not None else self.link_of(self),
             )
 
     def go(self, frame: int) -> None:
@@ -192,7 +199,7 @@ class Session(SceneServer):
         server, guard = self._server, self._guard
         set_theme(server, dark=False)
         has_object = self._content.fitted is not None
-        simulated: tuple[TabName, ...] = ("Physics", "Steer") if has_object else ()
+        simulated: tuple[TabName, ...] = ("Physics", "Edit", "Steer") if has_object else ()
         tabs = self._tabs = Tabs(server.gui, "Play", "Look", *simulated, "Inspect", "Export")
         with tabs["Play"]:
             self._legend = server.gui.add_html("")
@@ -219,7 +226,11 @@ class Session(SceneServer):
             self._layers = LayersPanel(server, guard, self._playback.redraw)
         with tabs["Inspect"]:
             self._inspector = Inspector(
-                server, guard, self._playback.redraw, open_tab=lambda: tabs.open("Inspect")
+                server,
+                guard,
+                self._playback.redraw,
+                open_tab=lambda: tabs.open("Inspect"),
+                instead=self._takes_clicks,
             )
         with tabs["Export"]:
             export = self._export = ExportPanel(server, guard, self.snapshot)
@@ -273,6 +284,27 @@ class Session(SceneServer):
             newtons=lambda: scene.painter.force_factor,
             keep=None if self._storage is None else self._keep_take,
         )
+        self._edit = EditPanel(
+            self._server,
+            self._guard,
+            self._playback,
+            tabs=self._tabs,
+            framing=framing,
+            physics=self._object.panel,
+            rollout_at=self._object.at,
+            leave_others=self._leave_others,
+        )
+
+    def _takes_clicks(self) -> TakeClick | None:
+        """Give what selects what is clicked, while the object is edited."""
+        edit = self._edit
+        return edit.take_click if edit is not None and edit.is_on else None
+
+    def _leave_others(self) -> None:
+        """End what else takes the pointer or shows another object."""
+        if self._steer is not None:
+            self._steer.leave()
+        self._comparison.stop()
 
     def _keep_take(
         self, take: Take, frame: int, name: str, report: Callable[[SavedRun], None]
@@ -295,7 +327,9 @@ class Session(SceneServer):
             self._layers.restore(state.layers, state.theme, prefers_dark=state.prefers_dark)
             self._colors.restore()
         if self._object is not None and state.parameters:
-            self._object.panel.restore(state.parameters, is_automatic=state.automatic_substeps)
+            self._object.panel.restore(
+                state.parameters, is_automatic=state.automatic_substeps, edits=state.edits
+            )
         if state.pose is not None:
             state.pose.give_first(self._server.initial_camera)
         if state.is_figure:
@@ -313,6 +347,9 @@ class Session(SceneServer):
                 content.close()
                 return
             self._playback.play(on=False)
+            if self._edit is not None:
+                self._edit.remove()
+                self._edit = None
             if self._steer is not None:
                 self._steer.remove()
                 self._steer = None
@@ -354,6 +391,8 @@ class Session(SceneServer):
             if self._steer is not None and self._comparison.is_on:
                 self._steer.leave()  # Two rollouts are shown on the clock.
             steered = None if self._steer is None else self._steer.shown()
+            if self._edit is not None and (steered is not None or self._comparison.is_on):
+                self._edit.leave()
             if steered is None:
                 rollout, rollout_frame = self._rollout_at(frame)
                 self._view.draw(frame, rollout, rollout_frame, is_playing=is_playing)
@@ -362,6 +401,8 @@ class Session(SceneServer):
                 self._view.draw(frame, rollout, rollout_frame, is_playing=True, hands=hands)
             self._timeline.show(is_playing=is_playing)
             is_hidden = self._comparison.is_on and rollout is not None
+            if self._edit is not None and rollout is not None:
+                self._edit.show(rollout, rollout_frame, is_hidden=is_hidden)
             if self._legend.visible == is_hidden:
                 self._legend.visible = not is_hidden
             written = legend_of(self._content, self._view.scene.layers)

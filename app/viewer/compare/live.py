@@ -18,7 +18,7 @@ from app.viewer.content.content import Content
 from app.viewer.content.layers import Layers
 from app.viewer.content.session_state import Pose
 from app.viewer.live.client import LiveRollouts, SimulationClient
-from app.viewer.physics.parameters import changes_in, knobs
+from app.viewer.physics.parameters import changes_in, edits_text, knobs
 from app.viewer.scene.framing import Framing
 from app.viewer.ui.guard import Guard, notify
 from app.viewer.ui.keyboard import bind
@@ -388,8 +388,10 @@ class LiveComparison:
         unit = self._content.length_unit if self._content is not None else "m"
         sliders = knobs(kept.parameters, length_unit=unit)
         changes = changes_in(sliders, kept.parameters, newest.parameters)
-        if changes:
-            return (f"From A to B: {', '.join(change.text for change in changes)}",)
+        texts = [change.text for change in changes]
+        texts += edits_text(kept.edits, newest.edits)
+        if texts:
+            return (f"From A to B: {', '.join(texts)}",)
         return ("From A to B: equal parameters. Move a slider to change B.",)
 
     def _changes(self, rollout: ObjectRollout) -> str:
@@ -400,7 +402,8 @@ class LiveComparison:
             return "the fit"
         sliders = knobs(fitted.parameters, length_unit=content.length_unit)
         changes = changes_in(sliders, fitted.parameters, rollout.parameters)
-        text = ", ".join(change.text for change in changes) or "as fitted"
+        texts = [change.text for change in changes] + edits_text(fitted.edits, rollout.edits)
+        text = ", ".join(texts) or "as fitted"
         return text if len(text) <= _LONGEST_TEXT else f"{text[:_LONGEST_TEXT]} …"
 
     def _topology(self, rollout: ObjectRollout) -> str:

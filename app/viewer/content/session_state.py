@@ -11,6 +11,7 @@ from numpy import ndarray
 
 from app.viewer.content.layers import Layers, Theme
 from physhandi.data.camera import PinholeCamera
+from physhandi.simulation.edits import Edits
 from physhandi.simulation.parameters import SimulationParameters
 
 Kind = Literal["run", "sequence", "comparison"]
@@ -122,6 +123,9 @@ class SessionState:
     """Without `layers`: fields of `Layers` that differ from what suits the content."""
     parameter_changes: Mapping[str, Any] = field(default_factory=dict[str, Any])
     """Parameters that differ from the fitted ones; they count if there are no `parameters`."""
+
+    edits: Edits | None = None
+    """What is done to single springs and nodes; None for the object's own edits."""
 
     @property
     def is_changed(self) -> bool:

@@ -43,6 +43,10 @@ def clickable(content: Content) -> str:
     return " or ".join([", ".join(found[:-1]), found[-1]] if len(found) > 1 else found)
 
 
+TakeClick = Callable[[viser.SceneClickEvent, int | None, int | None], None]
+"""Takes a click, and the number of the node or that of the spring under it, if there is one."""
+
+
 class Inspector:
     """The panel of the thing that was clicked; clicks and the clock come in different threads."""
 
@@ -53,6 +57,7 @@ class Inspector:
         redraw: Callable[[], None],
         *,
         open_tab: Callable[[], None] = lambda: None,
+        instead: Callable[[], TakeClick | None] = lambda: None,
     ) -> None:
         """Add the panel, which says what to do until something is clicked.
 
@@ -61,7 +66,9 @@ class Inspector:
             guard: Wraps the callbacks.
             redraw: Draws the current frame again.
             open_tab: Brings the panel into sight.
+            instead: Finds what takes clicks in the place of this panel, if anything does now.
         """
+        self._instead = instead
         self._server = server
         self._redraw = redraw
         self._open_tab = open_tab
@@ -195,9 +202,10 @@ class Inspector:
             if content is None or scene is None or framing is None:
                 return
             rollout, frame, rollout_frame = self._shown
-            grab = self._grab
-            if grab is not None:
-                content = dataclasses.replace(content, hands=())  # They are not where they were.
+            grab, take = self._grab, self._instead()
+            if grab is not None or take is not None:
+                # They are not where they were, or in the way.
+                content = dataclasses.replace(content, hands=())
             camera = event.client.camera
             ray = Ray(
                 origin=np.asarray(event.ray_origin, dtype=np.float64),
@@ -213,7 +221,10 @@ class Inspector:
                 spacing=framing.spacing,
             )
             found = pick(ray, target, prefers_hand=prefers_hand)
-        if found is not None and grab is not None and rollout is not None:
+        if take is not None:
+            numbers = {} if found is None else {found.kind: found.index}
+            take(event, numbers.get("node"), numbers.get("spring"))
+        elif found is not None and grab is not None and rollout is not None:
             if found.kind == "node":
                 grab(found.index)
             elif found.kind == "spring":  # An end that is a control node has the higher number.

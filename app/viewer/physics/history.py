@@ -1,7 +1,8 @@
-"""The parameters that were tried in a session, with undo and redo."""
+"""The parameters and edits that were tried in a session, with undo and redo."""
 
 from typing import Any, NamedTuple
 
+from physhandi.simulation.edits import Edits
 from physhandi.simulation.parameters import SimulationParameters
 
 MOST_STEPS = 50
@@ -15,6 +16,8 @@ class Setting(NamedTuple):
     """Their number of substeps is that in force before the automatic choice."""
     is_automatic: bool = False
     """Whether the number of substeps is chosen automatically."""
+    edits: Edits = ()
+    """What is done to single springs and nodes."""
 
 
 class History:
@@ -26,15 +29,16 @@ class History:
     thread at a time; `setting` may be read by any.
     """
 
-    def __init__(self, start: SimulationParameters) -> None:
+    def __init__(self, start: SimulationParameters, edits: Edits = ()) -> None:
         """Begin with the fitted parameters.
 
         Args:
             start: The fitted parameters, to which `reset` returns.
+            edits: Those of the fitted object, likewise.
         """
         self.start = start
-        self.setting = Setting(start)
-        """What is in force."""
+        self.begin = self.setting = Setting(start, edits=edits)
+        """What is in force; it was `begin` at first."""
         self._steps = [self.setting]
         self._index = 0
         self._before = 0
@@ -75,8 +79,12 @@ class History:
         return self._put(changed, (field, gesture))
 
     def replace(self, parameters: SimulationParameters, *, is_automatic: bool = False) -> Setting:
-        """Change all parameters at once."""
-        return self._put(Setting(parameters, is_automatic), None)
+        """Change all parameters at once; edits stay."""
+        return self._put(Setting(parameters, is_automatic, self.setting.edits), None)
+
+    def edit(self, edits: Edits) -> Setting:
+        """Change what is done to single springs and nodes; this is a step of its own."""
+        return self._put(self.setting._replace(edits=edits), None)
 
     def choose_substeps(self, *, is_automatic: bool) -> Setting:
         """Have the number of substeps chosen automatically, or take the fitted one."""
@@ -106,8 +114,8 @@ class History:
         return self.setting
 
     def reset(self) -> Setting:
-        """Return to the fitted parameters; this can be undone."""
-        return self.replace(self.start)
+        """Return to the fitted parameters and edits; this can be undone."""
+        return self._put(self.begin, None)
 
     def _put(self, setting: Setting, gesture: tuple[str, int] | None) -> Setting:
         """Bring a setting into force; what a gesture has set before gives way to it."""

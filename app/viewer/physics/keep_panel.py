@@ -28,8 +28,10 @@ from physhandi.data.layout import PARAMETERS_FILE
 from physhandi.data.run_folder import new_run_id
 from physhandi.data.sequence_meta import SAFE_NAME
 from physhandi.errors import UsageError
+from physhandi.fitting.stored_edits import describe_edits, store_edits
 from physhandi.fitting.stored_take import StoredTake
 from physhandi.run import Run
+from physhandi.simulation.edits import Edits
 from physhandi.simulation.parameters import SimulationParameters, parameter_changes
 
 _POLL_S = 0.3
@@ -84,7 +86,14 @@ class RunSaver:
         self._start = start
         self._sequences = folder.parent / "sequences" if sequences is None else sequences
 
-    def save(self, source_id: str, sequence: str, name: str, changes: Mapping[str, Any]) -> Run:
+    def save(
+        self,
+        source_id: str,
+        sequence: str,
+        name: str,
+        changes: Mapping[str, Any],
+        edits: Edits | None = None,
+    ) -> Run:
         """Make a run and have it worked on.
 
         Args:
@@ -92,6 +101,7 @@ class RunSaver:
             sequence: Which of its sequences.
             name: What the user calls the new run.
             changes: Parameters that differ from the source's; see `run_changes`.
+            edits: What is done to single springs and nodes; None for the source's own edits.
 
         Raises:
             UsageError: If the name is empty or too long.
@@ -107,8 +117,14 @@ class RunSaver:
             name=name,
             kind="simulation",
             sequences=[str(recording.folder)],
-            config={"source": str(source.folder.resolve()), "parameters": dict(changes)},
+            config={
+                "source": str(source.folder.resolve()),
+                **({} if edits is None else {"edits": describe_edits(edits)}),
+                "parameters": dict(changes),
+            },
         )
+        if edits is not None:
+            store_edits(run.folder, edits)
         self._start(run)
         return run
 
@@ -297,7 +313,7 @@ class PresetChoice:
     @property
     def chosen(self) -> Preset | None:
         """The preset whose parameters are in force, if there is one; of several that was chosen."""
-        now = self._history.setting
+        now = self._history.setting[:2]
         fits = {n: p for n, p in self._presets.items() if p.apply(self._history.start) == now}
         return fits.get(self._wanted, next(iter(fits.values()), None))
 
@@ -419,7 +435,8 @@ class KeepPanel:
             setting.parameters,
             is_automatic=setting.is_automatic,
         )
-        run = self._saver.save(self._source.id, self._sequence, name, changes)
+        edits = setting.edits if setting.edits != self._history.begin.edits else None
+        run = self._saver.save(self._source.id, self._sequence, name, changes, edits)
         self._saver.follow(run, self.show_run, self._closed)
 
     def _save_preset(self, event: Any) -> None:
@@ -430,7 +447,10 @@ class KeepPanel:
         preset = self._store.save(self._name.value, changes, self._unit)
         self._choice.want(preset.label)
         self.show()
-        notify(event.client, "Preset saved", preset.name, color="blue")
+        kept = preset.name
+        if history.setting.edits:
+            kept += ": the parameters. Edits are of this object alone; save them as a run."
+        notify(event.client, "Preset saved", kept, color="blue")
 
     def _remove(self, event: Any) -> None:
         chosen = self._choice.chosen

@@ -22,6 +22,7 @@ from app.viewer.physics.parameters import (
     Knob,
     Switch,
     changes_in,
+    edits_text,
     ground_knobs,
     knobs_of,
 )
@@ -30,8 +31,10 @@ from app.viewer.ui.gestures import Gestures
 from app.viewer.ui.guard import Guard
 from app.viewer.ui.keyboard import bind
 from app.viewer.ui.tabs import Tabs
+from physhandi.errors import UsageError
 from physhandi.object_rollout import ObjectRollout
 from physhandi.run import Run
+from physhandi.simulation.edits import MOST_EDITS, AnyEdit, Edits
 from physhandi.simulation.parameters import PARAMETERS, SimulationParameters
 
 _CHANGED = "● "
@@ -250,7 +253,7 @@ class PhysicsPanel:
             storage: Where presets and runs are kept; None where nothing can be kept.
         """
         fitted = rollouts.fitted
-        self.history = History(fitted.parameters)
+        self.history = History(fitted.parameters, fitted.edits)
         self._gestures = Gestures(server.gui)
         self._step_texts: dict[tuple[Setting, Setting], str] = {}
         self._rollouts = rollouts
@@ -305,9 +308,21 @@ class PhysicsPanel:
                 )
         self._commands = self._add_keys(server, guard)
 
-    def restore(self, parameters: SimulationParameters, *, is_automatic: bool) -> None:
-        """Simulate what another session of the same object simulates."""
+    def restore(
+        self, parameters: SimulationParameters, *, is_automatic: bool, edits: Edits | None = None
+    ) -> None:
+        """Simulate what another session of the same object simulates; None for its own edits."""
         self._replace(parameters, is_automatic)
+        if edits is not None:
+            self._change(lambda: self.history.edit(edits))
+
+    def edit(self, *edits: AnyEdit) -> None:
+        """Do something more to single springs and nodes, as one step.
+
+        Raises:
+            UsageError: If there are too many edits.
+        """
+        self._change(lambda: self.history.edit(_with(self.history.setting.edits, edits)))
 
     def remove(self) -> None:
         """Take the panel away."""
@@ -455,7 +470,9 @@ class PhysicsPanel:
 
     def _simulate(self, setting: Setting) -> None:
         """Simulate a setting and say what it changes, leaving the controls alone."""
-        self._rollouts.request(setting.parameters, automatic_substeps=setting.is_automatic)
+        self._rollouts.request(
+            setting.parameters, automatic_substeps=setting.is_automatic, edits=setting.edits
+        )
         self._sliders.mark()
         self._presets.show()
         if self.keep is not None:
@@ -477,7 +494,8 @@ class PhysicsPanel:
             self._sliders.knobs, history.start, history.current, is_automatic=history.is_automatic
         )
         self._changed = {change.name: change.fields for change in changes}
-        text = ", ".join(change.text for change in changes)
+        edits = edits_text(history.begin.edits, history.setting.edits)
+        text = ", ".join([*(change.text for change in changes), *edits])
         self._put_back.offer((_PUT_BACK, *self._changed))
         self._put_back.show(_PUT_BACK)
         self._put_back.handle.visible = bool(changes)
@@ -490,7 +508,7 @@ class PhysicsPanel:
         self._step_texts = {
             pair: known.get(pair) or step_text(self._sliders.knobs, *pair) for pair in pairs
         }
-        begins = "as fitted" if history.steps[0] == Setting(history.start) else "before"
+        begins = "as fitted" if history.steps[0] == history.begin else "before"
         names = _numbered([begins, *(self._step_texts[pair] for pair in pairs)])
         self._steps.offer(names)
         self._steps.show(names[history.index])
@@ -509,8 +527,15 @@ def step_text(knobs: tuple[Knob | Switch, ...], before: Setting, after: Setting)
     texts = [change.text for change in changes]
     if before.is_automatic and not after.is_automatic:
         texts.append(f"substeps automatic → {after.parameters.substeps_per_frame}")
+    texts.extend(edits_text(before.edits, after.edits))
     text = ", ".join(texts)
     return text if len(text) <= _LONGEST_STEP else f"{text[: _LONGEST_STEP - 1]}…"
+
+
+def _with(edits: Edits, more: Edits) -> Edits:
+    if len(edits) + len(more) > MOST_EDITS:
+        raise UsageError(f"{MOST_EDITS} edits are the most that an object can have.")
+    return (*edits, *more)
 
 
 def _numbered(texts: list[str]) -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 
+from physhandi.simulation.edits import Edits
 from physhandi.simulation.parameters import (
     AUTOMATIC,
     PARAMETERS,
@@ -243,6 +244,16 @@ def changes_in(
             texts = f"{_said(getattr(start, field))} → {_said(value)}"
             said.append(Change(name, (field,), f"{name} {texts}"))
     return tuple(said)
+
+
+def edits_text(before: Edits, after: Edits) -> list[str]:
+    """Say what became of edits: the titles of new ones, and how many there are no more."""
+    shared = 0
+    while shared < min(len(before), len(after)) and before[shared] == after[shared]:
+        shared += 1
+    gone = len(before) - shared
+    texts = [f"{gone} edit{'' if gone == 1 else 's'} taken back"] if gone else []
+    return texts + [edit.title for edit in after[shared:]]
 
 
 def _said(value: object) -> str:

@@ -5,7 +5,7 @@ from typing import Literal
 
 import viser
 
-TabName = Literal["Play", "Look", "Physics", "Steer", "Inspect", "Export"]
+TabName = Literal["Play", "Look", "Physics", "Edit", "Steer", "Inspect", "Export"]
 
 _BELOW = 1e9
 """Order of the tabs: below the clock, which is seen with all of them."""

@@ -1,0 +1,336 @@
+"""Editing in a live scene: what a shape selects, what buttons do to it, and the way back."""
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from spring_world import two_springs
+from viewer_client import ViewerClient
+from viewer_world import FakeSettings, FolderCatalog, rest_at
+from waiting import LIMIT_S
+
+from app.viewer.content.session_state import Pose
+from app.viewer.edit.edit_panel import attach_to_nearest, pairs_to_join
+from app.viewer.edit.selection import (
+    Polygon,
+    ScreenView,
+    Selection,
+    Stroke,
+    ends_of,
+    select,
+    springs_between,
+    within,
+)
+from app.viewer.physics.keep_panel import RunSaver, UserStorage
+from app.viewer.physics.presets import PresetStore
+from app.viewer.session import Session
+from app.viewer.sessions import Sessions
+from physhandi.errors import UsageError
+from physhandi.run import Run
+
+AT = 4
+CHOSEN = "/edit/chosen_nodes"
+
+
+def eye_of(pose: Pose, aspect: float) -> ScreenView:
+    view = pose.camera(100, 100).T_world_camera
+    return ScreenView(position=view[:3, 3], axes=view[:3, :3].T, fov=pose.fov, aspect=aspect)
+
+
+POSE = Pose(
+    position=np.array([0.3, -2.0, 1.2]),
+    look_at=np.array([0.1, 0.0, 0.2]),
+    up=np.array([0.0, 0.0, 1.0]),
+    fov=0.8,
+)
+
+
+def test_points_are_found_where_a_camera_of_the_same_pose_sees_them() -> None:
+    point = np.random.default_rng(3).normal(0.0, 0.4, (50, 3))
+    camera = POSE.camera(1600, 900)
+    ahead = (
+        np.concatenate([point, np.ones((50, 1))], axis=1) @ np.linalg.inv(camera.T_world_camera).T
+    )
+    pixel = ahead[:, :3] @ camera.K.T
+    # The middle of the upper left pixel of so many is (0, 0) there.
+    expected = (pixel[:, :2] / pixel[:, 2:] + 0.5) / [1600, 900]
+    eye = eye_of(POSE, 1600 / 900)
+    np.testing.assert_allclose(eye.project(point), expected, atol=1e-9)
+    assert np.isnan(eye.project(np.array([[0.5, -4.0, 2.2]]))).all()
+
+
+def test_a_polygon_holds_what_is_within_it() -> None:
+    hook = np.array([[0.1, 0.1], [0.9, 0.1], [0.9, 0.9], [0.7, 0.9], [0.7, 0.3], [0.1, 0.3]])
+    place = np.array([[0.2, 0.2], [0.8, 0.8], [0.4, 0.6], [0.95, 0.5], [0.05, 0.2], [np.nan, 0.2]])
+    assert within(hook, place).tolist() == [True, True, False, False, False, False]
+    assert within(hook[::-1], place).tolist() == [True, True, False, False, False, False]
+    crossed = np.array([[0.0, 0.0], [1.0, 1.0], [1.0, 0.0], [0.0, 1.0]])
+    beside = np.array([[0.1, 0.5], [0.9, 0.5], [0.5, 0.1], [0.5, 0.9]])
+    assert within(crossed, beside).tolist() == [True, True, False, False]
+    box = Polygon.rectangle((0.2, 0.4), (0.3, 0.9))
+    assert box.holds(np.array([[0.25, 0.5], [0.5, 0.25]]), 1.0).tolist() == [True, False]
+
+
+def test_a_brush_holds_what_it_went_over_in_a_round_on_the_screen() -> None:
+    stroke = Stroke(points=np.array([[0.2, 0.5], [0.6, 0.5]]), radius=0.1)
+    place = np.array([[0.4, 0.59], [0.4, 0.61], [0.64, 0.5], [0.66, 0.5], [np.nan, 0.5]])
+    # The screen is twice as wide as high: 0.05 of its width are 0.1 of its height.
+    assert stroke.holds(place, 2.0).tolist() == [True, False, True, False, False]
+    dab = Stroke(points=np.array([[0.2, 0.5]]), radius=0.1)
+    assert dab.holds(np.array([[0.2, 0.58], [0.3, 0.5]]), 2.0).tolist() == [True, False]
+
+
+def test_selections_are_replaced_added_to_and_taken_from() -> None:
+    first = Selection(nodes=frozenset({1, 2}), springs=frozenset({(0, 1)}))
+    new = Selection(nodes=frozenset({2, 3}), virtual=frozenset({(4, 0)}))
+    assert first.changed(new, "replace") is new
+    added = first.changed(new, "add")
+    assert (added.nodes, added.springs, added.virtual) == ({1, 2, 3}, {(0, 1)}, {(4, 0)})
+    assert first.changed(new, "remove").nodes == {1}
+    assert first.changed(new, "toggle").nodes == {1, 3}
+    assert added.text == "3 nodes, 1 spring, 1 virtual spring"
+    assert Selection().text == "nothing"
+    assert ends_of(added) == {0, 1, 2, 3, 4}
+    model = two_springs().model
+    kept = Selection(
+        nodes=frozenset({2, 3}), springs=frozenset({(0, 1), (1, 2)}), virtual=frozenset({(0, 0)})
+    ).within(model)
+    assert (kept.nodes, kept.springs, kept.virtual) == ({2}, {(0, 1)}, {(0, 0)})
+    assert springs_between(model, frozenset({0, 1})) == {(0, 1)}
+    assert springs_between(model, frozenset({0, 2})) == frozenset()
+
+
+def test_a_spring_is_selected_where_its_middle_is_while_it_is_attached() -> None:
+    take = two_springs()
+    eye = eye_of(POSE, 1.0)
+    for kind, middle in (("springs", [0.5, 0.0, 0.0]), ("virtual springs", [0.0, 0.0, 0.5])):
+        (place,) = eye.project(np.array([middle]))
+        box = Polygon.rectangle(tuple(place - 0.01), tuple(place + 0.01))
+        found = select(eye, box, take, 0, kind)
+        expected = {(0, 1)} if kind == "springs" else {(0, 0)}
+        assert (found.springs or found.virtual) == expected
+        assert not select(eye, box, take, 0, "nodes")
+    # In frame 3 node 1 is 0.3 m on, and the middle of its spring 0.15 m.
+    (place,) = eye.project(np.array([[0.65, 0.0, 0.0]]))
+    box = Polygon.rectangle(tuple(place - 0.01), tuple(place + 0.01))
+    assert select(eye, box, take, 3, "springs").springs == {(0, 1)}
+    assert not select(eye, box, take, 0, "springs")
+
+
+def test_nodes_are_joined_and_attached_to_what_is_nearest() -> None:
+    take = two_springs()
+    assert pairs_to_join(take, np.array([0, 1, 2])) == ((0, 2), (1, 2))
+    with pytest.raises(UsageError, match="joined to each other already"):
+        pairs_to_join(take, np.array([0, 1]))
+    with pytest.raises(UsageError, match="two nodes or more"):
+        pairs_to_join(take, np.array([0]))
+    tied = attach_to_nearest(take, 3, np.array([1]))
+    assert (tied.nodes, tied.controls, tied.frame) == ((1,), (0,), 3)
+    assert tied.lengths[0] == pytest.approx(np.hypot(1.3, 1.0))
+
+
+class Places(FolderCatalog):
+    """Knows where recordings would be."""
+
+    def sequences_of(self, run: Run) -> list[SimpleNamespace]:
+        return [SimpleNamespace(folder=self.root / name) for name in run.sequence_names]
+
+
+@pytest.fixture
+def begun() -> list[Run]:
+    """Runs that a worker would work on."""
+    return []
+
+
+@pytest.fixture
+def sessions(catalog, tmp_path: Path, begun: list[Run]) -> Iterator[Sessions]:
+    saver = RunSaver(Places(catalog.root), tmp_path / "runs", begun.append)
+    storage = UserStorage(PresetStore(tmp_path / "presets"), saver)
+    sessions = Sessions(FakeSettings(), catalog, storage)
+    yield sessions
+    sessions.shutdown()
+
+
+@pytest.fixture
+def scene(sessions: Sessions) -> Iterator[tuple[Session, ViewerClient]]:
+    """The sheet seen from above, at rest in a frame in which it is lifted, and being edited."""
+    session = sessions.get(sessions.open("run", "sheet", "me"))
+    with ViewerClient(f"ws://127.0.0.1:{session.port}") as client:
+        client.tell_camera(**camera_above())
+        wait(client, lambda: "simulated" in texts(client))
+        rest_at(client, AT)
+        wait(client, lambda: session._playback.frame == AT)
+        client.set("Edit (B)", True)
+        wait(client, lambda: "Selected: " in texts(client) and "/edit/nodes" in client.nodes)
+        yield session, client
+
+
+def camera_above() -> dict[str, object]:
+    """A camera above the sheet: x of the world is right of the screen, y is up."""
+    return {"position": (0.0, 0.0, 1.0), "look_at": (0.0, 0.0, 0.0), "wxyz": (0.0, 1.0, 0.0, 0.0)}
+
+
+def texts(client: ViewerClient) -> str:
+    """All that the panel says."""
+    said = (p.get("content", p.get("_markdown")) for p in client.gui.values())
+    return "\n".join(str(content) for content in said if content)
+
+
+def wait(client: ViewerClient, condition: Callable[[], object]) -> None:
+    client.until(condition, LIMIT_S)
+
+
+def draw(session: Session, client: ViewerClient, low, high, modifier: str | None = None) -> None:
+    """Draw a rectangle around part of the world, as a browser tells of it."""
+    camera = session._server.get_clients()[next(iter(session._server.get_clients()))].camera
+    eye = ScreenView.of(camera)
+    corner = eye.project(np.array([[*low, 0.05], [*high, 0.05]]))
+    client.send(
+        "ScenePointerMessage",
+        event_type="rect-select",
+        ray_origin=None,
+        ray_direction=None,
+        screen_pos=(corner.min(axis=0).tolist(), corner.max(axis=0).tolist()),
+        modifier=modifier,
+    )
+
+
+def selected(client: ViewerClient) -> str:
+    return texts(client).partition("data-selected>")[2].partition("<")[0]
+
+
+def test_a_rectangle_selects_and_each_button_is_one_step(scene, run: Run) -> None:
+    session, client = scene
+    position = run.array("sequences/lift/rollout.npy")
+    # The camera is 1 m above the ground, the corners of the rectangle are 0.95 m below it.
+    x, y, z = position[AT].T
+    right = np.flatnonzero(x / (1.0 - z) > 0.03 / 0.95)
+    assert 9 < len(right) < 40
+    draw(session, client, (0.03, -0.3), (0.3, 0.3))
+    wait(client, lambda: selected(client) == f"{len(right)} nodes")
+    np.testing.assert_allclose(client.array(CHOSEN, "points"), position[AT][right], atol=1e-6)
+    draw(session, client, (0.03, -0.3), (0.3, 0.01), "cmd/ctrl")
+    fewer = [node for node in right if y[node] / (1.0 - z[node]) > 0.01 / 0.95]
+    assert 0 < len(fewer) < len(right)
+    wait(client, lambda: selected(client) == f"{len(fewer)} nodes")
+    draw(session, client, (0.03, -0.3), (0.3, 0.3), "shift")
+    wait(client, lambda: selected(client) == f"{len(right)} nodes")
+
+    history = session._object.panel.history
+    client.set("Nodes", "Pin")
+    wait(client, lambda: f"Pin {len(right)} nodes from frame {AT} on" in texts(client))
+    wait(client, lambda: "simulated 20/20" in texts(client) and session._object.newest.edits)
+    rollout = session._object.newest
+    assert rollout.model.pin_count == len(right)
+    np.testing.assert_allclose(rollout.position[:AT], position[:AT], atol=1e-6)
+    held, free = (
+        np.abs(p[-1][right] - position[AT][right]).max() for p in (rollout.position, position)
+    )
+    assert held < 0.025 < 0.6 * free
+
+    client.set("Multiply", "Stiffness")
+    wait(client, lambda: "Stiffness ×0.5 of" in texts(client))
+    client.set("Springs", "Cut")
+    wait(client, lambda: len(history.setting.edits) == 3)
+    cut = history.setting.edits[2]
+    own = rollout.model.spring_nodes[: rollout.model.object_spring_count]
+    expected = own[np.isin(own, right).all(axis=1)]
+    assert cut.springs == tuple(sorted(map(tuple, np.sort(expected, axis=1).tolist())))
+    assert cut.title == f"Cut {len(expected)} springs"
+    wait(client, lambda: client.value("History") == f"3 · {cut.title}")
+    client.set("Steps", "Undo")
+    wait(client, lambda: len(history.setting.edits) == 2)
+    client.set("Steps", "Reset")
+    fitted = session._content.fitted
+    wait(client, lambda: "No edits." in texts(client) and session._object.newest is fitted)
+    assert len(history.steps) == 4
+
+
+def is_told(client: ViewerClient, text: str) -> bool:
+    return any("Notification" in m["type"] and text in str(m) for m in client.messages)
+
+
+def test_what_cannot_be_edited_changes_nothing(scene, run: Run) -> None:
+    session, client = scene
+    history = session._object.panel.history
+    client.set("Nodes", "Pin")
+    wait(client, lambda: is_told(client, "Nothing is selected."))
+    client.set("Selection", "All")
+    wait(client, lambda: selected(client) == "81 nodes")
+    client.set("Selection", "Invert")
+    wait(client, lambda: selected(client) == "nothing")
+    x, y, z = run.array("sequences/lift/rollout.npy")[AT][0]
+    place = 0.95 * np.array([x, y]) / (1.0 - z)
+    draw(session, client, place - 0.002, place + 0.002)
+    wait(client, lambda: selected(client) == "1 node")
+    client.set("Springs", "Join")
+    wait(client, lambda: is_told(client, "two nodes or more"))
+    client.set("Nodes", "Release")
+    wait(client, lambda: is_told(client, "nothing to release"))
+    client.set("Factor", 1.0)
+    client.set("Multiply", "Damping")
+    wait(client, lambda: is_told(client, "No spring joins two"))
+    assert history.steps == (history.begin,)
+
+
+def test_clicks_select_while_editing_and_read_otherwise(scene, run: Run) -> None:
+    session, client = scene
+    node = run.array("sequences/lift/rollout.npy")[AT]
+
+    def click(number: int, modifier: str | None = None) -> None:
+        client.send(
+            "ScenePointerMessage",
+            event_type="click",
+            ray_origin=(float(node[number, 0]), float(node[number, 1]), 3.0),
+            ray_direction=(0.0, 0.0, -1.0),
+            screen_pos=((0.5, 0.5),),
+            modifier=modifier,
+        )
+
+    client.set("Surface", False)
+    client.set("Object nodes", True)
+    layers = session._view.scene.layers
+    wait(client, lambda: layers.nodes and not layers.surface)
+    click(0)
+    wait(client, lambda: session._edit.selection.nodes == {0})
+    click(8, "shift")
+    wait(client, lambda: session._edit.selection.nodes == {0, 8})
+    click(0, "shift")
+    wait(client, lambda: session._edit.selection.nodes == {8})
+    client.set("Select", "springs")
+    wait(client, lambda: not session._edit.selection)
+    click(8)
+    wait(client, lambda: len(session._edit.selection.springs) == 2)
+    assert all(8 in pair for pair in session._edit.selection.springs)
+    assert session._inspector.pick is None
+    client.set("Back to playback (B)", True)
+    wait(client, lambda: client.find("Edit (B)"))
+    assert not session._edit.selection
+    click(8)
+    wait(client, lambda: session._inspector.pick is not None)
+
+
+def test_edits_are_saved_as_a_run_and_go_into_a_copy_but_not_into_a_link(
+    scene, sessions: Sessions, begun: list[Run]
+) -> None:
+    session, client = scene
+    assert session.state.edits is None
+    draw(session, client, (-0.3, -0.3), (-0.02, 0.3))
+    wait(client, lambda: selected(client).endswith("nodes"))
+    client.set("Springs", "Cut")
+    wait(client, lambda: session.state.edits)
+    edits = session.state.edits
+    client.set("name", "Cut sheet")
+    client.set("Save as", "Run")
+    wait(client, lambda: begun)
+    (saved,) = begun
+    assert list(saved.config) == ["source", "edits", "parameters"]
+    assert saved.config["edits"]["steps"] == [edits[0].title]
+    stored = json.loads((saved.folder / "edits.json").read_text())
+    assert len(stored[0]["springs"]) == len(edits[0].springs) > 0
+    copied = sessions.get(sessions.copy(session))
+    assert copied.state.edits == edits
+    assert session.snapshot().link == ""
