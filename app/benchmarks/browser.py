@@ -1,4 +1,4 @@
-"""What a person sees in a real browser, and when: the home page, and a slider of a live scene."""
+"""What a person sees in a real browser, and when: the home page, a live scene and its slider."""
 
 import re
 import shutil
@@ -30,7 +30,8 @@ _PAINTED = """() => {
 }"""
 # viser's messages come in through a worker: the page is told of them after they were unpacked.
 _WATCH = """(() => {
-  const watch = { expected: null, pressed: 0, arrived: 0, drawn: 0, frames: 0 };
+  const watch = { expected: null, pressed: 0, arrived: 0, drawn: 0, frames: 0, first: 0 };
+  let isResult = false;
   window.physhandiWatch = watch;
   const isOf = (rollout, shown) => rollout.some((frame) =>
     frame.length === shown.length
@@ -40,6 +41,11 @@ _WATCH = """(() => {
   const look = ({ data }) => {
     if (data?.type !== "message_batch") return;
     for (const message of data.messages) {
+      if (!isResult && message.name?.startsWith("/object/")) {
+        isResult = true;
+        const note = () => { watch.first = performance.timeOrigin + performance.now(); };
+        requestAnimationFrame(() => requestAnimationFrame(note));
+      }
       const moved = message.type === "SceneNodeUpdateMessage" && message.name === "/object/surface"
         && message.updates.vertices;
       if (!moved) continue;
@@ -62,6 +68,12 @@ _WATCH = """(() => {
   addEventListener("pointerdown", (event) => { watch.pressed = event.timeStamp; }, true);
   addEventListener("mousedown", (event) => { watch.pressed ||= event.timeStamp; }, true);
 })()"""
+# The page of the scene is another one; what a tab remembers is known to both.
+_CLICKED = "physhandi-clicked"
+_REMEMBER = f"""() => addEventListener("click", (event) => sessionStorage.setItem(
+  "{_CLICKED}", performance.timeOrigin + event.timeStamp), true)"""
+_SINCE_CLICK = f"""() => window.physhandiWatch.first
+  - Number(sessionStorage.getItem("{_CLICKED}"))"""
 # A scene belongs to the browser that opened it.
 _OPEN = """(id) => fetch("/api/v1/sessions", {
   method: "POST", headers: { "Content-Type": "application/json" },
@@ -131,6 +143,34 @@ def measure_first_paint(served: Served, browser: "Browser", visits: int) -> dict
     }
 
 
+def measure_opening(served: Served, browser: "Browser", run_id: str, visits: int) -> dict[str, Any]:
+    """Press *Open* of a run on the home page, and wait for the first frame of its object.
+
+    The first visit, in which the browser gets the scene's scripts, is not counted.
+
+    Args:
+        served: The server.
+        browser: The browser.
+        run_id: The run, which the home page lists.
+        visits: How often.
+
+    Returns:
+        Time from the click until the first frame with the object is drawn.
+    """
+    seconds: list[float] = []
+    with _new_page(browser) as page:
+        page.add_init_script(_WATCH)
+        for _ in range(1 + visits):
+            page.goto(served.url)
+            page.evaluate(_REMEMBER)
+            page.locator(f'#runs [data-run="{run_id}"] [data-open]').click()
+            scene = _scene_of(page)
+            scene.wait_for_function("() => window.physhandiWatch.first > 0")
+            seconds.append(1e-3 * float(scene.evaluate(_SINCE_CLICK)))
+            page.evaluate(_CLOSE)
+    return {"visits": visits, **percentiles(seconds[1:])}
+
+
 def measure_slider_in_browser(
     served: Served, browser: "Browser", run_id: str, slider: MeasuredSlider, moves: list[Move]
 ) -> dict[str, Any]:
@@ -154,11 +194,7 @@ def measure_slider_in_browser(
         page.add_init_script(_WATCH)
         page.goto(served.url)
         page.evaluate(_OPEN, run_id)
-        page.wait_for_url("**/live/**")
-        frame = page.wait_for_selector("#scene")
-        scene = frame.content_frame() if frame is not None else None
-        if scene is None:
-            raise ServerFailedError("The page of the live scene holds no scene.")
+        scene = _scene_of(page)
         scene.get_by_role("button", name="Pause", exact=True).wait_for()
         scene.wait_for_function("() => window.physhandiWatch.frames > 30")
         opened = 1e-3 * float(page.evaluate("() => performance.now()"))
@@ -192,6 +228,16 @@ def _new_page(browser: "Browser") -> "Generator[Page]":
         yield context.new_page()
     finally:
         context.close()
+
+
+def _scene_of(page: "Page") -> "Frame":
+    """Wait for the page of a live scene, and give the scene in it."""
+    page.wait_for_url("**/live/**")
+    frame = page.wait_for_selector("#scene")
+    scene = frame.content_frame() if frame is not None else None
+    if scene is None:
+        raise ServerFailedError("The page of the live scene holds no scene.")
+    return scene
 
 
 def _press(page: "Page", scene: "Frame", slider: MeasuredSlider, move: Move) -> None:

@@ -2,6 +2,8 @@
 
 from typing import Literal, get_args
 
-Part = Literal["paint", "scrub", "slider", "browser", "start", "bytes", "sessions", "runs", "live"]
+Part = Literal[
+    "paint", "open", "scrub", "slider", "browser", "start", "bytes", "sessions", "runs", "live"
+]
 """One thing that can be measured on its own."""
 PARTS: tuple[Part, ...] = get_args(Part)

@@ -103,16 +103,21 @@ def test_the_first_move_after_a_start_is_timed(little: None) -> None:
 @pytest.mark.slow
 def test_a_browser_sees_the_first_paint_and_the_first_new_frame(little: None) -> None:
     run = Run.open(BUNDLED / "runs" / BUNDLED_RUN)
-    result = measure_viewer(run, "towel_fold", parts=("paint", "browser"), is_quick=True)
-    paint, slider = result["paint"], result["browser"]
+    parts = ("paint", "open", "browser")
+    result = measure_viewer(run, "towel_fold", parts=parts, is_quick=True)
+    paint, opened, slider = (result[part] for part in parts)
     assert is_in_order(paint)
+    assert is_in_order(opened)
+    assert opened["visits"] == 1
     assert 0.0 < paint["answered_ms"] <= paint["loaded_ms"]
     assert is_in_order(slider)
     assert slider["moves"] == 2
     # It arrives, and then it is drawn.
     for name in ("p50_ms", "p95_ms", "worst_ms"):
         assert 0.0 < slider[f"arrived_{name}"] < slider[name]
-    assert set(result["figures"]) == {"first_paint_ms", "slider_in_browser_p95_ms"}
+    named = {"first_paint_ms", "click_to_result_p95_ms", "slider_in_browser_p95_ms"}
+    assert set(result["figures"]) == named
+    assert result["figures"]["click_to_result_p95_ms"]["value"] == opened["p95_ms"]
 
 
 def test_goals_are_compared_in_the_right_direction() -> None:
