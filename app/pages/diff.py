@@ -83,9 +83,9 @@ def compare_runs(
         results: `describe_results` of each.
 
     Returns:
-        Sections of facts, what somebody chose, and what came of it: settings, and parameters where
-        they were chosen, then scores, losses, parameters where they were fitted, and surroundings.
-        One without rows is left out. Only scores have a best value.
+        Sections of edits, facts, what somebody chose, and what came of it: settings, and
+        parameters where they were chosen, then scores, losses, parameters where they were fitted,
+        and surroundings. One without rows is left out. Only scores have a best value.
     """
     parameters = [result.get("parameters", {}) for result in results]
     surroundings = [_surroundings_of(result.get("environment", {})) for result in results]
@@ -93,6 +93,7 @@ def compare_runs(
     found = Section("Parameters that the simulation ended with", _parameter_rows(parameters))
     losses = [_losses_of(result) for result in results]
     sections = [
+        Section("Edits of springs and nodes", _edit_rows(configs)),
         Section("The runs", _fact_rows(described)),
         *([found] if is_chosen else []),
         Section("Settings", _setting_rows(configs)),
@@ -133,6 +134,21 @@ def _setting_rows(configs: Sequence[Mapping[str, Any]]) -> list[Row]:
     changed = [{k: v for k, v in c.items() if k.startswith(_CHANGED)} for c in columns]
     others = [{k: v for k, v in c.items() if not k.startswith(_CHANGED)} for c in columns]
     return _plain_rows(changed) + _plain_rows(others, counts_absence=False)
+
+
+def _edit_rows(configs: Sequence[Mapping[str, Any]]) -> list[Row]:
+    """Lay edits side by side, step by step; those of one name may be of other springs or nodes."""
+    told = [named_fields(config.get("edits")) or {} for config in configs]
+    columns = [
+        {f"step {number}": step for number, step in enumerate(edits.get("steps", ()), start=1)}
+        for edits in told
+    ]
+    rows = _plain_rows(columns)
+    hashes = [str(edits.get("sha256", ""))[:_COMMIT_DIGITS] for edits in told]
+    if len(set(hashes)) > 1 and not any(row.differs for row in rows):
+        cells = [ComparedCell(text) for text in hashes]
+        rows.append(Row("the same steps, of other springs, nodes or frames", cells, differs=True))
+    return rows
 
 
 def _plain_rows(columns: Sequence[Mapping[str, Any]], *, counts_absence: bool = True) -> list[Row]:
@@ -234,7 +250,7 @@ def _losses_of(result: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 def _settings_of(config: Mapping[str, Any]) -> dict[str, Any]:
     """Flatten a configuration; the settings of a profile are named without saying so."""
     profile = named_fields(config.get("profile")) or {}
-    others = {key: value for key, value in config.items() if key != "profile"}
+    others = {key: value for key, value in config.items() if key not in {"profile", "edits"}}
     flat = flatten(profile) | flatten(others)
     return {name: value for name, value in flat.items() if name not in _UNCOMPARED}
 

@@ -114,6 +114,28 @@ def test_what_was_changed_comes_first_and_scores_only_if_they_really_differ() ->
     ]
 
 
+def test_edits_come_first_step_by_step() -> None:
+    fit = {"profile": {"profile": "quick"}}
+    steps = ["Cut 12 springs", "Pin 4 nodes from frame 10 on"]
+    again = {"source": "/runs/fit", "edits": {"steps": steps, "sha256": "abc"}, "parameters": {}}
+    pair = [described(), described(kind="simulation")]
+    first = compare_runs(pair, [fit, again], [{}, {}])[0]
+    assert first.name == "Edits of springs and nodes"
+    assert [(row.name, [cell.text for cell in row.cells]) for row in first.shown] == [
+        ("step 1", ["–", steps[0]]),  # noqa: RUF001
+        ("step 2", ["–", steps[1]]),  # noqa: RUF001
+    ]
+    fewer = {**again, "edits": {"steps": steps[:1], "sha256": "def"}}
+    first = compare_runs(pair, [again, fewer], [{}, {}])[0]
+    assert [row.name for row in first.shown] == ["step 2"]
+    others = {**again, "edits": {"steps": steps, "sha256": "def"}}
+    first = compare_runs(pair, [again, others], [{}, {}])[0]
+    assert [row.name for row in first.shown] == [
+        "the same steps, of other springs, nodes or frames"
+    ]
+    assert compare_runs(pair, [fit, fit], [{}, {}])[0].name == "The runs"
+
+
 def test_nested_fields_are_named_by_their_path() -> None:
     assert flatten({"a": {"b": 1, "c": {}}, "d": [1]}) == {"a.b": 1, "d": [1]}
 
