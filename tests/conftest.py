@@ -20,6 +20,8 @@ def pytest_configure(config):
     # Servers and workers start by the hundred; each would compile all modules again.
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     sys.dont_write_bytecode = False
+    # What a disk keeps through a power failure no test can see, and many wait for it.
+    os.fsync = lambda _descriptor: None
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -19,6 +19,8 @@ KERNEL_FILES = [
     ROOT / "physhandi/rendering/kernels.py",
     *sorted((ROOT / "physhandi/simulation/kernels").glob("*.py")),
 ]
+SHAPED = ("data", "fitting", "hand", "metrics")
+"""Packages of which pyproject.toml names the modules whose arrays are checked."""
 READABLE = 20
 """Files of a folder that a person reads at a glance."""
 
@@ -226,3 +228,13 @@ def test_vendored_and_bundled_data_stay_small() -> None:
         str(p) for p in (ROOT / "sequences").rglob("*") if p.is_file()
     ]
     assert 0 < sum((ROOT / name).stat().st_size for name in files) <= 6_600_000
+
+
+def test_shapes_that_a_module_tells_are_checked_while_tests_run(pytestconfig) -> None:
+    checked = pytestconfig.getoption("jaxtyping_packages").split(",")
+    for path in SOURCE_FILES:
+        place = path.relative_to(ROOT).with_suffix("")
+        names = [".".join(place.parts[:count]) for count in range(1, len(place.parts) + 1)]
+        asks = place.parts[:2] in {("physhandi", part) for part in SHAPED}
+        if asks and "from jaxtyping import" in path.read_text():
+            assert set(names) & set(checked), f"name {names[-1]} in pyproject.toml"
