@@ -209,8 +209,14 @@ def in_a_process(folder: Path, *order: str, setup: str = "") -> tuple[int, str]:
     return done.returncode, done.stderr
 
 
-FULL = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))"
-"""No file of the process may grow beyond 4 kB: the kernel refuses the write itself."""
+FULL = (
+    "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096)); "
+    "sys.dont_write_bytecode = True"
+)
+"""No file of the process may grow beyond 4 kB: the kernel refuses the write itself.
+
+Python does not notice when that cuts the bytecode of a module off, and nobody could import it.
+"""
 
 
 @table(
