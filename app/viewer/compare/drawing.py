@@ -264,7 +264,9 @@ class CompareDrawing:
     def _draw_hands(
         self, key: str, side: ComparedSide, layers: Layers, *, is_visible: bool
     ) -> None:
-        opacity = _HAND_OPACITY if self._surface_of(side, layers) is None else None
+        is_alone = side.rollout is None and self._look.mode == "side"
+        has_surface = self._surface_of(side, layers) is not None
+        opacity = None if is_alone or has_surface else _HAND_OPACITY
         for hand in side.content.hands:
             path, color = f"{_ROOT}/{key}/hand/{hand.side}", SKIN[hand.side]
             frame = min(side.content_frame, len(hand.vertex) - 1)

@@ -217,6 +217,7 @@ class ComparePanel:
 
     def _draw_plot(self) -> None:
         self._plotted = self._tick
+        self._plot.offer(on=self._curve.way is not None)
         self._plot.show([curve * self._factor for curve in self._curve.columns()], self._tick)
 
 

@@ -92,6 +92,11 @@ class FramePlot:
         """Frames, curves and mark as they are drawn."""
         return self._plot.data
 
+    def offer(self, *, on: bool) -> None:
+        """Show the plot, or hide it where there is nothing to be drawn."""
+        if self._plot.visible != on:
+            self._plot.visible = on
+
     def measure_in(self, unit: str, frame_count: int) -> None:
         """Change the unit and the number of frames."""
         self._frame_count = max(frame_count, 2)

@@ -270,6 +270,18 @@ def test_what_cannot_be_compared_is_refused_or_told(catalog: FolderCatalog) -> N
     assert "A has 30 and B 15 frames/s" in slow.notes[0]
 
 
+def test_without_a_second_object_there_is_no_empty_plot(sessions: Sessions) -> None:
+    def shown(client: ViewerClient) -> list[bool]:
+        return [p["visible"] for p in client.gui.values() if "data" in p and "series" in p]
+
+    with watch(sessions, "a=sheet&b=hands") as client:
+        client.until(lambda: "B has no fitted object" in said(client))
+        client.until(lambda: shown(client) == [False])
+    with watch(sessions, "a=sheet&b=moved") as client:
+        client.until(lambda: "between A and B" in said(client))
+        client.until(lambda: shown(client) == [True])
+
+
 def test_an_ask_survives_its_query() -> None:
     ask = CompareAsk(a="x", b="y-1", sequence="a b&c", mode="wipe", color="difference", f=12)
     assert CompareAsk.parse(ask.query) == ask
