@@ -225,8 +225,8 @@ KEYS: tuple[KeyGroup, ...] = (
             ),
             Key(
                 shown=("drag",),
-                about="while editing: select what is within a rectangle; with shift add it, with "
-                "ctrl take it out; the right button still moves the camera",
+                about="while editing: select what the rectangle, lasso or brush holds; with shift "
+                "add it, with ctrl take it out; the right button still moves the camera",
             ),
             Key(
                 shown=("click",),

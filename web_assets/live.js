@@ -29,7 +29,10 @@
     }
     scene.contentWindow.addEventListener("keydown", onKey);
     wireScene(scene, seek);
-    if (scene.dataset.offers.split(" ").includes("object")) wireSteering(scene, session);
+    if (scene.dataset.offers.split(" ").includes("object")) {
+      wireSteering(scene, session);
+      wireDrawing(scene, session);
+    }
     wish();
     scene.contentWindow.focus();
   }

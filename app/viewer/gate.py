@@ -15,6 +15,7 @@ from starlette.websockets import WebSocketDisconnect, WebSocketState
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
+from app.viewer.edit.selection import DrawnShape
 from app.viewer.sessions import Session, Sessions
 from app.viewer.steer.key_channel import KeyChannel
 from app.viewer.ui.scene_frame import scene_page
@@ -38,7 +39,8 @@ def create_gate(sessions: Sessions) -> APIRouter:
 
     ``GET /viewer/{session_id}/`` answers with viser's one page and nothing else; no path is passed
     on. ``/viewer/{session_id}`` with or without the slash is the websocket, passed on unchanged;
-    ``/viewer/{session_id}/keys`` is another one, for keys that are held while hands are steered.
+    ``/viewer/{session_id}/keys`` is another one, for keys that are held while hands are steered;
+    ``/viewer/{session_id}/shape`` takes what was drawn by a lasso or a brush.
     Who may come in is decided before the gate; that a session is one's own, here. Each tab has a
     session of its own: a page that is opened while another tab watches the session is sent on to a
     copy, which begins with the same state. A tab that is reloaded has hung up before.
@@ -87,8 +89,21 @@ def create_gate(sessions: Sessions) -> APIRouter:
             if upstream is not None:
                 await upstream.close()
 
+    _add_shapes(router, sessions)
     _add_keys(router, sessions)
     return router
+
+
+def _add_shapes(router: APIRouter, sessions: Sessions) -> None:
+    """Let pages tell what was drawn in a scene that is edited."""
+
+    @router.post("/viewer/{session_id}/shape", status_code=204)
+    async def take_shape(session_id: str, request: Request) -> None:
+        session = sessions.find(session_id, request.state.owner)
+        if not isinstance(session, Session):
+            raise HTTPException(404, _GONE)
+        drawn = DrawnShape.parse(await request.body())
+        await asyncio.to_thread(session.select, drawn)
 
 
 def _add_keys(router: APIRouter, sessions: Sessions) -> None:

@@ -19,6 +19,7 @@ from app.viewer.content.content import Catalog, Content, open_run, open_sequence
 from app.viewer.content.layers import default_layers
 from app.viewer.content.session_state import Kind, Pose, SessionState
 from app.viewer.edit.edit_panel import EditPanel
+from app.viewer.edit.selection import DrawnShape
 from app.viewer.export.export_panel import ExportPanel
 from app.viewer.export.snapshot import Snapshot
 from app.viewer.inspect.inspector import Inspector, TakeClick
@@ -295,6 +296,11 @@ class Session(SceneServer):
             leave_others=self._leave_others,
         )
 
+    def select(self, drawn: DrawnShape) -> None:
+        """Select what is within a shape that somebody drew, if the object is being edited."""
+        if self._edit is not None:
+            self._edit.take_drawn(drawn)
+
     def _takes_clicks(self) -> TakeClick | None:
         """Give what selects what is clicked, while the object is edited."""
         edit = self._edit
@@ -400,6 +406,7 @@ class Session(SceneServer):
                 rollout, rollout_frame, hands = steered
                 self._view.draw(frame, rollout, rollout_frame, is_playing=True, hands=hands)
             self._timeline.show(is_playing=is_playing)
+            self._restart.follow(rollout)
             is_hidden = self._comparison.is_on and rollout is not None
             if self._edit is not None and rollout is not None:
                 self._edit.show(rollout, rollout_frame, is_hidden=is_hidden)

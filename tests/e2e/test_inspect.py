@@ -135,3 +135,25 @@ def test_keys_colors_and_clicks_work_in_the_scene_and_around_it(scene, picture):
     with page.expect_download() as download:
         page.keyboard.press("s")
     assert download.value.suggested_filename.endswith(".png")
+
+
+def test_a_lasso_selects_nodes_that_are_cut_apart_and_undone(scene) -> None:
+    page = scene.page
+    page.keyboard.press("b")
+    scene.until(lambda: scene.has("Selected: nothing"), "the scene is edited")
+    scene.choose("Tool", "lasso")
+    view = page.locator("#scene").bounding_box()
+    frame = page.locator("#scene").content_frame
+    frame.locator("[data-draws=lasso]").wait_for(state="attached")
+    corners = [(0.3, 0.35), (0.68, 0.35), (0.68, 0.95), (0.3, 0.95)]
+    x, y = zip(*corners, strict=True)
+    page.mouse.move(view["x"] + x[0] * view["width"], view["y"] + y[0] * view["height"])
+    page.mouse.down()
+    for across, down in corners[1:]:
+        page.mouse.move(view["x"] + across * view["width"], view["y"] + down * view["height"])
+    page.mouse.up()
+    scene.until(lambda: (scene.number("Selected: ", " nodes") or 0) > 50, "nodes are selected")
+    scene.press("Cut")
+    scene.until(lambda: (scene.number("Cut ", " springs") or 0) > 50, "springs are cut")
+    page.keyboard.press("Control+z")
+    scene.until(lambda: scene.has("No edits."), "it is undone")

@@ -3,6 +3,7 @@
 import viser
 
 from app.viewer.content.content import Content
+from physhandi.object_rollout import ObjectRollout
 
 _FITTED, _PREDICTED = "rgba(120,130,145,0.35)", "rgb(230,140,30)"
 
@@ -20,14 +21,21 @@ class RestartMark:
             server: Where to.
             order: Place in the panel, just behind the slider's.
         """
+        self._frame: int | None = None
         self._html = server.gui.add_html("", order=order, visible=False)
 
     def replace(self, content: Content) -> None:
         """Mark the restart of another content, or nothing."""
-        frame = restart_frame(content)
+        self._frame = frame = restart_frame(content)
         if frame is not None:
             self._html.content = mark_html(frame, content.frame_count)
         self._html.visible = frame is not None
+
+    def follow(self, rollout: ObjectRollout | None) -> None:
+        """Mark nothing while a rollout is shown that does not restart, as an edited one."""
+        is_there = self._frame is not None and (rollout is None or rollout.restart is not None)
+        if self._html.visible != is_there:
+            self._html.visible = is_there
 
 
 def restart_frame(content: Content) -> int | None:

@@ -12,6 +12,7 @@ from numpy import ndarray
 
 from app.viewer.clock.playback import Playback
 from app.viewer.edit.selection import (
+    DrawnShape,
     Highlights,
     Polygon,
     ScreenView,
@@ -52,6 +53,7 @@ SELECTED = (255, 122, 0)
 _OFFERED = (120, 128, 140)
 """Color of what can be selected."""
 _START, _STOP = "Edit (B)", "Back to playback (B)"
+_RECTANGLE, _LASSO, _BRUSH = "rectangle", "lasso", "brush"
 _ALL, _INVERT, _NOTHING = "All", "Invert", "Nothing"
 _STIFFNESS, _DAMPING = "Stiffness", "Damping"
 _CUT, _JOIN = "Cut", "Join"
@@ -64,7 +66,7 @@ _HOW = (
     "takes back."
 )
 _HOW_NOW = (
-    "Drag a rectangle in the scene, or click; <b>shift</b> adds, <b>ctrl</b> takes out. The right "
+    "Drag in the scene, or click; <b>shift</b> adds, <b>ctrl</b> takes out. The right "
     "button still moves the camera."
 )
 
@@ -109,6 +111,7 @@ class EditPanel:
         self._selection = Selection()
         self._highlights = Highlights()
         self._is_on = False
+        self._sign = server.gui.add_html("")
         self._callbacks: list[Callable[[viser.SceneRectSelectEvent], None]] = []
         self._add_controls(server.gui)
         self._commands = bind(server, guard, "edit", lambda _, __: self.toggle())
@@ -121,6 +124,18 @@ class EditPanel:
         with self._folder:
             self._button = gui.add_button(_START, hint="B")
             self._status = gui.add_html("")
+            self._tool: Any = gui.add_dropdown(
+                "Tool", (_RECTANGLE, _LASSO, _BRUSH), hint="What a drag in the scene draws"
+            )
+            self._radius: Any = gui.add_slider(
+                "Brush [%]",
+                1.0,
+                20.0,
+                0.5,
+                4.0,
+                visible=False,
+                hint="Radius of the brush, as a part of the height of the scene",
+            )
             self._kind: Any = gui.add_dropdown(
                 "Select", get_args(SelectKind), hint="What a rectangle or a click selects"
             )
@@ -157,6 +172,8 @@ class EditPanel:
                 buttons.on_click(guard(lambda event: self._press(event.target.value)))
             self._list = gui.add_html("")
         self._button.on_click(guard(lambda _: self.toggle()))
+        self._tool.on_update(guard.by_user(lambda _: self._choose_tool()))
+        self._radius.on_update(guard.by_user(lambda _: self._choose_tool()))
         self._kind.on_update(guard.by_user(lambda _: self._choose_kind()))
 
     @property
@@ -183,10 +200,7 @@ class EditPanel:
                 return
             self._is_on = False
             self._selection = Selection()
-            scene: Any = self._server.scene
-            for callback in self._callbacks:
-                scene.remove_rect_select_callback(callback)
-            self._callbacks.clear()
+            self._choose_tool()
             self._nodes.clear()
             self._write()
 
@@ -237,6 +251,7 @@ class EditPanel:
         for command in self._commands:
             command.remove()
         self._folder.remove()
+        self._sign.remove()
 
     def _enter(self) -> None:
         self._playback.play(on=False)
@@ -245,11 +260,7 @@ class EditPanel:
             if self._is_on:
                 return
             self._is_on = True
-            for modifier, way in _MODIFIERS.items():
-                callback = self._guard(lambda event, way=way: self._take_rectangle(event, way))
-                self._callbacks.append(callback)
-                name: Any = modifier
-                self._server.scene.on_rect_select(modifier=name)(callback)
+            self._choose_tool()
             self._write()
         self._tabs.open("Edit")
         self._playback.redraw()
@@ -261,6 +272,12 @@ class EditPanel:
     def _take_rectangle(self, event: viser.SceneRectSelectEvent, way: SelectWay) -> None:
         shape = Polygon.rectangle(event.screen_min, event.screen_max)
         self._take_shape(ScreenView.of(event.client.camera), shape, way)
+
+    def take_drawn(self, drawn: DrawnShape) -> None:
+        """Select what is within what the page tells that somebody drew."""
+        client = next(iter(self._server.get_clients().values()), None)
+        if client is not None:
+            self._take_shape(ScreenView.of(client.camera), drawn.shape, drawn.way)
 
     def _take_shape(self, eye: ScreenView, shape: Polygon | Stroke, way: SelectWay) -> None:
         """Select what is within a shape that was drawn."""
@@ -285,6 +302,26 @@ class EditPanel:
             return Selection(nodes=frozenset({node}))
         chosen = np.flatnonzero((model.spring_nodes == node).any(axis=1))
         return only(of_springs(model, chosen), kind)
+
+    def _choose_tool(self) -> None:
+        """Let viser draw rectangles, and our part of the page lassos and strokes, or nothing."""
+        with self._lock:
+            tool = self._tool.value
+            scene: Any = self._server.scene
+            self._radius.visible = tool == _BRUSH
+            for callback in self._callbacks:
+                scene.remove_rect_select_callback(callback)
+            self._callbacks.clear()
+            if self._is_on and tool == _RECTANGLE:
+                for modifier, way in _MODIFIERS.items():
+                    callback = self._guard(lambda event, way=way: self._take_rectangle(event, way))
+                    self._callbacks.append(callback)
+                    scene.on_rect_select(modifier=modifier)(callback)
+            draws = self._is_on and tool != _RECTANGLE
+            radius = 0.01 * float(self._radius.value)
+            self._sign.content = (
+                f'<i hidden data-draws="{tool}" data-radius="{radius:.4g}"></i>' if draws else ""
+            )
 
     def _choose_kind(self) -> None:
         with self._lock:

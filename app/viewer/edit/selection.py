@@ -1,14 +1,17 @@
 """What is selected in a scene: nodes or springs within a shape that somebody drew on the screen."""
 
 from dataclasses import dataclass, field
-from typing import Literal, TypeVar
+from typing import Annotated, Literal, TypeVar
 
+import msgspec
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from msgspec import Meta
 from numpy import ndarray
 from viser import CameraHandle
 from viser.transforms import SO3
 
+from physhandi.errors import UsageError
 from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.edits import NodePair
 from physhandi.simulation.model import SpringMassModel
@@ -17,6 +20,8 @@ SelectKind = Literal["nodes", "springs", "virtual springs"]
 """What a shape selects."""
 SelectWay = Literal["replace", "add", "remove", "toggle"]
 """What a new selection does to the one before."""
+MOST_SHAPE_BYTES = 1 << 18
+"""Longer messages of a page are no shapes."""
 _NEAREST = 1e-6
 _Item = TypeVar("_Item", int, NodePair)
 
@@ -229,6 +234,46 @@ class Stroke:
             apart = np.linalg.norm(offset - part[:, None] * step, axis=1)
             held |= apart <= self.radius
         return held
+
+
+_Coordinate = Annotated[float, Meta(ge=-10.0, le=10.0)]
+
+
+class DrawnShape(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a page tells of a lasso or a brush when the pointer goes up."""
+
+    tool: Literal["lasso", "brush"]
+    """Which of them."""
+    way: SelectWay
+    """What becomes of the selection before."""
+    points: Annotated[
+        tuple[tuple[_Coordinate, _Coordinate], ...], Meta(min_length=1, max_length=4000)
+    ]
+    """Where the pointer was, as `ScreenView.project` has it."""
+    radius: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
+    """Of the brush, as a part of the screen's height."""
+
+    @classmethod
+    def parse(cls, text: bytes) -> "DrawnShape":
+        """Read one.
+
+        Raises:
+            UsageError: If it is none; says what is wrong with it.
+        """
+        if len(text) > MOST_SHAPE_BYTES:
+            raise UsageError(f"A shape has at most {MOST_SHAPE_BYTES} bytes, not {len(text)}.")
+        try:
+            return msgspec.json.decode(text, type=cls)
+        except (msgspec.DecodeError, UnicodeError, RecursionError) as error:
+            raise UsageError(f"This is no shape: {error}.") from error
+
+    @property
+    def shape(self) -> Polygon | Stroke:
+        """The shape."""
+        points = np.array(self.points, np.float64)
+        if self.tool == "lasso":
+            return Polygon(corners=points)
+        return Stroke(points=points, radius=self.radius)
 
 
 @dataclass(eq=False)

@@ -15,6 +15,8 @@ from waiting import LIMIT_S
 from app.viewer.content.session_state import Pose
 from app.viewer.edit.edit_panel import attach_to_nearest, pairs_to_join
 from app.viewer.edit.selection import (
+    MOST_SHAPE_BYTES,
+    DrawnShape,
     Polygon,
     ScreenView,
     Selection,
@@ -251,6 +253,53 @@ def test_a_rectangle_selects_and_each_button_is_one_step(scene, run: Run) -> Non
 
 def is_told(client: ViewerClient, text: str) -> bool:
     return any("Notification" in m["type"] and text in str(m) for m in client.messages)
+
+
+def test_a_lasso_and_a_brush_select_when_the_pointer_goes_up(scene, run: Run) -> None:
+    session, client = scene
+    position = run.array("sequences/lift/rollout.npy")[AT]
+    (camera,) = (c.camera for c in session._server.get_clients().values())
+    place = ScreenView.of(camera).project(position)
+
+    def tell(tool: str, points, way: str = "replace", radius: float = 0.0) -> None:
+        shape = {"tool": tool, "points": points, "way": way, "radius": radius}
+        session.select(DrawnShape.parse(json.dumps(shape).encode()))
+
+    assert "data-draws" not in texts(client)
+    client.set("Tool", "lasso")
+    wait(client, lambda: 'data-draws="lasso"' in texts(client))
+    triangle = [[0.5, 0.5], [1.0, 0.0], [1.0, 1.0]]
+    inside = (place[:, 0] > 0.5) & (np.abs(place[:, 1] - 0.5) < place[:, 0] - 0.5)
+    tell("lasso", triangle)
+    assert session._edit.selection.nodes == set(np.flatnonzero(inside).tolist())
+    assert 5 < inside.sum() < 40
+    client.set("Tool", "brush")
+    client.set("Brush [%]", 5.0)
+    wait(client, lambda: 'data-draws="brush" data-radius="0.05"' in texts(client))
+    tell("brush", [place[0].tolist()], "add", 0.001)
+    assert session._edit.selection.nodes == {0, *np.flatnonzero(inside).tolist()}
+    tell("brush", [[0.0, 0.5], [1.0, 0.5]], "remove", 1.0)
+    assert not session._edit.selection
+    client.set("Back to playback (B)", True)
+    wait(client, lambda: "data-draws" not in texts(client))
+    tell("lasso", triangle)
+    assert not session._edit.selection
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[]", "Expected `object`"),
+        ('{"tool": "lasso", "way": "replace", "points": []}', "points"),
+        ('{"tool": "knife", "way": "replace", "points": [[0, 0]]}', "knife"),
+        ('{"tool": "lasso", "way": "add", "points": [[0, 99]]}', r"\$.points\[0\]\[1\]"),
+        ('{"tool": "lasso", "way": "add", "points": [[0, 0]], "more": 1}', "more"),
+        (" " * (MOST_SHAPE_BYTES + 1), "at most"),
+    ],
+)
+def test_a_page_that_tells_of_no_shape_is_refused(text: str, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        DrawnShape.parse(text.encode())
 
 
 def test_what_cannot_be_edited_changes_nothing(scene, run: Run) -> None:

@@ -22,6 +22,7 @@ from websockets.sync.client import connect
 
 from app.settings import WEB_ASSETS
 from app.viewer.content.session_state import SessionState
+from app.viewer.edit.selection import DrawnShape
 from app.viewer.gate import create_gate
 from app.viewer.sessions import Sessions
 
@@ -49,9 +50,9 @@ def address(sessions: Sessions) -> Iterator[str]:
     thread.join()
 
 
-def fetch(url: str, **headers: str) -> tuple[int, bytes]:
+def fetch(url: str, body: bytes | None = None, **headers: str) -> tuple[int, bytes]:
     headers = {name.replace("_", "-"): value for name, value in headers.items()}
-    request = urllib.request.Request(url, headers=headers)  # noqa: S310
+    request = urllib.request.Request(url, body, headers=headers)  # noqa: S310
     opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     try:
         with opener.open(request) as response:
@@ -113,6 +114,18 @@ def test_keys_come_by_a_websocket_of_their_own_and_are_let_go_with_it(address, s
         with pytest.raises(ConnectionClosed):
             page.recv(timeout=LIMIT_S)
     assert held.get(timeout=LIMIT_S) == frozenset()
+
+
+def test_what_was_drawn_reaches_the_scene_that_is_edited(address, sessions) -> None:
+    name = sessions.open("run", "sheet", "me")
+    drawn: list[DrawnShape] = []
+    sessions.get(name).select = drawn.append
+    url = f"http://{address}/viewer/{name}/shape"
+    shape = {"tool": "lasso", "way": "add", "points": [[0.1, 0.2], [0.3, 0.4], [0.5, 0.2]]}
+    body = json.dumps(shape).encode()
+    assert fetch(url, body, **{"X-Owner": "somebody else"})[0] == 404
+    assert fetch(url, body)[0] == 204
+    assert [item.points for item in drawn] == [((0.1, 0.2), (0.3, 0.4), (0.5, 0.2))]
 
 
 @pytest.mark.parametrize("slash", ["", "/"])
