@@ -192,8 +192,12 @@ KEYS: tuple[KeyGroup, ...] = (
             ),
             Key(
                 shown=("I", "K", "J", "L", "U", "O"),
-                about="while steering: tip it ahead and back, turn and roll it left and right; "
-                "none of these twelve keys means anything else then",
+                about="while steering: tip it ahead and back, turn and roll it left and right",
+            ),
+            Key(
+                shown=("R", "F"),
+                about="while steering: close and open its fingers; none of these fourteen keys "
+                "means anything else then",
             ),
             Key(
                 shown=("X",),

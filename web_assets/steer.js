@@ -4,7 +4,7 @@
    says on the screen that they steer. Keys are told by their places on the keyboard. */
 
 {
-  const HELD = ["KeyW", "KeyS", "KeyA", "KeyD", "KeyE", "KeyQ", "KeyI", "KeyK", "KeyJ", "KeyL", "KeyU", "KeyO"];
+  const HELD = ["KeyW", "KeyS", "KeyA", "KeyD", "KeyE", "KeyQ", "KeyI", "KeyK", "KeyJ", "KeyL", "KeyU", "KeyO", "KeyR", "KeyF"];
   const AGAIN_MS = 2000;
   /* On phones the panel is below the scene. */
   const SIGN = `
@@ -43,8 +43,9 @@
       sign.hidden = !state.steering;
       /* The hint of a first visit would lie over the sign. */
       document.body.toggleAttribute("data-steering", Boolean(state.steering));
-      const turn = state.turns ? ", I K J L U O to turn it, X lets go and grips" : ", X lets go of it";
-      sign.textContent = state.steering ? `Steering ${state.what}: hold W S A D Q E to move it${turn}, click a point of the object to pull it, space records, ctrl Z takes back, G returns to playback` : "";
+      const fingers = state.curls ? ", R F close and open its fingers" : "";
+      const own = state.turns ? `, I K J L U O turn it${fingers}, X lets go and grips` : ", X lets go of it";
+      sign.textContent = state.steering ? `Steering ${state.what}: W S A D Q E move it${own}, a click holds a point to pull, space records, ctrl Z takes back, G ends` : "";
       if (state.recording) sign.textContent = `● Recording. ${sign.textContent}`;
       sign.dataset.recording = state.recording ? "yes" : "";
     }

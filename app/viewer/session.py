@@ -4,6 +4,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import viser
@@ -35,6 +36,7 @@ from app.viewer.steer.key_channel import KeyChannel
 from app.viewer.steer.steer_panel import SteerPanel
 from app.viewer.ui.keyboard import bind
 from app.viewer.ui.tabs import TabName, Tabs
+from physhandi.data.exporters.scene_data import read_skins
 from physhandi.fitting.stored_take import StoredTake
 from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.parameters import parameter_changes
@@ -283,6 +285,7 @@ class Session(SceneServer):
             rollout_at=self._object.at,
             stop_comparing=self._comparison.stop,
             newtons=lambda: scene.painter.force_factor,
+            skins=partial(read_skins, run, content.sequence_name),
             keep=None if self._storage is None else self._keep_take,
         )
         self._edit = EditPanel(

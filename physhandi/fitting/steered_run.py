@@ -21,6 +21,8 @@ from physhandi.data.sequence_meta import SequenceMeta, Side
 from physhandi.data.sequence_writer import write_sequence
 from physhandi.fitting import artefacts
 from physhandi.fitting.stored_take import StoredTake
+from physhandi.hand.curl import BONE_OF_KEYPOINT, blended, curl_motion, curled_rotations
+from physhandi.hand.loading import load_hand_model
 from physhandi.hand.motion import HandMotion
 from physhandi.progress import Progress
 from physhandi.simulation.contact_intervals import ContactIntervals, acts_in, always
@@ -159,29 +161,45 @@ def store_hands(source: RunFolder, stored: StoredTake, name: str, attempt: Attem
 def _store_hand(
     source: RunFolder,
     stored: StoredTake,
-    place: tuple[str, str],
+    place: tuple[str, Side],
     which: tuple[int, SteeredHand],
     attempt: Attempt,
 ) -> None:
     (name, side), (number, hand) = place, which
     was, now = SequenceFiles(stored.sequence), SequenceFiles(name)
     pose = stored.take.pose[:, number]
+    bones: dict[str, ndarray] | None = None
+    if source.has(was.hand_skin(side)) and hand.curls is not None:
+        bones = source.tensors(was.hand_skin(side))
+    joints = np.array(BONE_OF_KEYPOINT)[:, None]
     for old, new in (
         (was.hand_vertex(side), now.hand_vertex(side)),
         (was.hand_keypoint(side), now.hand_keypoint(side)),
     ):
         if source.has(old):
             point = _in_frame(source.array(old), stored.frame)
-            moved = np.stack([hand.moved(point, its) for its in pose])
+            points = np.repeat(point[None], len(pose), axis=0)
+            if bones is not None:
+                is_surface = old == was.hand_vertex(side)
+                bone = bones["vertex_bone"] if is_surface else joints
+                weight = bones["vertex_weight"] if is_surface else np.ones(joints.shape)
+                motion = curl_motion(bones, side, stored.frame, np.append(pose[:, 6], 0.0))
+                curled = blended(motion, bone, weight, point)
+                points += curled[:-1] - curled[-1]
+            moved = np.stack([hand.moved(*its) for its in zip(points, pose, strict=True)])
             attempt.save_array(new, moved.astype(np.float32))
     if source.has(was.hand_face(side)):
         attempt.save_array(now.hand_face(side), source.array(was.hand_face(side)))
+    rotation: ndarray | None = None
     if source.has(was.hand_skin(side)):
         skin = source.tensors(was.hand_skin(side))
-        attempt.save_tensors(now.hand_skin(side), _moved_skin(skin, stored.frame, hand, pose))
+        if bones is not None and pose[:, 6].any():
+            rotation = curled_rotations(bones, side, stored.frame, pose[:, 6])
+        moved_skin = _moved_skin(skin, stored.frame, hand, pose, rotation)
+        attempt.save_tensors(now.hand_skin(side), moved_skin)
     if source.has(was.hand_motion(side)):
         motion = HandMotion.from_tensors(source.tensors(was.hand_motion(side)))
-        moved = _moved_motion(motion, stored.frame, hand, pose)
+        moved = _moved_motion(motion, stored.frame, hand, pose, rotation)
         attempt.save_tensors(now.hand_motion(side), moved.to_tensors())
 
 
@@ -191,30 +209,48 @@ def _in_frame(array: ndarray, frame: int) -> ndarray:
 
 
 def _moved_skin(
-    skin: Mapping[str, ndarray], frame: int, hand: SteeredHand, pose: ndarray
+    skin: Mapping[str, ndarray],
+    frame: int,
+    hand: SteeredHand,
+    pose: ndarray,
+    curled: Float[ndarray, "frame bone 4"] | None,
 ) -> dict[str, ndarray]:
-    """Let the bones of a skin stay as they are in a frame, but for the wrist, which moves."""
+    """Let the wrist move; other bones stay as they are in a frame, unless they are curled."""
     translation = np.repeat(_in_frame(skin["translation"], frame)[None], len(pose), axis=0)
     rotation = np.repeat(_in_frame(skin["rotation"], frame)[None], len(pose), axis=0)
+    if curled is not None:
+        rotation[:, 1:] = curled[:, 1:]
     wrist = Rotation.from_quat(rotation[0, 0])
     for number, its in enumerate(pose):
         translation[number, 0] = hand.moved(translation[number, :1], its)[0]
-        turned = (Rotation.from_rotvec(its[3:]) * wrist).as_quat()
-        nearer = rotation[max(number - 1, 0), 0]
-        rotation[number, 0] = turned if float(turned @ nearer) >= 0.0 else -turned
+        rotation[number, 0] = (Rotation.from_rotvec(its[3:6]) * wrist).as_quat()
+    # Of q and -q, which are the same rotation, the one nearer to the frame before.
+    flips = np.where((rotation[1:] * rotation[:-1]).sum(axis=-1) < 0.0, -1.0, 1.0)
+    rotation[1:] *= np.cumprod(flips, axis=0)[..., None]
     moved = {"translation": translation, "rotation": rotation}
     return {**skin, **{name: value.astype(np.float32) for name, value in moved.items()}}
 
 
-def _moved_motion(motion: HandMotion, frame: int, hand: SteeredHand, pose: ndarray) -> HandMotion:
-    """Let a hand keep the articulation of a frame while its wrist moves."""
+def _moved_motion(
+    motion: HandMotion,
+    frame: int,
+    hand: SteeredHand,
+    pose: ndarray,
+    curled: Float[ndarray, "frame bone 4"] | None,
+) -> HandMotion:
+    """Let the wrist of a hand move, which keeps the articulation of a frame unless it is curled."""
     turn, place = (
         _in_frame(value, frame) for value in (motion.wrist_rotation, motion.wrist_translation)
     )
     wrist = motion.scale * place[None]
+    articulation = np.repeat(_in_frame(motion.articulation, frame)[None], len(pose), axis=0)
+    if curled is not None:
+        axes = load_hand_model(motion.side, motion.model).joint_axes
+        turned = Rotation.from_quat(curled[:, 1:].reshape(-1, 4)).as_rotvec()
+        articulation = np.einsum("jca,fjc->fja", axes, turned.reshape(articulation.shape))
     return replace(
         motion,
-        articulation=np.repeat(_in_frame(motion.articulation, frame)[None], len(pose), axis=0),
-        wrist_rotation=np.stack([turn_on(turn, its[3:]) for its in pose]),
+        articulation=articulation,
+        wrist_rotation=np.stack([turn_on(turn, its[3:6]) for its in pose]),
         wrist_translation=np.stack([hand.moved(wrist, its)[0] / motion.scale for its in pose]),
     )

@@ -29,6 +29,15 @@ from physhandi.simulation.topology import MINIMUM_VIRTUAL_REST_LENGTH, virtual_s
 
 _ARRAYS = {"control", "hand_of_control", "hand_name", "wrist", "pose", "is_regripped"}
 """Arrays of a stored take besides those of its model and its start."""
+_SHAPES = "curls_"
+"""Prefix of the arrays that hold `SteeredHand.curls`, by the hand's number."""
+
+
+POSE = 7
+"""Numbers of a hand's pose: how far its wrist has moved [m], the rotation vector about it [rad],
+and how far its fingers are closed: 1 for a fist, 0 for as they were, -1 for open."""
+CURLS = np.linspace(-1.0, 1.0, 17)
+"""Curls of the fingers for which the shape of a hand is known; in between it is interpolated."""
 
 
 def turn_on(rotation: Float[ndarray, " 3"], by: Float[ndarray, " 3"]) -> Float[ndarray, " 3"]:
@@ -59,6 +68,24 @@ def nearest_surface(
     return np.argmin(distance, axis=0)
 
 
+def curled(shapes: Float[ndarray, "curl point 3"], curl: float) -> Float[ndarray, "point 3"]:
+    """Interpolate points of a hand between `CURLS` [m].
+
+    Args:
+        shapes: The points for each of `CURLS`, or one row for a hand whose fingers do not move [m].
+        curl: How far the fingers are closed.
+    """
+    if len(shapes) == 1:
+        return shapes[0]
+    place = float(np.interp(curl, CURLS, np.arange(len(CURLS))))
+    low = min(int(place), len(CURLS) - 2)
+    share = place - low
+    # One of the two alone where the curl is a sample, so that a hand that is not curled keeps bits.
+    if share in {0.0, 1.0}:
+        return shapes[low + int(share)]
+    return (1.0 - share) * shapes[low] + share * shapes[low + 1]
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SteeredHand:
     """Control nodes that move as one rigid body."""
@@ -69,18 +96,62 @@ class SteeredHand:
     """Numbers of its control nodes."""
     wrist: Float[ndarray, " 3"]
     """Point about which it turns, in its pose of zero [m]."""
+    curls: Float32[ndarray, "curl own 3"] | None = None
+    """Its control nodes for each of `CURLS`, the rest of the pose zero [m]; None if its fingers do
+    not move."""
 
-    def moved(
-        self, point: Float[ndarray, "point 3"], pose: Float[ndarray, " 6"]
-    ) -> Float[ndarray, "point 3"]:
-        """Move points with the hand.
+    @classmethod
+    def of_surface(
+        cls,
+        name: str,
+        shapes: Float[ndarray, "curl vertex 3"],
+        *,
+        control: Int[ndarray, " own"],
+        recorded: Float[ndarray, "all 3"],
+        place: Float32[ndarray, "all 3"],
+        wrist: Float[ndarray, " 3"] | None,
+    ) -> "SteeredHand":
+        """Let control nodes move as the vertices of a hand's surface that are nearest to them.
 
         Args:
-            point: Points in the hand's pose of zero [m].
-            pose: How far the wrist has moved [m], then the rotation vector about it [rad].
+            name: What the hand is called.
+            shapes: Vertices for each of `CURLS`, or one row if the fingers do not move [m].
+            control: Numbers of its control nodes.
+            recorded: Where all control nodes are on the surface [m].
+            place: Where they are simulated [m].
+            wrist: Point about which it turns [m]; the middle of the surface if left out.
         """
-        turn = Rotation.from_rotvec(pose[3:]).as_matrix()
+        surface, curls = curled(shapes, 0.0), None
+        if len(shapes) > 1:
+            nearest = np.asarray(KDTree(surface).query(recorded[control])[1])
+            curls = place[control] + (shapes[:, nearest] - surface[nearest])
+            curls = curls.astype(np.float32)
+        middle = surface.mean(axis=0) if wrist is None else wrist
+        return cls(name=name, control=control, wrist=middle, curls=curls)
+
+    def moved(
+        self, point: Float[ndarray, "point 3"], pose: Float[ndarray, " 7"]
+    ) -> Float[ndarray, "point 3"]:
+        """Move points with the wrist of the hand.
+
+        Args:
+            point: Points in the hand's pose of zero, but for its curl [m].
+            pose: Its pose.
+        """
+        turn = Rotation.from_rotvec(pose[3:6]).as_matrix()
         return (np.asarray(point, np.float64) - self.wrist) @ turn.T + (self.wrist + pose[:3])
+
+    def moved_control(
+        self, control: Float32[ndarray, "control 3"], pose: Float[ndarray, " 7"]
+    ) -> Float[ndarray, "own 3"]:
+        """Give its control nodes.
+
+        Args:
+            control: All control nodes where all poses are zero [m].
+            pose: Its pose.
+        """
+        own = control[self.control]
+        return self.moved(own if self.curls is None else curled(self.curls, pose[6]), pose)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -98,25 +169,33 @@ class Take:
     hands: tuple[SteeredHand, ...]
     """The hands; control nodes of none of them, such as those that nodes are pinned to, stay where
     they are."""
-    pose: Float[ndarray, "frame hand 6"] = field(default_factory=lambda: np.zeros((1, 1, 6)))
-    """How far each wrist has moved from where it is in `control` [m], and the rotation vector about
-    it [rad]."""
+    pose: Float[ndarray, "frame hand 7"] = field(default_factory=lambda: np.zeros((1, 1, POSE)))
+    """Poses of the hands (`POSE`); where they are zero, control nodes are as in `control`."""
     is_regripped: bool = False
     """Whether something was gripped or let go since the rollout from which the hands are steered,
     so that what they hold is written in `model` alone."""
 
     def __post_init__(self) -> None:
         checked_control(self.control[None], self.model.control_count)
-        expected = (len(self.pose), len(self.hands), 6)
+        expected = (len(self.pose), len(self.hands), POSE)
         if self.pose.shape != expected or not len(self.pose) or not len(self.hands):
             raise ValueError(
                 f"pose has shape {self.pose.shape}; expected at least one frame, "
-                f"{len(self.hands)} hands and 6 numbers."
+                f"{len(self.hands)} hands and {POSE} numbers."
             )
         wrong = np.argwhere(~np.isfinite(self.pose))
         if len(wrong):
             frame, hand = (int(index) for index in wrong[0][:2])
             raise ValueError(f"pose is not finite at frame {frame}, hand {hand}.")
+        for hand in self.hands:
+            expected = (len(CURLS), len(hand.control), 3)
+            if hand.curls is not None and (
+                hand.curls.shape != expected or not np.isfinite(hand.curls).all()
+            ):
+                raise ValueError(
+                    f"curls of {hand.name} has shape {hand.curls.shape} or values that are not "
+                    f"finite; expected {expected}."
+                )
         number = np.concatenate([hand.control for hand in self.hands])
         moving = self.model.control_count - self.model.pin_count
         if len(np.unique(number)) != len(number) or np.any((number < 0) | (number >= moving)):
@@ -127,18 +206,18 @@ class Take:
         """Number of frames."""
         return len(self.pose)
 
-    def control_at(self, pose: Float[ndarray, "hand 6"]) -> Float32[ndarray, "control 3"]:
+    def control_at(self, pose: Float[ndarray, "hand 7"]) -> Float32[ndarray, "control 3"]:
         """Give the control nodes while the hands have these poses [m]."""
         moved = np.array(self.control, np.float32)
         for hand, its in zip(self.hands, pose, strict=True):
-            moved[hand.control] = hand.moved(self.control[hand.control], its)
+            moved[hand.control] = hand.moved_control(self.control, its)
         return moved
 
     def controls(self) -> Float32[ndarray, "frame control 3"]:
         """Give the control nodes of all frames [m]."""
         return np.stack([self.control_at(pose) for pose in self.pose])
 
-    def depth_below_ground(self, hand: int, pose: Float[ndarray, " 6"]) -> float:
+    def depth_below_ground(self, hand: int, pose: Float[ndarray, " 7"]) -> float:
         """Tell how much too low a hand would be.
 
         Args:
@@ -152,8 +231,8 @@ class Take:
         ground, its = self.parameters.ground_height, self.hands[hand]
         if ground is None or not len(its.control):
             return -math.inf
-        own = self.control[its.control]
-        return float(min(ground, own[:, 2].min()) - its.moved(own, pose)[:, 2].min())
+        lowest = its.moved_control(self.control, pose)[:, 2].min()
+        return float(min(ground, self.control[its.control, 2].min()) - lowest)
 
     def simulate(self, device: str = "cpu") -> Iterator[NodeState]:
         """Simulate the frames one after the other; the first is the state that the take begins in.
@@ -173,7 +252,7 @@ class Take:
         """Whether a virtual spring joins a hand to the object."""
         return bool(self._springs_of(hand).any())
 
-    def let_go(self, hand: int, state: NodeState, pose: Float[ndarray, "hand 6"]) -> "Take":
+    def let_go(self, hand: int, state: NodeState, pose: Float[ndarray, "hand 7"]) -> "Take":
         """Begin another take, in which a hand holds nothing.
 
         Args:
@@ -183,7 +262,7 @@ class Take:
         """
         return self._rejoined(~self._springs_of(hand), state, pose)
 
-    def grip(self, hand: int, state: NodeState, pose: Float[ndarray, "hand 6"]) -> "Take":
+    def grip(self, hand: int, state: NodeState, pose: Float[ndarray, "hand 7"]) -> "Take":
         """Begin another take, in which a hand holds what is near its control nodes.
 
         The arguments are those of `let_go`. Nodes are near that are nearer than
@@ -205,7 +284,7 @@ class Take:
         return self._rejoined(~self._springs_of(hand), state, pose, (springs, length))
 
     def hold_point(
-        self, node: int, state: NodeState, pose: Float[ndarray, "hand 6"], name: str
+        self, node: int, state: NodeState, pose: Float[ndarray, "hand 7"], name: str
     ) -> "Take":
         """Begin another take, in which the object is held at one more point, by a hand of its own.
 
@@ -242,14 +321,14 @@ class Take:
             ),
             control=control,
             hands=(*self.hands, hand),
-            pose=np.zeros((1, len(self.hands) + 1, 6)),
+            pose=np.zeros((1, len(self.hands) + 1, POSE)),
         )
         length = np.linalg.norm(position[springs[:, 0]] - control[own], axis=1)
         every = np.ones(len(ends), bool)
-        held = np.concatenate([pose, np.zeros((1, 6))])
+        held = np.concatenate([pose, np.zeros((1, POSE))])
         return more._rejoined(every, state, held, (springs, length))
 
-    def without_point(self, hand: int, state: NodeState, pose: Float[ndarray, "hand 6"]) -> "Take":
+    def without_point(self, hand: int, state: NodeState, pose: Float[ndarray, "hand 7"]) -> "Take":
         """Begin another take, in which a point is held no more; the arguments are `let_go`'s."""
         free = self.let_go(hand, state, pose)
         gone, model = self.hands[hand].control, free.model
@@ -279,7 +358,7 @@ class Take:
         self,
         kept: Bool[ndarray, " spring"],
         state: NodeState,
-        pose: Float[ndarray, "hand 6"],
+        pose: Float[ndarray, "hand 7"],
         joined: tuple[Int[ndarray, "new 2"], Float[ndarray, " new"]] | None = None,
     ) -> "Take":
         """Begin another take with other virtual springs, and with more substeps if they need it.
@@ -340,18 +419,19 @@ class Take:
             return self
         width = seconds * self.parameters.frame_rate
         count, hands = self.pose.shape[:2]
-        turn = Rotation.from_rotvec(self.pose[..., 3:].reshape(-1, 3)).as_quat()
+        turn = Rotation.from_rotvec(self.pose[..., 3:6].reshape(-1, 3)).as_quat()
         # Of q and -q, which are the same rotation, the one nearer to the frame before.
         turn = turn.reshape(count, hands, 4)
         flips = np.where((turn[1:] * turn[:-1]).sum(axis=-1) < 0.0, -1.0, 1.0)
         turn[1:] *= np.cumprod(flips, axis=0)[..., None]
-        values = np.concatenate([self.pose[..., :3], turn], axis=-1)
+        values = np.concatenate([self.pose[..., :3], self.pose[..., 6:], turn], axis=-1)
         # Reflected about the first frame, whose pose is a point of symmetry and stays.
         before = 2.0 * values[:1] - values[:0:-1]
         both: ndarray = np.concatenate([before, values])
         smooth = gaussian_filter1d(both, width, axis=0, mode="nearest")[count - 1 :]
-        rotation = Rotation.from_quat(smooth[..., 3:].reshape(-1, 4)).as_rotvec()
-        pose = np.concatenate([smooth[..., :3], rotation.reshape(count, hands, 3)], axis=-1)
+        rotation = Rotation.from_quat(smooth[..., 4:].reshape(-1, 4)).as_rotvec()
+        rotation = rotation.reshape(count, hands, 3)
+        pose = np.concatenate([smooth[..., :3], rotation, smooth[..., 3:4]], axis=-1)
         pose[0] = self.pose[0]
         return replace(self, pose=pose)
 
@@ -370,6 +450,11 @@ class Take:
             "wrist": np.stack([np.asarray(hand.wrist, np.float64) for hand in self.hands]),
             "pose": np.asarray(self.pose, np.float64),
             "is_regripped": np.array([self.is_regripped], np.uint8),
+            **{
+                f"{_SHAPES}{number}": hand.curls
+                for number, hand in enumerate(self.hands)
+                if hand.curls is not None
+            },
         }
 
     @classmethod
@@ -382,6 +467,7 @@ class Take:
             ValueError: If an array is missing, unknown or inconsistent.
         """
         model, start, rest = (_named(tensors, prefix) for prefix in ("model_", "start_", ""))
+        shapes = {name: rest.pop(name) for name in list(rest) if name.startswith(_SHAPES)}
         if set(rest) != _ARRAYS:
             raise ValueError(
                 f"A take needs the arrays {', '.join(sorted(_ARRAYS))}, a start and a model; "
@@ -394,7 +480,12 @@ class Take:
         if wrist.shape != (len(names), 3) or not np.all(np.isfinite(wrist)):
             raise ValueError(f"wrist has shape {wrist.shape}; expected ({len(names)}, 3).")
         hands = tuple(
-            SteeredHand(name=name, control=np.flatnonzero(owner == number), wrist=wrist[number])
+            SteeredHand(
+                name=name,
+                control=np.flatnonzero(owner == number),
+                wrist=wrist[number],
+                curls=shapes.get(f"{_SHAPES}{number}"),
+            )
             for number, name in enumerate(names)
         )
         return cls(
@@ -442,7 +533,7 @@ class SteeredSimulation:
         simulator = self._simulator
         return simulator.position.numpy().copy(), simulator.velocity.numpy().copy()
 
-    def step(self, pose: Float[ndarray, "hand 6"]) -> NodeState:
+    def step(self, pose: Float[ndarray, "hand 7"]) -> NodeState:
         """Simulate a frame while the hands move to their next poses.
 
         Raises:

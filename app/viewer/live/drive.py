@@ -29,17 +29,23 @@ class HandOrder:
     velocity: tuple[float, ...] = (0.0,) * 6
     """Speed of the wrist [m/s] and its turning about the world's axes [rad/s], without a goal."""
     goal: tuple[float, ...] | None = None
-    """Pose to go to: offset of the wrist [m] and rotation vector [rad]; None to move freely."""
+    """Place to go to: offset of the wrist [m] and rotation vector [rad]; None to move freely."""
+    closing: float = 0.0
+    """How fast the fingers close [1/s]; negative for opening."""
 
     def to_dict(self) -> dict[str, Any]:
         """Describe it in plain data."""
-        return {"velocity": self.velocity, "goal": self.goal}
+        return {"velocity": self.velocity, "goal": self.goal, "closing": self.closing}
 
     @classmethod
     def from_dict(cls, fields: Mapping[str, Any]) -> "HandOrder":
         """Rebuild it from plain data."""
         goal = fields["goal"]
-        return cls(velocity=tuple(fields["velocity"]), goal=None if goal is None else tuple(goal))
+        return cls(
+            velocity=tuple(fields["velocity"]),
+            goal=None if goal is None else tuple(goal),
+            closing=float(fields["closing"]),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,16 +63,16 @@ class HandDrive:
 
     def __init__(
         self,
-        pose: Float[ndarray, " 6"],
+        pose: Float[ndarray, " 7"],
         *,
         frame_rate: float,
         limits: HandLimits,
-        depth: Callable[[Float[ndarray, " 6"]], float],
+        depth: Callable[[Float[ndarray, " 7"]], float],
     ) -> None:
         """Begin at rest.
 
         Args:
-            pose: Where the hand is: offset of the wrist [m] and rotation vector [rad].
+            pose: Where the hand is; see `POSE`.
             frame_rate: Frames per second [Hz].
             limits: How fast and how far it goes.
             depth: Tells how far a pose is too low [m]; the hand is lifted by so much. Negative for
@@ -84,8 +90,9 @@ class HandDrive:
         self._reach = limits.reach
         self._depth = depth
         self._velocity = np.zeros(6)
+        self._closing = 0.0
 
-    def next(self, pull: Float[ndarray, " 3"]) -> Float[ndarray, " 6"]:
+    def next(self, pull: Float[ndarray, " 3"]) -> Float[ndarray, " 7"]:
         """Move on by a frame.
 
         Args:
@@ -100,7 +107,7 @@ class HandDrive:
             self._limit()
         else:
             offset = np.array(goal[:3]) - self.pose[:3]
-            away = np.concatenate([offset, turn_between(self.pose[3:], np.array(goal[3:]))])
+            away = np.concatenate([offset, turn_between(self.pose[3:6], np.array(goal[3:]))])
             self._velocity = away * (self._share / self._step)
             self._limit()
             if np.abs(away).max() < _THERE:
@@ -109,7 +116,9 @@ class HandDrive:
         before = self.pose[:3].copy()
         move = self._velocity * self._step
         self.pose[:3] += move[:3]
-        self.pose[3:] = turn_on(self.pose[3:], move[3:])
+        self.pose[3:6] = turn_on(self.pose[3:6], move[3:])
+        self._closing += self._share * (self.order.closing - self._closing)
+        self.pose[6] = np.clip(self.pose[6] + self._closing * self._step, -1.0, 1.0)
         self._stop_at_bounds(before)
         return self.pose.copy()
 
@@ -184,7 +193,7 @@ class Drives:
             drive.order = HandOrder.from_dict(order)
             drive.most_force = math.inf if most_force is None else most_force
 
-    def next(self, pull: Float[ndarray, "hand 3"]) -> Float[ndarray, "hand 6"]:
+    def next(self, pull: Float[ndarray, "hand 3"]) -> Float[ndarray, "hand 7"]:
         """Move all hands on by a frame.
 
         Args:

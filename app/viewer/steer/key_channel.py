@@ -7,7 +7,7 @@ which keys are held now, each time that changes; the channel tells the page when
 import json
 import threading
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import msgspec
 import numpy as np
@@ -21,7 +21,20 @@ MOST_LETTERS = 1_000
 """Longest message of a page."""
 
 HeldKey = Literal[
-    "KeyW", "KeyS", "KeyA", "KeyD", "KeyE", "KeyQ", "KeyI", "KeyK", "KeyJ", "KeyL", "KeyU", "KeyO"
+    "KeyW",
+    "KeyS",
+    "KeyA",
+    "KeyD",
+    "KeyE",
+    "KeyQ",
+    "KeyI",
+    "KeyK",
+    "KeyJ",
+    "KeyL",
+    "KeyU",
+    "KeyO",
+    "KeyR",
+    "KeyF",
 ]
 """Places of keys on a keyboard, by their names in browsers."""
 Press = Literal["undo", "record", "grip"]
@@ -177,7 +190,7 @@ class KeyChannel:
         except (msgspec.DecodeError, UnicodeError) as error:
             raise UsageError(
                 f'This is no message: {error}. Expected {{"held": ["KeyW", …]}} with keys among '
-                f'{", ".join(_MOVES | _TURNS)}, or {{"press": …}}.'
+                f'{", ".join(get_args(HeldKey))}, or {{"press": …}}.'
             ) from error
         with self._lock:
             on_held, on_press = self._on_held, self._on_press

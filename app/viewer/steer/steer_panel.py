@@ -15,7 +15,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from app.viewer.clock.playback import Playback
-from app.viewer.content.content import Content
+from app.viewer.content.content import Content, ShownHand
 from app.viewer.content.session_state import Pose
 from app.viewer.live.client import STARTING, SimulationClient
 from app.viewer.live.drive import HandOrder
@@ -28,9 +28,17 @@ from app.viewer.ui.guard import Guard, notify
 from app.viewer.ui.keyboard import bind
 from app.viewer.ui.tabs import Tabs
 from physhandi.errors import PhysHandiError, UsageError
+from physhandi.hand.curl import blended, curl_motion
 from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.restart import NodeState
-from physhandi.simulation.steering import SteeredHand, Take, from_quaternion, to_quaternion
+from physhandi.simulation.steering import (
+    CURLS,
+    SteeredHand,
+    Take,
+    curled,
+    from_quaternion,
+    to_quaternion,
+)
 
 GIZMO = "/steer/wrist"
 """Path of the gizmo in the scene."""
@@ -49,6 +57,8 @@ _SPEED = 0.25
 """Speed of a wrist at first, in extents of the scene a second."""
 _TURN_SPEED = 90.0
 """Turning of a hand at first [°/s]."""
+_CLOSING = 0.8
+"""How fast keys close the fingers of a hand: all the way from open takes 2.5 s [1/s]."""
 _GRAVITY = 9.81
 """What a weight is compared with where nothing falls [m/s²]."""
 _REFRESH = 0.25
@@ -58,9 +68,9 @@ _STYLE = "font-size:0.85em;line-height:1.5;padding:0.2em 0.9em 0.5em"
 _HOW = (
     "The object is simulated on from the frame that is shown while you move the hand: by the "
     "arrows and rings on its wrist, or by keys that you hold. <b>W S A D Q E</b> move it as you "
-    "see it, "
-    "<b>I K J L U O</b> turn it. <b>X</b> lets go of the object, and grips what is near. Click a "
-    "point of the object to hold it there and pull. Ctrl Z takes back."
+    "see it, <b>I K J L U O</b> turn it, <b>R F</b> close and open its fingers. <b>X</b> lets go "
+    "of the object, and grips what is near. Click a point of the object to hold it there and pull. "
+    "Ctrl Z takes back."
 )
 
 
@@ -72,8 +82,8 @@ class Recorded:
     """Its poses, and the state that they begin with."""
     frames: tuple[SteeredFrame, ...]
     """All its frames."""
-    vertices: Mapping[str, Float[ndarray, "vertex 3"]]
-    """Vertices of each hand in its pose of zero [m]."""
+    vertices: Mapping[str, Float[ndarray, "curl vertex 3"]]
+    """Vertices of each hand in its pose of zero, for each of `CURLS` or for none [m]."""
     frame: int
     """Frame of the sequence from which the hands were steered."""
 
@@ -113,6 +123,7 @@ class SteerPanel:
         rollout_at: Callable[[int], tuple[ObjectRollout, int]],
         stop_comparing: Callable[[], None],
         newtons: Callable[[], float],
+        skins: Callable[[], Mapping[str, Mapping[str, ndarray]]],
         keep: KeepTake | None = None,
     ) -> None:
         """Add the tab's controls.
@@ -130,6 +141,7 @@ class SteerPanel:
             rollout_at: Finds the rollout of a frame, and which of its frames.
             stop_comparing: Ends a comparison, which shows two objects.
             newtons: Tells the force on the object for one newton of its model.
+            skins: Reads the skeletons of the hands that have one; see `HandSkin.to_tensors`.
             keep: Makes a run and a recording of a take; None where nothing can be kept.
         """
         self._server = server
@@ -144,6 +156,7 @@ class SteerPanel:
         self._rollout_at = rollout_at
         self._stop_comparing = stop_comparing
         self._newtons = newtons
+        self._skins = skins
         self._keep = keep
         self._recorded: Recorded | None = None
         self._take_folder: TakeFolder | None = None
@@ -270,7 +283,7 @@ class SteerPanel:
                 self._tell()
             self._write()
             vertices = {
-                hand.name: hand.moved(self._vertices[hand.name], pose)
+                hand.name: hand.moved(curled(self._vertices[hand.name], pose[6]), pose)
                 for hand, pose in zip(newest.take.hands, newest.pose, strict=True)
                 if hand.name in self._vertices
             }
@@ -298,13 +311,28 @@ class SteerPanel:
         self._stop_comparing()
         self._frame = playback.frame
         rollout, frame = self._rollout_at(self._frame)
-        vertices = {
-            hand.side: np.asarray(hand.vertex[min(self._frame, len(hand.vertex) - 1)], np.float64)
+        skins = self._skins()
+        vertices = {hand.side: self._shapes(hand, skins) for hand in self._content.hands}
+        wrists = {
+            hand.side: np.array(hand.joint[min(self._frame, len(hand.joint) - 1)][0], np.float64)
             for hand in self._content.hands
+            if hand.joint is not None
         }
-        self._begin(begin_take(self._content, rollout, frame, self._frame), vertices)
+        self._begin(begin_take(rollout, frame, vertices, wrists), vertices)
 
-    def _begin(self, take: Take, vertices: Mapping[str, Float[ndarray, "vertex 3"]]) -> None:
+    def _shapes(
+        self, hand: ShownHand, skins: Mapping[str, Mapping[str, ndarray]]
+    ) -> Float[ndarray, "curl vertex 3"]:
+        """Give the vertices of a hand in the frame, for each of `CURLS` if they have bones [m]."""
+        vertex = np.asarray(hand.vertex[min(self._frame, len(hand.vertex) - 1)], np.float64)
+        skin = skins.get(hand.side)
+        if skin is None or len(skin["vertex_bone"]) != len(vertex):
+            return vertex[None]
+        motion = curl_motion(skin, hand.side, self._frame, CURLS)
+        moved = blended(motion, skin["vertex_bone"], skin["vertex_weight"], vertex)
+        return vertex + (moved - curled(moved, 0.0))
+
+    def _begin(self, take: Take, vertices: Mapping[str, Float[ndarray, "curl vertex 3"]]) -> None:
         """Simulate on from the state of a take; called under the lock."""
         self._vertices = dict(vertices)
         self._object = SteeredObject(
@@ -407,7 +435,7 @@ class SteerPanel:
                 return
             hand, is_point = self._hand, self._is_point(steered.take, self._hand)
 
-            def change(take: Take, state: NodeState, pose: Float[ndarray, "hand 6"]) -> Take:
+            def change(take: Take, state: NodeState, pose: Float[ndarray, "hand 7"]) -> Take:
                 if is_point:
                     return take.without_point(hand, state, pose)
                 if take.holds(hand):
@@ -523,7 +551,7 @@ class SteerPanel:
             return
         pose = frame.pose[self._hand]
         position = hands[self._hand].wrist + pose[:3]
-        wxyz = to_quaternion(pose[3:])
+        wxyz = to_quaternion(pose[3:6])
         if not np.allclose(gizmo.position, position, atol=1e-6 * self._extent):
             gizmo.position = position
         if not np.allclose(gizmo.wxyz, wxyz, atol=1e-6):
@@ -551,7 +579,8 @@ class SteerPanel:
     def _drive(self, steered: SteeredObject) -> None:
         turn_speed = math.radians(self._turn_speed.value)
         velocity = velocity_of(self._held, self._axes(), self._speed.value, turn_speed)
-        steered.order(self._hand, HandOrder(velocity=velocity))
+        closing = _CLOSING * (("KeyR" in self._held) - ("KeyF" in self._held))
+        steered.order(self._hand, HandOrder(velocity=velocity, closing=closing))
 
     def _weight(self) -> float:
         """Tell what the object weighs, as forces are shown [N]."""
@@ -605,6 +634,7 @@ class SteerPanel:
             is_point = self._is_point(self._take, self._hand)
             state["what"] = name if is_point else f"the {name}{hand}"
             state["turns"] = not is_point
+            state["curls"] = self._take.hands[self._hand].curls is not None
             state["recording"] = self._object is not None and self._object.is_recording
         self._channel.tell(state)
 

@@ -2,21 +2,20 @@
 
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Float32
 from numpy import ndarray
 
-from app.viewer.content.content import Content, ShownHand
 from app.viewer.live.client import SimulationClient
 from app.viewer.live.drive import HandLimits, HandOrder
 from app.viewer.live.wire import Message
 from physhandi.errors import UsageError
 from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.restart import NodeState
-from physhandi.simulation.steering import SteeredHand, Take, nearest_surface
+from physhandi.simulation.steering import POSE, SteeredHand, Take, curled, nearest_surface
 
 TOP_SPEED = 3.0
 """A wrist moves no faster than this many extents of the scene in a second."""
@@ -40,22 +39,27 @@ class SteeredFrame:
     """Object nodes [m]."""
     velocity: Float32[ndarray, "node 3"]
     """Their velocities [m/s]."""
-    pose: Float[ndarray, "hand 6"]
+    pose: Float[ndarray, "hand 7"]
     """Poses of the hands; see `Take`."""
     pull: Float[ndarray, "hand 3"] | None = None
     """How the object pulls at each hand [N]; None before the first frame was simulated."""
 
 
-def begin_take(content: Content, rollout: ObjectRollout, frame: int, shown: int) -> Take:
+def begin_take(
+    rollout: ObjectRollout,
+    frame: int,
+    hands: Mapping[str, Float[ndarray, "curl vertex 3"]],
+    wrists: Mapping[str, Float[ndarray, " 3"]],
+) -> Take:
     """Let hands be steered from a frame of a rollout on.
 
     Control nodes belong to the hand whose surface is nearest; without hands, to one body.
 
     Args:
-        content: The hands.
         rollout: The object's motion.
         frame: Frame of the rollout.
-        shown: Frame of the hands.
+        hands: Vertices of each hand in the frame, for each of `CURLS` or for none [m].
+        wrists: Wrist of each hand [m]; the middle of the hand where it is not known.
 
     Raises:
         UsageError: If nothing moves the object.
@@ -66,36 +70,32 @@ def begin_take(content: Content, rollout: ObjectRollout, frame: int, shown: int)
     if not moving:
         raise UsageError("Nothing holds this object, so there is no hand to steer.")
     recorded = np.asarray(rollout.control[frame], np.float64)
-    surfaces = [np.asarray(hand.vertex[_within(shown, hand)], float) for hand in content.hands]
-    if surfaces:
+    if hands:
+        surfaces = [curled(shapes, 0.0) for shapes in hands.values()]
         owner = nearest_surface(recorded[:moving], surfaces)
-        hands = tuple(
-            SteeredHand(
-                name=hand.side,
+        steered = tuple(
+            SteeredHand.of_surface(
+                name,
+                shapes,
                 control=np.flatnonzero(owner == number),
-                wrist=surfaces[number].mean(axis=0)
-                if hand.joint is None
-                else np.array(hand.joint[_within(shown, hand)][0], np.float64),
+                recorded=recorded,
+                place=control,
+                wrist=wrists.get(name),
             )
-            for number, hand in enumerate(content.hands)
+            for number, (name, shapes) in enumerate(hands.items())
         )
     else:
         every = np.arange(moving)
         wrist = recorded[:moving].mean(axis=0)
-        hands = (SteeredHand(name="controls", control=every, wrist=wrist),)
+        steered = (SteeredHand(name="controls", control=every, wrist=wrist),)
     return Take(
         model=model,
         start=start,
         parameters=rollout.parameters,
         control=control,
-        hands=hands,
-        pose=np.zeros((1, len(hands), 6)),
+        hands=steered,
+        pose=np.zeros((1, len(steered), POSE)),
     )
-
-
-def _within(frame: int, hand: ShownHand) -> int:
-    """Give the frame, or the last one that the hand has."""
-    return min(frame, len(hand.vertex) - 1)
 
 
 class SteeredObject:
@@ -205,7 +205,7 @@ class SteeredObject:
         with self._lock:
             self._undone.append(self._newest)
 
-    def regrip(self, change: Callable[[Take, NodeState, Float[ndarray, "hand 6"]], Take]) -> Take:
+    def regrip(self, change: Callable[[Take, NodeState, Float[ndarray, "hand 7"]], Take]) -> Take:
         """Change what the hands hold; what was recorded is not recorded any more.
 
         Args:

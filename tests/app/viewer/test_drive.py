@@ -22,7 +22,7 @@ def drive(
     depth: Callable[[np.ndarray], float] = lambda _: -math.inf,
 ) -> HandDrive:
     limits = HandLimits(top_speed=top_speed, reach=reach)
-    return HandDrive(np.zeros(6), frame_rate=RATE, limits=limits, depth=depth)
+    return HandDrive(np.zeros(7), frame_rate=RATE, limits=limits, depth=depth)
 
 
 def two_hands(**changes: object) -> Take:
@@ -43,12 +43,12 @@ def two_hands(**changes: object) -> Take:
         parameters=parameters,
         control=control,
         hands=hands,
-        pose=np.zeros((1, 2, 6)),
+        pose=np.zeros((1, 2, 7)),
     )
 
 
 def poses(hand: HandDrive, count: int) -> np.ndarray:
-    return np.stack([hand.next(NO_PULL) for _ in range(count)])
+    return np.stack([hand.next(NO_PULL)[:6] for _ in range(count)])
 
 
 def test_a_hand_takes_up_its_speed_smoothly_keeps_it_and_stops_smoothly() -> None:
@@ -101,7 +101,7 @@ def test_each_hand_follows_its_own_order_until_the_next() -> None:
     for _ in range(40):
         pose = drives.next(np.zeros((2, 3)))
     assert pose[0, 1] == pytest.approx(0.1 * (40 / RATE - LAG), abs=0.003)
-    np.testing.assert_allclose(pose[1], [0.2, 0, 0, 0, 0, 0], atol=1e-5)
+    np.testing.assert_allclose(pose[1], [0.2, 0, 0, 0, 0, 0, 0], atol=1e-5)
     np.testing.assert_array_equal(pose[0, [0, 2, 3, 4, 5]], 0.0)
 
 
@@ -150,8 +150,22 @@ def test_a_hand_gives_way_along_a_pull_that_is_too_strong() -> None:
         hand.order = HandOrder(velocity=(0.3, 0.0, 0.6, 0.0, 0.0, 0.0))
         way = np.stack([hand.next(np.array([0.0, 0.0, -force])) for _ in range(60)])
         last = RATE * (way[-1] - way[-2])
-        np.testing.assert_allclose(last, [0.3, 0, speed, 0, 0, 0], rtol=1e-6, atol=1e-12)
+        np.testing.assert_allclose(last, [0.3, 0, speed, 0, 0, 0, 0], rtol=1e-6, atol=1e-12)
     # One that is told to go along the pull, and faster, does so.
     hand.order = HandOrder(velocity=(0.0, 0.0, -1.0, 0.0, 0.0, 0.0))
     way = np.stack([hand.next(np.array([0.0, 0.0, -12.5])) for _ in range(60)])
     np.testing.assert_allclose(RATE * (way[-1] - way[-2])[2], -1.0, rtol=1e-6)
+
+
+def test_fingers_close_while_a_key_is_held_and_no_farther_than_a_fist() -> None:
+    hand = drive()
+    hand.order = HandOrder(goal=(0.1,) + (0.0,) * 5, closing=0.5)
+    curl = np.array([hand.next(NO_PULL)[6] for _ in range(30)])
+    expected = 0.5 * np.cumsum(1.0 - np.exp(-np.arange(1, 31) / (RATE * LAG))) / RATE
+    np.testing.assert_allclose(curl, expected, rtol=1e-6)
+    for closing, end in ((0.8, 1.0), (-0.8, -1.0)):
+        hand.order = HandOrder(closing=closing)
+        for _ in range(120):
+            pose = hand.next(NO_PULL)
+        assert pose[6] == end
+    assert HandOrder.from_dict(hand.order.to_dict()) == hand.order

@@ -121,5 +121,5 @@ def test_what_is_no_message_is_refused_and_changes_nothing(text: str) -> None:
     with pytest.raises(UsageError):
         keys.hear(text)
     assert heard == []
-    with pytest.raises(UsageError, match="KeyW, KeyS, KeyD"):
+    with pytest.raises(UsageError, match="KeyW, KeyS, KeyA"):
         keys.hear('{"held": ["Enter"]}')

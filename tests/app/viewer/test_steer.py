@@ -8,9 +8,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from viewer_client import ViewerClient
-from viewer_world import FakeSettings, rest_at
+from viewer_world import FakeSettings, FolderCatalog, rest_at
 from waiting import LIMIT_S, until
 
+from app.settings import BUNDLED
 from app.viewer.physics.keep_panel import RunSaver, UserStorage
 from app.viewer.physics.presets import PresetStore
 from app.viewer.session import Session
@@ -24,6 +25,7 @@ from physhandi.run import Run
 AT = 8
 STEER, BACK = "Steer (G)", "Back to playback (G)"
 NODES = "/object/nodes"
+HAND = "/hand/right"
 
 
 @pytest.fixture
@@ -83,7 +85,13 @@ def test_a_held_key_moves_hand_gizmo_and_object_until_it_is_let_go(scene, run) -
     control = run.array("sequences/lift/control.npy")[AT]
     start = steer(client)
     np.testing.assert_allclose(start, control.mean(axis=0), atol=1e-6)
-    says = {"steering": True, "what": "the controls", "turns": True, "recording": False}
+    says = {
+        "steering": True,
+        "what": "the controls",
+        "turns": True,
+        "curls": False,
+        "recording": False,
+    }
     assert json.loads(told[-1]) == says
     first = nodes(client)
     hold(session, "KeyD")  # To the right of somebody who looks along y.
@@ -122,7 +130,7 @@ def test_the_hand_follows_the_gizmo_and_no_farther_than_it_reaches(scene) -> Non
     half = 0.5**0.5
     drag([float(v) for v in start + np.array([0.0, 0.02, 0.03])], (half, 0.0, 0.0, half))
     goal = [0.0, 0.02, 0.03, 0.0, 0.0, np.pi / 2]
-    wait(client, lambda: np.allclose(object_.newest.pose[0], goal, atol=1e-5))
+    wait(client, lambda: np.allclose(object_.newest.pose[0, :6], goal, atol=1e-5))
     for place, why in (((np.nan,) * 3, "finite numbers"), ((1e9, 0.0, 0.0), "no farther")):
         drag(place)
         wait(
@@ -133,7 +141,7 @@ def test_the_hand_follows_the_gizmo_and_no_farther_than_it_reaches(scene) -> Non
                 if "Notification" in message["type"]
             ),
         )
-    np.testing.assert_allclose(object_.newest.pose[0], goal, atol=1e-4)
+    np.testing.assert_allclose(object_.newest.pose[0, :6], goal, atol=1e-4)
 
 
 def press(session: Session, name: str) -> None:
@@ -228,6 +236,8 @@ def test_a_point_that_is_clicked_is_held_and_pulled_until_it_is_let_go(scene) ->
     session, client = scene
     start = steer(client)
     object_ = session._steer._object
+    # Where it is at rest, what is clicked is where it was seen.
+    wait(client, lambda: np.abs(object_.newest.velocity).max() < 0.002)
     # Nothing of the sheet is above it.
     corner = int(np.argmax(object_.newest.position[:, :2].sum(axis=1)))
     place = object_.newest.position[corner]
@@ -255,6 +265,41 @@ def looking_down_at(place: np.ndarray) -> SimpleNamespace:
         ray_origin=(*place[:2], 2.0),
         ray_direction=(0.0, 0.0, -1.0),
     )
+
+
+@pytest.fixture
+def towel() -> Iterator[Session]:
+    """The bundled towel, which a hand with bones holds."""
+    sessions = Sessions(FakeSettings(), FolderCatalog(BUNDLED))
+    yield sessions.get(sessions.open("run", "towel_fold_quick", "me"))
+    sessions.shutdown()
+
+
+def test_the_fingers_of_a_hand_close_while_a_key_is_held(towel: Session) -> None:
+    session = towel
+    with ViewerClient(f"ws://127.0.0.1:{session.port}") as client:
+        client.tell_camera(position=(0.0, -1.0, 0.5), look_at=(0.0, 0.0, 0.0))
+        rest_at(client, AT)
+        wait(client, lambda: session._playback.frame == AT and HAND in client.nodes)
+        start = steer(client)
+        object_ = session._steer._object
+        wait(client, lambda: object_.newest.pull is not None)
+        before = client.array(HAND, "vertices")
+        np.testing.assert_allclose(before, session._content.hands[0].vertex[AT], atol=1e-6)
+        hold(session, "KeyR")
+        wait(client, lambda: object_.newest.pose[0, 6] == 1.0)
+        hold(session)
+        np.testing.assert_array_equal(object_.newest.pose[0, :6], 0.0)
+
+        def moved() -> np.ndarray:
+            return np.linalg.norm(client.array(HAND, "vertices") - before, axis=1)
+
+        wait(client, lambda: moved().max() > 0.03)
+        near = np.linalg.norm(before - start, axis=1) < 0.03
+        assert near.any()
+        assert moved()[near].max() < 1e-3
+        control = object_.take.control_at(object_.newest.pose)
+        np.testing.assert_allclose(client.array(HAND, "vertices"), control, atol=1e-5)
 
 
 def test_a_hand_lets_go_and_grips_what_is_near_it(scene) -> None:

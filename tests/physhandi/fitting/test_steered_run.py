@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from app.settings import BUNDLED
 from physhandi.data.layout import SequenceFiles
@@ -12,12 +13,13 @@ from physhandi.errors import RunError, UsageError
 from physhandi.fitted_object import FittedObject
 from physhandi.fitting.steered_run import contacts_from
 from physhandi.fitting.stored_take import TAKE_FILE, StoredTake
+from physhandi.hand.curl import blended, curl_motion
 from physhandi.hand.loading import load_hand_model
 from physhandi.hand.motion import HandMotion
 from physhandi.pipeline import run_job
 from physhandi.run import Run
 from physhandi.simulation.contact_intervals import NEVER, ContactIntervals
-from physhandi.simulation.steering import SteeredHand, Take
+from physhandi.simulation.steering import CURLS, SteeredHand, Take
 
 AT, FRAMES = 20, 4
 TOWEL = BUNDLED / "runs" / "towel_fold_quick"
@@ -32,7 +34,7 @@ def taken() -> Take:
     hand = SteeredHand(
         name="right", control=np.arange(len(control)), wrist=joints[AT, 0].astype(np.float64)
     )
-    pose = np.linspace(0, 1, FRAMES)[:, None, None] * [[0.0, 0.0, 0.02, 0.6, 0.0, 0.0]]
+    pose = np.linspace(0, 1, FRAMES)[:, None, None] * [[0.0, 0.0, 0.02, 0.6, 0.0, 0.0, 0.0]]
     return Take(
         model=model,
         start=start,
@@ -136,12 +138,43 @@ def test_contacts_that_hold_at_the_start_hold_for_good() -> None:
     assert len(nothing.node) == 0
 
 
+def test_a_hand_that_closes_is_stored_with_its_bones(tmp_path: Path) -> None:
+    take, source = taken(), Run.open(TOWEL)
+    files, was = SequenceFiles("up"), SequenceFiles("towel_fold")
+    vertex = source.array(was.hand_vertex("right"))[AT].astype(np.float64)
+    skin = source.tensors(was.hand_skin("right"))
+    motion = curl_motion(skin, "right", AT, CURLS)
+    shapes = blended(motion, skin["vertex_bone"], skin["vertex_weight"], vertex)
+    hand = replace(take.hands[0], curls=shapes.astype(np.float32))
+    pose = take.pose.copy()
+    pose[:, 0, 6] = np.linspace(0.0, 0.5, FRAMES)
+    run = run_of(replace(take, hands=(hand,), pose=pose), tmp_path)
+    stored = run.array(files.hand_vertex("right"))
+    # At the end the curl is one of those whose shape is known.
+    expected = hand.moved(shapes[np.flatnonzero(CURLS == 0.5)[0]], pose[-1, 0])
+    np.testing.assert_allclose(stored[-1], expected, atol=1e-6)
+    assert np.linalg.norm(stored[-1] - hand.moved(vertex, pose[-1, 0]), axis=1).max() > 0.02
+    np.testing.assert_allclose(run.array(files.control)[-1], expected, atol=1e-5)
+    # Skin, motion and keypoints say the same.
+    model = load_hand_model("right")
+    moved = HandMotion.from_tensors(run.tensors(files.hand_motion("right")))
+    offset = np.linalg.norm(moved.vertices(model) - stored, axis=2).mean(axis=1)
+    np.testing.assert_allclose(offset, offset[0], atol=5e-4)
+    joint = run.array(files.hand_keypoint("right"))
+    np.testing.assert_allclose(moved.keypoints(model), joint, atol=1e-4)
+    skinned = run.tensors(files.hand_skin("right"))["rotation"]
+    turn = np.einsum("jca,fja->fjc", model.joint_axes, moved.articulation)
+    expected = Rotation.from_rotvec(turn.reshape(-1, 3)).as_matrix()
+    found = Rotation.from_quat(skinned[:, 1:].reshape(-1, 4)).as_matrix()
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
 def test_what_was_gripped_by_hand_is_stored_and_built_again(tmp_path: Path) -> None:
     take = taken()
     node = int(np.argmin(take.start[0][:, 0]))
     held = take.hold_point(node, take.start, take.pose[0], "point 1")
     free = held.let_go(0, take.start, held.pose[0])
-    pose = np.zeros((FRAMES, 2, 6))
+    pose = np.zeros((FRAMES, 2, 7))
     pose[:, 1, 2] = np.linspace(0, 0.02, FRAMES)
     run = run_of(replace(free, pose=pose), tmp_path)
     object_ = FittedObject.of(run)

@@ -196,7 +196,7 @@ def test_pins_stay_where_they_are_whatever_hand_is_steered() -> None:
         parameters=parameters,
         control=control,
         hands=(hand,),
-        pose=np.array([[np.zeros(6)], [[0.1, 0.0, 0.0, 0.0, 0.0, 0.0]]]),
+        pose=np.array([[np.zeros(7)], [[0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]]]),
     )
     moved = take.controls()[1] - control
     np.testing.assert_allclose(moved[:4], np.tile([[0.1, 0, 0]], (4, 1)), atol=1e-7)

@@ -8,6 +8,7 @@ from reference.scenes import as_model, cube_scene
 from reference.spring_mass import simulate
 
 from physhandi.simulation.steering import (
+    CURLS,
     SteeredHand,
     SteeredSimulation,
     Take,
@@ -36,9 +37,9 @@ def steered_cube(frames: int = FRAMES) -> Take:
     scene = cube_scene()
     model, parameters = as_model(scene)
     way = np.linspace(0, 1, frames)[:, None]
-    pose = np.zeros((frames, 2, 6))
+    pose = np.zeros((frames, 2, 7))
     pose[:, 0, :3] = way * [0.004, -0.002, 0.006]
-    pose[:, 0, 3:] = way * [0.0, 0.0, 0.3]
+    pose[:, 0, 3:6] = way * [0.0, 0.0, 0.3]
     hands = (
         SteeredHand(name="right", control=np.array([0, 1, 2]), wrist=np.array([0.02, 0.0, 0.03])),
         SteeredHand(name="left", control=np.array([3]), wrist=np.zeros(3)),
@@ -86,6 +87,36 @@ def test_the_same_take_gives_the_same_bits_from_any_of_its_frames_on() -> None:
     assert steered.frame == 5
 
 
+def test_fingers_move_control_nodes_between_the_shapes_that_are_known() -> None:
+    take = steered_cube()
+    own = take.control[[0, 1, 2]]
+    # Of the three nodes the second goes along x with the curl, and the third by its square.
+    shapes = np.repeat(own[None], len(CURLS), axis=0)
+    shapes[:, 1, 0] += np.float32(0.01) * CURLS.astype(np.float32)
+    shapes[:, 2, 0] += np.float32(0.01) * CURLS.astype(np.float32) ** 2
+    right = replace(take.hands[0], curls=shapes)
+    pose = np.zeros((4, 2, 7))
+    pose[:, 0, 6] = [0.0, 0.3, 1.0, -1.0]
+    closing = replace(take, hands=(right, take.hands[1]), pose=pose)
+    moved = closing.controls() - take.control
+    np.testing.assert_array_equal(moved[0], 0.0)
+    np.testing.assert_allclose(moved[:, 1, 0], [0.0, 0.003, 0.01, -0.01], atol=1e-8)
+    low, high = 0.25**2, 0.375**2
+    np.testing.assert_allclose(
+        moved[:, 2, 0], [0.0, 0.01 * (low + 0.4 * (high - low)), 0.01, 0.01], atol=1e-8
+    )
+    np.testing.assert_array_equal(moved[:, [0, 3]], 0.0)
+    again = Take.from_tensors(closing.to_tensors(), closing.parameters)
+    np.testing.assert_array_equal(again.controls(), closing.controls())
+    with pytest.raises(ValueError, match="curls of right has shape"):
+        replace(take, hands=(replace(right, curls=shapes[1:]), take.hands[1]))
+    # Where fingers are turned in the same way, the wrist takes them along.
+    pose[2, 0, 3:6] = [0.0, 0.0, np.pi / 2]
+    turned = closing.control_at(pose[2])[1] - take.hands[0].wrist
+    still = take.control[1] + [0.01, 0, 0] - take.hands[0].wrist
+    np.testing.assert_allclose(turned, [-still[1], still[0], still[2]], atol=1e-7)
+
+
 def test_a_take_is_stored_with_every_bit() -> None:
     take = steered_cube()
     again = Take.from_tensors(take.to_tensors(), take.parameters)
@@ -108,7 +139,7 @@ def test_smoothing_takes_jitter_out_and_leaves_straight_ways_and_the_start() -> 
     np.testing.assert_allclose(take.smoothed(0.1).pose[middle], take.pose[middle], atol=2e-5)
     assert take.smoothed(0.0) is take
     # A hand that turns beyond half a turn does not spin back.
-    pose = np.zeros((60, 2, 6))
+    pose = np.zeros((60, 2, 7))
     pose[:, 0, 5] = (np.linspace(0, 1.5 * np.pi, 60) + np.pi) % (2 * np.pi) - np.pi
     steps = np.diff(np.unwrap(replace(take, pose=pose).smoothed(0.1).pose[:, 0, 5]))
     assert 0.0 < steps.min() <= steps.max() < 0.1
@@ -117,9 +148,9 @@ def test_smoothing_takes_jitter_out_and_leaves_straight_ways_and_the_start() -> 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"pose": np.full((2, 2, 6), np.nan)}, "pose is not finite at frame 0, hand 0"),
-        ({"pose": np.zeros((2, 1, 6))}, "at least one frame, 2 hands and 6 numbers"),
-        ({"pose": np.zeros((0, 2, 6))}, "at least one frame"),
+        ({"pose": np.full((2, 2, 7), np.nan)}, "pose is not finite at frame 0, hand 0"),
+        ({"pose": np.zeros((2, 1, 7))}, "at least one frame, 2 hands and 7 numbers"),
+        ({"pose": np.zeros((0, 2, 7))}, "at least one frame"),
         ({"control": np.zeros((3, 3), np.float32)}, r"expected \(frames, 4, 3\)"),
     ],
 )
@@ -133,7 +164,7 @@ def test_hands_of_the_same_or_unknown_control_nodes_are_refused() -> None:
     for numbers in ([0, 0], [4], [-1]):
         hand = SteeredHand(name="right", control=np.array(numbers), wrist=np.zeros(3))
         with pytest.raises(ValueError, match="must name different control nodes"):
-            replace(take, hands=(hand,), pose=np.zeros((1, 1, 6)))
+            replace(take, hands=(hand,), pose=np.zeros((1, 1, 7)))
     with pytest.raises(ValueError, match="frames 3 to 6 are not among the 6"):
         take.part(3, 6, next(take.simulate()))
     tensors = take.to_tensors()
