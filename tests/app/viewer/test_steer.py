@@ -236,14 +236,18 @@ def test_a_point_that_is_clicked_is_held_and_pulled_until_it_is_let_go(scene) ->
     session, client = scene
     start = steer(client)
     object_ = session._steer._object
-    # Where it is at rest, what is clicked is where it was seen.
-    wait(client, lambda: np.abs(object_.newest.velocity).max() < 0.002)
-    # Nothing of the sheet is above it.
-    corner = int(np.argmax(object_.newest.position[:, :2].sum(axis=1)))
-    place = object_.newest.position[corner]
-    session._inspector._click(looking_down_at(place), prefers_hand=False)
+    wait(client, lambda: session._inspector._grab is not None)
+    with session._lock:  # Nothing is drawn meanwhile, so that it is where the click goes.
+        rollout, _, frame = session._inspector._shown
+        # Nothing of the sheet is above it.
+        corner = int(np.argmax(rollout.position[frame][:, :2].sum(axis=1)))
+        click = looking_down_at(rollout.position[frame][corner])
+        session._inspector._click(click, prefers_hand=False)
     wait(client, lambda: client.value("Move") == "point 1")
-    wait(client, lambda: np.linalg.norm(client.positions[GIZMO] - place) < 0.02)
+    place = object_.take.hands[1].wrist
+    wait(client, lambda: np.allclose(client.positions[GIZMO], place, atol=1e-6))
+    held = object_.take.model.spring_nodes - [0, object_.take.model.node_count]
+    assert [corner, len(object_.take.control) - 1] in held.tolist()
     assert {hand.name for hand in object_.take.hands} == {"controls", "point 1"}
     hold(session, "KeyE")
     wait(client, lambda: object_.newest.position[corner, 2] > place[2] + 0.03)
