@@ -1,6 +1,5 @@
 """Replays: recordings that play in the browser without a live session."""
 
-import gzip
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
@@ -17,7 +16,7 @@ from app.exports.schema import errors, files
 from app.ids import ItemId
 from app.jobs.catalog import Catalog
 from app.pages.render import Pages
-from app.viewer.ui.scene_frame import scene_page
+from app.viewer.ui.scene_frame import packed_scene_page, scene_page
 from physhandi.errors import UsageError
 
 _CAMERA = ("cam", "up", "fov")
@@ -39,7 +38,7 @@ def create_replays(catalog: Catalog, file_cache: FileCache, pages: Pages) -> API
     """
     router = APIRouter()
     client = scene_page()
-    packed = gzip.compress(client, mtime=0)
+    packed = packed_scene_page()
 
     def order(run_id: str, sequence: str | None, theme: str) -> FileRequest:
         query = {"sequence": sequence} if sequence else {}

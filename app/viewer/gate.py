@@ -1,7 +1,6 @@
 """The gate: one address for all live sessions, in front of their loopback viser servers."""
 
 import asyncio
-import gzip
 import json
 import logging
 from collections import Counter
@@ -18,7 +17,7 @@ from websockets.typing import Subprotocol
 from app.viewer.edit.selection import DrawnShape
 from app.viewer.sessions import Session, Sessions
 from app.viewer.steer.key_channel import KeyChannel
-from app.viewer.ui.scene_frame import scene_page
+from app.viewer.ui.scene_frame import packed_scene_page, scene_page
 from physhandi.errors import UsageError
 
 logger = logging.getLogger(__name__)
@@ -51,7 +50,7 @@ def create_gate(sessions: Sessions) -> APIRouter:
     watching: Counter[str] = Counter()
     router = APIRouter(include_in_schema=False)
     page = scene_page()
-    packed = gzip.compress(page, mtime=0)
+    packed = packed_scene_page()
 
     @router.get("/viewer/{session_id}/")
     async def show_page(session_id: str, request: Request) -> Response:
