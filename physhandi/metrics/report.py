@@ -154,7 +154,8 @@ def measure_run(
     rollout = read_scoring_inputs(out / files.rollout)
     reference = read_reference(out, sequence, rollout)
     report: dict[str, Any] = {}
-    frames: dict[str, Any] = {"unit": "m", "frames": list(range(sequence.frame_count))}
+    unit = _unit_of(sequence)
+    frames: dict[str, Any] = {"unit": unit, "frames": list(range(sequence.frame_count))}
     if reference is not None:
         splits = {
             "reconstruction": sequence.reconstruction_frames,
@@ -166,7 +167,7 @@ def measure_run(
         if not with_baselines:
             motions = {"rollout": motions["rollout"]}
         curves = _curves_of(motions, reference)
-        report |= _tabulated(motions, curves, substituted, reference, splits)
+        report |= _tabulated(motions, curves, substituted, reference, splits) | {"unit": unit}
         if with_baselines and "future" in report:
             report["future"] |= _last_residual(
                 motions["rollout"],
@@ -488,6 +489,11 @@ def _each(
     return np.array([chamfer_one_way(o, nodes[frame], norm) for frame, o in enumerate(observed)])
 
 
+def _unit_of(sequence: Sequence) -> str:
+    """Name the unit of all distances."""
+    return "m" if sequence.metric else sequence.length_unit
+
+
 def score_hands(
     out: Path, sequence: Sequence, hand_points: StoredPoints | None = None
 ) -> tuple[dict[str, Any], dict[str, Curves]]:
@@ -535,7 +541,7 @@ def score_hands(
             continue
         score |= {name: _mean(curve) for name, curve in errors.items()}
         scores[side] = score | {
-            "unit": "m",
+            "unit": _unit_of(sequence),
             "aggregation": HAND_AGGREGATION,
             "substituted_frames": missing,
         }

@@ -1,5 +1,6 @@
 """Runs measured from their files."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -168,6 +169,12 @@ def test_hands_are_compared_with_keypoints_points_and_truth(tmp_path: Path, fold
     curve = frames["hands"]["right"]["chamfer_points_to_mesh"]
     assert [value is None for value in curve] == [False, False, True, False]
     assert report["hands"]["right"]["substituted_frames"] == 0
+
+    assert report["unit"] == right["unit"] == frames["unit"] == "m"
+    squares = replace(sequence.meta, metric=False, length_unit="board square")
+    report, frames = measure_run(tmp_path / "out", Sequence(sequence.folder, squares))
+    assert report["hands"]["right"] == right | {"unit": "board square"}
+    assert report["unit"] == frames["unit"] == "board square"
 
 
 def test_a_hand_that_was_not_fitted_is_listed_without_figures(tmp_path: Path, folder: Path) -> None:
