@@ -11,6 +11,8 @@ RED = (214, 39, 40)
 GREEN = (46, 160, 67)
 YELLOW = (245, 190, 20)
 GREY = (120, 130, 145)
+TEAL = (0, 175, 140)
+PURPLE = (125, 65, 195)
 SKIN = {"right": (224, 172, 140), "left": (205, 150, 122)}
 
 Theme = Literal["as the browser", "light", "dark"]

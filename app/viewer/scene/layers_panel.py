@@ -10,7 +10,19 @@ import viser
 from app.keys import LAYER_KEYS
 from app.viewer.color.legend import swatches_html
 from app.viewer.content.content import Content
-from app.viewer.content.layers import BLUE, GREEN, GREY, RED, SKIN, THEMES, YELLOW, Layers, Theme
+from app.viewer.content.layers import (
+    BLUE,
+    GREEN,
+    GREY,
+    PURPLE,
+    RED,
+    SKIN,
+    TEAL,
+    THEMES,
+    YELLOW,
+    Layers,
+    Theme,
+)
 from app.viewer.scene.cameras import pose_of_view
 from app.viewer.scene.framing import Framing
 from app.viewer.scene.scene import grid_cell
@@ -41,6 +53,7 @@ def legend_of(content: Content, layers: Layers) -> str:
     controls = "control points" if content.hands or content.markers is None else "grippers"
     holds = (layers.controls or layers.all_controls) and content.control is not None
     forces = layers.forces and has_object
+    has_changes = content.fitted is not None and not content.fitted.model.is_always_attached
     red = [name for name, is_shown in (("controls", holds), ("forces", forces)) if is_shown]
     observed = content.observed
     is_green = observed is not None and not observed.is_colored
@@ -48,6 +61,8 @@ def legend_of(content: Content, layers: Layers) -> str:
         (SKIN["right"], "hand", layers.hands and bool(content.hands or content.skeletons)),
         (BLUE, "object nodes", layers.nodes and has_object and not is_colored),
         (RED, ", ".join(red) if has_object else controls, bool(red)),
+        (TEAL, "contact begins", forces and has_changes),
+        (PURPLE, "contact ends", forces and has_changes),
         (YELLOW, "virtual springs", layers.virtual_springs and has_object and not is_colored),
         (GREEN, "markers" if is_marked else "observed", layers.observed and is_green),
         (GREY, "cameras", layers.cameras and bool(content.views) and layers.looks_from is None),

@@ -7,7 +7,16 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from app.viewer.color.coloring import Painted
-from app.viewer.content.layers import BLUE, GREY, PLAYING_SPRINGS, RED, YELLOW, Layers
+from app.viewer.content.layers import (
+    BLUE,
+    GREY,
+    PLAYING_SPRINGS,
+    PURPLE,
+    RED,
+    TEAL,
+    YELLOW,
+    Layers,
+)
 from app.viewer.scene.framing import Framing
 from app.viewer.scene.nodes import SceneNodes
 from physhandi.object_rollout import ObjectRollout
@@ -23,6 +32,8 @@ QUIET_FORCE = 1e-6
 """Weaker forces are no forces [N]."""
 _SAMPLED_FRAMES = 8
 _LEAST_ARROWS = 60
+RECENT = 3
+"""So many frames long it is shown that something has taken hold of a node, or let it go."""
 _OF_RECORDING = 1.4
 """Diameter of control points where there is no object, as a part of the spacing."""
 
@@ -140,7 +151,7 @@ class ObjectDrawing:
 
     def hide(self) -> None:
         """Hide the object until it is drawn again."""
-        parts = ("object/", "springs/", "controls/", "forces")
+        parts = ("object/", "springs/", "controls/", "contact/", "forces")
         self._nodes.hide(*(f"{self._root}/{part}" for part in parts))
 
     def draw(
@@ -195,6 +206,7 @@ class ObjectDrawing:
                 width,
                 is_visible=is_visible,
             )
+        self._draw_contact(rollout.model, frame, position, is_visible=layers.forces)
         arrows = np.zeros((0, 2, 3), np.float32)
         if layers.forces:
             unit = force_unit * layers.force_scale
@@ -203,6 +215,23 @@ class ObjectDrawing:
         arrows = arrows[np.linalg.norm(arrows[:, 1] - arrows[:, 0], axis=-1) > shortest]
         width = style.arrow_width * self._framing.extent
         self._nodes.arrows(f"{root}/forces", arrows, style.arrow, width)
+
+    def _draw_contact(
+        self,
+        model: SpringMassModel,
+        frame: int,
+        position: Float[ndarray, "node 3"],
+        *,
+        is_visible: bool,
+    ) -> None:
+        """Mark the nodes that something has just taken hold of or let go."""
+        none = np.zeros(0, np.int64)
+        begins, ends = contact_changes(model, frame) if is_visible else (none, none)
+        size = 0.5 * self._framing.spacing
+        for name, node, color in (("begins", begins, TEAL), ("ends", ends, PURPLE)):
+            self._nodes.points(
+                f"{self._root}/contact/{name}", position[node], color, size, is_visible=is_visible
+            )
 
     def _draw_surface(
         self,
@@ -239,6 +268,19 @@ class ObjectDrawing:
             point = np.zeros((0, 3), np.float32) if free is None else free
             name = f"{root}/controls/free"
             self._nodes.points(name, point, style.control, 0.12 * spacing, is_visible=is_shown)
+
+
+def contact_changes(
+    model: SpringMassModel, frame: int
+) -> tuple[Int[ndarray, " begun"], Int[ndarray, " ended"]]:
+    """Find the nodes that are held in a frame and were not `RECENT` frames ago, and the reverse."""
+    if model.is_always_attached:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    now, before = (
+        np.unique(model.spring_nodes[virtual_springs_in(model, at)].min(axis=1))
+        for at in (frame, max(frame - RECENT, 0))
+    )
+    return np.setdiff1d(now, before), np.setdiff1d(before, now)
 
 
 def virtual_springs_in(model: SpringMassModel, frame: int | None) -> Int[ndarray, " spring"]:

@@ -115,11 +115,11 @@ def test_the_panel_shows_what_the_link_changed(
     asked = []
     restore = PhysicsPanel.restore
 
-    def remember(panel: PhysicsPanel, parameters: object, *, is_automatic: bool) -> None:
-        asked.append((parameters.stiffness_scale, is_automatic))
-        restore(panel, parameters, is_automatic=is_automatic)
+    def remember(panel: PhysicsPanel, parameters: object, **how: object) -> None:
+        asked.append((parameters.stiffness_scale, how))
+        restore(panel, parameters, **how)
 
     monkeypatch.setattr(PhysicsPanel, "restore", remember)
     open_link(world, "stiffness_scale=0.25&substeps_per_frame=auto")
-    assert asked == [(0.25, True)]
+    assert asked == [(0.25, {"is_automatic": True, "edits": None})]
     world.sessions.shutdown()

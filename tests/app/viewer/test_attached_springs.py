@@ -15,7 +15,7 @@ from app.viewer.export.snapshot import Snapshot, snapshot_npz
 from app.viewer.inspect.picking import Pick, Ray, Target, pick
 from app.viewer.inspect.readings import Readings, follow
 from app.viewer.scene.framing import Framing
-from app.viewer.scene.object_drawing import Budget, ObjectDrawing
+from app.viewer.scene.object_drawing import Budget, ObjectDrawing, contact_changes
 from physhandi.data.exporters.scene_data import SceneData
 from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.contact_intervals import NEVER
@@ -68,6 +68,35 @@ def test_a_spring_is_drawn_while_it_is_attached(take: ObjectRollout, frame: int,
     if held:
         np.testing.assert_allclose(drawn["/springs/virtual"][0], [[0, 0, 1], [0, 0, 0]])
     assert len(drawing.attached(take)) == 1
+
+
+@pytest.mark.parametrize(
+    ("frame", "begun", "ended"),
+    [
+        (4, [], []),
+        (5, [0], []),
+        (7, [0], []),
+        (8, [], []),
+        (9, [], [0]),
+        (11, [], [0]),
+        (12, [], []),
+    ],
+)
+def test_contact_is_marked_for_three_frames_when_it_begins_and_ends(frame, begun, ended) -> None:
+    world = two_springs(14)
+    take = replace(world, model=replace(world.model, attached=np.int32([[4, 8]])))
+    found = contact_changes(take.model, frame)
+    assert [part.tolist() for part in found] == [begun, ended]
+    nodes: Any = DrawnNodes()
+    drawing = ObjectDrawing(
+        nodes, Framing(center=np.zeros(3), extent=5.0, low=0.0, spacing=1.0, frustum=0.1)
+    )
+    drawing.draw(take, frame, Layers(), Budget(), force_unit=0.01, longest=1.0)
+    assert len(nodes.drawn["/contact/begins"]) == len(begun)
+    assert len(nodes.drawn["/contact/ends"]) == len(ended)
+    drawing.draw(take, frame, Layers(forces=False), Budget(), force_unit=0.01, longest=1.0)
+    assert len(nodes.drawn["/contact/begins"]) == len(nodes.drawn["/contact/ends"]) == 0
+    assert [len(part) for part in contact_changes(world.model, frame)] == [0, 0]
 
 
 def test_what_is_read_of_a_spring_is_of_the_frame(take: ObjectRollout) -> None:

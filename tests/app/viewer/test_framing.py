@@ -68,5 +68,11 @@ def test_the_legend_of_parts_names_what_is_shown_alone(catalog) -> None:
     assert said() == ["forces"]  # Of this run there is no hand.
     layers.nodes = layers.controls = layers.virtual_springs = layers.observed = True
     assert said() == ["object nodes", "controls", "forces", "virtual springs", "observed"]
+    assert "contact begins" not in legend_of(content, layers)
+    fitted = content.fitted
+    late = replace(fitted.model, attached=np.int32([[2, 9]]).repeat(53, axis=0))
+    changing = replace(content, fitted=replace(fitted, model=late))
+    assert "contact begins" in legend_of(changing, layers)
+    assert "contact ends" not in legend_of(changing, replace(layers, forces=False))
     layers.color = "speed"  # Nodes and springs have other colors now.
     assert said() == ["controls", "forces", "observed"]

@@ -194,8 +194,9 @@ class SlowRollouts:
         self.asked: list[Any] = []
         self.has_begun, self.may_end = threading.Event(), threading.Event()
 
-    def request(self, parameters: Any, *, automatic_substeps: bool) -> None:
+    def request(self, parameters: Any, *, automatic_substeps: bool, edits: Any) -> None:
         assert not automatic_substeps
+        assert edits == ()
         if not self.has_begun.is_set():
             self.has_begun.set()
             self.may_end.wait(SHORT)
