@@ -25,6 +25,7 @@ from physhandi.data.layout import (
     SHAPE_FILE,
     SequenceFiles,
 )
+from physhandi.data.observation import ObjectObservation
 from physhandi.data.run import RunFolder
 from physhandi.data.run_folder import read_mapping
 from physhandi.data.sequence import Sequence
@@ -47,6 +48,7 @@ from physhandi.fitting.config import (
     SEARCH,
     SIMULATION,
     SPRINGS,
+    ObjectFitConfig,
     PipelineConfig,
     apply_overrides,
     load_profile,
@@ -56,6 +58,8 @@ from physhandi.fitting.contact_detection import find_contacts
 from physhandi.fitting.hand_reconstruction import reconstruct_hands
 from physhandi.fitting.object_problem import ObjectProblem, build_problem
 from physhandi.fitting.object_reconstruction import search_object
+from physhandi.fitting.observed.state_estimate import observed_state
+from physhandi.fitting.observed.track_registration import with_late_tracks
 from physhandi.fitting.placement import (
     bends_as_rod,
     control_trajectory_of,
@@ -66,7 +70,6 @@ from physhandi.fitting.placement import (
 from physhandi.fitting.rest_state import resting_clearance
 from physhandi.fitting.rope.fit import fit_rope, start_rope
 from physhandi.fitting.spring_optimisation import optimise_springs
-from physhandi.fitting.state_estimate import observed_state
 from physhandi.fitting.steered_run import (
     contacts_from,
     contacts_in,
@@ -327,7 +330,9 @@ def _object_in(
     return object_
 
 
-def _store_restart(attempt: Attempt, sequence: Sequence, device: str) -> None:
+def _store_restart(
+    attempt: Attempt, sequence: Sequence, device: str, config: ObjectFitConfig
+) -> None:
     """Estimate the object's state in the last fitted frame, from which prediction starts."""
     fitted = _stored_object(attempt, sequence)
     try:
@@ -335,7 +340,7 @@ def _store_restart(attempt: Attempt, sequence: Sequence, device: str) -> None:
             fitted.model,
             fitted.parameters,
             fitted.fitted.control,
-            artefacts.load_observation(attempt.out, sequence.name),
+            _followed(attempt, sequence, fitted.model.object_node, config),
             sequence.reconstruction_frames[-1],
             device=device,
             moves_hands=(attempt.out / SequenceFiles(sequence.name).contacts).is_file(),
@@ -361,7 +366,7 @@ def predict_again(
         RunError: If the run holds no fitted object.
         SimulationDivergedError: If the motion runs away.
     """
-    _store_restart(attempt, sequence, device)
+    _store_restart(attempt, sequence, device, ObjectFitConfig())
     fitted = _stored_object(attempt, sequence)
     _store_rollout(attempt, fitted, fitted.begin(fitted.parameters), device, progress)
     attempt.save_json(METRICS_FILE, {sequence.name: _measure(sequence, attempt)})
@@ -486,7 +491,7 @@ def _problems(
             clearance = resting_clearance(
                 object_node, sequence.ground_height, kind, thickness=thickness
             )
-        observation = artefacts.load_observation(attempt.out, sequence.name)
+        observation = _followed(attempt, sequence, object_node, config.object_)
         control = artefacts.load_control(attempt.out, sequence.name)
         contacts = None
         if config.object_.contact_over_time and not bends_as_rod(sequences, config):
@@ -518,6 +523,16 @@ def _problems(
             )
         )
     return problems
+
+
+def _followed(
+    attempt: Attempt, sequence: Sequence, node: Float[ndarray, "node 3"], config: ObjectFitConfig
+) -> ObjectObservation:
+    """Read what was seen of the object, with its late tracks where a fit takes them."""
+    observation = artefacts.load_observation(attempt.out, sequence.name)
+    if not config.follows_late_tracks:
+        return observation
+    return with_late_tracks(observation, node, len(sequence.reconstruction_frames))
 
 
 def _stage_search(
@@ -620,7 +635,7 @@ def _stage_evaluation(
         if has_object:
             if config.prediction.restarts and sequence.future_frames:
                 try:
-                    _store_restart(attempt, sequence, device)
+                    _store_restart(attempt, sequence, device, config.object_)
                 except MissingInputError as error:
                     told = f"Predicted without a restart. {error}"
                     progress.report(EVALUATION, number, len(sequences), message=told)

@@ -22,6 +22,10 @@ class ObjectObservation:
     node_of_track: Int[ndarray, " track"] | None = None
     """Object node that each track observes, where the recording identifies it."""
 
+    late: Float[ndarray, "frame late 3"] | None = None
+    """Tracks that frame 0 does not show, whose place on the object nobody knows yet [m]; NaN where
+    they are not visible. None if there can be none."""
+
     def __post_init__(self) -> None:
         shape = self.point.shape[:2]
         for name in ("is_visible", "is_motion_valid"):
@@ -31,6 +35,8 @@ class ObjectObservation:
                 )
         if self.cloud and len(self.cloud) != shape[0]:
             raise ValueError(f"cloud has {len(self.cloud)} frames, but point has {shape[0]}")
+        if self.late is not None and len(self.late) != shape[0]:
+            raise ValueError(f"late has {len(self.late)} frames, but point has {shape[0]}")
         if self.node_of_track is not None and self.node_of_track.shape != shape[1:]:
             raise ValueError(
                 f"node_of_track has shape {self.node_of_track.shape} for {shape[1]} tracks"

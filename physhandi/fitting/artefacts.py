@@ -72,6 +72,11 @@ def save_observation(output: Attempt, name: str, observation: ObjectObservation)
     output.save_array(file_of("is_motion_valid"), observation.is_motion_valid)
     if observation.node_of_track is not None:
         output.save_array(file_of("node_of_track"), observation.node_of_track.astype(np.int32))
+    if observation.late is not None:
+        # Most of them are seen in few frames.
+        seen = np.argwhere(np.isfinite(observation.late).all(axis=2))
+        output.save_array(file_of("late_point"), observation.late[tuple(seen.T)].astype(np.float32))
+        output.save_array(file_of("late_seen"), seen.astype(np.int32))
     if observation.cloud:
         # Losses and metrics are defined on all points of a cloud of markers.
         identified = 0 if observation.node_of_track is None else observation.track_count
@@ -105,13 +110,29 @@ def load_observation(out: Path, name: str) -> ObjectObservation:
     if cloud is not None and cloud_end is not None:
         clouds = tuple(np.split(cloud, cloud_end[:-1]))
     with reading(out / files.folder / "observation"):
+        point = load_array(out / files.observation("point"))
         return ObjectObservation(
-            point=load_array(out / files.observation("point")),
+            point=point,
             is_visible=load_array(out / files.observation("is_visible")),
             is_motion_valid=load_array(out / files.observation("is_motion_valid")),
             cloud=clouds,
             node_of_track=read("node_of_track"),
+            late=_dense(read("late_point"), read("late_seen"), len(point)),
         )
+
+
+def _dense(
+    point: ndarray | None, seen: ndarray | None, frame_count: int
+) -> Float[ndarray, "frame late 3"] | None:
+    """Give late tracks their places in the frames that show them; NaN elsewhere."""
+    if point is None or seen is None:
+        return None
+    count = int(seen[:, 1].max()) + 1 if len(seen) else 0
+    if seen.shape != (len(point), 2) or seen.min(initial=0) < 0 or count > len(seen):
+        raise ValueError("late_seen does not name a frame and a track for each late_point")
+    late = np.full((frame_count, count, 3), np.nan, np.float32)
+    late[tuple(seen.T)] = point
+    return late
 
 
 def lifted_hand_points(

@@ -264,6 +264,9 @@ class ObjectFitConfig(Settings, frozen=True, kw_only=True):
     rests_where_seen: bool = False
     """Whether nodes that lie on the ground at frame 0 stay as high above it as they were seen,
     instead of falling by the object's thickness."""
+    follows_late_tracks: bool = False
+    """Whether tracks that come into view after frame 0 take part, and those that slide over the
+    object do not: it is laid onto what was seen of it, and tells which are which."""
     holds_still: bool = False
     """Whether springs have rest lengths with which they carry the object at frame 0, against its
     weight, instead of their lengths there, with which it sags."""

@@ -257,13 +257,27 @@ def _carriers(
         return track, carrier, weight, np.zeros((len(track), 3), np.float32)
     track = np.flatnonzero(observation.is_visible[0])
     start = np.asarray(observation.point[0, track], np.float32)
-    count = min(TRACK_CARRIERS, len(object_node))
-    distance, carrier = KDTree(object_node).query(start, k=count)
+    return track, *attach(start, object_node)
+
+
+def attach(
+    point: Float[ndarray, "point 3"], node: Float[ndarray, "node 3"]
+) -> tuple[
+    Int[ndarray, "point carrier"], Float[ndarray, "point carrier"], Float[ndarray, "point 3"]
+]:
+    """Let each point be carried by the `TRACK_CARRIERS` nodes nearest to it.
+
+    Returns:
+        The nodes, nearest first; their weights, by inverse distance; and the point less their
+        weighted mean [m].
+    """
+    count = min(TRACK_CARRIERS, len(node))
+    distance, carrier = KDTree(node).query(point, k=count)
     distance, carrier = np.reshape(distance, (-1, count)), np.reshape(carrier, (-1, count))
     weight = 1.0 / (distance + 1e-4)
     weight = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
-    offset = start - (object_node[carrier] * weight[..., None]).sum(axis=1)
-    return track, carrier.astype(np.int64), weight, offset.astype(np.float32)
+    offset = point - (node[carrier] * weight[..., None]).sum(axis=1)
+    return carrier.astype(np.int64), weight, offset.astype(np.float32)
 
 
 def initial_velocity(

@@ -31,8 +31,8 @@ def observe_object(sequence: Sequence, progress: Progress | None = None) -> Obje
 
     Markers, where the sequence has them, become the tracks and name their nodes; where it also
     marks which of their motions are valid, they are the cloud too, and no depth is read. Otherwise
-    the pixel tracks of every view are lifted by depth; tracks that frame 0 does not show on the
-    object are left out.
+    the pixel tracks of every view are lifted by depth; those that frame 0 does not show on the
+    object are kept apart, as `ObjectObservation.late`.
 
     Args:
         sequence: Recording with markers, or with views that have depth and masks.
@@ -66,13 +66,14 @@ def observe_object(sequence: Sequence, progress: Progress | None = None) -> Obje
         progress.report("observation", frame + 1, sequence.frame_count)
     if sequence.marker is not None:
         return _from_markers(sequence, tuple(clouds))
-    point = _join(paths, sequence.frame_count)
+    point, late = _join(paths, sequence.frame_count)
     is_visible = np.asarray(np.isfinite(point).all(axis=-1))
     return ObjectObservation(
         point=point.astype(np.float32),
         is_visible=is_visible,
         is_motion_valid=motion_validity(point, is_visible),
         cloud=tuple(clouds),
+        late=late.astype(np.float32),
     )
 
 
@@ -194,11 +195,14 @@ def _lift_tracks(
     return lift_pixels(view.camera, depth, is_object, pixel)
 
 
-def _join(paths: list[list[ndarray]], frame_count: int) -> Float[ndarray, "frame track 3"]:
-    """Concatenate the tracks of all views, without those that frame 0 does not show."""
+def _join(
+    paths: list[list[ndarray]], frame_count: int
+) -> tuple[Float[ndarray, "frame track 3"], Float[ndarray, "frame late 3"]]:
+    """Join the tracks of all views: those that frame 0 shows, and those that it does not."""
     parts = [np.stack(path) for path in paths if path]
     point = np.concatenate([np.zeros((frame_count, 0, 3)), *parts], axis=1)
-    return point[:, np.isfinite(point[0]).all(axis=-1)]
+    is_there = np.asarray(np.isfinite(point).all(axis=-1))
+    return point[:, is_there[0]], point[:, ~is_there[0] & is_there.any(axis=0)]
 
 
 def _from_surface_markers(sequence: Sequence, progress: Progress) -> ObjectObservation:

@@ -29,12 +29,15 @@ def test_clouds_of_identified_points_are_kept_whole(tmp_path: Path, *, is_identi
     point = np.random.default_rng(0).normal(size=(3, count, 3)).astype(np.float32)
     point[2, 7] = np.nan
     seen = np.isfinite(point).all(axis=-1)
+    late = np.full((3, 2, 3), np.nan, np.float32)
+    late[1:, 0], late[2, 1] = point[1:, 0], point[2, 1]
     observation = ObjectObservation(
         point=point,
         is_visible=seen,
         is_motion_valid=np.zeros_like(seen),
         cloud=tuple(p[s] for p, s in zip(point, seen, strict=True)),
         node_of_track=np.arange(count, dtype=np.int32) if is_identified else None,
+        late=None if is_identified else late,
     )
     with make_run(tmp_path / "run").begin_attempt() as attempt:
         save_observation(attempt, "lift", observation)
@@ -45,6 +48,10 @@ def test_clouds_of_identified_points_are_kept_whole(tmp_path: Path, *, is_identi
     np.testing.assert_array_equal(again.cloud[2][0], point[2, 0])
     np.testing.assert_array_equal(again.cloud[2][-1], point[2, -1])
     np.testing.assert_array_equal(again.point, point)
+    if is_identified:
+        assert again.late is None
+    else:
+        np.testing.assert_array_equal(again.late, late)
 
 
 def test_measured_hand_points_lie_on_the_hand_of_their_frame(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from reference.spring_mass import simulate
 
 from physhandi.data.observation import ObjectObservation
 from physhandi.errors import MissingInputError
-from physhandi.fitting.state_estimate import observed_state
+from physhandi.fitting.observed.state_estimate import observed_state
 
 LAST = 2
 SCENE = cube_scene()

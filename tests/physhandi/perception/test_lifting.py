@@ -37,6 +37,21 @@ def test_tracks_of_a_rising_plate_are_lifted_to_where_they_are(plate):
     assert observation.is_motion_valid[1:].all()
 
 
+def test_tracks_that_come_into_view_later_are_kept_apart(plate):
+    known = observe_object(plate)
+    for view in plate.views:
+        visible = np.ones(view.track.shape[:2], dtype=bool)
+        visible[0, 4] = visible[:2, 9] = visible[:, 5] = False
+        object.__setattr__(view, "track_visible", visible)
+    observation = observe_object(plate)
+    shown = [track for track in range(2 * 153) if track % 153 not in {4, 5, 9}]
+    np.testing.assert_array_equal(observation.point, known.point[:, shown])
+    late = known.point[:, [4, 9, 153 + 4, 153 + 9]].copy()
+    late[0] = late[1, 1::2] = np.nan
+    np.testing.assert_array_equal(observation.late, late)
+    assert known.late.shape == (3, 0, 3)
+
+
 def test_cloud_covers_the_plate_once_at_voxel_spacing(plate):
     cloud = observe_object(plate).cloud
     assert len(cloud) == 3
