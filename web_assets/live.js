@@ -37,9 +37,16 @@
     scene.contentWindow.focus();
   }
 
+  /* Refused where an address would show something else. */
+  async function wholeLink() {
+    const link = await send("GET", `/api/v1/sessions/${session}/link`);
+    if (link.lost) throw new Error(link.lost);
+    return link;
+  }
+
   /* The link restores frame, camera, layers and parameters; the address bar follows it. */
   async function copyLink() {
-    const link = await send("GET", `/api/v1/sessions/${session}/link`);
+    const link = await wholeLink();
     const address = new URL(link.url, location.href).href;
     const inside = document.activeElement === scene ? scene.contentWindow : window;
     try {
@@ -55,7 +62,7 @@
 
   /* What the link restores is filmed: parameters, layers and camera as they are now. */
   async function film(entry) {
-    const link = await send("GET", `/api/v1/sessions/${session}/link`);
+    const link = await wholeLink();
     const address = link.url.replace(/^\/runs\/([^/]+)\/view\??/, "/api/v1/runs/$1/export?");
     const query = new URLSearchParams(entry.dataset.sessionFilm);
     await fetchSlowFile(`${address}${address.endsWith("?") ? "" : "&"}${query}`, "Filming");

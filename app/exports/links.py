@@ -28,6 +28,8 @@ class Link(BaseModel):
     """Address on this server that opens a scene in the same state."""
     query: str
     """Its part after the question mark."""
+    lost: str = ""
+    """What is not in it, and what to do; empty if the address says all."""
 
 
 def create_links(sessions: Sessions) -> APIRouter:
@@ -63,13 +65,15 @@ def create_links(sessions: Sessions) -> APIRouter:
         session = sessions.find(session_id, request.state.owner)
         if session is None:
             raise HTTPException(404, CLOSED)
-        if isinstance(session, Session) and session.state.edits is not None:
-            raise UsageError(
-                "Springs or nodes were edited here, which no link holds. Save it as a run "
-                "(Export) and share that."
+        if not isinstance(session, Session):
+            return Link(url=session.link, query=session.link.partition("?")[2])
+        link, lost = link_of(session), ""
+        if session.state.edits is not None:
+            lost = (
+                "Springs or nodes were edited here, which no link holds. Save it as a run (Export) "
+                "and share that."
             )
-        link = link_of(session) if isinstance(session, Session) else session.link
-        return Link(url=link, query=link.partition("?")[2])
+        return Link(url=link, query=link.partition("?")[2], lost=lost)
 
     return router
 

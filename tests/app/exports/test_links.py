@@ -1,11 +1,13 @@
 """Links that open a live scene as it was, through the server."""
 
+from dataclasses import replace
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
 from server_world import World
 
 from app.viewer.physics.panel import PhysicsPanel
+from physhandi.simulation.edits import Cut
 
 QUERY = "f=3&cam=1,-2,0.5,0.1,0.2,0.3&fov=40&show=nodes,forces&scale=0.5&theme=dark&speed=0.5"
 
@@ -51,6 +53,11 @@ def test_the_link_of_a_scene_opens_another_one_like_it(world: World) -> None:
     assert other is not first
     assert other.state.layers == first.state.layers
     assert other.state.frame == 3
+    assert link["lost"] == ""
+    edited = replace(first.state, edits=(Cut(springs=((0, 1),)),))
+    third = world.sessions.open("run", "fitted", first.owner, state=edited)
+    told = browser.get(f"/api/v1/sessions/{third}/link").json()
+    assert (told["query"], "Save it as a run" in told["lost"]) == (link["query"], True)
     stranger = world.browser().get(f"/api/v1/sessions/{session}/link")
     assert stranger.status_code == 404
     world.sessions.close(session)
