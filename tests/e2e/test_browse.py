@@ -166,7 +166,7 @@ def test_no_page_keeps_anybody_out(home: Page, base: str) -> None:
     for scheme in ("dark", "light"):
         home.emulate_media(color_scheme=scheme)
         frame.locator(f"html[data-mantine-color-scheme={scheme}]").wait_for(state="attached")
-        for tab in ("Physics", "Look", "Play", "Export"):
+        for tab in ("Physics", "Look", "Play", "Edit", "Export"):
             scene.tab(tab)
             assert violations(frame) == [], f"{tab}, {scheme}"
 
