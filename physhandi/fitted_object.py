@@ -13,6 +13,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from physhandi.data.exporters.scene_data import MovingSurface, SceneData, read_scene
+from physhandi.data.files import named_fields
 from physhandi.data.layout import MATERIAL_FILE, SequenceFiles
 from physhandi.data.run import RunFolder
 from physhandi.data.run_folder import reading
@@ -74,6 +75,7 @@ class FittedObject:
         attachment: Float[ndarray, "control 3"] | None = None,
         rest_node: Float[ndarray, "node 3"] | None = None,
         contacts: ContactIntervals | None = None,
+        keeps_springs: bool = False,
         run: RunFolder | None = None,
         sequence: str = "",
     ) -> None:
@@ -86,6 +88,8 @@ class FittedObject:
             rest_node: Its rest shape [m]; frame 0 if left out.
             contacts: What the control nodes hold, and when; if left out, what is near them at
                 frame 0, always.
+            keeps_springs: Whether its springs cannot be laid anew, since they were edited before
+                it was steered.
             run: Run that it was fitted in.
             sequence: Name of the sequence.
         """
@@ -95,6 +99,7 @@ class FittedObject:
         self.sequence = sequence
         self.rest_node = rest_node
         self.contacts = contacts
+        self._keeps_springs = keeps_springs
         self.placement: PlacedObject | None = None
         """What was found out to lay the object into a recording that it was not fitted in."""
         self._unedited = fitted.model if fitted.unedited is None else fitted.unedited
@@ -145,6 +150,7 @@ class FittedObject:
             attachment=folder.array(attachment) if folder.has(attachment) else None,
             rest_node=rest.get("rest_node"),
             contacts=contacts,
+            keeps_springs=keeps_springs(folder),
             run=folder,
             sequence=name,
         )
@@ -461,9 +467,15 @@ class FittedObject:
 
     def _build(self, parameters: SimulationParameters) -> SpringMassModel:
         fitted, model = self.parameters, self._unedited
+        is_changed = set(_BUILT_IN) & set(changed_settings(fitted, parameters))
+        if self._keeps_springs and (self._chosen is not None or not is_changed <= set(_MATERIAL)):
+            raise UsageError(
+                "Springs or nodes of this object were edited before it was steered, so that its "
+                "springs cannot be laid anew: leave radii and neighbors as they are, or change "
+                "them in the run that was steered."
+            )
         if self._chosen is not None:
             return _hold_anew(model, parameters, self._attached, self._chosen)
-        is_changed = set(_BUILT_IN) & set(changed_settings(fitted, parameters))
         if is_changed <= set(_MATERIAL):
             return _scale_material(model, fitted, parameters) if is_changed else model
         return retopologize(
@@ -490,6 +502,11 @@ class FittedObject:
             return latest
         self._simulator = Simulator(model, parameters, device=device)
         return self._simulator
+
+
+def keeps_springs(run: RunFolder) -> bool:
+    """Whether a run's object was edited before it was steered, so that its springs must stay."""
+    return bool((named_fields(run.config.get("take")) or {}).get("is_edited"))
 
 
 def _filled(rollout: ObjectRollout, simulator: Simulator) -> Iterator[Frame]:

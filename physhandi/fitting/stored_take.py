@@ -38,7 +38,12 @@ class StoredTake:
     def to_dict(self) -> dict[str, Any]:
         """Describe it in plain data, but for its arrays, for ``take`` of a run's configuration."""
         parameters = self.take.parameters.to_dict()
-        return {"sequence": self.sequence, "frame": self.frame, "parameters": parameters}
+        return {
+            "sequence": self.sequence,
+            "frame": self.frame,
+            "is_edited": self.take.is_edited,
+            "parameters": parameters,
+        }
 
     @classmethod
     def load(cls, run: RunFolder) -> "StoredTake | None":

@@ -27,7 +27,7 @@ from physhandi.simulation.simulator import Simulator, checked_control
 from physhandi.simulation.stability import stable_substeps
 from physhandi.simulation.topology import MINIMUM_VIRTUAL_REST_LENGTH, virtual_springs
 
-_ARRAYS = {"control", "hand_of_control", "hand_name", "wrist", "pose", "is_regripped"}
+_ARRAYS = {"control", "hand_of_control", "hand_name", "wrist", "pose", "is_edited", "is_regripped"}
 """Arrays of a stored take besides those of its model and its start."""
 _SHAPES = "curls_"
 """Prefix of the arrays that hold `SteeredHand.curls`, by the hand's number."""
@@ -171,6 +171,8 @@ class Take:
     they are."""
     pose: Float[ndarray, "frame hand 7"] = field(default_factory=lambda: np.zeros((1, 1, POSE)))
     """Poses of the hands (`POSE`); where they are zero, control nodes are as in `control`."""
+    is_edited: bool = False
+    """Whether single springs or nodes were edited, so that its springs cannot be laid anew."""
     is_regripped: bool = False
     """Whether something was gripped or let go since the rollout from which the hands are steered,
     so that what they hold is written in `model` alone."""
@@ -449,6 +451,7 @@ class Take:
             "hand_name": np.frombuffer(names, np.uint8),
             "wrist": np.stack([np.asarray(hand.wrist, np.float64) for hand in self.hands]),
             "pose": np.asarray(self.pose, np.float64),
+            "is_edited": np.array([self.is_edited], np.uint8),
             "is_regripped": np.array([self.is_regripped], np.uint8),
             **{
                 f"{_SHAPES}{number}": hand.curls
@@ -495,6 +498,7 @@ class Take:
             control=np.asarray(rest["control"], np.float32),
             hands=hands,
             pose=np.asarray(rest["pose"], np.float64),
+            is_edited=bool(np.any(rest["is_edited"])),
             is_regripped=bool(np.any(rest["is_regripped"])),
         )
 

@@ -28,6 +28,7 @@ from physhandi.data.layout import PARAMETERS_FILE
 from physhandi.data.run_folder import new_run_id
 from physhandi.data.sequence_meta import SAFE_NAME
 from physhandi.errors import UsageError
+from physhandi.fitted_object import keeps_springs
 from physhandi.fitting.stored_edits import describe_edits, store_edits
 from physhandi.fitting.stored_take import StoredTake
 from physhandi.run import Run
@@ -152,6 +153,9 @@ class RunSaver:
         if folder.exists() or (BUNDLED / folder.name).exists():
             raise UsageError(f"There is a recording '{folder.name}' already. Type another name.")
         source = self._catalog.run(source_id)
+        take = stored.to_dict()
+        if keeps_springs(source):  # What is steered of such an object is another one.
+            take["is_edited"] = True
         run = Run.create(
             self._folder / new_run_id(),
             name=name,
@@ -160,7 +164,7 @@ class RunSaver:
             config={
                 "source": str(source.folder.resolve()),
                 "parameters": dict(changes),
-                "take": stored.to_dict(),
+                "take": take,
             },
         )
         stored.save(run.folder)

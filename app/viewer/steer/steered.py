@@ -94,6 +94,7 @@ def begin_take(
         parameters=rollout.parameters,
         control=control,
         hands=steered,
+        is_edited=bool(rollout.edits),
         pose=np.zeros((1, len(steered), POSE)),
     )
 

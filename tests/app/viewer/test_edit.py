@@ -30,6 +30,7 @@ from app.viewer.physics.keep_panel import RunSaver, UserStorage
 from app.viewer.physics.presets import PresetStore
 from app.viewer.session import Session
 from app.viewer.sessions import Sessions
+from app.viewer.steer.steered import begin_take
 from physhandi.errors import UsageError
 from physhandi.run import Run
 
@@ -372,6 +373,10 @@ def test_edits_are_saved_as_a_run_and_go_into_a_copy_but_not_into_a_link(
     client.set("Springs", "Cut")
     wait(client, lambda: session.state.edits)
     edits = session.state.edits
+    wait(client, lambda: session._object.newest.edits)
+    rollout, frame = session._object.at(0)
+    assert begin_take(rollout, frame, {}, {}).is_edited
+    assert not begin_take(session._content.fitted, 0, {}, {}).is_edited
     client.set("name", "Cut sheet")
     client.set("Save as", "Run")
     wait(client, lambda: begun)

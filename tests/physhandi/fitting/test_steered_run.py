@@ -169,6 +169,20 @@ def test_a_hand_that_closes_is_stored_with_its_bones(tmp_path: Path) -> None:
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
+def test_edited_springs_stay_in_a_run_that_was_steered(tmp_path: Path) -> None:
+    take = taken()
+    stiffness = take.model.stiffness.copy()
+    stiffness[:5] *= 0.5
+    edited = replace(take, model=replace(take.model, stiffness=stiffness), is_edited=True)
+    object_ = FittedObject.of(run_of(edited, tmp_path))
+    np.testing.assert_array_equal(object_.model.stiffness, stiffness)
+    softer = object_.changed({"stiffness": 0.5 * object_.parameters.stiffness}).model
+    own = slice(0, softer.object_spring_count)
+    np.testing.assert_allclose(softer.stiffness[own], 0.5 * stiffness[own], rtol=1e-6)
+    with pytest.raises(UsageError, match="were edited before it was steered"):
+        object_.changed({"connection_radius": 0.9 * object_.parameters.connection_radius})
+
+
 def test_what_was_gripped_by_hand_is_stored_and_built_again(tmp_path: Path) -> None:
     take = taken()
     node = int(np.argmin(take.start[0][:, 0]))
