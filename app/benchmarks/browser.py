@@ -6,6 +6,7 @@ import time
 from collections.abc import Generator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 import numpy as np
 
@@ -78,9 +79,9 @@ _SINCE_CLICK = f"""() => window.physhandiWatch.first
 _OPEN = """(id) => fetch("/api/v1/sessions", {
   method: "POST", headers: { "Content-Type": "application/json" },
   body: JSON.stringify({ kind: "run", id }),
-}).then((answer) => answer.json()).then((answer) => { location.href = answer.url; })"""
-_CLOSE = """() => fetch(`/api/v1/sessions/${location.pathname.split("/").pop()}`, {
-  method: "DELETE" })"""
+}).then((answer) => answer.ok ? answer.json() : answer.text().then((text) => { throw text; }))
+  .then((session) => new URL(session.url, location).href)"""
+_CLOSE = """(id) => fetch(`/api/v1/sessions/${id}`, { method: "DELETE" })"""
 _COMPARED = 600
 """Coordinates by which frames are told apart."""
 _EXPECT = """([rollout, before, tolerance]) => Object.assign(window.physhandiWatch, {
@@ -160,14 +161,14 @@ def measure_opening(served: Served, browser: "Browser", run_id: str, visits: int
     seconds: list[float] = []
     with _new_page(browser) as page:
         page.add_init_script(_WATCH)
+        page.goto(served.url)
         for _ in range(1 + visits):
-            page.goto(served.url)
             page.evaluate(_REMEMBER)
             page.locator(f'#runs [data-run="{run_id}"] [data-open]').click()
             scene = _scene_of(page)
             scene.wait_for_function("() => window.physhandiWatch.first > 0")
             seconds.append(1e-3 * float(scene.evaluate(_SINCE_CLICK)))
-            page.evaluate(_CLOSE)
+            _close(page, served)
     return {"visits": visits, **percentiles(seconds[1:])}
 
 
@@ -193,7 +194,7 @@ def measure_slider_in_browser(
     with _new_page(browser) as page:
         page.add_init_script(_WATCH)
         page.goto(served.url)
-        page.evaluate(_OPEN, run_id)
+        page.goto(page.evaluate(_OPEN, run_id))
         scene = _scene_of(page)
         scene.get_by_role("button", name="Pause", exact=True).wait_for()
         scene.wait_for_function("() => window.physhandiWatch.frames > 30")
@@ -209,7 +210,7 @@ def measure_slider_in_browser(
             page.wait_for_timeout(300)
             before = move.shown
         rate = _rate(page, scene)
-        page.evaluate(_CLOSE)
+        _close(page, served)
     when = {f"arrived_{name}": value for name, value in percentiles(arrived).items()}
     return {
         "moves": len(moves),
@@ -224,10 +225,10 @@ def measure_slider_in_browser(
 def _new_page(browser: "Browser") -> "Generator[Page]":
     context = browser.new_context(viewport={"width": _SIZE[0], "height": _SIZE[1]})
     context.set_default_timeout(_PATIENCE_MS)
-    try:
-        yield context.new_page()
-    finally:
-        context.close()
+    yield context.new_page()
+    # After an error only the browser as a whole is closed: Chromium may never end a page that is
+    # on its way to another one.
+    context.close()
 
 
 def _scene_of(page: "Page") -> "Frame":
@@ -238,6 +239,13 @@ def _scene_of(page: "Page") -> "Frame":
     if scene is None:
         raise ServerFailedError("The page of the live scene holds no scene.")
     return scene
+
+
+def _close(page: "Page", served: Served) -> None:
+    """Go home and end the live scene; its own page would load itself again to say that it ended."""
+    session = urlsplit(page.url).path.split("/")[-1]
+    page.goto(served.url)
+    page.evaluate(_CLOSE, session)
 
 
 def _press(page: "Page", scene: "Frame", slider: MeasuredSlider, move: Move) -> None:

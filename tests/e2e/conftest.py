@@ -130,6 +130,8 @@ def quiet_context(browser: Browser) -> Iterator[BrowserContext]:
     )
     context.on("weberror", lambda error: complaints.append(str(error.error)))
     yield context
+    for page in context.pages:
+        page.wait_for_load_state()  # Chromium may never end a page that is still being loaded.
     context.close()
     assert complaints == []
 
