@@ -43,7 +43,7 @@ from physhandi.simulation.stability import (
     stable_substeps,
     with_stable_substeps,
 )
-from physhandi.simulation.topology import MINIMUM_VIRTUAL_REST_LENGTH, retopologize, virtual_springs
+from physhandi.simulation.topology import retopologize, virtual_floor, virtual_springs
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -618,7 +618,7 @@ def _hold_anew(
         parameters.virtual_connection_radius,
         parameters.virtual_max_neighbors,
     )
-    floor = max(parameters.virtual_rest_length_floor, MINIMUM_VIRTUAL_REST_LENGTH)
+    floor = virtual_floor(parameters)
     own = slice(0, model.object_spring_count)
 
     def joined(fitted: ndarray, new: ndarray | float) -> ndarray:

@@ -4,6 +4,7 @@ import itertools
 from collections.abc import Sequence as Listing
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import viser
@@ -47,6 +48,10 @@ class FolderCatalog:
 
     def sequence(self, sequence_id: str, /) -> Sequence:
         return Sequence.load(self.root / "sequences" / sequence_id)
+
+    def sequences_of(self, run: Run, /) -> list[SimpleNamespace]:
+        """Give where recordings of a run would be."""
+        return [SimpleNamespace(folder=self.root / name) for name in run.sequence_names]
 
 
 @dataclass

@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 from physhandi.data.sequence_meta import ShapeClass
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
-from physhandi.simulation.topology import MINIMUM_LENGTH, MINIMUM_VIRTUAL_REST_LENGTH
+from physhandi.simulation.topology import MINIMUM_LENGTH, MINIMUM_VIRTUAL_REST_LENGTH, virtual_floor
 
 NEAR_GROUND = 1.25
 """Height below which the lowest node of its column rests on the ground, in distances of nodes."""
@@ -120,7 +120,7 @@ def hold_still(
     is_virtual = np.arange(len(rest)) >= model.object_spring_count
     floor = np.where(
         is_virtual,
-        max(parameters.virtual_rest_length_floor, MINIMUM_VIRTUAL_REST_LENGTH),
+        virtual_floor(parameters),
         parameters.rest_length_floor,
     )
     acts = (stiffness > 0.0) & (length > np.maximum(floor, MINIMUM_LENGTH))

@@ -25,6 +25,7 @@ from physhandi.hand.curl import BONE_OF_KEYPOINT, blended, curl_motion, curled_r
 from physhandi.hand.loading import load_hand_model
 from physhandi.hand.motion import HandMotion
 from physhandi.progress import Progress
+from physhandi.quaternions import without_jumps
 from physhandi.simulation.contact_intervals import ContactIntervals, acts_in, always
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.steering import SteeredHand, turn_on
@@ -168,33 +169,33 @@ def _store_hand(
     (name, side), (number, hand) = place, which
     was, now = SequenceFiles(stored.sequence), SequenceFiles(name)
     pose = stored.take.pose[:, number]
-    bones: dict[str, ndarray] | None = None
-    if source.has(was.hand_skin(side)) and hand.curls is not None:
-        bones = source.tensors(was.hand_skin(side))
-    joints = np.array(BONE_OF_KEYPOINT)[:, None]
-    for old, new in (
-        (was.hand_vertex(side), now.hand_vertex(side)),
-        (was.hand_keypoint(side), now.hand_keypoint(side)),
-    ):
-        if source.has(old):
-            point = _in_frame(source.array(old), stored.frame)
-            points = np.repeat(point[None], len(pose), axis=0)
-            if bones is not None:
-                is_surface = old == was.hand_vertex(side)
-                bone = bones["vertex_bone"] if is_surface else joints
-                weight = bones["vertex_weight"] if is_surface else np.ones(joints.shape)
-                motion = curl_motion(bones, side, stored.frame, np.append(pose[:, 6], 0.0))
-                curled = blended(motion, bone, weight, point)
-                points += curled[:-1] - curled[-1]
-            moved = np.stack([hand.moved(*its) for its in zip(points, pose, strict=True)])
-            attempt.save_array(new, moved.astype(np.float32))
+    skin = source.tensors(was.hand_skin(side)) if source.has(was.hand_skin(side)) else None
+    bones, rotation = None, None
+    if skin is not None and hand.curls is not None and pose[:, 6].any():
+        rotation = curled_rotations(skin, side, stored.frame, pose[:, 6])
+        # The last one tells where points are without any curl.
+        bones = curl_motion(skin, side, stored.frame, np.append(pose[:, 6], 0.0))
+
+    def save_moved(old: str, new: str, bone: ndarray, weight: ndarray) -> None:
+        if not source.has(old):
+            return
+        point = _in_frame(source.array(old), stored.frame)
+        points = np.repeat(point[None], len(pose), axis=0)
+        if bones is not None:
+            curled = blended(bones, bone, weight, point)
+            points += curled[:-1] - curled[-1]
+        moved = np.stack([hand.moved(*its) for its in zip(points, pose, strict=True)])
+        attempt.save_array(new, moved.astype(np.float32))
+
+    bone = np.array(BONE_OF_KEYPOINT)[:, None]
+    weight = np.ones(bone.shape)
+    save_moved(was.hand_keypoint(side), now.hand_keypoint(side), bone, weight)
+    if skin is not None:
+        bone, weight = skin["vertex_bone"], skin["vertex_weight"]
+    save_moved(was.hand_vertex(side), now.hand_vertex(side), bone, weight)
     if source.has(was.hand_face(side)):
         attempt.save_array(now.hand_face(side), source.array(was.hand_face(side)))
-    rotation: ndarray | None = None
-    if source.has(was.hand_skin(side)):
-        skin = source.tensors(was.hand_skin(side))
-        if bones is not None and pose[:, 6].any():
-            rotation = curled_rotations(bones, side, stored.frame, pose[:, 6])
+    if skin is not None:
         moved_skin = _moved_skin(skin, stored.frame, hand, pose, rotation)
         attempt.save_tensors(now.hand_skin(side), moved_skin)
     if source.has(was.hand_motion(side)):
@@ -224,10 +225,7 @@ def _moved_skin(
     for number, its in enumerate(pose):
         translation[number, 0] = hand.moved(translation[number, :1], its)[0]
         rotation[number, 0] = (Rotation.from_rotvec(its[3:6]) * wrist).as_quat()
-    # Of q and -q, which are the same rotation, the one nearer to the frame before.
-    flips = np.where((rotation[1:] * rotation[:-1]).sum(axis=-1) < 0.0, -1.0, 1.0)
-    rotation[1:] *= np.cumprod(flips, axis=0)[..., None]
-    moved = {"translation": translation, "rotation": rotation}
+    moved = {"translation": translation, "rotation": without_jumps(rotation)}
     return {**skin, **{name: value.astype(np.float32) for name, value in moved.items()}}
 
 

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from physhandi.hand.model import JOINT_COUNT, JOINT_NAMES, HandModel
 from physhandi.hand.motion import HandMotion
+from physhandi.quaternions import without_jumps
 
 BONES_PER_VERTEX = 4
 """Most bones of one vertex; viewers read no more."""
@@ -101,7 +102,7 @@ def hand_skin(model: HandModel, motion: HandMotion) -> HandSkin:
         vertex_bone=bone,
         vertex_weight=weight,
         translation=translation,
-        rotation=_without_jumps(rotation),
+        rotation=without_jumps(rotation),
     )
 
 
@@ -112,11 +113,3 @@ def _strongest(
     bone = np.argsort(-weight, axis=1, kind="stable")[:, :BONES_PER_VERTEX]
     share = np.take_along_axis(weight, bone, axis=1).clip(min=0)
     return bone, share / share.sum(axis=1, keepdims=True)
-
-
-def _without_jumps(rotation: Float[ndarray, "frame bone 4"]) -> Float[ndarray, "frame bone 4"]:
-    """Choose of q and -q, which are the same rotation, the one nearer to the frame before."""
-    flips = np.sign((rotation[1:] * rotation[:-1]).sum(axis=-1))
-    flips = np.where(flips == 0, 1.0, flips)
-    sign = np.concatenate([np.ones((1, rotation.shape[1])), np.cumprod(flips, axis=0)])
-    return rotation * sign[..., None]

@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 from physhandi.simulation.contact_intervals import ContactIntervals, always
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
-from physhandi.simulation.topology import MINIMUM_LENGTH, MINIMUM_VIRTUAL_REST_LENGTH
+from physhandi.simulation.topology import MINIMUM_LENGTH, virtual_floor
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -121,8 +121,7 @@ class MasterTopology:
 
     def rest_length(self, parameters: SimulationParameters) -> Float32[ndarray, " spring"]:
         """Compute the rest length of every spring with a candidate's floors [m]."""
-        virtual_floor = max(parameters.virtual_rest_length_floor, MINIMUM_VIRTUAL_REST_LENGTH)
-        floor = np.full(len(self.length), virtual_floor)
+        floor = np.full(len(self.length), virtual_floor(parameters))
         floor[: self.object_spring_count] = parameters.rest_length_floor
         return np.maximum(self.length, floor).astype(np.float32)
 

@@ -18,6 +18,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from physhandi.quaternions import without_jumps
 from physhandi.simulation.contact_intervals import always
 from physhandi.simulation.forces import virtual_spring_forces
 from physhandi.simulation.model import SpringMassModel
@@ -25,7 +26,7 @@ from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.restart import NodeState, start_from_tensors, start_to_tensors
 from physhandi.simulation.simulator import Simulator, checked_control
 from physhandi.simulation.stability import stable_substeps
-from physhandi.simulation.topology import MINIMUM_VIRTUAL_REST_LENGTH, virtual_springs
+from physhandi.simulation.topology import virtual_floor, virtual_springs
 
 _ARRAYS = {"control", "hand_of_control", "hand_name", "wrist", "pose", "is_edited", "is_regripped"}
 """Arrays of a stored take besides those of its model and its start."""
@@ -373,7 +374,6 @@ class Take:
         """
         model, parameters = self.model, self.parameters
         ends, length = (np.zeros((0, 2), np.int32), np.zeros(0)) if joined is None else joined
-        floor = max(parameters.virtual_rest_length_floor, MINIMUM_VIRTUAL_REST_LENGTH)
 
         def spread(old: ndarray, new: ndarray | float) -> ndarray:
             return np.concatenate([old[kept], np.broadcast_to(new, len(ends)).astype(old.dtype)])
@@ -382,7 +382,7 @@ class Take:
         model = replace(
             model,
             spring_nodes=np.concatenate([model.spring_nodes[kept], ends]).astype(np.int32),
-            rest_length=spread(model.rest_length, np.maximum(length, floor)),
+            rest_length=spread(model.rest_length, np.maximum(length, virtual_floor(parameters))),
             stiffness=spread(model.stiffness, parameters.virtual_stiffness),
             damping=spread(model.damping, damping),
             attached=np.concatenate(
@@ -422,10 +422,7 @@ class Take:
         width = seconds * self.parameters.frame_rate
         count, hands = self.pose.shape[:2]
         turn = Rotation.from_rotvec(self.pose[..., 3:6].reshape(-1, 3)).as_quat()
-        # Of q and -q, which are the same rotation, the one nearer to the frame before.
-        turn = turn.reshape(count, hands, 4)
-        flips = np.where((turn[1:] * turn[:-1]).sum(axis=-1) < 0.0, -1.0, 1.0)
-        turn[1:] *= np.cumprod(flips, axis=0)[..., None]
+        turn = without_jumps(turn.reshape(count, hands, 4))
         values = np.concatenate([self.pose[..., :3], self.pose[..., 6:], turn], axis=-1)
         # Reflected about the first frame, whose pose is a point of symmetry and stays.
         before = 2.0 * values[:1] - values[:0:-1]
@@ -528,6 +525,8 @@ class SteeredSimulation:
         self._simulator.reset(*take.start)
         self._control = take.control_at(take.pose[0])
         self._control_velocity = np.zeros_like(self._control)
+        ends = take.model.spring_nodes[take.model.object_spring_count :].max(axis=1)
+        self._springs = [np.isin(ends - take.model.node_count, hand.control) for hand in take.hands]
         self.frame = 0
         """Frames that have been simulated."""
 
@@ -557,9 +556,6 @@ class SteeredSimulation:
         Args:
             state: The newest state, as `step` gives it.
         """
-        take = self._take
-        model = take.model
-        moved = self._control_velocity
-        force = virtual_spring_forces(model, take.parameters, *state, self._control, moved)
-        control = model.spring_nodes[model.object_spring_count :].max(axis=1) - model.node_count
-        return np.stack([-force[np.isin(control, hand.control)].sum(axis=0) for hand in take.hands])
+        take, moved = self._take, self._control_velocity
+        force = virtual_spring_forces(take.model, take.parameters, *state, self._control, moved)
+        return np.stack([-force[own].sum(axis=0) for own in self._springs])

@@ -100,6 +100,11 @@ def virtual_springs(
     return springs.astype(np.int32), distance[is_kept][order]
 
 
+def virtual_floor(parameters: SimulationParameters) -> float:
+    """Give the shortest rest length that a virtual spring may have [m]."""
+    return max(parameters.virtual_rest_length_floor, MINIMUM_VIRTUAL_REST_LENGTH)
+
+
 def build_model(  # noqa: PLR0917  (nodes, what holds them, then what is known of the object)
     object_node: Float[ndarray, "node 3"],
     control_0: Float[ndarray, "control 3"],
@@ -144,11 +149,10 @@ def build_model(  # noqa: PLR0917  (nodes, what holds them, then what is known o
         near = contacts.within(*reach)
         virtual, virtual_length = near.spring_nodes(len(node)), near.distance.astype(np.float64)
         attached = near.interval
-    virtual_floor = max(parameters.virtual_rest_length_floor, MINIMUM_VIRTUAL_REST_LENGTH)
     rest_length = np.concatenate(
         [
             np.maximum(length, parameters.rest_length_floor),
-            np.maximum(virtual_length, virtual_floor),
+            np.maximum(virtual_length, virtual_floor(parameters)),
         ]
     )
     stiffness = np.repeat(

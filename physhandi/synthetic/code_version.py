@@ -14,14 +14,15 @@ INPUTS = ("synthetic/suite/variants.py", "data/sequence_writer.py", "data/truth.
 """Code that makes the inputs of methods."""
 PREDICTIONS = (
     *("pipeline.py", "fitted_object.py", "object_rollout.py", "settings.py", "triangles.py"),
-    *("parallel_transport.py", "data", "hand", "perception", "simulation", "fitting"),
+    *("parallel_transport.py", "quaternions.py"),
+    *("data", "hand", "perception", "simulation", "fitting"),
     *("metrics/baselines.py", "metrics/alignment.py", "metrics/geometry.py"),
     "metrics/truth_metrics.py",
     *("synthetic/suite/methods.py", "synthetic/suite/cells.py"),
     *INPUTS[:1],
 )
 """Code that makes predictions: fits, rules, corrections and noise."""
-SCORES = ("metrics", "synthetic/suite/cells.py", "data", "hand", "triangles.py")
+SCORES = ("metrics", "synthetic/suite/cells.py", "data", "hand", "quaternions.py", "triangles.py")
 """Code that scores predictions."""
 PACKAGES = ("torch", "warp-lang", "numpy", "scipy", "cma", "safetensors")
 """Libraries that predictions and figures are computed with, beside OpenCV."""

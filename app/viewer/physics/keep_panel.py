@@ -4,7 +4,7 @@ import html
 import re
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -153,9 +153,8 @@ class RunSaver:
         if folder.exists() or (BUNDLED / folder.name).exists():
             raise UsageError(f"There is a recording '{folder.name}' already. Type another name.")
         source = self._catalog.run(source_id)
-        take = stored.to_dict()
-        if keeps_springs(source):  # What is steered of such an object is another one.
-            take["is_edited"] = True
+        if keeps_springs(source):  # What is steered of such an object is an edited one, too.
+            stored = replace(stored, take=replace(stored.take, is_edited=True))
         run = Run.create(
             self._folder / new_run_id(),
             name=name,
@@ -164,7 +163,7 @@ class RunSaver:
             config={
                 "source": str(source.folder.resolve()),
                 "parameters": dict(changes),
-                "take": take,
+                "take": stored.to_dict(),
             },
         )
         stored.save(run.folder)

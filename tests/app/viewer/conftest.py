@@ -6,6 +6,8 @@ import viser
 from viewer_client import ViewerClient
 from viewer_world import FakeSettings, FolderCatalog, Recording, make_run, make_sequence
 
+from app.viewer.physics.keep_panel import RunSaver, UserStorage
+from app.viewer.physics.presets import PresetStore
 from app.viewer.sessions import Sessions
 from physhandi.run import Run
 
@@ -33,8 +35,21 @@ def catalog(root: Path) -> FolderCatalog:
 
 
 @pytest.fixture
-def sessions(catalog: FolderCatalog) -> Iterator[Sessions]:
-    sessions = Sessions(FakeSettings(), catalog)
+def begun() -> list[Run]:
+    """Runs that a worker would work on."""
+    return []
+
+
+@pytest.fixture
+def storage(catalog: FolderCatalog, tmp_path: Path, begun: list[Run]) -> UserStorage:
+    """Where users keep presets and runs."""
+    saver = RunSaver(catalog, tmp_path / "runs", begun.append)
+    return UserStorage(PresetStore(tmp_path / "presets"), saver)
+
+
+@pytest.fixture
+def sessions(catalog: FolderCatalog, storage: UserStorage) -> Iterator[Sessions]:
+    sessions = Sessions(FakeSettings(), catalog, storage)
     yield sessions
     sessions.shutdown()
 

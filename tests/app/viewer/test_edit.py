@@ -2,14 +2,12 @@
 
 import json
 from collections.abc import Callable, Iterator
-from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from spring_world import two_springs
 from viewer_client import ViewerClient
-from viewer_world import FakeSettings, FolderCatalog, rest_at
+from viewer_world import rest_at
 from waiting import LIMIT_S
 
 from app.viewer.content.session_state import Pose
@@ -26,8 +24,6 @@ from app.viewer.edit.selection import (
     springs_between,
     within,
 )
-from app.viewer.physics.keep_panel import RunSaver, UserStorage
-from app.viewer.physics.presets import PresetStore
 from app.viewer.session import Session
 from app.viewer.sessions import Sessions
 from app.viewer.steer.steered import begin_take
@@ -133,28 +129,6 @@ def test_nodes_are_joined_and_attached_to_what_is_nearest() -> None:
     tied = attach_to_nearest(take, 3, np.array([1]))
     assert (tied.nodes, tied.controls, tied.frame) == ((1,), (0,), 3)
     assert tied.lengths[0] == pytest.approx(np.hypot(1.3, 1.0))
-
-
-class Places(FolderCatalog):
-    """Knows where recordings would be."""
-
-    def sequences_of(self, run: Run) -> list[SimpleNamespace]:
-        return [SimpleNamespace(folder=self.root / name) for name in run.sequence_names]
-
-
-@pytest.fixture
-def begun() -> list[Run]:
-    """Runs that a worker would work on."""
-    return []
-
-
-@pytest.fixture
-def sessions(catalog, tmp_path: Path, begun: list[Run]) -> Iterator[Sessions]:
-    saver = RunSaver(Places(catalog.root), tmp_path / "runs", begun.append)
-    storage = UserStorage(PresetStore(tmp_path / "presets"), saver)
-    sessions = Sessions(FakeSettings(), catalog, storage)
-    yield sessions
-    sessions.shutdown()
 
 
 @pytest.fixture

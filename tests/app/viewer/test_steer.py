@@ -12,8 +12,6 @@ from viewer_world import FakeSettings, FolderCatalog, rest_at
 from waiting import LIMIT_S, until
 
 from app.settings import BUNDLED
-from app.viewer.physics.keep_panel import RunSaver, UserStorage
-from app.viewer.physics.presets import PresetStore
 from app.viewer.session import Session
 from app.viewer.sessions import Sessions
 from app.viewer.steer.steer_panel import GIZMO, Recorded
@@ -26,21 +24,6 @@ AT = 8
 STEER, BACK = "Steer (G)", "Back to playback (G)"
 NODES = "/object/nodes"
 HAND = "/hand/right"
-
-
-@pytest.fixture
-def begun() -> list[Run]:
-    """Runs that a worker would work on."""
-    return []
-
-
-@pytest.fixture
-def sessions(catalog, tmp_path: Path, begun: list[Run]) -> Iterator[Sessions]:
-    saver = RunSaver(catalog, tmp_path / "runs", begun.append)
-    storage = UserStorage(PresetStore(tmp_path / "presets"), saver)
-    sessions = Sessions(FakeSettings(), catalog, storage)
-    yield sessions
-    sessions.shutdown()
 
 
 @pytest.fixture

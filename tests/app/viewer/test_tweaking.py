@@ -2,51 +2,23 @@
 
 import re
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from viewer_client import ViewerClient
-from viewer_world import FRAMES, PARAMETERS, FakeSettings, FolderCatalog
+from viewer_world import FRAMES, PARAMETERS
 from waiting import until
 
 from app.viewer.physics.history import Setting
-from app.viewer.physics.keep_panel import RunSaver, SavedRun, UserStorage, run_changes
+from app.viewer.physics.keep_panel import SavedRun, run_changes
 from app.viewer.physics.parameters import Knob
-from app.viewer.physics.presets import PresetStore
 from app.viewer.sessions import Sessions
-from physhandi.data.sequence import Sequence
 from physhandi.errors import UsageError
 from physhandi.run import Run
 from physhandi.simulation.parameters import SimulationParameters
-
-
-class RecordedCatalog(FolderCatalog):
-    """Knows the recording behind every sequence of a run."""
-
-    def sequences_of(self, run: Run) -> list[Sequence]:
-        return [self.sequence("gesture") for _ in run.sequence_names]
-
-
-@pytest.fixture
-def begun() -> list[Run]:
-    """Runs that a worker would work on."""
-    return []
-
-
-@pytest.fixture
-def storage(root: Path, recording, tmp_path: Path, begun: list[Run]) -> UserStorage:
-    saver = RunSaver(RecordedCatalog(root), tmp_path / "runs", begun.append)
-    return UserStorage(PresetStore(tmp_path / "presets"), saver)
-
-
-@pytest.fixture
-def sessions(catalog, storage: UserStorage) -> Iterator[Sessions]:
-    sessions = Sessions(FakeSettings(), catalog, storage)
-    yield sessions
-    sessions.shutdown()
 
 
 def watch(sessions: Sessions) -> ViewerClient:
