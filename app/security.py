@@ -51,15 +51,15 @@ _STYLE = (
     "code{padding:.1em .35em;border:1px solid;border-radius:.3em;opacity:.85}"
 )
 _STYLE_HASH = base64.b64encode(hashlib.sha256(_STYLE.encode()).digest()).decode()
-_LOCKED_PAGE = (
-    "<!doctype html><html lang=en><meta charset=utf-8><title>PhysHanDI is locked</title>"
-    f"<style>{_STYLE}</style><h1>This page needs its token</h1>"
+_LOCKED = (
     "<p>Open the full address that <code>physhandi serve</code> printed in the terminal; it ends "
     "in <code>?token=…</code>. Your browser then remembers it until the server stops.</p>"
     "<p>Was the server restarted? Then it has a new token: use the new address.</p>"
     # A browser that came from another site brings its cookie only when it is asked again from here.
-    "<p>Did you just open that address? <a href=''>Try again</a></p></html>"
+    "<p>Did you just open that address? <a href=''>Try again</a></p>"
 )
+SHARED = "/shared/"
+"""Where pages are that can be looked at without the token; see `app.exports.shares`."""
 
 
 class Security:
@@ -160,6 +160,8 @@ class Gatekeeper:
             return _error(400, "unknown_host", "This server does not answer to that host name.")
         offered = _bearer(headers)
         owner = self._identify(headers, offered)
+        if owner is None and _is_shared(scope):
+            return None
         if owner is None:
             return self._admit(scope, headers, offered)
         if offered is None and not self._has_own_origin(scope, headers):
@@ -196,7 +198,7 @@ class Gatekeeper:
             limited.headers["Retry-After"] = "60"
             return limited
         if is_visit and "text/html" in headers.get("accept", ""):
-            return _locked_page()
+            return bare_page(401, "This page needs its token", _LOCKED)
         refused = _error(401, "unauthorized", "A valid token is needed.")
         refused.headers["WWW-Authenticate"] = 'Bearer realm="physhandi"'
         return refused
@@ -234,9 +236,26 @@ def _error(status: int, kind: str, message: str) -> Response:
     return JSONResponse({"error": {"code": kind, "message": message}}, status)
 
 
-def _locked_page() -> Response:
+def bare_page(status: int, title: str, content: str) -> Response:
+    """Answer with a page that needs nothing else of the server, for who may not come in.
+
+    Args:
+        status: HTTP status.
+        title: Its heading.
+        content: HTML below that.
+    """
     policy = f"default-src 'none'; style-src 'sha256-{_STYLE_HASH}'; frame-ancestors 'self'"
-    return HTMLResponse(_LOCKED_PAGE, 401, {"Content-Security-Policy": policy})
+    page = (
+        f"<!doctype html><html lang=en><meta charset=utf-8><title>{title} · PhysHanDI</title>"
+        f"<style>{_STYLE}</style><h1>{title}</h1>{content}</html>"
+    )
+    return HTMLResponse(page, status, {"Content-Security-Policy": policy})
+
+
+def _is_shared(scope: Scope) -> bool:
+    """Whether a request only looks at a page that was shared."""
+    is_visit = scope["type"] == "http" and scope["method"] in {"GET", "HEAD"}
+    return is_visit and scope["path"].startswith(SHARED)
 
 
 async def _refuse(response: Response, scope: Scope, receive: Receive, send: Send) -> None:

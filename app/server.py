@@ -20,6 +20,7 @@ from app.api import create_api
 from app.comparing import create_comparing
 from app.exports.cache import FileCache, TooManyFilesError
 from app.exports.routes import create_exports
+from app.exports.shares import Shares
 from app.jobs.catalog import Catalog, NotFoundError
 from app.jobs.machine import Machine
 from app.jobs.order import SkippedObjectError
@@ -158,7 +159,8 @@ def create_app(
             suites=settings.suite_dir,
         )
     )
-    app.include_router(create_exports(catalog, sessions, pages, file_cache))
+    shares = Shares(settings.data_dir / "shares")
+    app.include_router(create_exports(catalog, sessions, pages, file_cache, shares))
     app.include_router(create_comparing(catalog, scheduler, pages))
     app.include_router(create_gate(sessions))
     app.mount("/assets", StaticFiles(directory=WEB_ASSETS), name="assets")

@@ -50,26 +50,55 @@ async function openScene(button) {
   location.href = session.url;
 }
 
-/* A file for which every frame is drawn is made first, with a bar, and then fetched. */
-async function fetchSlowFile(address, about) {
+/* A file for which every frame is drawn is made first, with a bar. */
+async function makeSlowFile(address, about) {
   const line = document.createElement("p");
   const bar = document.createElement("progress");
-  line.append(`${about}: the download begins when it is ready.`, bar);
+  line.append(about, bar);
   document.getElementById("toast").append(line);
   try {
     for (;;) {
       const file = await send("POST", address);
       if (file.state === "failed") throw new Error(file.message);
-      if (file.state === "ready") {
-        location.href = file.url;
-        return;
-      }
+      if (file.state === "ready") return file;
       if (file.of) Object.assign(bar, { max: file.of, value: file.done });
       await new Promise((done) => setTimeout(done, 500));
     }
   } finally {
     line.remove();
   }
+}
+
+async function fetchSlowFile(address, about) {
+  location.href = (await makeSlowFile(address, `${about}: the download begins when it is ready.`)).url;
+}
+
+/* Outside of localhost and https, browsers have no clipboard for pages but what is selected. */
+async function copyText(text, inside = window) {
+  try {
+    await inside.navigator.clipboard.writeText(text);
+    return true;
+  } catch {
+    const field = inside.document.body.appendChild(inside.document.createElement("textarea"));
+    field.value = text;
+    field.select();
+    const isDone = inside.document.execCommand("copy");
+    field.remove();
+    if (!isDone) prompt("Copy this link:", text);
+    return isDone;
+  }
+}
+
+/* A copy of the replay gets an address that needs no token, until it is withdrawn. */
+async function shareView(run, query, inside = window) {
+  const fields = new URLSearchParams(query);
+  fields.set("format", "html");
+  await makeSlowFile(`/api/v1/runs/${run}/export?${fields}`, "Making the page that is shared");
+  const share = await send("POST", `/api/v1/runs/${run}/shares?${query}`);
+  if (await copyText(new URL(share.url, location.href).href, inside)) {
+    toast("Link copied: whoever has it sees this replay, and nothing else, until you withdraw it.", false, { href: `/runs/${run}#shares`, textContent: "Shared pages" });
+  }
+  dispatchEvent(new Event("shares-changed"));
 }
 
 async function act(button) {
@@ -161,6 +190,7 @@ document.addEventListener("click", (event) => {
   if ("open" in data) busy(button, () => openScene(button));
   else if ("act" in data) busy(button, () => act(button));
   else if ("delete" in data) busy(button, () => remove(button));
+  else if ("share" in data) busy(button, () => shareView(data.share, ""));
   else if ("new" in data) showForm(button);
   else if ("help" in data) document.getElementById("help").showModal();
   else if ("close" in data) button.closest("dialog").close();

@@ -55,10 +55,7 @@
   async function copyLink() {
     const address = new URL((await link()).url, location.href).href;
     const inside = document.activeElement === scene ? scene.contentWindow : window;
-    await inside.navigator.clipboard.writeText(address).then(
-      () => toast("Link copied: it opens this comparison as you see it now."),
-      () => prompt("Copy this link:", address),
-    );
+    if (await copyText(address, inside)) toast("Link copied: it opens this comparison as you see it now.");
   }
 
   function onKey(event) {

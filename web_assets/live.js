@@ -49,15 +49,7 @@
     const link = await wholeLink();
     const address = new URL(link.url, location.href).href;
     const inside = document.activeElement === scene ? scene.contentWindow : window;
-    try {
-      await inside.navigator.clipboard.writeText(address);
-    } catch {
-      if (!copyByHand(address, inside.document)) {
-        prompt("Copy this link:", address);
-        return;
-      }
-    }
-    toast("Link copied: it opens this run as you see it now.");
+    if (await copyText(address, inside)) toast("Link copied: it opens this run as you see it now.");
   }
 
   /* What the link restores is filmed: parameters, layers and camera as they are now. */
@@ -76,15 +68,15 @@
     });
   }
 
-  /* Outside of localhost and https, browsers have no clipboard for pages but this one. */
-  function copyByHand(text, place) {
-    const field = place.body.appendChild(place.createElement("textarea"));
-    field.value = text;
-    field.select();
-    const isDone = place.execCommand("copy");
-    field.remove();
-    return isDone;
-  }
+  document.querySelector("[data-share-view]")?.addEventListener("click", (event) => {
+    event.preventDefault();
+    event.target.closest("details").open = false;
+    const share = async () => {
+      const { query } = await wholeLink();
+      await shareView(event.target.closest("a").dataset.shareView, query);
+    };
+    share().catch((error) => toast(error.message, true));
+  });
 
   function onKey(event) {
     const isTyping = event.target.matches?.("input:not([type=checkbox]), textarea, select");

@@ -1,4 +1,4 @@
-"""The routes of links, replays and files."""
+"""The routes of links, replays, shared pages and files."""
 
 from fastapi import APIRouter
 
@@ -6,25 +6,28 @@ from app.exports.cache import FileCache
 from app.exports.files import create_files
 from app.exports.links import create_links, link_of
 from app.exports.replay import create_replays
+from app.exports.shares import Shares, create_shares
 from app.jobs.catalog import Catalog
 from app.pages import Pages
 from app.viewer.sessions import Sessions
 
 
 def create_exports(
-    catalog: Catalog, sessions: Sessions, pages: Pages, file_cache: FileCache
+    catalog: Catalog, sessions: Sessions, pages: Pages, file_cache: FileCache, shares: Shares
 ) -> APIRouter:
-    """Make the routes of links, replays and files, and let scenes know their links.
+    """Make the routes of links, replays, shared pages and files, and let scenes know their links.
 
     Args:
         catalog: Finds runs and sequences.
         sessions: The live scenes.
         pages: Renders.
         file_cache: Makes files.
+        shares: Keeps pages that were shared.
     """
     sessions.link_of = link_of
     router = APIRouter()
     router.include_router(create_links(sessions))
     router.include_router(create_files(catalog, sessions, file_cache))
     router.include_router(create_replays(catalog, file_cache, pages))
+    router.include_router(create_shares(catalog, file_cache, shares))
     return router

@@ -37,7 +37,11 @@ def addresses(world: World) -> Iterator[tuple[str, str]]:
 
 def test_nothing_is_told_to_anybody_without_the_token(world: World) -> None:
     client = world.client(Origin=ORIGIN)
-    known = list(addresses(world))
+    # What was shared is seen by who has its address; nothing is shared here.
+    shared = "GET", "/shared/fitted"
+    known = [pair for pair in addresses(world) if pair != shared]
+    told = client.request(*shared)
+    assert (told.status_code, "Nothing is shared here" in told.text) == (404, True)
     assert {"GET /", "POST /api/v1/runs", "GET /api/v1/openapi.json", "GET /healthz"} <= {
         " ".join(pair) for pair in known
     }

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 from gltf_player import Player
-from playwright.sync_api import BrowserContext, Page, expect
-from scene_page import TIMEOUT_MS, ScenePage
+from playwright.sync_api import Browser, BrowserContext, Page, expect
+from scene_page import FEWER_PICTURES, TIMEOUT_MS, ScenePage
 
 pytestmark = pytest.mark.e2e
 BUNDLED = Path(__file__).parents[2] / "sequences/runs/towel_fold_quick"
@@ -89,7 +89,7 @@ def test_a_link_opens_a_scene_whose_files_agree_with_the_server_s(
 
 
 def test_a_replay_plays_without_a_session_and_from_one_file(
-    home: Page, base: str, context: BrowserContext, served: Any, tmp_path: Path
+    home: Page, base: str, browser: Browser, served: Any, tmp_path: Path
 ) -> None:
     home.goto(f"{base}/runs/towel_fold_quick/replay")
     player = home.frame_locator("#scene")
@@ -116,13 +116,22 @@ def test_a_replay_plays_without_a_session_and_from_one_file(
         home.get_by_role("link", name="One HTML file").click()
     page = tmp_path / "replay.html"
     download.value.save_as(page)
-    alone = home  # One scene at a time: without a graphics card each takes a processor.
-    alone.goto("about:blank")  # What it would ask for meanwhile, it would complain of.
-    context.set_offline(True)
-    alone.goto(page.as_uri())
-    alone.locator("input.mantine-NumberInput-input").wait_for()
-    until_drawn(alone)
-    context.set_offline(False)
+    # Who has not the token sees the same page, which may ask the server for nothing.
+    home.goto(f"{base}/runs/towel_fold_quick")
+    home.get_by_role("button", name="Share").click()
+    address = home.locator("#shares a").get_attribute("href")
+    stranger = browser.new_context(viewport={"width": 1280, "height": 800}).new_page()
+    stranger.set_default_timeout(TIMEOUT_MS)
+    stranger.add_init_script(FEWER_PICTURES)
+    complaints: list[str] = []
+    stranger.on("console", lambda m: m.type == "error" and complaints.append(m.text))
+    stranger.goto(f"{base}{address}")
+    stranger.locator("input.mantine-NumberInput-input").wait_for()
+    until_drawn(stranger)
+    stranger.context.close()
+    assert complaints == []
+    home.get_by_role("button", name="Withdraw").click()
+    expect(home.locator("#shares")).to_be_hidden()
 
 
 def copied_link(page: Page) -> dict[str, list[str]]:
