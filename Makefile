@@ -20,7 +20,7 @@ $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install $(PIP_FLAGS) --upgrade pip
 	$(BIN)/python -m pip install $(PIP_FLAGS) $(TORCH)
-	$(BIN)/python -m pip install $(PIP_FLAGS) -e ".[dev,synth,capture,models,usd]"
+	$(BIN)/python -m pip install $(PIP_FLAGS) -e ".[dev,synth,capture,models,newton,usd]"
 	touch $@
 
 demo: install

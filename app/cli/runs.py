@@ -202,6 +202,7 @@ def export(
         "html",
         "usd",
         "mjcf",
+        "newton",
     ],
     out: Path,
     sequence: str | None = None,
@@ -221,8 +222,9 @@ def export(
         format: ply: meshes and points per frame; gltf and usd: one file that moves, hands skinned;
             npz and csv: trajectories; yaml: parameters and metrics; png: a picture; mp4 and gif: a
             film of all frames; zip: a picture with all its data; viser: a recording for viser's
-            player; html: one file that plays in any browser; mjcf: the object as a MuJoCo scene
-            with the hand's motion and a script that simulates it (ZIP).
+            player; html: one file that plays in any browser; mjcf and newton: the object as a
+            MuJoCo scene or a Newton model, with the hand's motion and a script that simulates it
+            (ZIP).
         out: File or folder to write.
         sequence: Which sequence of the run; none takes the first one.
         frame: Only this frame (ply), or which one (png, zip).

@@ -10,9 +10,22 @@ from app.viewer.content.session_state import SessionState
 from physhandi.errors import UsageError
 
 Format = Literal[
-    "ply", "gltf", "npz", "csv", "yaml", "png", "mp4", "gif", "zip", "viser", "html", "usd", "mjcf"
+    "ply",
+    "gltf",
+    "npz",
+    "csv",
+    "yaml",
+    "png",
+    "mp4",
+    "gif",
+    "zip",
+    "viser",
+    "html",
+    "usd",
+    "mjcf",
+    "newton",
 ]
-_SUFFIXES = {"gltf": "glb", "ply": "zip", "mjcf": "zip"}
+_SUFFIXES = {"gltf": "glb", "ply": "zip", "mjcf": "zip", "newton": "zip"}
 """How the files of formats end, if not like the format."""
 SMALLEST, LARGEST = 16, 4_096
 """Shortest and longest side of a picture [px]."""

@@ -20,6 +20,7 @@ MEDIA_TYPES: dict[str, str] = {
     "html": "text/html",
     "usd": "application/octet-stream",
     "mjcf": "application/zip",
+    "newton": "application/zip",
 }
 
 

@@ -190,7 +190,10 @@ def test_the_home_page_opens_what_came_with_it_and_says_whose_it_is(world: World
     of_hand = world.browser().get("/runs/stereo_hand_default").text
     assert "<dd>1.52 px</dd>" in of_hand
     assert "format=mjcf" not in of_hand
-    assert "format=mjcf" in world.browser().get("/runs/towel_fold_quick").text
+    assert "format=newton" not in of_hand
+    of_towel = world.browser().get("/runs/towel_fold_quick").text
+    assert "format=mjcf" in of_towel
+    assert "format=newton" in of_towel
 
 
 @pytest.mark.parametrize(

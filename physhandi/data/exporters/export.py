@@ -8,6 +8,7 @@ from pathlib import Path
 from physhandi.data.exporters.gltf import scene_to_gltf
 from physhandi.data.exporters.mesh import frame_files
 from physhandi.data.exporters.mjcf import mjcf_files
+from physhandi.data.exporters.newton import newton_files
 from physhandi.data.exporters.scene_data import LaySurface, SceneData, read_scene
 from physhandi.data.exporters.table import (
     write_npz,
@@ -21,7 +22,7 @@ from physhandi.data.run import RunFolder
 from physhandi.errors import UsageError
 
 FORMATS = ("ply", "npz", "csv", "yaml", "gltf", "usd")
-SCENE_FORMATS = ("ply", "npz", "csv", "gltf", "usd", "mjcf")
+SCENE_FORMATS = ("ply", "npz", "csv", "gltf", "usd", "mjcf", "newton")
 
 
 def export_run(
@@ -86,7 +87,8 @@ def export_scene(
     Args:
         scene: The motion.
         format: ``ply``, ``npz``, ``csv`` (trajectories), ``gltf`` or ``usd``; see `export_run`.
-            ``mjcf`` is a ZIP of the object as a MuJoCo scene with the hand's motion.
+            ``mjcf`` and ``newton`` are ZIPs of the object as a scene of MuJoCo or a model of Newton
+            with the hand's motion.
         out_path: File to write; all frames as PLY go to a ``.zip`` or a folder.
         frame: Only this frame (PLY).
         overwrite: Whether to replace an export that is there.
@@ -120,6 +122,7 @@ def _write_scene(
         "csv": lambda path: write_trajectories(path, scene),
         "usd": lambda path: write_bytes(path, scene_to_usd(scene)),
         "mjcf": lambda path: write_bytes(path, zip_bytes(mjcf_files(scene))),
+        "newton": lambda path: write_bytes(path, zip_bytes(newton_files(scene))),
     }
     if format in whole:
         return _publish(out, whole[format], is_folder=False)

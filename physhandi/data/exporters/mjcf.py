@@ -6,16 +6,15 @@ spring.
 """
 
 import io
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 from xml.etree.ElementTree import Comment, Element, SubElement, indent, tostring
 
 import numpy as np
-from jaxtyping import Float
 from numpy import ndarray
 
 from physhandi.data.exporters.scene_data import SceneData
-from physhandi.errors import UsageError
+from physhandi.data.exporters.twin import Twin
 
 _SMALLEST_BALL = 1e-3
 """Radius of a node that touches the ground with itself [m]."""
@@ -88,175 +87,95 @@ def mjcf_files(scene: SceneData) -> Iterator[tuple[str, bytes]]:
     Raises:
         UsageError: If there is no object to simulate, or it bends as an elastic rod.
     """
-    if "rod_node" in scene.model:
-        raise UsageError(
-            f"The rope of sequence '{scene.sequence}' bends as an elastic rod, which tendons of a "
-            "MuJoCo scene do not. Export its motion (gltf, usd, npz), or fit it with springs "
-            "alone (object_.bends_ropes: false)."
-        )
-    if not scene.model or not scene.parameters:
-        raise UsageError(f"Sequence '{scene.sequence}' has no object that MuJoCo could simulate.")
-    twin = _Twin(scene)
-    yield "scene.xml", twin.xml().encode()
+    twin = Twin(scene, "MuJoCo")
+    yield "scene.xml", _scene_xml(twin, scene).encode()
     content = io.BytesIO()
     arrays: dict[str, Any] = twin.motion()
+    if "restart_clearance" in arrays:
+        arrays["restart_ball_height"] = _ball(twin, arrays.pop("restart_clearance"))[1]
     np.savez_compressed(content, allow_pickle=False, **arrays)
     yield "motion.npz", content.getvalue()
     yield "play.py", _PLAY.encode()
 
 
-class _Twin:
-    """The arrays of a scene in the order and the units of MuJoCo."""
+def _ball(twin: Twin, clearance: ndarray) -> tuple[ndarray, ndarray]:
+    """Give the balls of nodes that touch the ground at their clearances.
 
-    def __init__(self, scene: SceneData) -> None:
-        self._scene, self._model = scene, scene.model
-        self._parameters: Mapping[str, Any] = scene.parameters
-        self._node = np.asarray(scene.model["object_node"], np.float64)
-        count = len(self._node)
-        self._factor = 1.0 if scene.mass is None else scene.mass.force_factor(count)
-        springs = np.sort(scene.spring_nodes, axis=1)
-        self._object_springs = scene.object_spring_count
-        # Of a hand's many vertices few hold anything.
-        self._held, place = np.unique(
-            springs[self._object_springs :, 1] - count, return_inverse=True
+    Returns:
+        Radii, which stay what they are at frame 0, and heights of the middles above the nodes
+        [m].
+    """
+    radius = np.maximum(twin.clearance, _SMALLEST_BALL)
+    return radius, radius - clearance
+
+
+def _scene_xml(twin: Twin, scene: SceneData) -> str:
+    parameters = twin.parameters
+    root = Element("mujoco", model=scene.sequence or "object")
+    root.append(Comment(f" {twin.about} "))
+    # Nodes may be lighter than what MuJoCo takes for the least sensible mass.
+    SubElement(root, "compiler", boundmass="0", boundinertia="0")
+    gravity = f"0 0 {-parameters['gravity']:.9g}"
+    SubElement(root, "option", timestep=_number(scene.dt), gravity=gravity)
+    default = SubElement(root, "default")
+    friction = f"{parameters['friction']:.9g} 0.005 0.0001"
+    SubElement(default, "geom", contype="0", conaffinity="1", mass="0", friction=friction)
+    world = SubElement(root, "worldbody")
+    _add_ground(world, parameters["ground_height"])
+    _add_bodies(world, twin)
+    _add_tendons(SubElement(root, "tendon"), twin)
+    SubElement(SubElement(root, "keyframe"), "key", name="start", qvel=_numbers(twin.velocity))
+    indent(root)
+    return tostring(root, encoding="unicode") + "\n"
+
+
+def _add_ground(world: Element, height: float | None) -> None:
+    if height is not None:
+        place = _numbers([0.0, 0.0, height])
+        SubElement(
+            world,
+            "geom",
+            name="ground",
+            type="plane",
+            size="1 1 0.01",
+            pos=place,
+            contype="1",
+            conaffinity="0",
         )
-        self._ends = springs.copy()
-        self._ends[self._object_springs :, 1] = count + place
 
-    def _stiffness(self, rest_length: Float[ndarray, " spring"]) -> Float[ndarray, " spring"]:
-        """Stiffness of the tendons [N/m]."""
-        force = self._parameters["stiffness_scale"] * self._model["stiffness"].astype(np.float64)
-        return self._factor * force / rest_length
 
-    def _ball(self, clearance: ndarray) -> tuple[ndarray, ndarray]:
-        """Give the balls of nodes that touch the ground at their clearances.
+def _add_bodies(world: Element, twin: Twin) -> None:
+    drag = _number(twin.mass * twin.parameters["drag"])
+    radius, height = _ball(twin, twin.clearance)
+    for index, place in enumerate(twin.node):
+        body = SubElement(world, "body", name=f"node{index}", pos=_numbers(place))
+        inertia = _numbers(np.full(3, twin.mass))
+        SubElement(body, "inertial", pos="0 0 0", mass=_number(twin.mass), diaginertia=inertia)
+        for axis in ("1 0 0", "0 1 0", "0 0 1"):
+            SubElement(body, "joint", type="slide", axis=axis, damping=drag)
+        middle = _numbers([0.0, 0.0, height[index]])
+        SubElement(body, "geom", type="sphere", size=_number(float(radius[index])), pos=middle)
+        SubElement(body, "site", name=f"end{index}")
+    for index, place in enumerate(twin.control[0]):
+        name = f"hand{index}"
+        body = SubElement(world, "body", name=name, mocap="true", pos=_numbers(place))
+        SubElement(body, "site", name=f"end{len(twin.node) + index}", rgba="1 0 0 1")
 
-        Returns:
-            Radii, which stay what they are at frame 0, and heights of the middles above the nodes
-            [m].
-        """
-        radius = np.maximum(self._model["clearance"].astype(np.float64), _SMALLEST_BALL)
-        return radius, radius - clearance.astype(np.float64)
 
-    def xml(self) -> str:
-        """Write the scene."""
-        parameters = self._parameters
-        root = Element("mujoco", model=self._scene.sequence or "object")
-        root.append(Comment(self._about()))
-        # Nodes may be lighter than what MuJoCo takes for the least sensible mass.
-        SubElement(root, "compiler", boundmass="0", boundinertia="0")
-        gravity = f"0 0 {-parameters['gravity']:.9g}"
-        SubElement(root, "option", timestep=_number(self._scene.dt), gravity=gravity)
-        default = SubElement(root, "default")
-        friction = f"{parameters['friction']:.9g} 0.005 0.0001"
-        SubElement(default, "geom", contype="0", conaffinity="1", mass="0", friction=friction)
-        world = SubElement(root, "worldbody")
-        self._add_ground(world)
-        self._add_bodies(world)
-        self._add_tendons(SubElement(root, "tendon"))
-        start = self._model["initial_velocity"].astype(np.float64)
-        SubElement(SubElement(root, "keyframe"), "key", name="start", qvel=_numbers(start))
-        indent(root)
-        return tostring(root, encoding="unicode") + "\n"
-
-    def _about(self) -> str:
-        mass, scene = self._scene.mass, self._scene
-        weight = (
-            "nobody knows what the object weighs, so each node weighs 1 kg, as in the model"
-            if mass is None
-            else f"the object weighs {mass.text} ({mass.source}), so masses, stiffness and damping "
-            f"are those of the model times {self._factor:.6g}"
+def _add_tendons(tendons: Element, twin: Twin) -> None:
+    columns = (twin.stiffness, twin.damping, twin.rest_length)
+    for ends, *values in zip(twin.ends, *columns, strict=True):
+        stiffness, damping, length = (_number(float(value)) for value in values)
+        tendon = SubElement(
+            tendons,
+            "spatial",
+            width="0.0003",
+            stiffness=stiffness,
+            damping=damping,
+            springlength=length,
         )
-        run = f" of run {scene.run}" if scene.run else ""
-        return f" Sequence {scene.sequence}{run}, in metres, z up: {weight}. "
-
-    def _add_ground(self, world: Element) -> None:
-        height = self._parameters["ground_height"]
-        if height is not None:
-            place = _numbers([0.0, 0.0, height])
-            SubElement(
-                world,
-                "geom",
-                name="ground",
-                type="plane",
-                size="1 1 0.01",
-                pos=place,
-                contype="1",
-                conaffinity="0",
-            )
-
-    def _add_bodies(self, world: Element) -> None:
-        drag = _number(self._factor * self._parameters["drag"])
-        radius, height = self._ball(self._model["clearance"])
-        for index, place in enumerate(self._node):
-            body = SubElement(world, "body", name=f"node{index}", pos=_numbers(place))
-            inertia = _numbers(np.full(3, self._factor))
-            SubElement(
-                body, "inertial", pos="0 0 0", mass=_number(self._factor), diaginertia=inertia
-            )
-            for axis in ("1 0 0", "0 1 0", "0 0 1"):
-                SubElement(body, "joint", type="slide", axis=axis, damping=drag)
-            middle = _numbers([0.0, 0.0, height[index]])
-            SubElement(body, "geom", type="sphere", size=_number(float(radius[index])), pos=middle)
-            SubElement(body, "site", name=f"end{index}")
-        for index, place in enumerate(self._scene.control[0][self._held]):
-            name = f"hand{index}"
-            body = SubElement(world, "body", name=name, mocap="true", pos=_numbers(place))
-            SubElement(body, "site", name=f"end{len(self._node) + index}", rgba="1 0 0 1")
-
-    def _add_tendons(self, tendons: Element) -> None:
-        rest = self._model["rest_length"].astype(np.float64)
-        columns = (self._stiffness(rest), self._factor * self._model["damping"], rest)
-        for ends, *values in zip(self._ends, *columns, strict=True):
-            stiffness, damping, length = (_number(float(value)) for value in values)
-            tendon = SubElement(
-                tendons,
-                "spatial",
-                width="0.0003",
-                stiffness=stiffness,
-                damping=damping,
-                springlength=length,
-            )
-            for end in ends:
-                SubElement(tendon, "site", site=f"end{end}")
-
-    def motion(self) -> dict[str, ndarray]:
-        """Collect what changes over time: control nodes, springs that hold, and the restart."""
-        scene, model = self._scene, self._model
-        rest = model["rest_length"].astype(np.float64)
-        # Springs of the object act in every frame.
-        first = np.full(len(rest), -1)
-        last = np.full(len(rest), scene.frame_count)
-        first[self._object_springs :], last[self._object_springs :] = model["attached"].T
-        control = scene.control[:, self._held].astype(np.float64)
-        arrays = {
-            "node": self._node,
-            "control": control,
-            "spring_first": first,
-            "spring_last": last,
-            "stiffness": self._stiffness(rest),
-            "damping": self._factor * model["damping"].astype(np.float64),
-            "substeps": np.array(self._parameters["substeps_per_frame"]),
-            "frame_rate": np.array(scene.frame_rate),
-            "rollout": np.asarray(scene.rollout, np.float32),
-            "restart_frame": np.array(scene.frame_count),
-        }
-        if "restart_rest_length" not in model:
-            return arrays
-        frame = int(model["restart_frame"][0])
-        shift = model.get("restart_hand_shift", np.zeros((1, 3)))
-        after = model["restart_rest_length"].astype(np.float64)
-        held = (scene.control + shift)[:, self._held].astype(np.float64)
-        control[frame + 1 :] = held[frame + 1 :]
-        return arrays | {
-            "restart_frame": np.array(frame),
-            "restart_control": held[frame],
-            "restart_position": model["restart_position"].astype(np.float64),
-            "restart_velocity": model["restart_velocity"].astype(np.float64),
-            "restart_rest_length": after,
-            "restart_stiffness": self._stiffness(after),
-            "restart_ball_height": self._ball(model["restart_clearance"])[1],
-        }
+        for end in ends:
+            SubElement(tendon, "site", site=f"end{end}")
 
 
 def _number(value: float) -> str:

@@ -9,17 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hanging_node import hanging_node, scene_of, unpacked
 from server_world import World
 
 from app.cli import main
 from app.settings import BUNDLED
 from physhandi.data.exporters.mjcf import mjcf_files
-from physhandi.data.exporters.scene_data import SceneData
-from physhandi.data.object_mass import given_mass
 from physhandi.errors import UsageError
-from physhandi.object_rollout import ObjectRollout
-from physhandi.simulation.model import SpringMassModel
-from physhandi.simulation.parameters import SimulationParameters
 
 mujoco: Any = pytest.importorskip("mujoco")
 
@@ -28,13 +24,6 @@ def played(folder: Path) -> np.ndarray:
     """Simulate an unpacked export with the script that is in it."""
     play = runpy.run_path(str(folder / "play.py"))["play"]
     return np.stack([position.copy() for position in play(folder)])
-
-
-def unpacked(scene: SceneData, folder: Path) -> Path:
-    folder.mkdir()
-    for name, content in mjcf_files(scene):
-        (folder / name).write_bytes(content)
-    return folder
 
 
 @pytest.mark.slow
@@ -60,38 +49,11 @@ def test_the_bundled_towel_folds_in_mujoco_as_in_our_rollout(
     assert model.body_mass.sum() == pytest.approx(0.0082, rel=0.02)
 
 
-def pendulum(**changes: Any) -> ObjectRollout:
-    """A node that hangs on a control node, beside one that falls; made without a simulation."""
-    values: dict[str, Any] = {
-        "object_node": np.array([[0.0, 0.0, 0.4], [0.3, 0.0, 0.25]], np.float32),
-        "initial_velocity": np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]], np.float32),
-        "spring_nodes": np.array([[0, 2]], np.int32),
-        "rest_length": np.array([0.1], np.float32),
-        "stiffness": np.array([40.0], np.float32),
-        "damping": np.array([0.0], np.float32),
-        "object_spring_count": 0,
-        "control_count": 1,
-        "clearance": np.array([0.0, 0.05], np.float32),
-    }
-    model = SpringMassModel(**(values | changes))
-    parameters = SimulationParameters(
-        drag=0.0, gravity=9.81, ground_height=0.0, substeps_per_frame=100, friction=0.3
-    )
-    control = np.tile(np.array([[[0.0, 0.0, 0.5]]], np.float32), (11, 1, 1))
-    return ObjectRollout.empty(model, parameters, control)
-
-
-def scene_of(rollout: ObjectRollout, kilograms: float | None = None) -> SceneData:
-    rollout.ready = rollout.frame_count
-    mass = None if kilograms is None else given_mass(kilograms)
-    return replace(rollout.scene_data(), sequence="made", mass=mass)
-
-
 @pytest.mark.parametrize("kilograms", [None, 0.03])
 def test_springs_gravity_and_the_ground_are_those_of_closed_forms(
     tmp_path: Path, kilograms: float | None
 ) -> None:
-    position = played(unpacked(scene_of(pendulum(), kilograms), tmp_path / "twin"))
+    position = played(unpacked(mjcf_files(scene_of(hanging_node(), kilograms)), tmp_path / "twin"))
     time = np.arange(11) / 30.0
     # One kilogram on a spring of 40 N / 0.1 m, let go at its rest length.
     rate = np.sqrt(400.0)
@@ -107,8 +69,8 @@ def test_springs_gravity_and_the_ground_are_those_of_closed_forms(
 
 
 def test_a_spring_holds_only_while_it_is_attached(tmp_path: Path) -> None:
-    rollout = pendulum(attached=np.array([[3, 6]], np.int32))
-    position = played(unpacked(scene_of(rollout), tmp_path / "twin"))[:, 0, 2]
+    rollout = hanging_node(attached=np.array([[3, 6]], np.int32))
+    position = played(unpacked(mjcf_files(scene_of(rollout)), tmp_path / "twin"))[:, 0, 2]
     time = np.arange(11) / 30.0
     np.testing.assert_allclose(position[:4], 0.4 - 0.5 * 9.81 * time[:4] ** 2, atol=1e-3)
     acceleration = 900.0 * np.diff(position, 2)
@@ -119,10 +81,10 @@ def test_a_spring_holds_only_while_it_is_attached(tmp_path: Path) -> None:
 def test_what_cannot_be_simulated_is_refused_and_the_server_offers_the_rest(
     world: World, made: list[Any]
 ) -> None:
-    bare = replace(scene_of(pendulum()), model={})
+    bare = replace(scene_of(hanging_node()), model={})
     with pytest.raises(UsageError, match="made' has no object"):
         list(mjcf_files(bare))
-    rope = scene_of(pendulum())
+    rope = scene_of(hanging_node())
     with pytest.raises(UsageError, match="made' bends as an elastic rod"):
         list(mjcf_files(replace(rope, model=rope.model | {"rod_node": np.arange(2)})))
     answer = world.script().get("/api/v1/runs/fitted/export?format=mjcf&mass=0.5")
