@@ -252,6 +252,7 @@ class ObjectRollout:
             "parameters": self.parameters.to_dict(),
             "dt": self.parameters.dt,
             "lay_surface": self.surface,
+            "forces": self.forces,
         }
         if self.scene is None:
             rate = self.parameters.frame_rate

@@ -203,6 +203,7 @@ def export(
         "usd",
         "mjcf",
         "newton",
+        "rrd",
     ],
     out: Path,
     sequence: str | None = None,
@@ -224,7 +225,7 @@ def export(
             film of all frames; zip: a picture with all its data; viser: a recording for viser's
             player; html: one file that plays in any browser; mjcf and newton: the object as a
             MuJoCo scene or a Newton model, with the hand's motion and a script that simulates it
-            (ZIP).
+            (ZIP); rrd: a recording for Rerun's viewer, with cameras and images.
         out: File or folder to write.
         sequence: Which sequence of the run; none takes the first one.
         frame: Only this frame (ply), or which one (png, zip).

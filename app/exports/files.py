@@ -129,11 +129,11 @@ def create_files(catalog: Catalog, sessions: Sessions, file_cache: FileCache) ->
         """Write a run as a file that other programs read.
 
         `ply`, `gltf`, `usd`, `npz`, `csv`: motion; `mjcf`, `newton`: the object as a scene of
-        MuJoCo or a model of Newton; `yaml`: parameters and metrics; `png`: a picture; `mp4`,
-        `gif`: a film of all frames; `zip`: a picture with all its data; `viser`, `html`: a
-        recording that plays without the server. All fields of a link are understood. A parameter
-        of the simulation by its name, such as `drag=4`, has the object simulated anew before it is
-        written.
+        MuJoCo or a model of Newton; `rrd`: a recording for Rerun; `yaml`: parameters
+        and metrics; `png`: a picture; `mp4`, `gif`: a film of all frames; `zip`: a picture with all
+        its data; `viser`, `html`: a recording that plays without the server. All fields of a link
+        are understood. A parameter of the simulation by its name, such as `drag=4`, has the object
+        simulated anew before it is written.
         """
         del sequence, cam, fov, show, color, scale, theme  # Read with the rest of the link.
         run, query = catalog.run(run_id), read_query(request, without=_OWN_FIELDS)

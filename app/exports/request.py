@@ -24,6 +24,7 @@ Format = Literal[
     "usd",
     "mjcf",
     "newton",
+    "rrd",
 ]
 _SUFFIXES = {"gltf": "glb", "ply": "zip", "mjcf": "zip", "newton": "zip"}
 """How the files of formats end, if not like the format."""

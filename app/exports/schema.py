@@ -21,6 +21,7 @@ MEDIA_TYPES: dict[str, str] = {
     "usd": "application/octet-stream",
     "mjcf": "application/zip",
     "newton": "application/zip",
+    "rrd": "application/octet-stream",
 }
 
 

@@ -9,6 +9,7 @@ from physhandi.data.exporters.gltf import scene_to_gltf
 from physhandi.data.exporters.mesh import frame_files
 from physhandi.data.exporters.mjcf import mjcf_files
 from physhandi.data.exporters.newton import newton_files
+from physhandi.data.exporters.rrd import scene_to_rrd
 from physhandi.data.exporters.scene_data import LaySurface, SceneData, read_scene
 from physhandi.data.exporters.table import (
     write_npz,
@@ -22,7 +23,7 @@ from physhandi.data.run import RunFolder
 from physhandi.errors import UsageError
 
 FORMATS = ("ply", "npz", "csv", "yaml", "gltf", "usd")
-SCENE_FORMATS = ("ply", "npz", "csv", "gltf", "usd", "mjcf", "newton")
+SCENE_FORMATS = ("ply", "npz", "csv", "gltf", "usd", "mjcf", "newton", "rrd")
 
 
 def export_run(
@@ -88,7 +89,8 @@ def export_scene(
         scene: The motion.
         format: ``ply``, ``npz``, ``csv`` (trajectories), ``gltf`` or ``usd``; see `export_run`.
             ``mjcf`` and ``newton`` are ZIPs of the object as a scene of MuJoCo or a model of Newton
-            with the hand's motion.
+            with the hand's motion; ``rrd`` is a recording for Rerun's viewer, for which rerun-sdk
+            must be installed.
         out_path: File to write; all frames as PLY go to a ``.zip`` or a folder.
         frame: Only this frame (PLY).
         overwrite: Whether to replace an export that is there.
@@ -122,6 +124,7 @@ def _write_scene(
         "csv": lambda path: write_trajectories(path, scene),
         "usd": lambda path: write_bytes(path, scene_to_usd(scene)),
         "mjcf": lambda path: write_bytes(path, zip_bytes(mjcf_files(scene))),
+        "rrd": lambda path: write_bytes(path, scene_to_rrd(scene)),
         "newton": lambda path: write_bytes(path, zip_bytes(newton_files(scene))),
     }
     if format in whole:

@@ -13,6 +13,7 @@ from physhandi.data.layout import SequenceFiles
 from physhandi.data.object_mass import ObjectMass
 from physhandi.data.run import RunFolder
 from physhandi.data.sequence_meta import SIDES
+from physhandi.data.view import View
 from physhandi.errors import RunError, UsageError
 
 
@@ -89,6 +90,11 @@ class SceneData:
         default_factory=dict[str, Mapping[str, ndarray]]
     )
     """Bones and weights of the hands that have them, by side; see `read_skins`."""
+    forces: Callable[[int], Float[ndarray, "node 3"]] | None = None
+    """Sums the virtual springs' forces on each node in a frame, for nodes of 1 kg [N]; None if they
+    are not known."""
+    views: tuple[View, ...] = ()
+    """What cameras recorded of it, if that is there."""
 
     @property
     def frame_count(self) -> int:
