@@ -4,6 +4,7 @@ import json
 import math
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -138,7 +139,8 @@ def make(
         content_ = picture.content if order.format == "png" else bundle(snapshot, picture)
         write_bytes(out, content_)
     else:
-        export_scene(scene_data(snapshot), order.format, out, frame=order.frame, overwrite=True)
+        scene = replace(scene_data(snapshot), views=tuple(content.views))
+        export_scene(scene, order.format, out, frame=order.frame, overwrite=True)
 
 
 def surface_of(order: FileRequest) -> ObjectSurface | None:

@@ -86,7 +86,6 @@ def scene_data(snapshot: Snapshot) -> SceneData:
         run="" if run is None else run.id,
         mass=snapshot.mass,
         skins={} if run is None else read_skins(run, content.sequence_name),
-        views=tuple(content.views),
     )
     if rollout is None:
         return hands_alone
