@@ -1,5 +1,6 @@
 """Fixtures that all tests share."""
 
+import gc
 import os
 import sys
 from pathlib import Path
@@ -22,6 +23,17 @@ def pytest_configure(config):
     sys.dont_write_bytecode = False
     # What a disk keeps through a power failure no test can see, and many wait for it.
     os.fsync = lambda _descriptor: None
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """Look for no garbage among modules and tests, which stay: a sixth of what collecting takes."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -1,6 +1,7 @@
 """Filling templates, and how numbers, names and times are written on pages."""
 
 from collections.abc import Iterable
+from functools import cache
 from typing import Any
 from urllib.parse import urlencode
 
@@ -32,32 +33,35 @@ _TITLES = {
 }
 
 
+@cache
+def _environment() -> Environment:
+    """The templates, each of which is compiled when it is first shown, once in a process."""
+    environment: Any = Environment(
+        loader=FileSystemLoader(WEB_ASSETS / "templates"),
+        autoescape=select_autoescape(default=True),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(
+        short=short,
+        words=words,
+        duration=duration,
+        about=about,
+        level=level_of,
+        millimetres=millimetres,
+        query=query,
+    )
+    environment.globals["key_groups"] = KEYS
+    return environment
+
+
 class Pages:
     """Renders templates; everything a user wrote is escaped."""
 
-    def __init__(self) -> None:
-        environment: Any = Environment(
-            loader=FileSystemLoader(WEB_ASSETS / "templates"),
-            autoescape=select_autoescape(default=True),
-            undefined=StrictUndefined,
-            trim_blocks=True,
-            lstrip_blocks=True,
-        )
-        environment.filters.update(
-            short=short,
-            words=words,
-            duration=duration,
-            about=about,
-            level=level_of,
-            millimetres=millimetres,
-            query=query,
-        )
-        environment.globals["key_groups"] = KEYS
-        self._environment: Environment = environment
-
     def render(self, name: str, *, status: int = 200, **values: Any) -> HTMLResponse:
         """Fill a template."""
-        return HTMLResponse(self._environment.get_template(name).render(values), status_code=status)
+        return HTMLResponse(_environment().get_template(name).render(values), status_code=status)
 
     def error(self, status: int, message: str) -> HTMLResponse:
         """Show an error in the frame of the application."""

@@ -414,7 +414,13 @@ def named_profile(name: str) -> PipelineConfig:
         raise UsageError(
             f"There is no profile '{name[:80]}'. Choose one of: {', '.join(profile_names())}."
         )
-    return _profile_file(PROFILES / f"{name}.yaml")
+    return _shipped(PROFILES / f"{name}.yaml")
+
+
+@cache
+def _shipped(path: Path) -> PipelineConfig:
+    """Read a file of the package once: pages and suites ask for it again and again."""
+    return _profile_file(path)
 
 
 def load_profile(name: str | Path) -> PipelineConfig:

@@ -1,6 +1,7 @@
 """The load of the machine against what the kernel tells, and graphics cards that are made up."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -8,6 +9,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 from waiting import until
 
@@ -35,26 +37,37 @@ def made_up(arguments: list[str]) -> str:
     return TWO_CARDS[arguments[0].partition("=")[0]]
 
 
-def taken(folder: Path) -> tuple[int, int, int, int]:
-    """Bytes of memory, of used memory, of the disk and of its free part, as the kernel tells."""
-    lines = Path("/proc/meminfo").read_text().splitlines()
-    kibibytes = {line.split(":")[0]: int(line.split()[1]) for line in lines}
-    used = (kibibytes["MemTotal"] - kibibytes["MemAvailable"]) * 1024
-    disk = shutil.disk_usage(folder)
-    return kibibytes["MemTotal"] * 1024, used, disk.total, disk.free
+def test_the_load_is_what_the_kernel_tells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told: dict[str, Any] = {}
 
+    def hear(name: str) -> None:
+        """Remember an answer: others take and give back all the time, so the next is another."""
+        ask = getattr(psutil, name)
+        monkeypatch.setattr(psutil, name, lambda *about: told.setdefault(name, ask(*about)))
 
-def test_the_load_is_what_the_kernel_tells(tmp_path: Path) -> None:
     machine = Machine(tmp_path, Cards(made_up))
-    # Others take and give back meanwhile: what is told lies between before and after.
-    before, load, after = taken(tmp_path), machine.load(), taken(tmp_path)
-    total, used, disk_total, disk_free = (sorted(pair) for pair in zip(before, after, strict=True))
-    assert load["memory"]["total"] == total[0]
-    assert used[0] * 0.8 < load["memory"]["used"] < used[1] * 1.2
-    assert used[0] / total[0] - 0.05 < load["memory"]["share"] < used[1] / total[0] + 0.05
-    assert load["disk"]["total"] == disk_total[0]
-    assert disk_free[0] * 0.95 < load["disk"]["free"] < disk_free[1] * 1.05
+    for name in ("virtual_memory", "disk_usage", "cpu_percent"):
+        hear(name)
+    load = machine.load()
+    (memory_total,) = re.findall(r"MemTotal: +(\d+) kB", Path("/proc/meminfo").read_text())
+    disk_total = shutil.disk_usage(tmp_path).total
+    memory, disk = told["virtual_memory"], told["disk_usage"]
+    used = memory.total - memory.available
+    assert 0 < used < memory.total == int(memory_total) * 1024
+    assert load["memory"] == {
+        "used": used,
+        "total": memory.total,
+        "share": pytest.approx(used / memory.total, abs=6e-4),
+    }
+    assert 0 < disk.free < disk_total
+    assert load["disk"] == {
+        "used": disk_total - disk.free,
+        "free": disk.free,
+        "total": disk_total,
+        "share": pytest.approx(1 - disk.free / disk_total, abs=6e-4),
+    }
     assert load["processor"]["count"] == os.cpu_count()
+    assert load["processor"]["share"] == pytest.approx(told["cpu_percent"] / 100, abs=6e-4)
     assert 0.0 <= load["processor"]["share"] <= 1.0
 
 
