@@ -21,6 +21,11 @@ window.cancelAnimationFrame = (number) => clearTimeout(number);
 
 Software draws them, which is much of what these tests cost. `physhandi benchmark viewer` measures
 how many a browser gets."""
+COARSER_PICTURES = """
+if (location.pathname.startsWith("/viewer/"))
+  Object.defineProperty(window, "devicePixelRatio", { get: () => 0.5 });
+"""
+"""Scenes are drawn with a quarter of their pixels and stretched; files of pictures keep theirs."""
 _SENT = "() => new Promise((done) => setTimeout(done, 60))"
 """viser's browser sends at once or 50 ms later, and of what waits until then only the last."""
 _PICTURE = "() => new Promise((done) => requestAnimationFrame(done))"

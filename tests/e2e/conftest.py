@@ -7,7 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
@@ -17,10 +17,11 @@ from playwright.sync_api import (
     BrowserContext,
     Page,
     Playwright,
+    ViewportSize,
     expect,
     sync_playwright,
 )
-from scene_page import FEWER_PICTURES, TIMEOUT_MS, ScenePage
+from scene_page import COARSER_PICTURES, FEWER_PICTURES, TIMEOUT_MS, ScenePage
 from waiting import until
 
 from app.jobs.processes import end_processes
@@ -35,6 +36,7 @@ _CHROMIUM = [
     "--disable-gpu-compositing",
     "--webgl-msaa-sample-count=0",
 ]
+_VIEWPORT: ViewportSize = {"width": 1280, "height": 800}
 _PICTURES = "PHYSHANDI_PICTURES"
 """Names the folder of the README's pictures, which are made anew if it is set (`make pictures`)."""
 _SETTLE_MS = 2_000
@@ -67,16 +69,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.no_cover)
 
 
-@pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    folder = tmp_path_factory.mktemp("served")
+@contextmanager
+def _serving(folder: Path) -> Iterator[Served]:
+    """Start the program in a folder as a user does, and end it with the fits that it began."""
     # Users start it where they work, and often have a package of this name there.
     (folder / "app").mkdir()
     (folder / "app" / "__init__.py").write_text("raise SystemExit('a package of the user')")
     command = [sys.executable, "-P", "-c", START, "serve", "--port", "0", "--data-dir", "data"]
     printed = folder / "printed"
     with printed.open("w") as out, (folder / "log").open("w") as log:
-        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        # Tabs that tests have left keep their scenes for a while.
+        environment = os.environ | {"PYTHONPATH": str(ROOT), "PHYSHANDI_LIVE_SESSIONS": "100"}
         server = subprocess.Popen(command, cwd=folder, stdout=out, stderr=log, env=environment)
     try:
 
@@ -95,6 +98,28 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         finally:
             server.kill()
             server.wait()
+
+
+@pytest.fixture(scope="package")
+def _shared_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    with _serving(tmp_path_factory.mktemp("shared_server")) as served:
+        yield served
+
+
+@pytest.fixture(scope="module")
+def own_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """A server for one file, for tests that look at everything that a server has."""
+    with _serving(tmp_path_factory.mktemp("own_server")) as served:
+        yield served
+
+
+@pytest.fixture(scope="module")
+def served(_shared_server: Served) -> Served:
+    """The server of all files whose tests mind no runs of others; it draws its pictures once.
+
+    A file that minds them takes `own_server` in its place, by a fixture of this name.
+    """
+    return _shared_server
 
 
 @pytest.fixture(scope="package")
@@ -117,44 +142,87 @@ def browser(playwright_driver: Playwright) -> Iterator[Browser]:
     browser.close()
 
 
-@contextmanager
-def quiet_context(browser: Browser) -> Iterator[BrowserContext]:
-    """A browser without history; its pages may not complain of anything."""
+def _complaints_in(context: BrowserContext) -> list[str]:
+    """Prepare a browser without history, and list what its pages complain of from now on."""
     complaints: list[str] = []
-    context = browser.new_context(viewport={"width": 1280, "height": 800})
     context.set_default_timeout(TIMEOUT_MS)
     context.add_init_script(_REPORT_VIOLATIONS + FEWER_PICTURES)
+    if not os.environ.get(_PICTURES):
+        context.add_init_script(COARSER_PICTURES)
     context.on(
         "console",
         lambda m: m.type == "error" and _HARMLESS not in m.text and complaints.append(m.text),
     )
     context.on("weberror", lambda error: complaints.append(str(error.error)))
-    yield context
+    return complaints
+
+
+def _close(context: BrowserContext) -> None:
     for page in context.pages:
         page.wait_for_load_state()  # Chromium may never end a page that is still being loaded.
     context.close()
-    assert complaints == []
 
 
 @pytest.fixture
 def context(browser: Browser) -> Iterator[BrowserContext]:
-    """A browser for one test."""
-    with quiet_context(browser) as context:
-        yield context
+    """A browser for one test; its pages may not complain of anything."""
+    context = browser.new_context(viewport=_VIEWPORT)
+    complaints = _complaints_in(context)
+    yield context
+    _close(context)
+    assert complaints == []
 
 
-@pytest.fixture(scope="module")
-def shared_scene(browser: Browser, served: Served) -> Iterator[ScenePage]:
-    """The finished run in the viewer, paused, in a browser that the tests of a file share.
+@dataclass(eq=False)
+class _OpenedScene:
+    """The scene that tests share; none before the first of them, and after one that failed."""
 
-    Opening a scene takes longer than most of what is done in it.
+    scene: ScenePage | None = None
+    complaints: list[str] = field(default_factory=list[str])
+
+    def close(self) -> None:
+        if self.scene is not None:
+            _close(self.scene.page.context)
+        self.scene = None
+
+
+@pytest.fixture(scope="package")
+def _opened_scene(browser: Browser) -> Iterator[_OpenedScene]:
+    opened = _OpenedScene()
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def shared_scene(
+    browser: Browser,
+    _shared_server: Served,
+    _opened_scene: _OpenedScene,
+    request: pytest.FixtureRequest,
+) -> Iterator[ScenePage]:
+    """The finished run in the viewer, paused and as fitted, in a browser that tests share.
+
+    Opening a scene takes longer than most of what is done in it. Whoever changes its physics or
+    what it shows of it changes that back.
     """
-    with quiet_context(browser) as context:
-        page = context.new_page()
-        page.goto(served.url)
+    opened = _opened_scene
+    if opened.scene is None:
+        page = browser.new_context(viewport=_VIEWPORT).new_page()
+        opened.complaints = _complaints_in(page.context)
+        page.goto(_shared_server.url)
         scene = ScenePage.opened_from(page)
         scene.pause()
-        yield scene
+        opened.scene = scene
+    failed = request.session.testsfailed
+    opened.scene.page.set_viewport_size(_VIEWPORT)
+    for tab in ("Physics", "Springs"):
+        opened.scene.tab(tab)
+    yield opened.scene
+    complaints = [*opened.complaints]
+    opened.complaints.clear()
+    if complaints or request.session.testsfailed > failed:
+        opened.close()
+    assert complaints == []
 
 
 @pytest.fixture

@@ -229,6 +229,7 @@ def test_another_tab_is_left_alone(shared_scene: ScenePage, served):
     other.press("1 ▶")
     other.until(lambda: other.value("Frame") != frame, "a step by one frame")
     page.close()
+    scene.press("Reset")
 
 
 def test_a_run_page_exports_the_rollout(home, fitted, tmp_path, picture):

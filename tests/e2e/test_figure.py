@@ -86,3 +86,5 @@ def test_a_scene_is_one_tab_s_own(shared_scene: ScenePage, browser: Browser, ser
     assert stranger.goto(address).status == 404
     expect(stranger.locator("main")).to_contain_text("belongs to another browser")
     stranger.context.close()
+    second.close()
+    scene.press("Reset")

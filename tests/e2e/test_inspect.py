@@ -17,13 +17,6 @@ BUNDLED = Path(__file__).parents[2] / "sequences"
 FRAME, NODE = 30, 0
 
 
-@pytest.fixture
-def scene(home):
-    scene = ScenePage.opened_from(home)
-    scene.pause()
-    return scene
-
-
 def place_on_page(scene: ScenePage, point: np.ndarray) -> tuple[float, float]:
     """Where a point of the scene is seen, with the camera where it stands at first."""
     framing = frame_content(open_run(FolderCatalog(BUNDLED), "towel_fold_quick"))
@@ -89,8 +82,10 @@ def press_and_see(scene: ScenePage, key: str, field: str) -> None:
     scene.until(lambda: scene.link().get(field) != before, f"another '{field}' by {key}")
 
 
-def test_keys_colors_and_clicks_work_in_the_scene_and_around_it(scene, picture):
-    page = scene.page
+def test_keys_colors_and_clicks_work_in_the_scene_and_around_it(shared_scene, picture):
+    scene, page = shared_scene, shared_scene.page
+    scene.tab("Look")
+    plain = scene.chosen("Color by")
     # The page around has the focus; the keys reach the scene all the same.
     page.locator(".hints").click()
     page.keyboard.press("Home")
@@ -135,10 +130,14 @@ def test_keys_colors_and_clicks_work_in_the_scene_and_around_it(scene, picture):
     with page.expect_download() as download:
         page.keyboard.press("s")
     assert download.value.suggested_filename.endswith(".png")
+    for layer in "12":
+        press_and_see(scene, layer, "show")
+    scene.tab("Look")
+    scene.choose("Color by", plain)
 
 
-def test_a_lasso_selects_nodes_that_are_cut_apart_and_undone(scene) -> None:
-    page = scene.page
+def test_a_lasso_selects_nodes_that_are_cut_apart_and_undone(shared_scene) -> None:
+    scene, page = shared_scene, shared_scene.page
     page.keyboard.press("b")
     scene.until(lambda: scene.has("Selected: nothing"), "the scene is edited")
     scene.choose("Tool", "lasso")
@@ -157,3 +156,5 @@ def test_a_lasso_selects_nodes_that_are_cut_apart_and_undone(scene) -> None:
     scene.until(lambda: (scene.number("Cut ", " springs") or 0) > 50, "springs are cut")
     page.keyboard.press("Control+z")
     scene.until(lambda: scene.has("No edits."), "it is undone")
+    page.keyboard.press("b")
+    scene.until(lambda: scene.has("Edit (B)"), "playback again")

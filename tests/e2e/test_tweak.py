@@ -1,12 +1,13 @@
 """What sliders find is undone by keys, kept as a preset and as a run, in a real browser."""
 
 import re
+import shutil
 
 import numpy as np
 import pytest
 import yaml
+from accessibility import violations
 from playwright.sync_api import expect
-from scene_page import ScenePage
 
 from physhandi.run import Run
 
@@ -102,6 +103,7 @@ def test_every_tab_fits_its_window_and_is_reached_by_keys(shared_scene):
         scene.until(lambda at=frame: scene.value("Frame") != at, "another frame")
         if name == "Look":
             page.keyboard.press("v")
+            plain = scene.chosen("Color by")
             scene.choose("Color by", "stiffness")
             scene.until(lambda: scene.has("Force per unit strain"), "the legend")
             scene.row("Cameras").get_by_role("checkbox").check()  # Keys go on working.
@@ -110,8 +112,25 @@ def test_every_tab_fits_its_window_and_is_reached_by_keys(shared_scene):
             scene.until(lambda: scene.has("Swap sides"), "the comparison")
         assert tab.evaluate(_HANGS_OVER) <= 0, name
     page.keyboard.press("v")
+    scene.tab("Look")
+    scene.choose("Color by", plain)
+    scene.row("Cameras").get_by_role("checkbox").uncheck()
     scene.tab("Physics")
     scene.press("Reset")
+
+
+def test_no_tab_keeps_anybody_out(shared_scene):
+    """Not by names that are missing, nor by colors that cannot be told apart."""
+    scene, page = shared_scene, shared_scene.page
+    page.emulate_media(reduced_motion="reduce")  # Or colors are looked at while they change.
+    frame = next(frame for frame in page.frames if "/viewer/" in frame.url)
+    for scheme in ("dark", "light"):
+        page.emulate_media(color_scheme=scheme)
+        frame.locator(f"html[data-mantine-color-scheme={scheme}]").wait_for(state="attached")
+        for tab in ("Physics", "Look", "Play", "Edit", "Export"):
+            scene.tab(tab)
+            assert violations(frame) == [], f"{tab}, {scheme}"
+    page.emulate_media(color_scheme="null", reduced_motion="null")
 
 
 _STEERED = """() => {
@@ -145,6 +164,7 @@ def test_a_held_key_and_the_dragged_gizmo_move_hand_and_object(shared_scene):
     scene.tab("Physics")
     before = look()["object"]
     hint = page.locator("[data-first-hint]")
+    hint.evaluate("hint => (hint.hidden = false)")  # Somebody may have closed it.
     expect(hint).to_be_visible()
     keyboard.press("g")
     sign = scene.panel.get_by_role("status").filter(has_text="Steering the right hand")
@@ -202,9 +222,8 @@ def test_on_a_phone_the_panel_is_a_sheet_below_the_scene(shared_scene):
     page.set_viewport_size({"width": 1280, "height": 800})
 
 
-def test_a_change_is_kept_as_preset_and_run(home, served, tmp_path):
-    scene = ScenePage.opened_from(home)
-    scene.pause()
+def test_a_change_is_kept_as_preset_and_run(shared_scene, served, tmp_path):
+    scene = shared_scene
     scene.set("stiffness", 0.2)
     scene.new_difference("a softer object")
     scene.tab("Export")
@@ -219,7 +238,7 @@ def test_a_change_is_kept_as_preset_and_run(home, served, tmp_path):
 
     with np.load(scene.download("NPZ", tmp_path)) as data:
         shown = data["position"]
-    with home.context.expect_page() as opened:
+    with scene.page.context.expect_page() as opened:
         scene.panel.get_by_role("link", name="Soft <b>towel").click()
     page = opened.value
     expect(page.locator("h1")).to_have_text("Soft <b>towel")
@@ -228,5 +247,9 @@ def test_a_change_is_kept_as_preset_and_run(home, served, tmp_path):
     assert run.kind == "simulation"
     assert run.json("metrics.json")["towel_fold"]
     np.testing.assert_array_equal(run.array("sequences/towel_fold/rollout.npy"), shown)
-    home.goto(served.url)
-    expect(home.locator(f"#runs [data-run='{run.id}']")).to_contain_text("Soft <b>towel")
+    page.goto(served.url)
+    expect(page.locator(f"#runs [data-run='{run.id}']")).to_contain_text("Soft <b>towel")
+    page.close()
+    scene.tab("Physics")
+    scene.press("Reset")
+    shutil.rmtree(run.folder)  # Other tests show the lists of this server.
