@@ -212,6 +212,7 @@ def export(
     width: int = 1280,
     height: int = 720,
     turn: float = 0.0,
+    camera_path: Path | None = None,
     overwrite: bool = False,
     device: Device = "auto",
     data_dir: DataDir = None,
@@ -234,6 +235,8 @@ def export(
         width: Width of a picture or film in pixels, 16 to 4096.
         height: Height of a picture or film in pixels, 16 to 4096.
         turn: Angle in degrees by which the camera of a film goes round what it looks at.
+        camera_path: JSON file with key frames that the camera of a film passes through
+            (docs/formats.md).
         overwrite: Replace what is there.
     """
     from app.exports.shell import ExportOptions
@@ -249,6 +252,7 @@ def export(
         width=width,
         height=height,
         turn=turn,
+        camera_path=camera_path,
         device=pick_device(device) if link else "cpu",
         overwrite=overwrite,
     )

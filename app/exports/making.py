@@ -121,7 +121,7 @@ def make(
             out,
             as_gif=order.format == "gif",
             size=(order.width, order.height),
-            turn=order.turn,
+            motion=order.motion,
             time_limit_s=time_limit_s,
         )
         return

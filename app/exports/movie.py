@@ -11,8 +11,9 @@ from jaxtyping import UInt8
 from numpy import ndarray
 
 from app.exports.offscreen import Offscreen
+from app.viewer.content.camera_path import CameraMotion
 from app.viewer.content.content import Content
-from app.viewer.content.session_state import Pose, SessionState
+from app.viewer.content.session_state import SessionState
 from physhandi.data.files import replacing
 from physhandi.errors import UsageError
 from physhandi.object_rollout import ObjectRollout
@@ -35,7 +36,7 @@ def film_scene(
     *,
     as_gif: bool,
     size: tuple[int, int],
-    turn: float = 0.0,
+    motion: CameraMotion | None = None,
     time_limit_s: float = math.inf,
 ) -> None:
     """Film the frames of a sequence that are played, in one step or not at all.
@@ -51,13 +52,14 @@ def film_scene(
         out: File to write.
         as_gif: Whether to write a GIF instead of an MP4.
         size: Columns and rows [px].
-        turn: Angle by which the camera goes round what it looks at, from the first frame to one
-            after the last, so that a whole turn repeats without a jump [degrees].
+        motion: How the camera moves; None for one that stands still.
         time_limit_s: Time that there is [s].
 
     Raises:
         UsageError: If the film would take longer than there is time, or cannot be encoded.
     """
+    if motion is not None:
+        motion.check(content.frame_count, content.sequence_name)
     first, last = state.part or (0, content.frame_count - 1)
     frames = range(first, last + 1)
     most_pixels = time_limit_s * FILMED_PIXELS_PER_SECOND / len(frames)
@@ -68,7 +70,7 @@ def film_scene(
             f"takes for a file. Choose at most {int(most_pixels):,} pixels or a shorter part "
             "(part=FIRST,LAST), or film it with 'physhandi export', which takes its time."
         )
-    pictures = _pictures(content, take, state, report, frames=frames, size=size, turn=turn)
+    pictures = _pictures(content, take, state, report, frames=frames, size=size, motion=motion)
     rate = content.frame_rate * state.speed
     with replacing(out) as temporary:
         if as_gif:
@@ -85,7 +87,7 @@ def _pictures(
     *,
     frames: range,
     size: tuple[int, int],
-    turn: float,
+    motion: CameraMotion | None,
 ) -> Iterator[UInt8[ndarray, "row column 3"]]:
     """Draw frame after frame (red, green, blue)."""
     count = len(frames)
@@ -93,24 +95,9 @@ def _pictures(
         for done, frame in enumerate(frames):
             scene.recorded = frame / content.frame_rate
             scene.draw(frame, is_playing=False)
-            pose = turned_pose(scene.pose, np.radians(turn) * done / count)
+            pose = scene.pose if motion is None else motion.pose(frame, scene.pose, frames)
             yield np.ascontiguousarray(scene.picture(size, pose))
             report(done + 1, count)
-
-
-def turned_pose(pose: Pose, angle: float) -> Pose:
-    """Move a camera round what it looks at, anticlockwise seen from above.
-
-    Args:
-        pose: Where it stands.
-        angle: By how much [rad].
-    """
-    up = pose.up / np.linalg.norm(pose.up)
-    arm = pose.position - pose.look_at
-    along = (arm @ up) * up
-    across = arm - along
-    moved = along + np.cos(angle) * across + np.sin(angle) * np.cross(up, across)
-    return Pose(position=pose.look_at + moved, look_at=pose.look_at, up=pose.up, fov=pose.fov)
 
 
 def _write_mp4(path: Path, pictures: Iterator[ndarray], rate: float, size: tuple[int, int]) -> None:

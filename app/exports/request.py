@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Literal
 
 from app.exports.permalink import state_from_query
+from app.viewer.content.camera_path import CameraMotion, Turntable, parse_camera_path
 from app.viewer.content.session_state import SessionState
 from physhandi.errors import UsageError
 
@@ -58,6 +59,8 @@ class FileRequest:
     """Height of a picture or film [px]."""
     turn: float = 0.0
     """Angle by which the camera of a film goes round [degrees]."""
+    camera_path: str = ""
+    """How the camera of a film moves, as JSON; see `parse_camera_path`."""
     device: str = "cpu"
     """Warp device, if parameters were changed."""
     link: str = ""
@@ -68,6 +71,19 @@ class FileRequest:
         """How the file ends, without the dot."""
         is_one = self.format == "ply" and self.frame is not None
         return "ply" if is_one else _SUFFIXES.get(self.format, self.format)
+
+    @property
+    def motion(self) -> CameraMotion | None:
+        """How the camera of a film moves; None for one that stands still.
+
+        Raises:
+            UsageError: If the camera path makes no sense, or there is a turn, too.
+        """
+        if not self.camera_path:
+            return Turntable(self.turn) if self.turn else None
+        if self.turn:
+            raise UsageError("turn: a film has a camera path or a turn, not both.")
+        return parse_camera_path(self.camera_path)
 
     def check(self) -> SessionState:
         """Find out early what cannot work.
@@ -85,6 +101,8 @@ class FileRequest:
             raise UsageError(
                 f"turn: {self.turn} is not between -{LARGEST_TURN:g} and {LARGEST_TURN:g} degrees."
             )
+        if self.motion is not None and self.camera_path and self.format not in {"mp4", "gif"}:
+            raise UsageError(f"camera_path: mp4 and gif have one, {self.format} has none.")
         state = state_from_query(self.query)
         if self.format == "yaml" and state.is_changed:
             raise UsageError(

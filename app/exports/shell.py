@@ -11,6 +11,7 @@ from app.exports.files import request_of
 from app.exports.making import Report, make, surface_of
 from app.exports.permalink import state_from_query
 from app.jobs.catalog import Catalog
+from app.viewer.content.camera_path import read_camera_path
 from physhandi.data.exporters import FORMATS, export_run
 from physhandi.errors import UsageError
 from physhandi.run import Run
@@ -36,6 +37,8 @@ class ExportOptions:
     """Height of a picture [px]."""
     turn: float = 0.0
     """Angle by which the camera of a film goes round [degrees]."""
+    camera_path: Path | None = None
+    """File that tells how the camera of a film moves."""
     device: str = "cpu"
     """Warp device, if the link changes parameters."""
     overwrite: bool = False
@@ -76,6 +79,7 @@ def export(
         width=options.width,
         height=options.height,
         turn=options.turn,
+        camera_path=_path_text(options.camera_path),
         device=options.device,
     )
     if options.format in FORMATS and not state.is_changed:
@@ -102,6 +106,14 @@ def export(
     out.parent.mkdir(parents=True, exist_ok=True)
     make(order, out, report)
     return out
+
+
+def _path_text(path: Path | None) -> str:
+    """Read a camera path, and refuse one that makes no sense by its file's name."""
+    if path is None:
+        return ""
+    read_camera_path(path)
+    return path.read_text(encoding="utf-8")
 
 
 def read_link(text: str) -> Mapping[str, str]:

@@ -1,5 +1,6 @@
 """Films, read back by a decoder and compared with pictures of single frames."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,9 @@ from server_world import World
 from app.cli import main
 from app.exports.files import request_of
 from app.exports.making import make
-from app.exports.movie import FILMED_PIXELS_PER_SECOND, gif_durations, turned_pose
+from app.exports.movie import FILMED_PIXELS_PER_SECOND, gif_durations
 from app.exports.request import FileRequest
+from app.viewer.content.camera_path import PATH_FORMAT, read_camera_path, turned_pose
 from app.viewer.content.session_state import Pose
 from physhandi.errors import UsageError
 from physhandi.run import Run
@@ -105,6 +107,67 @@ def test_the_command_films(world: World, tmp_path: Path) -> None:
     assert end.value.code in {0, None}
     _, frames = frames_of(out)
     assert frames[0].shape == (64, 96, 3)
+
+
+def test_the_camera_of_a_film_passes_through_key_frames(
+    world: World, made: list[FileRequest], tmp_path: Path
+) -> None:
+    file, out, data = tmp_path / "way.json", tmp_path / "a.mp4", str(world.settings.data_dir)
+    keys = [
+        {"frame": 1, "position": [0.5, -0.4, 0.5], "look_at": [0.05, 0.05, 0.0], "fov": 50},
+        {"frame": 7, "position": [0.1, -0.6, 0.4], "look_at": [-0.05, 0.0, 0.05], "fov": 40},
+    ]
+    file.write_text(json.dumps({"format": PATH_FORMAT, "kind": "keys", "keys": keys}))
+    order = ["export", "fitted", "--format", "mp4", "--out", str(out), "--data-dir", data]
+    look = ["--link", "show=nodes", "--width", "160", "--height", "120"]
+    with pytest.raises(SystemExit) as end:
+        main([*order, *look, "--camera-path", str(file)])
+    assert end.value.code in {0, None}
+    _, frames = frames_of(out)
+    path = read_camera_path(file)
+    seen = []
+    for frame in (0, 4, 9):
+        pose = path.pose(frame, None, range(10))
+        cam = ",".join(f"{x:.9g}" for x in (*pose.position, *pose.look_at))
+        up = ",".join(f"{x:.9g}" for x in pose.up)
+        view = f"cam={cam}&up={up}&fov={np.degrees(pose.fov):.9g}"
+        content = world.script().get(f"{RUN}?format=png&f={frame}&{LOOK}&{view}").content
+        image: Any = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+        seen.append(middle(image.astype(int)))
+        np.testing.assert_allclose(middle(frames[frame]), seen[-1], atol=1.0)
+    assert min(np.linalg.norm(seen[0] - seen[1]), np.linalg.norm(seen[2] - seen[1])) > 3.0
+
+
+def test_a_camera_path_that_does_not_fit_is_refused(
+    world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, data = tmp_path / "way.json", str(world.settings.data_dir)
+    key = {"frame": 10, "position": [0.5, -0.4, 0.5], "look_at": [0.0, 0.0, 0.0]}
+    table = {"format": PATH_FORMAT, "kind": "turntable", "turn": 90}
+    for content, more, suffix, told in (
+        (
+            {"format": PATH_FORMAT, "kind": "keys", "keys": [key]},
+            (),
+            "mp4",
+            "key frame 0: frame: 'sheet",
+        ),
+        (table, ("--turn", "5"), "mp4", "turn: a film has a camera path or a turn, not both"),
+        (table, (), "png", "camera_path: mp4 and gif have one, png has none"),
+        (
+            {"format": PATH_FORMAT, "kind": "keys", "keys": [{}]},
+            (),
+            "gif",
+            "way.json: key frame 0: frame",
+        ),
+    ):
+        file.write_text(json.dumps(content))
+        out = tmp_path / f"a.{suffix}"
+        order = ["export", "fitted", "--format", suffix, "--out", str(out), "--data-dir", data]
+        with pytest.raises(SystemExit) as end:
+            main([*order, *more, "--camera-path", str(file)])
+        assert end.value.code not in {0, None}
+        assert told in capsys.readouterr().err
+        assert not out.exists()
 
 
 def test_a_film_that_takes_longer_than_there_is_time_is_refused_at_once(
