@@ -1,7 +1,8 @@
 """Simulates many candidates of one object together: on CUDA, one launch a substep for all.
 
 `BatchSimulator` is the entry; `Population` holds the candidates on the device, `LossSum` their
-losses. Few candidates are moved side by side instead (`engines.side_by_side`).
+losses. Few candidates are moved in one launch a frame instead: side by side
+(`engines.side_by_side`), or those of larger objects several to a block (`engines.batch_blocks`).
 """
 
 from collections.abc import Iterator
@@ -17,10 +18,11 @@ from numpy import ndarray
 
 from physhandi.errors import SimulationDivergedError, UsageError
 from physhandi.simulation.contact_intervals import NEVER, acts_in, always
+from physhandi.simulation.engines.batch_blocks import BatchBlocks
 from physhandi.simulation.engines.cpu import CpuEngine
 from physhandi.simulation.engines.graph import LaunchGraph
 from physhandi.simulation.engines.partition import bisect_nodes
-from physhandi.simulation.engines.side_by_side import SideBySide
+from physhandi.simulation.engines.side_by_side import FEW_OWN, SideBySide
 from physhandi.simulation.kernels.batch import (
     CANDIDATE_FIELDS,
     block_threads,
@@ -29,10 +31,12 @@ from physhandi.simulation.kernels.batch import (
     place_batch,
     take_batch,
 )
+from physhandi.simulation.kernels.batch_frame import GROUP_WIDTH
 from physhandi.simulation.kernels.batch_losses import (
     NODES,
     POINTS_PER_THREAD,
     add_losses,
+    find_nearest,
     sum_accelerations,
     sum_chamfer,
     sum_tracks,
@@ -43,6 +47,8 @@ from physhandi.simulation.simulator import SPEED_LIMIT, Simulator, checked_contr
 
 _BUSY_WARPS = 24
 """Warps that keep a multiprocessor busy."""
+_BUSY_THREADS, _MOST_SLICES = 2**18, 64
+"""Threads that keep a GPU busy, and most slices of an object's surface to get as many."""
 BLOCK_NODES = 4
 """Consecutive nodes in memory that are also neighbours in space."""
 batch_kernel = lru_cache(maxsize=None)(make_batch_kernel)
@@ -116,11 +122,13 @@ class LossSum:
         more = ((0, 0), (0, chunks * POINTS_PER_THREAD - points))
         cloud = np.pad(target.cloud[:, :points], (*more, (0, 0)))
         weight = np.pad(target.cloud_weight[:, :points], more)
-        self._cloud = [
-            self._array(surface, wp.int32),
-            self._array(cloud, wp.vec3),
-            self._array(weight, wp.float32),
-        ]
+        self._cloud = [self._array(surface, wp.int32), self._array(cloud, wp.vec3)]
+        self._cloud_weight = self._array(weight, wp.float32)
+        # A few candidates keep a GPU busy only if several threads walk over the nodes.
+        threads = _BUSY_THREADS if wp.get_device(device).is_cuda else 1
+        slices = min(max(threads // max(chunks * lanes, 1), 1), _MOST_SLICES)
+        shape = (slices, chunks * POINTS_PER_THREAD, lanes)
+        self._nearest = wp.zeros(shape, dtype=wp.float32, device=device)
         self._track = [
             self._array(target.track, wp.vec3),
             self._array(target.track_weight, wp.float32),
@@ -146,7 +154,15 @@ class LossSum:
             diverged_frame: Frame in which each candidate diverged; -1 for none.
         """
         if frame > 0:
-            self._launch(sum_chamfer, 0, [frame, *self._layout, *self._cloud, state])
+            slices, points, _ = self._nearest.shape
+            wp.launch(
+                find_nearest,
+                dim=(points // POINTS_PER_THREAD, slices, self._lanes),
+                inputs=[frame, *self._layout, slices, *self._cloud, state],
+                outputs=[self._nearest],
+                device=self._device,
+            )
+            self._launch(sum_chamfer, 0, [frame, self._cloud_weight, self._nearest])
             self._launch(sum_tracks, 1, [frame, *self._layout, *self._track, state])
             if frame > 1:
                 inputs = [self._acceleration_weight, *self._layout, *self._past, state]
@@ -199,7 +215,10 @@ class BatchLosses:
 
 
 class Population:
-    """The arrays of a batch of candidates on a CUDA device; one launch advances them all."""
+    """The arrays of a batch of candidates on a CUDA device; one launch advances them all.
+
+    It advances them by a substep, or by a frame if there are few enough for `BatchBlocks`.
+    """
 
     def __init__(
         self,
@@ -207,23 +226,36 @@ class Population:
         parameters: tuple[SimulationParameters, ...],
         substeps: int,
         device: Any,
+        *,
+        in_blocks: bool = False,
     ) -> None:
+        """Copy candidates to the device.
+
+        Args:
+            master: Springs of all candidates.
+            parameters: The candidates.
+            substeps: Of a frame, for all.
+            device: Warp device.
+            in_blocks: Whether one launch advances them by a frame, if they fit the device so.
+        """
         self._device = device
         self._substeps = substeps
         self._count = len(parameters)
         self._nodes = len(master.object_node)
-        # More candidates a thread share more memory reads, but small batches need all threads.
-        self._each = 1 if self._count <= 64 else 2
-        self._width = 32 * self._each
-        self._groups = -(-self._count // self._width)
-        # A few candidates of a small object leave most of the device idle, so nodes get more warps.
-        needed_warps = _BUSY_WARPS * device.sm_count / (self._groups * max(self._nodes, 1))
-        self._parts = next((parts for parts in (1, 8, 16) if parts >= needed_warps), 32)
         # Candidates with similar radii share a group, so that few of them wait for others.
         reach = np.array([(p.connection_radius, p.virtual_connection_radius) for p in parameters])
         self._order = np.lexsort(reach.T[::-1])
-        lanes = np.full(self._groups * self._width, self._order[-1])
-        lanes[: self._count] = self._order
+        self._model_node = bisect_nodes(master.object_node, max(1, self._nodes // BLOCK_NODES))[0]
+        self.blocks: BatchBlocks | None = None
+        if in_blocks:
+            sharing = [parameters[i] for i in self._lanes(GROUP_WIDTH)]
+            self.blocks = BatchBlocks.of(master, sharing, self._node_number(), device)
+        # More candidates a thread share more memory reads, but small batches need all threads.
+        self._each = 1 if self._count <= 64 else 2
+        self._width = 32 * self._each if self.blocks is None else GROUP_WIDTH
+        lanes = self._lanes(self._width)
+        self._groups = len(lanes) // self._width
+        self._parts = _warps_of_a_node(self._groups * self._nodes, device)
         numbers = [
             [_number(parameters[i], name, substeps) for i in lanes] for name in CANDIDATE_FIELDS
         ]
@@ -233,15 +265,14 @@ class Population:
         group_reach = reach[lanes].reshape(self._groups, self._width, 2).max(axis=1)
         limit = np.array([(p.connection_radius, p.max_neighbors) for p in parameters])
         group_limit = limit[lanes].reshape(self._groups, self._width, 2).min(axis=1)
-        blocks = max(1, self._nodes // BLOCK_NODES)
-        self._model_node = bisect_nodes(master.object_node, blocks)[0]
         rest_length = master.rest_length(parameters[0])
         self._inputs = [
             self._array(master.clearance[self._model_node], wp.float32),
             self._array(table.swapaxes(0, 1).ravel(), wp.float32),
             self._array(group_reach.T.astype(np.float32), wp.float32),
-            *self._entries(master, rest_length, group_reach[:, 0], group_limit),
         ]
+        if self.blocks is None:
+            self._inputs += self._entries(master, rest_length, group_reach[:, 0], group_limit)
         virtual, start = self._virtual(master)
         control = master.spring_nodes[virtual].max(axis=1) - self._nodes
         self._inputs += [start, *self._springs(master, rest_length, control, virtual)]
@@ -280,9 +311,7 @@ class Population:
         self, control: Float32[ndarray, "frame control 3"], target: MotionTarget
     ) -> BatchLosses:
         """Simulate the observed frames and compare; the host waits once, at the end."""
-        number = np.empty(self._nodes, dtype=np.int64)
-        number[self._model_node] = np.arange(self._nodes)
-        lanes = len(self._diverged)
+        lanes, number = len(self._diverged), self._node_number()
         losses = LossSum(target, number, lanes=lanes, width=self._width, device=self._device)
         for frame in self._frames(control[: target.frame_count]):
             losses.add(frame, self._state[0], self._diverged_frame)
@@ -311,7 +340,7 @@ class Population:
                         wp.copy(place, path, src_offset=source * count, count=count)
                 if ranks is not None:
                     wp.copy(self._held_rank, ranks, src_offset=frame * held, count=held)
-                self._frame.replay()
+                self._advance()
                 self._launch(
                     note_divergence,
                     len(self._diverged),
@@ -319,6 +348,21 @@ class Population:
                     [self._diverged_frame],
                 )
             yield frame
+
+    def _advance(self) -> None:
+        """Advance all candidates by a frame."""
+        if self.blocks is None:
+            self._frame.replay()
+            return
+        self.blocks.advance(
+            self._substeps,
+            *self._state,
+            model=self._inputs[:3],
+            held=self._inputs[-3:],
+            controls=self._controls,
+            diverged=self._diverged,
+        )
+        self._state.reverse()
 
     def _acting_ranks(self, frame_count: int) -> wp.array | None:
         """List the rank of every virtual spring for every frame; None if all act in all frames.
@@ -401,9 +445,19 @@ class Population:
 
     def _numbered(self, node: Int[ndarray, "*ends"]) -> Int[ndarray, "*ends"]:
         """Turn the model's numbers of object nodes into those of the batch."""
+        return self._node_number()[node]
+
+    def _node_number(self) -> Int[ndarray, " node"]:
+        """Return the index in the states of each of the model's nodes."""
         number = np.empty(self._nodes, dtype=np.int64)
         number[self._model_node] = np.arange(self._nodes)
-        return number[node]
+        return number
+
+    def _lanes(self, width: int) -> Int[ndarray, " lane"]:
+        """Return the candidates in groups of a width; the last one fills the last group."""
+        lanes = np.full(-(-self._count // width) * width, self._order[-1])
+        lanes[: self._count] = self._order
+        return lanes
 
     def _sorted(
         self, source: Int[ndarray, " entry"], length: Float[ndarray, " entry"]
@@ -425,6 +479,15 @@ class Population:
 
     def _array(self, value: ndarray, dtype: Any) -> wp.array:
         return wp.array(np.ascontiguousarray(value), dtype=dtype, device=self._device)
+
+
+def _warps_of_a_node(tasks: int, device: Any) -> int:
+    """Return how many warps share a node.
+
+    A few candidates of a small object leave most of the device idle, so nodes get more warps.
+    """
+    needed = _BUSY_WARPS * device.sm_count / max(tasks, 1)
+    return next((parts for parts in (1, 8, 16) if parts >= needed), 32)
 
 
 def _number(parameters: SimulationParameters, name: str, substeps: int) -> float:
@@ -471,8 +534,8 @@ class BatchSimulator:
             device: Warp device.
             threads: Threads of a candidate on a CPU, 1 or 2; None for whichever is faster. The
                 bits are the same.
-            side_by_side: Whether few candidates are moved side by side on CUDA, in one launch a
-                frame, or interleaved as many are.
+            side_by_side: Whether few candidates are moved in one launch a frame on CUDA, each in
+                blocks of its own or four to a block, or interleaved as many are.
 
         Raises:
             UsageError: If there is no candidate, or candidates differ in what must be common:
@@ -564,9 +627,14 @@ class BatchSimulator:
             return None
         if self._population is None:
             candidates = self.master, self.parameters, self.substeps, self.device
+            # The fastest first, as measured (docs/benchmarks).
             if self._side_by_side:
-                self._population = SideBySide.of(*candidates)
-            self._population = self._population or Population(*candidates)
+                self._population = SideBySide.of(*candidates, most_own=FEW_OWN)
+            if self._population is None:
+                population = Population(*candidates, in_blocks=self._side_by_side)
+                if self._side_by_side and population.blocks is None:
+                    self._population = SideBySide.of(*candidates)
+                self._population = self._population or population
         return self._population
 
     def _side_by_side_rollout(

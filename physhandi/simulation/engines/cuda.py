@@ -51,7 +51,7 @@ LANES_PER_NODE = (8, 4, 2, 1)
 LOCALS_STEP = 512
 """Large frames: step of the number of local nodes, so that few sizes are compiled."""
 _BYTES_OF_A_LOCAL = 4 * FLOATS_OF_A_LOCAL
-_BYTES_OF_A_THREAD = 4
+BYTES_OF_A_THREAD = 4
 """Shared memory that Warp itself uses for each thread [B]."""
 large_frame_kernel = lru_cache(maxsize=None)(make_large_frame_kernel)
 
@@ -111,7 +111,7 @@ def arrange_columns(partition: Partition, lanes: int, threads: int) -> HalfEdgeC
 
 def most_large_locals(device: Any) -> int:
     """Return how many nodes, own and halo, fit the shared memory of a block."""
-    free = int(device.max_shared_memory_per_block) - _BYTES_OF_A_THREAD * max(LARGE_BLOCK_SIZES)
+    free = int(device.max_shared_memory_per_block) - BYTES_OF_A_THREAD * max(LARGE_BLOCK_SIZES)
     return max(0, free // _BYTES_OF_A_LOCAL)
 
 
@@ -235,6 +235,28 @@ class BlockLayout:
         return has_threads and partition.most_entries <= self.lanes * self.kept
 
 
+class Relay:
+    """Where blocks of a launch publish values, each under a tag that it never had before."""
+
+    def __init__(self, count: int, device: Any) -> None:
+        """Allocate places for values.
+
+        Args:
+            count: Places.
+            device: Warp device.
+        """
+        self.value = wp.zeros(count, dtype=wp.vec4, device=device)
+        self._tag = 1
+
+    def next_tags(self, count: int) -> int:
+        """Reserve tags that no value has; the first of them is returned."""
+        if self._tag > _LAST_TAG:
+            self.value.zero_()
+            self._tag = 1
+        self._tag += count
+        return self._tag - count
+
+
 class CudaEngine:
     """The arrays of one model for the CUDA kernels."""
 
@@ -264,9 +286,8 @@ class CudaEngine:
         bodies = np.zeros(partition.block_count, np.int32) if body_of is None else body_of
         self._body = simulator.array(bodies, wp.int32)
         count = len(partition.model_node)
-        self._relay = wp.zeros(4 * count, dtype=wp.vec4, device=simulator.device)
+        self._relay = Relay(4 * count, simulator.device)
         self._no_tape = wp.zeros((0, 0), dtype=wp.vec4, device=simulator.device)
-        self._tag = 1
         is_large = partition.most_locals > FORWARD_LOCALS
         is_large = is_large or (has_many and not layout.holds(partition))
         self.large: LargeFrames | None = None
@@ -287,14 +308,6 @@ class CudaEngine:
         partition = partition_model(model, blocks)
         fits = partition.most_locals <= max(FORWARD_LOCALS, most_large_locals(device))
         return CudaEngine(simulator, partition) if fits else None
-
-    def next_tags(self, count: int) -> int:
-        """Reserve tags that no value in the relay has."""
-        if self._tag > _LAST_TAG:
-            self._relay.zero_()
-            self._tag = 1
-        self._tag += count
-        return self._tag - count
 
     def advance(
         self,
@@ -317,16 +330,16 @@ class CudaEngine:
         if self.large is not None:
             if tape is not None:
                 raise ValueError("Blocks in dynamic shared memory keep no tape.")
-            tag = self.next_tags(substeps + 1)
-            self.large.advance([self._body, *self._map[:4]], self._relay, tag, before, after)
+            tag = self._relay.next_tags(substeps + 1)
+            self.large.advance([self._body, *self._map[:4]], self._relay.value, tag, before, after)
             return
         self._launch(
             frame_kernel(self.layout.lanes, self.layout.kept),
-            [self.layout.threads, substeps, self.next_tags(substeps + 1), simulator.world],
+            [self.layout.threads, substeps, self._relay.next_tags(substeps + 1), simulator.world],
             [self._body, simulator.clearance, *self._map, *simulator.material],
             [*simulator.controls, *before],
             [
-                self._relay,
+                self._relay.value,
                 self._no_tape if tape is None else tape,
                 *after,
                 simulator.first_divergence,
@@ -354,10 +367,10 @@ class CudaEngine:
         substeps = simulator.parameters.substeps_per_frame
         self._launch(
             adjoint_kernel(self.layout.lanes, self.layout.kept),
-            [self.layout.threads, substeps, self.next_tags(substeps), simulator.world],
+            [self.layout.threads, substeps, self._relay.next_tags(substeps), simulator.world],
             [simulator.clearance, *self._map, is_first, object_spring_count],
             [*simulator.material, *simulator.controls, tape],
-            [*state_bars, self._relay, *bars],
+            [*state_bars, self._relay.value, *bars],
         )
 
     def _launch(self, kernel: Any, *arguments: list[Any]) -> None:

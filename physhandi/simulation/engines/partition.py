@@ -53,13 +53,16 @@ class Partition:
 
 
 def bisect_nodes(
-    node: Float[ndarray, "node 3"], block_count: int
+    node: Float[ndarray, "node 3"],
+    block_count: int,
+    weight: Float[ndarray, " node"] | None = None,
 ) -> tuple[Int[ndarray, " node"], Int[ndarray, " block_1"]]:
     """Bisect a point set recursively across its longest side into blocks of equal size.
 
     Args:
         node: Positions [m].
         block_count: Number of blocks, at most the number of nodes.
+        weight: What each node adds to the size of its block; 1 if left out. A block has a node.
 
     Returns:
         The nodes block by block, and where each block begins.
@@ -75,7 +78,13 @@ def bisect_nodes(
         part = order[begin:end]
         axis = int(np.ptp(node[part], axis=0).argmax())
         order[begin:end] = part[np.argsort(node[part, axis], kind="stable")]
-        middle = begin + round((end - begin) * (blocks // 2) / blocks)
+        if weight is None:
+            middle = begin + round((end - begin) * (blocks // 2) / blocks)
+        else:
+            total = np.cumsum(weight[order[begin:end]])
+            share = total[-1] * (blocks // 2) / blocks
+            middle = begin + int(np.searchsorted(total, share))
+            middle = min(max(middle, begin + blocks // 2), end - (blocks - blocks // 2))
         cut(begin, middle, blocks // 2)
         cut(middle, end, blocks - blocks // 2)
 

@@ -2,7 +2,8 @@
 
 Each body has blocks of its own, which wait for each other within a frame as those of a single
 model do (`engines.cuda`). For tens of candidates of hundreds of nodes that is two to four times as
-fast as one launch a substep (`engines.batch.Population`), which pays for more.
+fast as one launch a substep (`engines.batch.Population`). Where more than `FEW_OWN` nodes come to a
+block, blocks that several candidates share are faster (`engines.batch_blocks`).
 """
 
 from collections.abc import Iterator
@@ -27,8 +28,9 @@ from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.simulator import NO_DIVERGENCE, world_array
 
 _WORLD: Any = World
-LEAST_BLOCKS, MOST_OWN = 2, 1024
-"""Fewest blocks of a body, and most nodes of a block; beyond, interleaved candidates are faster."""
+LEAST_BLOCKS, FEW_OWN, MOST_OWN = 2, 512, 1024
+"""Fewest blocks of a body, nodes of a block up to which nothing is faster, and most nodes of one;
+beyond, interleaved candidates are faster."""
 
 
 class MasterHalfEdges:
@@ -190,6 +192,8 @@ class SideBySide:
         parameters: tuple[SimulationParameters, ...],
         substeps: int,
         device: Any,
+        *,
+        most_own: int = MOST_OWN,
     ) -> "SideBySide | None":
         """Create one; None if the bodies are too many or too large for the device.
 
@@ -198,10 +202,11 @@ class SideBySide:
             parameters: The candidates.
             substeps: Of a frame, for all.
             device: Warp device.
+            most_own: Most nodes of a block.
         """
         nodes = len(master.object_node)
         blocks = min(int(device.sm_count) // len(parameters), max(1, nodes // LEAST_OWN))
-        if blocks < LEAST_BLOCKS or nodes > MOST_OWN * blocks:
+        if blocks < LEAST_BLOCKS or nodes > most_own * blocks:
             return None
         edges = MasterHalfEdges(master, blocks)
         exists = [master.has(each) for each in parameters]

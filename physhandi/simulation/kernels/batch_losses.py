@@ -20,20 +20,20 @@ _Nearest = wp.types.vector(length=POINTS_PER_THREAD, dtype=wp.float32)
 
 
 @wp.kernel
-def sum_chamfer(
+def find_nearest(
     frame: int,
     width: int,
     nodes: int,
+    slices: int,
     surface: wp.array[int],
     cloud: wp.array2d[wp.vec3],
-    weight: wp.array2d[float],
     # State in:
     state: wp.array[float],
     # Out:
-    part_out: wp.array2d[float],
+    nearest_out: wp.array3d[float],
 ):
-    """Add up the squared distances of some observed points to the nearest surface node."""
-    chunk, candidate = wp.tid()
+    """Find the squared distances of some observed points to the nearest node of a slice."""
+    chunk, part, candidate = wp.tid()
     first = wp.static(POINTS_PER_THREAD) * chunk
     points = _Points()
     nearest = _Nearest()
@@ -43,8 +43,10 @@ def sum_chamfer(
         points[k, 1] = point[1]
         points[k, 2] = point[2]
         nearest[k] = wp.inf
-    for s in range(surface.shape[0]):
-        base = place_of(candidate, surface[s], nodes, width)
+    of_candidate = place_of(candidate, 0, nodes, width)
+    begin = part * surface.shape[0] // slices
+    for s in range(begin, (part + 1) * surface.shape[0] // slices):
+        base = of_candidate + 6 * width * surface[s]
         x = state[base]
         y = state[base + width]
         z = state[base + 2 * width]
@@ -53,9 +55,27 @@ def sum_chamfer(
             dy = points[k, 1] - y
             dz = points[k, 2] - z
             nearest[k] = wp.min(nearest[k], dx * dx + dy * dy + dz * dz)
-    total = float(0.0)
     for k in range(wp.static(POINTS_PER_THREAD)):
-        total += weight[frame, first + k] * nearest[k]
+        nearest_out[part, first + k, candidate] = nearest[k]
+
+
+@wp.kernel
+def sum_chamfer(
+    frame: int,
+    weight: wp.array2d[float],
+    nearest: wp.array3d[float],
+    # Out:
+    part_out: wp.array2d[float],
+):
+    """Add up the squared distances of some observed points to the nearest surface node."""
+    chunk, candidate = wp.tid()
+    first = wp.static(POINTS_PER_THREAD) * chunk
+    total = float(0.0)
+    for point in range(first, first + wp.static(POINTS_PER_THREAD)):
+        least = nearest[0, point, candidate]
+        for part in range(1, nearest.shape[0]):
+            least = wp.min(least, nearest[part, point, candidate])
+        total += weight[frame, point] * least
     part_out[chunk, candidate] = total
 
 

@@ -102,9 +102,9 @@ def test_tags_begin_again_before_they_run_out(monkeypatch):
     model, control = thrown_block(4)
     simulator = Simulator(model, PARAMETERS, device="cuda:0")
     wanted = simulator.rollout(control).position
-    simulator.engine._tag = 2**31 - 2**20 - 100
+    simulator.engine._relay._tag = 2**31 - 2**20 - 100
     assert np.array_equal(simulator.rollout(control).position, wanted)
-    assert simulator.engine._tag < 10_000
+    assert simulator.engine._relay._tag < 10_000
 
 
 def test_a_processor_has_another_engine():
