@@ -66,6 +66,8 @@ FIGURE_STYLE = Style(
     arrow_width=0.0032,
 )
 """Style of the paper's figure, in which the colors of both sides mean the object's parts."""
+_COLOR_NAMES = {"a": "blue", "b": "orange"}
+"""Words for the colors of `STYLES`."""
 GHOST: RGB = (140, 148, 160)
 """Color of A's nodes where B shows the difference from them."""
 ARROWS = 300
@@ -85,11 +87,14 @@ _NARROWEST = 13.0
 """Least width of a side in lines of text."""
 _ABOVE = 4.0
 """Room for captions above the sides in lines of text."""
+_SMALLER = 0.7
+"""Size of captions above sides that are in one place, as a part of others."""
 _BELOW = {False: 0.6, True: 2.6}
 """Room below the sides in lines of text, without and with the figure's legend."""
 _LONGEST_ARROW = 0.22
 _LONGEST_ARROW_OF_FIGURE = 0.3
 _HAND_OPACITY = 0.35
+_OVERLAY_OPACITY = 0.7
 _SAME_HAND = 1e-5
 _LIGHTNESS = np.array([0.299, 0.587, 0.114])
 """How much red, green and blue contribute to how light a color is."""
@@ -134,6 +139,15 @@ class Look:
             return 1.0
         part = 1.0 - self.fade if side == "a" else self.fade
         return min(1.0, 2.0 * part)
+
+    def opacity(self, side: str) -> float | None:
+        """Tell how opaque a side's surface is, so that both are seen in one place; None if it is.
+
+        Where colors mean the difference, A is a shadow of nodes.
+        """
+        if self.mode != "overlay" or self.fade in {0.0, 1.0} or self.tint == "difference":
+            return None
+        return _OVERLAY_OPACITY * self.strength(side)
 
 
 class CompareDrawing:
@@ -265,7 +279,7 @@ class CompareDrawing:
         self, key: str, side: ComparedSide, layers: Layers, *, is_visible: bool
     ) -> None:
         is_alone = side.rollout is None and self._look.mode == "side"
-        has_surface = self._surface_of(side, layers) is not None
+        has_surface = self._surface_of(key, layers) is not None
         opacity = None if is_alone or has_surface else _HAND_OPACITY
         for hand in side.content.hands:
             path, color = f"{_ROOT}/{key}/hand/{hand.side}", SKIN[hand.side]
@@ -304,8 +318,8 @@ class CompareDrawing:
             return
         # Springs would hide the other side long before they have faded.
         is_strong = strength > 0.5 and not look.is_ghost(key)
-        surface = self._surface_of(side, layers)
-        # Figures are of nodes and springs; in one place two objects are told apart by them.
+        surface = self._surface_of(key, layers)
+        # Figures are of nodes and springs.
         has_object = layers.nodes or (layers.surface and surface is None)
         has_parts = look.is_figure and layers.surface
         has_springs = layers.object_springs or (
@@ -350,10 +364,13 @@ class CompareDrawing:
         is_visible = has_object and strength > 0.0
         self._nodes.points(colored_path, point, color, size, is_visible=is_visible)
 
-    def _surface_of(self, side: ComparedSide, layers: Layers) -> ObjectSurface | None:
-        """Find the surface by which a side is shown, if it is: beside the other one, alone."""
-        look, surface, rollout = self._look, side.content.surface, side.rollout
-        if surface is None or rollout is None or look.mode != "side" or look.is_figure:
+    def _surface_of(self, key: str, layers: Layers) -> ObjectSurface | None:
+        """Find the surface by which a side is shown, if it is."""
+        side, look = self._sides[key], self._look
+        surface, rollout = side.content.surface, side.rollout
+        if surface is None or rollout is None or look.is_figure or look.is_ghost(key):
+            return None
+        if look.strength(key) == 0.0:
             return None
         has_its_nodes = surface.node_count == rollout.model.node_count
         return surface if layers.surface and has_its_nodes else None
@@ -373,7 +390,8 @@ class CompareDrawing:
         if painted is not None:
             color = painted.vertices(surface)
         vertex = surface.place(rollout.position[self._sides[key].frame])
-        self._nodes.mesh(path, vertex, surface.face, color, is_visible=True, opacity=None)
+        opacity = self._look.opacity(key)
+        self._nodes.mesh(path, vertex, surface.face, color, is_visible=True, opacity=opacity)
 
     def _painted(self, key: str, side: ComparedSide, other: ComparedSide) -> Painted | None:
         """Choose the colors of the difference; None for those of the side."""
@@ -436,18 +454,21 @@ class CompareDrawing:
         is_side = look.mode == "side"
         for key, side in self._sides.items():
             sign = -1.0 if (key == "a") != look.is_swapped else 1.0
-            aside = 0.5 * sign * GAP * wide * eye.right if is_side else np.zeros(3)
-            nodes.frame(f"{_ROOT}/{key}", aside)
-            for part, text, size, lines in (
-                ("title", side.title, 1.2, 2.9),
+            beside = 0.5 * sign * GAP * wide * eye.right
+            nodes.frame(f"{_ROOT}/{key}", beside if is_side else np.zeros(3))
+            # In one place sides are told apart by their colors, or by the line between them.
+            is_named = look.mode == "overlay" and look.tint == "side"
+            title = f"{side.title} ({_COLOR_NAMES[key]})" if is_named else side.title
+            for name, text, size, lines in (
+                ("title", title, 1.2, 2.9),
                 ("detail", side.detail, 0.9, 1.5),
             ):
-                path = f"{_ROOT}/{part}_{key}"
-                if is_side:
-                    place = middle + aside + (0.5 * high + lines * line) * eye.up
-                    height = size * line
-                    nodes.label(path, text, place, anchor="center-center", height=height)
-                nodes.show(path, is_visible=is_side and bool(text))
+                path = f"{_ROOT}/{name}_{key}"
+                part = 1.0 if is_side else _SMALLER
+                place = middle + part * beside + (0.5 * high + part * lines * line) * eye.up
+                height = part * size * line
+                nodes.label(path, text, place, anchor="center-center", height=height)
+                nodes.show(path, is_visible=bool(text))
         self._place_legend(middle - (0.5 * high + 1.6 * line) * eye.up)
         foot = middle + (self._border() - float(middle @ eye.right)) * eye.right
         ends = [foot + sign * 0.55 * high * eye.up for sign in (-1.0, 1.0)]

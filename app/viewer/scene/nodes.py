@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import viser
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 from numpy import ndarray
 
 from physhandi.srgb import to_linear
@@ -157,6 +157,8 @@ class SceneNodes:
             )
             return
         node.text, node.position, node.visible = text, position, True
+        if node.font_scene_height != height:
+            node.font_scene_height = height
 
     def segments(
         self,
@@ -281,15 +283,78 @@ class Plane:
         along = point @ self.direction
         return np.asarray(along <= self.limit if self.has_border else along < self.limit)
 
+    def cut(
+        self,
+        vertex: Float[ndarray, "vertex 3"],
+        face: Int[ndarray, "face 3"],
+        color: UInt8[ndarray, "vertex 3"],
+    ) -> tuple[Float32[ndarray, "kept 3"], Int[ndarray, "cut 3"], UInt8[ndarray, "kept 3"]]:
+        """Keep the part of a surface that lies in it; triangles on the border are cut.
+
+        Args:
+            vertex: Its vertices [m].
+            face: Its triangles.
+            color: Colors of the vertices.
+
+        Returns:
+            The same of the part, with the vertices that it needs; those on the border are not
+            shared between triangles.
+        """
+        is_in = self.keeps(vertex)
+        count = is_in[face].sum(axis=1)
+        # The vertex that is alone on its side comes first: two edges leave it over the border.
+        crossing = face[(count == 1) | (count == 2)]
+        alone = is_in[crossing] == (is_in[crossing].sum(axis=1) == 1)[:, None]
+        first = np.argmax(alone, axis=1)[:, None]
+        crossing = np.take_along_axis(crossing, (first + np.arange(3)) % 3, axis=1)
+        start, end = crossing[:, [0, 0]], crossing[:, 1:]
+        height = vertex @ self.direction - self.limit
+        part = height[start] / np.where(
+            height[start] == height[end], 1.0, height[start] - height[end]
+        )
+        part = np.clip(part, 0.0, 1.0)[..., None]
+        on_border = vertex[start] + part * (vertex[end] - vertex[start])
+        its_color = color[start] + part * (color[end].astype(float) - color[start])
+        a, b = len(vertex) + np.arange(2 * len(crossing)).reshape(-1, 2).T
+        is_first_in = is_in[crossing[:, 0]]
+        one = np.stack([crossing[:, 0], a, b], axis=1)[is_first_in]
+        two = np.stack([a, crossing[:, 1], crossing[:, 2], a, crossing[:, 2], b], axis=1)
+        part_face = np.concatenate([face[count == 3], one, two[~is_first_in].reshape(-1, 3)])
+        used, place = np.unique(part_face, return_inverse=True)
+        return (
+            np.concatenate([vertex, on_border.reshape(-1, 3)])[used].astype(np.float32),
+            place.reshape(-1, 3),
+            np.concatenate([color, its_color.reshape(-1, 3).round().astype(np.uint8)])[used],
+        )
+
 
 class ClippedNodes(SceneNodes):
-    """Scene nodes that are cut at a plane; surfaces stay whole.
+    """Scene nodes that are cut at a plane.
 
     Attributes:
         plane: What is kept; None for everything.
     """
 
     plane: Plane | None = None
+
+    def mesh(
+        self,
+        name: str,
+        vertex: ndarray,
+        face: ndarray,
+        color: Any,
+        *,
+        is_visible: bool,
+        **options: Any,
+    ) -> None:
+        """Draw the part of a surface that is kept."""
+        if self.plane is not None:
+            is_plain = isinstance(color, tuple)
+            painted: Any = np.zeros((len(vertex), 3), np.uint8) if is_plain else color
+            vertex, face, painted = self.plane.cut(vertex, face, painted)
+            color = color if is_plain else painted
+            is_visible = is_visible and len(face) > 0
+        super().mesh(name, vertex, face, color, is_visible=is_visible, **options)
 
     def points(self, name: str, point: ndarray, color: Any, size: float, **options: Any) -> None:
         """Draw the points that are kept, in a size that may change."""

@@ -11,9 +11,11 @@ from viewer_client import ViewerClient
 from viewer_world import FRAMES, PARAMETERS, FakeSettings, FolderCatalog, hear_all, make_run
 
 from app.comparison import CompareAsk
+from app.viewer.compare.drawing import GHOST
 from app.viewer.compare.pair import open_pair
 from app.viewer.compare.sides import ComparedSide, compared_rollouts
 from app.viewer.export.snapshot import snapshot_npz
+from app.viewer.scene.nodes import Plane
 from app.viewer.sessions import Sessions
 from physhandi.errors import MissingInputError, PhysHandiError, UsageError
 from physhandi.object_rollout import load_fitted, load_surface
@@ -192,16 +194,56 @@ def test_an_overlay_colors_the_difference_with_numbers(sessions: Sessions) -> No
         # Neither is moved aside, which viser need not say.
         assert np.allclose(client.positions.get("/compare/a", 0.0), 0.0)
         # 55 of 100 mm is the middle of the scale: green, more than red and blue. The legend may
-        # tell the scale before anything is drawn in it.
+        # tell the scale before anything is drawn in it. A is the shadow of its nodes.
+        client.until(lambda: surface_color(client, "b").argmax() == 1)
+        client.until(lambda: client.visible.get("/compare/a/object/compared", True))
+        client.until(lambda: only_color(client, "object/compared", "a").tolist() == [*GHOST])
+        client.set("Frame", 0)
+        client.until(lambda: surface_color(client, "b")[1] < 60)
+        # Without the surface nodes and springs tell the same.
+        client.set("Surface", False)
+        client.set("Object nodes", True)
+        client.set("Object springs", True)
+        client.set("Frame", 11)
+        client.until(lambda: client.visible.get("/compare/b/object/surface") is False)
         client.until(lambda: only_color(client, "object/compared").argmax() == 1)
         client.until(lambda: only_color(client, "springs/object_painted").argmax() == 1)
-        client.set("Frame", 0)
-        client.until(lambda: only_color(client, "object/compared")[1] < 60)
         # B fades into the white background, and A comes back in its own colors.
         client.set("A ↔ B", 0.0)
         client.until(lambda: client.visible.get("/compare/b/object/compared") is False)
         client.set("Colors of A and B", "of A and B")
         client.until(lambda: only_color(client, "object/compared", "a").tolist() == [47, 111, 222])
+
+
+def test_surfaces_in_one_place_are_seen_through_and_named(
+    sessions: Sessions, catalog: FolderCatalog
+) -> None:
+    run = catalog.run("sheet")
+    surface = load_surface(run, load_fitted(run, "lift"), ())
+    position = run.array("sequences/lift/rollout.npy")[3]
+
+    def opacity(client: ViewerClient, side: str) -> float | None:
+        return client.nodes.get(f"/compare/{side}/object/surface", {}).get("opacity", -1.0)
+
+    with watch(sessions, "a=sheet&b=moved&f=3&mode=overlay") as client:
+        client.until(lambda: is_laid(client, surface, "a", position))
+        client.until(lambda: is_laid(client, surface, "b", position + 3 * OFFSET))
+        assert np.allclose(client.positions.get("/compare/b", 0.0), 0.0)
+        blue, orange = (surface_color(client, side) for side in "ab")
+        assert (blue.argmax(), orange.argmax()) == (2, 0)
+        client.until(lambda: opacity(client, "a") == opacity(client, "b") == 0.7)
+        client.until(lambda: client.nodes["/compare/title_b"]["text"] == "B · moved (orange)")
+        client.set("A ↔ B", 0.75)
+        client.until(lambda: (opacity(client, "a"), opacity(client, "b")) == (0.35, 0.7))
+        client.set("A ↔ B", 1.0)
+        client.until(lambda: client.visible.get("/compare/a/object/surface") is False)
+        client.until(lambda: opacity(client, "b") is None)
+
+
+def surface_color(client: ViewerClient, side: str) -> np.ndarray:
+    """The mean color of a side's surface; bright red if it has none."""
+    color = client.nodes.get(f"/compare/{side}/object/surface", {}).get("color", (255, 254, 254))
+    return np.frombuffer(bytes(color), np.uint8).reshape(-1, 3)[0].astype(float)
 
 
 def only_color(client: ViewerClient, part: str, side: str = "b") -> np.ndarray:
@@ -212,7 +254,19 @@ def only_color(client: ViewerClient, part: str, side: str = "b") -> np.ndarray:
 
 
 def test_a_wipe_cuts_both_at_one_line(sessions: Sessions, catalog: FolderCatalog) -> None:
-    sheet = catalog.run("sheet").array("sequences/lift/rollout.npy")[0]
+    run = catalog.run("sheet")
+    sheet = run.array("sequences/lift/rollout.npy")[0]
+    surface = load_surface(run, load_fitted(run, "lift"), ())
+    whole = area(surface.place(sheet), surface.face)
+
+    def areas(client: ViewerClient) -> np.ndarray:
+        """How much of the sheet's surface both sides show."""
+        shown = [client.nodes.get(f"/compare/{side}/object/surface", {}) for side in "ab"]
+        if not all("faces" in node for node in shown):
+            return np.zeros(2)
+        arrays = [np.asarray(node["vertices"], float).reshape(-1, 3) for node in shown]
+        faces = [np.asarray(node["faces"], int).reshape(-1, 3) for node in shown]
+        return np.array([area(*its) for its in zip(arrays, faces, strict=True)])
 
     def parts(client: ViewerClient) -> tuple[int, int]:
         """How many nodes both sides show, if together they are the sheet; else none."""
@@ -230,11 +284,49 @@ def test_a_wipe_cuts_both_at_one_line(sessions: Sessions, catalog: FolderCatalog
         client.until(lambda: client.find("Frame") and client.value("Frame") == 1)
         client.set("Frame", 0)
         # At frame 0 both are one sheet: the parts together are the whole.
+        client.until(lambda: abs(areas(client).sum() - whole) < 1e-5 * whole)
+        assert areas(client).min() > 0.3 * whole
+        client.set("Object nodes", True)
         client.until(lambda: min(parts(client)) > 10)
         before, _ = parts(client)
         client.until(lambda: client.gui.get(client.find("Line"), {}).get("visible") is True)
         client.set("Line", 0.2)
         client.until(lambda: 0 < parts(client)[0] < before)
+        client.until(lambda: abs(areas(client).sum() - whole) < 1e-5 * whole)
+        client.until(lambda: 0.1 * whole < areas(client)[0] < 0.3 * whole)
+        client.set("Line", 0.0)
+        client.until(lambda: client.visible.get("/compare/a/object/surface") is False)
+        client.until(lambda: abs(areas(client)[1] - whole) < 1e-5 * whole)
+
+
+def area(vertex: np.ndarray, face: np.ndarray) -> float:
+    """How large triangles are together [m²]."""
+    a, b, c = np.asarray(vertex, float)[face].transpose(1, 0, 2)
+    return float(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+
+
+def test_a_surface_is_cut_where_the_plane_is() -> None:
+    # A unit square of two triangles, whose colors grow along x; x < 0.25 is kept.
+    vertex = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
+    face = np.array([[0, 1, 2], [0, 2, 3]])
+    color = np.array([[0, 9, 9], [200, 9, 9], [200, 9, 9], [0, 9, 9]], np.uint8)
+    along_x = np.array([1.0, 0.0, 0.0], np.float32)
+    for sign, kept, border in ((1.0, 0.25, True), (-1.0, 0.75, False)):
+        plane = Plane(direction=sign * along_x, limit=sign * 0.25, has_border=border)
+        part, its_face, its_color = plane.cut(vertex, face, color)
+        assert area(part, its_face) == pytest.approx(kept, rel=1e-6)
+        used = part[its_face.ravel()]
+        assert (sign * used[:, 0] <= sign * 0.25 + 1e-6).all()
+        assert np.isclose(used[:, 0], 0.25).any()
+        np.testing.assert_allclose(its_color[:, 0], 200.0 * part[:, 0], atol=0.6)
+        # Triangles look the same way as before.
+        a, b, c = part[its_face].transpose(1, 0, 2)
+        assert (np.cross(b - a, c - a)[:, 2] > 0.0).all()
+    whole = Plane(direction=along_x, limit=2.0, has_border=True).cut(vertex, face, color)
+    np.testing.assert_array_equal(whole[0][whole[1]], vertex[face])
+    assert (
+        len(Plane(direction=along_x, limit=-1.0, has_border=True).cut(vertex, face, color)[1]) == 0
+    )
 
 
 def test_other_nodes_and_lengths_say_so(sessions: Sessions) -> None:

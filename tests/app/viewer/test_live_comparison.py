@@ -77,6 +77,7 @@ def mean_difference(client: ViewerClient) -> float:
 
 def test_the_fit_is_kept_while_sliders_move_the_other(client: ViewerClient, run: Run) -> None:
     fitted = run.array("sequences/lift/rollout.npy")
+    client.set("Object nodes", True)
     client.set("Keep as A", "the fit")
     client.until(lambda: "/compare/b/object/compared" in client.nodes)
     client.until(lambda: "mean 0 mm" in said(client) and "equal parameters" in said(client))
@@ -103,6 +104,7 @@ def test_a_key_compares_with_what_was_kept_last_or_with_the_fit(
     client: ViewerClient, run: Run
 ) -> None:
     fitted = run.array("sequences/lift/rollout.npy")
+    client.set("Object nodes", True)
     # Nothing was changed: a rollout is not compared with itself.
     press(client, "V")
     client.until(lambda: any("V compares with the fit" in str(m) for m in client.messages))
