@@ -349,10 +349,10 @@ class ClippedNodes(SceneNodes):
     ) -> None:
         """Draw the part of a surface that is kept."""
         if self.plane is not None:
-            is_plain = isinstance(color, tuple)
-            painted: Any = np.zeros((len(vertex), 3), np.uint8) if is_plain else color
+            is_painted = np.ndim(color) == 2
+            painted: Any = color if is_painted else np.zeros((len(vertex), 3), np.uint8)
             vertex, face, painted = self.plane.cut(vertex, face, painted)
-            color = color if is_plain else painted
+            color = painted if is_painted else color
             is_visible = is_visible and len(face) > 0
         super().mesh(name, vertex, face, color, is_visible=is_visible, **options)
 
