@@ -403,6 +403,87 @@ def make_batch_frame_kernel(locals_: int, entries: int) -> wp.Kernel:
     def kept_clearance(local: int) -> float:
         """Read a node's clearance."""
 
+    @wp.func
+    def add_held(
+        node: int,
+        pair: int,
+        fraction: float,
+        reach: float,
+        here: _PAIR,
+        force: _FORCES,
+        held_start: wp.array[int],
+        held_length: wp.array[wp.vec4],
+        held_rank: wp.array[int],
+        control_start: wp.array[wp.vec3],
+        control_end: wp.array[wp.vec3],
+    ) -> _FORCES:
+        """Add the virtual springs of one node for two candidates."""
+        near = kept_numbers(wp.static(_row("virtual_connection_radius")) + 2 * pair)
+        limit = kept_numbers(wp.static(_row("virtual_max_neighbors")) + 2 * pair)
+        stiffness = kept_numbers(wp.static(_row("virtual_stiffness")) + 2 * pair)
+        damping = kept_numbers(wp.static(_row("virtual_damping")) + 2 * pair)
+        rate = kept_numbers(wp.static(_row("control_rate")) + 2 * pair)
+        for e in range(held_start[node], held_start[node + 1]):
+            length = held_length[e]
+            # The nearest control comes first, so no later one is in reach either.
+            if length[0] >= reach:
+                break
+            control = wp.cast(length[3], wp.int32)
+            rank = float(held_rank[e])
+            end = control_position(control, fraction, control_start, control_end)
+            for c in range(2):
+                if length[0] < near[c] and rank < limit[c]:
+                    speed = control_velocity(control, rate[c], control_start, control_end)
+                    tension = pull(
+                        end - wp.vec3(here[0, c], here[1, c], here[2, c]),
+                        speed - wp.vec3(here[3, c], here[4, c], here[5, c]),
+                        length[1],
+                        stiffness[c] * length[2],
+                        damping[c],
+                    )
+                    for k in range(3):
+                        force[k, c] = force[k, c] + tension[k]
+        return force
+
+    @wp.func
+    def moved(
+        clearance: float,
+        pair: int,
+        here: _PAIR,
+        force: _FORCES,
+        candidate: int,
+        diverged_out: wp.array[int],
+    ) -> _PAIR:
+        """Move one node by a substep for two candidates; `candidate` is the first of them."""
+        dt = kept_numbers(wp.static(_row("dt")) + 2 * pair)
+        loss = kept_numbers(wp.static(_row("velocity_loss")) + 2 * pair)
+        gravity = kept_numbers(wp.static(_row("gravity")) + 2 * pair)
+        has_ground = kept_numbers(wp.static(_row("has_ground")) + 2 * pair)
+        height = kept_numbers(wp.static(_row("ground_height")) + 2 * pair)
+        restitution = kept_numbers(wp.static(_row("restitution")) + 2 * pair)
+        friction = kept_numbers(wp.static(_row("friction")) + 2 * pair)
+        speed_limit = kept_numbers(wp.static(_row("speed_limit")) + 2 * pair)
+        for c in range(2):
+            world = World()
+            world.dt = dt[c]
+            world.velocity_loss = loss[c]
+            world.gravity = gravity[c]
+            world.has_ground = int(has_ground[c])
+            world.ground_height = height[c]
+            world.restitution = restitution[c]
+            world.friction = friction[c]
+            world.speed_limit = speed_limit[c]
+            total = wp.vec3(force[0, c], force[1, c], force[2, c])
+            x = wp.vec3(here[0, c], here[1, c], here[2, c])
+            v = wp.vec3(here[3, c], here[4, c], here[5, c])
+            motion = advance(world, clearance, x, free_velocity(world, v, total))
+            for k in range(3):
+                here[k, c] = motion.position[k]
+                here[3 + k, c] = motion.velocity[k]
+            if is_too_fast(world, motion.velocity):
+                diverged_out[candidate + c] = 1
+        return here
+
     @wp.kernel(enable_backward=False, module="unique", launch_bounds=SUMMING + CARRYING)
     def advance_batch_frame(
         substeps: int,
@@ -510,83 +591,31 @@ def make_batch_frame_kernel(locals_: int, entries: int) -> wp.Kernel:
                         place_of_node = kept_node(i)
                         node = place_of_node // 2
                         if place_of_node % 2 == 1:
-                            for e in range(held_start[node], held_start[node + 1]):
-                                length = held_length[e]
-                                # The nearest control comes first, so no later one is in reach.
-                                if length[0] >= reach[1, group]:
-                                    break
-                                control = wp.cast(length[3], wp.int32)
-                                end = control_position(
-                                    control, fraction, control_start, control_end
-                                )
-                                rank = float(held_rank[e])
-                                near = kept_numbers(
-                                    wp.static(_row("virtual_connection_radius")) + 2 * pair
-                                )
-                                limit = kept_numbers(
-                                    wp.static(_row("virtual_max_neighbors")) + 2 * pair
-                                )
-                                tie = kept_numbers(wp.static(_row("virtual_stiffness")) + 2 * pair)
-                                dashpot = kept_numbers(
-                                    wp.static(_row("virtual_damping")) + 2 * pair
-                                )
-                                rate = kept_numbers(wp.static(_row("control_rate")) + 2 * pair)
-                                for c in range(2):
-                                    if length[0] < near[c] and rank < limit[c]:
-                                        speed = control_velocity(
-                                            control, rate[c], control_start, control_end
-                                        )
-                                        tension = pull(
-                                            end - wp.vec3(here[0, c], here[1, c], here[2, c]),
-                                            speed - wp.vec3(here[3, c], here[4, c], here[5, c]),
-                                            length[1],
-                                            tie[c] * length[2],
-                                            dashpot[c],
-                                        )
-                                        for k in range(3):
-                                            force[k, c] = force[k, c] + tension[k]
-                        touching = kept_clearance(i)
-                        dt = kept_numbers(wp.static(_row("dt")) + 2 * pair)
-                        loss = kept_numbers(wp.static(_row("velocity_loss")) + 2 * pair)
-                        gravity = kept_numbers(wp.static(_row("gravity")) + 2 * pair)
-                        has_ground = kept_numbers(wp.static(_row("has_ground")) + 2 * pair)
-                        height = kept_numbers(wp.static(_row("ground_height")) + 2 * pair)
-                        restitution = kept_numbers(wp.static(_row("restitution")) + 2 * pair)
-                        friction = kept_numbers(wp.static(_row("friction")) + 2 * pair)
-                        speed_limit = kept_numbers(wp.static(_row("speed_limit")) + 2 * pair)
-                        for c in range(2):
-                            world = World()
-                            world.dt = dt[c]
-                            world.velocity_loss = loss[c]
-                            world.gravity = gravity[c]
-                            world.has_ground = int(has_ground[c])
-                            world.ground_height = height[c]
-                            world.restitution = restitution[c]
-                            world.friction = friction[c]
-                            world.speed_limit = speed_limit[c]
-                            total = wp.vec3(force[0, c], force[1, c], force[2, c])
-                            x = wp.vec3(here[0, c], here[1, c], here[2, c])
-                            v = wp.vec3(here[3, c], here[4, c], here[5, c])
-                            motion = advance(world, touching, x, free_velocity(world, v, total))
-                            for k in range(3):
-                                here[k, c] = motion.position[k]
-                                here[3 + k, c] = motion.velocity[k]
-                            if is_too_fast(world, motion.velocity):
-                                diverged_out[wp.static(GROUP_WIDTH) * group + 2 * pair + c] = 1
+                            force = add_held(
+                                node,
+                                pair,
+                                fraction,
+                                reach[1, group],
+                                here,
+                                force,
+                                held_start,
+                                held_length,
+                                held_rank,
+                                control_start,
+                                control_end,
+                            )
+                        first = wp.static(GROUP_WIDTH) * group + 2 * pair
+                        here = moved(kept_clearance(i), pair, here, force, first, diverged_out)
                         if i < border:
                             relay = (1 - parity) * half_relay + pair
                             relay += wp.static(2 * GROUP_WIDTH) * (group * nodes + node)
+                            beside = relay + wp.static(GROUP_WIDTH)
                             next_tag = tag + substep + 1
                             for c in range(2):
                                 x = wp.vec3(here[0, c], here[1, c], here[2, c])
                                 v = wp.vec3(here[3, c], here[4, c], here[5, c])
                                 publish(relay_out, relay + 2 * c, x, next_tag)
-                                publish(
-                                    relay_out,
-                                    relay + wp.static(GROUP_WIDTH) + 2 * c,
-                                    v,
-                                    tag + substep + 1,
-                                )
+                                publish(relay_out, beside + 2 * c, v, next_tag)
                         keep_pair(1 - parity, slot, here)
                 block_barrier()
 
