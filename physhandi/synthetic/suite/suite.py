@@ -109,7 +109,7 @@ SUITES: dict[str, Suite] = {
                 "object_.first_order.iterations": 2,
                 "refinement.iterations": 0,
             },
-            recording={"preset": "clean", "resolution": "tiny", "images": "none", "frames": 30},
+            recording={"preset": "clean", "resolution": "tiny", "images": "none", "frames": 20},
         ),
         Suite(
             name="dev",

@@ -36,7 +36,7 @@ from physhandi.perception.keypoints import detect_sequence
 from physhandi.progress import NullProgress, Progress
 
 QUICK = HandFitConfig(iterations=250)
-RECORDED = 120
+RECORDED = 60
 """Frames of the real recording that are used."""
 
 
@@ -322,8 +322,8 @@ def test_the_recorded_hand_is_reconstructed(tmp_path: Path) -> None:
     assert np.isfinite(joint).all()
     cameras = [view.camera for view in sequence.views]
     (score,) = evaluate_hands(cameras, [joint], keypoint, hidden, least_views=2)
-    assert score.frame_count >= 0.9 * RECORDED
+    assert score.frame_count >= RECORDED - 12  # It comes into view first.
     assert score.fitted.median <= 4
     assert score.hidden.median <= 6
-    assert score.hidden.keypoint_count > 3.7 * RECORDED
+    assert score.hidden.keypoint_count > 3.7 * score.frame_count
     assert max(score.joint_median) < 8
