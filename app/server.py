@@ -216,6 +216,9 @@ def _answer_errors(app: FastAPI, pages: Pages) -> None:
             for entry in error.errors()
         ]
         first = f"{fields[0]['field']}: {fields[0]['message']}"
+        part, _, name = fields[0]["field"].partition(".")
+        if part == "query" and error.errors()[0]["type"] == "missing":
+            first = f"The address lacks “{name}=…”. It may have been cut off."
         return answer(request, 422, "invalid", first, fields)
 
     @app.exception_handler(Exception)

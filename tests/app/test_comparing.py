@@ -67,7 +67,7 @@ def test_the_page_shows_both_and_only_where_they_differ(
 @pytest.mark.parametrize(
     ("query", "status", "word"),
     [
-        ("a=fitted", 422, "b"),
+        ("a=fitted", 422, "lacks “b=…”"),
         ("a=fitted&b=fitted", 422, "both run"),
         ("a=fitted&b=nothing", 404, "nothing"),
         ("a=fitted&b=..%2F..%2Fetc", 422, "b"),
