@@ -9,8 +9,8 @@ from physhandi.data.sequence import Sequence, ViewMeta
 from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import SequenceWriter
 from physhandi.hand.loading import load_hand_model
-from physhandi.hand.model import HandKind, HandSide
 from physhandi.hand.motion import HandMotion
+from physhandi.hand.names import HandKind, HandSide
 
 SIZE = 240
 

@@ -29,8 +29,9 @@ from physhandi.fitting.checks.readiness import LEAST_PALM_POINTS, PALM, REMEDIES
 from physhandi.fitting.config import HandFitConfig
 from physhandi.fitting.one_thread import one_thread
 from physhandi.hand.loading import load_hand_model
-from physhandi.hand.model import HandModel, HandSide
+from physhandi.hand.model import HandModel
 from physhandi.hand.motion import HandMotion
+from physhandi.hand.names import HandSide
 from physhandi.hand.rotation import quaternion_matrix
 from physhandi.perception.keypoints import detect_sequence
 from physhandi.perception.lifting import HAND_LABEL, surface_points

@@ -1,6 +1,7 @@
 """Loads hand models: the built-in open hand, or the user's MANO."""
 
-from physhandi.hand.model import HandKind, HandModel, HandSide
+from physhandi.hand.model import HandModel
+from physhandi.hand.names import HandKind, HandSide
 
 
 def load_hand_model(side: HandSide, kind: HandKind = "open") -> HandModel:

@@ -18,7 +18,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from physhandi.errors import MissingInputError
-from physhandi.hand.model import JOINT_COUNT, HandModel, HandPose, HandSide
+from physhandi.hand.model import JOINT_COUNT, HandModel, HandPose
+from physhandi.hand.names import HandSide
 from physhandi.hand.open_hand import OpenHand
 from physhandi.hand.rotation import rotation_offset
 from physhandi.hand.skinning import blend, place, turn_bones

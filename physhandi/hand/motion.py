@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Float
 from numpy import ndarray
 
-from physhandi.hand.model import HandKind, HandModel, HandPose, HandSide
+from physhandi.hand.model import HandModel, HandPose
+from physhandi.hand.names import HandKind, HandSide
 
 _BATCH = 128
 _SIDES: tuple[HandSide, HandSide] = ("right", "left")

@@ -13,7 +13,8 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from torch import Tensor
 
-from physhandi.hand.model import JOINT_COUNT, HandModel, HandPose, HandSide
+from physhandi.hand.model import JOINT_COUNT, HandModel, HandPose
+from physhandi.hand.names import HandSide
 from physhandi.hand.rotation import rotation_offset
 from physhandi.hand.skinning import blend, place, turn_bones
 

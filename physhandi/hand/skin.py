@@ -8,8 +8,9 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from physhandi.hand.model import JOINT_COUNT, JOINT_NAMES, HandModel
+from physhandi.hand.model import JOINT_COUNT, HandModel
 from physhandi.hand.motion import HandMotion
+from physhandi.hand.names import JOINT_NAMES
 from physhandi.quaternions import without_jumps
 
 BONES_PER_VERTEX = 4

@@ -18,7 +18,7 @@ import physhandi.hand
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
 from physhandi.errors import MissingInputError
-from physhandi.hand.model import HandSide
+from physhandi.hand.names import HandSide
 from physhandi.progress import NullProgress, Progress
 
 _ASSETS = Path(physhandi.hand.__file__).parent / "assets"

@@ -196,9 +196,10 @@ def test_an_empty_server_tells_how_to_begin(tmp_path: Path) -> None:
     assert "No runs yet." in page.text
 
 
-def test_a_server_starts_without_what_only_fits_need() -> None:
+def test_a_server_and_what_annotates_start_without_what_only_fits_need() -> None:
     heavy = ["torch", "ai_edge_litert", "mujoco", "matplotlib"]
-    code = f"import sys; sys.modules.update(dict.fromkeys({heavy!r})); import app.cli, app.server"
+    parts = "app.cli, app.server, app.jobs.recordings.annotator"
+    code = f"import sys; sys.modules.update(dict.fromkeys({heavy!r})); import {parts}"
     root = Path(__file__).parents[2]
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=False

@@ -16,7 +16,7 @@ from physhandi.fitting.artefacts import load_motions
 from physhandi.fitting.config import HandFitConfig, PipelineConfig, load_profile
 from physhandi.fitting.hand_reconstruction import reconstruct_hands
 from physhandi.hand.loading import load_hand_model
-from physhandi.hand.model import HandSide
+from physhandi.hand.names import HandSide
 from physhandi.run import Run
 
 BUNDLED = Path(__file__).parents[3] / "sequences"

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from physhandi.hand.loading import load_hand_model
-from physhandi.hand.model import JOINT_NAMES, KEYPOINT_NAMES, HandKind, HandModel, HandPose
+from physhandi.hand.model import HandModel, HandPose
+from physhandi.hand.names import JOINT_NAMES, KEYPOINT_NAMES, HandKind
 from physhandi.hand.open_hand import OpenHand
 
 PALM_SIDE = {

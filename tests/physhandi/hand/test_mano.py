@@ -10,7 +10,7 @@ from mano_file import JOINTS, TO_MANO, mano_arrays, posed_mano
 from physhandi.errors import MissingInputError
 from physhandi.hand.loading import load_hand_model
 from physhandi.hand.mano import FINGERTIP_VERTEX, ManoHand, hands_folder
-from physhandi.hand.model import JOINT_NAMES, KEYPOINT_NAMES
+from physhandi.hand.names import JOINT_NAMES, KEYPOINT_NAMES
 
 MANO_NAMES = [
     f"{finger}_{joint}"

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from physhandi.hand.loading import load_hand_model
-from physhandi.hand.model import HandSide
 from physhandi.hand.motion import HandMotion, control_trajectory
+from physhandi.hand.names import HandSide
 
 
 def _motion(side: HandSide = "right", frame_count: int = 200) -> HandMotion:

@@ -8,7 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from physhandi.hand.model import JOINT_NAMES, HandPose
+from physhandi.hand.model import HandPose
+from physhandi.hand.names import JOINT_NAMES
 from physhandi.hand.open_hand import ASSETS, SHAPE_NAMES, SHAPE_RATE, OpenHand, read_skinned_mesh
 
 

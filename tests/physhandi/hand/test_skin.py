@@ -8,8 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from physhandi.hand.loading import load_hand_model
-from physhandi.hand.model import JOINT_NAMES, HandKind, HandSide
 from physhandi.hand.motion import HandMotion
+from physhandi.hand.names import JOINT_NAMES, HandKind, HandSide
 from physhandi.hand.skin import HandSkin, hand_skin
 
 
