@@ -35,8 +35,9 @@ SLIP = 1.0
 GIVE = 0.5
 """What its distance from the hand adds to that, as a part of it: what is between them deforms."""
 LATE, EARLY = 0.3, 0.5
-"""Parts of that way within which a node must be to be attached later than frame 0, and to hold on
-before the last frame: it is approaching before, and leaving after."""
+"""Parts of that way within which a node must be to be attached later than frame 0, where it is
+approaching before, and to hold at frame 0 and before the last frame, where it still slips or
+leaves. Springs as long as at frame 0 would pull what slipped then away from where it stays."""
 SHORTEST = 0.2
 """Shortest contact [s]."""
 SMOOTHING = 0.15
@@ -236,7 +237,7 @@ def _contacts_of(
         off = np.linalg.norm(place - np.median(place, axis=0), axis=1) / tolerance[seed]
         attached = begin + np.flatnonzero(off < max(LATE, 1.001 * off.min()))
         holding = begin + np.flatnonzero(off < max(EARLY, 1.001 * off.min()))
-        begin = begin if begin == 0 else int(attached[0])
+        begin = 0 if holding[0] == 0 else int(attached[0])
         end = end if end == count - 1 else int(holding[-1])
         if begin < end:
             found.append((begin, end))

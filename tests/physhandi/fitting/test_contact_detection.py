@@ -82,6 +82,22 @@ def test_a_late_hand_holds_once_it_has_come_to_rest() -> None:
     assert left < 0.004
 
 
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_what_slips_at_first_is_held_where_it_stays(sign: float) -> None:
+    # A node's distance and half of that from the hand, 11.5 mm, is the way that counts.
+    for slip, first in ((0.005, 0), (0.009, 7)):
+        slipping = sign * along(1, ramp(0, 10, slip))
+        way = along(0, ramp(12, 36, 0.05))
+        contacts = found(seen(way), hand(ABOVE + slipping + way))
+        ((begin, end),) = at(contacts, MIDDLE)
+        assert begin == first
+        assert end == NEVER
+        # Springs are as long as they are then, so what was slipped before pulls at nothing.
+        beside = PALM[24] + RISE + slipping[begin]
+        pair = np.flatnonzero((contacts.node == MIDDLE) & (contacts.control == 24))[0]
+        assert contacts.distance[pair] == pytest.approx(np.linalg.norm(beside), abs=1e-6)
+
+
 def test_a_hand_that_lets_go_holds_until_then() -> None:
     way = along(0, ramp(3, 18, 0.05))
     leaving = along(2, ramp(22, 32, 0.04))

@@ -84,6 +84,23 @@ def test_a_track_that_slides_is_hidden_once_it_is_away() -> None:
     assert found.is_visible[:, :45][:, others].all()
 
 
+@pytest.mark.parametrize("noise", [0.001, 0.003], ids=["a sensor's", "three times that"])
+def test_noise_hides_no_track_that_follows(noise: float) -> None:
+    random = np.random.default_rng(1)
+    seen = observed()
+    for array in (seen.point, seen.late):
+        array[:] = array + random.normal(0.0, noise, array.shape).astype(np.float32)
+    found = with_late_tracks(seen, NODE, FRAMES)
+    follows = np.arange(64) != SLIDING
+    expected = np.isfinite(np.concatenate([seen.point, seen.late], axis=1)).all(axis=2)
+    np.testing.assert_array_equal(
+        found.is_visible[1:, :64][:, follows], expected[1:, :64][:, follows]
+    )
+    assert found.is_visible[:2, SLIDING].all()
+    assert not found.is_visible[6:, SLIDING].any()
+    np.testing.assert_allclose(found.point[0, 60:64], LATE, atol=6 * noise)
+
+
 def test_frames_that_are_not_fitted_say_nothing_of_those_before() -> None:
     known = observed()
     changed = replace(known, late=known.late.copy(), point=known.point.copy())
