@@ -294,6 +294,7 @@ class Session(SceneServer):
             self._playback,
             tabs=self._tabs,
             framing=framing,
+            surface=content.surface,
             physics=self._object.panel,
             rollout_at=self._object.at,
             leave_others=self._leave_others,

@@ -12,6 +12,7 @@ from numpy import ndarray
 
 from app.viewer.clock.playback import Playback
 from app.viewer.edit.selection import (
+    Cover,
     DrawnShape,
     Highlights,
     Polygon,
@@ -47,6 +48,7 @@ from physhandi.simulation.edits import (
     ScaleMaterial,
     apply_edits,
 )
+from physhandi.simulation.object_surface import ObjectSurface
 
 SELECTED = (255, 122, 0)
 """Color of what is selected."""
@@ -58,6 +60,8 @@ _ALL, _INVERT, _NOTHING = "All", "Invert", "Nothing"
 _STIFFNESS, _DAMPING = "Stiffness", "Damping"
 _CUT, _JOIN = "Cut", "Join"
 _PIN, _ATTACH, _RELEASE = "Pin", "Attach", "Release"
+_PART_OF_SURFACE = 0.25
+"""How far behind the surface nodes still belong to it, in distances of nodes."""
 _FACTORS = (0.001, 1000.0)
 _MODIFIERS: dict[str | None, SelectWay] = {None: "replace", "shift": "add", "cmd/ctrl": "remove"}
 _STYLE = "font-size:0.85em;line-height:1.5;padding:0.2em 0.9em 0.5em"
@@ -82,6 +86,7 @@ class EditPanel:
         *,
         tabs: Tabs,
         framing: Framing,
+        surface: ObjectSurface | None,
         physics: PhysicsPanel,
         rollout_at: Callable[[int], tuple[ObjectRollout, int]],
         leave_others: Callable[[], None],
@@ -94,6 +99,7 @@ class EditPanel:
             playback: The session's clock.
             tabs: Where the controls go.
             framing: Sizes.
+            surface: The object's surface, behind which things can be left out.
             physics: Keeps the edits with its parameters, and has them simulated.
             rollout_at: Finds the rollout of a frame, and which of its frames.
             leave_others: Ends what else takes the pointer or shows another object.
@@ -103,6 +109,7 @@ class EditPanel:
         self._playback = playback
         self._tabs = tabs
         self._spacing = framing.spacing
+        self._surface = surface
         self._physics = physics
         self._rollout_at = rollout_at
         self._leave_others = leave_others
@@ -138,6 +145,12 @@ class EditPanel:
             )
             self._kind: Any = gui.add_dropdown(
                 "Select", get_args(SelectKind), hint="What a rectangle or a click selects"
+            )
+            self._only_seen: Any = gui.add_checkbox(
+                "Only what is seen",
+                False,
+                hint="Leaves out what lies behind the object's own surface",
+                visible=self._surface is not None,
             )
             self._factor: Any = gui.add_number(
                 "Factor",
@@ -284,9 +297,22 @@ class EditPanel:
         with self._lock:
             if not self._is_on:
                 return
-            found = select(eye, shape, *self._shown(), self._kind.value)
+            rollout, frame = self._shown()
+            cover = self._cover(rollout, frame) if self._only_seen.value else None
+            found = select(eye, shape, rollout, frame, self._kind.value, cover=cover)
             self._selection = self._selection.changed(found, way)
         self._show_selection()
+
+    def _cover(self, rollout: ObjectRollout, frame: int) -> Cover | None:
+        """Find what keeps the view of the object's other side: its own surface."""
+        surface = self._surface
+        if surface is None or surface.node_count != rollout.model.node_count:
+            return None
+        # Nodes of a rope are in its middle.
+        radius = 0.0 if surface.tube is None else surface.tube.radius
+        depth = _PART_OF_SURFACE * self._spacing + 2.0 * radius
+        vertex = surface.place(np.asarray(rollout.position[frame]))
+        return Cover(vertex=vertex, face=surface.face, depth=depth)
 
     def _clicked(self, rollout: ObjectRollout, node: int | None, spring: int | None) -> Selection:
         """Give what a click selects: one thing, the ends of a spring, or the springs of a node."""

@@ -23,6 +23,8 @@ SelectWay = Literal["replace", "add", "remove", "toggle"]
 MOST_SHAPE_BYTES = 1 << 18
 """Longer messages of a page are no shapes."""
 _NEAREST = 1e-6
+_MOST_PAIRS = 500_000
+"""Rays times triangles that are looked at in one go."""
 _Item = TypeVar("_Item", int, NodePair)
 
 
@@ -57,6 +59,47 @@ class ScreenView:
         half = np.tan(self.fov / 2)
         place = np.stack([across / (half * self.aspect), down / half], axis=1)
         return 0.5 + 0.5 * place / ahead[:, None]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Cover:
+    """A surface behind which things are not seen."""
+
+    vertex: Float[ndarray, "vertex 3"]
+    """Its vertices [m]."""
+    face: Int[ndarray, "face 3"]
+    """Its triangles."""
+    depth: float
+    """How far behind it things still count as parts of it [m]."""
+
+    def hides(
+        self, eye: Float[ndarray, " 3"], point: Float[ndarray, "point 3"]
+    ) -> Bool[ndarray, " point"]:
+        """Mark points of which the surface keeps somebody's view.
+
+        Möller and Trumbore's intersection of rays and triangles; as all rays have one origin, its
+        triple products are matrix products.
+
+        Args:
+            eye: Where somebody stands [m].
+            point: What is looked at [m].
+        """
+        a, b, c = np.asarray(self.vertex, np.float64)[self.face].transpose(1, 0, 2)
+        one, two, from_a = b - a, c - a, eye - a
+        across = np.cross(from_a, one)
+        normal, first = np.cross(two, one), np.cross(two, from_a)
+        height = (across * two).sum(axis=1)
+        hidden = np.zeros(len(point), bool)
+        rows = max(1, _MOST_PAIRS // max(1, len(self.face)))
+        for start in range(0, len(point), rows):
+            way = point[start : start + rows] - eye
+            scale = way @ normal.T
+            with np.errstate(divide="ignore", invalid="ignore"):
+                u, v, part = way @ first.T / scale, way @ across.T / scale, height / scale
+            nearer = 1.0 - self.depth / np.linalg.norm(way, axis=1, keepdims=True)
+            is_hit = (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (part > 0.0) & (part < nearer)
+            hidden[start : start + rows] = is_hit.any(axis=1)
+        return hidden
 
 
 def within(
@@ -168,8 +211,10 @@ def select(
     rollout: ObjectRollout,
     frame: int,
     kind: SelectKind,
+    *,
+    cover: Cover | None = None,
 ) -> Selection:
-    """Select what is within a shape on the screen, also behind other things.
+    """Select what is within a shape on the screen.
 
     A spring is where its middle is; one that is not attached in the frame is not there.
 
@@ -179,18 +224,23 @@ def select(
         rollout: The object's motion.
         frame: Which frame of it.
         kind: What is selected.
+        cover: What lies behind it is left out; None selects also behind other things.
     """
     model = rollout.model
     position = np.asarray(rollout.position[frame], np.float64)
+
+    def held(point: Float[ndarray, "point 3"]) -> Int[ndarray, " chosen"]:
+        chosen = np.flatnonzero(shape.holds(eye.project(point), eye.aspect))
+        return chosen if cover is None else chosen[~cover.hides(eye.position, point[chosen])]
+
     if kind == "nodes":
-        chosen = np.flatnonzero(shape.holds(eye.project(position), eye.aspect))
-        return Selection(nodes=frozenset(map(int, chosen)))
+        return Selection(nodes=frozenset(map(int, held(position))))
     point = np.concatenate([position, np.asarray(rollout.held_control(frame), np.float64)])
     own, count = model.object_spring_count, len(model.spring_nodes)
     number = np.arange(own) if kind == "springs" else np.arange(own, count)
     number = number[model.acts_in(frame)[number]]
     middle = point[model.spring_nodes[number]].mean(axis=1)
-    return of_springs(model, number[shape.holds(eye.project(middle), eye.aspect)])
+    return of_springs(model, number[held(middle)])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,9 +12,11 @@ from viewer_world import rest_at
 from waiting import LIMIT_S
 
 from app.viewer.content.session_state import Pose
+from app.viewer.edit import selection
 from app.viewer.edit.edit_panel import attach_to_nearest, pairs_to_join
 from app.viewer.edit.selection import (
     MOST_SHAPE_BYTES,
+    Cover,
     DrawnShape,
     Polygon,
     ScreenView,
@@ -119,6 +122,49 @@ def test_a_spring_is_selected_where_its_middle_is_while_it_is_attached() -> None
     assert not select(eye, box, take, 0, "springs")
 
 
+def test_what_lies_behind_a_surface_is_hidden() -> None:
+    plate = np.array([[-0.5, -0.5, 1.0], [0.5, -0.5, 1.0], [0.5, 0.5, 1.0], [-0.5, 0.5, 1.0]])
+    face = np.array([[0, 1, 2], [0, 3, 2]])  # They look to opposite sides.
+    eye = np.array([0.0, 0.0, 3.0])
+    # The shadow of a plate 2 m from the eye is 1.5 times as wide on the ground, 3 m from it.
+    point = np.array(
+        [[0.74, 0, 0], [0.76, 0, 0], [-0.7, 0.74, 0], [0, 0, 0.99], [0, 0, 1.5], [0, 0, 5]]
+    )
+    hidden = Cover(vertex=plate, face=face, depth=0.02).hides(eye, point)
+    assert hidden.tolist() == [True, False, True, False, False, False]
+    thin = Cover(vertex=plate, face=face, depth=0.005)
+    assert thin.hides(eye, point[3:4]).tolist() == [True]
+    assert thin.hides(eye, point[:0]).tolist() == []
+    none = Cover(vertex=plate, face=face[:0], depth=0.0)
+    assert not none.hides(eye, point).any()
+
+
+def test_hidden_points_are_those_whose_ray_meets_a_triangle_before(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    random = np.random.default_rng(5)
+    vertex, eye = random.normal(0.0, 0.5, (30, 3)), np.array([0.1, -2.5, 0.4])
+    face = np.arange(30).reshape(10, 3)
+    point = random.normal(0.0, 0.7, (80, 3))
+    depth = 0.1
+
+    def is_hidden(place: np.ndarray) -> bool:
+        distance = np.linalg.norm(place - eye)
+        for a, b, c in vertex[face]:
+            sides = np.stack([b - a, c - a, eye - place], axis=1)
+            u, v, part = np.linalg.solve(sides, eye - a)
+            if min(u, v, 1.0 - u - v, part) > 0.0 and part * distance < distance - depth:
+                return True
+        return False
+
+    expected = [is_hidden(place) for place in point]
+    assert 10 < sum(expected) < 70
+    cover = Cover(vertex=vertex, face=face, depth=depth)
+    assert cover.hides(eye, point).tolist() == expected
+    monkeypatch.setattr(selection, "_MOST_PAIRS", 25)  # Two points at a time.
+    assert cover.hides(eye, point).tolist() == expected
+
+
 def test_nodes_are_joined_and_attached_to_what_is_nearest() -> None:
     take = two_springs()
     assert pairs_to_join(take, np.array([0, 1, 2])) == ((0, 2), (1, 2))
@@ -177,6 +223,26 @@ def draw(session: Session, client: ViewerClient, low, high, modifier: str | None
 
 def selected(client: ViewerClient) -> str:
     return texts(client).partition("data-selected>")[2].partition("<")[0]
+
+
+def test_what_the_object_hides_can_be_left_out(scene, run: Run) -> None:
+    session, client = scene
+    y = run.array("sequences/lift/rollout.npy")[AT][:, 1]
+    every = (-0.4, -0.4), (0.4, 0.4)
+    draw(session, client, *every)
+    wait(client, lambda: selected(client) == "81 nodes")
+    client.set("Only what is seen", True)
+    board = np.array([[-0.4, 0.0, 0.9], [0.4, 0.0, 0.9], [0.4, 0.4, 0.9], [-0.4, 0.4, 0.9]])
+    session._edit._surface = SimpleNamespace(
+        node_count=81, tube=None, face=np.array([[0, 1, 2], [0, 2, 3]]), place=lambda _: board
+    )
+    draw(session, client, *every)
+    seen = np.count_nonzero(y < 0.0)
+    assert 30 < seen < 50
+    wait(client, lambda: selected(client) == f"{seen} nodes")
+    client.set("Only what is seen", False)
+    draw(session, client, *every)
+    wait(client, lambda: selected(client) == "81 nodes")
 
 
 def test_a_rectangle_selects_and_each_button_is_one_step(scene, run: Run) -> None:
