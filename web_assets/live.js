@@ -52,11 +52,12 @@
     if (await copyText(address, inside)) toast("Link copied: it opens this run as you see it now.");
   }
 
-  /* What the link restores is filmed: parameters, layers and camera as they are now. */
+  /* What the link restores is filmed: parameters, layers and camera as they are now, or the camera's path. */
   async function film(entry) {
     const link = await wholeLink();
     const address = link.url.replace(/^\/runs\/([^/]+)\/view\??/, "/api/v1/runs/$1/export?");
     const query = new URLSearchParams(entry.dataset.sessionFilm);
+    if (link.camera_path && !query.has("turn")) query.set("camera_path", link.camera_path);
     await fetchSlowFile(`${address}${address.endsWith("?") ? "" : "&"}${query}`, "Filming");
   }
 

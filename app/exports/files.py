@@ -29,7 +29,7 @@ from physhandi.data.layout import SequenceFiles
 from physhandi.errors import PhysHandiError, RunError, UsageError, describe
 from physhandi.run import Run
 
-_OWN_FIELDS = ("format", "width", "height", "turn", "download")
+_OWN_FIELDS = ("format", "width", "height", "turn", "camera_path", "download")
 _STORED = ("npz", "csv", "yaml")
 """Formats of what a run holds, which is written sooner than a process is started."""
 PictureSide = Annotated[
@@ -43,6 +43,10 @@ Turn = Annotated[
         allow_inf_nan=False,
         description="Angle by which the camera of a film goes round [degrees].",
     ),
+]
+CameraPathField = Annotated[
+    str,
+    Query(max_length=50_000, description="Of films: the JSON of a camera path (docs/formats.md)."),
 ]
 LinkField = Annotated[
     str | None,
@@ -60,6 +64,8 @@ class PictureOptions:
     """Rows [px]."""
     turn: Turn = 0.0
     """Angle by which the camera goes round [degrees]."""
+    camera_path: CameraPathField = ""
+    """How the camera of a film moves; docs/formats.md describes the JSON."""
 
 
 class FileProgress(BaseModel):

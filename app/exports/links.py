@@ -30,6 +30,8 @@ class Link(BaseModel):
     """Its part after the question mark."""
     lost: str = ""
     """What is not in it, and what to do; empty if the address says all."""
+    camera_path: str = ""
+    """What the camera of a film of the scene follows, as JSON; empty if it stands still."""
 
 
 def create_links(sessions: Sessions) -> APIRouter:
@@ -73,7 +75,8 @@ def create_links(sessions: Sessions) -> APIRouter:
                 "Springs or nodes were edited here, which no link holds. Save it as a run (Export) "
                 "and share that."
             )
-        return Link(url=link, query=link.partition("?")[2], lost=lost)
+        path = "" if session.camera_path is None else session.camera_path.to_text()
+        return Link(url=link, query=link.partition("?")[2], lost=lost, camera_path=path)
 
     return router
 

@@ -16,11 +16,13 @@ from app.viewer.clock.restart_mark import RestartMark
 from app.viewer.clock.timeline_panel import TimelinePanel
 from app.viewer.color.color_panel import ColorPanel
 from app.viewer.compare.live import LiveComparison
+from app.viewer.content.camera_path import CameraPath
 from app.viewer.content.content import Catalog, Content, open_run, open_sequence
 from app.viewer.content.layers import default_layers
 from app.viewer.content.session_state import Kind, Pose, SessionState
 from app.viewer.edit.edit_panel import EditPanel
 from app.viewer.edit.selection import DrawnShape
+from app.viewer.export.camera_path_panel import CameraPathPanel
 from app.viewer.export.export_panel import ExportPanel
 from app.viewer.export.snapshot import Snapshot
 from app.viewer.inspect.inspector import Inspector, TakeClick
@@ -172,6 +174,11 @@ class Session(SceneServer):
                 link="" if self.state.edits is not None else self.link_of(self),
             )
 
+    @property
+    def camera_path(self) -> CameraPath | None:
+        """What the camera of a film follows; None if it stands still."""
+        return self._path.path
+
     def go(self, frame: int) -> None:
         """Stop at a frame."""
         self._timeline.go(frame)
@@ -237,6 +244,7 @@ class Session(SceneServer):
             )
         with tabs["Export"]:
             export = self._export = ExportPanel(server, guard, self.snapshot)
+            self._path = CameraPathPanel(server, guard, lambda: self._playback.frame, self.go)
         bind(server, guard, "reset", lambda event, _: self._reset_view(event))
         bind(server, guard, "snapshot", lambda event, _: export.save("PNG", event.client))
         self._fill()
@@ -256,6 +264,7 @@ class Session(SceneServer):
         self._restart.replace(content)
         run = self._catalog.run(self._target) if self.kind == "run" else None
         self._export.offer(content)
+        self._path.replace(framing.frustum)
         self._comparison.offer(content, framing, run.folder if run is not None else None)
         if content.fitted is None or run is None:
             return
@@ -409,6 +418,7 @@ class Session(SceneServer):
             else:
                 rollout, rollout_frame, hands = steered
                 self._view.draw(frame, rollout, rollout_frame, is_playing=True, hands=hands)
+            self._path.follow(frame)
             self._timeline.show(is_playing=is_playing)
             self._restart.follow(rollout)
             is_hidden = self._comparison.is_on and rollout is not None

@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import cv2
 import numpy as np
@@ -95,6 +96,13 @@ def test_the_progress_of_a_film_is_told_until_it_can_be_fetched(
     assert [order.turn for order in made] == [90.0]
     ready = world.script().post(f"{RUN}?{query}").json()
     assert (ready["state"], ready["bytes"]) == ("ready", len(film.content))
+    table = json.dumps({"format": PATH_FORMAT, "kind": "turntable", "turn": 90})
+    way = f"format=gif&{LOOK}&camera_path={quote(table)}"
+    film = world.script().get(world.script().post(f"{RUN}?{way}").json()["url"])
+    assert film.headers["content-type"] == "image/gif"
+    assert [order.camera_path for order in made] == ["", table]
+    refused = world.script().post(f"{RUN}?{way[:-3]}")
+    assert (refused.status_code, "this is not JSON" in refused.text) == (422, True)
     for bad in ("format=png", f"{query}&turn=3601", f"{query}&turn=nan", "format=mp4&color=magic"):
         assert world.script().post(f"{RUN}?{bad}").status_code == 422
 

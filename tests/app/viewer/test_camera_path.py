@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from viewer_client import ViewerClient
+from viewer_world import rest_at
 
 from app.viewer.content.camera_path import (
     PATH_FORMAT,
@@ -17,6 +19,8 @@ from app.viewer.content.camera_path import (
     read_camera_path,
 )
 from app.viewer.content.session_state import Pose
+from app.viewer.session import Session
+from app.viewer.sessions import Sessions
 from physhandi.errors import UsageError
 
 X, Y, Z = np.eye(3)
@@ -184,3 +188,66 @@ def test_files_that_are_no_camera_path_are_refused(text: str, told: str) -> None
     with pytest.raises(UsageError) as refused:
         parse_camera_path(text)
     assert str(refused.value).startswith(told)
+
+
+FIRST, SECOND, THIRD = (0.9, 0.0, 0.5), (0.0, 0.9, 0.5), (-0.9, 0.1, 0.6)
+
+
+def places_of_keys(session: Session) -> dict[int, list[float]]:
+    path = session.camera_path
+    found = {} if path is None else {each.frame: each.pose.position for each in path.keys}
+    return {frame: [round(float(x), 6) for x in place] for frame, place in found.items()}
+
+
+def stand(client: ViewerClient, session: Session, frame: int, position: Any) -> None:
+    client.set("Frame", frame)
+    client.until(lambda: session.state.frame == frame)
+    client.tell_camera(position=position, look_at=(0.0, 0.0, 0.0))
+
+
+def is_sent_to(client: ViewerClient, position: Any) -> bool:
+    kind = "SetCameraPositionMessage"
+    places = [m["position"] for m in client.messages if m["type"] == kind]
+    return bool(places) and np.allclose(places[-1], position, atol=1e-5)
+
+
+def shows_way(client: ViewerClient) -> bool:
+    kinds = [m["type"] for m in client.messages if m.get("name") == "/camera_path/way"]
+    return bool(kinds) and kinds[-1] != "RemoveSceneNodeMessage"
+
+
+def test_key_frames_are_set_visited_moved_and_deleted(sessions: Sessions) -> None:
+    session = sessions.get(sessions.open("run", "sheet", "me"))
+    assert isinstance(session, Session)
+    with ViewerClient(f"ws://127.0.0.1:{session.port}") as client:
+        rest_at(client, 1)
+        for frame, place in ((3, FIRST), (8, SECOND)):
+            stand(client, session, frame, place)
+            client.set("Camera path", "Add key frame")
+            client.until(lambda at=frame: client.value("Key frame") == f"frame {at}")
+        assert places_of_keys(session) == {3: list(FIRST), 8: list(SECOND)}
+        client.until(lambda: shows_way(client))
+        assert {"/camera_path/3", "/camera_path/8"} <= set(client.nodes)
+        way = client.array("/camera_path/way", "points")
+        np.testing.assert_allclose(way[[0, -1]], [FIRST, SECOND], atol=1e-6)
+        client.set("Key frame", "frame 3")
+        client.set("This one", "Go to")
+        client.until(lambda: session.state.frame == 3 and is_sent_to(client, FIRST))
+        client.set("Play along the path", True)
+        client.until(lambda: not shows_way(client))
+        path = session.camera_path
+        assert path is not None
+        client.set("Frame", 6)
+        client.until(lambda: is_sent_to(client, path.at(6).position))
+        client.set("Play along the path", False)
+        client.until(lambda: shows_way(client))
+        stand(client, session, 5, THIRD)
+        client.set("This one", "Move here")
+        client.until(lambda: client.value("Key frame") == "frame 5")
+        assert places_of_keys(session) == {5: list(THIRD), 8: list(SECOND)}
+        client.set("This one", "Delete")
+        client.until(lambda: client.value("Key frame") == "frame 8")
+        assert places_of_keys(session) == {8: list(SECOND)}
+        client.set("This one", "Delete")
+        client.until(lambda: client.value("Key frame") == "none yet")
+        assert session.camera_path is None

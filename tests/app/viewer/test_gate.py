@@ -284,7 +284,12 @@ def test_a_second_tab_gets_a_copy_with_the_same_state(address, sessions) -> None
                 lambda: np.abs(second.array("/object/nodes", "points") - fitted).max() > 1e-4
             )
             other = second.array("/object/nodes", "points")
-            client.until(lambda: np.array_equal(client.array("/object/nodes", "points"), other))
+            client.until(
+                lambda: (
+                    "/object/nodes" in client.nodes
+                    and np.array_equal(client.array("/object/nodes", "points"), other)
+                )
+            )
 
 
 def test_no_client_can_open_a_public_tunnel(sessions) -> None:
