@@ -72,7 +72,7 @@ def test_two_runs_are_compared_in_one_scene(home: Page, lifted: str, picture) ->
     # Beside each other both colors are seen, each in its half; over each other in one place.
     def are_apart() -> bool:
         left, right = (colored(home, color) for color in ("blue", "orange"))
-        return min(left.size, right.size) > 120 and left.max() < right.min()
+        return min(left.size, right.size) > 60 and left.max() < right.min()
 
     scene.until(are_apart, "both halves are drawn")
     picture(home, "compare")
