@@ -90,12 +90,12 @@ async function copyText(text, inside = window) {
 }
 
 /* A copy of the replay gets an address that needs no token, until it is withdrawn. */
-async function shareView(run, query, inside = window) {
+async function shareView(run, query) {
   const fields = new URLSearchParams(query);
   fields.set("format", "html");
   await makeSlowFile(`/api/v1/runs/${run}/export?${fields}`, "Making the page that is shared");
   const share = await send("POST", `/api/v1/runs/${run}/shares?${query}`);
-  if (await copyText(new URL(share.url, location.href).href, inside)) {
+  if (await copyText(new URL(share.url, location.href).href)) {
     toast("Link copied: whoever has it sees this replay, and nothing else, until you withdraw it.", false, { href: `/runs/${run}#shares`, textContent: "Shared pages" });
   }
   dispatchEvent(new Event("shares-changed"));

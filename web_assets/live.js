@@ -61,23 +61,20 @@
     await fetchSlowFile(`${address}${address.endsWith("?") ? "" : "&"}${query}`, "Filming");
   }
 
-  for (const entry of document.querySelectorAll("[data-session-film]")) {
-    entry.addEventListener("click", (event) => {
-      event.preventDefault();
-      entry.closest("details").open = false;
-      film(entry).catch((error) => toast(error.message, true));
-    });
+  async function share(entry) {
+    const { query } = await wholeLink();
+    await shareView(entry.dataset.shareView, query);
   }
 
-  document.querySelector("[data-share-view]")?.addEventListener("click", (event) => {
-    event.preventDefault();
-    event.target.closest("details").open = false;
-    const share = async () => {
-      const { query } = await wholeLink();
-      await shareView(event.target.closest("a").dataset.shareView, query);
-    };
-    share().catch((error) => toast(error.message, true));
-  });
+  for (const [chosen, work] of [["[data-session-film]", film], ["[data-share-view]", share]]) {
+    for (const entry of document.querySelectorAll(chosen)) {
+      entry.addEventListener("click", (event) => {
+        event.preventDefault();
+        entry.closest("details").open = false;
+        work(entry).catch((error) => toast(error.message, true));
+      });
+    }
+  }
 
   function onKey(event) {
     const isTyping = event.target.matches?.("input:not([type=checkbox]), textarea, select");

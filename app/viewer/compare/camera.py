@@ -117,12 +117,8 @@ class ComparisonCameras:
         """Let all cameras stand again where they stood before."""
         for client in server.get_clients().values():
             pose = self._poses.get(client.client_id)
-            if pose is None:
-                continue
-            with client.atomic():
-                eye = client.camera
-                eye.up_direction, eye.fov = pose.up, pose.fov
-                eye.position, eye.look_at = pose.position, pose.look_at
+            if pose is not None:
+                pose.give(client)
         self._poses.clear()
         self._aims.clear()
 

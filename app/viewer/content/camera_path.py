@@ -261,11 +261,8 @@ def _vector(value: Any, name: str) -> Float[ndarray, " 3"]:
 
 def _orientation(pose: Pose) -> Rotation:
     """Give the camera's axes: to the right, up, and back."""
-    back = pose.position - pose.look_at
-    back = back / np.linalg.norm(back)
-    right = np.cross(pose.up, back)
-    right = right / np.linalg.norm(right)
-    return Rotation.from_matrix(np.stack([right, np.cross(back, right), back], axis=1))
+    right_down_ahead = pose.camera(1, 1).T_world_camera[:3, :3]
+    return Rotation.from_matrix(right_down_ahead * [1.0, -1.0, -1.0])
 
 
 def _key_speeds(speed: Float[ndarray, "gap n"], steps: Float[ndarray, "gap 1"]) -> ndarray:

@@ -83,6 +83,13 @@ class Pose:
         K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
         return PinholeCamera(K=K, T_world_camera=pose, width=width, height=height)
 
+    def give(self, client: viser.ClientHandle) -> None:
+        """Put a client's camera here."""
+        camera = client.camera
+        with client.atomic():
+            camera.fov, camera.up_direction = self.fov, self.up
+            camera.position, camera.look_at = self.position, self.look_at
+
     def give_first(self, camera: viser.InitialCameraConfig) -> None:
         """Put the cameras of new clients here."""
         camera.fov, camera.up = self.fov, self.up

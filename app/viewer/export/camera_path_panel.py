@@ -90,7 +90,7 @@ class CameraPathPanel:
             return
         pose = path.at(frame)
         for client in self._server.get_clients().values():
-            _place(client, pose)
+            pose.give(client)
 
     def _press(self, event: Any) -> None:
         if event.target.value == _ADD:
@@ -113,7 +113,7 @@ class CameraPathPanel:
             deed = event.target.value
             if deed == _GO:
                 self._seek(chosen)
-                _place(event.client, self._keys[chosen].pose)
+                self._keys[chosen].pose.give(event.client)
             else:
                 del self._keys[chosen]
                 if deed == _MOVE:
@@ -184,10 +184,3 @@ class CameraPathPanel:
                 thickness_units="screen",
             )
             self._nodes.append(line)
-
-
-def _place(client: viser.ClientHandle, pose: Pose) -> None:
-    eye = client.camera
-    with client.atomic():
-        eye.fov, eye.up_direction = pose.fov, pose.up
-        eye.position, eye.look_at = pose.position, pose.look_at

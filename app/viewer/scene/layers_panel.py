@@ -227,16 +227,15 @@ class LayersPanel:
 
     def place(self, client: viser.ClientHandle) -> None:
         """Put the camera of a client where the view is that is looked from, or to the overview."""
-        framing, eye = self._framing, client.camera
+        framing = self._framing
         if framing is None:
             return
         view = self._views.get(self._place.value)
+        if view is not None:
+            pose_of_view(view, framing).give(client)
+            return
+        eye = client.camera
         with client.atomic():
-            if view is None:
-                eye.up_direction = (0.0, 0.0, 1.0)
-                eye.fov = framing.fov
-                eye.position, eye.look_at = framing.camera, framing.look_at
-                return
-            pose = pose_of_view(view, framing)
-            eye.fov, eye.up_direction = pose.fov, pose.up
-            eye.position, eye.look_at = pose.position, pose.look_at
+            eye.up_direction = (0.0, 0.0, 1.0)
+            eye.fov = framing.fov
+            eye.position, eye.look_at = framing.camera, framing.look_at
