@@ -9,7 +9,7 @@ DATA ?= data
 TORCH ?= torch==2.13.0
 PIP_FLAGS := --quiet --disable-pip-version-check --no-compile -c constraints.txt
 
-.PHONY: install demo test coverage races check fmt bench test-gpu pictures browser clean
+.PHONY: install demo test coverage races reliability check fmt bench test-gpu pictures browser clean
 
 install: $(STAMP)
 
@@ -49,6 +49,10 @@ coverage: install browser
 # Live scenes, jobs and pages while their threads are held up at random.
 races: install
 	PYTHONPATH=tests $(BIN)/python -m pytest -n 2 --dist loadfile -p random_pauses tests/app
+
+# Kills, full disks and impatient clients by the hundred; takes hours. Writes docs/reliability.md.
+reliability: install
+	PYTHONPATH=tests $(BIN)/python -m reliability --page
 
 # The README's pictures, made by the browser tests.
 pictures: install browser

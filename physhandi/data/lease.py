@@ -19,6 +19,9 @@ from physhandi.errors import RunError
 REMOTE_TIMEOUT_S = 120.0
 _LOCK = ".lease.lock"
 _CLOCK_TOLERANCE_S = 2.0
+_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+_watched: dict[str, tuple[object, float]] = {}
+"""Of each claim of another host that was looked at: what it said, and since when [s]."""
 
 
 class Lease:
@@ -89,7 +92,7 @@ class Lease:
         claim = {
             "nonce": self.nonce,
             "pid": os.getpid(),
-            "process_created": psutil.Process().create_time(),
+            "process": process_identity(os.getpid()),
             "host": socket.gethostname(),
             "time": time.time(),
         }
@@ -131,21 +134,65 @@ def _held(descriptor: int) -> Generator[None]:
         os.close(descriptor)
 
 
+def process_identity(pid: int) -> str | None:
+    """Tell one process from every other that has or had its number, whatever the clock is set to.
+
+    Returns:
+        The start of the machine and, counted from there, of the process; none if it has ended.
+    """
+    try:
+        # The name of the program, in brackets, may hold anything.
+        status = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()
+        boot = _BOOT_ID.read_text().strip()
+    except FileNotFoundError:
+        return _identity_by_clock(pid)
+    except OSError:
+        return None
+    return None if status[0] in {"Z", "X"} else f"{boot}.{status[19]}"
+
+
+def _identity_by_clock(pid: int) -> str | None:
+    """Do so without Linux's files, where only the time of its start is known."""
+    try:
+        process = psutil.Process(pid)
+        return None if process.status() == psutil.STATUS_ZOMBIE else f"{process.create_time():.0f}"
+    except psutil.Error:
+        return None
+
+
 def live_holder(folder: Path) -> dict[str, Any] | None:
     """Give the claim on a run, or None if there is none or its process is gone.
 
     On this host the process itself decides; on another host a claim that was not renewed for
     `REMOTE_TIMEOUT_S` seconds is void.
     """
+    path = folder / LEASE
     try:
-        claim = read_mapping(folder / LEASE)
+        claim = read_mapping(path)
     except RunError:
         return None  # A damaged claim protects nobody.
     try:
         if claim["host"] != socket.gethostname():
-            return claim if time.time() - claim["time"] < REMOTE_TIMEOUT_S else None
+            return claim if _is_renewed(path, claim) else None
+        if "process" in claim:
+            return claim if process_identity(claim["pid"]) == claim["process"] else None
+        # Written by version 0.1.0 before November 2026: the clock tells when the process began.
         process = psutil.Process(claim["pid"])
         is_same = abs(process.create_time() - claim["process_created"]) < _CLOCK_TOLERANCE_S
         return claim if is_same and process.status() != psutil.STATUS_ZOMBIE else None
     except (KeyError, TypeError, ValueError, psutil.Error):
         return None
+
+
+def _is_renewed(path: Path, claim: dict[str, Any]) -> bool:
+    """Tell whether another host still renews its claim.
+
+    Whoever has looked before goes by what changed since; only the first look trusts the clocks.
+    """
+    content, clock = (claim.get("nonce"), claim["time"]), time.monotonic()
+    known = _watched.get(str(path))
+    if known is not None and known[0] == content:
+        return clock - known[1] < REMOTE_TIMEOUT_S
+    age = 0.0 if known is not None else min(max(0.0, time.time() - claim["time"]), REMOTE_TIMEOUT_S)
+    _watched[str(path)] = (content, clock - age)
+    return age < REMOTE_TIMEOUT_S

@@ -3,13 +3,16 @@
 import json
 import multiprocessing
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 from run_world import fill, make_run
 from safetensors.numpy import load_file
 
+from physhandi.data import lease
 from physhandi.data.run_folder import read_events
 from physhandi.errors import CancelledError, RunError
 from physhandi.progress import Progress
@@ -98,12 +101,17 @@ def test_a_claim_of_a_process_that_is_gone_is_void(tmp_path: Path) -> None:
     attempt = run.begin_attempt()
     path = run.folder / "lease.json"
     claim = json.loads(path.read_text())
-    path.write_text(json.dumps(claim | {"process_created": claim["process_created"] - 100}))
-    assert run.state == "failed"
-    assert "gone without a word" in (run.error or "")
-    path.write_text(json.dumps(claim | {"host": "elsewhere"}))
+    boot, _, ticks = claim["process"].rpartition(".")
+    for later in (f"{boot}.{int(ticks) + 1}", f"another-boot.{ticks}"):
+        path.write_text(json.dumps(claim | {"process": later}))
+        assert run.state == "failed"
+        assert "gone without a word" in (run.error or "")
+    # As earlier versions wrote it.
+    created = psutil.Process().create_time()
+    old = {name: value for name, value in claim.items() if name != "process"}
+    path.write_text(json.dumps(old | {"process_created": created}))
     assert run.state == "running"
-    path.write_text(json.dumps(claim | {"host": "elsewhere", "time": claim["time"] - 1000}))
+    path.write_text(json.dumps(old | {"process_created": created - 100}))
     assert run.state == "failed"
     path.write_text("{torn")
     assert run.state == "failed"
@@ -111,6 +119,35 @@ def test_a_claim_of_a_process_that_is_gone_is_void(tmp_path: Path) -> None:
         assert second.number == attempt.number + 1
         second.publish()
     assert run.state == "succeeded"
+
+
+def test_a_claim_of_another_host_is_void_when_it_is_not_renewed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, late = make_run(tmp_path / "fit"), make_run(tmp_path / "late")
+    clock = {"time": 5_000.0, "monotonic": 100.0}
+    monkeypatch.setattr(lease, "time", SimpleNamespace(**{k: lambda k=k: clock[k] for k in clock}))
+
+    def claim(of: Run, at: float) -> None:
+        content = {"nonce": "n", "host": "elsewhere", "pid": 1, "time": at}
+        (of.folder / "lease.json").write_text(json.dumps(content))
+
+    def is_held(of: Run) -> bool:
+        return lease.live_holder(of.folder) is not None
+
+    claim(run, at=4_990.0)
+    claim(late, at=5_000.0 - lease.REMOTE_TIMEOUT_S)
+    assert (is_held(run), is_held(late)) == (True, False)
+    # Who has looked before does not care what the clock is set to, only whether it is renewed.
+    clock["time"] += 3_600.0
+    assert is_held(run)
+    for _ in range(3):
+        clock["monotonic"] += 0.9 * lease.REMOTE_TIMEOUT_S
+        assert is_held(run)
+        claim(run, at=clock["monotonic"])
+    assert is_held(run)
+    clock["monotonic"] += lease.REMOTE_TIMEOUT_S
+    assert not is_held(run)
 
 
 def fail_in_the_second_stage(run: Run) -> None:
