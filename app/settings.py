@@ -52,6 +52,9 @@ class ServerSettings(BaseSettings):
     """Fits that may wait in line."""
     cancel_grace_s: float = Field(default=8.0, gt=0, le=600)
     """Time that a cancelled fit has to stop by itself before it is killed [s]."""
+    hung_after_s: float = Field(default=120.0, ge=0.1, le=86_400)
+    """Time without a sign of life after which an idle fit is ended and started once more [s]; one
+    that computes has 20 times as long."""
     live_sessions: int = Field(default=10, ge=1, le=100)
     """Most live scenes at a time."""
     live_idle_s: float = Field(default=900.0, gt=0)

@@ -14,6 +14,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -284,8 +285,10 @@ class Channel:
     def __init__(self) -> None:
         self.arguments = sys.argv[1:]
         # Libraries print to standard output; messages have that place to themselves.
-        self._messages = os.fdopen(os.dup(1), "w", encoding="utf-8")
+        # Written without a buffer, which a thread that ends with the process might hold locked.
+        self._messages = os.dup(1)
         self._telling = threading.Lock()
+        self._steps = 0
         os.dup2(2, 1)
 
     def requests(self) -> Iterator[Any]:
@@ -295,9 +298,29 @@ class Channel:
 
     def tell(self, **fields: object) -> None:
         """Send a message; from any thread."""
+        content = memoryview(json.dumps(fields).encode() + b"\n")
         with self._telling:
-            self._messages.write(json.dumps(fields) + "\n")
-            self._messages.flush()
+            while content:
+                content = content[os.write(self._messages, content) :]
+
+    def beat(self, interval_s: float) -> None:
+        """Tell from now on that this process is alive, and how far it is (``beat``).
+
+        Args:
+            interval_s: Time between two signs [s].
+        """
+
+        def tell() -> None:
+            with suppress(OSError):  # A parent that has gone takes this process along, or need not.
+                while True:
+                    self.tell(beat=self._steps)
+                    time.sleep(interval_s)
+
+        threading.Thread(target=tell, name="beat", daemon=True).start()
+
+    def step(self) -> None:
+        """Note that the work got on."""
+        self._steps += 1
 
 
 def run_child(work: Callable[[Channel], None]) -> NoReturn:

@@ -52,9 +52,12 @@ def stubborn(run: Run, attempt: Attempt) -> None:
         signal.pause()
 
 
-def killed(run: Run, attempt: Attempt) -> None:
-    attempt.progress().report("first", 1, 1, 2.0)
-    os.kill(os.getpid(), signal.SIGKILL)
+def frozen(run: Run, attempt: Attempt) -> None:
+    """Stand still once, then do the work."""
+    if attempt.number == 1:
+        attempt.progress().report("first", 1, 1, 2.0)
+        os.kill(os.getpid(), signal.SIGSTOP)
+    publish(run, attempt)
 
 
 def fail(run: Run, attempt: Attempt) -> None:
@@ -102,11 +105,13 @@ def crash(run: Run, attempt: Attempt) -> None:
     os._exit(7)
 
 
-BEHAVIOURS = {f.__name__: f for f in (publish, wait, stubborn, killed, fail, crash, defect, script)}
+DEEDS = (publish, wait, stubborn, frozen, fail, crash, defect, script)
+BEHAVIOURS = {f.__name__: f for f in DEEDS}
 
 
 def work(channel: Channel) -> None:
     run = Run.open(channel.arguments[0])
+    channel.beat(float(channel.arguments[2]))
     if run.name == "silent":
         raise SystemExit(5)
     with run.begin_attempt() as attempt:

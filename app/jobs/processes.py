@@ -144,7 +144,12 @@ WORKER = "app.jobs.worker"
 
 
 def start_supervisor(
-    run_folder: Path, device: str, *, worker: str = WORKER, threads: int | None = None
+    run_folder: Path,
+    device: str,
+    *,
+    hung_after_s: float,
+    worker: str = WORKER,
+    threads: int | None = None,
 ) -> "subprocess.Popen[str]":
     """Start the process that starts and watches a run's worker, in a session of its own.
 
@@ -153,6 +158,7 @@ def start_supervisor(
     Args:
         run_folder: Folder of the run.
         device: Warp device.
+        hung_after_s: Time without a sign of life after which its worker is taken to hang [s].
         worker: Python module that does the work.
         threads: How many threads its libraries may start; none for one each processor.
 
@@ -161,7 +167,7 @@ def start_supervisor(
     """
     return start_module(
         "app.jobs.supervise",
-        *(str(run_folder), device, worker),
+        *(str(run_folder), device, worker, str(hung_after_s)),
         threads=threads,
         environment={COOKIE: cookie_of(run_folder, secrets.token_hex(8))},
         outlives_parent=True,

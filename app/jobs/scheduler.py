@@ -1,7 +1,6 @@
 """The queue of fits: one thread starts them, watches them and ends cancelled ones."""
 
 import fcntl
-import json
 import logging
 import os
 import subprocess
@@ -23,9 +22,18 @@ from app.jobs.processes import (
     start_supervisor,
     supervisor_of,
 )
-from app.jobs.supervise import note_end
+from app.jobs.ticket import (
+    QUEUED,
+    STARTED,
+    Ticket,
+    is_lost,
+    note_end,
+    note_start,
+    put_in_line,
+    read_ticket,
+    start_again_or_end,
+)
 from app.settings import ServerSettings
-from physhandi.data.files import write_json
 from physhandi.data.lease import live_holder
 from physhandi.data.run_folder import EXIT, new_run_id
 from physhandi.errors import PhysHandiError, RunError, UsageError
@@ -58,10 +66,9 @@ def claim_folder(data_dir: Path) -> int:
 
 logger = logging.getLogger(__name__)
 
-QUEUED = "queued.json"
-"""File in a run's folder that puts it into the queue; the queue survives a restart."""
 AT_WORK = frozenset({"starting", "running", "stopping"})
 ENDED = frozenset({"succeeded", "failed", "cancelled"})
+_LOST = "It lost its process, which something outside ended."
 _INTERVAL_S = 0.25
 _IDLE_INTERVAL_S = 1.0
 _SWEEP_INTERVAL_S = 5.0
@@ -280,13 +287,21 @@ class Scheduler:
             # Until nothing is left: what is started meanwhile would be ended with the rest.
             return JobView("stopping", reason="Ending its processes.", progress=run.progress)
         if is_running:
-            return JobView("running", progress=run.progress)
+            return JobView("running", reason=_remark(run.folder), progress=run.progress)
         if (run.folder / QUEUED).is_file():
             return self._look_in_line(run)
         started = self._started.get(run.id)
         is_starting = is_supervised or (started is not None and started.poll() is None)
         if is_starting and not (run.folder / EXIT).is_file():
-            return JobView("starting", reason="Loading the program.")
+            told = f"{_remark(run.folder)} Loading the program.".lstrip()
+            return JobView("starting", reason=told)
+        return self._look_back(run)
+
+    @staticmethod
+    def _look_back(run: Run) -> JobView:
+        """Tell how a run ended that is neither in line nor at work."""
+        if is_lost(run.folder):
+            return JobView("stopping", reason=f"{_LOST} What is left of it is being ended.")
         state = run.state
         if state == "queued":
             return JobView("failed", reason="It was never started. Resume starts it.")
@@ -312,16 +327,18 @@ class Scheduler:
         return self._catalog.run(run_id), self.view(item)
 
     def _enqueue(self, run: Run) -> None:
-        write_json(run.folder / QUEUED, {"time": time.time()})
+        put_in_line(run.folder, Ticket(time=time.time()))
         self._line = (*self._line, run.id)
         self._wake.set()
 
     def _queue(self, items: list[RunItem]) -> list[RunItem]:
         waiting: list[tuple[float, str, RunItem]] = []
         for item in items:
-            path = item.folder / QUEUED
-            if item.run is not None and not item.is_bundled and path.is_file():
-                waiting.append((_queued_at(path), item.id, item))
+            if item.run is None or item.is_bundled:
+                continue
+            ticket = read_ticket(item.folder / QUEUED)
+            if ticket is not None:
+                waiting.append((ticket.time, item.id, item))
         return [item for _, _, item in sorted(waiting, key=lambda entry: entry[:2])]
 
     def _watch(self) -> None:
@@ -359,11 +376,13 @@ class Scheduler:
             self._line = tuple(item.id for item in queue if item.id not in self._started)
 
     def _start(self, item: RunItem) -> None:
+        note_start(item.folder)
         (item.folder / EXIT).unlink(missing_ok=True)
         at_a_time = self._settings.parallel_fits
         process = start_supervisor(
             item.folder,
             self._settings.device,
+            hung_after_s=self._settings.hung_after_s,
             worker=self._worker,
             threads=None if at_a_time == 1 else max(1, (os.cpu_count() or 1) // at_a_time),
         )
@@ -380,10 +399,29 @@ class Scheduler:
             if folder.parent != self._settings.run_dir:
                 continue
             with self._lock:  # A run that is being started has a process before it is noted.
-                is_lost = folder.name not in self._started and supervisor_of(folder) is None
-            if is_lost:
+                is_left = folder.name not in self._started and supervisor_of(folder) is None
+            if is_left:
                 logger.warning("process %d of run %s lost its supervisor", process.pid, folder.name)
                 end_processes(folder, grace_s=0.0)
+        for folder in self._lost_runs():
+            logger.warning("run %s lost its process", folder.name)
+            end_processes(folder, grace_s=0.0)
+            start_again_or_end(folder, _LOST)
+            self._wake.set()
+
+    def _lost_runs(self) -> list[Path]:
+        """Find the runs that were started, have not ended and are worked on by nobody."""
+        with self._lock:
+            folders = [run.folder for run in self.at_work()]
+            return [
+                folder
+                for folder in folders
+                if folder.name not in self._started
+                and folder.name not in self._stopping
+                and is_lost(folder)
+                and supervisor_of(folder) is None
+                and live_holder(folder) is None
+            ]
 
     def _end(self, run_id: str, folder: Path) -> None:
         """Wait for the worker to stop by itself, then make sure that nothing of it is left."""
@@ -437,8 +475,7 @@ def _is_at(path: str, folder: Path) -> bool:
     return Path(path).name == folder.name and Path(path).resolve() == folder
 
 
-def _queued_at(path: Path) -> float:
-    try:
-        return float(json.loads(path.read_text(encoding="utf-8"))["time"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return 0.0
+def _remark(folder: Path) -> str:
+    """Tell of a run at work if it was not started for the first time."""
+    ticket = read_ticket(folder / STARTED)
+    return "" if ticket is None else ticket.remark

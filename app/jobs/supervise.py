@@ -1,84 +1,159 @@
 """The small process between server and worker: ``python -m app.jobs.supervise``.
 
-It loads no heavy library, writes the log, notes how the worker ended if the worker could not, and
-leaves no process behind.
+It loads no heavy library, writes the log, ends a worker that hangs, notes how the worker ended if
+the worker could not, and leaves no process behind.
 """
 
 import os
+import re
 import signal
+import threading
+import time
+from contextlib import suppress
 from pathlib import Path
 
+import psutil
+
 from app.jobs.processes import COOKIE, adopt_orphans, claim_supervision, end_processes
+from app.jobs.ticket import QUEUED, note_end, start_again_or_end
+from app.jobs.vigil import Vigil
 from physhandi.child import Channel, Child, ChildEndedError, run_child
-from physhandi.data.files import write_json
-from physhandi.data.lease import live_holder, locked
-from physhandi.data.run_folder import CANCEL, EXIT, LOG, now
+from physhandi.data.run_folder import EXIT, LOG
 from physhandi.errors import PhysHandiError
 
+_BEATS = 6.0
+"""Signs of life in the time after which a silent worker hangs."""
 
-def supervise(run_folder: Path, device: str, worker: str) -> None:
-    """Run the worker of a run until it ends; nothing happens if the run has a supervisor."""
+
+def supervise(run_folder: Path, device: str, worker: str, hung_after_s: float) -> None:
+    """Run the worker of a run until it ends; nothing happens if the run has a supervisor.
+
+    Args:
+        run_folder: The run.
+        device: Warp device.
+        worker: Python module that does the work.
+        hung_after_s: See `Vigil`.
+    """
     claim = claim_supervision(run_folder)
     if claim is None:
         return
     adopt_orphans()
+    # A server that was killed just now has not taken it out of line.
+    (run_folder / QUEUED).unlink(missing_ok=True)
     (run_folder / EXIT).unlink(missing_ok=True)
-    with Child(worker, str(run_folder), device, log=run_folder / LOG) as child:
+    killed_before = count_memory_kills()
+    beat_s = str(hung_after_s / _BEATS)
+    with Child(worker, str(run_folder), device, beat_s, log=run_folder / LOG) as child:
         signal.signal(signal.SIGTERM, lambda _number, _frame: child.terminate())
-        error, kind = _hear(child)
+        watch = _Watch(child, hung_after_s)
+        error, kind = watch.hear()
         nonce = os.environ.get(COOKIE, "").rpartition(":")[2]
         end_processes(run_folder, grace_s=0.0, spare=os.getpid(), nonce=nonce)
-    if not (run_folder / EXIT).is_file():
+    if watch.hung is not None:
+        start_again_or_end(run_folder, watch.hung)
+    elif kind == _KILLED and count_memory_kills() > killed_before:
+        told = "The system killed the worker because memory had run out."
+        note_end(run_folder, told, MemoryError.__name__)
+    elif kind == _KILLED:
+        start_again_or_end(run_folder, error)
+    else:
         note_end(run_folder, error, kind)
 
 
-def note_end(run_folder: Path, error: str, kind: str = "") -> None:
-    """Write how a run ended for a worker that could not; what it wrote itself stays.
+def count_memory_kills(root: Path = Path("/")) -> int:
+    """Count the processes that the kernel has killed because memory ran out (Linux).
+
+    They are those of this process's control group, or where that cannot be read, of the machine.
 
     Args:
-        run_folder: The run.
-        error: What went wrong; a run that was to be cancelled is cancelled whatever it is.
-        kind: Name of the error's class, if it is known.
+        root: Where the kernel's files are.
     """
-    is_cancelled = (run_folder / CANCEL).exists()
-    with locked(run_folder):
-        if (run_folder / EXIT).is_file() or live_holder(run_folder) is not None:
-            return
-        content = {"state": "cancelled" if is_cancelled else "failed", "time": now()}
-        content |= (
-            {"error": "Cancelled.", "error_type": ""}
-            if is_cancelled
-            else {"error": error, "error_type": kind}
-        )
-        write_json(run_folder / EXIT, content)
-
-
-def _hear(child: Child) -> tuple[str, str]:
-    """Wait for the worker's end; returns what went wrong and the name of the error's class."""
     try:
-        for _ in child.messages():
-            pass
-    except ChildEndedError as error:
-        return _explain(error.code), ""
-    except PhysHandiError as error:
-        return str(error), type(error).__name__
-    return _explain(0), ""
+        groups = (root / "proc/self/cgroup").read_text()
+    except OSError:
+        return 0
+    tried: list[tuple[Path, str]] = []
+    for line in groups.splitlines():
+        _, kinds, path = line.split(":", 2)
+        place = path.lstrip("/")
+        if not kinds:
+            tried.append((root / "sys/fs/cgroup" / place, "memory.events"))
+        elif "memory" in kinds.split(","):
+            tried.append((root / "sys/fs/cgroup/memory" / place, "memory.oom_control"))
+            tried.append((root / "sys/fs/cgroup/memory", "memory.oom_control"))
+    for file in (*(folder / name for folder, name in tried), root / "proc/vmstat"):
+        with suppress(OSError):
+            found = re.search(r"^oom_kill (\d+)$", file.read_text(), re.MULTILINE)
+            if found:
+                return int(found[1])
+    return 0
 
 
-def _explain(code: int) -> str:
+_KILLED = "killed"
+
+
+class _Watch:
+    """Hears a worker until it ends, and ends it if it hangs."""
+
+    def __init__(self, child: Child, hung_after_s: float) -> None:
+        self._child = child
+        self._vigil = Vigil(hung_after_s, now=time.monotonic())
+        self._is_over = threading.Event()
+        self.hung: str | None = None
+        """Why it was ended, if it hung."""
+
+    def hear(self) -> tuple[str, str]:
+        """Wait for the worker's end; returns what went wrong and the name of the error's class."""
+        thread = threading.Thread(target=self._look, daemon=True)
+        thread.start()
+        try:
+            for message in self._child.messages():
+                if isinstance(beat := message.get("beat"), int):
+                    self._vigil.hear(beat)
+        except ChildEndedError as error:
+            return _explain(error.code)
+        except PhysHandiError as error:
+            return str(error), type(error).__name__
+        finally:
+            self._is_over.set()
+            thread.join()
+        return _explain(0)
+
+    def _look(self) -> None:
+        process = psutil.Process(self._child.pid)
+        while not self._is_over.wait(self._vigil.interval_s):
+            why = self._vigil.look(time.monotonic(), _computed(process))
+            if why is not None:
+                self.hung = why
+                self._child.kill()
+                return
+
+
+def _computed(process: psutil.Process) -> float:
+    """Give what a process and all that it started have computed [s]."""
+    total = 0.0
+    with suppress(psutil.Error):
+        for one in (process, *process.children(recursive=True)):
+            with suppress(psutil.Error):
+                total += sum(one.cpu_times()[:4])
+    return total
+
+
+def _explain(code: int) -> tuple[str, str]:
     if code == -signal.SIGKILL:
         return (
-            "The worker was killed (signal 9), most likely because memory ran out. "
-            "Use a profile with fewer nodes, or resume."
+            "It lost its process: something outside killed the worker (signal 9), and memory had "
+            "not run out.",
+            _KILLED,
         )
     if code < 0:
-        return f"The worker died of {signal.Signals(-code).name}. Its log may tell why."
-    return f"The worker ended with code {code} before it could say why. Its log may tell."
+        return f"The worker died of {signal.Signals(-code).name}. Its log may tell why.", ""
+    return f"The worker ended with code {code} before it could say why. Its log may tell.", ""
 
 
 def _work(channel: Channel) -> None:
-    run_folder, device, worker = channel.arguments
-    supervise(Path(run_folder), device, worker)
+    run_folder, device, worker, hung_after_s = channel.arguments
+    supervise(Path(run_folder), device, worker, float(hung_after_s))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The process that fills one run: ``python -m app.jobs.worker RUN_FOLDER DEVICE``.
+"""The process that fills one run: ``python -m app.jobs.worker RUN_FOLDER DEVICE BEAT_S``.
 
 The run folder tells how far it is and how it ended; its log has the details.
 """
@@ -6,6 +6,7 @@ The run folder tells how far it is and how it ended; its log has the details.
 import logging
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 
@@ -21,7 +22,13 @@ _LOG_INTERVAL_S = 5.0
 class LoggedProgress(Progress):
     """Logs when a stage begins, and now and then how far it is."""
 
-    def __init__(self) -> None:
+    def __init__(self, step: Callable[[], None]) -> None:
+        """Prepare.
+
+        Args:
+            step: Is told that the work got on.
+        """
+        self._step = step
         self._stage = ""
         self._time = 0.0
 
@@ -34,6 +41,7 @@ class LoggedProgress(Progress):
         message: str = "",
     ) -> None:
         """Log a report, unless the last one was just now; see `Progress.report`."""
+        self._step()
         if stage == self._stage and time.monotonic() - self._time < _LOG_INTERVAL_S:
             return
         self._stage, self._time = stage, time.monotonic()
@@ -42,8 +50,13 @@ class LoggedProgress(Progress):
         logger.info("%s", f"{line} ({message})" if message else line)
 
 
-def fill_run(run_folder: Path, device: str) -> None:
+def fill_run(run_folder: Path, device: str, step: Callable[[], None]) -> None:
     """Run the pipeline for a run folder.
+
+    Args:
+        run_folder: The run.
+        device: Warp device.
+        step: Is told that the work got on.
 
     Raises:
         PhysHandiError: If it failed or was cancelled, as the run folder says too.
@@ -52,7 +65,7 @@ def fill_run(run_folder: Path, device: str) -> None:
     logger.info("run %s begins on %s", run.id, device)
     from physhandi import pipeline
 
-    pipeline.run_job(run, LoggedProgress(), device=device)
+    pipeline.run_job(run, LoggedProgress(step), device=device)
     logger.info("run %s is finished", run.id)
 
 
@@ -61,10 +74,11 @@ def _stop(_number: int, _frame: FrameType | None) -> None:
 
 
 def _work(channel: Channel) -> None:
-    run_folder, device = channel.arguments
+    run_folder, device, beat_s = channel.arguments
+    channel.beat(float(beat_s))
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
     signal.signal(signal.SIGTERM, _stop)
-    fill_run(Path(run_folder), device)
+    fill_run(Path(run_folder), device, channel.step)
 
 
 if __name__ == "__main__":

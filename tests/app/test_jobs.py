@@ -30,7 +30,7 @@ GRACE_S = 0.4
 class Desk:
     """A scheduler, and shortcuts to what a test asks it."""
 
-    def __init__(self, data_dir: Path, **settings: int) -> None:
+    def __init__(self, data_dir: Path, **settings: Any) -> None:
         self.settings = ServerSettings(data_dir=data_dir, cancel_grace_s=GRACE_S, **settings)
         self.catalog = Catalog(self.settings)
         self.scheduler = Scheduler(self.settings, self.catalog, worker="job_worker")
@@ -58,7 +58,7 @@ def desks(data_dir: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[
     monkeypatch.setattr(scheduler_module, "_SWEEP_INTERVAL_S", 0.3)
     made: list[Desk] = []
 
-    def make(**settings: int) -> Desk:
+    def make(**settings: Any) -> Desk:
         desk = Desk(data_dir, **settings)
         made.append(desk)
         desk.scheduler.start()
@@ -236,14 +236,35 @@ def test_a_closed_server_starts_nothing_more(desk: Desk) -> None:
 
 
 def test_a_killed_worker_fails_with_a_reason_and_takes_its_children_along(desk: Desk) -> None:
-    killed = desk.launch("killed")
-    view = desk.until(killed, "failed")
-    assert "signal 9" in view.reason
     stubborn = desk.launch("stubborn")
-    worker, child = pids_of(desk.run(stubborn))
-    os.kill(worker, signal.SIGKILL)
-    assert "signal 9" in desk.until(stubborn, "failed").reason
-    until(lambda: not is_alive(child))
+    run = desk.run(stubborn)
+    for start in (1, 2):
+        worker, child = pids_of(run)
+        (run.folder / "pids").unlink()
+        told = "It was started again (2 of 2)" if start == 2 else ""
+        assert told in desk.view(stubborn).reason
+        os.kill(worker, signal.SIGKILL)
+        until(lambda child=child: not is_alive(child))
+    reason = desk.until(stubborn, "failed").reason
+    assert "killed the worker (signal 9), and memory had not run out" in reason
+    assert "That happened twice, so it is not started again." in reason
+    # Whoever resumes it has two starts again.
+    desk.scheduler.resume(stubborn)
+    pids_of(run)
+    assert desk.view(stubborn).reason == ""
+
+
+def test_a_hung_worker_is_ended_and_its_run_started_once_more(desks: Callable[..., Desk]) -> None:
+    desk = desks(hung_after_s=2.0)
+    run_id = desk.launch("frozen")
+    run = desk.run(run_id)
+    until(lambda: desk.state(run_id) == "running")
+    stopped = live_holder(run.folder)
+    assert stopped is not None
+    desk.until(run_id, "succeeded")
+    assert not is_alive(stopped["pid"])
+    assert (run.folder / "current").read_text().strip() == "2"
+    until(lambda: not (run.folder / "started.json").exists())
 
 
 @pytest.mark.parametrize(
@@ -263,17 +284,27 @@ def test_every_way_to_fail_tells_why(desk: Desk, behaviour: str, reason: str) ->
         until(lambda: "the last words" in (desk.run(run_id).folder / "log.txt").read_text())
 
 
-def test_the_worker_dies_with_its_supervisor_and_the_run_can_go_on(desk: Desk) -> None:
+def test_a_run_that_loses_its_supervisor_is_started_once_more(desk: Desk) -> None:
     run_id = desk.launch("wait")
     run = desk.run(run_id)
     until(lambda: (run.progress or {}).get("stage") == "second")
     supervisor = supervisor_of(run.folder)
     assert supervisor is not None
     os.kill(supervisor, signal.SIGKILL)
-    desk.until(run_id, "failed")
+    until(lambda: run.attempt == 2)
+    told = "It lost its process, which something outside ended. It was started again (2 of 2)."
+    assert told in desk.view(run_id).reason
+    # It goes on after its last finished stage, but only once.
+    desk.until(run_id, "running")
+    again = supervisor_of(run.folder)
+    assert again is not None
+    os.kill(again, signal.SIGKILL)
+    assert "That happened twice" in desk.until(run_id, "failed").reason
+    assert run.attempt == 2
     (run.folder / "go").touch()
     desk.scheduler.resume(run_id)
     desk.until(run_id, "succeeded")
+    assert run.json("first.json") == {"attempt": 1}
 
 
 def test_a_restarted_server_finds_running_and_waiting_runs_again(
@@ -350,7 +381,8 @@ def test_a_sweep_spares_the_run_that_is_just_being_started(
     new, lost = desk.run(desk.launch("new")), data_dir / "runs" / "lost"
     folders = (new.folder, lost, data_dir / "elsewhere" / "lost")
     ended: list[tuple[Path, bool]] = []
-    reached, lock = threading.Event(), desk.scheduler._lock
+    reached = threading.Event()
+    lock: Any = desk.scheduler._lock
 
     class WatchedLock:
         def __enter__(self) -> None:

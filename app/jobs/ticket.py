@@ -1,0 +1,112 @@
+"""A run's ticket: its place in line, and how often it was started, as its folder keeps it."""
+
+import json
+from dataclasses import asdict, dataclass, replace
+from math import isfinite
+from pathlib import Path
+
+from physhandi.data.files import named_fields, write_json
+from physhandi.data.lease import live_holder, locked
+from physhandi.data.run_folder import CANCEL, EXIT, now
+
+QUEUED = "queued.json"
+"""File in a run's folder that puts it into the queue; the queue survives a restart."""
+STARTED = "started.json"
+"""File of a run that the queue has started and that has not ended."""
+MOST_STARTS = 2
+"""How often a run is started that loses its process through no fault of its own."""
+
+
+@dataclass(frozen=True)
+class Ticket:
+    """What the queue knows of a run that waits or is at work."""
+
+    time: float = 0.0
+    """When it was put in line [s since 1970]."""
+    starts: int = 0
+    """How often it was started."""
+    why: str = ""
+    """Why it was started again."""
+
+    @property
+    def remark(self) -> str:
+        """What is told of a run that was not started for the first time."""
+        if not self.why:
+            return ""
+        return f"{self.why} It was started again ({self.starts} of {MOST_STARTS})."
+
+
+def read_ticket(path: Path) -> Ticket | None:
+    """Read a ticket; None if there is none. Fields that are damaged are as in a new one."""
+    try:
+        content = named_fields(json.loads(path.read_bytes())) or {}
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, RecursionError):
+        return Ticket()
+    time, starts, why = (content.get(name) for name in ("time", "starts", "why"))
+    return Ticket(
+        time=time if isinstance(time, float) and isfinite(time) else 0.0,
+        starts=starts if isinstance(starts, int) else 0,
+        why=why if isinstance(why, str) else "",
+    )
+
+
+def put_in_line(run_folder: Path, ticket: Ticket) -> None:
+    """Put a run in line."""
+    write_json(run_folder / QUEUED, asdict(ticket))
+
+
+def note_start(run_folder: Path) -> None:
+    """Note that a run is about to be started once more; it stays in line until it has begun."""
+    ticket = read_ticket(run_folder / QUEUED) or Ticket()
+    write_json(run_folder / STARTED, asdict(replace(ticket, starts=ticket.starts + 1)))
+
+
+def start_again_or_end(run_folder: Path, why: str) -> None:
+    """Put a run that lost its process back to its old place, once; then it has failed.
+
+    Args:
+        run_folder: The run; nothing of it is at work any more.
+        why: How it lost its process, as a sentence.
+    """
+    ticket = read_ticket(run_folder / STARTED) or Ticket(starts=MOST_STARTS)
+    if (run_folder / EXIT).is_file() or (run_folder / CANCEL).exists():
+        note_end(run_folder, why)
+    elif ticket.starts < MOST_STARTS:
+        put_in_line(run_folder, replace(ticket, why=why))
+    else:
+        times = "twice" if MOST_STARTS == 2 else f"{MOST_STARTS} times"
+        note_end(run_folder, f"{why} That happened {times}, so it is not started again.")
+
+
+def note_end(run_folder: Path, error: str, kind: str = "") -> None:
+    """Write how a run ended for a worker that could not; what it wrote itself stays.
+
+    Args:
+        run_folder: The run.
+        error: What went wrong; a run that was to be cancelled is cancelled whatever it is.
+        kind: Name of the error's class, if it is known.
+    """
+    is_cancelled = (run_folder / CANCEL).exists()
+    with locked(run_folder):
+        if live_holder(run_folder) is not None:
+            return
+        if not (run_folder / EXIT).is_file():
+            content = {"state": "cancelled" if is_cancelled else "failed", "time": now()}
+            content |= (
+                {"error": "Cancelled.", "error_type": ""}
+                if is_cancelled
+                else {"error": error, "error_type": kind}
+            )
+            write_json(run_folder / EXIT, content)
+        (run_folder / STARTED).unlink(missing_ok=True)
+
+
+def is_lost(run_folder: Path) -> bool:
+    """Tell whether a run was started and is neither in line nor ended; if nobody works on it."""
+    return (
+        (run_folder / STARTED).is_file()
+        and not (run_folder / QUEUED).is_file()
+        and not (run_folder / EXIT).is_file()
+    )
