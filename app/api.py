@@ -18,6 +18,7 @@ from app.ids import ItemId
 from app.jobs.about import RunChanges, change_about
 from app.jobs.catalog import Catalog, NotFoundError
 from app.jobs.checks import check_item
+from app.jobs.launch_keys import KeyedRequest
 from app.jobs.listing import RunQuery, page_of, select_runs
 from app.jobs.log import open_log
 from app.jobs.machine import Machine
@@ -409,7 +410,21 @@ def _add_jobs(
         )
 
     @router.post("/runs", status_code=201)
-    def launch(new: NewRun) -> dict[str, Any]:
+    def launch(
+        new: NewRun,
+        response: Response,
+        idempotency_key: Annotated[
+            str | None, Header(min_length=1, max_length=255, pattern=r"^[!-~]+$")
+        ] = None,
+    ) -> dict[str, Any]:
+        """Launch a fit; whoever asks again with the same Idempotency-Key gets the same run."""
+        request = None
+        if idempotency_key is not None:
+            request = KeyedRequest.of(idempotency_key, new.model_dump(mode="json"))
+            launched = scheduler.launched_by(request)
+            if launched is not None:
+                response.headers["Idempotency-Replayed"] = "true"
+                return describe_run(catalog.run_item(launched.id), scheduler)
         tasks.require_settled(new.sequences)
         run = scheduler.launch(
             new.sequences,
@@ -418,6 +433,7 @@ def _add_jobs(
             overrides=new.overrides,
             parent=new.parent,
             accepts_missing=new.accepts_missing,
+            request=request,
         )
         return describe_run(catalog.run_item(run.id), scheduler)
 

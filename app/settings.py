@@ -126,6 +126,11 @@ class ServerSettings(BaseSettings):
         return self.data_dir / "suites"
 
     @property
+    def launches_path(self) -> Path:
+        """File that says which run was launched by which key of a client."""
+        return self.data_dir / "launches.json"
+
+    @property
     def index_path(self) -> Path:
         """File of the index of runs; made again when it is deleted."""
         return self.data_dir / "cache" / "runs.json"

@@ -14,6 +14,7 @@ import difflib
 import inspect
 import math
 import re
+import threading
 import types
 import typing
 from collections.abc import Iterable, Mapping
@@ -346,12 +347,15 @@ def _unwrapped(hint: Any) -> tuple[Any, list[Any], bool]:
     return hint, [], False
 
 
+_parsing = threading.Lock()
 _UNIT = re.compile(r"\s*\[((?:1/)?[A-Za-z][^\]\d]*)\]")
 
 
 def _meanings(kind: type) -> dict[str, tuple[str, str]]:
     """Read meaning and unit of each field from the text below it."""
-    (declared,) = ast.parse(inspect.getsource(kind)).body
+    # Python 3.11 counts the depth of a tree that it makes for all threads together, and fails.
+    with _parsing:
+        (declared,) = ast.parse(inspect.getsource(kind)).body
     meanings: dict[str, tuple[str, str]] = {}
     body = declared.body if isinstance(declared, ast.ClassDef) else []
     for declaration, note in pairwise(body):

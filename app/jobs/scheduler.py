@@ -13,6 +13,7 @@ from typing import Any
 
 from app.jobs.catalog import Catalog, RunItem
 from app.jobs.eta import Forecast
+from app.jobs.launch_keys import KeyedRequest, LaunchKeys
 from app.jobs.order import default_name, fit_config, require_agreement
 from app.jobs.processes import (
     WORKER,
@@ -111,6 +112,7 @@ class Scheduler:
         self.forecast = Forecast(catalog, settings.device)
         """Estimates how long fits still take."""
         self._lock = threading.RLock()
+        self._keys = LaunchKeys(settings.launches_path)
         self._started: dict[str, subprocess.Popen[str]] = {}
         self._stopping: dict[str, threading.Thread] = {}
         self._ended: dict[str, tuple[int, JobView]] = {}
@@ -154,6 +156,7 @@ class Scheduler:
         overrides: Mapping[str, Any] | None = None,
         parent: str | None = None,
         accepts_missing: bool = False,
+        request: KeyedRequest | None = None,
     ) -> Run:
         """Make a run of one or several sequences and queue it.
 
@@ -164,6 +167,7 @@ class Scheduler:
             overrides: Settings that differ from the profile, by their paths.
             parent: Id of the run that it was made from.
             accepts_missing: Whether the object may be left out although depth was recorded.
+            request: The request that asks for it, if it may come again; then it is made once.
 
         Raises:
             UsageError: If there is no sequence or no such profile.
@@ -181,12 +185,21 @@ class Scheduler:
         sequences = [self._catalog.sequence(sequence_id) for sequence_id in sequence_ids]
         require_agreement(sequences, accepts_missing=accepts_missing)
         with self._lock:
+            run_id = None
+            if request is not None:
+                if (launched := self.launched_by(request)) is not None:
+                    return launched
+                run_id = self._keys.run_of(request)
             if len(self._queue(self._catalog.runs())) >= self._settings.waiting_fits:
                 raise QueueFullError(
                     f"{self._settings.waiting_fits} fits wait already. Cancel some of them first."
                 )
+            run_id = run_id or new_run_id()
+            if request is not None:
+                # Before the run: who is killed now makes the same run when it is asked again.
+                self._keys.note(request, run_id)
             run = Run.create(
-                self._settings.run_dir / new_run_id(),
+                self._settings.run_dir / run_id,
                 name=name.strip() or default_name(sequences[0].name, config),
                 kind="reconstruction",
                 sequences=[str(sequence.folder) for sequence in sequences],
@@ -194,6 +207,23 @@ class Scheduler:
             )
             self._enqueue(run)
         return run
+
+    def launched_by(self, request: KeyedRequest) -> Run | None:
+        """Give the run that a request has launched already; None if it has not.
+
+        Raises:
+            UsageError: If another request had its key.
+            RunError: If its run was deleted since.
+        """
+        with self._lock:
+            run_id = self._keys.run_of(request)
+            if run_id is None or not (self._settings.run_dir / run_id).is_dir():
+                return None
+            run = self._catalog.run(run_id)
+            marks = (QUEUED, STARTED, EXIT)
+            if run.attempt is None and not any((run.folder / mark).is_file() for mark in marks):
+                self._enqueue(run)  # The server was killed before it did so.
+            return run
 
     def start_now(self, run: Run) -> None:
         """Start a run beside the line, for what takes seconds while somebody waits."""
@@ -249,6 +279,7 @@ class Scheduler:
                     "before you delete it."
                 )
             run.delete()
+            self._keys.note_deleted(run_id)
 
     @property
     def slots(self) -> int:
