@@ -69,8 +69,8 @@ def reconstruct(
 ) -> Run:
     """Reconstruct hands and object of one or several recordings of the same object.
 
-    A run that was interrupted goes on after its last finished stage; one that is finished and was
-    asked for the same is opened as it is.
+    A run that was interrupted goes on from its latest checkpoint and ends with the same bits; one
+    that is finished and was asked for the same is opened as it is.
 
     Args:
         sequences: The recordings; the first one defines the object's nodes.

@@ -1,12 +1,13 @@
 """The paper on one page: hands, then the object that they move, then how well it went.
 
-Each stage reads what earlier stages stored and stores what it found, so that an interrupted run
-goes on after its last finished stage.
+Each stage reads what earlier stages stored and stores what it found, and keeps its state while it
+works, so that an interrupted run goes on where it was.
 """
 
+import hashlib
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Many
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,9 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from physhandi.data.attempt import Attempt
+from physhandi.data.checkpoint import Checkpointer
 from physhandi.data.environment import ENVIRONMENT, describe_environment
+from physhandi.data.files import json_line
 from physhandi.data.layout import (
     MATERIAL_FILE,
     METRICS_FILE,
@@ -92,6 +95,9 @@ Rule = Callable[
 ]
 """Moves the object's nodes of frame 0 with the control nodes of all frames [m]."""
 
+Keeper = Callable[[], Checkpointer]
+"""Gives what keeps the states of the stage that begins."""
+
 Problems = Callable[[], list[ObjectProblem]]
 """Gives what the object is fitted to, one for each sequence."""
 
@@ -131,15 +137,34 @@ def reconstruct(
         CancelledError: If the user asked to stop.
     """
     config = config.replace(object_=config.object_.on(device))
-    has_object = _prepare(sequences, config, attempt, progress)
+    keeper = partial(attempt.checkpointer, _origin_of(sequences, config, device))
+    has_object = _prepare(sequences, config, attempt, progress, keeper)
     if has_object:
         # Built once, by the first stage that is not finished yet.
         problems = cache(lambda: _problems(sequences, config, attempt))
         is_rod = bends_as_rod(sequences, config)
-        _stage_search(problems, config, attempt, progress, device, is_rod=is_rod)
-        _stage_springs(problems, config, attempt, progress, device, is_rod=is_rod)
-        _stage_refinement(sequences, problems, config, attempt, progress, device=device)
+        _stage_search(problems, config, attempt, progress, device, is_rod=is_rod, keeper=keeper)
+        _stage_springs(problems, config, attempt, progress, device, is_rod=is_rod, keeper=keeper)
+        _stage_refinement(
+            sequences, problems, config, attempt, progress, device=device, keeper=keeper
+        )
     return _stage_evaluation(sequences, config, attempt, progress, device, has_object=has_object)
+
+
+def _origin_of(sequences: Many[Sequence], config: PipelineConfig, device: str) -> dict[str, str]:
+    """Name what a fit depends on: a checkpoint of another one says nothing about this one."""
+    made_with = describe_environment(device, describe_device(device))
+    program = {key: made_with[key] for key in ("commit", "packages", "python", "system")}
+    recordings = [sequence.content_fingerprint() for sequence in sequences]
+    parts = {
+        "program": program,
+        "settings": config.to_dict(),
+        "recordings": recordings,
+        "device": [device, made_with["device_name"]],
+    }
+    return {
+        name: hashlib.sha256(json_line(part).encode()).hexdigest() for name, part in parts.items()
+    }
 
 
 def predict(
@@ -158,7 +183,8 @@ def predict(
         MissingInputError: If the sequence has no object, or nothing that moves it.
         CancelledError: If the user asked to stop.
     """
-    if not _prepare([sequence], config, attempt, progress):
+    keeper = partial(attempt.checkpointer, _origin_of([sequence], config, "cpu"))
+    if not _prepare([sequence], config, attempt, progress, keeper):
         raise MissingInputError(nothing_to_fit([sequence]))
     if attempt.stage_done(EVALUATION):
         return
@@ -412,7 +438,11 @@ def evaluate(run: RunFolder, sequences: Many[Sequence]) -> dict[str, Any]:
 
 
 def _prepare(
-    sequences: Many[Sequence], config: PipelineConfig, attempt: Attempt, progress: Progress
+    sequences: Many[Sequence],
+    config: PipelineConfig,
+    attempt: Attempt,
+    progress: Progress,
+    keeper: Keeper,
 ) -> bool:
     """Reconstruct hands and collect what was seen; tell whether there is an object to fit."""
     found = readiness(sequences, config)
@@ -420,24 +450,29 @@ def _prepare(
         raise MissingInputError(nothing_to_fit(sequences))
     for sequence in sequences:
         artefacts.save_sequence_meta(attempt, sequence)
-    _stage_hands(sequences, config, attempt, progress)
+    _stage_hands(sequences, config, attempt, progress, keeper)
     if found[OBSERVATION].is_ready:
         _stage_observation(sequences, config, attempt, progress)
     return found[OBSERVATION].is_ready
 
 
 def _stage_hands(
-    sequences: Many[Sequence], config: PipelineConfig, attempt: Attempt, progress: Progress
+    sequences: Many[Sequence],
+    config: PipelineConfig,
+    attempt: Attempt,
+    progress: Progress,
+    keeper: Keeper,
 ) -> None:
     """Stage 1: a hand mesh for every frame, from keypoints and depth of all views."""
     if attempt.stage_done(HANDS):
         return
     before, after, curve = [], [], []
     left_out: list[str] = []
+    checkpointer = keeper()
     for sequence in sequences:
         if missing_for_hands(sequence):
             continue
-        fit = reconstruct_hands(sequence, config.hand, progress)
+        fit = reconstruct_hands(sequence, config.hand, progress, checkpointer=checkpointer)
         artefacts.save_motions(attempt, sequence.name, fit.motions)
         artefacts.save_hand_observation(attempt, sequence.name, fit.keypoint)
         artefacts.save_hand_points(attempt, sequence, progress)
@@ -543,6 +578,7 @@ def _stage_search(
     device: str,
     *,
     is_rod: bool,
+    keeper: Keeper,
 ) -> None:
     """Stage 2, zeroth-order: topology and the other global parameters."""
     if attempt.stage_done(SEARCH):
@@ -551,7 +587,9 @@ def _stage_search(
     if is_rod:
         result = start_rope(problems(), *settings, progress)
     else:
-        result = search_object(problems(), *settings, progress, device=device)
+        result = search_object(
+            problems(), *settings, progress, device=device, checkpointer=keeper()
+        )
     attempt.save_yaml(PARAMETERS_FILE, result.parameters.to_dict())
     searched = {name: variable.to_dict() for name, variable in result.intervals.items()}
     attempt.save_yaml(SEARCH_FILE, {"intervals": searched, "widened": list(result.widened)})
@@ -567,6 +605,7 @@ def _stage_springs(
     device: str,
     *,
     is_rod: bool,
+    keeper: Keeper,
 ) -> None:
     """Stage 2, first-order: a stiffness and a damping for each spring; or how a rope bends."""
     if attempt.stage_done(SPRINGS):
@@ -575,7 +614,14 @@ def _stage_springs(
     if is_rod:
         result = fit_rope(problems(), parameters, config.object_, progress)
     else:
-        result = optimise_springs(problems(), parameters, config.object_, progress, device=device)
+        result = optimise_springs(
+            problems(),
+            parameters,
+            config.object_,
+            progress,
+            device=device,
+            checkpointer=keeper(),
+        )
     for problem in problems():
         artefacts.save_model(attempt, problem.name, result.models[problem.name])
         if problem.contacts is not None:
@@ -595,6 +641,7 @@ def _stage_refinement(
     progress: Progress,
     *,
     device: str,
+    keeper: Keeper,
 ) -> None:
     """Stage 3: hands whose object moves as it was seen to; point controllers are as they are."""
     if attempt.stage_done(REFINEMENT):
@@ -604,8 +651,17 @@ def _stage_refinement(
     if readiness(sequences, config)[REFINEMENT].is_ready:
         by_name = {problem.name: problem for problem in problems()}
         shown = [by_name[sequence.name] for sequence in held]
+        checkpointer = keeper()
         results = [
-            refine_sequence(attempt, sequence, problem, config, progress, device=device)
+            refine_sequence(
+                attempt,
+                sequence,
+                problem,
+                config,
+                progress,
+                device=device,
+                checkpointer=checkpointer,
+            )
             for sequence, problem in zip(held, shown, strict=True)
         ]
         # Earlier stages' files are replaced, so an interruption before this must leave them all.

@@ -95,7 +95,8 @@ class Chart {
   append(points) {
     const data = this.data.map((column) => column.slice());
     for (const [x, ...ys] of points) {
-      if (data[0].length && x <= data[0][data[0].length - 1]) data.forEach((column) => (column.length = 0));
+      // What was started again, or goes on from an earlier checkpoint, replaces what was there.
+      while (data[0].length && x <= data[0][data[0].length - 1]) data.forEach((column) => column.pop());
       [x, ...ys].forEach((value, i) => data[i].push(value));
     }
     this.setData(data);

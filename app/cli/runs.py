@@ -88,7 +88,7 @@ def reconstruct(
 
     Args:
         sequences: Folders or names of sequences.
-        out: Run folder to fill; an interrupted run goes on after its last finished stage. None
+        out: Run folder to fill; an interrupted run goes on where it was. None
             makes one in `runs/` of the data folder, and prints it.
         profile: Settings: quick, default, paper, phystwin, or a YAML file with what differs from
             one of them.

@@ -231,7 +231,7 @@ class Scheduler:
             self._start(RunItem(run.id, run.folder, False, run, None))
 
     def resume(self, run_id: str) -> None:
-        """Queue a run that did not succeed again; it goes on after its last finished stage.
+        """Queue a run that did not succeed again; it goes on where it was.
 
         Raises:
             RunError: If the run is unknown, bundled, finished or at work.

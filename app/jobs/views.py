@@ -293,8 +293,8 @@ _ADVICE = {
     "SimulationDivergedError": (
         "Launch a fit with a profile that searches softer springs or takes more substeps."
     ),
-    "RunError": "Resume goes on after the last finished stage.",
-    "": "Resume goes on after the last finished stage.",
+    "RunError": "Resume goes on where it was, a few seconds before it stopped.",
+    "": "Resume goes on where it was, a few seconds before it stopped.",
 }
 _DEFECT = (
     "This is a mistake of the program, not of your recording. Resume tries the stage again; "
@@ -493,8 +493,8 @@ def loss_curves(run: Run) -> tuple[dict[str, dict[str, Any]], int]:
         if not isinstance(loss, int | float) or not isinstance(iteration, int):
             continue
         curve = curves.setdefault(str(event.get("stage")), [])
-        if curve and iteration <= curve[-1][0]:
-            curve.clear()  # The stage was started again.
+        while curve and iteration <= curve[-1][0]:
+            curve.pop()  # It was started again, or goes on from an earlier checkpoint.
         curve.append([iteration, float(loss)])
     stages = describe_results(run).get("losses", {})
     result: dict[str, dict[str, Any]] = {}

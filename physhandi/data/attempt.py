@@ -1,10 +1,10 @@
 """One try at filling a run: its files, finished stages and publication."""
 
+import hashlib
 import json
 import os
 import shutil
 import time
-import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
@@ -13,14 +13,13 @@ from typing import Any, cast
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
-from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from physhandi.data.checkpoint import FileCheckpointer, packed
 from physhandi.data.environment import ENVIRONMENT
 from physhandi.data.files import (
     json_line,
     named_fields,
-    read_tensors,
     sweep_temporary,
     temporary_name,
     write_array,
@@ -125,57 +124,6 @@ def _link(source: Path, target: Path) -> None:
         os.link(source, target)
     except OSError:  # Some file systems have no hard links.
         shutil.copy2(source, target)
-
-
-def packed(tensors: Mapping[str, ndarray]) -> dict[str, ndarray]:
-    """Copy tensors into the layout that safetensors can store (C order)."""
-    return {name: np.array(tensor, order="C") for name, tensor in tensors.items()}
-
-
-def write_checkpoint(folder: Path, name: str, tensors: Mapping[str, ndarray]) -> None:
-    """Replace the older of a checkpoint's two files."""
-    folder.mkdir(parents=True, exist_ok=True)
-    numbers = {slot: _number(folder / f"{name}.{slot}.safetensors") for slot in "ab"}
-    slot = min("ab", key=lambda slot: numbers[slot])
-    content = packed(tensors)
-    note = {"number": str(max(numbers.values()) + 1), "crc32": str(_checksum(content))}
-    write_bytes(folder / f"{name}.{slot}.safetensors", save(content, metadata=note))
-
-
-def read_checkpoint(folder: Path, name: str) -> dict[str, ndarray] | None:
-    """Read the newest whole checkpoint of a name; None if there is none."""
-    paths = [folder / f"{name}.{slot}.safetensors" for slot in "ab"]
-    for path in sorted(paths, key=_number, reverse=True):
-        if _number(path) < 0:
-            continue
-        tensors = read_tensors(path)
-        if _note(path).get("crc32") == str(_checksum(tensors)):
-            return tensors
-    return None
-
-
-def _number(path: Path) -> int:
-    """Give a checkpoint file's running number; -1 if it is absent or damaged."""
-    number = _note(path).get("number", "")
-    return int(number) if number.isdigit() else -1
-
-
-def _note(path: Path) -> dict[str, str]:
-    try:
-        opened: Any = safe_open(path, framework="numpy")
-        with opened as stream:
-            return dict(stream.metadata() or {})
-    except (SafetensorError, OSError):
-        return {}
-
-
-def _checksum(tensors: Mapping[str, ndarray]) -> int:
-    checksum = 0
-    for name in sorted(tensors):
-        tensor = tensors[name]
-        header = f"{name} {tensor.dtype.str} {tensor.shape}".encode()
-        checksum = zlib.crc32(tensor.tobytes(), zlib.crc32(header, checksum))
-    return checksum
 
 
 PREVIEW = "preview.safetensors"
@@ -398,7 +346,7 @@ class Attempt:
     """One try at filling a run; only its process may write, and only until it is replaced.
 
     Use it as a context manager: an exception marks the run as failed or cancelled. Finished stages
-    of the attempt before are taken over, so that work goes on after the last of them.
+    of the attempt before are taken over, and the checkpoints of the one that it was in.
     """
 
     def __init__(self, run_folder: Path, lease: Lease) -> None:
@@ -410,6 +358,7 @@ class Attempt:
         self.folder = run_folder / ATTEMPTS / str(self.number)
         self.out = self.folder / OUT
         self._checkpoints = self.folder / CHECKPOINTS
+        self._checkpointer: FileCheckpointer | None = None
         self._records: dict[str, tuple[tuple[int, int, int], dict[str, Any]]] = {}
         self._stages: list[dict[str, Any]] = []
         self._is_open = True
@@ -470,15 +419,17 @@ class Attempt:
         write_yaml(path, obj)
         return path
 
-    def checkpoint(self, name: str, tensors: Mapping[str, ndarray]) -> None:
-        """Keep the state of an unfinished stage, so that a later attempt can go on with it."""
-        inside(self._checkpoints, name)
-        write_checkpoint(self._checkpoints, name, tensors)
+    def checkpointer(self, origin: Mapping[str, str]) -> FileCheckpointer:
+        """Keep the states of the next stage's loops, and find those of the attempt before.
 
-    def load_checkpoint(self, name: str) -> dict[str, ndarray] | None:
-        """Read the newest whole checkpoint of that name, also of the attempt before."""
-        inside(self._checkpoints, name)
-        return read_checkpoint(self._checkpoints, name)
+        Args:
+            origin: What the stage depends on, by names; its inputs, which are the files of the
+                finished stages, are added.
+        """
+        files = json_line([[stage["name"], stage["files"]] for stage in self._stages])
+        inputs = hashlib.sha256(files.encode()).hexdigest()
+        self._checkpointer = FileCheckpointer(self._checkpoints, {**origin, "inputs": inputs})
+        return self._checkpointer
 
     def stage_done(self, name: str) -> bool:
         """Tell whether a stage is finished, here or in the attempt before."""
@@ -488,10 +439,14 @@ class Attempt:
         """Declare a stage finished with all files that were written until now.
 
         Summaries of all stages are collected in ``losses.json``. A stage's time runs from the end
-        of the one before, or from the beginning of the attempt.
+        of the one before, or from the beginning of the attempt; what an earlier attempt had taken
+        up to the checkpoint that it went on from is added. Checkpoints are removed.
         """
         self._lease.check()
         seconds = time.monotonic() - self._stage_clock
+        if self._checkpointer is not None:
+            seconds += self._checkpointer.earlier_s
+            self._checkpointer = None
         known: dict[str, Any] = {}
         for stage in self._stages:
             known |= stage["files"]
@@ -512,6 +467,8 @@ class Attempt:
         )
         self._stage_clock = time.monotonic()
         write_json(self.folder / STAGES_FILE, self._stages)
+        # They led to what is finished now; if this process dies here, nothing reads them any more.
+        shutil.rmtree(self._checkpoints, ignore_errors=True)
         self._save_losses()
 
     def heartbeat(self) -> None:
@@ -536,6 +493,7 @@ class Attempt:
             "stages": [stage["name"] for stage in self._stages],
             "files": self._hash_outputs(),
         }
+        shutil.rmtree(self._checkpoints, ignore_errors=True)
         with locked(self.run_folder):
             self._lease.check()
             write_json(self.folder / MANIFEST, manifest)
@@ -564,10 +522,12 @@ class Attempt:
         """Make the attempt's folder in one step, so that a crash here loses no earlier work."""
         temporary = self.folder.with_name(temporary_name(self.folder.name))
         (temporary / OUT).mkdir(parents=True)
-        (temporary / CHECKPOINTS).mkdir()
-        if numbers:
-            self._stages = take_over(self.folder.with_name(str(numbers[-1])), temporary)
+        previous = self.folder.with_name(str(numbers[-1])) if numbers else None
+        if previous is not None:
+            self._stages = take_over(previous, temporary)
         temporary.replace(self.folder)
+        if previous is not None:  # Later attempts go on from this one.
+            shutil.rmtree(previous / CHECKPOINTS, ignore_errors=True)
         if self._stages:
             self._save_losses()
 

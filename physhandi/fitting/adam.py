@@ -1,9 +1,11 @@
 """Adam, as PyTorch computes it on a CPU, without the seconds that importing its compiler takes."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy import ndarray
 from torch import Tensor
 
 
@@ -64,3 +66,22 @@ class Adam:
             size = moments.second.sqrt() / (1 - beta_2**moments.count) ** 0.5
             step = share * moments.rate / (1 - beta_1**moments.count)
             moments.tensor.addcdiv_(moments.first, size.add_(self._epsilon), value=-step)
+
+    def state(self) -> dict[str, ndarray]:
+        """Copy everything that the next steps depend on, the learned tensors included."""
+        state: dict[str, ndarray] = {}
+        for number, moments in enumerate(self._moments):
+            state[f"adam.{number}.value"] = moments.tensor.detach().numpy().copy()
+            state[f"adam.{number}.first"] = moments.first.numpy().copy()
+            state[f"adam.{number}.second"] = moments.second.numpy().copy()
+            state[f"adam.{number}.count"] = np.array([moments.count])
+        return state
+
+    @torch.no_grad()
+    def restore(self, state: Mapping[str, ndarray]) -> None:
+        """Return to what `state` gave."""
+        for number, moments in enumerate(self._moments):
+            moments.tensor.copy_(torch.from_numpy(state[f"adam.{number}.value"]))
+            moments.first.copy_(torch.from_numpy(state[f"adam.{number}.first"]))
+            moments.second.copy_(torch.from_numpy(state[f"adam.{number}.second"]))
+            moments.count = int(state[f"adam.{number}.count"][0])

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
 from physhandi.data.camera import PinholeCamera, triangulate
+from physhandi.data.checkpoint import Checkpointer, SavedState, resumed_note
 from physhandi.data.observation import evenly
 from physhandi.data.sequence import Sequence
 from physhandi.errors import FitError, MissingInputError
@@ -102,6 +103,7 @@ def reconstruct_hands(
     progress: Progress | None = None,
     *,
     keypoint: Float[ndarray, "view frame hand 21 3"] | None = None,
+    checkpointer: Checkpointer | None = None,
 ) -> HandFit:
     """Fit a hand model to all frames of a sequence at once.
 
@@ -114,6 +116,7 @@ def reconstruct_hands(
         config: Settings of the fit.
         progress: Receives a report every tenth iteration.
         keypoint: Keypoints to fit to [px]; None takes those of `observed_keypoints`.
+        checkpointer: Keeps the state of each hand's fit; None keeps nothing.
 
     Raises:
         MissingInputError: If there is no hand, no view, no color image to detect keypoints in, or
@@ -140,7 +143,7 @@ def reconstruct_hands(
             left_out[side] = str(error)
             continue
         try:
-            fits.append(problem.solve(progress))
+            fits.append(problem.solve(progress, checkpointer or Checkpointer()))
         except FitError as error:
             raise FitError(f"Sequence '{sequence.name}': {error}") from error
     if not fits:
@@ -316,41 +319,38 @@ class HandProblem:
         local = self.model(shape, self.parameters["articulation"], still, still).vertex
         return local @ rotation.transpose(-1, -2) + translation[:, None]
 
-    def solve(self, progress: Progress) -> SolvedHand:
+    def solve(self, progress: Progress, checkpointer: Checkpointer) -> SolvedHand:
         """Fit to keypoints, then to keypoints and depth."""
         config = self.config
         with torch.no_grad():
             before = float(self.loss(config.doubt))
         curve: list[tuple[int, float]] = []
         total = config.iterations + (config.depth_iterations if self.depth else 0)
+        loop = f"{HAND_STAGE}.{self.name}.{self.model.side}"
 
-        def widening(iteration: int) -> float:
-            share = min(iteration / (0.6 * config.iterations), 1.0)
-            return config.doubt * 10 ** (1 - share)
+        def state(optimizer: Adam) -> dict[str, ndarray]:
+            return optimizer.state() | self._depth_state() | {"curve": _curve_array(curve)}
 
-        def step(iteration: int, loss: Tensor) -> None:
+        resumed = checkpointer.load(loop, state(self._optimizer(0.0)), growing=("curve",))
+        if resumed is not None:
+            curve = [(int(iteration), loss) for iteration, loss in resumed.tensors["curve"]]
+            self._restore_depth(resumed.tensors)
+            note = f"{self.model.side.capitalize()} hand. {resumed_note(resumed.iteration)}"
+            progress.report(HAND_STAGE, resumed.iteration, total, None, note)
+
+        def step(iteration: int, loss: Tensor, optimizer: Adam) -> None:
             progress.check_cancelled()
-            if iteration % 10 == 0 or iteration == total:
-                value = float(loss.detach())
+            is_told, value = iteration % 10 == 0 or iteration == total, float(loss.detach())
+            if is_told:
                 curve.append((iteration, value))
+            checkpointer.offer(loop, iteration, lambda: state(optimizer))
+            if is_told:
                 message = f"{self.model.side.capitalize()} hand"
                 progress.report(HAND_STAGE, iteration, total, value, message)
                 self._show(value, progress)
 
         with one_thread():
-            self._descend(
-                config.iterations, config.learning_rate, lambda i: self.loss(widening(i)), step, 0
-            )
-            if self.depth is not None:
-                depth = self.depth
-                self._place_by_depth(depth)
-                self._descend(
-                    config.depth_iterations,
-                    config.depth_learning_rate,
-                    lambda _: self.loss(config.doubt) + self.depth_term(depth),
-                    step,
-                    config.iterations,
-                )
+            self._fit(step, resumed)
         with torch.no_grad():
             after = float(self.loss(config.doubt))
         if not math.isfinite(after):
@@ -358,6 +358,36 @@ class HandProblem:
                 f"The fit of the {self.model.side} hand did not stay finite (loss {after})."
             )
         return SolvedHand(self._motion(), before, after, curve)
+
+    def _fit(self, step: Callable[[int, Tensor, Adam], None], resumed: SavedState | None) -> None:
+        """Descend on keypoints, place the hand by depth, and descend on both."""
+        config, depth = self.config, self.depth
+
+        def widening(iteration: int) -> float:
+            share = min(iteration / (0.6 * config.iterations), 1.0)
+            return config.doubt * 10 ** (1 - share)
+
+        if resumed is None or resumed.iteration <= config.iterations:
+            self._descend(
+                config.iterations,
+                config.learning_rate,
+                lambda iteration: self.loss(widening(iteration)),
+                step,
+                first=0,
+                resumed=resumed,
+            )
+            resumed = None
+            if depth is not None:
+                self._place_by_depth(depth)
+        if depth is not None:
+            self._descend(
+                config.depth_iterations,
+                config.depth_learning_rate,
+                lambda _: self.loss(config.doubt) + self.depth_term(depth),
+                step,
+                first=config.iterations,
+                resumed=resumed,
+            )
 
     def _place_by_depth(self, target: DepthTarget) -> None:
         """Move the hand to where depth was measured, if keypoints left it out of the loss's reach.
@@ -390,9 +420,23 @@ class HandProblem:
         iterations: int,
         rate: float,
         loss_at: Callable[[int], Tensor],
-        step: Callable[[int, Tensor], None],
+        step: Callable[[int, Tensor, Adam], None],
+        *,
         first: int,
+        resumed: SavedState | None,
     ) -> None:
+        optimizer, begin = self._optimizer(rate), 0
+        if resumed is not None:
+            optimizer.restore(resumed.tensors)
+            begin = resumed.iteration - first
+        for iteration in range(begin, iterations):
+            optimizer.zero_grad()
+            loss = loss_at(iteration)
+            loss.backward()
+            optimizer.step(0.05 + 0.475 * (1 + math.cos(math.pi * iteration / iterations)))
+            step(first + iteration + 1, loss, optimizer)
+
+    def _optimizer(self, rate: float) -> Adam:
         share = {
             "shape": 2.0,
             "articulation": 1.0,
@@ -400,7 +444,7 @@ class HandProblem:
             "translation": 0.1,
             "log_scale": 0.1,
         }
-        optimizer = Adam(
+        return Adam(
             [
                 (value.requires_grad_(), rate * share[name])
                 for name, value in self.parameters.items()
@@ -408,12 +452,30 @@ class HandProblem:
             ],
             betas=(0.9, 0.99),
         )
-        for iteration in range(iterations):
-            optimizer.zero_grad()
-            loss = loss_at(iteration)
-            loss.backward()
-            optimizer.step(0.05 + 0.475 * (1 + math.cos(math.pi * iteration / iterations)))
-            step(first + iteration + 1, loss)
+
+    def _depth_state(self) -> dict[str, ndarray]:
+        """Copy which vertices measured points correspond to; the age is -1 before they do."""
+        depth = self.depth
+        if depth is None:
+            return {}
+        vertex, normal = depth.vertex, depth.normal
+        known = np.zeros(depth.weight.shape, np.int64) if vertex is None else vertex.numpy().copy()
+        normals = np.zeros(depth.point.shape, np.float32)
+        return {
+            "depth.vertex": known,
+            "depth.normal": normals if normal is None else normal.numpy().copy(),
+            "depth.age": np.array([-1 if vertex is None else depth.age]),
+        }
+
+    def _restore_depth(self, state: Mapping[str, ndarray]) -> None:
+        """Return to what `_depth_state` gave."""
+        depth = self.depth
+        if depth is None or state["depth.age"][0] < 0:
+            return
+        depth.age = int(state["depth.age"][0])
+        depth.vertex = torch.from_numpy(state["depth.vertex"])
+        if self.config.fixed_normals:
+            depth.normal = torch.from_numpy(state["depth.normal"])
 
     def _motion(self) -> HandMotion:
         with torch.no_grad():
@@ -428,6 +490,10 @@ class HandProblem:
             wrist_translation=translation.detach().numpy().copy(),
             scale=1.0 if self.metric else float(scale),
         )
+
+
+def _curve_array(curve: list[tuple[int, float]]) -> Float[ndarray, "report 2"]:
+    return np.array(curve, np.float64).reshape(-1, 2)
 
 
 def _parameters(guess: WristGuess, frame_count: int) -> dict[str, Tensor]:

@@ -5,7 +5,7 @@ of one hand and `OffsetDescent` their optimizer. Paper, section 3.3 ("Hand Refin
 supplement; physics.md §9 and §10.9-10.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +15,7 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from physhandi.data.checkpoint import Checkpointer, resumed_note
 from physhandi.errors import SimulationDivergedError
 from physhandi.fitting.config import RefinementConfig as RefinementConfig
 from physhandi.fitting.hand_reconstruction import KeypointTarget, reprojection_loss
@@ -93,6 +94,7 @@ def refine_hands(
     progress: Progress,
     *,
     device: str = "cpu",
+    checkpointer: Checkpointer | None = None,
 ) -> RefinedHands:
     """Correct the poses of the hands by gradient descent through the simulator.
 
@@ -111,6 +113,7 @@ def refine_hands(
         config: Settings of the stage.
         progress: Receives a report each iteration.
         device: Warp device.
+        checkpointer: Keeps the state after an iteration; None keeps nothing.
 
     Returns:
         The best correction; the hands of stage 1 if none explains the object better.
@@ -122,7 +125,19 @@ def refine_hands(
     refinement = Refinement(problem, config, device)
     preview = RolloutPreview(REFINEMENT_STAGE, progress)
     curve: list[list[float]] = []
-    for iteration in range(config.iterations + 1):
+
+    def state() -> dict[str, ndarray]:
+        return refinement.state() | {"curve": np.array(curve, np.float64).reshape(-1, 2)}
+
+    checkpointer, first = checkpointer or Checkpointer(), 0
+    loop = f"{REFINEMENT_STAGE}.{problem.object_.name}"
+    resumed = checkpointer.load(loop, state(), growing=("curve",))
+    if resumed is not None:
+        first, curve = resumed.iteration, resumed.tensors["curve"].tolist()
+        refinement.restore(resumed.tensors)
+        note = resumed_note(first)
+        progress.report(REFINEMENT_STAGE, first, config.iterations, None, note)
+    for iteration in range(first, config.iterations + 1):
         progress.check_cancelled()
         message = ""
         try:
@@ -139,6 +154,7 @@ def refine_hands(
             preview.show(loss)
         if iteration < config.iterations:
             refinement.step()
+            checkpointer.offer(loop, iteration + 1, state)
     return refinement.result(curve, progress)
 
 
@@ -185,6 +201,37 @@ class Refinement:
             hand.forget_gradient()
         ((control * pull).sum() + ties).backward()
         return loss
+
+    def state(self) -> dict[str, ndarray]:
+        """Copy everything that the next iterations depend on, as it is after a step."""
+        first = np.nan if self.first_loss is None else self.first_loss
+        state: dict[str, ndarray] = {
+            "reach": np.array([self.reach]),
+            "rate": np.array([self.rate]),
+            "losses": np.array([first, self.best_total], np.float64),
+        }
+        for number, (descent, best) in enumerate(zip(self.descents, self.best, strict=True)):
+            state[f"{number}.count"] = np.array([descent.count])
+            parts = {"value": descent.hand.value, "best": best}
+            parts |= {"first": descent.first, "second": descent.second}
+            for part, tensors in parts.items():
+                for name, tensor in tensors.items():
+                    state[f"{number}.{part}.{name}"] = tensor.detach().numpy().copy()
+        return state
+
+    def restore(self, state: Mapping[str, ndarray]) -> None:
+        """Return to what `state` gave."""
+        self.reach, self.rate = int(state["reach"][0]), float(state["rate"][0])
+        first, self.best_total = state["losses"].tolist()
+        self.first_loss = None if np.isnan(first) else first
+        for number, (descent, best) in enumerate(zip(self.descents, self.best, strict=True)):
+            descent.count = int(state[f"{number}.count"][0])
+            parts = {"value": descent.hand.value, "best": best}
+            parts |= {"first": descent.first, "second": descent.second}
+            with torch.no_grad():
+                for part, tensors in parts.items():
+                    for name, tensor in tensors.items():
+                        tensor.copy_(torch.from_numpy(state[f"{number}.{part}.{name}"]))
 
     def step(self) -> None:
         """Update the corrections along the gradient and decay the step."""

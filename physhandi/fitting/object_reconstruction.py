@@ -4,6 +4,10 @@
 `check_springs` refuse objects that no parameters, or not these, can hold together.
 """
 
+import hashlib
+import json
+import logging
+from collections.abc import Callable
 from collections.abc import Sequence as Many
 from concurrent.futures import ThreadPoolExecutor
 
@@ -14,6 +18,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial import KDTree
 
+from physhandi.data.checkpoint import Checkpointer, SavedState, resumed_note
 from physhandi.errors import FitError, SimulationDivergedError, UsageError
 from physhandi.fitting.config import ObjectFitConfig, SearchConfig
 from physhandi.fitting.object_problem import (
@@ -27,7 +32,7 @@ from physhandi.fitting.object_problem import (
 from physhandi.fitting.preview import RolloutPreview
 from physhandi.fitting.search import SEARCH_STAGE, SearchResult, search_parameters
 from physhandi.fitting.search_bounds import fit_intervals, measure_object
-from physhandi.progress import Progress
+from physhandi.progress import Preview, Progress
 from physhandi.simulation.contact_intervals import ContactIntervals
 from physhandi.simulation.engines.batch import BatchSimulator, MotionTarget
 from physhandi.simulation.engines.cpu import processor_count
@@ -35,6 +40,10 @@ from physhandi.simulation.master_topology import MasterTopology
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.parameters import SimulationParameters
 from physhandi.simulation.topology import MINIMUM_LENGTH
+
+logger = logging.getLogger(__name__)
+_DIGEST = 16
+"""Bytes by which a candidate is told from others."""
 
 
 def search_object(
@@ -44,8 +53,12 @@ def search_object(
     progress: Progress,
     *,
     device: str = "cpu",
+    checkpointer: Checkpointer | None = None,
 ) -> SearchResult:
     """Search the global parameters, topology included, that explain all sequences best.
+
+    A search that was stopped runs again from its seed with the losses that were computed before:
+    the strategy's own steps take milliseconds, and so all of its state comes out as it was.
 
     Args:
         problems: One for each sequence; all must have the same object nodes at rest.
@@ -53,6 +66,7 @@ def search_object(
         config: Settings of stage 2.
         progress: Receives a report each generation.
         device: Warp device.
+        checkpointer: Keeps the losses of all candidates; None keeps nothing.
 
     Raises:
         FitError: If no spring can form, or every candidate diverges.
@@ -66,8 +80,98 @@ def search_object(
         models = [build_problem_model(problem, start) for problem in problems]
         needed = settle_substeps(models, start, config).substeps_per_frame
         config = config.replace(most_substeps=max(config.most_substeps, 2 * needed))
-    evaluate = CandidateEvaluator(problems, config, progress, device=device)
-    return search_parameters(evaluate, start, search, progress)
+    known = _KnownLosses(checkpointer or Checkpointer())
+    evaluate = CandidateEvaluator(problems, config, progress, device=device, known=known)
+    return search_parameters(evaluate, start, search, _ResumedSearch(progress, known))
+
+
+class _KnownLosses:
+    """Losses of all candidates so far, in the order in which the search asked for them."""
+
+    def __init__(self, checkpointer: Checkpointer) -> None:
+        self._checkpointer = checkpointer
+        self._digest = np.zeros((0, _DIGEST), np.uint8)
+        self._loss, self._substeps = np.zeros(0), np.zeros(0, np.int64)
+        state = checkpointer.load(SEARCH_STAGE, self._state(), growing=self._state())
+        if state is not None:
+            self._digest, self._loss = state.tensors["digest"], state.tensors["loss"]
+            self._substeps = state.tensors["substeps"]
+        self._next = 0
+        self.resumed: SavedState | None = state
+        """From where a search goes on, until it does."""
+
+    @property
+    def is_recalling(self) -> bool:
+        """Whether the next candidates have known losses."""
+        return self._next < len(self._loss)
+
+    def recall(self, candidates: Many[SimulationParameters]) -> list[tuple[int, float]] | None:
+        """Give substeps and loss of the next candidates; None if they are not known."""
+        if not self.is_recalling:
+            return None
+        part = slice(self._next, self._next + len(candidates))
+        if not np.array_equal(self._digest[part], _digests(candidates)):
+            logger.warning("The search asks for other candidates than before; it begins anew.")
+            self._digest, self._loss = self._digest[: self._next], self._loss[: self._next]
+            self._substeps, self.resumed = self._substeps[: self._next], None
+            return None
+        self._next = part.stop
+        return list(zip(self._substeps[part].tolist(), self._loss[part].tolist(), strict=True))
+
+    def add(
+        self,
+        candidates: Many[SimulationParameters],
+        settled: Many[SimulationParameters],
+        losses: list[float],
+    ) -> None:
+        """Remember what was computed for candidates."""
+        substeps = [parameters.substeps_per_frame for parameters in settled]
+        self._digest = np.concatenate([self._digest, _digests(candidates)])
+        self._loss = np.append(self._loss, losses)
+        self._substeps = np.append(self._substeps, np.array(substeps, np.int64))
+        self._next = len(self._loss)
+        self._checkpointer.offer(SEARCH_STAGE, self._next, self._state)
+
+    def _state(self) -> dict[str, ndarray]:
+        return {"digest": self._digest, "loss": self._loss, "substeps": self._substeps}
+
+
+def _digests(candidates: Many[SimulationParameters]) -> ndarray:
+    """Hash all values of each candidate."""
+    texts = [json.dumps(parameters.to_dict(), sort_keys=True) for parameters in candidates]
+    digests = [hashlib.sha256(text.encode()).digest()[:_DIGEST] for text in texts]
+    return np.frombuffer(b"".join(digests), np.uint8).reshape(-1, _DIGEST)
+
+
+class _ResumedSearch(Progress):
+    """Hears of the generations after those whose losses were known, and where these ended."""
+
+    def __init__(self, progress: Progress, known: _KnownLosses) -> None:
+        self._progress, self._known = progress, known
+
+    def report(
+        self,
+        stage: str,
+        iteration: int,
+        total: int,
+        loss: float | None = None,
+        message: str = "",
+    ) -> None:
+        if self._known.is_recalling:
+            return
+        if self._known.resumed is not None:
+            self._known.resumed = None
+            message = resumed_note(iteration)
+        self._progress.report(stage, iteration, total, loss, message)
+
+    def wants_preview(self) -> bool:
+        return self._progress.wants_preview()
+
+    def preview(self, make: Callable[[], Preview]) -> None:
+        self._progress.preview(make)
+
+    def check_cancelled(self) -> None:
+        self._progress.check_cancelled()
 
 
 def check_problem(
@@ -182,6 +286,7 @@ class CandidateEvaluator:
         *,
         device: str = "cpu",
         threads: int | None = None,
+        known: _KnownLosses | None = None,
     ) -> None:
         """Prepare the observations of all sequences.
 
@@ -192,6 +297,7 @@ class CandidateEvaluator:
             device: Warp device.
             threads: Candidates at once on a CPU; None for as many as processors. The bits are the
                 same.
+            known: Losses that need not be computed again; None for none.
         """
         self._threads = threads or processor_count()
         self._problems, self._config, self._progress = problems, config, progress
@@ -199,7 +305,8 @@ class CandidateEvaluator:
         self._targets = [motion_target(problem, config) for problem in problems]
         self._preview = RolloutPreview(SEARCH_STAGE, progress)
         self._best_loss = np.inf
-        self._best: tuple[SimulationParameters, SpringMassModel] | None = None
+        self._best: SimulationParameters | None = None
+        self._known = known or _KnownLosses(Checkpointer())
 
     def __call__(
         self, candidates: Many[SimulationParameters]
@@ -210,6 +317,27 @@ class CandidateEvaluator:
         the configuration allows.
         """
         candidates = [problem_parameters(p, self._problems[0]) for p in candidates]
+        known = self._known.recall(candidates)
+        if known is None:
+            settled, mean = self._evaluate(candidates)
+            self._known.add(candidates, settled, mean)
+        else:
+            settled = [
+                parameters.replace(substeps_per_frame=substeps)
+                for parameters, (substeps, _) in zip(candidates, known, strict=True)
+            ]
+            mean = [loss for _, loss in known]
+        winner = int(np.argmin(mean))
+        if mean[winner] < self._best_loss:
+            self._best_loss, self._best = mean[winner], settled[winner]
+        if not self._known.is_recalling:
+            self._show_best()
+        return list(zip(settled, mean, strict=True))
+
+    def _evaluate(
+        self, candidates: Many[SimulationParameters]
+    ) -> tuple[list[SimulationParameters], list[float]]:
+        """Settle the substeps of candidates and compute their losses [m²]."""
         masters = [
             MasterTopology.of(
                 problem.object_node,
@@ -223,7 +351,8 @@ class CandidateEvaluator:
             for problem in self._problems
         ]
         is_batched = wp.get_device(self._device).is_cuda
-        settled, possible = [], []
+        settled: list[SimulationParameters] = []
+        possible: list[int] = []
         for index, parameters in enumerate(candidates):
             models = [master.model(parameters) for master in masters]
             chosen = settle_substeps(models, parameters, self._config, is_quick=is_batched)
@@ -246,11 +375,7 @@ class CandidateEvaluator:
                 break
             mean[winner] = np.inf
             winner = int(np.argmin(mean))
-        if mean[winner] < self._best_loss:
-            self._best_loss = mean[winner]
-            self._best = settled[winner], masters[0].model(settled[winner])
-        self._show_best()
-        return list(zip(settled, mean, strict=True))
+        return settled, mean
 
     def _holds_alone(self, masters: Many[MasterTopology], parameters: SimulationParameters) -> bool:
         """Tell whether a candidate does not diverge when it is simulated alone.
@@ -268,8 +393,9 @@ class CandidateEvaluator:
         """Show the best candidate in a preview, at most once for each."""
         if self._best is None or not self._progress.wants_preview():
             return
-        (parameters, model), self._best = self._best, None
+        parameters, self._best = self._best, None
         problem = self._problems[0]
+        model = build_problem_model(problem, parameters)
         self._preview.show_simulated(
             problem,
             self._best_loss,

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from physhandi.data.attempt import Attempt
+from physhandi.data.checkpoint import Checkpointer
 from physhandi.data.layout import SequenceFiles
 from physhandi.data.observation import ObjectObservation
 from physhandi.data.run import RunFolder
@@ -280,6 +281,7 @@ def refine_sequence(
     progress: Progress,
     *,
     device: str,
+    checkpointer: Checkpointer | None = None,
 ) -> RefinedHands:
     """Run stage 3 on the stored hands and the stored object of a sequence."""
     motions = artefacts.load_motions(output.out, sequence.name)
@@ -308,6 +310,7 @@ def refine_sequence(
         config.refinement,
         progress,
         device=device,
+        checkpointer=checkpointer,
     )
 
 

@@ -14,8 +14,10 @@ import numpy as np
 import torch
 import warp as wp
 from jaxtyping import Float
+from numpy import ndarray
 from torch import Tensor
 
+from physhandi.data.checkpoint import Checkpointer, resumed_note
 from physhandi.errors import FitError, SimulationDivergedError
 from physhandi.fitting.adam import Adam
 from physhandi.fitting.config import FirstOrderConfig, ObjectFitConfig
@@ -47,6 +49,8 @@ SMALLEST_VALUE = 1e-6
 State = tuple[Float[Tensor, "node 3"], Float[Tensor, "node 3"]]
 """Positions [m] and velocities [m/s] of the object nodes."""
 SPRING_STAGE = "first_order"
+_WHOLE = -1
+"""Stored reach of gradients that were never too steep."""
 logger = logging.getLogger(__name__)
 
 
@@ -77,6 +81,7 @@ def optimise_springs(
     progress: Progress,
     *,
     device: str = "cpu",
+    checkpointer: Checkpointer | None = None,
 ) -> FirstOrderResult:
     """Fit each spring's own stiffness and damping by gradient descent through the simulator.
 
@@ -88,6 +93,7 @@ def optimise_springs(
         config: Settings of stage 2.
         progress: Receives a report each iteration.
         device: Warp device.
+        checkpointer: Keeps the state after an iteration; None keeps nothing.
 
     Returns:
         The best models, as `FirstOrderConfig` ranks them.
@@ -108,13 +114,15 @@ def optimise_springs(
         mean_loss(problems, models, parameters, config, device),
         "The searched parameters diverge; raise substeps_per_frame in the profile.",
     )
-    best, best_parameters = dict(models), parameters
-    best_loss = math.inf if settings.judges_online else loss_before
-    curve = [[0.0, loss_before]]
+    course = _Course(models, parameters, loss_before, is_candidate=not settings.judges_online)
     descent = SpringDescent(material, parameters, config, device)
-    preview = RolloutPreview(SPRING_STAGE, progress)
-    stopped = ""
-    for iteration in range(settings.iterations):
+    checkpointer = checkpointer or Checkpointer()
+    first = course.resume(problems, descent, checkpointer)
+    if first:
+        last = course.curve[-1][1]
+        progress.report(SPRING_STAGE, first, settings.iterations, last, resumed_note(first))
+    preview, stopped = RolloutPreview(SPRING_STAGE, progress), ""
+    for iteration in range(first, settings.iterations):
         progress.check_cancelled()
         try:
             losses = [
@@ -125,7 +133,7 @@ def optimise_springs(
         except (SimulationDivergedError, FitError) as error:
             stopped = f"Stopped after {iteration} of {settings.iterations} iterations. {error}"
             logger.warning("%s: %s", SPRING_STAGE, stopped)
-            progress.report(SPRING_STAGE, iteration, settings.iterations, best_loss, stopped)
+            progress.report(SPRING_STAGE, iteration, settings.iterations, course.loss, stopped)
             break
         now = {name: material.model(name, model) for name, model in models.items()}
         now_parameters = material.parameters(parameters)
@@ -138,19 +146,73 @@ def optimise_springs(
                     problems, now, now_parameters, config, device, on_rollout=preview.update
                 )
             preview.show(loss)
-        if _is_judged(iteration, settings) and loss < best_loss:
-            best, best_parameters, best_loss = now, now_parameters, loss
-        curve.append([float(iteration + 1), loss])
+        if _is_judged(iteration, settings) and loss < course.loss:
+            course.models, course.parameters, course.loss = now, now_parameters, loss
+        course.curve.append([float(iteration + 1), loss])
+        checkpointer.offer(SPRING_STAGE, iteration + 1, lambda: course.state(problems, descent))
         progress.report(SPRING_STAGE, iteration + 1, settings.iterations, loss, message)
-    result = FirstOrderResult(
-        models=best,
-        parameters=best_parameters,
-        loss_before=loss_before,
-        loss_after=best_loss,
-        curve=curve,
-        stopped=stopped,
-    )
-    return _settled(problems, result, config, device)
+    return _settled(problems, course.result(loss_before, stopped), config, device)
+
+
+class _Course:
+    """The best springs so far, and how the loss went."""
+
+    def __init__(
+        self,
+        models: Mapping[str, SpringMassModel],
+        parameters: SimulationParameters,
+        loss: float,
+        *,
+        is_candidate: bool,
+    ) -> None:
+        self.models, self.parameters = dict(models), parameters
+        self.loss = loss if is_candidate else math.inf
+        self.curve = [[0.0, loss]]
+
+    def result(self, loss_before: float, stopped: str) -> FirstOrderResult:
+        """Give what the descent has found."""
+        return FirstOrderResult(
+            models=self.models,
+            parameters=self.parameters,
+            loss_before=loss_before,
+            loss_after=self.loss,
+            curve=self.curve,
+            stopped=stopped,
+        )
+
+    def state(self, problems: Many[ObjectProblem], descent: "SpringDescent") -> dict[str, ndarray]:
+        """Give everything that the next iterations depend on."""
+        contact = [getattr(self.parameters, name) for name in CONTACT]
+        state = descent.state(problems) | {
+            "best.loss": np.array([self.loss]),
+            "best.contact": np.array(contact, np.float64),
+            "curve": np.array(self.curve, np.float64),
+        }
+        for number, problem in enumerate(problems):
+            state[f"best.{number}.stiffness"] = self.models[problem.name].stiffness
+            state[f"best.{number}.damping"] = self.models[problem.name].damping
+        return state
+
+    def resume(
+        self, problems: Many[ObjectProblem], descent: "SpringDescent", checkpointer: Checkpointer
+    ) -> int:
+        """Go on from the latest checkpoint, if there is one; return its iteration, else 0."""
+        like = self.state(problems, descent)
+        resumed = checkpointer.load(SPRING_STAGE, like, growing=("curve",))
+        if resumed is None:
+            return 0
+        state = resumed.tensors
+        descent.restore(problems, state)
+        self.loss, self.curve = float(state["best.loss"][0]), state["curve"].tolist()
+        contact = zip(CONTACT, state["best.contact"].tolist(), strict=True)
+        self.parameters = self.parameters.replace(**dict(contact))
+        for number, problem in enumerate(problems):
+            self.models[problem.name] = replace(
+                self.models[problem.name],
+                stiffness=state[f"best.{number}.stiffness"],
+                damping=state[f"best.{number}.damping"],
+            )
+        return resumed.iteration
 
 
 def _settled(
@@ -389,6 +451,20 @@ class SpringDescent:
         )
         self._reach: dict[str, int] = {}
         self._ahead: FitWindow | None = None
+
+    def state(self, problems: Many[ObjectProblem]) -> dict[str, ndarray]:
+        """Copy everything that the next passes over some sequences depend on.
+
+        What `loss_ahead` has simulated of the next pass is simulated once more then.
+        """
+        reach = [self._reach.get(problem.name, _WHOLE) for problem in problems]
+        return self._optimizer.state() | {"reach": np.array(reach)}
+
+    def restore(self, problems: Many[ObjectProblem], state: Mapping[str, ndarray]) -> None:
+        """Return to what `state` gave."""
+        self._optimizer.restore(state)
+        reach = zip(problems, state["reach"].tolist(), strict=True)
+        self._reach = {problem.name: frames for problem, frames in reach if frames != _WHOLE}
 
     def loss_ahead(
         self,

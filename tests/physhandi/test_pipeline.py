@@ -6,11 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from sheet_sequence import FITTED, FRAMES, NODE, sheet_config, write_sheet
+from stopped_fits import Stopper, write_always
 
+from app.jobs.views import loss_curves
 from physhandi import pipeline
-from physhandi.data.run_folder import read_events
+from physhandi.data.run_folder import artefacts, read_events
 from physhandi.data.sequence import Sequence
 from physhandi.errors import CancelledError, MissingInputError, RunError, UsageError
 from physhandi.fitting.artefacts import load_model, load_parameters
@@ -25,7 +27,7 @@ def small_config() -> PipelineConfig:
     return sheet_config(generations=8, population=8, iterations=8)
 
 
-def new_run(folder: Path, sequences: list[Path], config: PipelineConfig | None = None) -> Run:
+def new_run(folder: Path, sequences: list[Path], config: dict[str, Any] | None = None) -> Run:
     return Run.create(
         folder,
         name="test",
@@ -181,7 +183,7 @@ def test_contacts_over_time_are_stored_and_kept_with_other_radii(
     late = tmp_path / "late"
     shutil.copytree(recordings / "low", late)
     control = np.load(late / "control.npy")
-    control[:1] += np.float32([0.0, 0.0, 0.2])
+    control[:1] += np.array([0.0, 0.0, 0.2], np.float32)
     np.save(late / "control.npy", control)
     config = sheet_config(generations=1, population=4, iterations=1)
     config = config.replace(object_=config.object_.replace(contact_over_time=True))
@@ -227,7 +229,7 @@ def test_another_radius_gives_the_springs_that_scipy_counts(
         tmp_path / "wide", fitted, recordings / "low", connection_radius=0.055, max_neighbors=24
     )
     model = load_model(again.out, "low")
-    expected = len(cKDTree(NODE.astype(np.float32)).query_pairs(0.055))
+    expected = len(KDTree(NODE.astype(np.float32)).query_pairs(0.055))
     assert model.object_spring_count == expected == 40
     difference = again.array("sequences/low/rollout.npy") - fitted.array(
         "sequences/low/rollout.npy"
@@ -306,10 +308,46 @@ def test_a_run_without_an_object_cannot_be_simulated(tmp_path: Path, recordings:
         simulate(tmp_path / "again", empty, recordings / "low")
 
 
-def test_the_same_input_gives_the_same_bits(tmp_path: Path, recordings: Path) -> None:
-    outs = []
-    for name in ("one", "two"):
-        run = new_run(tmp_path / name, [recordings / "low"])
-        pipeline.run_job(run)
-        outs.append(run.array("sequences/low/rollout.npy").copy())
-    np.testing.assert_array_equal(outs[0], outs[1])
+def test_a_stopped_run_ends_with_the_bits_of_an_undisturbed_one(
+    tmp_path: Path, recordings: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_always(monkeypatch)
+    runs = [new_run(tmp_path / name, [recordings / "low"]) for name in ("one", "two")]
+    pipeline.run_job(runs[0])
+    for stage, at in ((pipeline.SEARCH, 3), (pipeline.SEARCH, 2), (pipeline.SPRINGS, 5)):
+        with pytest.raises(CancelledError):
+            pipeline.run_job(runs[1], Stopper(at, stage=stage))
+    last = Stopper(stage=pipeline.SPRINGS)
+    pipeline.run_job(runs[1], last)
+    assert [report[1] for report in last.reports] == [5, 6, 7, 8]
+    assert last.reports[0][3] == "Resumed after iteration 5."
+    for run in runs:
+        Run.open(run.folder).verify()
+    outs = [run.out for run in runs]
+    files = [rel for rel, _ in artefacts(outs[0]) if rel != "environment.json"]
+    assert files == [rel for rel, _ in artefacts(outs[1]) if rel != "environment.json"]
+    for rel in files:
+        assert (outs[0] / rel).read_bytes() == (outs[1] / rel).read_bytes(), rel
+    # Curves have no gap, and no checkpoint is left, counted as a result or published.
+    whole, stopped = (loss_curves(run)[0] for run in runs)
+    assert whole == stopped
+    assert list(tmp_path.rglob("ckpt")) == []
+
+
+def test_a_checkpoint_of_other_settings_is_not_used(
+    tmp_path: Path,
+    recordings: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    write_always(monkeypatch)
+    run = new_run(tmp_path / "fit", [recordings / "low"])
+    with pytest.raises(CancelledError):
+        pipeline.run_job(run, Stopper(2, stage=pipeline.SEARCH))
+    job = run.folder / "job.yaml"
+    job.write_text(job.read_text().replace("seed: 42", "seed: 43"))
+    again = Stopper(1, stage=pipeline.SEARCH)
+    with pytest.raises(CancelledError):
+        pipeline.run_job(Run.open(run.folder), again)
+    assert "it was made with other settings." in caplog.text
+    assert again.reports[0][1] == 1

@@ -14,7 +14,6 @@ import yaml
 from safetensors.numpy import load_file
 from waiting import until
 
-from physhandi.data.attempt import read_checkpoint
 from physhandi.data.run_folder import attempt_numbers, read_events
 from physhandi.run import Run
 
@@ -46,8 +45,12 @@ def write_for_ever(folder: Path, written: Any, last: int | None) -> None:
         die_before(last)
     attempt = run.begin_attempt()
     progress = attempt.progress()
-    known = attempt.load_checkpoint("state")
-    number = 0 if known is None else int(known["x"][0])
+    if not attempt.stage_done("first"):
+        attempt.save_json("first.json", [1])
+        attempt.finish_stage("first")
+    checkpointer = attempt.checkpointer({"settings": "any"})
+    state = checkpointer.load("state", {"x": np.full(20_000, 0)})
+    number = 0 if state is None else state.iteration
     while True:
         number += 1
         for write in (
@@ -55,9 +58,8 @@ def write_for_ever(folder: Path, written: Any, last: int | None) -> None:
             lambda n: attempt.save_tensors("tensors.safetensors", {"x": np.full(20_000, n)}),
             lambda n: attempt.save_json("data.json", [n] * 100),
             lambda n: attempt.save_yaml("data.yaml", {"number": n}),
-            lambda n: attempt.checkpoint("state", {"x": np.full(20_000, n)}),
+            lambda n: checkpointer.write("state", n, {"x": np.full(20_000, n)}),
             lambda n: progress.report("write", n, 10**9, float(n)),
-            lambda n: attempt.finish_stage(f"stage{n % 3}", {"number": n}),
         ):
             write(number)
             written.value += 1
@@ -68,12 +70,11 @@ def holder_of(folder: Path) -> int | None:
     return json.loads(path.read_text())["pid"] if path.exists() else None
 
 
-def latest_checkpoint(run: Run) -> dict[str, np.ndarray] | None:
-    """The checkpoint that a new attempt would go on from."""
+def kept_number(run: Run) -> int:
+    """Number of the latest checkpoint that the next attempt would go on from; 0 without one."""
     numbers = attempt_numbers(run.folder)
-    if not numbers:
-        return None
-    return read_checkpoint(run.folder / "attempts" / str(numbers[-1]) / "ckpt", "state")
+    folder = run.folder / "attempts" / str(numbers[-1] if numbers else 0) / "ckpt"
+    return max((int(load_file(path)["x"][0]) for path in folder.glob("[!.]*")), default=0)
 
 
 def check_whole(run: Run) -> int:
@@ -130,12 +131,9 @@ def test_kills_in_the_middle_of_writing(tmp_path: Path) -> None:
         files += check_whole(run)
         leftovers += last is not None and any(run.folder.rglob(".*.tmp"))
         states.add(run.state)
-        state = latest_checkpoint(run)
-        if furthest > 0:
-            assert state is not None  # A crash, also one at the very start, loses no earlier work.
-        if state is not None:
-            assert state["x"][0] >= furthest
-            furthest = int(state["x"][0])
+        kept = kept_number(run)
+        assert kept >= furthest  # A crash, also one at the very start, loses no earlier work.
+        furthest = kept
     assert states <= {"failed", "queued"}
     assert "failed" in states
     assert files > 5 * KILLS
@@ -143,10 +141,9 @@ def test_kills_in_the_middle_of_writing(tmp_path: Path) -> None:
     assert leftovers > 2  # Otherwise no death came within a write, and the test shows nothing.
     with run.begin_attempt() as attempt:
         assert list(run.folder.rglob(".*.tmp")) == []
-        state = read_checkpoint(attempt.folder / "ckpt", "state")
-        assert state is not None
-        assert set(state["x"].tolist()) == {furthest}
+        assert kept_number(run) == furthest
         attempt.publish()
     run.verify()
+    assert list(run.folder.glob("attempts/*/ckpt")) == []
     assert run.state == "succeeded"
     assert len(list((run.folder / "attempts").iterdir())) <= 3

@@ -3,6 +3,7 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import hand_scene as scene
@@ -11,8 +12,10 @@ import pytest
 import torch
 from recordings import recording
 from scipy.spatial.transform import Rotation
+from stopped_fits import check_resumed, write_always
 
 import physhandi as ph
+from physhandi.data.checkpoint import Checkpointer
 from physhandi.data.importers.stereo import import_stereo
 from physhandi.data.sequence import Sequence
 from physhandi.errors import CancelledError, FitError, MissingInputError, SettingsError
@@ -141,6 +144,7 @@ def test_without_masks_a_hand_is_measured_at_its_keypoints(tmp_path: Path) -> No
     folder = sequence.views[0].folder
     for path in sorted((folder / "depth").iterdir()):
         image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        assert image is not None
         image[image == 0] = 900  # A wall behind the hand, and something that hides some fingers.
         image[:, : int(np.nanmin(keypoint[0, :, 0, :, 0]) + 12)] = 200
         cv2.imwrite(str(path), image)
@@ -168,14 +172,16 @@ def test_depth_tells_a_pose_from_its_mirror_image(tmp_path: Path) -> None:
     palm, seen = list(PALM), keypoint[:, :, 0][:, :, list(PALM)]
     template = model.keypoint_position[palm]
     true = Rotation.from_rotvec(truth.wrist_rotation)
-    guesses = [_guess_from_one_view(CAMERAS[:1], seen[:, frame], template) for frame in range(6)]
+    guesses: list[Any] = [
+        _guess_from_one_view(CAMERAS[:1], seen[:, frame], template) for frame in range(6)
+    ]
     assert all(guess is not None for guess in guesses)
     wrong = list(guesses)
     for frame in (0, 2, 3):
         wrong[frame] = _mirrored(CAMERAS[:1], seen[:, frame], template, guesses[frame])[0]
         assert (wrong[frame][0] * true[frame].inv()).magnitude() > 0.8
     wrong[4] = None  # Nothing is known of it, and nothing is made up.
-    told = _told_from_mirrored(CAMERAS[:1], seen, model, wrong, depth)
+    told: list[Any] = _told_from_mirrored(CAMERAS[:1], seen, model, wrong, depth)
     assert told[4] is None
     for frame in (0, 1, 2, 3, 5):
         assert (told[frame][0] * true[frame].inv()).magnitude() < 0.5
@@ -327,3 +333,39 @@ def test_the_recorded_hand_is_reconstructed(tmp_path: Path) -> None:
     assert score.hidden.median <= 6
     assert score.hidden.keypoint_count > 3.7 * score.frame_count
     assert max(score.joint_median) < 8
+
+
+@pytest.mark.parametrize("is_new", [True, False])
+def test_a_stopped_fit_goes_on_to_the_same_bits(
+    is_new: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_always(monkeypatch)
+    truth = scene.grasping(frames=3)
+    keypoint = scene.seen_keypoints([truth], CAMERAS[:1])
+    sequence = scene.write_scene(tmp_path / "a", [truth], CAMERAS[:1], keypoint, depth=True)
+    config = HandFitConfig(
+        iterations=20, depth_iterations=25, starts_at_depth=is_new, fixed_normals=is_new
+    )
+
+    def fit(progress: Progress, checkpointer: Checkpointer | None) -> HandFit:
+        return reconstruct_hands(sequence, config, progress, checkpointer=checkpointer)
+
+    # Once before depth is seen, at the end of that, and between two looks for nearest vertices.
+    reports = check_resumed(fit, tmp_path / "ckpt", (1, 2, 2))
+    assert [report[1] for report in reports] == [30, 40, 45]
+
+
+def test_of_two_hands_the_first_is_not_fitted_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_always(monkeypatch)
+    motions = [scene.grasping("right", frames=3), scene.grasping("left", frames=3)]
+    keypoint = scene.seen_keypoints(motions, CAMERAS)
+    sequence = scene.write_scene(tmp_path / "a", motions, CAMERAS, keypoint)
+
+    def fit(progress: Progress, checkpointer: Checkpointer | None) -> HandFit:
+        config = HandFitConfig(iterations=30, depth_iterations=0)
+        return reconstruct_hands(sequence, config, progress, checkpointer=checkpointer)
+
+    reports = check_resumed(fit, tmp_path / "ckpt", (5,))
+    assert [report[1] for report in reports] == [30, 20, 30]

@@ -1,6 +1,7 @@
 """Stage 3 on small rigs: gradients, known errors, and what it does when things go wrong."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,9 @@ from hand_scene import grasping, looking_at_hand, seen_keypoints
 from reference.spring_mass import Scene, simulate
 from refinement_world import SOFT, held_patch, moved, mpjpe
 from scipy.spatial.transform import Rotation
+from stopped_fits import check_resumed, write_always
 
+from physhandi.data.checkpoint import Checkpointer
 from physhandi.errors import CancelledError, SettingsError, SimulationDivergedError
 from physhandi.fitting import hand_refinement
 from physhandi.fitting.hand_reconstruction import keypoint_target
@@ -394,7 +397,7 @@ def test_a_gradient_that_grows_with_its_reach_reaches_less_far(
 @pytest.mark.parametrize(
     "wrong", [{"iterations": -1}, {"window": 0}, {"decay": 0.0}, {"translation_rate": -1.0}]
 )
-def test_settings_that_make_no_sense_are_refused(wrong: dict[str, float]) -> None:
+def test_settings_that_make_no_sense_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(SettingsError, match=r" is .*; expected "):
         RefinementConfig(**wrong)
 
@@ -405,3 +408,20 @@ def test_the_rig_is_damped_enough_to_have_useful_gradients() -> None:
     control = problem.object_.control
     node = Simulator(problem.model, SOFT).rollout(control).position
     assert np.abs(node[-1] - node[-2]).max() < 3e-4
+
+
+def test_a_stopped_refinement_goes_on_to_the_same_bits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_always(monkeypatch)
+    truth = two_hands(frames=5)
+    seen = tuple(moved(motion, (0.005, 0.0, 0.0)) for motion in truth)
+    problem = held_patch(truth, seen, fitted=4, every=4)
+
+    def fit(progress: Progress, checkpointer: Checkpointer | None) -> Any:
+        return refine_hands(
+            problem, FREE.replace(iterations=6), progress, checkpointer=checkpointer
+        )
+
+    reports = check_resumed(fit, tmp_path, (4, 3))
+    assert [report[1] for report in reports] == [4, 4, 5, 6]

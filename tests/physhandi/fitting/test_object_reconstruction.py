@@ -1,11 +1,14 @@
 """Stage 2 recovers a made-up object, alone and from several sequences."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from stopped_fits import ORIGIN, Stopper, check_resumed, same_bits, write_always
 
+from physhandi.data.checkpoint import Checkpointer, FileCheckpointer
 from physhandi.data.observation import ObjectObservation
 from physhandi.errors import CancelledError, FitError
 from physhandi.fitting.config import FirstOrderConfig, ObjectFitConfig, SearchConfig, SearchVariable
@@ -70,8 +73,8 @@ def held_sheet(name: str, lift: float, scale: float = 1.0) -> ObjectProblem:
     )
 
 
-def config(**first_order: object) -> ObjectFitConfig:
-    settings = {"iterations": 30, "learning_rate": 0.1, "is_annealed": False}
+def config(**first_order: Any) -> ObjectFitConfig:
+    settings: dict[str, Any] = {"iterations": 30, "learning_rate": 0.1, "is_annealed": False}
     return ObjectFitConfig(
         search=SearchConfig(
             generations=4,
@@ -205,3 +208,46 @@ def test_cancelling_stops_between_iterations() -> None:
     with pytest.raises(CancelledError):
         optimise_springs([held_sheet("slow", 0.2)], PARAMETERS, config(), progress)
     assert progress.seen == [1, 2]
+
+
+def test_a_stopped_search_goes_on_to_the_same_bits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    write_always(monkeypatch)
+    problem, settings = held_sheet("low", 0.1), config()
+    # The best stiffness is beyond the interval, so that the search goes on with a wider one.
+    stiffness = SearchVariable(low=50.0, high=100.0, scale="log")
+    search = settings.search.replace(
+        generations=3, widening_generations=2, variables={"stiffness": stiffness}
+    )
+    settings = settings.replace(search=search)
+
+    def fit(progress: Progress, checkpointer: Checkpointer | None) -> Any:
+        return search_object([problem], PARAMETERS, settings, progress, checkpointer=checkpointer)
+
+    reports = check_resumed(fit, tmp_path, (2, 3))
+    # The second attempt repeated the second generation, told of it, and computed two more.
+    assert [report[1] for report in reports] == [4, 5]
+    whole = fit(Stopper(), None)
+    assert whole.widened == ("stiffness",)
+    # Losses of other candidates, as of another version of the strategy, are not taken for theirs.
+    other = settings.replace(search=search.replace(seed=7))
+    checkpointer = FileCheckpointer(tmp_path, ORIGIN)
+    seeded = search_object([problem], PARAMETERS, other, NullProgress(), checkpointer=checkpointer)
+    assert "asks for other candidates" in caplog.text
+    same_bits(seeded, search_object([problem], PARAMETERS, other, NullProgress()))
+
+
+@pytest.mark.parametrize("window", [None, 3])
+def test_a_stopped_descent_goes_on_to_the_same_bits(
+    window: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_always(monkeypatch)
+    problems = [held_sheet("low", 0.1), held_sheet("high", 0.2)][: 1 if window is None else 2]
+    settings = config(iterations=6, window=window, learns_contact=window is not None)
+
+    def fit(progress: Progress, checkpointer: Checkpointer | None) -> Any:
+        return optimise_springs(problems, PARAMETERS, settings, progress, checkpointer=checkpointer)
+
+    reports = check_resumed(fit, tmp_path, (1, 4))
+    assert [report[1] for report in reports] == [4, 5, 6]
