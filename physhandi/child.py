@@ -28,7 +28,7 @@ logger = logging.getLogger(__name__)
 
 PACKAGE_ROOT = Path(__file__).resolve().parent.parent
 """Folder of the packages and, in a checkout and in a wheel alike, of the data beside them."""
-LOG_START = 50 * 2**20
+LOG_START = 49 * 2**20
 """Bytes of a log file that are kept from its start."""
 LOG_END = 2**20
 """Bytes that are kept from the end of a log that is longer."""
@@ -252,18 +252,51 @@ class Child:
 
 
 def copy_log(source: IO[Any], path: Path) -> None:
-    """Append what a process prints to a file; of too much, keep the start and the end."""
-    tail = b""
-    with path.open("ab") as log:
-        room = max(0, LOG_START - log.tell())
-        while chunk := os.read(source.fileno(), 65536):
-            if room:
-                log.write(chunk[:room])
-                log.flush()
-            tail = (tail + chunk[room:])[-LOG_END:]
-            room = max(0, room - len(chunk))
-        if tail:
-            log.write(b"\n[the log is too long; this is its end]\n" + tail)
+    """Append what a process prints to a file; of too much, keep the start and the end.
+
+    The process never waits: what cannot be written, as on a full disk, waits here for room, and of
+    that the oldest is left out.
+    """
+    log = _CappedLog(path)
+    while chunk := os.read(source.fileno(), 65536):
+        log.append(chunk)
+    log.end()
+
+
+class _CappedLog:
+    """A file of at most `LOG_START` bytes, and `LOG_END` more in memory."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._waiting = b""
+        self._room: int | None = None
+
+    def append(self, chunk: bytes) -> None:
+        self._waiting += chunk
+        with suppress(OSError):
+            if self._room is None:
+                self._room = self._find_room()
+            if self._room > 0:
+                with self._path.open("ab", buffering=0) as log:
+                    count = log.write(self._waiting[: self._room])
+                self._room -= count
+                self._waiting = self._waiting[count:]
+        self._waiting = self._waiting[-LOG_END:]
+
+    def end(self) -> None:
+        if not self._waiting:
+            return
+        is_full = self._room is None or self._room <= 0
+        mark = b"\n[the log is too long; this is its end]\n" if is_full else b""
+        with suppress(OSError), self._path.open("ab") as log:
+            log.write(mark + self._waiting)
+
+    def _find_room(self) -> int:
+        """Leave out the end of the attempt before, if that has filled the log."""
+        size = self._path.stat().st_size if self._path.exists() else 0
+        if size > LOG_START:
+            os.truncate(self._path, LOG_START)
+        return max(0, LOG_START - size)
 
 
 def error_of(message: Mapping[str, Any]) -> PhysHandiError:

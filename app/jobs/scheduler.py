@@ -6,7 +6,8 @@ import os
 import subprocess
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -37,7 +38,7 @@ from app.jobs.ticket import (
 from app.settings import ServerSettings
 from physhandi.data.lease import live_holder
 from physhandi.data.run_folder import EXIT, new_run_id
-from physhandi.errors import PhysHandiError, RunError, UsageError
+from physhandi.errors import PhysHandiError, RunError, UsageError, describe
 from physhandi.run import Run
 
 _LOCK = ".server.lock"
@@ -116,6 +117,7 @@ class Scheduler:
         self._started: dict[str, subprocess.Popen[str]] = {}
         self._stopping: dict[str, threading.Thread] = {}
         self._ended: dict[str, tuple[int, JobView]] = {}
+        self._hindered: dict[str, str] = {}
         self._line: tuple[str, ...] = ()
         self._busy: tuple[str, ...] = ()
         self._known: dict[str, Run] = {}
@@ -328,11 +330,11 @@ class Scheduler:
             return JobView("starting", reason=told)
         return self._look_back(run)
 
-    @staticmethod
-    def _look_back(run: Run) -> JobView:
+    def _look_back(self, run: Run) -> JobView:
         """Tell how a run ended that is neither in line nor at work."""
         if is_lost(run.folder):
-            return JobView("stopping", reason=f"{_LOST} What is left of it is being ended.")
+            told = self._hindered.get(run.id, "What is left of it is being ended.")
+            return JobView("stopping", reason=f"{_LOST} {told}")
         state = run.state
         if state == "queued":
             return JobView("failed", reason="It was never started. Resume starts it.")
@@ -347,6 +349,8 @@ class Scheduler:
         place = line.index(run.id) + 1
         slots = self._settings.parallel_fits
         at_a_time = "one fit runs" if slots == 1 else f"{slots} fits run"
+        if run.id in self._hindered:
+            return JobView("queued", place, f"It cannot be started: {self._hindered[run.id]}")
         if len(busy) < slots and place == 1:
             return JobView("queued", place, "It starts next.")
         return JobView("queued", place, f"Waits for a free place: {at_a_time} at a time.")
@@ -401,10 +405,27 @@ class Scheduler:
             moving = {*self._busy, *(item.id for item in queue)}
             self._known = {item.id: item.run for item in items if item.run and item.id in moving}
             free = max(0, self._settings.parallel_fits - len(self._busy))
-            ready = [item for item in queue if supervisor_of(item.folder) is None]
+            # A supervisor that put its run back in line has still to end.
+            ready = [
+                item
+                for item in queue
+                if item.id not in self._started and supervisor_of(item.folder) is None
+            ]
             for item in ready[:free]:
-                self._start(item)
+                with self._hindering(item.id):
+                    self._start(item)
             self._line = tuple(item.id for item in queue if item.id not in self._started)
+
+    @contextmanager
+    def _hindering(self, run_id: str) -> Generator[None]:
+        """Remember what the disk keeps from being done with a run; it is tried again later."""
+        try:
+            yield
+            self._hindered.pop(run_id, None)
+        except OSError as error:
+            if run_id not in self._hindered:
+                logger.warning("run %s cannot go on: %s", run_id, describe(error))
+            self._hindered[run_id] = describe(error)
 
     def _start(self, item: RunItem) -> None:
         note_start(item.folder)
@@ -437,8 +458,9 @@ class Scheduler:
         for folder in self._lost_runs():
             logger.warning("run %s lost its process", folder.name)
             end_processes(folder, grace_s=0.0)
-            start_again_or_end(folder, _LOST)
-            self._wake.set()
+            with self._hindering(folder.name):
+                start_again_or_end(folder, _LOST)
+                self._wake.set()
 
     def _lost_runs(self) -> list[Path]:
         """Find the runs that were started, have not ended and are worked on by nobody."""

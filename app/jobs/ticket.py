@@ -7,7 +7,7 @@ from pathlib import Path
 
 from physhandi.data.files import named_fields, write_json
 from physhandi.data.lease import live_holder, locked
-from physhandi.data.run_folder import CANCEL, EXIT, now
+from physhandi.data.run_folder import CANCEL, EXIT, RESERVE, now
 
 QUEUED = "queued.json"
 """File in a run's folder that puts it into the queue; the queue survives a restart."""
@@ -92,6 +92,7 @@ def note_end(run_folder: Path, error: str, kind: str = "") -> None:
     with locked(run_folder):
         if live_holder(run_folder) is not None:
             return
+        (run_folder / RESERVE).unlink(missing_ok=True)
         if not (run_folder / EXIT).is_file():
             content = {"state": "cancelled" if is_cancelled else "failed", "time": now()}
             content |= (

@@ -1,7 +1,9 @@
 """One try at filling a run: its files, finished stages and publication."""
 
+import errno
 import hashlib
 import json
+import logging
 import os
 import shutil
 import time
@@ -40,6 +42,7 @@ from physhandi.data.run_folder import (
     MANIFEST,
     OUT,
     PROGRESS,
+    RESERVE,
     RUN_FORMAT,
     STAGES_FILE,
     artefacts,
@@ -54,6 +57,8 @@ from physhandi.data.run_folder import (
 )
 from physhandi.errors import CancelledError, RunError, describe
 from physhandi.progress import Preview, Progress
+
+logger = logging.getLogger(__name__)
 
 
 def take_over(previous: Path, folder: Path) -> list[dict[str, Any]]:
@@ -230,6 +235,9 @@ def _box(picked: dict[str, Float[ndarray, "frame point 3"]]) -> tuple[ndarray, f
 _SNAPSHOT_INTERVAL_S = 0.2
 _HEARTBEAT_INTERVAL_S = 5.0
 _LINE_LIMIT = 4096
+_NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EIO}
+_RESERVED = 16_384
+"""Bytes that are kept for the note on the end of an attempt."""
 
 
 class RunProgress(Progress):
@@ -250,7 +258,8 @@ class RunProgress(Progress):
         self._snapshot_time = -_SNAPSHOT_INTERVAL_S
         self._heartbeat_time = time.monotonic()
         self._preview = PreviewFile(folder)
-        self._end_torn_line()
+        self._is_torn = self._has_torn_line()
+        self._is_mute = False
 
     def report(
         self,
@@ -265,9 +274,8 @@ class RunProgress(Progress):
         is_new_stage = stage != self._stage
         if is_new_stage:
             self._stage, self._stage_start = stage, (clock, iteration)
-        self._seq += 1
         event: dict[str, object] = {
-            "seq": self._seq,
+            "seq": self._seq + 1,
             "time": time.time(),
             "attempt": self._attempt,
             "stage": stage,
@@ -276,7 +284,7 @@ class RunProgress(Progress):
             "loss": loss,
             "message": message,
         }
-        self._append(event)
+        self._tell(lambda: self._append(event))
         if (
             is_new_stage
             or iteration >= total
@@ -284,10 +292,10 @@ class RunProgress(Progress):
         ):
             self._snapshot_time = clock
             snapshot = event | {"eta_s": self._eta(clock, iteration, total)}
-            write_json(self._folder / PROGRESS, snapshot, is_durable=False)
+            self._tell(lambda: write_json(self._folder / PROGRESS, snapshot, is_durable=False))
         if clock - self._heartbeat_time >= _HEARTBEAT_INTERVAL_S:
             self._heartbeat_time = clock
-            self._lease.heartbeat()
+            self._tell(self._lease.heartbeat)
         if self._also is not None:
             self._also.report(stage, iteration, total, loss, message)
 
@@ -297,7 +305,7 @@ class RunProgress(Progress):
 
     def preview(self, make: Callable[[], Preview]) -> None:
         """Replace the run's preview file."""
-        self._preview.write(make)
+        self._tell(lambda: self._preview.write(make))
 
     def check_cancelled(self) -> None:
         """Raise `CancelledError` if the run's ``CANCEL`` file is there."""
@@ -319,23 +327,38 @@ class RunProgress(Progress):
             if len(line) >= _LINE_LIMIT:  # Escaped characters count six times.
                 line = json_line(event | {"message": ""})
         self._write(line.encode() + b"\n")
+        self._seq += 1
+
+    def _tell(self, write: Callable[[], object]) -> None:
+        """Write what only tells of the work; where there is no room, the work goes on without."""
+        try:
+            write()
+        except OSError as error:
+            if error.errno not in _NO_ROOM:
+                raise
+            if not self._is_mute:
+                logger.warning("not all of how far this is can be told: %s", describe(error))
+            self._is_mute = True
 
     def _write(self, content: bytes) -> None:
         """Append with a single call, so that lines of two processes never mix."""
         descriptor = os.open(self._folder / EVENTS, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
         try:
-            os.write(descriptor, content)
+            content = b"\n" * self._is_torn + content
+            count = os.write(descriptor, content)
+            self._is_torn = count != len(content)
+            if self._is_torn:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self._folder / EVENTS))
         finally:
             os.close(descriptor)
 
-    def _end_torn_line(self) -> None:
+    def _has_torn_line(self) -> bool:
         path = self._folder / EVENTS
         if not path.is_file() or path.stat().st_size == 0:
-            return
+            return False
         with path.open("rb") as stream:
             stream.seek(-1, os.SEEK_END)
-            if stream.read(1) != b"\n":
-                self._write(b"\n")
+            return stream.read(1) != b"\n"
 
 
 _ATTEMPT_FILES = {LOSSES_FILE, ENVIRONMENT}
@@ -365,6 +388,8 @@ class Attempt:
         self._stage_clock = time.monotonic()
         sweep_temporary(run_folder.rglob(".*.tmp"))
         self._prepare(numbers)
+        # File systems that compress must keep room for it, too.
+        (run_folder / RESERVE).write_bytes(os.urandom(_RESERVED))
         if read_mapping(run_folder / EXIT).get("state") == "cancelled":
             (run_folder / CANCEL).unlink(missing_ok=True)
         (run_folder / EXIT).unlink(missing_ok=True)
@@ -538,6 +563,7 @@ class Attempt:
             kind = type(error).__name__ if isinstance(error, BaseException) else ""
             told = describe(error) if isinstance(error, BaseException) else error
             content |= {"error": told, "error_type": kind}
+        (self.run_folder / RESERVE).unlink(missing_ok=True)
         try:
             write_json(self.run_folder / EXIT, content)
         finally:  # On a full disk the end cannot be noted, but the run must be free again.

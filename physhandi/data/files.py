@@ -145,7 +145,19 @@ def zip_bytes(files: Iterable[tuple[str, bytes]]) -> bytes:
 def write_array(path: Path, array: np.ndarray) -> None:
     """Write an array as ``.npy``; arrays of Python objects are refused (ValueError)."""
     contiguous = np.asarray(array, order="C")
-    write_atomically(path, lambda stream: np.save(stream, contiguous, allow_pickle=False))
+
+    def write(stream: BinaryIO) -> None:
+        # NumPy's own writer of files does not say that a disk is full, so it is given no file.
+        np.save(_Unlabelled(stream), contiguous, allow_pickle=False)
+
+    write_atomically(path, write)
+
+
+class _Unlabelled:
+    """Something that can be written to, and nothing else."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self.write = stream.write
 
 
 def plain(value: Any) -> Any:

@@ -23,6 +23,8 @@ JOB, RUN, LEASE, EVENTS = "job.yaml", "run.yaml", "lease.json", "events.jsonl"
 PROGRESS, LOG, ATTEMPTS, CURRENT = "progress.json", "log.txt", "attempts", "current"
 EXIT, CANCEL, MANIFEST, STAGES_FILE = "exit.json", "CANCEL", "MANIFEST.json", "stages.json"
 OUT, CHECKPOINTS = "out", "ckpt"
+RESERVE = ".reserve"
+"""File of a run at work that is given up for the note on its end, where a disk is full."""
 
 _SAFE_PART = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*")
 _BASE32 = "0123456789ABCDEFGHJKMNPQRSTVWXYZ"

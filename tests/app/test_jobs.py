@@ -1,5 +1,6 @@
 """The queue, with real child processes."""
 
+import errno
 import os
 import signal
 import threading
@@ -365,6 +366,23 @@ def test_a_run_at_work_is_neither_deleted_nor_resumed(desk: Desk) -> None:
     assert not folder.exists()
     with pytest.raises(RunError, match="no run"):
         desk.view(run_id)
+
+
+def test_a_full_disk_keeps_a_run_in_line_until_there_is_room(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def no_room(_: Path) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as full:
+        full.setattr(scheduler_module, "note_start", no_room)
+        run_id = desk.launch("publish")
+        told = "It cannot be started: No space left on device. Free some space"
+        until(lambda: told in desk.view(run_id).reason, lambda: desk.view(run_id))
+        desk.scheduler._step()
+        assert desk.state(run_id) == "queued"
+    desk.until(run_id, "succeeded")
+    assert caplog.text.count(f"run {run_id} cannot go on") == 1
 
 
 def test_the_worker_never_learns_the_token(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -115,7 +116,7 @@ def test_a_child_ends_with_its_parent_unless_it_outlives_it() -> None:
         "    print(start_module('child_deeds', 'forever', **options).pid, flush=True)\n"
         "input()\n"
     )
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     with subprocess.Popen([sys.executable, "-c", code], **pipes, cwd=PACKAGE_ROOT) as parent:
         assert parent.stdout is not None
         bound, free = (psutil.Process(int(parent.stdout.readline())) for _ in range(2))
@@ -146,6 +147,32 @@ def test_of_too_long_a_log_the_start_and_the_end_are_kept(
     assert (tmp_path / "log.txt").read_bytes() == (
         b"0123456789\n[the log is too long; this is its end]\nfghij"
     )
+
+
+def test_a_log_waits_for_a_disk_and_the_process_does_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(child_module, "LOG_END", 6)
+    log = child_module._CappedLog(tmp_path / "late" / "log.txt")
+    log.append(b"lost")
+    log.append(b"kept")
+    (tmp_path / "late").mkdir()
+    log.append(b" on")
+    assert (tmp_path / "late" / "log.txt").read_bytes() == b"stkept on"
+    # An attempt that follows one that filled the log leaves out the end of that.
+    monkeypatch.setattr(child_module, "LOG_START", 3)
+    again = child_module._CappedLog(tmp_path / "late" / "log.txt")
+    again.append(b"new")
+    again.end()
+    mark = b"\n[the log is too long; this is its end]\n"
+    assert (tmp_path / "late" / "log.txt").read_bytes() == b"stk" + mark + b"new"
+    # A device on which every write fails for want of room.
+    reading, writing = os.pipe()
+    with os.fdopen(reading, "rb") as source, os.fdopen(writing, "wb") as sink:
+        sink.write(b"x" * 50_000)
+        sink.close()
+        copy_log(source, Path("/dev/full"))
+        assert source.read() == b""
 
 
 def test_a_message_that_is_none_ends_the_child() -> None:

@@ -1,7 +1,10 @@
 """Run folders: publication is all or nothing, and damage is named."""
 
+import errno
 import json
 import multiprocessing
+import os
+import resource
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,10 +14,12 @@ import psutil
 import pytest
 from run_world import fill, make_run
 
+from physhandi.data import attempt as attempt_module
 from physhandi.data import lease
+from physhandi.data.files import write_array
 from physhandi.data.run_folder import read_events
 from physhandi.errors import CancelledError, RunError
-from physhandi.progress import Progress
+from physhandi.progress import Preview, Progress
 from physhandi.run import Run
 
 
@@ -295,6 +300,89 @@ def test_a_replaced_process_stops_at_its_next_report(
     run.begin_attempt(take_over=True)
     with pytest.raises(RunError, match="taken over"):
         progress.report("fit", 2, 9)
+
+
+def no_room(*_: object, **__: object) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_a_full_disk_ends_no_fit_by_what_only_tells_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("physhandi.data.attempt._HEARTBEAT_INTERVAL_S", 0.0)
+    run = make_run(tmp_path / "fit")
+    shown = Preview(
+        stage="fit", sequence="a", loss=1.0, frame_rate=30.0, points={"object": np.zeros((2, 3, 3))}
+    )
+    with run.begin_attempt() as attempt:
+        progress = attempt.progress()
+        with monkeypatch.context() as full:
+            full.setattr("physhandi.data.attempt.write_atomically", no_room)
+            full.setattr("physhandi.data.attempt.write_json", no_room)
+            full.setattr("physhandi.data.lease.write_json", no_room)
+            events = run.folder / "events.jsonl"
+            events.symlink_to("/dev/full")
+            for iteration in range(3):
+                progress.report("fit", iteration, 9)
+                progress.preview(lambda: shown)
+            events.unlink()
+        assert caplog.text.count("can be told: ") == 1
+        assert "No space left on device" in caplog.text
+        # Half a line was written before the disk was full.
+        write = os.write
+        with monkeypatch.context() as full:
+            full.setattr(os, "write", lambda file, text: write(file, text[: len(text) // 2]))
+            progress.report("fit", 3, 9)
+        progress.report("fit", 4, 9)
+        progress.report("fit", 5, 9)
+        attempt.publish()
+    run.verify()
+    found, _ = read_events(run.folder)
+    assert [(event["seq"], event["iteration"]) for event in found] == [(0, 4), (1, 5)]
+    # Other errors are no want of room.
+    with run.begin_attempt(), monkeypatch.context() as gone:
+        gone.setattr(
+            "physhandi.data.attempt.write_json", lambda *_, **__: (run.folder / "x").stat()
+        )
+        with pytest.raises(FileNotFoundError):
+            progress.report("other", 1, 9)
+
+
+def test_the_end_of_a_fit_is_noted_on_a_full_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = make_run(tmp_path / "fit")
+    reserve = run.folder / ".reserve"
+    written = attempt_module.write_json
+
+    def write(path: Path, content: object) -> None:
+        if reserve.exists():
+            no_room()
+        written(path, content)
+
+    attempt = run.begin_attempt()
+    assert reserve.stat().st_size > 8000
+    monkeypatch.setattr(attempt_module, "write_json", write)
+    with pytest.raises(OSError, match=r"No space"), attempt:
+        attempt.save_json("result.json", {})
+    assert (run.state, reserve.exists()) == ("failed", False)
+    assert "No space left on device. Free some space" in (run.error or "")
+
+
+def test_an_array_too_large_for_its_disk_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "large.npy"
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
+    try:
+        with pytest.raises(OSError, match=r"large\.npy") as caught:
+            write_array(path, np.zeros(5000))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert caught.value.errno == errno.EFBIG
+    assert list(tmp_path.iterdir()) == []
+    for array in (np.arange(6.0).reshape(2, 3), np.asfortranarray(np.eye(3)), np.zeros(())):
+        write_array(path, array)
+        np.testing.assert_array_equal(np.load(path), array)
 
 
 def try_to_begin(folder: Path, start: Any, results: Any) -> None:
