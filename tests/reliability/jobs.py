@@ -1,21 +1,29 @@
 """The queue and its processes."""
 
+import os
+import signal
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 from psutil import _pslinux
 from sheet_sequence import write_sheet
+from waiting import until
 
-from app.jobs.catalog import Catalog
+from app.jobs import scheduler as scheduler_module
+from app.jobs.catalog import Catalog, RunItem
 from app.jobs.launch_keys import KeyedRequest
-from app.jobs.scheduler import Scheduler
+from app.jobs.processes import end_processes, processes_of, supervisor_of
+from app.jobs.scheduler import ENDED, Scheduler
 from app.settings import ServerSettings
 from physhandi.data.lease import live_holder
+from physhandi.errors import RunError
 from physhandi.run import Run
 from reliability import Case, Report
 
@@ -70,8 +78,138 @@ def submit_again(count: int, folder: Path) -> Report:
     return {"done": answers.total(), "runs": len(runs), "wrong": len(answers) + len(runs) - 2}
 
 
+@contextmanager
+def queue_in(folder: Path, **settings: Any) -> Iterator[Scheduler]:
+    """Work through a queue of made-up fits; when it is over, nothing of it is at work."""
+    write_sheet(folder / "sequences" / "sheet")
+    asked = ServerSettings(data_dir=folder, cancel_grace_s=1.0, **settings)
+    scheduler = Scheduler(asked, Catalog(asked), worker="job_worker")
+    with patch.object(scheduler_module, "_SWEEP_INTERVAL_S", 0.3):
+        scheduler.start()
+        try:
+            yield scheduler
+        finally:
+            scheduler.shutdown()
+            for run_folder in asked.run_dir.iterdir():
+                end_processes(run_folder, grace_s=0.0)
+            for process in scheduler._started.values():
+                process.wait()
+
+
+def state_of(scheduler: Scheduler, run: Run) -> str:
+    return scheduler.view(RunItem(run.id, run.folder, False, run, None)).state
+
+
+def disturb(count: int, folder: Path, deed: Callable[[Run], None], **settings: Any) -> Report:
+    """Do something to a fit in the middle of each of its attempts, then let it end."""
+    with queue_in(folder, **settings) as scheduler:
+        run = scheduler.launch(["sheet"], "quick", "wait")
+        resumed = 0
+
+        def is_at_work_for_the_time(number: int) -> bool:
+            told = run.progress
+            is_begun = (told.get("attempt"), told.get("stage")) == (number, "second")
+            return is_begun and live_holder(run.folder) is not None
+
+        for number in range(1, count + 1):
+            until(partial(is_at_work_for_the_time, number), lambda: run.progress)
+            deed(run)
+            if number % 2 == 0:
+                until(lambda: state_of(scheduler, run) == "failed")
+                scheduler.resume(run.id)
+                resumed += 1
+        until(partial(is_at_work_for_the_time, count + 1), lambda: run.progress)
+        (run.folder / "go").touch()
+        until(lambda: state_of(scheduler, run) in ENDED)
+        until(lambda: supervisor_of(run.folder) is None)
+        return {
+            "done": count,
+            "started again": count - resumed,
+            "resumed": resumed,
+            "lost": run.state != "succeeded",
+            "corrupt": is_damaged(run) or run.json("first.json") != {"attempt": 1},
+            "published twice": len(list(run.folder.glob("attempts/*/MANIFEST.json"))) - 1,
+            "orphans": len(list(processes_of(run.folder))),
+        }
+
+
+def is_damaged(run: Run) -> bool:
+    try:
+        run.verify()
+    except RunError:
+        return True
+    return False
+
+
+def signal_worker(run: Run, number: signal.Signals) -> None:
+    holder = live_holder(run.folder)
+    assert holder is not None
+    os.kill(holder["pid"], number)
+
+
+def kill_workers(count: int, folder: Path) -> Report:
+    return disturb(count, folder, lambda run: signal_worker(run, signal.SIGKILL))
+
+
+def stop_workers(count: int, folder: Path) -> Report:
+    return disturb(count, folder, lambda run: signal_worker(run, signal.SIGSTOP), hung_after_s=3.0)
+
+
+def kill_supervisors(count: int, folder: Path) -> Report:
+    def kill(run: Run) -> None:
+        supervisor = supervisor_of(run.folder)
+        assert supervisor is not None
+        os.kill(supervisor, signal.SIGKILL)
+
+    return disturb(count, folder, kill)
+
+
+def race_cancels(count: int, folder: Path) -> Report:
+    """Cancel fits while they publish."""
+    ends: Counter[str] = Counter()
+    wrong = corrupt = orphans = 0
+    with queue_in(folder) as scheduler:
+        for number in range(count):
+            run = scheduler.launch(["sheet"], "quick", "wait")
+            until(lambda run=run: run.progress.get("stage") == "second")
+            finish, cancel = (run.folder / "go").touch, partial(scheduler.cancel, run.id)
+            for act in (finish, cancel) if number % 3 else (cancel, finish):
+                with suppress(RunError):  # It has ended already: then there is nothing to cancel.
+                    act()
+                # Now the one wins, now the other: a step of the worker takes 20 ms and more.
+                time.sleep((number * 7 % 40) / 1000.0)
+            until(lambda run=run: state_of(scheduler, run) in ENDED)
+            until(lambda run=run: supervisor_of(run.folder) is None)
+            state = state_of(scheduler, run)
+            ends[state] += 1
+            wrong += run.is_published != (state == "succeeded") or run.state != state
+            corrupt += run.is_published and is_damaged(run)
+            orphans += len(list(processes_of(run.folder)))
+    return {"done": ends.total(), **ends, "wrong": wrong, "corrupt": corrupt, "orphans": orphans}
+
+
+def start_two_servers(count: int, folder: Path) -> Report:
+    wrong = done = 0
+    with queue_in(folder) as scheduler:
+        for _ in range(count):
+            second = Scheduler(scheduler._settings, Catalog(scheduler._settings))
+            done += 1
+            try:
+                second.start()
+            except RunError as error:
+                wrong += f"(process {os.getpid()})" not in str(error)
+            else:
+                wrong += 1
+    return {"done": done, "wrong": wrong}
+
+
 CASES = {
+    "R1": Case("The process of a fit is killed in the middle of a stage", 200, 1, kill_workers),
+    "R2": Case("The supervisor of a fit is killed", 100, 0, kill_supervisors),
+    "R6": Case("A fit is cancelled while it publishes", 200, 2, race_cancels),
+    "R12": Case("The process of a fit is stopped, so that it hangs", 20, 0, stop_workers),
     "R13": Case("The clock is set by hours, forth and back, during a fit", 10, 4, set_clocks),
+    "R14": Case("A second server is started on the same data folder", 10, 1, start_two_servers),
     "R15": Case(
         "The same fit is asked for again, at once and after restarts", 1000, 40, submit_again
     ),
