@@ -12,6 +12,7 @@ from sheet_sequence import FRAMES, write_sheet
 
 from physhandi import pipeline
 from physhandi.data.camera import PinholeCamera
+from physhandi.data.run import RunFolder
 from physhandi.data.sequence import Sequence, ViewMeta
 from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import write_sequence
@@ -19,7 +20,6 @@ from physhandi.errors import CancelledError
 from physhandi.hand.loading import load_hand_model
 from physhandi.hand.motion import HandMotion
 from physhandi.progress import NullProgress, Progress
-from physhandi.run import Run
 from physhandi.synthetic.bodies.sheets import fold_motion
 from physhandi.synthetic.suite import methods
 from physhandi.synthetic.suite.cells import Bench
@@ -37,7 +37,7 @@ def fitted(config: Any = None) -> HandMotion:
     return replace(motion, wrist_translation=motion.wrist_translation + aside)
 
 
-def error_of(run: Run, true: HandMotion) -> float:
+def error_of(run: RunFolder, true: HandMotion) -> float:
     """Mean distance of the joints of a run's hand from those of another one [m]."""
     model = load_hand_model("right")
     found = HandMotion.from_tensors(load_file(run.out / HAND))
@@ -49,7 +49,7 @@ def error_of(run: Run, true: HandMotion) -> float:
 def recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Sequence:
     """A sheet with a hand in place of controllers, whose fit is at hand."""
 
-    def fit(_sequence: Sequence, config: Any, _progress: Progress) -> SimpleNamespace:
+    def fit(_sequence: Sequence, config: Any, _progress: Progress, **_: Any) -> SimpleNamespace:
         keypoint = np.full((1, FRAMES, 1, 21, 3), 30.0, np.float32)
         return SimpleNamespace(
             motions=(fitted(config),),
@@ -81,7 +81,9 @@ class Stopper(Progress):
             raise CancelledError("enough")
 
 
-def run_of(recording: Sequence, folder: Path, progress: Progress | None = None, **more: Any) -> Run:
+def run_of(
+    recording: Sequence, folder: Path, progress: Progress | None = None, **more: Any
+) -> RunFolder:
     return execute(
         METHODS["rigid_follow"],
         recording,
@@ -136,7 +138,7 @@ def test_hands_are_disturbed_once_even_if_the_work_is_killed_at_it(
         patch.setattr(methods, "disturb_hands", killed)
         with pytest.raises(KeyboardInterrupt):
             run_of(recording, tmp_path / "noisy", hands=hands, noise=NOISE)
-    assert Run.open(tmp_path / "noisy").stages() == []
+    assert RunFolder.open(tmp_path / "noisy").stages() == []
     noisy = run_of(recording, tmp_path / "noisy", hands=hands, noise=NOISE)
     assert error_of(noisy, fitted()) == pytest.approx(0.010, rel=1e-3)
 
@@ -149,7 +151,7 @@ def test_a_method_with_hand_settings_of_its_own_has_its_own_hands_disturbed(
     for name, iterations in ((base, 500), (f"{base}@hand.iterations=7", 7)):
         outcome = bench.outcome(parse_method(name), recording, "noisy_hand")
         assert not outcome.error
-        run = Run.open(tmp_path / "suite/cells" / outcome.run)
+        run = RunFolder.open(tmp_path / "suite/cells" / outcome.run)
         own = fitted(SimpleNamespace(iterations=iterations))
         assert error_of(run, own) == pytest.approx(0.010, rel=1e-3)
 
@@ -162,7 +164,7 @@ def test_recordings_are_disturbed_independently(recording: Sequence, tmp_path: P
     places: list[np.ndarray] = []
     for one in (recording, other):
         outcome = bench.outcome(METHODS["static"], one, "noisy_hand")
-        run = Run.open(tmp_path / "suite/cells" / outcome.run)
+        run = RunFolder.open(tmp_path / "suite/cells" / outcome.run)
         places.append(
             run.tensors(f"sequences/{one.name}/hand_right.safetensors")["wrist_translation"]
         )
