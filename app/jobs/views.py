@@ -3,6 +3,7 @@
 import builtins
 import hashlib
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -302,6 +303,10 @@ _DEFECT = (
 )
 
 
+_NO_DEVICE_MEMORY = re.compile(r"Failed to allocate \d+ bytes on device|CUDA out of memory")
+"""What Warp and PyTorch say."""
+
+
 @dataclass(frozen=True)
 class Failure:
     """Why a run failed."""
@@ -326,15 +331,25 @@ def explain(run: Run | None, reason: str) -> Failure:
         return Failure(reason, _ADVICE[kind])
     if hasattr(errors, kind):
         return Failure(reason, _ADVICE["RunError"])
+    if kind == "MemoryError" or _NO_DEVICE_MEMORY.search(reason):
+        return _explain_memory(kind, reason)
+    builtin = getattr(builtins, kind, None)
+    if isinstance(builtin, type) and issubclass(builtin, OSError):
+        return Failure(reason, "Check the disk and the data folder, then resume.")
+    return Failure(f"The program stopped at a mistake of its own ({kind}: {reason}).", _DEFECT)
+
+
+def _explain_memory(kind: str, reason: str) -> Failure:
     if kind == "MemoryError":
         return Failure(
             "There was not enough memory.",
             "End other programs or use a profile with fewer nodes, then resume.",
         )
-    builtin = getattr(builtins, kind, None)
-    if isinstance(builtin, type) and issubclass(builtin, OSError):
-        return Failure(reason, "Check the disk and the data folder, then resume.")
-    return Failure(f"The program stopped at a mistake of its own ({kind}: {reason}).", _DEFECT)
+    return Failure(
+        f"The memory of the device ran out: {reason}",
+        "Let fewer fits and live scenes use it at a time, or use a profile with fewer nodes or a "
+        "smaller population, then resume.",
+    )
 
 
 @dataclass(frozen=True)

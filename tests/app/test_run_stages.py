@@ -89,6 +89,18 @@ def test_the_time_of_a_stage_is_measured_and_an_older_attempts_report_is_forgott
         ("SimulationDivergedError", "Node 3 is fast.", "Node 3 is fast.", "softer springs"),
         ("KeyError", "'node'", "mistake of its own (KeyError: 'node')", "not of your recording"),
         ("MemoryError", "", "not enough memory", "fewer nodes"),
+        (
+            "RuntimeError",
+            "Failed to allocate 80000 bytes on device 'cuda:0'",
+            "memory of the device ran out: Failed to allocate",
+            "smaller population",
+        ),
+        (
+            "OutOfMemoryError",
+            "CUDA out of memory. Tried to allocate 2.00 GiB.",
+            "memory of the device ran out: CUDA out of memory",
+            "smaller population",
+        ),
         ("PermissionError", "no", "no", "data folder"),
         ("", "The worker was killed.", "The worker was killed.", "Resume"),
         ("ImportFailedError", "bad", "bad", "Resume"),
