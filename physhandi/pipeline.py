@@ -612,7 +612,7 @@ def _stage_springs(
         return
     parameters = artefacts.load_parameters(attempt.out)
     if is_rod:
-        result = fit_rope(problems(), parameters, config.object_, progress)
+        result = fit_rope(problems(), parameters, config.object_, progress, checkpointer=keeper())
     else:
         result = optimise_springs(
             problems(),

@@ -56,6 +56,18 @@ class Bending:
         named = dict(zip(LOGARITHMS, values, strict=True))
         return cls(**named, curvature=vector[count:].reshape(-1, 2))
 
+    def to_array(self) -> Float[ndarray, " number"]:
+        """Give all numbers as they are: `LOGARITHMS`, then curvatures."""
+        positive = [getattr(self, name) for name in LOGARITHMS]
+        return np.concatenate([positive, self.curvature.ravel()])
+
+    @classmethod
+    def from_array(cls, array: Float[ndarray, " number"]) -> "Bending":
+        """Undo `to_array`, to the last bit."""
+        count = len(LOGARITHMS)
+        named = dict(zip(LOGARITHMS, array[:count].tolist(), strict=True))
+        return cls(**named, curvature=array[count:].reshape(-1, 2))
+
     @classmethod
     def straight(cls, vertex_count: int) -> "Bending":
         """Describe a rope of which nothing is known but that it is straight at rest."""

@@ -7,7 +7,7 @@ rollouts.
 import math
 from collections.abc import Iterator
 from collections.abc import Sequence as Many
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.interpolate import make_interp_spline
 
+from physhandi.data.checkpoint import Checkpointer, resumed_note
 from physhandi.errors import FitError, SimulationDivergedError
 from physhandi.fitting.config import ObjectFitConfig
 from physhandi.fitting.object_problem import (
@@ -96,6 +97,8 @@ def fit_rope(
     start: SimulationParameters,
     config: ObjectFitConfig,
     progress: Progress,
+    *,
+    checkpointer: Checkpointer | None = None,
 ) -> FirstOrderResult:
     """Fit how a rope bends to whole rollouts; the equivalent of `optimise_springs`.
 
@@ -106,6 +109,7 @@ def fit_rope(
         start: Parameters that `start_rope` found.
         config: Settings of stage 2.
         progress: Receives a report each iteration.
+        checkpointer: Keeps the state after a step; None keeps nothing.
 
     Raises:
         FitError: If nothing holds the rope.
@@ -114,14 +118,45 @@ def fit_rope(
     best, loss = fit.likely()
     loss_before, bending, curve = loss, best, [[0.0, loss]]
     count = config.rope_steps
-    for window in (WINDOW, None):
-        for stepped in fit.steps(bending, window, count):
-            bending = stepped
+    step = RopeStep(vector=best.to_vector(), levenberg=FIRST_LEVENBERG)
+    number = 0  # Which of the two windows steps look at.
+
+    def state() -> dict[str, ndarray]:
+        return {
+            "vector": step.vector,
+            "levenberg": np.array([step.levenberg]),
+            "place": np.array([number, step.made, step.is_last], np.int64),
+            "best": best.to_array(),
+            "loss": np.array([loss]),
+            "curve": np.array(curve, np.float64),
+        }
+
+    checkpointer = checkpointer or Checkpointer()
+    resumed = checkpointer.load(SPRING_STAGE, state(), growing=("curve",))
+    first, kept = 0, None
+    if resumed is not None:
+        tensors = resumed.tensors
+        first, made, is_last = tensors["place"].tolist()
+        kept = RopeStep(
+            vector=tensors["vector"],
+            levenberg=float(tensors["levenberg"][0]),
+            made=made,
+            is_last=bool(is_last),
+        )
+        bending, best = Bending.from_vector(kept.vector), Bending.from_array(tensors["best"])
+        loss, curve = float(tensors["loss"][0]), tensors["curve"].tolist()
+        done = resumed.iteration
+        progress.report(SPRING_STAGE, done, 2 * count, curve[-1][1], resumed_note(done))
+    for number in range(first, 2):
+        for step in fit.steps(bending, (WINDOW, None)[number], count, kept):
+            bending = Bending.from_vector(step.vector)
             now = fit.loss(bending)
             curve.append([float(len(curve)), now])
-            progress.report(SPRING_STAGE, len(curve) - 1, 2 * count, now)
             if now < loss:
                 best, loss = bending, now
+            checkpointer.offer(SPRING_STAGE, len(curve) - 1, state)
+            progress.report(SPRING_STAGE, len(curve) - 1, 2 * count, now)
+        kept = None
     return FirstOrderResult(
         models=fit.models(best),
         parameters=fit.parameters.replace(drag=best.drag),
@@ -129,6 +164,20 @@ def fit_rope(
         loss_after=loss,
         curve=curve,
     )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RopeStep:
+    """Where a step of Levenberg and Marquardt led."""
+
+    vector: Float[ndarray, " number"]
+    """The numbers after it, see `Bending.to_vector`."""
+    levenberg: float
+    """Levenberg's term for the next one."""
+    made: int = 0
+    """Steps until here, this one included."""
+    is_last: bool = False
+    """Whether it gained so little that no other one follows."""
 
 
 class RopeFit:
@@ -193,25 +242,31 @@ class RopeFit:
         self._preview.show(loss)
         return loss
 
-    def steps(self, start: Bending, window: float | None, most: int) -> Iterator[Bending]:
+    def steps(
+        self, start: Bending, window: float | None, most: int, kept: RopeStep | None = None
+    ) -> Iterator[RopeStep]:
         """Make Levenberg-Marquardt steps that lower the cost of `_errors`.
 
         Args:
             start: Where to begin.
             window: Time over which rollouts follow from an observed state; None for whole ones [s].
             most: Number of steps.
+            kept: Step after which to go on; None for the first one.
 
         Yields:
-            The numbers after each step; it ends where steps gain next to nothing.
+            Each step; it ends where steps gain next to nothing.
         """
-        vector, levenberg = start.to_vector(), FIRST_LEVENBERG
+        step = kept or RopeStep(vector=start.to_vector(), levenberg=FIRST_LEVENBERG)
+        if step.is_last:
+            return
+        vector, levenberg = step.vector, step.levenberg
         errors = self._errors(vector, window)
         if errors is None:
             return
         longest = np.full(len(vector), LARGEST_CHANGE[1])
         longest[: len(LOGARITHMS)] = LARGEST_CHANGE[0]
         cost = _cost(errors)
-        for _ in range(most):
+        for made in range(step.made, most):
             matrix, slope = self._normal_equations(vector, errors, window)
             before = cost
             for _ in range(MOST_TRIALS):
@@ -225,8 +280,9 @@ class RopeFit:
             else:
                 return
             levenberg = max(levenberg / 4.0, LEAST_LEVENBERG)
-            yield Bending.from_vector(vector)
-            if cost > (1.0 - LEAST_GAIN) * before:
+            is_last = cost > (1.0 - LEAST_GAIN) * before
+            yield RopeStep(vector=vector, levenberg=levenberg, made=made + 1, is_last=is_last)
+            if is_last:
                 return
 
     def _normal_equations(

@@ -2,11 +2,14 @@
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from stopped_fits import check_resumed, write_always
 
+from physhandi.data.checkpoint import Checkpointer
 from physhandi.data.importers.mocap import held_point
 from physhandi.data.observation import ObjectObservation
 from physhandi.errors import FitError
@@ -26,7 +29,8 @@ from physhandi.fitting.rope.bending import (
 )
 from physhandi.fitting.rope.fit import fit_rope, start_rope
 from physhandi.fitting.rope.moments import balance_moments
-from physhandi.progress import NullProgress
+from physhandi.fitting.spring_optimisation import FirstOrderResult
+from physhandi.progress import NullProgress, Progress
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.rod import Rod
 from physhandi.simulation.simulator import Simulator
@@ -140,6 +144,21 @@ def test_a_fitted_rope_predicts_how_it_moves_when_it_is_swung_otherwise():
     assert error(model) > 0.01
     # The lengths at its vertices are this recording's, the other numbers the rope's.
     assert error(replace(model, rod=replace(rod, length=rod_of(model).length))) < 0.002
+
+
+def test_a_stopped_fit_of_a_rope_goes_on_to_the_same_bits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    write_always(monkeypatch)
+    problem = swung_rope(60.0, 12.0, 0.03)
+    config = CONFIG.object_.replace(rope_steps=2)
+
+    def fit(progress: Progress, checkpointer: Checkpointer | None) -> FirstOrderResult:
+        return fit_rope([problem], CONFIG.simulation, config, progress, checkpointer=checkpointer)
+
+    # Within the steps over windows, and within those over whole rollouts.
+    reports = check_resumed(fit, tmp_path, (1, 3))
+    assert [report[1] for report in reports] == [3, 4]
 
 
 def test_grips_decide_the_lengths_beside_them():
