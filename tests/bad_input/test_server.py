@@ -293,7 +293,7 @@ def test_a_fit_of_wrong_values_fails_with_its_reason_and_advice(
     damage(world.settings.sequence_dir / name)
     run_id = response.json()["id"]
     with pytest.raises((PhysHandiError, OSError)):
-        fill_run(world.settings.run_dir / run_id, "cpu")
+        fill_run(world.settings.run_dir / run_id, "cpu", lambda: None)
     (world.settings.run_dir / run_id / "queued.json").unlink()
     shown = client.get(f"/api/v1/runs/{run_id}").json()
     assert shown["state"] == "failed"
