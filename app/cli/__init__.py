@@ -47,6 +47,7 @@ def build() -> SubcommandApp:
         help="Turn a recording, a result or a hand model of another format into ours.",
     )
     app.command(runs.export)
+    app.command(runs.gallery)
     app.command(recordings.check)
     app.command(recordings.annotate)
     app.command(recordings.shape)

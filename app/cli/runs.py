@@ -266,6 +266,40 @@ def export(
     print(made)
 
 
+def gallery(
+    runs: Positional[tuple[str, ...]],
+    *,
+    out: Path,
+    title: str = "Results",
+    link: str = "",
+    overwrite: bool = False,
+    data_dir: DataDir = None,
+) -> None:
+    """Write a folder of plain pages that shows runs without a server: an index, and replays.
+
+    Args:
+        runs: Folders or ids of finished runs, in the order in which they are shown.
+        out: Folder to make.
+        title: Heading of the index.
+        link: Link of the viewer, or its part after "?": camera, layers, colors, theme of all pages.
+        overwrite: Replace a gallery that is there.
+    """
+    from app.exports.gallery import write_gallery
+
+    found = [find_result(name, data_dir) for name in runs]
+    with watched(True) as progress:
+        index = write_gallery(
+            found,
+            out,
+            open_catalog(data_dir),
+            title=title,
+            link=link,
+            overwrite=overwrite,
+            report=lambda name, done, of: progress.report(f"page of {name}", done, of),
+        )
+    print(index)
+
+
 def _measured(run: str, data_dir: Path | None) -> dict[str, Any]:
     from physhandi import pipeline
 
