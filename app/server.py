@@ -22,7 +22,8 @@ from app.exports.cache import FileCache, TooManyFilesError
 from app.exports.routes import create_exports
 from app.exports.shares import Shares
 from app.jobs.catalog import Catalog, NotFoundError
-from app.jobs.machine import Machine
+from app.jobs.device_choice import DeviceChoice
+from app.jobs.machine import Cards, Machine
 from app.jobs.order import SkippedObjectError
 from app.jobs.overview import Overview
 from app.jobs.recordings.annotations import Annotations
@@ -92,13 +93,14 @@ def create_app(
     """
     security = security or Security(settings)
     catalog = catalog or Catalog(settings)
-    scheduler = scheduler or Scheduler(settings, catalog)
+    cards = Cards()
+    scheduler = scheduler or Scheduler(settings, catalog, choice=DeviceChoice(settings, cards))
     storage = UserStorage(
         PresetStore(settings.data_dir / "presets"),
         RunSaver(catalog, settings.run_dir, scheduler.start_now, settings.sequence_dir),
     )
     sessions = sessions or Sessions(settings, catalog, storage)
-    machine = Machine(settings.data_dir)
+    machine = Machine(settings.data_dir, cards)
     feed = Feed(lambda: [describe_run(item, scheduler) for item in catalog.runs()])
     tasks = tasks or BackgroundTasks()
     imports = Imports(settings, catalog, tasks)

@@ -39,15 +39,18 @@ class ServerSettings(BaseSettings):
     port: int = Field(default=8080, ge=0, le=65535)
     """Port to listen on; 0 takes a free one."""
     device: str = "cpu"
-    """Warp device of fits and of the live simulation."""
+    """Warp devices of fits, separated by commas; the first one also runs the live simulation."""
     auth: bool = True
     """Whether requests need the token; only a loopback server may go without."""
     token: SecretStr | None = Field(default=None, min_length=16)
     """Token to use instead of a new random one at each start."""
     allowed_hosts: Annotated[tuple[str, ...], NoDecode] = ()
     """Further host names that browsers may use, as behind a reverse proxy (comma separated)."""
-    parallel_fits: int = Field(default=1, ge=1, le=64)
-    """Fits that run side by side, each with its share of threads; others wait."""
+    parallel_fits: int | None = Field(default=None, ge=1, le=64)
+    """Fits that run side by side, each with its share of threads; others wait. None for one each
+    device."""
+    fit_memory_gib: float = Field(default=2.0, ge=0, le=1024)
+    """Least free memory of a GPU for a fit to be started on it [GiB]."""
     waiting_fits: int = Field(default=100, ge=1, le=10_000)
     """Fits that may wait in line."""
     cancel_grace_s: float = Field(default=8.0, gt=0, le=600)
@@ -99,6 +102,21 @@ class ServerSettings(BaseSettings):
                 "Listen on 127.0.0.1 or keep the token."
             )
         return self
+
+    @property
+    def devices(self) -> tuple[str, ...]:
+        """Warp devices of fits."""
+        return tuple(name.strip() for name in self.device.split(","))
+
+    @property
+    def live_device(self) -> str:
+        """Warp device of the live simulation."""
+        return self.devices[0]
+
+    @property
+    def slots(self) -> int:
+        """Number of fits that run side by side."""
+        return self.parallel_fits or len(self.devices)
 
     @property
     def run_dir(self) -> Path:

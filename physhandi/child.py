@@ -124,6 +124,7 @@ class Child:
         module: str,
         *arguments: str,
         threads: int | None = None,
+        environment: Mapping[str, str] | None = None,
         time_limit_s: float | None = None,
         log: Path | None = None,
         pass_fds: Collection[int] = (),
@@ -134,6 +135,7 @@ class Child:
             module: See `start_module`.
             arguments: See `start_module`.
             threads: See `start_module`.
+            environment: See `start_module`.
             time_limit_s: Time after which it is killed [s]; None for no limit.
             log: File that what it prints is appended to; None keeps only the end, in memory.
             pass_fds: See `start_module`.
@@ -143,6 +145,7 @@ class Child:
             module,
             *arguments,
             threads=threads,
+            environment=environment,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

@@ -54,6 +54,40 @@ def pick_device(name: str) -> str:
     return name
 
 
+def pick_devices(names: str) -> tuple[str, ...]:
+    """Turn names of devices, separated by commas, into Warp devices of this machine.
+
+    ``all`` names every GPU, or the CPU where there is none; each name may be one of `pick_device`.
+
+    Raises:
+        UsageError: If a device does not exist here, one is named twice, or a CPU beside GPUs.
+    """
+    import warp as wp
+
+    start_warp()
+    if names == "all":
+        return tuple(str(device) for device in wp.get_cuda_devices()) or ("cpu",)
+    devices = tuple(pick_device(name.strip()) for name in names.split(","))
+    if len(set(devices)) < len(devices):
+        raise UsageError(f"'{names}' names a device twice.")
+    if len(devices) > 1 and "cpu" in devices:
+        raise UsageError(f"'{names}' names the CPU beside a GPU, which is faster; leave it out.")
+    return devices
+
+
+def card_of(name: str) -> str | None:
+    """Give the identity of a Warp device's graphics card, as `nvidia-smi` tells it; None for a CPU.
+
+    Numbers of devices do not tell: CUDA may count the cards in another order. A process that is
+    started with it in ``CUDA_VISIBLE_DEVICES`` sees this card alone, as ``cuda:0``.
+    """
+    import warp as wp
+
+    start_warp()
+    device = wp.get_device(name)
+    return str(device.uuid) if device.is_cuda else None
+
+
 def describe_device(name: str) -> str:
     """Give the model of a Warp device, as its driver names it."""
     import warp as wp

@@ -118,6 +118,7 @@ def reconstruct(
     progress: Progress,
     *,
     device: str = "cpu",
+    more_devices: Many[str] = (),
 ) -> dict[str, Any]:
     """Reconstruct hands and one object from one or several sequences (paper, sections 3.2-3.4).
 
@@ -127,6 +128,7 @@ def reconstruct(
         attempt: Where results go; finished stages in it are not computed again.
         progress: Told about every iteration.
         device: Warp device.
+        more_devices: Further GPUs that share the candidates of the search with it.
 
     Returns:
         The measures of each sequence by its name, as ``metrics.json`` holds them.
@@ -137,13 +139,14 @@ def reconstruct(
         CancelledError: If the user asked to stop.
     """
     config = config.replace(object_=config.object_.on(device))
-    keeper = partial(attempt.checkpointer, _origin_of(sequences, config, device))
+    devices = (device, *more_devices)
+    keeper = partial(attempt.checkpointer, _origin_of(sequences, config, devices))
     has_object = _prepare(sequences, config, attempt, progress, keeper)
     if has_object:
         # Built once, by the first stage that is not finished yet.
         problems = cache(lambda: _problems(sequences, config, attempt))
         is_rod = bends_as_rod(sequences, config)
-        _stage_search(problems, config, attempt, progress, device, is_rod=is_rod, keeper=keeper)
+        _stage_search(problems, config, attempt, progress, devices, is_rod=is_rod, keeper=keeper)
         _stage_springs(problems, config, attempt, progress, device, is_rod=is_rod, keeper=keeper)
         _stage_refinement(
             sequences, problems, config, attempt, progress, device=device, keeper=keeper
@@ -151,16 +154,18 @@ def reconstruct(
     return _stage_evaluation(sequences, config, attempt, progress, device, has_object=has_object)
 
 
-def _origin_of(sequences: Many[Sequence], config: PipelineConfig, device: str) -> dict[str, str]:
+def _origin_of(
+    sequences: Many[Sequence], config: PipelineConfig, devices: tuple[str, ...]
+) -> dict[str, str]:
     """Name what a fit depends on: a checkpoint of another one says nothing about this one."""
-    made_with = describe_environment(device, describe_device(device))
+    made_with = describe_environment(devices[0], describe_device(devices[0]))
     program = {key: made_with[key] for key in ("commit", "packages", "python", "system")}
     recordings = [sequence.content_fingerprint() for sequence in sequences]
     parts = {
         "program": program,
         "settings": config.to_dict(),
         "recordings": recordings,
-        "device": [device, made_with["device_name"]],
+        "device": [*devices, made_with["device_name"]],
     }
     return {
         name: hashlib.sha256(json_line(part).encode()).hexdigest() for name, part in parts.items()
@@ -183,7 +188,7 @@ def predict(
         MissingInputError: If the sequence has no object, or nothing that moves it.
         CancelledError: If the user asked to stop.
     """
-    keeper = partial(attempt.checkpointer, _origin_of([sequence], config, "cpu"))
+    keeper = partial(attempt.checkpointer, _origin_of([sequence], config, ("cpu",)))
     if not _prepare([sequence], config, attempt, progress, keeper):
         raise MissingInputError(nothing_to_fit([sequence]))
     if attempt.stage_done(EVALUATION):
@@ -575,7 +580,7 @@ def _stage_search(
     config: PipelineConfig,
     attempt: Attempt,
     progress: Progress,
-    device: str,
+    devices: tuple[str, ...],
     *,
     is_rod: bool,
     keeper: Keeper,
@@ -588,7 +593,12 @@ def _stage_search(
         result = start_rope(problems(), *settings, progress)
     else:
         result = search_object(
-            problems(), *settings, progress, device=device, checkpointer=keeper()
+            problems(),
+            *settings,
+            progress,
+            device=devices[0],
+            more_devices=devices[1:],
+            checkpointer=keeper(),
         )
     attempt.save_yaml(PARAMETERS_FILE, result.parameters.to_dict())
     searched = {name: variable.to_dict() for name, variable in result.intervals.items()}
@@ -726,13 +736,20 @@ def _finish(
     attempt.finish_stage(stage, summary)
 
 
-def run_job(run: RunFolder, progress: Progress | None = None, *, device: str = "cpu") -> None:
+def run_job(
+    run: RunFolder,
+    progress: Progress | None = None,
+    *,
+    device: str = "cpu",
+    more_devices: Many[str] = (),
+) -> None:
     """Execute what a run folder asks for, and publish the result.
 
     Args:
         run: The run; its configuration says what to do.
         progress: Also told what the run's own event log is told.
         device: Warp device.
+        more_devices: Further GPUs that share the search of a reconstruction with it.
 
     Raises:
         PhysHandiError: If the work failed; the run folder then says why.
@@ -764,5 +781,7 @@ def run_job(run: RunFolder, progress: Progress | None = None, *, device: str = "
             )
         else:
             config = PipelineConfig.from_dict(run.config["profile"])
-            reconstruct(sequences, config, attempt, watched, device=device)
+            reconstruct(
+                sequences, config, attempt, watched, device=device, more_devices=more_devices
+            )
         attempt.publish()

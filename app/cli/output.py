@@ -14,6 +14,10 @@ DataDir = Annotated[
     arg(help="Folder with `sequences/` and `runs/` (PHYSHANDI_DATA_DIR, else `data`)."),
 ]
 Device = Annotated[str, arg(help="Warp device: auto, cpu, cuda or cuda:0.")]
+Devices = Annotated[
+    str,
+    arg(help="Warp device: auto, cpu, cuda or cuda:0; several GPUs: all, or cuda:0,cuda:1."),
+]
 AsJson = Annotated[bool, arg(name="json", help="Print JSON instead of lines.")]
 
 

@@ -14,14 +14,14 @@ from app.cli.lookup import (
     open_catalog,
     read_settings,
 )
-from app.cli.output import AsJson, DataDir, Device, show
+from app.cli.output import AsJson, DataDir, Device, Devices, show
 from app.jobs.order import default_name, fit_settings
 from physhandi.api import prepare_run
 from physhandi.data.layout import LOSSES_FILE, METRICS_FILE, PARAMETERS_FILE
 from physhandi.data.run import RunKind
 from physhandi.data.run_folder import new_run_id
 from physhandi.data.sequence import Sequence
-from physhandi.devices import pick_device
+from physhandi.devices import pick_device, pick_devices
 from physhandi.errors import RunError, UsageError
 from physhandi.fitting.checks.readiness import skipped_object
 from physhandi.fitting.config import (
@@ -81,7 +81,7 @@ def reconstruct(
     settings: UseAppendAction[
         Annotated[tuple[str, ...], arg(name="set", metavar="PATH=VALUE")]
     ] = (),
-    device: Device = "auto",
+    device: Devices = "auto",
     data_dir: DataDir = None,
 ) -> None:
     """Fit hands and object of one or several sequences of the same object.
@@ -105,13 +105,13 @@ def reconstruct(
         print(f"physhandi: warning: {told}", file=sys.stderr)
     base = load_profile(profile)
     stored = fit_settings(base, dict(parse_override(text) for text in settings))
-    device = pick_device(device)
+    devices = pick_devices(device)
     if out is None:
         name = default_name(recordings[0].name, stored)
         run = _run_at(_new_folder(data_dir), "reconstruction", recordings, stored, name)
     else:
         run = _run_at(out, "reconstruction", recordings, stored)
-    show(_execute(run, device))
+    show(_execute(run, *devices))
 
 
 def simulate(
@@ -325,12 +325,12 @@ def _run_at(
     return run
 
 
-def _execute(run: Run, device: str) -> dict[str, Any]:
+def _execute(run: Run, device: str, *more_devices: str) -> dict[str, Any]:
     """Fill a run; gives its folder, the losses of its stages, its metrics and last its warnings."""
     from physhandi import pipeline
 
     with watched(True) as progress:
-        pipeline.run_job(run, progress, device=device)
+        pipeline.run_job(run, progress, device=device, more_devices=more_devices)
     finished = Run.open(run.folder)
     result: dict[str, Any] = {"run": str(finished.folder)}
     if finished.has(LOSSES_FILE):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from app.cli.lookup import open_catalog, read_settings
 from app.cli.output import DataDir
-from physhandi.devices import pick_device
+from physhandi.devices import pick_device, pick_devices
 
 
 def serve(
@@ -25,7 +25,10 @@ def serve(
         host: Address to listen on; others reach anything but loopback (PHYSHANDI_HOST, else
             127.0.0.1).
         port: Port to listen on; 0 takes a free one (PHYSHANDI_PORT, else 8080).
-        device: Warp device: auto, cpu or cuda:0 (PHYSHANDI_DEVICE, else auto).
+        device: Warp devices of fits: all (every GPU, or the CPU where there is none), auto (the
+            first of them), cpu, or names like cuda:0,cuda:1. Each is given as many fits at a time
+            as the others, one by default; the first also runs live scenes (PHYSHANDI_DEVICE, else
+            all).
         captures: Folders, besides `captures/` of the data folder, from which recordings may be
             imported in the browser (PHYSHANDI_CAPTURES).
         demo: Also queue a quick fit of the bundled sequence.
@@ -35,8 +38,8 @@ def serve(
     settings = read_settings(
         host=host, port=port, data_dir=data_dir, device=device, captures=captures or None
     )
-    named = settings.device if "device" in settings.model_fields_set else "auto"
-    settings = settings.model_copy(update={"device": pick_device(named)})
+    named = settings.device if "device" in settings.model_fields_set else "all"
+    settings = settings.model_copy(update={"device": ",".join(pick_devices(named))})
     serve_application(settings, on_ready=lambda url: print(url, flush=True), queue_demo=demo)
 
 

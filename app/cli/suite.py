@@ -12,9 +12,9 @@ from typing import Annotated, Literal
 from tyro.conf import arg
 
 from app.cli.lookup import find_sequence, read_settings
-from app.cli.output import AsJson, DataDir, Device, show
+from app.cli.output import AsJson, DataDir, Devices, show
 from physhandi.data.sequence import Sequence
-from physhandi.devices import pick_device
+from physhandi.devices import pick_devices
 from physhandi.errors import UsageError
 from physhandi.progress import watched
 
@@ -39,8 +39,8 @@ def evaluate_suite(
         tuple[str, ...], arg(help_behavior_hint="(default: the suite's scenes)")
     ] = (),
     out: Path | None = None,
-    jobs: int = 1,
-    device: Device = "auto",
+    jobs: Annotated[int | None, arg(help_behavior_hint="(default: one each device)")] = None,
+    device: Devices = "auto",
     as_json: AsJson = False,
     data_dir: DataDir = None,
 ) -> None:
@@ -59,8 +59,9 @@ def evaluate_suite(
         sequences: Folders or names of sequences to evaluate in place of the suite's scenes.
         out: Folder to fill, and to go on with; none takes one of its own in `suites/` of the data
             folder, whose suites the server shows.
-        jobs: How many sequences and cells are computed side by side, each in a process of its own.
-            Then the times in the table are those of a shared machine.
+        jobs: How many sequences and cells are computed side by side, each in a process of its own;
+            with several GPUs they take turns with them. Then the times in the table are those of a
+            shared machine.
 
     Raises:
         UsageError: If a method, seed or sequence makes no sense, or the folder holds other data.
@@ -93,9 +94,8 @@ def evaluate_suite(
     for method in methods:  # Tells a wrong one before a sequence is made, which takes long.
         for one in searched_from(parse_method(method), search_seeds):
             method_settings(one, settings)
-    seeds = seeds or chosen.seeds
-    check_seeds(seeds)
-    device = pick_device(device)
+    check_seeds(seeds := seeds or chosen.seeds)
+    devices = pick_devices(device)
     named = [find_sequence(name, data_dir) for name in sequences]
     folders = read_settings(data_dir=data_dir).suite_dir
     if named:
@@ -106,13 +106,14 @@ def evaluate_suite(
         of_seeds = "" if set(seeds) == set(chosen.seeds) else f"-seeds-{_joined(seeds)}"
         out = out or folders / f"{chosen.name}{of_seeds}"
     check_folder(out, title, cases)
+    jobs = len(devices) if jobs is None else jobs
     if not 1 <= jobs <= MOST_PROCESSES:
         raise UsageError(f"--jobs {jobs} makes no sense; choose 1 to {MOST_PROCESSES}.")
     with watched(True) as progress, ExitStack() as stack:
         # Everything that a user may have got wrong is told before they are started.
         make, workers = partial(make_one_by_one, progress=progress), None
         if jobs > 1:
-            workers = stack.enter_context(SuiteWorkers(jobs, progress))
+            workers = stack.enter_context(SuiteWorkers(jobs, progress, devices))
             make = workers.make
         order = Order(
             title=title,
@@ -121,8 +122,8 @@ def evaluate_suite(
             protocols=protocols or chosen.protocols,
             settings=settings,
             search_seeds=search_seeds,
-            device=device,
-            command=_command(suite, given, sequences, jobs, device),
+            device="cuda:0" if workers and devices[0] != "cpu" else devices[0],
+            command=_command(suite, given, sequences, jobs, ",".join(devices)),
             at_once=jobs,
         )
         for recording in order.recordings:

@@ -15,6 +15,7 @@ from typing import Any
 
 from physhandi.child import Channel, Child, ChildEndedError, run_child
 from physhandi.data.sequence import Sequence
+from physhandi.devices import card_of
 from physhandi.errors import PhysHandiError, RunError, UsageError
 from physhandi.progress import Progress
 from physhandi.synthetic.suite.evaluation import Fill, Order, Task
@@ -115,16 +116,19 @@ class SuiteWorkers:
     """A few processes that share the work on a suite; they end with it.
 
     After an error nothing more can be asked of them: some may still work on what was asked before.
-    Each has its own share of the machine's processors. Cells that are made from others (a last
-    residual, an unseen interaction) come last, so that processes seldom wait for each other.
+    Each has its own share of the machine's processors, and the GPUs in turn. Cells that are made
+    from others (a last residual, an unseen interaction) come last, so that processes seldom wait
+    for each other.
     """
 
-    def __init__(self, count: int, progress: Progress) -> None:
+    def __init__(self, count: int, progress: Progress, devices: Many[str] = ("cpu",)) -> None:
         """Start them.
 
         Args:
             count: How many, 2 or more.
             progress: Told what they do; may ask to stop.
+            devices: Warp devices of this process. Each of them has one for itself; if that is a
+                GPU, it is their ``cuda:0``, which orders name.
 
         Raises:
             UsageError: If the number makes no sense.
@@ -133,7 +137,10 @@ class SuiteWorkers:
             raise UsageError(f"{count} processes make no sense; choose 2 to {MOST_PROCESSES}.")
         self._progress = progress
         self._heard: queue.Queue[tuple[int, Any]] = queue.Queue()
-        self._workers = [self._start(number, share) for number, share in enumerate(_shares(count))]
+        self._workers = [
+            self._start(number, share, devices[number % len(devices)])
+            for number, share in enumerate(_shares(count))
+        ]
 
     def __enter__(self) -> "SuiteWorkers":
         return self
@@ -234,9 +241,15 @@ class SuiteWorkers:
         worker.state = job.label
         worker.child.send(job.request)
 
-    def _start(self, number: int, share: Many[int]) -> _Worker:
+    def _start(self, number: int, share: Many[int], device: str) -> _Worker:
         processors = ",".join(str(processor) for processor in share)
-        child = Child("app.cli.suite_workers", processors, threads=len(share))
+        card = card_of(device)
+        child = Child(
+            "app.cli.suite_workers",
+            processors,
+            threads=len(share),
+            environment=None if card is None else {"CUDA_VISIBLE_DEVICES": card},
+        )
         listener = threading.Thread(target=self._listen, args=(number, child), daemon=True)
         listener.start()
         return _Worker(child=child, listener=listener)

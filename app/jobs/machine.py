@@ -19,7 +19,10 @@ _CARDS_KEPT_S = 2.0
 _PATIENCE_S = 10.0
 """The tool takes seconds where the driver sleeps between its calls [s]."""
 _MEBIBYTE = 2**20
-_FIELDS = ("index", "name", "utilization.gpu", "memory.used", "memory.total", "temperature.gpu")
+_FIELDS = (
+    *("index", "name", "utilization.gpu", "memory.used", "memory.total", "temperature.gpu"),
+    "uuid",
+)
 
 Ask = Callable[[list[str]], str]
 """Calls the tool with arguments and gives what it prints; raises OSError if it fails."""
@@ -63,8 +66,8 @@ class Cards:
         """Give what was found last, and see to it that it is not old the next time.
 
         Returns:
-            For each card ``index name share memory memory_total temperature``: the share of time
-            that it worked, bytes, and degrees Celsius; none where it does not tell.
+            For each card ``index name share memory memory_total temperature uuid``: the share of
+            time that it worked, bytes, and degrees Celsius; none where it does not tell.
         """
         with self._lock:
             is_old = self._time is None or time.monotonic() - self._time > _CARDS_KEPT_S
@@ -80,6 +83,13 @@ class Cards:
                 return None
             return sum(self._by_process.get(pid, 0) for pid in pids)
 
+    def free_memory(self, uuid: str) -> float | None:
+        """Give the free memory of a graphics card as it was found last [bytes]; none if unknown."""
+        for card in self.read():
+            if card["uuid"] == uuid and None not in (card["memory"], card["memory_total"]):
+                return card["memory_total"] - card["memory"]
+        return None
+
     def refresh(self) -> None:
         """Ask the tool now."""
         cards: list[dict[str, Any]] = []
@@ -93,6 +103,7 @@ class Cards:
                     "memory": _scaled(values[3], _MEBIBYTE),
                     "memory_total": _scaled(values[4], _MEBIBYTE),
                     "temperature": _scaled(values[5], 1.0),
+                    "uuid": values[6],
                 }
                 for values in self._table(f"--query-gpu={','.join(_FIELDS)}", len(_FIELDS))
             ]

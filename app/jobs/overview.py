@@ -28,7 +28,7 @@ class Overview:
         self._catalog = catalog
         self._scheduler = scheduler
         self._machine = machine
-        about = describe_environment(settings.device)
+        about = describe_environment(settings.live_device)
         self._program = {
             name: about[name] for name in ("packages", "python", "system", "commit", "started")
         }
@@ -42,7 +42,7 @@ class Overview:
         """
         return self.moving() | {
             "program": self._program,
-            "device": self._settings.device,
+            "device": ", ".join(self._settings.devices),
             "data_dir": str(self._settings.data_dir),
         }
 

@@ -148,6 +148,7 @@ def start_supervisor(
     device: str,
     *,
     hung_after_s: float,
+    card: str | None = None,
     worker: str = WORKER,
     threads: int | None = None,
 ) -> "subprocess.Popen[str]":
@@ -159,17 +160,19 @@ def start_supervisor(
         run_folder: Folder of the run.
         device: Warp device.
         hung_after_s: Time without a sign of life after which its worker is taken to hang [s].
+        card: The only graphics card that it sees, as ``cuda:0``; None for whatever there is.
         worker: Python module that does the work.
         threads: How many threads its libraries may start; none for one each processor.
 
     Returns:
         The started process.
     """
+    only = {} if card is None else {"CUDA_VISIBLE_DEVICES": card}
     return start_module(
         "app.jobs.supervise",
         *(str(run_folder), device, worker, str(hung_after_s)),
         threads=threads,
-        environment={COOKIE: cookie_of(run_folder, secrets.token_hex(8))},
+        environment={COOKIE: cookie_of(run_folder, secrets.token_hex(8)), **only},
         outlives_parent=True,
         stderr=subprocess.DEVNULL,
         start_new_session=True,

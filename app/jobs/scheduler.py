@@ -13,8 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from app.jobs.catalog import Catalog, RunItem
+from app.jobs.device_choice import DeviceChoice
 from app.jobs.eta import Forecast
 from app.jobs.launch_keys import KeyedRequest, LaunchKeys
+from app.jobs.machine import Cards
 from app.jobs.order import default_name, fit_config, require_agreement
 from app.jobs.processes import (
     WORKER,
@@ -99,18 +101,28 @@ class JobView:
 class Scheduler:
     """Starts queued runs while slots are free; folders hold all state that must not be lost."""
 
-    def __init__(self, settings: ServerSettings, catalog: Catalog, *, worker: str = WORKER) -> None:
+    def __init__(
+        self,
+        settings: ServerSettings,
+        catalog: Catalog,
+        *,
+        choice: DeviceChoice | None = None,
+        worker: str = WORKER,
+    ) -> None:
         """Prepare; `start` begins.
 
         Args:
-            settings: Slots, device and grace of a cancel.
+            settings: Slots, devices and grace of a cancel.
             catalog: Finds runs.
+            choice: Chooses the devices of fits; none chooses among those of the settings.
             worker: Module of the worker process.
         """
         self._settings = settings
         self._catalog = catalog
         self._worker = worker
-        self.forecast = Forecast(catalog, settings.device)
+        self._choice = choice or DeviceChoice(settings, Cards())
+        self._is_short = False
+        self.forecast = Forecast(catalog, settings.devices[0])
         """Estimates how long fits still take."""
         self._lock = threading.RLock()
         self._keys = LaunchKeys(settings.launches_path)
@@ -230,7 +242,9 @@ class Scheduler:
     def start_now(self, run: Run) -> None:
         """Start a run beside the line, for what takes seconds while somebody waits."""
         with self._lock:
-            self._start(RunItem(run.id, run.folder, False, run, None))
+            # It takes seconds, so it may be where memory is short.
+            device = self._choice.choose(self._devices_at_work()) or self._settings.devices[0]
+            self._start(RunItem(run.id, run.folder, False, run, None), device)
 
     def resume(self, run_id: str) -> None:
         """Queue a run that did not succeed again; it goes on where it was.
@@ -286,7 +300,7 @@ class Scheduler:
     @property
     def slots(self) -> int:
         """Number of fits that run side by side."""
-        return self._settings.parallel_fits
+        return self._settings.slots
 
     def at_work(self) -> list[Run]:
         """List the runs that have a place, as the queue saw them last."""
@@ -347,10 +361,12 @@ class Scheduler:
         if run.id not in line:
             return JobView("queued", reason="It was just put in line.")
         place = line.index(run.id) + 1
-        slots = self._settings.parallel_fits
+        slots = self._settings.slots
         at_a_time = "one fit runs" if slots == 1 else f"{slots} fits run"
         if run.id in self._hindered:
             return JobView("queued", place, f"It cannot be started: {self._hindered[run.id]}")
+        if len(busy) < slots and self._is_short:
+            return JobView("queued", place, self._choice.shortage)
         if len(busy) < slots and place == 1:
             return JobView("queued", place, "It starts next.")
         return JobView("queued", place, f"Waits for a free place: {at_a_time} at a time.")
@@ -404,16 +420,21 @@ class Scheduler:
             self._busy = tuple(run_id for run_id, view in views.items() if view.state in AT_WORK)
             moving = {*self._busy, *(item.id for item in queue)}
             self._known = {item.id: item.run for item in items if item.run and item.id in moving}
-            free = max(0, self._settings.parallel_fits - len(self._busy))
+            free = max(0, self._settings.slots - len(self._busy))
             # A supervisor that put its run back in line has still to end.
             ready = [
                 item
                 for item in queue
                 if item.id not in self._started and supervisor_of(item.folder) is None
             ]
+            self._is_short = False
             for item in ready[:free]:
+                device = self._choice.choose(self._devices_at_work())
+                if device is None:
+                    self._is_short = True
+                    break
                 with self._hindering(item.id):
-                    self._start(item)
+                    self._start(item, device)
             self._line = tuple(item.id for item in queue if item.id not in self._started)
 
     @contextmanager
@@ -427,13 +448,20 @@ class Scheduler:
                 logger.warning("run %s cannot go on: %s", run_id, describe(error))
             self._hindered[run_id] = describe(error)
 
-    def _start(self, item: RunItem) -> None:
-        note_start(item.folder)
+    def _devices_at_work(self) -> list[str]:
+        """List the devices of the runs that have a place."""
+        tickets = (read_ticket(self._settings.run_dir / run_id / STARTED) for run_id in self._busy)
+        return [ticket.device for ticket in tickets if ticket is not None]
+
+    def _start(self, item: RunItem, device: str) -> None:
+        note_start(item.folder, device)
         (item.folder / EXIT).unlink(missing_ok=True)
-        at_a_time = self._settings.parallel_fits
+        at_a_time = self._settings.slots
+        card = self._choice.card(device)
         process = start_supervisor(
             item.folder,
-            self._settings.device,
+            device if card is None else "cuda:0",
+            card=card,
             hung_after_s=self._settings.hung_after_s,
             worker=self._worker,
             threads=None if at_a_time == 1 else max(1, (os.cpu_count() or 1) // at_a_time),
@@ -442,7 +470,7 @@ class Scheduler:
         self._busy = (*self._busy, item.id)
         (item.folder / QUEUED).unlink(missing_ok=True)
         self._line = tuple(run_id for run_id in self._line if run_id != item.id)
-        logger.info("run %s started", item.id)
+        logger.info("run %s started on %s", item.id, device)
 
     def _sweep(self) -> None:
         """End what is left of runs whose supervisor was killed."""

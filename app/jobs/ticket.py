@@ -27,6 +27,8 @@ class Ticket:
     """How often it was started."""
     why: str = ""
     """Why it was started again."""
+    device: str = ""
+    """Warp device that it was started on."""
 
     @property
     def remark(self) -> str:
@@ -44,11 +46,13 @@ def read_ticket(path: Path) -> Ticket | None:
         return None
     except (OSError, ValueError, RecursionError):
         return Ticket()
-    time, starts, why = (content.get(name) for name in ("time", "starts", "why"))
+    time, starts = content.get("time"), content.get("starts")
+    why, device = content.get("why"), content.get("device")
     return Ticket(
         time=time if isinstance(time, float) and isfinite(time) else 0.0,
         starts=starts if isinstance(starts, int) else 0,
         why=why if isinstance(why, str) else "",
+        device=device if isinstance(device, str) else "",
     )
 
 
@@ -57,10 +61,11 @@ def put_in_line(run_folder: Path, ticket: Ticket) -> None:
     write_json(run_folder / QUEUED, asdict(ticket))
 
 
-def note_start(run_folder: Path) -> None:
+def note_start(run_folder: Path, device: str) -> None:
     """Note that a run is about to be started once more; it stays in line until it has begun."""
     ticket = read_ticket(run_folder / QUEUED) or Ticket()
-    write_json(run_folder / STARTED, asdict(replace(ticket, starts=ticket.starts + 1)))
+    started = replace(ticket, starts=ticket.starts + 1, device=device)
+    write_json(run_folder / STARTED, asdict(started))
 
 
 def start_again_or_end(run_folder: Path, why: str) -> None:

@@ -74,7 +74,7 @@ class Sessions:
         self._closed_sessions: OrderedDict[str, ClosedSession] = OrderedDict()
         self._opening = 0
         self.link_of: Callable[[Session], str] = lambda _: ""
-        self.live = SimulationClient(settings.device)
+        self.live = SimulationClient(settings.live_device)
         self._closed = threading.Event()
         self._reaper: threading.Thread | None = None
 

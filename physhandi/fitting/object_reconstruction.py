@@ -53,6 +53,7 @@ def search_object(
     progress: Progress,
     *,
     device: str = "cpu",
+    more_devices: Many[str] = (),
     checkpointer: Checkpointer | None = None,
 ) -> SearchResult:
     """Search the global parameters, topology included, that explain all sequences best.
@@ -66,6 +67,7 @@ def search_object(
         config: Settings of stage 2.
         progress: Receives a report each generation.
         device: Warp device.
+        more_devices: Further GPUs that share the candidates of a generation with it.
         checkpointer: Keeps the losses of all candidates; None keeps nothing.
 
     Raises:
@@ -81,7 +83,9 @@ def search_object(
         needed = settle_substeps(models, start, config).substeps_per_frame
         config = config.replace(most_substeps=max(config.most_substeps, 2 * needed))
     known = _KnownLosses(checkpointer or Checkpointer())
-    evaluate = CandidateEvaluator(problems, config, progress, device=device, known=known)
+    evaluate = CandidateEvaluator(
+        problems, config, progress, device=device, more_devices=more_devices, known=known
+    )
     return search_parameters(evaluate, start, search, _ResumedSearch(progress, known))
 
 
@@ -274,8 +278,9 @@ def _node_gap(node: ndarray) -> float:
 class CandidateEvaluator:
     """Computes the loss of candidate parameters over all sequences.
 
-    On CUDA each sequence simulates a generation as one batch; on a CPU as many candidates at once
-    as there are processors, each in a thread of its own. With self-collision they take turns.
+    On CUDA each sequence simulates a generation as one batch, or as one on each of several GPUs; on
+    a CPU as many candidates at once as there are processors, each in a thread of its own. With
+    self-collision they take turns.
     """
 
     def __init__(
@@ -285,6 +290,7 @@ class CandidateEvaluator:
         progress: Progress,
         *,
         device: str = "cpu",
+        more_devices: Many[str] = (),
         threads: int | None = None,
         known: _KnownLosses | None = None,
     ) -> None:
@@ -295,13 +301,15 @@ class CandidateEvaluator:
             config: Weights of the loss and bounds of the substeps.
             progress: Can cancel between two simulations; shows the best candidate.
             device: Warp device.
+            more_devices: Further GPUs that share each batch with it. Losses are rounded otherwise,
+                but in the same way every time.
             threads: Candidates at once on a CPU; None for as many as processors. The bits are the
                 same.
             known: Losses that need not be computed again; None for none.
         """
         self._threads = threads or processor_count()
         self._problems, self._config, self._progress = problems, config, progress
-        self._device = device
+        self._device, self._gpus = device, (device, *more_devices)
         self._targets = [motion_target(problem, config) for problem in problems]
         self._preview = RolloutPreview(SEARCH_STAGE, progress)
         self._best_loss = np.inf
@@ -416,47 +424,69 @@ class CandidateEvaluator:
     ) -> None:
         """Write one sequence's losses of the possible candidates into `losses`."""
         problem = self._problems[row]
-        is_batched = wp.get_device(self._device).is_cuda
-        batch = []
         for index in possible:
-            if not candidates[index].self_collision:
-                batch.append(index)
-                continue
-            self._progress.check_cancelled()
-            models = {problem.name: master.model(candidates[index])}
-            losses[index] = mean_loss(
-                [problem],
-                models,
-                candidates[index],
-                self._config,
-                self._device,
-                acceleration_weight=self._config.acceleration_weight,
-            )
-        if not batch:
-            return
-        control, target = problem.control[: problem.frame_count], self._targets[row]
+            if candidates[index].self_collision:
+                self._progress.check_cancelled()
+                losses[index] = mean_loss(
+                    [problem],
+                    {problem.name: master.model(candidates[index])},
+                    candidates[index],
+                    self._config,
+                    self._device,
+                    acceleration_weight=self._config.acceleration_weight,
+                )
+        batch = [index for index in possible if not candidates[index].self_collision]
+        if batch:
+            self._simulate_batch(row, master, candidates, batch, losses)
 
-        def simulate(part: list[int], threads: int | None = None) -> None:
+    def _simulate_batch(
+        self,
+        row: int,
+        master: MasterTopology,
+        candidates: Many[SimulationParameters],
+        batch: list[int],
+        losses: np.ndarray,
+    ) -> None:
+        problem, target = self._problems[row], self._targets[row]
+        control = problem.control[: problem.frame_count]
+
+        def simulator_of(
+            part: list[int], device: str, threads: int | None = None
+        ) -> BatchSimulator:
             self._progress.check_cancelled()
             parameters = [problem_parameters(candidates[index], problem) for index in part]
-            simulator = BatchSimulator(master, parameters, self._device, threads=threads)
-            losses[part] = simulator.losses(control, target).loss
+            return BatchSimulator(master, parameters, device, threads=threads)
 
-        if is_batched:
-            simulate(batch)
+        def simulate(index: int, threads: int | None = None) -> None:
+            simulator = simulator_of([index], self._device, threads)
+            losses[index] = simulator.losses(control, target).loss[0]
+
+        if wp.get_device(self._device).is_cuda:
+            parts = shared_out(batch, len(self._gpus))
+            simulators = [simulator_of(*shared) for shared in zip(parts, self._gpus, strict=False)]
+            # All of them begin before the host waits for the first one.
+            begun = [simulator.start_losses(control, target) for simulator in simulators]
+            for part, finish in zip(parts, begun, strict=True):
+                losses[part] = finish().loss
             return
         if len(batch) == 1 or self._threads == 1:
             for index in batch:
-                simulate([index])
+                simulate(index)
             return
         with ThreadPoolExecutor(self._threads, thread_name_prefix="physhandi-candidate") as pool:
-            jobs = [pool.submit(simulate, [index], 1) for index in batch]
+            jobs = [pool.submit(simulate, index, 1) for index in batch]
             try:
                 for job in jobs:
                     job.result()
             finally:
                 for job in jobs:
                     job.cancel()
+
+
+def shared_out(batch: Many[int], count: int) -> list[list[int]]:
+    """Divide a batch into as many parts, of which none is empty or longer by more than one."""
+    parts = np.array_split(np.array(batch, dtype=int), min(count, len(batch)))
+    return [part.tolist() for part in parts]
 
 
 def motion_target(problem: ObjectProblem, config: ObjectFitConfig) -> MotionTarget:

@@ -152,8 +152,9 @@ def test_a_fit_takes_a_profile_file_and_single_settings(
 ) -> None:
     made: list[Mapping[str, Any]] = []
 
-    def keep(run: RunFolder, _progress: object, *, device: str) -> None:
+    def keep(run: RunFolder, _progress: object, **devices: object) -> None:
         made.append(run.config)
+        assert devices == {"device": "cpu", "more_devices": ()}
 
     monkeypatch.setattr(pipeline, "run_job", keep)
     Path("mine.yaml").write_text("base: quick\nnode_spacing: 0.03\n")

@@ -16,8 +16,11 @@ from waiting import until
 
 from app.jobs import scheduler as scheduler_module
 from app.jobs.catalog import Catalog
+from app.jobs.device_choice import DeviceChoice
+from app.jobs.machine import Cards
 from app.jobs.processes import end_processes, processes_of, supervisor_of
 from app.jobs.scheduler import JobView, Scheduler
+from app.jobs.ticket import STARTED, read_ticket
 from app.settings import ServerSettings
 from physhandi.data.lease import live_holder
 from physhandi.data.run_folder import read_events
@@ -31,10 +34,11 @@ GRACE_S = 0.4
 class Desk:
     """A scheduler, and shortcuts to what a test asks it."""
 
-    def __init__(self, data_dir: Path, **settings: Any) -> None:
+    def __init__(self, data_dir: Path, cards: Cards | None = None, **settings: Any) -> None:
         self.settings = ServerSettings(data_dir=data_dir, cancel_grace_s=GRACE_S, **settings)
         self.catalog = Catalog(self.settings)
-        self.scheduler = Scheduler(self.settings, self.catalog, worker="job_worker")
+        choice = cards and DeviceChoice(self.settings, cards, card_of=lambda name: f"GPU {name}")
+        self.scheduler = Scheduler(self.settings, self.catalog, choice=choice, worker="job_worker")
 
     def launch(self, behaviour: str) -> str:
         return self.scheduler.launch(["sheet"], "quick", behaviour).id
@@ -59,8 +63,8 @@ def desks(data_dir: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[
     monkeypatch.setattr(scheduler_module, "_SWEEP_INTERVAL_S", 0.3)
     made: list[Desk] = []
 
-    def make(**settings: Any) -> Desk:
-        desk = Desk(data_dir, **settings)
+    def make(cards: Cards | None = None, **settings: Any) -> Desk:
+        desk = Desk(data_dir, cards, **settings)
         made.append(desk)
         desk.scheduler.start()
         return desk
@@ -144,6 +148,38 @@ def test_two_slots_run_two_fits_side_by_side(desks: Callable[..., Desk]) -> None
     assert worker.environ()["OMP_NUM_THREADS"] == str(max(1, (os.cpu_count() or 1) // 2))
     desk.scheduler.cancel(runs[0])
     until(lambda: [desk.state(r) for r in runs] == ["cancelled", "running", "running"])
+
+
+def test_each_graphics_card_has_one_fit(desks: Callable[..., Desk]) -> None:
+    desk = desks(Cards(lambda _: ""), device="cuda:0,cuda:1")
+    first, second, third = (desk.launch(f"wait {number}") for number in range(3))
+    until(lambda: [desk.state(r) for r in (first, second, third)] == ["running"] * 2 + ["queued"])
+    assert "2 fits run at a time" in desk.view(third).reason
+    assert [device_of(desk, run_id) for run_id in (first, second)] == ["cuda:0", "cuda:1"]
+    (desk.run(second).folder / "go").touch()
+    desk.until(third, "running")
+    assert device_of(desk, third) == "cuda:1"
+    (worker, *_) = processes_of(desk.run(third).folder)
+    assert worker.environ()["CUDA_VISIBLE_DEVICES"] == "GPU cuda:1"
+    assert "cuda:0" in worker.cmdline()
+
+
+def test_a_fit_waits_for_memory_of_a_graphics_card(desks: Callable[..., Desk]) -> None:
+    used = [78976]
+    cards = Cards(lambda _: f"0, NVIDIA H200, 0, {used[0]}, 80000, 40, GPU cuda:0")
+    cards.refresh()
+    desk = desks(cards, device="cuda:0")
+    run_id = desk.launch("wait")
+    until(lambda: "Waits for memory of a GPU: cuda:0 has 1.0 GiB" in desk.view(run_id).reason)
+    used[0] = 70_000
+    cards.refresh()
+    desk.until(run_id, "running")
+
+
+def device_of(desk: Desk, run_id: str) -> str:
+    ticket = read_ticket(desk.run(run_id).folder / STARTED)
+    assert ticket is not None
+    return ticket.device
 
 
 def test_the_line_has_an_end(desks: Callable[..., Desk]) -> None:
@@ -371,7 +407,7 @@ def test_a_run_at_work_is_neither_deleted_nor_resumed(desk: Desk) -> None:
 def test_a_full_disk_keeps_a_run_in_line_until_there_is_room(
     desk: Desk, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def no_room(_: Path) -> None:
+    def no_room(_: Path, __: str) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as full:

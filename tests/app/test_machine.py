@@ -27,7 +27,8 @@ print(child.pid, flush=True)
 child.wait()
 """
 TWO_CARDS = {
-    "--query-gpu": "0, NVIDIA H200, 50, 1024, 143771, 41\n1, NVIDIA H200, [N/A], 0, 9, [N/A]\n",
+    "--query-gpu": "0, NVIDIA H200, 50, 1024, 143771, 41, GPU-a\n"
+    "1, NVIDIA H200, [N/A], 0, 9, [N/A], GPU-b\n",
     "--query-compute-apps": "4711, 900\n4712, 100\n4711, 24\n",
 }
 
@@ -116,7 +117,10 @@ def test_cards_are_read_as_their_driver_tells_and_held_by_process() -> None:
         "memory": 1024 * 2**20,
         "memory_total": 143771 * 2**20,
         "temperature": 41.0,
+        "uuid": "GPU-a",
     }
+    assert cards.free_memory("GPU-a") == (143771 - 1024) * 2**20
+    assert cards.free_memory("GPU-c") is None
     assert (second["share"], second["temperature"]) == (None, None)
     assert cards.memory_of([4711, 1]) == 924 * 2**20
     assert cards.memory_of([1]) == 0

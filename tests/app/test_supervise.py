@@ -88,15 +88,17 @@ def test_kills_for_want_of_memory_are_counted(tmp_path: Path, groups: str, file:
 def test_a_lost_run_gets_its_old_place_once(tmp_path: Path) -> None:
     folder = make_run(tmp_path / "fit").folder
     put_in_line(folder, Ticket(time=5.0))
-    note_start(folder)
+    note_start(folder, "cuda:1")
     (folder / QUEUED).unlink()
     assert is_lost(folder)
     start_again_or_end(folder, "It hung.")
     assert not is_lost(folder)
-    assert read_ticket(folder / QUEUED) == Ticket(time=5.0, starts=1, why="It hung.")
-    note_start(folder)
+    again = Ticket(time=5.0, starts=1, why="It hung.", device="cuda:1")
+    assert read_ticket(folder / QUEUED) == again
+    note_start(folder, "cpu")
     started = read_ticket(folder / STARTED)
     assert started is not None
+    assert started.device == "cpu"
     assert started.remark == "It hung. It was started again (2 of 2)."
     (folder / QUEUED).unlink()
     start_again_or_end(folder, "It hung.")
@@ -110,10 +112,10 @@ def test_a_lost_run_that_was_to_end_or_had_ended_is_not_started_again(
     tmp_path: Path, end: str
 ) -> None:
     run = make_run(tmp_path / "fit")
-    note_start(run.folder)
+    note_start(run.folder, "cpu")
     if end == EXIT:
         note_end(run.folder, "It failed.")
-        note_start(run.folder)
+        note_start(run.folder, "cpu")
     else:
         run.request_cancel()
     start_again_or_end(run.folder, "It hung.")

@@ -7,7 +7,13 @@ from pathlib import Path
 import pytest
 import warp as wp
 
-from physhandi.devices import describe_device, has_cuda_driver, pick_device
+from physhandi.devices import (
+    card_of,
+    describe_device,
+    has_cuda_driver,
+    pick_device,
+    pick_devices,
+)
 from physhandi.errors import UsageError
 
 
@@ -49,6 +55,21 @@ def test_a_device_is_picked_by_name() -> None:
     assert describe_device("cpu")
     with pytest.raises(UsageError, match="There is no device 'tpu' here"):
         pick_device("tpu")
+    assert pick_devices("auto") == (pick_device("auto"),)
+    assert card_of("cpu") is None
+    with pytest.raises(UsageError, match="names a device twice"):
+        pick_devices("cpu, cpu")
     if not has_cuda_driver():
+        assert pick_devices("all") == ("cpu",)
         with pytest.raises(UsageError, match="no device 'cuda:0'"):
             pick_device("cuda")
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device")
+def test_all_means_every_gpu_and_each_has_a_card() -> None:
+    devices = pick_devices("all")
+    assert devices[0] == "cuda:0"
+    assert len(devices) == wp.get_cuda_device_count() == len({card_of(name) for name in devices})
+    with pytest.raises(UsageError, match="the CPU beside a GPU"):
+        pick_devices("cuda:0,cpu")

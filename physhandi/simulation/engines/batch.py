@@ -5,7 +5,7 @@ losses. Few candidates are moved in one launch a frame instead: side by side
 (`engines.side_by_side`), or those of larger objects several to a block (`engines.batch_blocks`).
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from collections.abc import Sequence as Many
 from dataclasses import dataclass
 from functools import lru_cache
@@ -307,15 +307,15 @@ class Population:
         position[self._order] = positions.numpy().swapaxes(0, 1)
         return BatchRollout(position, self._by_candidate(self._diverged_frame))
 
-    def losses(
+    def start_losses(
         self, control: Float32[ndarray, "frame control 3"], target: MotionTarget
-    ) -> BatchLosses:
-        """Simulate the observed frames and compare; the host waits once, at the end."""
+    ) -> Callable[[], "BatchLosses"]:
+        """Let the device simulate the observed frames and compare; what is given waits for it."""
         lanes, number = len(self._diverged), self._node_number()
         losses = LossSum(target, number, lanes=lanes, width=self._width, device=self._device)
         for frame in self._frames(control[: target.frame_count]):
             losses.add(frame, self._state[0], self._diverged_frame)
-        return BatchLosses(
+        return lambda: BatchLosses(
             self._by_candidate(losses.loss), self._by_candidate(self._diverged_frame)
         )
 
@@ -587,8 +587,6 @@ class BatchSimulator:
     ) -> BatchLosses:
         """Simulate the observed frames and compare every candidate with the observations.
 
-        On CUDA the losses are summed on the device, and the host waits for it once.
-
         Args:
             control: Positions of the control nodes, in the observed frames at least [m].
             target: Observations.
@@ -596,6 +594,19 @@ class BatchSimulator:
         Raises:
             ValueError: If the trajectory does not fit the master topology, is not finite, or is
                 shorter than the observations.
+        """
+        return self.start_losses(control, target)()
+
+    def start_losses(
+        self, control: Float[ndarray, "frame control 3"], target: MotionTarget
+    ) -> Callable[[], BatchLosses]:
+        """Begin with `losses`, so that other devices can work at the same time.
+
+        On CUDA the losses are summed on the device, and the host waits for it once, in what is
+        given; this simulator must live until then. A CPU has finished before.
+
+        Raises:
+            ValueError: As `losses` does.
         """
         control = checked_control(control, self.master.control_count)
         if len(control) < target.frame_count:
@@ -606,7 +617,7 @@ class BatchSimulator:
         if isinstance(population, SideBySide):
             return self._side_by_side_losses(population, control[: target.frame_count], target)
         if population is not None:
-            return population.losses(control, target)
+            return population.start_losses(control, target)
         loss = np.full(len(self.parameters), np.inf, dtype=np.float32)
         diverged = np.full(len(self.parameters), -1)
         nodes = len(self.master.object_node)
@@ -620,7 +631,7 @@ class BatchSimulator:
                 loss[candidate] = sums.loss.numpy()[0]
             except SimulationDivergedError as error:
                 diverged[candidate] = error.frame
-        return BatchLosses(loss, diverged)
+        return lambda: BatchLosses(loss, diverged)
 
     def _on_device(self) -> "Population | SideBySide | None":
         if not self.device.is_cuda or len(self.master.object_node) == 0:
@@ -653,15 +664,15 @@ class BatchSimulator:
         bodies: SideBySide,
         control: Float32[ndarray, "frame control 3"],
         target: MotionTarget,
-    ) -> BatchLosses:
-        """Sum the losses on the device; the host waits once, at the end."""
+    ) -> Callable[[], BatchLosses]:
+        """Sum the losses on the device."""
         lanes = len(self.parameters)
         sums = LossSum(target, np.arange(bodies.nodes), lanes=lanes, width=1, device=self.device)
         first = wp.full(lanes, -1, dtype=wp.int32, device=self.device)
         for frame, state, diverged in bodies.frames(control):
             sums.add(frame, state, diverged)
             first = diverged
-        return BatchLosses(sums.loss.numpy(), first.numpy())
+        return lambda: BatchLosses(sums.loss.numpy(), first.numpy())
 
     def _alone(
         self, parameters: SimulationParameters, control: Float32[ndarray, "frame control 3"]

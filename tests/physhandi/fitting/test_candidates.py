@@ -19,7 +19,7 @@ from physhandi.fitting.object_problem import (
     build_problem_model,
     mean_loss,
 )
-from physhandi.fitting.object_reconstruction import CandidateEvaluator
+from physhandi.fitting.object_reconstruction import CandidateEvaluator, shared_out
 from physhandi.progress import NullProgress, Preview, Progress
 from physhandi.simulation.engines.batch import BatchSimulator
 from physhandi.simulation.parameters import SimulationParameters
@@ -116,6 +116,38 @@ def test_a_judgement_is_the_mean_loss_of_all_sequences(
         assert wanted > 1e-3
         assert loss == pytest.approx(wanted, rel=2e-5)
     assert len({loss for _, loss in judged}) == 4
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(wp.get_cuda_device_count() < 2, reason="needs two CUDA devices")
+def test_two_gpus_share_a_batch_and_judge_alike_every_time() -> None:
+    problems = [sheet("slow", 0.05), sheet("quicker", 0.2)]
+    candidates, config = drawn(7), ObjectFitConfig()
+
+    def judged(*more_devices: str) -> list[float]:
+        evaluate = CandidateEvaluator(
+            problems, config, NullProgress(), device="cuda:0", more_devices=more_devices
+        )
+        return [loss for _, loss in evaluate(candidates)]
+
+    alone, shared = judged(), judged("cuda:1")
+    assert len(set(shared)) == 7
+    assert shared == pytest.approx(alone, rel=2e-5)
+    assert judged("cuda:1") == shared
+    ((_, single),) = CandidateEvaluator(
+        problems, config, NullProgress(), device="cuda:0", more_devices=("cuda:1",)
+    )(candidates[:1])
+    assert single == pytest.approx(alone[0], rel=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("count", "parts"),
+    [(5, [[10, 11, 12], [13, 14]]), (4, [[10, 11], [12, 13]]), (1, [[10]])],
+)
+def test_a_batch_is_shared_out_evenly_and_nobody_gets_nothing(
+    count: int, parts: list[list[int]]
+) -> None:
+    assert shared_out(range(10, 10 + count), 2) == parts
 
 
 def test_what_cannot_be_simulated_is_infinitely_bad_and_harms_nobody(device: str) -> None:
