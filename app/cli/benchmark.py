@@ -7,9 +7,9 @@ from tyro.conf import Positional, arg
 
 from app.benchmarks.parts import PARTS, Part
 from app.cli.lookup import find_result, sequence_of
-from app.cli.output import AsJson, DataDir, Device, show
+from app.cli.output import AsJson, DataDir, Device, Devices, show
 from physhandi.data.layout import SequenceFiles
-from physhandi.devices import pick_device
+from physhandi.devices import pick_device, pick_devices
 
 NodeCount = Annotated[int, arg(name="nodes", help="Object nodes of a made-up block.")]
 Topology = Annotated[
@@ -65,22 +65,24 @@ def gradient(
 
 def batch(
     *,
-    device: Device = "auto",
+    device: Devices = "auto",
     node_count: NodeCount = 1000,
     topology: Topology = None,
     frame_count: FrameCount = 10,
     candidates: int = 64,
     as_json: AsJson = False,
 ) -> None:
-    """Time many candidates at once, beside one by one.
+    """Time many candidates at once, beside one by one; on several GPUs also shared among them.
 
     Args:
         candidates: Candidates of the batch.
     """
     from physhandi.benchmarks.batch import benchmark_batch
 
+    first, *others = pick_devices(device)
     result = benchmark_batch(
-        device=pick_device(device),
+        device=first,
+        more_devices=others,
         node_count=node_count,
         topology=topology,
         frame_count=frame_count,

@@ -1,5 +1,6 @@
 """Benchmark of a batch: frames a second of simulating and scoring many candidates."""
 
+from collections.abc import Sequence as Many
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
@@ -17,7 +18,12 @@ from physhandi.benchmarks.timing import (
     time_in_turns,
 )
 from physhandi.devices import start_warp
-from physhandi.simulation.engines.batch import BatchSimulator, MotionTarget
+from physhandi.simulation.engines.batch import (
+    BatchSimulator,
+    MotionTarget,
+    losses_at_once,
+    shared_out,
+)
 from physhandi.simulation.master_topology import MasterTopology
 from physhandi.simulation.parameters import SimulationParameters
 
@@ -31,6 +37,7 @@ _POINTS, _TRACKS = 300, 100
 def benchmark_batch(
     *,
     device: str = "cpu",
+    more_devices: Many[str] = (),
     node_count: int = 1000,
     frame_count: int = 10,
     candidate_count: int = 64,
@@ -46,6 +53,7 @@ def benchmark_batch(
 
     Args:
         device: Warp device, for example ``"cuda:0"``.
+        more_devices: Further GPUs, which share the batch with it in another measurement.
         node_count: Object nodes of the made-up block, with at most 18 springs at each.
         frame_count: Frames of a rollout.
         candidate_count: Candidates of the batch.
@@ -56,7 +64,9 @@ def benchmark_batch(
 
     Returns:
         Times a frame of a candidate, and the largest difference of the stiffest and the widest
-        candidate from the baseline's motion of the same, ready for JSON.
+        candidate from the baseline's motion of the same, ready for JSON. With several devices also
+        ``shared``: ``devices``, ``ms_per_frame`` of a candidate, the ``speedup`` over one device,
+        and the largest relative difference of a loss (``largest_loss_difference``).
 
     Raises:
         UsageError: If a number is not positive or the file is missing or incomplete.
@@ -78,10 +88,18 @@ def benchmark_batch(
         for index in {0, middling, stiffest}
     }
     target = _target(scene)
+    devices = (device, *more_devices)
+    parts = shared_out(range(candidate_count), len(devices))
+    simulators = [
+        BatchSimulator(master, [candidates[index] for index in part], one)
+        for part, one in zip(parts, devices, strict=False)
+    ]
     works = {
         "ours": lambda: simulator.losses(scene.control, target),
         "baseline": lambda: baselines[middling].rollout(scene.control),
     }
+    if more_devices:
+        works["shared"] = lambda: losses_at_once(simulators, scene.control, target)
     times = time_in_turns(works, device, _ROUNDS)
     ours = times["ours"] / (frame_count * candidate_count)
     rollout = simulator.rollout(scene.control)
@@ -95,6 +113,16 @@ def benchmark_batch(
                 scene.model.object_node,
             )
         )
+    shared: dict[str, Any] = {}
+    if more_devices:
+        alone = simulator.losses(scene.control, target).loss
+        together = losses_at_once(simulators, scene.control, target).loss
+        shared["shared"] = {
+            "devices": len(simulators),
+            "ms_per_frame": 1e3 * times["shared"] / (frame_count * candidate_count),
+            "speedup": times["ours"] / times["shared"],
+            "largest_loss_difference": float(np.max(np.abs(together / alone - 1.0))),
+        }
     return {
         "benchmark": "batch",
         **about,
@@ -106,6 +134,7 @@ def benchmark_batch(
         **describe_times(ours, times["baseline"] / frame_count),
         **{name: max(d[name] for d in differences) for name in differences[0]},
         **describe_traffic(widest, _COST, ours, device),
+        **shared,
     }
 
 

@@ -34,7 +34,12 @@ from physhandi.fitting.search import SEARCH_STAGE, SearchResult, search_paramete
 from physhandi.fitting.search_bounds import fit_intervals, measure_object
 from physhandi.progress import Preview, Progress
 from physhandi.simulation.contact_intervals import ContactIntervals
-from physhandi.simulation.engines.batch import BatchSimulator, MotionTarget
+from physhandi.simulation.engines.batch import (
+    BatchSimulator,
+    MotionTarget,
+    losses_at_once,
+    shared_out,
+)
 from physhandi.simulation.engines.cpu import processor_count
 from physhandi.simulation.master_topology import MasterTopology
 from physhandi.simulation.model import SpringMassModel
@@ -464,10 +469,7 @@ class CandidateEvaluator:
         if wp.get_device(self._device).is_cuda:
             parts = shared_out(batch, len(self._gpus))
             simulators = [simulator_of(*shared) for shared in zip(parts, self._gpus, strict=False)]
-            # All of them begin before the host waits for the first one.
-            begun = [simulator.start_losses(control, target) for simulator in simulators]
-            for part, finish in zip(parts, begun, strict=True):
-                losses[part] = finish().loss
+            losses[batch] = losses_at_once(simulators, control, target).loss
             return
         if len(batch) == 1 or self._threads == 1:
             for index in batch:
@@ -481,12 +483,6 @@ class CandidateEvaluator:
             finally:
                 for job in jobs:
                     job.cancel()
-
-
-def shared_out(batch: Many[int], count: int) -> list[list[int]]:
-    """Divide a batch into as many parts, of which none is empty or longer by more than one."""
-    parts = np.array_split(np.array(batch, dtype=int), min(count, len(batch)))
-    return [part.tolist() for part in parts]
 
 
 def motion_target(problem: ObjectProblem, config: ObjectFitConfig) -> MotionTarget:

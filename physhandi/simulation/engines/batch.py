@@ -682,3 +682,36 @@ class BatchSimulator:
         if self._threads is not None and isinstance(simulator.engine, CpuEngine):
             simulator.engine.threads = self._threads
         return simulator.frames(control)
+
+
+def shared_out(batch: Many[int], count: int) -> list[list[int]]:
+    """Divide a batch into as many parts, of which none is empty or longer by more than one."""
+    parts = np.array_split(np.array(batch, dtype=int), min(count, len(batch)))
+    return [part.tolist() for part in parts]
+
+
+def losses_at_once(
+    simulators: Many[BatchSimulator],
+    control: Float[ndarray, "frame control 3"],
+    target: MotionTarget,
+) -> BatchLosses:
+    """Compute the losses of parts of a batch, each on a device of its own, at the same time.
+
+    Args:
+        simulators: One for each part.
+        control: See `BatchSimulator.losses`.
+        target: See `BatchSimulator.losses`.
+
+    Returns:
+        Those of all candidates, part by part.
+
+    Raises:
+        ValueError: As `BatchSimulator.losses` does.
+    """
+    # All of them begin before the host waits for the first one.
+    begun = [simulator.start_losses(control, target) for simulator in simulators]
+    parts = [finish() for finish in begun]
+    return BatchLosses(
+        np.concatenate([part.loss for part in parts]),
+        np.concatenate([part.diverged_frame for part in parts]),
+    )

@@ -10,6 +10,7 @@ from physhandi.benchmarks import batch, timing
 from physhandi.benchmarks.batch import benchmark_batch
 from physhandi.benchmarks.phystwin_like import PhysTwinLike
 from physhandi.errors import UsageError
+from physhandi.simulation.engines.batch import losses_at_once
 
 SMALL = {"node_count": 60, "frame_count": 3, "candidate_count": 5, "substeps_per_frame": 200}
 
@@ -32,6 +33,19 @@ def test_a_batch_is_timed_a_candidate_and_compared(device):
     assert 0.0 < result["max_abs_difference_m"] < (2e-6 if device == "cpu" else 5e-5)
     assert 2e-3 < result["motion_m"] < 0.02
     assert result["bytes_per_frame"] == 200 * 48 * 60
+
+
+def test_a_shared_batch_is_timed_and_compared_with_the_whole_one(monkeypatch):
+    result = benchmark_batch(device="cpu", more_devices=("cpu",), **SMALL)
+    assert json.loads(json.dumps(result)) == result
+    shared = result["shared"]
+    assert shared["devices"] == 2
+    assert shared["speedup"] == pytest.approx(result["ms_per_frame"] / shared["ms_per_frame"])
+    assert shared["largest_loss_difference"] == 0.0
+    swapped = lambda simulators, *scene: losses_at_once(simulators[::-1], *scene)  # noqa: E731
+    monkeypatch.setattr(batch, "losses_at_once", swapped)
+    other = benchmark_batch(device="cpu", more_devices=("cpu",), **SMALL)["shared"]
+    assert other["largest_loss_difference"] > 1e-4
 
 
 def test_another_physics_is_not_called_the_same(device, monkeypatch):

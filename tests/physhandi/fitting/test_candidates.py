@@ -19,9 +19,9 @@ from physhandi.fitting.object_problem import (
     build_problem_model,
     mean_loss,
 )
-from physhandi.fitting.object_reconstruction import CandidateEvaluator, shared_out
+from physhandi.fitting.object_reconstruction import CandidateEvaluator
 from physhandi.progress import NullProgress, Preview, Progress
-from physhandi.simulation.engines.batch import BatchSimulator
+from physhandi.simulation.engines.batch import BatchSimulator, shared_out
 from physhandi.simulation.parameters import SimulationParameters
 
 PARAMETERS = SimulationParameters(
