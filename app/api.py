@@ -15,7 +15,7 @@ from starlette.exceptions import HTTPException
 
 from app.comparison import NewComparison
 from app.ids import ItemId
-from app.jobs.about import RunChanges, change_about
+from app.jobs.about import Line, RunChanges, change_about
 from app.jobs.catalog import Catalog, NotFoundError
 from app.jobs.checks import check_item
 from app.jobs.launch_keys import KeyedRequest
@@ -57,7 +57,7 @@ class NewRun(BaseModel):
 
     sequences: Annotated[list[ItemId], Field(min_length=1, max_length=64)]
     profile: ItemId = "quick"
-    name: Annotated[str, Field(max_length=120)] = ""
+    name: Line = ""
     overrides: Annotated[dict[SettingPath, JsonValue], Field(max_length=200)] = {}
     """New values of settings by their paths; `GET /api/v1/settings` lists them."""
     parent: ItemId | None = None
@@ -489,7 +489,9 @@ def _add_sessions(router: APIRouter, sessions: Sessions) -> None:
 
     @router.delete("/sessions/{session_id}", status_code=204)
     def close_session(session_id: ItemId, request: Request) -> Response:
-        if sessions.find(session_id, request.state.owner) is not None:
+        # Who asks again, because the answer was lost, is told the same.
+        if sessions.closed_session(session_id, request.state.owner) is None:
+            find(session_id, request)
             sessions.close(session_id)
         return Response(status_code=204)
 

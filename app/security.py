@@ -4,6 +4,7 @@ import base64
 import hashlib
 import hmac
 import logging
+import re
 import secrets
 import threading
 import time
@@ -23,6 +24,8 @@ logger = logging.getLogger(__name__)
 _SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
 _WRONG_TOKENS_PER_MINUTE = 20
 _CLIENTS_REMEMBERED = 1000
+_HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(?::[0-9]{1,5})?")
+"""A Host header: a name or an address, and maybe a port."""
 
 PAGE_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
@@ -108,11 +111,10 @@ class Security:
 
     def is_known_host(self, host: str) -> bool:
         """Check a Host header against the allow-list, against DNS rebinding."""
-        name = host.lower()
-        name = name.partition("]")[0] + "]" if name.startswith("[") else name.partition(":")[0]
-        if self._any_host and _is_address(name):
-            return True
-        return name in self._hosts
+        found = _HOST.fullmatch(host.lower())
+        if found is None:
+            return False
+        return found[1] in self._hosts or (self._any_host and _is_address(found[1]))
 
     def count_wrong(self, client: str) -> bool:
         """Note a wrong token; returns whether this client sent too many within a minute."""
@@ -166,7 +168,9 @@ class Gatekeeper:
             return self._admit(scope, headers, offered)
         if offered is None and not self._has_own_origin(scope, headers):
             return _error(403, "foreign_origin", "The request comes from another site.")
-        scope.setdefault("state", {})["owner"] = owner
+        state = scope.setdefault("state", {})
+        state["owner"] = owner
+        state["is_foreign"] = offered is None and _is_foreign(headers)
         return _without_token(scope)
 
     def _identify(self, headers: Headers, offered: str | None) -> str | None:
@@ -205,10 +209,31 @@ class Gatekeeper:
 
     def _has_own_origin(self, scope: Scope, headers: Headers) -> bool:
         if scope["type"] == "http" and scope["method"] in _SAFE_METHODS:
-            return True
+            # A link on another site may lead here; what such a site loads by itself may not, since
+            # looking can cost something, too. `state.is_foreign` tells routes of such visits.
+            return not _is_foreign(headers) or _is_navigation(headers)
         secure = {"http": "https", "websocket": "wss"}[scope["type"]]
         scheme = "https" if scope.get("scheme") == secure else "http"
         return headers.getlist("origin") == [f"{scheme}://{headers['host']}"]
+
+
+def _is_foreign(headers: Headers) -> bool:
+    """Tell whether a browser says that another site made it ask; other ports are other sites."""
+    if headers.get("sec-fetch-site", "none") not in {"none", "same-origin"}:
+        return True
+    # Browsers that tell where a request comes from send the origin of a page's own only to unsafe
+    # methods; with a safe one it is that of a page elsewhere, or of this one where they are old.
+    origin = headers.get("origin")
+    return origin is not None and origin.partition("://")[2] != headers["host"]
+
+
+def _is_navigation(headers: Headers) -> bool:
+    """Tell whether a browser shows what it asks for in a tab of its own, and tells no origin."""
+    return (
+        headers.get("sec-fetch-mode") == "navigate"
+        and headers.get("sec-fetch-dest", "document") == "document"
+        and "origin" not in headers
+    )
 
 
 def _bearer(headers: Headers) -> str | None:

@@ -17,6 +17,7 @@ from fastapi.staticfiles import StaticFiles
 from starlette.exceptions import HTTPException
 
 from app.api import create_api
+from app.body_limit import BodyLimit
 from app.comparing import create_comparing
 from app.exports.cache import FileCache, TooManyFilesError
 from app.exports.routes import create_exports
@@ -126,7 +127,6 @@ def create_app(
         openapi_url="/api/v1/openapi.json",
         docs_url=None,
         redoc_url=None,
-        max_body_size=_BODY_LIMIT,
     )
     app.state.stopping = threading.Event()
     app.state.scheduler = scheduler
@@ -172,8 +172,14 @@ def create_app(
         return {"status": "ok", "version": __version__}
 
     _answer_errors(app, pages)
-    app.add_middleware(Gatekeeper, security=security)
+    _guard(app, security)
     return app
+
+
+def _guard(app: FastAPI, security: Security) -> None:
+    """Put in front of all routes what requests have to pass; the last that is added comes first."""
+    app.add_middleware(BodyLimit, most_bytes=_BODY_LIMIT)
+    app.add_middleware(Gatekeeper, security=security)
 
 
 def _answer_errors(app: FastAPI, pages: Pages) -> None:
@@ -203,11 +209,11 @@ def _answer_errors(app: FastAPI, pages: Pages) -> None:
 
     @app.exception_handler(HTTPException)
     def on_http(request: Request, error: HTTPException) -> Response:
-        texts = {404: _NOWHERE, 413: "The request is too large."}
-        is_plain = error.detail in {"Not Found", "Content Too Large", "Request Entity Too Large"}
-        message = texts.get(error.status_code, error.detail) if is_plain else error.detail
+        message = _NOWHERE if error.detail == "Not Found" else error.detail
         code = {404: "not_found", 405: "wrong_method", 413: "too_large"}.get(error.status_code)
-        return answer(request, error.status_code, code or "http", str(message))
+        response = answer(request, error.status_code, code or "http", str(message))
+        response.headers.update(error.headers or {})
+        return response
 
     @app.exception_handler(RequestValidationError)
     def on_invalid(request: Request, error: RequestValidationError) -> Response:

@@ -58,8 +58,10 @@ class ServerSettings(BaseSettings):
     hung_after_s: float = Field(default=120.0, ge=0.1, le=86_400)
     """Time without a sign of life after which an idle fit is ended and started once more [s]; one
     that computes has 20 times as long."""
-    live_sessions: int = Field(default=10, ge=1, le=100)
+    live_sessions: int = Field(default=20, ge=1, le=100)
     """Most live scenes at a time."""
+    live_sessions_each: int = Field(default=10, ge=1, le=100)
+    """Most of them that one browser, or all scripts together, may have."""
     live_idle_s: float = Field(default=900.0, gt=0)
     """Seconds after which a live scene that nobody looks at is closed."""
 

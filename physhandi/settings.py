@@ -32,7 +32,6 @@ from physhandi.errors import SettingsError
 LARGEST_NUMBER = 1e30
 """Larger numbers, squared or multiplied, leave the simulator's float32; no setting exceeds it."""
 Finite = Annotated[float, Meta(ge=-LARGEST_NUMBER, le=LARGEST_NUMBER)]
-NonNegative = Annotated[float, Meta(ge=0.0, le=LARGEST_NUMBER)]
 
 ValueKind = Literal["number", "whole", "switch", "choice", "text", "settings", "mapping"]
 

@@ -22,7 +22,7 @@ from app.settings import ServerSettings
 from app.viewer.sessions import TooManySessionsError
 from physhandi.data.run_folder import read_events
 
-HOSTILE = "<img src=x onerror=alert(1)>\u202e"
+HOSTILE = "<img src=x onerror=alert(1)>"
 
 
 @dataclass

@@ -57,6 +57,7 @@ class FolderCatalog:
 @dataclass
 class FakeSettings:
     live_sessions: int = 3
+    live_sessions_each: int = 100
     live_idle_s: float = 900.0
     device: str = "cpu"
 

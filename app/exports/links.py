@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Literal
 from urllib.parse import urlencode
 
-from fastapi import APIRouter, Request
+from fastapi import APIRouter, Request, Response
 from fastapi.responses import RedirectResponse
 from pydantic import BaseModel
 from starlette.exceptions import HTTPException
@@ -12,11 +12,13 @@ from starlette.exceptions import HTTPException
 from app.exports.permalink import state_from_query, state_to_query
 from app.exports.schema import errors
 from app.ids import ItemId
+from app.security import bare_page
 from app.viewer.session import Session
 from app.viewer.sessions import Sessions
 from physhandi.errors import UsageError
 
 _LONGEST = 4_000
+_ASK = "<p>A page elsewhere leads here. <a href=''>Open the scene</a></p>"
 CLOSED = "This live scene was closed, or it is not yours."
 """Message to who asks for a scene that is not there."""
 
@@ -42,7 +44,10 @@ def create_links(sessions: Sessions) -> APIRouter:
     """
     router = APIRouter()
 
-    def open_scene(kind: Literal["run", "sequence"], target: str, request: Request) -> str:
+    def open_scene(kind: Literal["run", "sequence"], target: str, request: Request) -> Response:
+        if request.state.is_foreign:
+            # Whoever makes browsers come here must not fill the places for live scenes.
+            return bare_page(403, "Open this live scene?", _ASK)
         purpose = request.headers.get("sec-purpose", "") + request.headers.get("purpose", "")
         if "prefetch" in purpose:
             # A browser that only expects a visit must not take a place among the live scenes.
@@ -51,15 +56,15 @@ def create_links(sessions: Sessions) -> APIRouter:
         state = state_from_query(query)
         session = sessions.open(kind, target, request.state.owner, state=state)
         rest = urlencode(query, safe=",")
-        return f"/live/{session}" + (f"?{rest}" if rest else "")
+        return RedirectResponse(f"/live/{session}" + (f"?{rest}" if rest else ""), 303)
 
     @router.get("/runs/{run_id}/view", include_in_schema=False)
-    def view_run(run_id: ItemId, request: Request) -> RedirectResponse:
-        return RedirectResponse(open_scene("run", run_id, request), 303)
+    def view_run(run_id: ItemId, request: Request) -> Response:
+        return open_scene("run", run_id, request)
 
     @router.get("/sequences/{sequence_id}/view", include_in_schema=False)
-    def view_sequence(sequence_id: ItemId, request: Request) -> RedirectResponse:
-        return RedirectResponse(open_scene("sequence", sequence_id, request), 303)
+    def view_sequence(sequence_id: ItemId, request: Request) -> Response:
+        return open_scene("sequence", sequence_id, request)
 
     @router.get("/api/v1/sessions/{session_id}/link", responses=errors(404))
     def show_link(session_id: ItemId, request: Request) -> Link:

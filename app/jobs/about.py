@@ -11,22 +11,31 @@ from physhandi.errors import RunError
 _lock = threading.Lock()
 
 
-def _one_line(text: str) -> str:
+def one_line(text: str) -> str:
+    """Trim a text that a user gave for one line.
+
+    Raises:
+        ValueError: If it has a sign that cannot be printed, such as a line break.
+    """
     text = text.replace("\xa0", " ").strip()
     if not text.isprintable():
         raise ValueError("it has a line break or another sign that cannot be printed")
     return text
 
 
+Line = Annotated[str, Field(max_length=120), AfterValidator(one_line)]
+"""A name or another text of one line; may be empty."""
+
+
 def _named(text: str) -> str:
-    text = _one_line(text)
+    text = one_line(text)
     if not text:
         raise ValueError("a run needs a name")
     return text
 
 
 def _word(text: str) -> str:
-    text = _one_line(text)
+    text = one_line(text)
     if not text or "," in text or " " in text:
         raise ValueError("a tag is one word without blanks and commas")
     return text

@@ -18,6 +18,7 @@ from app.viewer.edit.selection import DrawnShape
 from app.viewer.sessions import Session, Sessions
 from app.viewer.steer.key_channel import KeyChannel
 from app.viewer.ui.scene_frame import packed_scene_page, scene_page
+from app.viewer.viewer_log import limit_viewer_log
 from physhandi.errors import UsageError
 
 logger = logging.getLogger(__name__)
@@ -47,6 +48,7 @@ def create_gate(sessions: Sessions) -> APIRouter:
     Args:
         sessions: The sessions that exist.
     """
+    limit_viewer_log()
     watching: Counter[str] = Counter()
     router = APIRouter(include_in_schema=False)
     page = scene_page()

@@ -3,7 +3,7 @@
 import logging
 import secrets
 import threading
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import get_args
@@ -72,7 +72,7 @@ class Sessions:
         self._lock = threading.Lock()
         self._sessions: dict[str, AnySession] = {}
         self._closed_sessions: OrderedDict[str, ClosedSession] = OrderedDict()
-        self._opening = 0
+        self._opening: Counter[str] = Counter()
         self.link_of: Callable[[Session], str] = lambda _: ""
         self.live = SimulationClient(settings.live_device)
         self._closed = threading.Event()
@@ -93,7 +93,7 @@ class Sessions:
             The session's id, for ``/viewer/<id>/``.
 
         Raises:
-            TooManySessionsError: If as many sessions as allowed are open.
+            TooManySessionsError: If as many sessions as allowed are open, in all or by this owner.
             PhysHandiError: If the run or sequence cannot be shown.
         """
         if kind not in get_args(Kind):
@@ -108,7 +108,7 @@ class Sessions:
                 self._sessions[session_id] = session
         finally:
             with self._lock:
-                self._opening -= 1
+                self._opening -= Counter([owner])  # Keeps no zeros.
         logger.info("session opened for %s %s by %s", kind, target, owner)
         return session_id
 
@@ -201,25 +201,37 @@ class Sessions:
     def _reserve(self, owner: str) -> None:
         self._make_room(owner)
         with self._lock:
+            if self._is_full(owner):
+                raise TooManySessionsError(
+                    f"You have {self._count(owner)} live sessions, the most that one browser may "
+                    "have. Close one of them, or watch the replay, which needs no session."
+                )
             if self._is_full():
                 raise TooManySessionsError(
                     f"{len(self._sessions)} live sessions are open, the most this server allows. "
                     "Close one of them, or watch the replay, which needs no session."
                 )
-            self._opening += 1
+            self._opening[owner] += 1
             if self._reaper is None:
                 self._reaper = threading.Thread(
                     target=self._reap_now_and_then, name="viewer-reaper", daemon=True
                 )
                 self._reaper.start()
 
-    def _is_full(self) -> bool:
-        return len(self._sessions) + self._opening >= self._settings.live_sessions
+    def _is_full(self, owner: str | None = None) -> bool:
+        """Whether all places are taken, or all that an owner may have."""
+        if owner is not None:
+            return self._count(owner) >= self._settings.live_sessions_each
+        return len(self._sessions) + self._opening.total() >= self._settings.live_sessions
+
+    def _count(self, owner: str) -> int:
+        own = sum(session.owner == owner for session in self._sessions.values())
+        return own + self._opening[owner]
 
     def _make_room(self, owner: str) -> None:
-        """If all places are taken, close a session that its owner, who asks, has left."""
+        """If no place is left for an owner who asks, close a session that this one has left."""
         with self._lock:
-            if not self._is_full():
+            if not (self._is_full() or self._is_full(owner)):
                 return
         left = [s for s in self.list() if s.owner == owner and s.idle >= _MAKES_ROOM_AFTER]
         if left:

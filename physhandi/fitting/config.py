@@ -50,7 +50,7 @@ SEARCHABLE = tuple(
 """Parameters that the zeroth-order stage may search."""
 
 Count = Annotated[int, Meta(ge=0, le=100_000)]
-Weight = Annotated[float, Meta(ge=0.0, le=1e9)]
+Weight = Annotated[float, Meta(ge=0.0, le=1e6)]
 Rate = Annotated[float, Meta(ge=1e-9, le=1.0)]
 Window = Annotated[int, Meta(ge=1, le=100_000)]
 
@@ -203,9 +203,9 @@ class FirstOrderConfig(Settings, frozen=True, kw_only=True):
     """Whether restitution and friction, of the ground and of self-collision, are optimised too."""
     prior_weight: Weight = 1e-8
     """Pull of every logarithm towards its searched value [m²]."""
-    most_stiffness: Annotated[float, Meta(ge=1.0, le=1e9)] | None = None
+    most_stiffness: Annotated[float, Meta(ge=1.0, le=1e8)] | None = None
     """A spring acts no stiffer than this, and has no gradient above it [N]; none for no limit."""
-    steepest: Annotated[float, Meta(ge=1e-3, le=1e9)] | None = 100.0
+    steepest: Annotated[float, Meta(ge=1e-3, le=1e6)] | None = 100.0
     """Largest sane gradient, in losses per unit of the logarithm of a stiffness; a steeper one
     reaches back over fewer frames, or is not used. None uses every gradient, as PhysTwin does."""
     truncates_damping: bool = False
@@ -231,7 +231,7 @@ class CudaConfig(Settings, frozen=True, kw_only=True):
     """Candidates a generation on CUDA."""
     most_generations: Count | None = None
     """Most generations of the search on CUDA, those with wider intervals not counted."""
-    least_damping: Annotated[float, Meta(ge=0.0, le=1e9)] | None = None
+    least_damping: Annotated[float, Meta(ge=0.0, le=1e6)] | None = None
     """Lowest damping that the search tries on CUDA, scaled as its interval is [N·s/m]. Springs that
     hardly damp are found by a search of many candidates; they explain the fitted frames and swing
     in the predicted ones."""

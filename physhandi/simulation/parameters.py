@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import Meta
 
 from physhandi.errors import SettingsError
-from physhandi.settings import Field, Finite, NonNegative, Settings, changes, fields_of, no_such
+from physhandi.settings import Field, Settings, changes, fields_of, no_such
 
 AUTOMATIC = "auto"
 """Instead of a number of substeps: as few as are stable and fine enough."""
@@ -21,6 +21,12 @@ AUTOMATIC = "auto"
 # float32 exp(-5e-5 drag) on an H200 for drag 0, 1, …, 20, less the nearest float32, in units of
 # 2^-24 (measured). PhysTwin truncates its drag to a whole number.
 _DECAY_UNITS = (0, 1, 1, -1, 0, 0, 0, 0, 1, 1, 1, 1, -1, 0, 0, 0, 0, 1, 1, 1, 1)
+
+# Wide enough for recordings in millimetres and for wild candidates of a search; beyond these no
+# object is meant, and squares and products of them stay within the simulator's float32.
+Length = Annotated[float, Meta(ge=0.0, le=1e3)]
+Stiffness = Annotated[float, Meta(ge=0.0, le=1e8)]
+Coordinate = Annotated[float, Meta(ge=-1e5, le=1e5)]
 
 Effect = Literal["live", "material", "topology", "step", "world"]
 """What has to be done for a new value: ``live`` is assigned to the device at once; ``material``
@@ -82,7 +88,7 @@ class SimulationParameters(Settings, frozen=True, kw_only=True):
     """The few numbers that describe an object as a whole; sliders and searches move these."""
 
     connection_radius: Annotated[
-        NonNegative,
+        Length,
         Role(
             effect="topology",
             label="δ object",
@@ -111,7 +117,7 @@ class SimulationParameters(Settings, frozen=True, kw_only=True):
     ] = 29
     """d_max: most object springs that one node may start, the node itself not counted."""
     virtual_connection_radius: Annotated[
-        NonNegative,
+        Length,
         Role(
             effect="topology",
             label="δ virtual",
@@ -141,7 +147,7 @@ class SimulationParameters(Settings, frozen=True, kw_only=True):
     ] = 6
     """Most virtual springs that one control node may start."""
     stiffness: Annotated[
-        NonNegative,
+        Stiffness,
         Role(
             effect="material",
             label="k object",
@@ -155,7 +161,8 @@ class SimulationParameters(Settings, frozen=True, kw_only=True):
     ] = 3e4
     """Force per unit strain that a new object spring gets [N]."""
     stiffness_scale: Annotated[
-        NonNegative,
+        float,
+        Meta(ge=0.0, le=1e6),
         Role(
             label="stiffness",
             slider=Slider(
@@ -168,7 +175,7 @@ class SimulationParameters(Settings, frozen=True, kw_only=True):
     ] = 1.0
     """Multiplies the stiffness of every spring."""
     virtual_stiffness: Annotated[
-        NonNegative,
+        Stiffness,
         Role(
             effect="material",
             label="k virtual",
@@ -182,7 +189,8 @@ class SimulationParameters(Settings, frozen=True, kw_only=True):
     ] = 3e4
     """Force per unit strain that a new virtual spring gets [N]."""
     damping: Annotated[
-        NonNegative,
+        float,
+        Meta(ge=0.0, le=1e6),
         Role(
             effect="material",
             label="damping",
@@ -191,7 +199,8 @@ class SimulationParameters(Settings, frozen=True, kw_only=True):
     ] = 100.0
     """Dashpot along each spring [N·s/m]."""
     drag: Annotated[
-        NonNegative,
+        float,
+        Meta(ge=0.0, le=1e6),
         Role(
             label="drag",
             slider=Slider(
@@ -227,11 +236,11 @@ class SimulationParameters(Settings, frozen=True, kw_only=True):
     ] = 0.3
     """Coulomb friction coefficient of the ground."""
     ground_height: Annotated[
-        Finite | None, Role(label="ground height", is_length=True, is_searched=False)
+        Coordinate | None, Role(label="ground height", is_length=True, is_searched=False)
     ] = 0.0
     """Height of the ground plane [m]; none for no ground."""
     gravity: Annotated[
-        Finite,
+        Coordinate,
         Role(
             label="gravity",
             is_length=True,
@@ -248,12 +257,12 @@ class SimulationParameters(Settings, frozen=True, kw_only=True):
     """Whether `in_world` takes the sequence's ground."""
     frame_rate: Annotated[
         float,
-        Meta(ge=1e-3, le=1e30),
+        Meta(ge=1e-3, le=1e6),
         Role(effect="step", is_of_recording=True, is_in_links=False, is_searched=False),
     ] = 30.0
     """Frames in a second [Hz]."""
     frame_duration: Annotated[
-        Annotated[float, Meta(ge=1e-6, le=1e30)] | None,
+        Annotated[float, Meta(ge=1e-6, le=1e3)] | None,
         Role(effect="step", is_of_recording=True, is_in_links=False, is_searched=False),
     ] = None
     """Time that the simulation takes a frame to last [s]; none for 1 / frame_rate. PhysTwin's 667
@@ -265,11 +274,11 @@ class SimulationParameters(Settings, frozen=True, kw_only=True):
     ] = 667
     """Integration steps in one frame; stiffer springs need more."""
     rest_length_floor: Annotated[
-        NonNegative, Role(effect="topology", label="shortest object spring", is_length=True)
+        Length, Role(effect="topology", label="shortest object spring", is_length=True)
     ] = 1e-3
     """Shortest rest length of an object spring [m]; 0 for none."""
     virtual_rest_length_floor: Annotated[
-        NonNegative, Role(effect="topology", label="shortest virtual spring", is_length=True)
+        Length, Role(effect="topology", label="shortest virtual spring", is_length=True)
     ] = 1e-3
     """Shortest rest length of a virtual spring [m]; 0 for none."""
     use_control_velocity: Annotated[bool, Role(label="dashpots see the hand move")] = True
@@ -288,7 +297,7 @@ class SimulationParameters(Settings, frozen=True, kw_only=True):
     ] = False
     """Whether object nodes bounce off each other."""
     collision_distance: Annotated[
-        NonNegative,
+        Length,
         Role(
             label="distance",
             is_length=True,

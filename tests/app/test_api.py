@@ -244,7 +244,8 @@ def test_a_live_scene_belongs_to_the_browser_that_opened_it(world: World) -> Non
         assert not world.sessions.get(name).state.prefers_dark
         assert mine.patch(f"/api/v1/sessions/{name}", json=wish).status_code == 204
         assert world.sessions.get(name).state.prefers_dark
-        theirs.delete(f"/api/v1/sessions/{name}")
+        assert theirs.delete(f"/api/v1/sessions/{name}").status_code == 404
+        assert theirs.delete("/api/v1/sessions/never-there").status_code == 404
         assert mine.get(page).status_code == 200
 
         world.sessions.close(name, "Nobody looked at it for 15 minutes.")
@@ -258,12 +259,17 @@ def test_a_live_scene_belongs_to_the_browser_that_opened_it(world: World) -> Non
 
 
 def test_too_many_live_scenes_are_refused(world: World) -> None:
-    world.settings.__dict__["live_sessions"] = 1
-    client = world.script()
+    world.settings.__dict__.update(live_sessions=2, live_sessions_each=1)
+    clients = [world.script(), world.browser(), world.browser()]
     try:
         body = {"kind": "run", "id": "fitted"}
-        assert client.post("/api/v1/sessions", json=body).status_code == 201
-        full = client.post("/api/v1/sessions", json=body)
+        assert clients[0].post("/api/v1/sessions", json=body).status_code == 201
+        full = clients[0].post("/api/v1/sessions", json=body)
         assert (full.status_code, error_of(full)["code"]) == (429, "too_many_sessions")
+        assert "You have 1 live sessions" in error_of(full)["message"]
+        # Who has none is not locked out by one who has all that one may have.
+        assert clients[1].post("/api/v1/sessions", json=body).status_code == 201
+        full = clients[2].post("/api/v1/sessions", json=body, headers={"Accept": "*/*"})
+        assert "2 live sessions are open" in error_of(full)["message"]
     finally:
         world.sessions.shutdown()

@@ -153,7 +153,11 @@ def test_a_bearer_needs_no_origin(door: Door) -> None:
 
 @pytest.mark.parametrize(
     "host",
-    ["evil.example", "evil.example:8080", "127.0.0.1.evil.example", "localhost.", "", "[::2]:8080"],
+    [
+        *("evil.example", "evil.example:8080", "127.0.0.1.evil.example", "localhost.", ""),
+        *("[::2]:8080", "localhost:8080@evil.example", "localhost:", "localhost:80800000"),
+        *("localhost:80:80", "localhost/x", "[::1]evil.example", "[::1", "localhost:8o80"),
+    ],
 )
 def test_another_host_name_is_refused_even_with_the_token(door: Door, host: str) -> None:
     response = door.client.get("/", headers={**door.bearer, "Host": host})
@@ -183,6 +187,27 @@ def test_another_site_can_change_nothing(door: Door, origin: str) -> None:
     ):
         pass
     assert refused.value.status_code == 403
+
+
+def test_a_page_elsewhere_can_lead_here_but_load_nothing(door: Door) -> None:
+    door.enter()
+
+    def ask(**headers: str) -> int:
+        sent = {name.replace("_", "-"): value for name, value in headers.items()}
+        return door.client.get("/runs/a/view", headers=sent).status_code
+
+    for site in ("cross-site", "same-site"):
+        assert ask(Sec_Fetch_Site=site, Sec_Fetch_Mode="no-cors", Sec_Fetch_Dest="image") == 403
+        assert ask(Sec_Fetch_Site=site, Sec_Fetch_Mode="navigate", Sec_Fetch_Dest="iframe") == 403
+        assert ask(Sec_Fetch_Site=site, Sec_Fetch_Mode="navigate", Sec_Fetch_Dest="document") == 200
+    for site in ("same-origin", "none"):
+        assert ask(Sec_Fetch_Site=site, Sec_Fetch_Mode="no-cors") == 200
+    for origin in FOREIGN:
+        if origin.partition("://")[2] != HOST:
+            assert ask(Origin=origin) == 403
+    assert ask(Origin=OWN) == ask() == 200
+    sent = {**door.bearer, "Origin": FOREIGN[0]}
+    assert door.client.get("/", headers=sent).status_code == 200
 
 
 def test_a_cookie_alone_neither_posts_nor_opens_a_websocket(door: Door) -> None:

@@ -85,6 +85,24 @@ LAUNCHES: dict[str, tuple[Any, int, str]] = {
     "unknown profile": (RUN | {"profile": "fastest"}, 422, "'fastest'"),
     "path for a profile": (RUN | {"profile": "../quick"}, 422, "profile"),
     "endless name": (RUN | {"name": "x" * 121}, 422, "name"),
+    "name with a NUL": (RUN | {"name": "a\0b"}, 422, "name"),
+    "name of two lines": (RUN | {"name": "a\nb"}, 422, "name"),
+    "name that turns round": (RUN | {"name": "\u202efdp.exe"}, 422, "name"),
+    "endless radius": (
+        RUN | {"overrides": {"simulation.connection_radius": 1e9}},
+        422,
+        "simulation.connection_radius is 1000000000.0; expected a number from 0 to 1000.",
+    ),
+    "endless neighbors": (
+        RUN | {"overrides": {"simulation.max_neighbors": 10**9}},
+        422,
+        "from 0 to 1000",
+    ),
+    "infinite stiffness": (
+        RUN | {"overrides": {"simulation.stiffness": 1e308}},
+        422,
+        "simulation.stiffness",
+    ),
     "negative parameter": (RUN | {"parameters": {"drag": -1}}, 422, "parameters"),
     "NaN parameter": ('{"sequences": ["sheet"], "drag": NaN}', 422, "drag"),
     "deep body": ("[" * 100_000, 400, "body"),
@@ -106,9 +124,19 @@ def test_a_senseless_launch_is_refused(
 
 
 def test_an_endless_body_is_not_read(client: TestClient) -> None:
-    headers = {"Content-Type": "application/json"}
-    response = client.post("/api/v1/runs", content="[" * (2**20 + 1), headers=headers)
-    assert (response.status_code, response.text) == (413, "Content Too Large")
+    def parts() -> Iterator[bytes]:
+        for _ in range(2**10 + 1):  # Without a length that was announced.
+            yield b"[" * 2**10
+
+    for content in ("[" * (2**20 + 1), parts()):
+        headers = {"Content-Type": "application/json"}
+        response = client.post("/api/v1/runs", content=content, headers=headers)
+        assert response.status_code == 413
+        assert response.json()["error"]["code"] == "too_large"
+        assert refusal(response) == "The request is too large: at most 1 MiB are read."
+        assert response.headers["connection"] == "close"
+    response = client.post("/api/v1/runs", content=" " * 2**20, headers=headers)
+    assert response.status_code == 422
 
 
 SESSIONS: dict[str, tuple[Any, int, str]] = {

@@ -202,6 +202,8 @@ def _checked_name(name: str) -> str:
     name = " ".join(name.split())
     if not name or len(name) > _MOST_LETTERS:
         raise UsageError(f"Type a name of 1 to {_MOST_LETTERS} letters for the run first.")
+    if not name.isprintable():
+        raise UsageError("The run's name has a sign that cannot be printed. Type another one.")
     return name
 
 

@@ -154,7 +154,7 @@ def _control(
             field=name,
             label=label,
             low=_POWERS[0],
-            high=_POWERS[1],
+            high=min(_POWERS[1], _power_to(parameter, value if is_relative else 1.0)),
             step=slider.step,
             hint=slider.hint,
             scale=1.0 / max(value, 1e-30) if is_relative else 1.0,
@@ -166,7 +166,8 @@ def _control(
     if slider.widest is not None:
         is_whole = parameter.kind == "whole"
         low = 1.0 if is_whole else 0.0
-        high = max(slider.widest, value if is_whole else round_up(2 * value))
+        wide = max(slider.widest, value if is_whole else round_up(2 * value))
+        high = min(wide, high)
     return Knob(
         field=name,
         label=f"{label} [{parameter.unit}]" if parameter.unit else label,
@@ -178,6 +179,11 @@ def _control(
     )
 
 
+def _power_to(parameter: Parameter, start: float) -> float:
+    """Give the power of ten by which a value may be multiplied until the parameter's bound."""
+    return math.log10(parameter.high / start) if parameter.high else math.inf
+
+
 def _length_knob(parameter: Parameter, slider: Slider, value: float, length_unit: str) -> Knob:
     """Make the slider of a length: in millimetres, or in the recording's unit."""
     if length_unit == "m":
@@ -186,6 +192,7 @@ def _length_knob(parameter: Parameter, slider: Slider, value: float, length_unit
     else:
         scale, unit, high = 1.0, length_unit, max(4 * value, 1e-6)
         step = high / 200
+    high = min(high, scale * (parameter.high or math.inf))
     return Knob(
         field=parameter.name,
         label=f"{parameter.title} [{unit}]",

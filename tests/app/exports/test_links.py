@@ -91,6 +91,19 @@ def test_a_link_that_makes_no_sense_is_a_page_that_names_the_field(
     assert world.sessions.list() == []
 
 
+def test_a_page_elsewhere_opens_no_scene_but_may_ask_for_one(world: World) -> None:
+    browser = world.browser()
+    visit = {"Sec-Fetch-Site": "same-site", "Sec-Fetch-Mode": "navigate"}
+    del browser.headers["origin"]
+    for path in ("/runs/fitted/view", "/sequences/sheet/view"):
+        asked = browser.get(path, headers={**visit, "Sec-Fetch-Dest": "document"})
+        assert (asked.status_code, "Open the scene" in asked.text) == (403, True)
+        loaded = browser.get(path, headers={**visit, "Sec-Fetch-Dest": "iframe"})
+        assert loaded.status_code == 403
+        assert browser.get(path, headers={"Origin": "http://127.0.0.1:9999"}).status_code == 403
+    assert world.sessions.list() == []
+
+
 def test_strangers_and_guesses_open_nothing(world: World) -> None:
     locked = world.client(Accept="text/html").get(f"/runs/fitted/view?{QUERY}")
     assert locked.status_code == 401

@@ -1,6 +1,7 @@
 import asyncio
 import gzip
 import json
+import logging
 import queue
 import threading
 import urllib.error
@@ -8,6 +9,7 @@ import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 import uvicorn
@@ -145,6 +147,26 @@ def test_a_client_without_viser_s_protocol_is_refused(address, sessions, offered
     with pytest.raises(InvalidStatus) as refused:
         connect(f"ws://{address}/viewer/{session}", subprotocols=offered, proxy=None)
     assert refused.value.response.status_code == 400
+
+
+def test_a_frame_that_nobody_can_read_ends_its_connection_with_one_line(
+    address, sessions, caplog
+) -> None:
+    session = sessions.open("run", "sheet", "me")
+    frames = ["text", b"\x00\xc1" * 20, b"\x91" * 5000, msgspec.msgpack.encode({"type": "Nothing"})]
+    for frame in frames:
+        url = f"ws://{address}/viewer/{session}"
+        with connect(url, subprotocols=[PROTOCOL], proxy=None, max_size=None) as client:
+            client.send(frame)
+            for _ in client:  # Until it is closed.
+                pass
+    told = [record for record in caplog.records if record.name == "websockets.server"]
+    errors = [record for record in told if record.levelno >= logging.ERROR]
+    assert len(errors) == len(frames)
+    assert all(record.getMessage().startswith("a viewer's connection") for record in errors)
+    assert not any(record.exc_info for record in errors)
+    with ViewerClient(f"ws://{address}/viewer/{session}") as client:
+        client.until(lambda: client.nodes)
 
 
 def test_closing_a_session_hangs_up(address, sessions) -> None:

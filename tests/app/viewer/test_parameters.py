@@ -38,6 +38,16 @@ def test_a_wider_fit_widens_its_slider() -> None:
     assert by_field["max_neighbors"].to_slider(wide) == 120
 
 
+def test_no_slider_reaches_beyond_what_its_parameter_may_be() -> None:
+    for fitted in (START, START.replace(drag=9e5, stiffness=9e7, connection_radius=999.0)):
+        for unit in ("m", "squares"):
+            for knob in knobs(fitted, length_unit=unit):
+                assert START.replace(**{knob.field: knob.from_slider(knob.high)}) != START
+    strong = START.replace(stiffness=9e7)
+    knob = next(k for k in knobs(strong, length_unit="m") if k.field == "stiffness")
+    assert knob.from_slider(knob.high) == pytest.approx(1e8, rel=1e-3)
+
+
 def test_stiffness_is_moved_by_powers_of_ten() -> None:
     knob = next(k for k in knobs(START, length_unit="m") if k.field == "stiffness_scale")
     assert (knob.label, knob.from_slider(-1.0), knob.from_slider(0.5)) == ("stiffness", 0.1, 3.162)

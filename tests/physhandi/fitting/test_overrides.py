@@ -50,7 +50,7 @@ def test_every_setting_has_a_meaning_a_group_and_bounds() -> None:
         assert "[" not in setting.about.replace("[0, 1", "").replace("]0, 1", "")
         assert setting.group in GROUPS
         is_number = setting.kind in {"number", "whole", "interval"}
-        assert not is_number or setting.low is not None or setting.path == "simulation.gravity"
+        assert not is_number or (setting.low is not None and setting.high is not None)
         assert (setting.kind == "choice") <= (len(setting.choices) > 1)
     kinds = {setting.path: setting.kind for setting in settings}
     assert kinds["object_.search.generations"] == "whole"
@@ -117,8 +117,8 @@ def test_what_is_changed_changes_and_nothing_else() -> None:
         ("node_spacing", float("nan"), "from 0.001 to 0.5"),
         ("node_spacing", "0.01", "a number"),
         ("node_spacing", [1], "a number"),
-        ("simulation.stiffness", -1.0, "from 0 on"),
-        ("simulation.gravity", float("inf"), "finite"),
+        ("simulation.stiffness", -1.0, "from 0 to 100000000"),
+        ("simulation.gravity", float("inf"), "from -100000 to 100000"),
         ("simulation.self_collision", 1, "true or false"),
         ("hand.model", "smplx", "one of open, mano"),
         ("object_.search.variables.drag", 3.0, "low, high and scale"),
@@ -133,7 +133,7 @@ def test_what_is_changed_changes_and_nothing_else() -> None:
             {"low": 1, "high": 9, "scale": "linear"},
             "integer",
         ),
-        ("simulation.drag", 10**40, "from 0 on"),
+        ("simulation.drag", 10**40, "from 0 to 1000000"),
         ("x" * 500, 1, "There is no setting"),
     ],
 )
@@ -164,6 +164,24 @@ def test_whatever_lies_on_the_bounds_is_taken_by_the_settings_classes() -> None:
                 continue
             value = int(end) if setting.kind == "whole" else end
             assert values_of(apply_overrides(QUICK, {setting.path: value}))[setting.path] == value
+
+
+def test_no_setting_takes_a_senseless_number_and_all_that_are_given_one_are_named() -> None:
+    numbers = [s for s in all_settings() if s.kind in {"number", "whole"} and s.name != "seed"]
+    for sense in (10**9, -(10**9)):
+        with pytest.raises(SettingsError) as refused:
+            apply_overrides(QUICK, {setting.path: sense for setting in numbers})
+        told = refused.value.fields
+        assert set(told) == {setting.path for setting in numbers}
+        assert told["simulation.connection_radius"].endswith("from 0 to 1000.")
+    intervals = {s.path: [s.low, 1e9] for s in all_settings() if s.kind == "interval"}
+    asked = {
+        path: {"low": low, "high": high, "scale": "linear"}
+        for path, (low, high) in intervals.items()
+    }
+    with pytest.raises(SettingsError) as refused:
+        apply_overrides(QUICK, asked)
+    assert set(refused.value.fields) == set(intervals)
 
 
 def test_settings_that_a_stored_configuration_lacks_are_dropped_and_only_these() -> None:
