@@ -193,7 +193,10 @@ class View:
         except (ValueError, OSError) as error:
             self._fail(kind, frame, f"cannot be decoded: {file} {error}", "re-export it")
         self._check_announced(kind, frame, size)
-        image: ndarray | None = cv2.imread(str(path), flags)
+        try:
+            image: ndarray | None = cv2.imread(str(path), flags)
+        except cv2.error:  # OpenCV has limits of its own.
+            image = None
         if image is None:
             self._fail(kind, frame, f"cannot be decoded ({file})", "re-export it")
         return image

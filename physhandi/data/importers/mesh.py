@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
+from physhandi.data.image_header import MOST_PIXELS
 from physhandi.errors import UsageError
 
 KINDS = (".glb", ".gltf", ".ply", ".obj", ".stl")
@@ -81,9 +82,21 @@ def _colors(part: Any) -> ndarray | None:
     if not visual.defined:
         return None
     if visual.kind == "texture":
+        _check_texture(visual.material)
         visual = visual.to_color()
     color = np.asarray(visual.vertex_colors)
     return color[:, :3].astype(np.uint8) if color.shape == (len(part.vertices), 4) else None
+
+
+def _check_texture(material: Any) -> None:
+    """Refuse a picture that is too large, of which only the header was read so far."""
+    for name in ("image", "baseColorTexture"):
+        picture = getattr(material, name, None)
+        if picture is None:
+            continue
+        width, height = picture.size
+        if width * height > MOST_PIXELS:
+            raise ValueError(f"its texture has {width}x{height} px, and {MOST_PIXELS} are the most")
 
 
 def _welded(vertex: ndarray, faces: ndarray, color: ndarray | None) -> Mesh:

@@ -17,6 +17,7 @@ from numpy import ndarray
 from numpy.random import Generator
 
 from physhandi.data.files import named_fields
+from physhandi.data.image_header import announced_size
 from physhandi.data.sequence import ARRAYS, Sequence
 from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import SequenceWriter
@@ -108,9 +109,13 @@ def noisy_depth(recording: Sequence, random: Generator) -> VariantChange:
     images: dict[str, ndarray] = {}
     for view in recording.views:
         for path in sorted((view.folder / "depth").glob("*.png")):
-            depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+            try:
+                announced_size(path)
+                depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+            except (ValueError, cv2.error) as error:
+                raise MissingInputError(f"{path} cannot be decoded: it {error}.") from error
             if depth is None:
-                raise MissingInputError(f"{path} is not a readable image.")
+                raise MissingInputError(f"{path} cannot be decoded: it is no readable image.")
             noise = random.normal(0.0, DEPTH_NOISE * _MILLIMETRES, depth.shape)
             moved = np.clip(np.rint(depth + noise), 1, np.iinfo(np.uint16).max)
             rel = path.relative_to(recording.folder).as_posix()

@@ -139,3 +139,16 @@ def test_an_array_that_announces_more_than_its_file_holds_is_refused(tmp_path: P
         read_array(path)
     np.save(path, np.arange(6.0).reshape(2, 3))
     np.testing.assert_array_equal(read_array(path), [[0, 1, 2], [3, 4, 5]])
+
+
+def test_what_opencv_itself_refuses_is_told_as_all_that_cannot_be_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_path: str, _flags: int) -> None:
+        raise cv2.error("too large for OpenCV")
+
+    own = put(tmp_path, "mask/00001.png", png(WIDTH, HEIGHT, content=b"\0" * (WIDTH + 1) * HEIGHT))
+    assert own.mask(1).shape == (HEIGHT, WIDTH)
+    monkeypatch.setattr(cv2, "imread", refuse)
+    with pytest.raises(SequenceError, match=r"mask of frame 1 cannot be decoded \(mask/00001\.png"):
+        own.mask(1)

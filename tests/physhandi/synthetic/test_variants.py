@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from header_bombs import png
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.sequence import Sequence, ViewMeta
@@ -174,6 +175,13 @@ def test_noise_has_the_size_that_the_paper_names(recording: Sequence, tmp_path: 
     assert noise.std() == pytest.approx(1.0, rel=0.03)
     assert abs(np.corrcoef(noise[0].ravel(), noise[1].ravel())[0, 1]) < 0.1
     np.testing.assert_array_equal(tracked.views[0].depth(0), recording.views[0].depth(0))
+
+
+def test_a_depth_that_announces_too_much_is_named(recording: Sequence, tmp_path: Path) -> None:
+    path = recording.folder / "views/a/depth/00001.png"
+    path.write_bytes(png(100_000, 100_000, bits=16))
+    with pytest.raises(MissingInputError, match=r"00001\.png cannot be decoded: it announces 1000"):
+        make_variant(recording, "noisy_depth", tmp_path / "inputs")
 
 
 @pytest.mark.parametrize("name", ["true_hand", "noisy_hand", "noisy_tracks"])

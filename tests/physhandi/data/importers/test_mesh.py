@@ -63,6 +63,24 @@ def test_a_texture_becomes_colors_of_corners(tmp_path: Path) -> None:
     assert read.color[order].tolist() == expected
 
 
+@pytest.mark.parametrize("kind", ["glb", "obj"])
+def test_a_texture_that_announces_too_much_is_refused_before_it_is_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    picture = Image.fromarray(np.zeros((3, 5, 3), np.uint8))
+    visual = TextureVisuals(uv=np.zeros((4, 2)), image=picture)
+    mesh = trimesh.Trimesh(CORNER, FACES, process=False, visual=visual)
+    path = tmp_path / f"painted.{kind}"
+    if kind == "glb":
+        path.write_bytes(mesh.export(file_type="glb"))
+    else:
+        mesh.export(path)
+    monkeypatch.setattr(importer, "MOST_PIXELS", 14)
+    monkeypatch.setattr(TextureVisuals, "to_color", lambda _: pytest.fail("was decoded"))
+    with pytest.raises(UsageError, match=r"painted\..* texture has 5x3 px, and 14 are the most"):
+        read_mesh(path)
+
+
 def test_corners_with_colors_keep_them(tmp_path: Path) -> None:
     color = np.array([[10, 20, 30], [40, 50, 60], [70, 80, 90], [100, 110, 120]], np.uint8)
     mesh = trimesh.Trimesh(CORNER, FACES, process=False, vertex_colors=color)
