@@ -38,6 +38,7 @@ from app.pages import Pages, create_pages
 from app.previews.store import Previews
 from app.security import Gatekeeper, Security
 from app.settings import WEB_ASSETS, ServerSettings
+from app.slow_requests import ImpatientProtocol
 from app.viewer.gate import create_gate
 from app.viewer.physics.keep_panel import RunSaver, UserStorage
 from app.viewer.physics.presets import PresetStore
@@ -269,6 +270,7 @@ def serve(
             scheduler.launch([DEMO_SEQUENCE], "quick", "Quick fit, running now")
         config = uvicorn.Config(
             app,
+            http=ImpatientProtocol,
             log_level="warning",
             access_log=False,
             server_header=False,

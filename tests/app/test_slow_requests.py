@@ -1,0 +1,190 @@
+"""Half-sent requests: time stands still here, and passes when a test says so."""
+
+import json
+import socket
+import threading
+from collections.abc import Callable, Coroutine
+from types import SimpleNamespace
+from typing import Any
+from unittest.mock import Mock
+
+import pytest
+import uvicorn
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse
+from starlette.routing import Route
+from uvicorn.server import ServerState
+from waiting import LIMIT_S, until
+
+from app.slow_requests import ImpatientProtocol
+
+HEAD = b"POST / HTTP/1.1\r\nHost: x\r\nContent-Length: 1000000\r\n\r\n"
+
+
+class Clock:
+    """A loop whose timers go off by hand, and whose tasks never run."""
+
+    def __init__(self) -> None:
+        self.timers: list[SimpleNamespace] = []
+
+    def call_later(self, delay: float, callback: Callable[[], None]) -> SimpleNamespace:
+        timer = SimpleNamespace(delay=delay, callback=callback)
+        timer.cancel = lambda: self.timers.remove(timer) if timer in self.timers else None
+        self.timers.append(timer)
+        return timer
+
+    def create_task(self, task: Coroutine[Any, Any, None]) -> Mock:
+        task.close()
+        return Mock()
+
+    def pass_by(self) -> None:
+        (timer,) = self.timers
+        self.timers.clear()
+        timer.callback()
+
+
+class Wire:
+    """A transport that keeps what is written to it."""
+
+    def __init__(self) -> None:
+        self.written, self.is_closed = b"", False
+
+    def get_extra_info(self, _name: str) -> None:
+        return None
+
+    def write(self, data: bytes) -> None:
+        self.written += data
+
+    def close(self) -> None:
+        self.is_closed = True
+
+    def is_closing(self) -> bool:
+        return self.is_closed
+
+    def pause_reading(self) -> None: ...
+
+    def resume_reading(self) -> None: ...
+
+
+class Line:
+    def __init__(self) -> None:
+        self.clock, self.wire = Clock(), Wire()
+        self.protocol = ImpatientProtocol(
+            uvicorn.Config(lambda: None, log_config=None), ServerState(), {}, self.clock
+        )
+        self.protocol.connection_made(self.wire)
+
+    def told(self) -> str:
+        """Which part did not come, by the answer."""
+        head, _, body = self.wire.written.partition(b"\r\n\r\n")
+        assert head.startswith(b"HTTP/1.1 408 ")
+        assert self.wire.is_closed
+        assert self.clock.timers == []
+        error = json.loads(body)["error"]
+        assert error["code"] == "too_slow"
+        return error["message"].split(" ")[1]
+
+
+@pytest.fixture
+def line() -> Line:
+    return Line()
+
+
+def test_who_connects_and_asks_nothing_is_hung_up_on(line: Line) -> None:
+    assert line.clock.timers[0].delay == 20.0
+    line.clock.pass_by()
+    assert line.told() == "head"
+
+
+def test_a_head_that_drips_in_gets_no_more_time_by_that(line: Line) -> None:
+    (timer,) = line.clock.timers
+    for byte in HEAD[:-1]:
+        line.protocol.data_received(bytes([byte]))
+        assert line.clock.timers == [timer]
+    line.clock.pass_by()
+    assert line.told() == "head"
+
+
+def test_a_whole_request_may_be_answered_as_late_as_it_takes(line: Line) -> None:
+    line.protocol.data_received(b"GET / HTTP/1.1\r\nHost: x\r\n\r\n")
+    assert line.clock.timers == []
+    assert not line.wire.is_closed
+
+
+def test_a_body_has_to_keep_up_a_rate(line: Line) -> None:
+    line.protocol.data_received(HEAD)
+    for _ in range(2):
+        assert line.clock.timers[0].delay == 30.0
+        for _ in range(30):
+            line.protocol.data_received(b"x" * 1024)
+        line.protocol.cycle.body = b""  # The application has read it.
+        line.clock.pass_by()
+        assert not line.wire.is_closed
+    line.protocol.data_received(b"x" * (30 * 1024 - 1))
+    cycle = line.protocol.cycle
+    assert not cycle.disconnected
+    line.clock.pass_by()
+    assert line.told() == "body"
+    assert cycle.disconnected
+    assert cycle.message_event.is_set()
+
+
+def test_a_body_that_the_server_does_not_read_is_not_the_clients_fault(line: Line) -> None:
+    line.protocol.data_received(HEAD)
+    line.protocol.data_received(b"x" * 100_000)
+    assert line.protocol.flow.read_paused
+    line.clock.pass_by()
+    line.clock.pass_by()
+    assert not line.wire.is_closed
+    line.protocol.flow.resume_reading()
+    line.clock.pass_by()
+    assert line.told() == "body"
+
+
+def test_a_body_that_nobody_waits_for_any_more_is_cut_off_without_a_word(line: Line) -> None:
+    line.protocol.data_received(HEAD)
+    line.protocol.cycle.response_started = True
+    line.clock.pass_by()
+    assert line.wire.is_closed
+    assert line.wire.written == b""
+
+
+def test_a_lost_connection_leaves_no_timer(line: Line) -> None:
+    line.protocol.data_received(b"GET")
+    line.protocol.connection_lost(None)
+    assert line.clock.timers == []
+
+
+class Hasty(ImpatientProtocol):
+    head_s, body_s = 0.1, 0.1
+
+
+def test_a_hundred_half_requests_are_closed_and_then_others_answered(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def answer(request: Request) -> PlainTextResponse:
+        return PlainTextResponse(f"{len(await request.body())} bytes")
+
+    app = Starlette(routes=[Route("/", answer, methods=["GET", "POST"])])
+    server = uvicorn.Server(
+        uvicorn.Config(app, host="127.0.0.1", port=0, http=Hasty, log_level="critical")
+    )
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    until(lambda: server.started)
+    place = ("127.0.0.1", server.servers[0].sockets[0].getsockname()[1])
+    try:
+        slow = [socket.create_connection(place, LIMIT_S) for _ in range(100)]
+        for number, one in enumerate(slow):
+            one.sendall((b"GET / HTTP/1.1\r\nHo", HEAD + b"x")[number % 2])
+        for one in slow:
+            with one, one.makefile("rb") as stream:
+                assert stream.read().startswith(b"HTTP/1.1 408 ")  # Until it is closed.
+        monkeypatch.setattr(Hasty, "head_s", LIMIT_S)
+        with socket.create_connection(place, LIMIT_S) as good, good.makefile("rb") as stream:
+            good.sendall(b"POST / HTTP/1.0\r\nHost: x\r\nContent-Length: 3\r\n\r\nabc")
+            assert stream.read().endswith(b"\r\n\r\n3 bytes")
+    finally:
+        server.should_exit = True
+        thread.join()
