@@ -23,6 +23,8 @@ _FLAGS = ("--no-sandbox", "--use-angle=gl-egl", "--ignore-gpu-blocklist")
 _SIZE = (1280, 800)
 _PATIENCE_MS = 1e3 * PATIENCE_S
 _COUNTED_MS = 3000.0
+_POLLING_MS = 100.0
+"""Pages are asked so often, and not with their pictures, of which a stalled one draws none."""
 _PAINTED = """() => {
   const paint = performance.getEntriesByName("first-contentful-paint")[0];
   const page = performance.getEntriesByType("navigation")[0];
@@ -134,7 +136,7 @@ def measure_first_paint(served: Served, browser: "Browser", visits: int) -> dict
     for _ in range(visits):
         with _new_page(browser) as page:
             page.goto(served.url, wait_until="load")
-            page.wait_for_function(_PAINTED)
+            page.wait_for_function(_PAINTED, polling=_POLLING_MS)
             visited.append(page.evaluate(_PAINTED))
     return {
         "visits": visits,
@@ -166,7 +168,7 @@ def measure_opening(served: Served, browser: "Browser", run_id: str, visits: int
             page.evaluate(_REMEMBER)
             page.locator(f'#runs [data-run="{run_id}"] [data-open]').click()
             scene = _scene_of(page)
-            scene.wait_for_function("() => window.physhandiWatch.first > 0")
+            scene.wait_for_function("() => window.physhandiWatch.first > 0", polling=_POLLING_MS)
             seconds.append(1e-3 * float(scene.evaluate(_SINCE_CLICK)))
             _close(page, served)
     return {"visits": visits, **percentiles(seconds[1:])}
@@ -197,13 +199,13 @@ def measure_slider_in_browser(
         page.goto(page.evaluate(_OPEN, run_id))
         scene = _scene_of(page)
         scene.get_by_role("button", name="Pause", exact=True).wait_for()
-        scene.wait_for_function("() => window.physhandiWatch.frames > 30")
+        scene.wait_for_function("() => window.physhandiWatch.frames > 30", polling=_POLLING_MS)
         opened = 1e-3 * float(page.evaluate("() => performance.now()"))
         for move in moves:
             pair = [r.reshape(len(r), -1)[:, :_COMPARED].tolist() for r in (move.shown, before)]
             scene.evaluate(_EXPECT, [*pair, TOLERANCE])
             _press(page, scene, slider, move)
-            scene.wait_for_function("() => window.physhandiWatch.drawn > 0")
+            scene.wait_for_function("() => window.physhandiWatch.drawn > 0", polling=_POLLING_MS)
             told = scene.evaluate("() => window.physhandiWatch")
             arrived.append(1e-3 * (told["arrived"] - told["pressed"]))
             drawn.append(1e-3 * (told["drawn"] - told["pressed"]))

@@ -21,21 +21,20 @@ from playwright.sync_api import (
     expect,
     sync_playwright,
 )
-from scene_page import COARSER_PICTURES, FEWER_PICTURES, TIMEOUT_MS, ScenePage
+from scene_page import (
+    COARSER_PICTURES,
+    FEWER_PICTURES,
+    LESS_DRAWING,
+    TIMEOUT_MS,
+    ScenePage,
+)
 from waiting import until
 
 from app.jobs.processes import end_processes
 
 ROOT = Path(__file__).parents[2]
 START = "from app.cli import main; main()"
-_CHROMIUM = [
-    "--no-sandbox",
-    "--use-angle=gl-egl",
-    "--ignore-gpu-blocklist",
-    # Without a graphics card every picture costs a processor: draw each once, and smooth none.
-    "--disable-gpu-compositing",
-    "--webgl-msaa-sample-count=0",
-]
+_CHROMIUM = ["--no-sandbox", "--use-angle=gl-egl", "--ignore-gpu-blocklist", *LESS_DRAWING]
 _VIEWPORT: ViewportSize = {"width": 1280, "height": 800}
 _PICTURES = "PHYSHANDI_PICTURES"
 """Names the folder of the README's pictures, which are made anew if it is set (`make pictures`)."""

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scene_page import FEWER_PICTURES
+from scene_page import COARSER_PICTURES, FEWER_PICTURES, LESS_DRAWING
 
 from app import cli
 from app.benchmarks import browser, streams, viewer
@@ -34,7 +34,9 @@ def little(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(streams, "_SETTLING_S", 0.3)
     monkeypatch.setattr(browser, "_COUNTED_MS", 500.0)
     # Without a graphics card every picture and every pixel costs.
-    monkeypatch.setattr(browser, "_WATCH", FEWER_PICTURES + browser._WATCH)
+    monkeypatch.setattr(browser, "_FLAGS", browser._FLAGS + LESS_DRAWING)
+    drawn = COARSER_PICTURES + FEWER_PICTURES
+    monkeypatch.setattr(browser, "_WATCH", drawn + browser._WATCH)
     monkeypatch.setattr(browser, "_SIZE", (900, 500))
 
 
