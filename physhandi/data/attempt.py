@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -21,7 +21,6 @@ from physhandi.data.checkpoint import FileCheckpointer, packed
 from physhandi.data.environment import ENVIRONMENT
 from physhandi.data.files import (
     json_line,
-    named_fields,
     sweep_temporary,
     temporary_name,
     write_array,
@@ -45,6 +44,7 @@ from physhandi.data.run_folder import (
     RESERVE,
     RUN_FORMAT,
     STAGES_FILE,
+    StageEntry,
     artefacts,
     attempt_numbers,
     file_record,
@@ -52,8 +52,9 @@ from physhandi.data.run_folder import (
     inside,
     now,
     read_events,
-    read_json,
     read_mapping,
+    read_number,
+    read_record,
 )
 from physhandi.errors import CancelledError, RunError, describe
 from physhandi.progress import Preview, Progress
@@ -84,10 +85,8 @@ def take_over(previous: Path, folder: Path) -> list[dict[str, Any]]:
 
 def prune(run_folder: Path, keep: set[int]) -> None:
     """Remove attempts that are neither to be kept nor published."""
-    current = run_folder / CURRENT
-    text = current.read_text().strip() if current.is_file() else ""
-    published = {int(text)} if text.isdigit() else set[int]()
-    for number in set(attempt_numbers(run_folder)) - keep - published:
+    published = read_number(run_folder / CURRENT)
+    for number in set(attempt_numbers(run_folder)) - keep - {published}:
         shutil.rmtree(run_folder / ATTEMPTS / str(number), ignore_errors=True)
 
 
@@ -107,18 +106,13 @@ def _whole_stages(previous: Path) -> list[dict[str, Any]]:
 def _listed_stages(path: Path) -> list[dict[str, Any]]:
     """Read the list of finished stages; a damaged one proves nothing, so none is finished."""
     try:
-        content = read_json(path)
+        stages = read_record(path, list[StageEntry]) or []
+        for rel in (rel for stage in stages for rel in stage.get("files", {})):
+            inside(path.parent, rel)
     except RunError:
         return []
-    entries: list[Any] = cast("list[Any]", content) if isinstance(content, list) else [None]
-    stages = [named_fields(entry) or {} for entry in entries]
-    is_whole = all(
-        isinstance(stage.get("name"), str)
-        and isinstance(stage.get("files"), dict)
-        and isinstance(stage.get("summary"), dict)
-        for stage in stages
-    )
-    return stages if is_whole else []
+    is_whole = all({"files", "summary"} <= set(stage) for stage in stages)
+    return [dict(stage) for stage in stages] if is_whole else []
 
 
 def _link(source: Path, target: Path) -> None:

@@ -11,6 +11,7 @@ import tokenize
 import zipfile
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path, PurePath
 from typing import Any, BinaryIO, cast
 
@@ -285,16 +286,12 @@ _FastLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 """PyYAML's reader in C, ten times as fast as that in Python, where PyYAML was built with it."""
 
 
-_DEEPEST = 100
-"""Levels of nesting that are read; the reader in C has no limit of its own but the stack."""
-
-
 def _check_depth(text: str) -> None:
     depth = 0
     for event in _yaml.parse(text, Loader=_FastLoader):
         depth += isinstance(event, yaml.CollectionStartEvent)
         depth -= isinstance(event, yaml.CollectionEndEvent)
-        if depth > _DEEPEST:
+        if depth > DEEPEST:
             raise RecursionError
 
 
@@ -313,3 +310,74 @@ class _Loader(_FastLoader):
                 )
             seen.add(key.value)
         return _FastLoader.construct_mapping(self, node, deep=deep)
+
+
+DEEPEST = 100
+"""Levels of nesting that are read; the YAML reader in C has no limit of its own but the stack."""
+_MOST_VALUES = 200_000
+"""Values that are read from YAML, whose aliases can make a few lines stand for any number."""
+
+
+def require_shallow(content: Any) -> None:
+    """Refuse what is nested so deeply that who walks through it would fail.
+
+    Raises:
+        ValueError: If it is.
+    """
+    level = [content]
+    for _ in range(DEEPEST):
+        level = [
+            inner for value in level for inner in _inside(value) if isinstance(inner, list | dict)
+        ]
+        if not level:
+            return
+    raise ValueError("it is nested too deeply")
+
+
+def require_plain(content: Any) -> None:
+    """Refuse what YAML has and JSON has not: dates, bytes, sets, names that are no text, NaN.
+
+    Raises:
+        ValueError: If it holds such a thing, or is nested too deeply or endlessly; tells where.
+    """
+    level: list[tuple[str, Any]] = [("", content)]
+    count = 0
+    for _ in range(DEEPEST + 1):
+        if not level:
+            return
+        count += len(level)
+        if count > _MOST_VALUES:
+            raise ValueError(f"it holds more than {_MOST_VALUES} values")
+        for place, value in level:
+            _require_plain_value(place, value)
+        level = list(islice((pair for v in level for pair in _places(*v)), _MOST_VALUES + 1))
+    raise ValueError("it is nested too deeply")
+
+
+def _require_plain_value(place: str, value: Any) -> None:
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError(f"field '{place}' is {value}, not a finite number")
+    if isinstance(value, int) and abs(value) >= 2**64:
+        raise ValueError(f"field '{place}' is a number that is too large")
+    if value is not None and not isinstance(value, str | int | float | list | dict):
+        kind = type(cast("object", value)).__name__
+        raise ValueError(f"field '{place}' is a {kind}; expected text, numbers, lists or fields")
+
+
+def _places(place: str, value: Any) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, list):
+        yield from ((f"{place}[{i}]", v) for i, v in enumerate(cast("list[Any]", value)))
+    elif isinstance(value, dict):
+        for name, inner in cast("dict[Any, Any]", value).items():
+            if not isinstance(name, str):
+                raise ValueError(  # noqa: TRY004 - of the file, not of an argument
+                    f"a name in field '{place}' is no text: {str(name)[:40]}"
+                )
+            yield f"{place}.{name}" if place else name, inner
+
+
+def _inside(value: Any) -> Iterator[Any]:
+    if isinstance(value, dict):
+        yield from cast("dict[Any, Any]", value).values()
+    elif isinstance(value, list):
+        yield from cast("list[Any]", value)

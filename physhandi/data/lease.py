@@ -1,6 +1,7 @@
 """The right to write into a run, held by one process at a time and fenced by a nonce."""
 
 import fcntl
+import math
 import os
 import secrets
 import socket
@@ -8,12 +9,11 @@ import time
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import psutil
 
 from physhandi.data.files import write_json
-from physhandi.data.run_folder import LEASE, read_mapping
+from physhandi.data.run_folder import LEASE, LeaseFile, read_record
 from physhandi.errors import RunError
 
 REMOTE_TIMEOUT_S = 120.0
@@ -59,7 +59,8 @@ class Lease:
 
     def is_held(self) -> bool:
         """Tell whether this claim is still the valid one."""
-        return read_mapping(self.folder / LEASE).get("nonce") == self.nonce
+        claim = read_record(self.folder / LEASE, LeaseFile)
+        return claim is not None and claim["nonce"] == self.nonce
 
     def check(self) -> None:
         """Make sure that this claim is still the valid one.
@@ -160,7 +161,7 @@ def _identity_by_clock(pid: int) -> str | None:
         return None
 
 
-def live_holder(folder: Path) -> dict[str, Any] | None:
+def live_holder(folder: Path) -> LeaseFile | None:
     """Give the claim on a run, or None if there is none or its process is gone.
 
     On this host the process itself decides; on another host a claim that was not renewed for
@@ -168,28 +169,30 @@ def live_holder(folder: Path) -> dict[str, Any] | None:
     """
     path = folder / LEASE
     try:
-        claim = read_mapping(path)
+        claim = read_record(path, LeaseFile)
     except RunError:
         return None  # A damaged claim protects nobody.
+    if claim is None:
+        return None
     try:
         if claim["host"] != socket.gethostname():
             return claim if _is_renewed(path, claim) else None
         if "process" in claim:
             return claim if process_identity(claim["pid"]) == claim["process"] else None
         # Written by version 0.1.0 before November 2026: the clock tells when the process began.
-        process = psutil.Process(claim["pid"])
-        is_same = abs(process.create_time() - claim["process_created"]) < _CLOCK_TOLERANCE_S
+        process, created = psutil.Process(claim["pid"]), claim.get("process_created", math.inf)
+        is_same = abs(process.create_time() - created) < _CLOCK_TOLERANCE_S
         return claim if is_same and process.status() != psutil.STATUS_ZOMBIE else None
-    except (KeyError, TypeError, ValueError, psutil.Error):
+    except psutil.Error:
         return None
 
 
-def _is_renewed(path: Path, claim: dict[str, Any]) -> bool:
+def _is_renewed(path: Path, claim: LeaseFile) -> bool:
     """Tell whether another host still renews its claim.
 
     Whoever has looked before goes by what changed since; only the first look trusts the clocks.
     """
-    content, clock = (claim.get("nonce"), claim["time"]), time.monotonic()
+    content, clock = (claim["nonce"], claim["time"]), time.monotonic()
     known = _watched.get(str(path))
     if known is not None and known[0] == content:
         return clock - known[1] < REMOTE_TIMEOUT_S

@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Mapping
 from collections.abc import Sequence as Many
 from pathlib import Path
-from typing import Any, Literal, TypeVar, cast, get_args
+from typing import Any, Literal, TypeVar
 
 from numpy import ndarray
 from safetensors import SafetensorError
@@ -17,6 +17,7 @@ from physhandi.data.files import (
     plain,
     read_array,
     read_tensors,
+    require_plain,
     temporary_name,
     write_bytes,
     write_yaml,
@@ -36,23 +37,31 @@ from physhandi.data.run_folder import (
     RUN_FORMAT,
     SAFE_ID,
     STAGES_FILE,
+    AboutFile,
+    EventLine,
+    ExitFile,
+    JobFile,
+    ManifestFile,
+    RunEnd,
+    RunKind,
+    StageEntry,
     artefacts,
     attempt_numbers,
+    checked,
     find_damage,
     inside,
     now,
     read_json,
-    read_mapping,
+    read_number,
+    read_record,
     read_yaml,
 )
 from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import FILE, read_meta
 from physhandi.errors import RunError
 
-RunKind = Literal["reconstruction", "simulation"]
-RunState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
+RunState = Literal["queued", "running"] | RunEnd
 _Kind = TypeVar("_Kind", bound="RunFolder")
-_ENDS: tuple[RunState, ...] = ("succeeded", "failed", "cancelled")
 _VANISHED = "The process that worked on this run is gone without a word. Start it again to go on."
 
 
@@ -65,7 +74,7 @@ class RunFolder:
     sequences can be moved together.
     """
 
-    def __init__(self, folder: Path, job: Mapping[str, Any], about: Mapping[str, Any]) -> None:
+    def __init__(self, folder: Path, job: JobFile, about: AboutFile) -> None:
         self.folder = folder
         self.id = folder.name
         self.kind: RunKind = job["kind"]
@@ -100,7 +109,8 @@ class RunFolder:
             config: Settings, in plain data.
 
         Raises:
-            RunError: If the folder is in use, its name is unsafe, or two sequences share a name.
+            RunError: If the folder is in use, its name is unsafe, there is no sequence, two of them
+                share a name, or the settings are no plain data.
             SequenceError: If a sequence folder has a damaged ``sequence.yaml``.
         """
         target = _absolute(folder)
@@ -108,6 +118,8 @@ class RunFolder:
             raise RunError(
                 f"'{target.name}' cannot name a run; use 1-64 letters, digits, '_' or '-'."
             )
+        if not sequences:
+            raise RunError(f"Run '{target.name}' needs a sequence; name at least one.")
         names = [_sequence_name(Path(sequence)) for sequence in sequences]
         doubled = [name for name in names if names.count(name) > 1]
         if doubled:
@@ -120,6 +132,11 @@ class RunFolder:
             "config": plain(config),
         }
         about = {"format": RUN_FORMAT, "name": name, "label": "", "created": now()}
+        try:
+            require_plain(job)
+        except ValueError as error:
+            raise RunError(f"Run '{target.name}' cannot be described: {error}.") from None
+        run = cls.of_content(target, job, about)
         target.parent.mkdir(parents=True, exist_ok=True)
         temporary = target.with_name(temporary_name(target.name))
         temporary.mkdir()
@@ -135,7 +152,7 @@ class RunFolder:
             raise RunError(
                 f"{target} exists already and is not empty. Choose another folder."
             ) from error
-        return cls(target, job, about)
+        return run
 
     @classmethod
     def open(cls: type[_Kind], folder: Path | str) -> _Kind:
@@ -147,31 +164,35 @@ class RunFolder:
         path = _absolute(folder)
         if not (path / RUN).is_file() or not (path / JOB).is_file():
             raise RunError(f"{path} is not a run: it needs {RUN} and {JOB}.")
-        job = named_fields(read_yaml(path / JOB)) or {}
-        about = named_fields(read_yaml(path / RUN)) or {}
-        for file, content, fields in (
-            (JOB, job, {"kind": str, "sequences": list, "sequence_names": list, "config": dict}),
-            (RUN, about, {"name": str, "created": str}),
-        ):
-            if content.get("format") != RUN_FORMAT:
+        job, about = read_yaml(path / JOB), read_yaml(path / RUN)
+        for file, content in ((JOB, job), (RUN, about)):
+            if (named_fields(content) or {}).get("format") != RUN_FORMAT:
                 raise RunError(f"{path / file} is not in format {RUN_FORMAT}.")
-            for field, kind in fields.items():
-                if not isinstance(content.get(field), kind):
-                    raise RunError(f"{path / file}: field '{field}' is missing or wrong.")
-        if job["kind"] not in get_args(RunKind):
-            known = " or ".join(get_args(RunKind))
-            raise RunError(f"{path / JOB}: kind is {job['kind']!r}; expected {known}.")
-        return cls(path, job, about)
+        return cls.of_content(path, job, about)
+
+    @classmethod
+    def of_content(cls: type[_Kind], folder: Path, job: Any, about: Any) -> _Kind:
+        """Make a run of what its files hold.
+
+        Raises:
+            RunError: If a field of them is missing or wrong; names it.
+        """
+        job = checked(job, JobFile, folder / JOB)
+        if len(job["sequences"]) != len(job["sequence_names"]):
+            raise RunError(
+                f"{folder / JOB} is damaged: it has {len(job['sequences'])} sequences, but "
+                f"{len(job['sequence_names'])} sequence_names."
+            )
+        return cls(folder, job, checked(about, AboutFile, folder / RUN))
 
     @property
     def state(self) -> RunState:
         """How far the run is."""
         if live_holder(self.folder) is not None:
             return "running"
-        state = read_mapping(self.folder / EXIT).get("state")
-        for end in _ENDS:
-            if state == end:
-                return end
+        end = read_record(self.folder / EXIT, ExitFile)
+        if end is not None:
+            return end["state"]
         numbers = attempt_numbers(self.folder)
         if numbers and self._published() == numbers[-1]:
             return "succeeded"
@@ -184,7 +205,8 @@ class RunFolder:
         """What went wrong in a failed run."""
         if self.state != "failed":
             return None
-        return str(read_mapping(self.folder / EXIT).get("error", _VANISHED))
+        end = read_record(self.folder / EXIT, ExitFile) or {}
+        return str(end.get("error") or _VANISHED)
 
     @property
     def is_published(self) -> bool:
@@ -207,13 +229,7 @@ class RunFolder:
             RunError: If their list is damaged.
         """
         path = self.folder / ATTEMPTS / str(self.attempt) / STAGES_FILE
-        content: Any = read_json(path) if path.is_file() else []
-        if not isinstance(content, list):
-            raise RunError(f"{path} must list stages; it is damaged.")
-        stages = [named_fields(entry) or {} for entry in cast("list[Any]", content)]
-        if any("name" not in stage for stage in stages):
-            raise RunError(f"{path} must name its stages; it is damaged.")
-        return stages
+        return [dict(stage) for stage in read_record(path, list[StageEntry]) or ()]
 
     @property
     def out(self) -> Path:
@@ -293,17 +309,13 @@ class RunFolder:
         number = self._published()
         if number is None:
             if self.state == "succeeded":
-                raise RunError(
-                    f"Run '{self.id}' has ended, but its results are not whole: '{CURRENT}' does "
-                    f"not lead to an attempt with a {MANIFEST}. Run it again."
-                )
+                raise RunError(not_whole(self.id))
             raise RunError(
                 f"Run '{self.id}' is {self.state}: there is nothing published to read yet."
             )
         folder = self.folder / ATTEMPTS / str(number)
-        files = named_fields(read_mapping(folder / MANIFEST).get("files"))
-        if files is None:
-            raise RunError(f"{folder / MANIFEST} lists no files; it is damaged. Run it again.")
+        manifest = checked(read_json(folder / MANIFEST), ManifestFile, folder / MANIFEST)
+        files: dict[str, Any] = dict(manifest["files"])
         damage = find_damage(folder / OUT, files)
         if damage is None and not allows_more:
             unknown = [rel for rel, _ in artefacts(folder / OUT) if rel not in files]
@@ -315,8 +327,12 @@ class RunFolder:
 
     @property
     def progress(self) -> dict[str, Any]:
-        """The latest report: ``stage iteration total loss message eta_s time``; empty at first."""
-        return read_mapping(self.folder / PROGRESS)
+        """The latest report: ``stage iteration total loss message eta_s time``; empty at first.
+
+        Raises:
+            RunError: If it is damaged.
+        """
+        return dict(read_record(self.folder / PROGRESS, EventLine) or {})
 
     def begin_attempt(self, *, take_over: bool = False) -> Attempt:
         """Start working on the run; stages that an earlier attempt finished are taken over.
@@ -367,16 +383,23 @@ class RunFolder:
         shutil.rmtree(trash, ignore_errors=True)
 
     def _published(self) -> int | None:
-        path = self.folder / CURRENT
-        text = path.read_text().strip() if path.is_file() else ""
-        is_whole = text.isdigit() and (self.folder / ATTEMPTS / text / MANIFEST).is_file()
-        return int(text) if is_whole else None
+        number = read_number(self.folder / CURRENT)
+        is_whole = (self.folder / ATTEMPTS / str(number) / MANIFEST).is_file()
+        return number if is_whole else None
 
     def _existing(self, rel: str) -> Path:
         path = inside(self.out, rel)
         if not path.is_file():
             raise RunError(f"Run '{self.id}' has no {rel}; it is {self.state}.")
         return path
+
+
+def not_whole(run_id: str) -> str:
+    """Say what is wrong with a run that has ended well, and has no results."""
+    return (
+        f"Run '{run_id}' has ended, but its results are not whole: '{CURRENT}' does not lead to an "
+        f"attempt with a {MANIFEST}. Run it again."
+    )
 
 
 def _sequence_name(folder: Path) -> str:

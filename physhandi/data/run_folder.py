@@ -1,20 +1,22 @@
-"""The files of a run folder: their names, how they are hashed and how damage is reported."""
+"""The files of a run folder: their names, what they hold, and how damage is reported."""
 
 import hashlib
-import json
 import os
 import re
 import secrets
+import stat
 import time
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Annotated, Any, Literal, NotRequired, Required, TypedDict, TypeVar, cast
 
+import msgspec
+from msgspec import Meta
 from safetensors import SafetensorError
 
-from physhandi.data.files import named_fields, parse_yaml
+from physhandi.data.files import named_fields, parse_yaml, require_plain, require_shallow
 from physhandi.errors import RunError, UsageError, describe
 
 RUN_FORMAT = "physhandi-run/1"
@@ -27,6 +29,7 @@ RESERVE = ".reserve"
 """File of a run at work that is given up for the note on its end, where a disk is full."""
 
 _SAFE_PART = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*")
+_NUMBER = re.compile(r"[0-9]{1,9}")
 _BASE32 = "0123456789ABCDEFGHJKMNPQRSTVWXYZ"
 
 
@@ -39,6 +42,14 @@ def new_run_id() -> str:
 def now() -> str:
     """Give the current time in UTC as ISO 8601 text."""
     return datetime.now(UTC).isoformat(timespec="milliseconds")
+
+
+def moment_of(text: object) -> float | None:
+    """Read a time as `now` writes it [s since the epoch]; None if it is none."""
+    try:
+        return datetime.fromisoformat(text).timestamp() if isinstance(text, str) else None
+    except (ValueError, OverflowError):
+        return None
 
 
 def inside(folder: Path, rel: str) -> Path:
@@ -60,7 +71,7 @@ def attempt_numbers(run_folder: Path) -> list[int]:
     folder = run_folder / ATTEMPTS
     if not folder.is_dir():
         return []
-    return sorted(int(path.name) for path in folder.iterdir() if path.name.isdigit())
+    return sorted(int(path.name) for path in folder.iterdir() if _NUMBER.fullmatch(path.name))
 
 
 def artefacts(folder: Path) -> Iterator[tuple[str, Path]]:
@@ -82,7 +93,10 @@ def find_damage(folder: Path, records: dict[str, Any]) -> str | None:
     """Name the first file that is not what its record says; None if all are whole."""
     for rel, entry in records.items():
         record = named_fields(entry) or {}
-        path = inside(folder, rel)
+        try:
+            path = inside(folder, rel)
+        except RunError as error:
+            return str(error).rstrip(".")
         if not {"size", "sha256"} <= set(record):
             return f"{rel} has no size and SHA-256 on record"
         if not path.is_file():
@@ -92,6 +106,161 @@ def find_damage(folder: Path, records: dict[str, Any]) -> str | None:
         if file_record(path)["sha256"] != record["sha256"]:
             return f"{rel} has changed (its SHA-256 differs)"
     return None
+
+
+# ---- what the files hold; they may have fields beside these
+
+RunKind = Literal["reconstruction", "simulation"]
+RunEnd = Literal["succeeded", "failed", "cancelled"]
+
+Text = Annotated[str, Meta(pattern=r"^[^\x00]*$")]
+Name = Annotated[str, Meta(pattern=r"^[^\x00]*$", min_length=1)]
+Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+Seconds = Annotated[float, Meta(ge=0.0)]
+
+
+class JobFile(TypedDict):
+    """``job.yaml``: what a run was asked for."""
+
+    kind: RunKind
+    sequences: Annotated[list[Name], Meta(min_length=1)]
+    sequence_names: Annotated[list[Name], Meta(min_length=1)]
+    config: dict[str, Any]
+
+
+class AboutFile(TypedDict):
+    """``run.yaml``: what its user calls a run."""
+
+    name: Text
+    created: Text
+    label: NotRequired[Text]
+    note: NotRequired[Text]
+
+
+class ExitFile(TypedDict, total=False):
+    """``exit.json``: how a run ended."""
+
+    state: Required[RunEnd]
+    error: Text | None
+    error_type: Text | None
+    time: Text
+
+
+class EventLine(TypedDict, total=False):
+    """A line of ``events.jsonl``: one report; ``progress.json`` holds the latest."""
+
+    stage: Required[Text]
+    seq: Annotated[int, Meta(ge=-1, le=2**63 - 1)]
+    time: float
+    attempt: Count
+    iteration: float
+    total: float
+    loss: float | None
+    message: Text
+    eta_s: float | None
+
+
+class LeaseFile(TypedDict):
+    """``lease.json``: who works on a run."""
+
+    nonce: Text
+    pid: Annotated[int, Meta(ge=1, le=2**31 - 1)]
+    host: Text
+    time: float
+    process: NotRequired[Text | None]
+    process_created: NotRequired[float]
+
+
+class StageEntry(TypedDict, total=False):
+    """An entry of ``stages.json``: a finished stage."""
+
+    name: Required[Name]
+    time: Text
+    seconds: Seconds
+    summary: dict[str, Any]
+    files: dict[str, Any]
+
+
+class FileRecord(TypedDict):
+    """A file as ``MANIFEST.json`` knows it."""
+
+    size: Count
+    sha256: Text
+
+
+class ManifestFile(TypedDict):
+    """``MANIFEST.json``: what was published."""
+
+    files: dict[str, FileRecord]
+
+
+class EnvironmentFile(TypedDict, total=False):
+    """``environment.json``: what a run was computed with, as far as it is shown."""
+
+    started: Text
+    device: Text
+    device_name: Text | None
+    cpu_count: Count | None
+    system: Text
+    python: Text
+    commit: Text | None
+    packages: dict[str, Text]
+
+
+PartsFile = dict[str, dict[str, Any]]
+"""``metrics.json`` and ``losses.json``: fields of each sequence, or of each stage."""
+Kind = TypeVar("Kind")
+
+
+def checked(content: Any, kind: type[Kind], where: object) -> Kind:
+    """Check what was read from a file.
+
+    Args:
+        content: Plain data, as JSON and YAML give it.
+        kind: One of the classes above, or a list of them.
+        where: The file, for the message.
+
+    Returns:
+        The same content.
+
+    Raises:
+        RunError: If a field is missing or wrong; names file and field.
+    """
+    try:
+        msgspec.convert(content, kind)
+    except (msgspec.ValidationError, RecursionError) as error:
+        raise RunError(f"{where} is damaged: {_told(str(error))}.") from None
+    return cast("Kind", content)
+
+
+_WORDS = {
+    "str": "text",
+    "int": "a whole number",
+    "float": "a number",
+    "bool": "true or false",
+    "object": "named fields",
+    "array": "a list",
+    "null": "nothing",
+}
+
+
+def _told(problem: str) -> str:
+    """Put what msgspec finds into our words."""
+    what, _, place = problem.partition(" - at ")
+    lost = re.fullmatch(r"Object missing required field `(.+)`", what)
+    field = place.strip("`").removeprefix("$").lstrip(".").replace("[...]", "[…]")
+    if place.startswith("`key`"):
+        field, what = place.partition("`$.")[2].rstrip("`") or "it", "A name of a field is no text"
+    if lost:
+        return f"field '{f'{field}.' if field else ''}{lost[1]}' is missing"
+    what = re.sub(r"`([^`]*)`", lambda found: _kinds(found[1]), what)
+    what = re.sub(r"^Invalid enum value (.*)", r"\1 is not known", what)
+    what = what[:1].lower() + what[1:]
+    return f"field '{field}' is wrong ({what})" if field else what
+
+
+def _kinds(types: str) -> str:
+    return " or ".join(_WORDS.get(name, name) for name in types.split(" | "))
 
 
 @contextmanager
@@ -112,18 +281,58 @@ def reading(path: Path) -> Generator[None]:
         raise RunError(f"{path} is damaged: {error}") from error
 
 
+_LARGEST = {".json": 2**28, ".yaml": 2**22}
+"""Largest file that is read, by its ending [bytes]."""
+
+
+def _content_of(path: Path) -> bytes:
+    """Read a file of a run that is a plain file of sane size.
+
+    Raises:
+        FileNotFoundError: If it is missing.
+        ValueError: If it is something else than a file, or too large.
+        OSError: If it cannot be read.
+    """
+    status = path.stat()
+    if not stat.S_ISREG(status.st_mode):
+        raise ValueError("it is not a file")
+    most = _LARGEST.get(path.suffix, 2**22)
+    if status.st_size > most:
+        raise ValueError(f"it is larger than {most} bytes")
+    return path.read_bytes()
+
+
 def read_json(path: Path) -> Any:
-    """Read a JSON file.
+    """Read a JSON file; what it holds are text, finite numbers, lists and named fields.
 
     Raises:
         RunError: If it is missing or damaged.
     """
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return _present_json(path)
     except FileNotFoundError:
         raise RunError(f"{path} is missing.") from None
-    except (ValueError, RecursionError, OSError) as error:
-        raise RunError(f"{path} cannot be read as JSON: {error}") from error
+
+
+def _present_json(path: Path) -> Any:
+    """Read a JSON file; as `read_json`, but a missing one is a FileNotFoundError."""
+    try:
+        return _parse_json(_content_of(path))
+    except FileNotFoundError:
+        raise
+    except ValueError as error:
+        raise RunError(f"{path} cannot be read as JSON: {str(error).rstrip('.')}.") from error
+    except OSError as error:
+        raise RunError(f"{path} cannot be read as JSON: {describe(error)}") from error
+
+
+def _parse_json(content: bytes) -> Any:
+    try:
+        value = msgspec.json.decode(content)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+    require_shallow(value)
+    return value
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
@@ -132,26 +341,53 @@ def read_mapping(path: Path) -> dict[str, Any]:
     Raises:
         RunError: If it is damaged.
     """
-    if not path.is_file():
+    try:
+        content = named_fields(_present_json(path))
+    except FileNotFoundError:
         return {}
-    content = named_fields(read_json(path))
     if content is None:
         raise RunError(f"{path} must hold named fields; it is damaged.")
     return content
 
 
+def read_record(path: Path, kind: type[Kind]) -> Kind | None:
+    """Read a JSON file with the fields of a class above; None if there is none.
+
+    Raises:
+        RunError: If it is damaged; names the field.
+    """
+    try:
+        content = _present_json(path)
+    except FileNotFoundError:
+        return None
+    return checked(content, kind, path)
+
+
 def read_yaml(path: Path) -> Any:
-    """Read a YAML file.
+    """Read a YAML file; what it holds are text, finite numbers, lists and named fields.
 
     Raises:
         RunError: If it is missing or damaged.
     """
     try:
-        return parse_yaml(path.read_text(encoding="utf-8"))
+        content = parse_yaml(_content_of(path).decode("utf-8"))
+        require_plain(content)
     except FileNotFoundError:
         raise RunError(f"{path} is missing.") from None
-    except (ValueError, OSError) as error:
-        raise RunError(f"{path} cannot be read as YAML: {error}.") from error
+    except ValueError as error:
+        raise RunError(f"{path} cannot be read as YAML: {str(error).rstrip('.')}.") from error
+    except OSError as error:
+        raise RunError(f"{path} cannot be read as YAML: {describe(error)}") from error
+    return content
+
+
+def read_number(path: Path) -> int | None:
+    """Read a file that holds nothing but the number of an attempt; None if it does not."""
+    try:
+        content = _content_of(path).strip()
+    except (OSError, ValueError):
+        return None
+    return int(content) if _NUMBER.fullmatch(content.decode("ascii", "replace")) else None
 
 
 def read_events(run_folder: Path, offset: int = 0) -> tuple[list[dict[str, Any]], int]:
@@ -164,7 +400,7 @@ def read_events(run_folder: Path, offset: int = 0) -> tuple[list[dict[str, Any]]
     Returns:
         The new events (fields ``seq time stage iteration total loss message``) and the offset for
         the next call. A line that is still being written is left for the next call; a line that a
-        crash tore is skipped.
+        crash tore, or that is no report, is skipped.
     """
     path = run_folder / EVENTS
     if not path.is_file():
@@ -176,9 +412,8 @@ def read_events(run_folder: Path, offset: int = 0) -> tuple[list[dict[str, Any]]
     events: list[dict[str, Any]] = []
     for line in whole.splitlines():
         try:
-            event = named_fields(json.loads(line))
-        except ValueError:
+            event: dict[str, Any] = dict(checked(_parse_json(line), EventLine, path))
+        except (ValueError, RunError):
             continue
-        if event is not None:
-            events.append(event)
+        events.append(event)
     return events, offset + len(whole)

@@ -261,6 +261,29 @@ def _naming(path: Path) -> Generator[None, None, None]:
         raise OSError(error.errno, error.strerror, str(path)) from error
 
 
+def can_be_gone_on_with(temporary: Path) -> bool:
+    """Tell whether a hidden folder that nobody writes any more holds a part of an import."""
+    return (temporary / _CHECKPOINTS).is_file()
+
+
+def interrupted_replacements(root: Path) -> list[Path]:
+    """Find sequences that a writer moved out of the way before it was killed.
+
+    Args:
+        root: Folder of the sequences.
+
+    Returns:
+        Where they belong; they lie beside that as ``.<name>.replaced``.
+    """
+    found: list[Path] = []
+    for replaced in sorted(root.glob(".*.replaced")):
+        folder = root / replaced.name.removeprefix(".").removesuffix(".replaced")
+        is_written = any(not is_abandoned(path) for path in root.glob(f".{folder.name}.*.tmp"))
+        if not folder.exists() and not is_written:
+            found.append(folder)
+    return found
+
+
 def _recover(folder: Path) -> None:
     """Undo what a killed writer of the same folder left behind."""
     sweep_temporary(

@@ -43,7 +43,7 @@ def clock_set_by(seconds: float) -> Iterator[None]:
 def set_clocks(count: int, folder: Path) -> Report:
     """Look at a run at work, and let it renew its lease, while the clock is set otherwise."""
     alive = Run.create(
-        folder / "alive", name="alive", kind="reconstruction", sequences=[], config={}
+        folder / "alive", name="alive", kind="reconstruction", sequences=["/data/sheet"], config={}
     )
     wrong = done = 0
     with alive.begin_attempt() as attempt:

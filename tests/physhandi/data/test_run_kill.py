@@ -110,7 +110,11 @@ def kill_after(count: int, child: Any, written: Any, run: Run) -> None:
 
 def test_kills_in_the_middle_of_writing(tmp_path: Path) -> None:
     run = Run.create(
-        tmp_path / "fit", name="fit", kind="reconstruction", sequences=[], config={"a": 1}
+        tmp_path / "fit",
+        name="fit",
+        kind="reconstruction",
+        sequences=["/data/sheet"],
+        config={"a": 1},
     )
     context = multiprocessing.get_context("fork")
     chance = np.random.default_rng(7)
