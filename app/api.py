@@ -32,6 +32,8 @@ from app.jobs.recordings.annotations import (
 )
 from app.jobs.recordings.background import BackgroundTasks
 from app.jobs.recordings.imports import ImportOrder, Imports
+from app.jobs.recovery.aside import MovedFolder
+from app.jobs.recovery.recovery import Recovery
 from app.jobs.scheduler import Scheduler
 from app.jobs.streams import News, Streams
 from app.jobs.views import (
@@ -216,6 +218,7 @@ def create_api(
     tasks: BackgroundTasks,
     annotations: Annotations,
     imports: Imports,
+    recovery: Recovery,
 ) -> APIRouter:
     """Make the routes.
 
@@ -229,6 +232,7 @@ def create_api(
         tasks: Tells which recordings are being worked on.
         annotations: Finds masks and tracks.
         imports: Makes sequences of recordings.
+        recovery: Knows what is damaged.
     """
     router = APIRouter(prefix="/api/v1")
     _add_listings(router, catalog, scheduler)
@@ -239,6 +243,7 @@ def create_api(
     _add_sessions(router, sessions)
     _add_streams(router, catalog, scheduler, feed, machine)
     _add_system(router, overview)
+    _add_recovery(router, scheduler, recovery)
     return router
 
 
@@ -536,6 +541,26 @@ def _add_streams(
             lambda: {"machine": machine.load(), "run": machine.of_run(item.folder)},
         )
         return streams.answer(request, watch.news)
+
+
+def _add_recovery(router: APIRouter, scheduler: Scheduler, recovery: Recovery) -> None:
+    def answer(moved: MovedFolder) -> dict[str, str]:
+        return asdict(moved) | {"moved_to": f"damaged/{moved.kind}/{moved.name}"}
+
+    @router.get("/recovery")
+    def show_recovery() -> dict[str, Any]:
+        """Tell what was damaged or left behind in the data folder, and what was done about it."""
+        return recovery.describe()
+
+    @router.post("/runs/{run_id}/aside")
+    def set_run_aside(run_id: ItemId) -> dict[str, str]:
+        """Move a damaged run to `damaged/runs` of the data folder; nothing is deleted."""
+        return answer(scheduler.set_aside(run_id))
+
+    @router.post("/sequences/{sequence_id}/aside")
+    def set_sequence_aside(sequence_id: ItemId) -> dict[str, str]:
+        """Move a sequence that cannot be read to `damaged/sequences`; nothing is deleted."""
+        return answer(recovery.set_sequence_aside(sequence_id))
 
 
 def _add_system(router: APIRouter, overview: Overview) -> None:

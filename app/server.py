@@ -31,6 +31,7 @@ from app.jobs.recordings.annotations import Annotations
 from app.jobs.recordings.background import BackgroundTasks
 from app.jobs.recordings.imports import Imports
 from app.jobs.recordings.models import ModelFolders
+from app.jobs.recovery.recovery import Recovery
 from app.jobs.scheduler import QueueFullError, Scheduler
 from app.jobs.views import describe_run
 from app.jobs.watch import Feed
@@ -97,15 +98,12 @@ def create_app(
     catalog = catalog or Catalog(settings)
     cards = Cards()
     scheduler = scheduler or Scheduler(settings, catalog, choice=DeviceChoice(settings, cards))
-    storage = UserStorage(
-        PresetStore(settings.data_dir / "presets"),
-        RunSaver(catalog, settings.run_dir, scheduler.start_now, settings.sequence_dir),
-    )
-    sessions = sessions or Sessions(settings, catalog, storage)
+    sessions = sessions or Sessions(settings, catalog, _storage(settings, catalog, scheduler))
     machine = Machine(settings.data_dir, cards)
     feed = Feed(lambda: [describe_run(item, scheduler) for item in catalog.runs()])
     tasks = tasks or BackgroundTasks()
     imports = Imports(settings, catalog, tasks)
+    recovery = Recovery(settings, catalog, scheduler, tasks)
     pages = Pages()
     previews = Previews(settings, catalog)
     file_cache = FileCache(settings.data_dir / "cache" / "exports")
@@ -114,6 +112,7 @@ def create_app(
     async def lifespan(_: FastAPI) -> AsyncGenerator[None]:
         scheduler.start()
         previews.start()
+        recovery.start()
         yield
         tasks.shutdown()
         previews.shutdown()
@@ -146,6 +145,7 @@ def create_app(
             tasks=tasks,
             annotations=Annotations(catalog, tasks, models),
             imports=imports,
+            recovery=recovery,
         )
     )
     app.include_router(
@@ -159,11 +159,13 @@ def create_app(
             previews=previews,
             imports=imports,
             models=models,
+            recovery=recovery,
             suites=settings.suite_dir,
         )
     )
-    shares = Shares(settings.data_dir / "shares")
-    app.include_router(create_exports(catalog, sessions, pages, file_cache, shares))
+    app.include_router(
+        create_exports(catalog, sessions, pages, file_cache, Shares(settings.data_dir / "shares"))
+    )
     app.include_router(create_comparing(catalog, scheduler, pages))
     app.include_router(create_gate(sessions))
     app.mount("/assets", StaticFiles(directory=WEB_ASSETS), name="assets")
@@ -175,6 +177,12 @@ def create_app(
     _answer_errors(app, pages)
     _guard(app, security)
     return app
+
+
+def _storage(settings: ServerSettings, catalog: Catalog, scheduler: Scheduler) -> UserStorage:
+    """Say where live scenes keep what their users make."""
+    saver = RunSaver(catalog, settings.run_dir, scheduler.start_now, settings.sequence_dir)
+    return UserStorage(PresetStore(settings.data_dir / "presets"), saver)
 
 
 def _guard(app: FastAPI, security: Security) -> None:

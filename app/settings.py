@@ -146,6 +146,11 @@ class ServerSettings(BaseSettings):
         return self.data_dir / "suites"
 
     @property
+    def damaged_dir(self) -> Path:
+        """Folder of what could not be read and was moved out of the way, by kind."""
+        return self.data_dir / "damaged"
+
+    @property
     def launches_path(self) -> Path:
         """File that says which run was launched by which key of a client."""
         return self.data_dir / "launches.json"

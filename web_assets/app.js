@@ -108,6 +108,16 @@ async function act(button) {
   dispatchEvent(new Event("run-changed"));
 }
 
+/* What cannot be read is kept, out of the way. */
+async function moveAside(button) {
+  const { aside, id, name } = button.dataset;
+  if (!confirm(`Move the folder of “${name}” to damaged/${aside} of the data folder? Nothing is deleted.`)) return;
+  const { moved_to } = await send("POST", `/api/v1/${aside}/${id}/aside`);
+  toast(`Moved to ${moved_to}`);
+  if (document.getElementById("run")) location.href = "/recovery";
+  else location.reload();
+}
+
 async function remove(button) {
   if (!confirm(`Delete “${button.dataset.name}” with all its results?`)) return;
   await send("DELETE", `/api/v1/runs/${button.dataset.delete}`);
@@ -189,6 +199,7 @@ document.addEventListener("click", (event) => {
   const data = button.dataset;
   if ("open" in data) busy(button, () => openScene(button));
   else if ("act" in data) busy(button, () => act(button));
+  else if ("aside" in data) busy(button, () => moveAside(button));
   else if ("delete" in data) busy(button, () => remove(button));
   else if ("share" in data) busy(button, () => shareView(data.share, ""));
   else if ("new" in data) showForm(button);

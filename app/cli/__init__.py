@@ -6,7 +6,7 @@ import sys
 import tyro
 from tyro.extras import SubcommandApp
 
-from app.cli import benchmark, recordings, runs, serving
+from app.cli import benchmark, data_folder, recordings, runs, serving
 from app.cli.suite import evaluate_suite
 from physhandi.errors import PhysHandiError, UsageError, describe
 
@@ -53,6 +53,7 @@ def build() -> SubcommandApp:
     app.command(recordings.shape)
     app.command(benchmarks, name="benchmark", help="Measure speed; see docs/benchmarks.")
     app.command(serving.doctor)
+    app.command(data_folder.reindex)
     return app
 
 

@@ -44,8 +44,11 @@ def serve(
 
 
 def doctor(*, data_dir: DataDir = None) -> int:
-    """Check that this machine can run the demo."""
+    """Check that this machine can run the demo, and that nothing in the data folder is damaged."""
+    from app.cli.data_folder import look_through
+
     checks = [_check(name, probe) for name, probe in _probes(data_dir)]
+    checks += look_through(data_dir)
     print("\n".join(line for _, line in checks))
     return 0 if all(ok for ok, _ in checks) else 1
 

@@ -27,8 +27,9 @@ from app.exports.schema import errors
 from app.ids import ItemId
 from app.jobs.catalog import Catalog, NotFoundError
 from app.security import SHARED, bare_page
-from physhandi.data.files import sweep_temporary, temporary_name, write_json
-from physhandi.errors import UsageError
+from physhandi.data.files import temporary_name, write_json
+from physhandi.data.run_folder import read_json
+from physhandi.errors import RunError, UsageError, describe
 
 logger = logging.getLogger(__name__)
 
@@ -73,14 +74,13 @@ class Shares:
     """The shares of a data folder."""
 
     def __init__(self, folder: Path) -> None:
-        """Clean up what an earlier server left unfinished.
+        """Prepare; nothing is read yet.
 
         Args:
             folder: Where they are kept; made with the first.
         """
         self._folder = folder
         self._lock = threading.Lock()
-        sweep_temporary(folder.glob(".*.tmp*"))
 
     def add(self, page: Path, about: StoredShare) -> Share:
         """Keep a page under a new address.
@@ -114,13 +114,24 @@ class Shares:
 
     def all(self) -> list[Share]:
         """List the shares, the newest first; damaged ones are named in the log alone."""
+        found, problems = self._read_all()
+        for problem in problems:
+            logger.warning("%s", problem)
+        return sorted(found, key=lambda share: share.created, reverse=True)
+
+    def problems(self) -> list[str]:
+        """Say of each damaged share what is wrong."""
+        return self._read_all()[1]
+
+    def _read_all(self) -> tuple[list[Share], list[str]]:
         found: list[Share] = []
-        for folder in self._folder.glob("[!.]*"):
+        problems: list[str] = []
+        for folder in sorted(self._folder.glob("[!.]*")):
             try:
                 found.append(self._read(folder))
-            except (OSError, ValidationError) as error:
-                logger.warning("the share %s cannot be read: %s", folder, error)
-        return sorted(found, key=lambda share: share.created, reverse=True)
+            except RunError as error:
+                problems.append(str(error))
+        return found, problems
 
     def page(self, name: str) -> tuple[Path, str] | None:
         """Find the page of a share, and the run that it shows.
@@ -130,7 +141,7 @@ class Shares:
         """
         try:
             share = self._read(self._folder / name)
-        except (OSError, ValidationError):
+        except RunError:
             return None
         return self._folder / name / _PAGE, share.run
 
@@ -151,13 +162,17 @@ class Shares:
             return True
 
     def _read(self, folder: Path) -> Share:
-        about = StoredShare.model_validate_json((folder / _ABOUT).read_bytes())
-        return Share(
-            id=folder.name,
-            url=f"{SHARED}{folder.name}",
-            bytes=(folder / _PAGE).stat().st_size,
-            **about.model_dump(),
-        )
+        path = folder / _ABOUT
+        try:
+            about = StoredShare.model_validate(read_json(path))
+            size = (folder / _PAGE).stat().st_size
+        except ValidationError as error:
+            first = error.errors()[0]
+            field = ".".join(str(part) for part in first["loc"])
+            raise RunError(f"{path} is damaged: {field}: {first['msg']}.") from None
+        except OSError as error:
+            raise RunError(describe(error)) from None
+        return Share(id=folder.name, url=f"{SHARED}{folder.name}", bytes=size, **about.model_dump())
 
 
 def create_shares(catalog: Catalog, file_cache: FileCache, shares: Shares) -> APIRouter:

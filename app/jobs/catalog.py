@@ -12,16 +12,18 @@ from typing import Any, Generic, TypeVar
 
 from app.settings import BUNDLED, ServerSettings
 from physhandi.data.files import named_fields, write_atomically
-from physhandi.data.run_folder import JOB, RUN
+from physhandi.data.run_folder import JOB, RUN, read_mapping
 from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import FILE
-from physhandi.errors import PhysHandiError, RunError, SequenceError
+from physhandi.errors import PhysHandiError, RunError, SequenceError, describe
 from physhandi.run import Run
 
 logger = logging.getLogger(__name__)
 
 _FORMAT = "physhandi-run-index/1"
 _WORTH_SAVING = 50
+DEFECT = "a mistake of the program, whose log tells more"
+"""What is to blame where no error of ours was expected."""
 
 Stamp = tuple[int, ...]
 
@@ -57,9 +59,11 @@ class RunIndex:
             entry = self._entries.get(str(folder))
         if entry is not None and entry.get("stamp") == list(stamp):
             try:
-                job = entry["job"] | {"config": self._configs[entry["config"]]}
-                return Run(folder, job, entry["about"])
-            except (KeyError, TypeError):
+                job = (named_fields(entry["job"]) or {}) | {
+                    "config": self._configs[entry["config"]]
+                }
+                return Run.of_content(folder, job, entry["about"])
+            except (KeyError, RunError):
                 logger.warning("%s is damaged at run %s; it is read anew", self._path, folder.name)
         run = Run.open(folder)
         job = {
@@ -68,27 +72,37 @@ class RunIndex:
             "sequence_names": run.sequence_names,
         }
         about = {"name": run.name, "label": run.label, "note": run.note, "created": run.created}
-        try:
-            text = json.dumps(run.config, sort_keys=True)
-        except TypeError:
-            return run  # Its settings hold what JSON has not, such as a date: nothing to keep.
+        text = json.dumps(run.config, sort_keys=True)
         # Most runs of many have the settings of another one, and settings are most of a run.
         key = hashlib.sha256(text.encode()).hexdigest()
         with self._lock:
-            run.config = self._configs.setdefault(key, run.config)
+            if self._configs.get(key) == run.config:
+                run.config = self._configs[key]
+            else:
+                self._configs[key] = run.config
             entry = {"stamp": list(stamp), "job": job, "config": key, "about": about}
             self._entries[str(folder)] = entry
             self._unsaved += 1
         return run
 
-    def save(self, present: Callable[[], set[str]]) -> None:
+    def forget(self) -> None:
+        """Know no run any more; the file stays until the next `save`."""
+        with self._lock:
+            self._entries, self._configs, self._unsaved = {}, {}, 0
+
+    def save(self, present: Callable[[], set[str]], *, is_asked_for: bool = False) -> None:
         """Write the index if that is worth it by now.
 
         Args:
             present: Gives the folders of the runs that there are; others are forgotten.
+            is_asked_for: Whether it is written in any case, and an error is raised.
+
+        Raises:
+            OSError: If it was asked for and cannot be written.
         """
         with self._lock:
-            if self._unsaved < _WORTH_SAVING or self._entries is None:
+            is_due = is_asked_for or self._unsaved >= _WORTH_SAVING
+            if not is_due or self._entries is None:
                 return
             self._unsaved = 0
             folders = present()
@@ -100,16 +114,16 @@ class RunIndex:
                 content = json.dumps(stored).encode()
                 self._path.parent.mkdir(parents=True, exist_ok=True)
                 write_atomically(self._path, lambda file: file.write(content), is_durable=False)
-            except (OSError, TypeError, ValueError) as error:
+            except OSError as error:
+                if is_asked_for:
+                    raise
                 logger.warning("the index of runs is not kept: %s", error)
 
     def _read(self) -> dict[str, dict[str, Any]]:
         try:
-            content = named_fields(json.loads(self._path.read_bytes())) or {}
-        except FileNotFoundError:
-            return {}
-        except (OSError, ValueError, RecursionError) as error:
-            logger.warning("%s cannot be read, so runs are read anew: %s", self._path, error)
+            content = read_mapping(self._path)
+        except RunError as error:
+            logger.warning("runs are read anew: %s", error)
             return {}
         if content.get("format") != _FORMAT:
             return {}
@@ -213,6 +227,17 @@ class Catalog:
                 items.setdefault(item.id, item)
         self._index.save(lambda: self._runs.paths)
         return list(items.values())
+
+    def reindex(self) -> None:
+        """Make the index of runs anew from their folders.
+
+        Raises:
+            OSError: If it cannot be written.
+        """
+        self._index.forget()
+        self._runs = _Folders(self._index.open, (JOB, RUN))
+        self.runs()
+        self._index.save(lambda: self._runs.paths, is_asked_for=True)
 
     def sequence_item(self, sequence_id: str) -> SequenceItem:
         """Find a sequence by id, usable or not.
@@ -342,7 +367,10 @@ class _Folders(Generic[T]):
         try:
             return self._load(folder, stamp), None
         except (PhysHandiError, OSError) as error:
-            return None, str(error)
+            return None, describe(error)
+        except Exception as error:  # One folder must never hide the others.
+            logger.exception("%s cannot be opened", folder)
+            return None, f"{folder} cannot be opened: {DEFECT} ({type(error).__name__}: {error})."
 
 
 def _names_in(root: Path) -> Iterator[str]:

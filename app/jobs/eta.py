@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from itertools import islice
 from typing import Any
 
@@ -16,8 +15,8 @@ from app.jobs.catalog import Catalog, RunItem
 from physhandi.data import sequence as recordings
 from physhandi.data.environment import ENVIRONMENT, processor_name
 from physhandi.data.files import named_fields
-from physhandi.data.run_folder import CURRENT, EXIT, read_mapping
-from physhandi.errors import PhysHandiError, UsageError
+from physhandi.data.run_folder import CURRENT, EXIT, moment_of, read_mapping
+from physhandi.errors import PhysHandiError, RunError, UsageError
 from physhandi.fitting.checks.readiness import missing_for_hands, missing_for_object
 from physhandi.fitting.config import (
     EVALUATION,
@@ -295,7 +294,7 @@ class Forecast:
             if begun is None or expected is None:
                 return None
             left, stage_left = time_left(expected, _position_of(run, begun[0], now))
-        except (PhysHandiError, OSError, ValueError, KeyError, TypeError):
+        except (PhysHandiError, OSError, KeyError):
             return None  # Its folder is being removed, or is damaged.
         elapsed = max(0.0, now - begun[0])
         # Digits that nobody reads are left out, so that what is shown changes once a second.
@@ -415,10 +414,10 @@ class Forecast:
                 for stage in run.stages()
                 if isinstance(stage.get("seconds"), int | float)
             }
-            end = datetime.fromisoformat(str(read_mapping(run.folder / EXIT)["time"])).timestamp()
-        except (PhysHandiError, OSError, ValueError, KeyError):
+            end = moment_of(read_mapping(run.folder / EXIT).get("time"))
+        except (PhysHandiError, OSError):
             return None
-        if begun is None or not seconds:
+        if begun is None or end is None or not seconds:
             return None
         profile = str(settings.get("profile", ""))
         return FinishedFit(_values_of(settings), profile, begun[1], work, seconds, end)
@@ -454,10 +453,12 @@ def _begin_of(run: Run) -> tuple[float, tuple[Any, ...]] | None:
     """Tell when the latest attempt of a run began [s since the epoch] and on which machine."""
     try:
         about = named_fields(run.json(ENVIRONMENT)) or {} if run.has(ENVIRONMENT) else {}
-        started = datetime.fromisoformat(str(about["started"])).timestamp()
-    except (PhysHandiError, ValueError, KeyError, OSError):
+    except (PhysHandiError, OSError):
         return None
-    return started, tuple(about.get(name) for name in _MACHINE)
+    started, machine = moment_of(about.get("started")), [about.get(name) for name in _MACHINE]
+    if started is None or any(isinstance(fact, list | dict) for fact in machine):
+        return None
+    return started, tuple(machine)
 
 
 def _position_of(run: Run, begin: float, now: float) -> Position:
@@ -465,7 +466,8 @@ def _position_of(run: Run, begin: float, now: float) -> Position:
     finished: dict[str, float] = {}
     stage_begin = begin
     for stage in run.stages():
-        ended = datetime.fromisoformat(str(stage["time"])).timestamp()
+        if (ended := moment_of(stage.get("time"))) is None:
+            raise RunError(f"Run '{run.id}' does not tell when {stage['name']} ended.")
         finished[str(stage["name"])] = float(stage.get("seconds", 0.0)) if ended > begin else 0.0
         stage_begin = max(stage_begin, ended)
     current = next((name for name in STAGES if name not in finished), "")

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from physhandi.data.files import named_fields, write_json
+from physhandi.data.run_folder import read_mapping
 from physhandi.errors import RunError, UsageError
 
 logger = logging.getLogger(__name__)
@@ -91,11 +92,9 @@ class LaunchKeys:
 
     def _load(self) -> dict[str, tuple[str, str, bool]]:
         try:
-            content = named_fields(json.loads(self._path.read_bytes())) or {}
-        except FileNotFoundError:
-            return {}
-        except (OSError, ValueError, RecursionError) as error:
-            logger.warning("%s cannot be read, so its keys are forgotten: %s", self._path, error)
+            content = read_mapping(self._path)
+        except RunError as error:
+            logger.warning("its keys are forgotten: %s", error)
             return {}
         found: dict[str, tuple[str, str, bool]] = {}
         for key, entry in (named_fields(content.get("launches")) or {}).items():

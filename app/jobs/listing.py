@@ -27,7 +27,10 @@ Sort = Literal[
     "-predicted",
 ]
 """A column to sort by; with a minus, from high to low."""
-STATES = ("queued", "starting", "running", "stopping", "succeeded", "failed", "cancelled")
+STATES = (
+    *("queued", "starting", "running", "stopping"),
+    *("succeeded", "failed", "cancelled", "damaged"),
+)
 """States in the order in which they come."""
 _FIELDS = {
     "name": "name",

@@ -99,15 +99,26 @@ def claim_supervision(run_folder: Path) -> int | None:
 
 def supervisor_of(run_folder: Path) -> int | None:
     """Give the process id of a run's live supervisor; None if it has none."""
+    return process_with_lock(run_folder / _LOCK)
+
+
+def process_with_lock(path: Path) -> int | None:
+    """Give the process id that whoever has locked a file wrote into it; None if nobody has.
+
+    It is 0 while that is being written.
+    """
     try:
-        descriptor = os.open(run_folder / _LOCK, os.O_RDONLY)
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     except OSError:
         return None
     try:
         if _try_lock(descriptor, fcntl.LOCK_SH):
             return None
         # The kernel lets go of the lock when its process ends, however it ends.
-        return int(os.read(descriptor, 32) or b"0")
+        content = os.read(descriptor, 32)
+        return int(content) if content.isdigit() else 0
+    except OSError:
+        return None
     finally:
         os.close(descriptor)
 

@@ -6,13 +6,14 @@ import os
 import subprocess
 import threading
 import time
+from collections import deque
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from app.jobs.catalog import Catalog, RunItem
+from app.jobs.catalog import DEFECT, Catalog, RunItem
 from app.jobs.device_choice import DeviceChoice
 from app.jobs.eta import Forecast
 from app.jobs.launch_keys import KeyedRequest, LaunchKeys
@@ -22,10 +23,12 @@ from app.jobs.processes import (
     WORKER,
     end_processes,
     marked_processes,
+    process_with_lock,
     processes_of,
     start_supervisor,
     supervisor_of,
 )
+from app.jobs.recovery.aside import MovedFolder, move_aside
 from app.jobs.ticket import (
     QUEUED,
     STARTED,
@@ -39,7 +42,8 @@ from app.jobs.ticket import (
 )
 from app.settings import ServerSettings
 from physhandi.data.lease import live_holder
-from physhandi.data.run_folder import EXIT, new_run_id
+from physhandi.data.run import not_whole
+from physhandi.data.run_folder import EXIT, new_run_id, now
 from physhandi.errors import PhysHandiError, RunError, UsageError, describe
 from physhandi.run import Run
 
@@ -68,14 +72,20 @@ def claim_folder(data_dir: Path) -> int:
     return descriptor
 
 
+def server_of(data_dir: Path) -> int | None:
+    """Give the process id of the server that works on a data folder; None if there is none."""
+    return process_with_lock(data_dir / _LOCK)
+
+
 logger = logging.getLogger(__name__)
 
 AT_WORK = frozenset({"starting", "running", "stopping"})
-ENDED = frozenset({"succeeded", "failed", "cancelled"})
+ENDED = frozenset({"succeeded", "failed", "cancelled", "damaged"})
 _LOST = "It lost its process, which something outside ended."
 _INTERVAL_S = 0.25
 _IDLE_INTERVAL_S = 1.0
 _SWEEP_INTERVAL_S = 5.0
+_KEPT_RESTARTS = 100
 
 
 class QueueFullError(PhysHandiError):
@@ -87,7 +97,7 @@ class JobView:
     """State and progress of a run, for people."""
 
     state: str
-    """queued, starting, running, stopping, succeeded, failed or cancelled."""
+    """queued, starting, running, stopping, succeeded, failed, cancelled or damaged."""
     place: int | None = None
     """Place in the queue, counted from 1."""
     reason: str = ""
@@ -96,6 +106,18 @@ class JobView:
     """The latest report of the worker."""
     is_published: bool = False
     """Whether there are results to look at."""
+
+
+@dataclass(frozen=True)
+class LostRun:
+    """What was done with a run that had lost its process."""
+
+    time: str
+    """When, ISO 8601."""
+    run: str
+    """Id of the run."""
+    why: str
+    """What happened, and what became of it."""
 
 
 class Scheduler:
@@ -130,6 +152,7 @@ class Scheduler:
         self._stopping: dict[str, threading.Thread] = {}
         self._ended: dict[str, tuple[int, JobView]] = {}
         self._hindered: dict[str, str] = {}
+        self._restarts: deque[LostRun] = deque(maxlen=_KEPT_RESTARTS)
         self._line: tuple[str, ...] = ()
         self._busy: tuple[str, ...] = ()
         self._known: dict[str, Run] = {}
@@ -254,7 +277,7 @@ class Scheduler:
         """
         with self._lock:
             run, view = self._own(run_id)
-            if view.state not in {"failed", "cancelled"}:
+            if view.state not in {"failed", "cancelled", "damaged"}:
                 raise RunError(
                     f"Run '{run_id}' is {view.state}; only a failed or cancelled run is resumed."
                 )
@@ -297,10 +320,40 @@ class Scheduler:
             run.delete()
             self._keys.note_deleted(run_id)
 
+    def set_aside(self, run_id: str) -> MovedFolder:
+        """Move the folder of a damaged run out of the way.
+
+        Raises:
+            RunError: If the run is unknown, bundled, of a suite, at work, or not damaged.
+        """
+        with self._lock:
+            item = self._catalog.run_item(run_id)
+            if item.folder.parent != self._settings.run_dir:
+                whose = "came with the program" if item.is_bundled else "belongs to a suite"
+                raise RunError(f"Run '{run_id}' {whose} and stays as it is.")
+            view = self.view(item)
+            if view.state != "damaged":
+                raise RunError(
+                    f"Run '{run_id}' is {view.state}; only a damaged one is moved aside."
+                )
+            is_watched = supervisor_of(item.folder) is not None or run_id in self._stopping
+            if is_watched or live_holder(item.folder) is not None:
+                raise RunError(
+                    f"Run '{run_id}' is damaged, but processes work on it. Wait until they have "
+                    "ended before you move it aside."
+                )
+            self._hindered.pop(run_id, None)
+            return move_aside(item.folder, "runs", self._settings.damaged_dir, view.reason)
+
     @property
     def slots(self) -> int:
         """Number of fits that run side by side."""
         return self._settings.slots
+
+    @property
+    def restarts(self) -> list[LostRun]:
+        """The runs that had lost their process, as far as this server saw it; the latest last."""
+        return list(self._restarts)
 
     def at_work(self) -> list[Run]:
         """List the runs that have a place, as the queue saw them last."""
@@ -313,7 +366,7 @@ class Scheduler:
     def view(self, item: RunItem) -> JobView:
         """Tell how far a run is and why it waits."""
         if item.run is None:
-            return JobView("failed", reason=str(item.error))
+            return JobView("damaged", reason=str(item.error))
         try:
             stamp = item.folder.stat().st_mtime_ns
             entry = self._ended.get(item.id)
@@ -321,9 +374,12 @@ class Scheduler:
                 return entry[1]
             view = self._look(item.run)
         except (PhysHandiError, OSError) as error:
-            return JobView("failed", reason=str(error))
+            return JobView("damaged", reason=describe(error))
+        except Exception as error:  # One folder must never stop the queue.
+            logger.exception("run %s cannot be looked at", item.id)
+            return JobView("damaged", reason=f"It cannot be looked at: {DEFECT} ({error!r}).")
         # Every change of state makes or removes a file of the folder, which changes its time.
-        if view.state in ENDED and time.time_ns() - stamp > 2e9:
+        if view.state in ENDED - {"damaged"} and time.time_ns() - stamp > 2e9:
             self._ended[item.id] = (stamp, view)
         return view
 
@@ -332,9 +388,11 @@ class Scheduler:
         is_running = live_holder(run.folder) is not None
         if run.id in self._stopping:
             # Until nothing is left: what is started meanwhile would be ended with the rest.
-            return JobView("stopping", reason="Ending its processes.", progress=run.progress)
+            told, _ = _told_by(run)
+            return JobView("stopping", reason="Ending its processes.", progress=told)
         if is_running:
-            return JobView("running", reason=_remark(run.folder), progress=run.progress)
+            told, problem = _told_by(run)
+            return JobView("running", reason=_remark(run.folder) or problem, progress=told)
         if (run.folder / QUEUED).is_file():
             return self._look_in_line(run)
         started = self._started.get(run.id)
@@ -352,9 +410,11 @@ class Scheduler:
         state = run.state
         if state == "queued":
             return JobView("failed", reason="It was never started. Resume starts it.")
-        return JobView(
-            state, reason=run.error or "", progress=run.progress, is_published=run.is_published
-        )
+        if state == "succeeded" and not run.is_published:
+            return JobView("damaged", reason=not_whole(run.id))
+        told, problem = _told_by(run)
+        reason = run.error or problem
+        return JobView(state, reason=reason, progress=told, is_published=run.is_published)
 
     def _look_in_line(self, run: Run) -> JobView:
         line, busy = self._line, self._busy
@@ -488,6 +548,9 @@ class Scheduler:
             end_processes(folder, grace_s=0.0)
             with self._hindering(folder.name):
                 start_again_or_end(folder, _LOST)
+                is_again = (folder / QUEUED).is_file()
+                did = "It was put back in line." if is_again else "It has failed."
+                self._restarts.append(LostRun(now(), folder.name, f"{_LOST} {did}"))
                 self._wake.set()
 
     def _lost_runs(self) -> list[Path]:
@@ -554,6 +617,14 @@ def require_unread(catalog: Catalog, sequence: Path) -> None:
 
 def _is_at(path: str, folder: Path) -> bool:
     return Path(path).name == folder.name and Path(path).resolve() == folder
+
+
+def _told_by(run: Run) -> tuple[dict[str, Any], str]:
+    """Give a run's latest report; if it is damaged, which costs no more than the report, why."""
+    try:
+        return run.progress, ""
+    except RunError as error:
+        return {}, str(error)
 
 
 def _remark(folder: Path) -> str:

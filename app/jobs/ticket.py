@@ -1,13 +1,13 @@
 """A run's ticket: its place in line, and how often it was started, as its folder keeps it."""
 
-import json
 from dataclasses import asdict, dataclass, replace
-from math import isfinite
 from pathlib import Path
+from typing import Any
 
-from physhandi.data.files import named_fields, write_json
+from physhandi.data.files import write_json
 from physhandi.data.lease import live_holder, locked
-from physhandi.data.run_folder import CANCEL, EXIT, RESERVE, now
+from physhandi.data.run_folder import CANCEL, EXIT, RESERVE, now, read_record
+from physhandi.errors import RunError
 
 QUEUED = "queued.json"
 """File in a run's folder that puts it into the queue; the queue survives a restart."""
@@ -41,16 +41,15 @@ class Ticket:
 def read_ticket(path: Path) -> Ticket | None:
     """Read a ticket; None if there is none. Fields that are damaged are as in a new one."""
     try:
-        content = named_fields(json.loads(path.read_bytes())) or {}
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError, RecursionError):
+        if (content := read_record(path, dict[str, Any])) is None:
+            return None
+    except RunError:
         return Ticket()
     time, starts = content.get("time"), content.get("starts")
     why, device = content.get("why"), content.get("device")
     return Ticket(
-        time=time if isinstance(time, float) and isfinite(time) else 0.0,
-        starts=starts if isinstance(starts, int) else 0,
+        time=time if isinstance(time, float) else 0.0,
+        starts=starts if isinstance(starts, int) and starts > 0 else 0,
         why=why if isinstance(why, str) else "",
         device=device if isinstance(device, str) else "",
     )

@@ -17,13 +17,27 @@ from physhandi import errors
 from physhandi.data.environment import ENVIRONMENT
 from physhandi.data.files import named_fields
 from physhandi.data.layout import LOSSES_FILE, METRICS_FILE, PARAMETERS_FILE, SequenceFiles
-from physhandi.data.run_folder import EXIT, read_events, read_mapping
-from physhandi.errors import PhysHandiError
+from physhandi.data.run_folder import (
+    EXIT,
+    EnvironmentFile,
+    PartsFile,
+    checked,
+    moment_of,
+    read_events,
+    read_mapping,
+)
+from physhandi.errors import PhysHandiError, describe
 from physhandi.fitting.config import SIMULATION, STAGES
 from physhandi.run import Run
 
 PARTS = ("color", "depth", "mask", "keypoint", "track", "control", "marker", "object_node")
-_RESULTS = (LOSSES_FILE, METRICS_FILE, PARAMETERS_FILE, ENVIRONMENT)
+_SHOWN: dict[str, tuple[str, Any]] = {
+    "losses": (LOSSES_FILE, PartsFile),
+    "metrics": (METRICS_FILE, PartsFile),
+    "environment": (ENVIRONMENT, EnvironmentFile),
+    "parameters": (PARAMETERS_FILE, dict[str, Any]),
+}
+"""What a run's page shows of its results, with file and shape."""
 CURVE_LIMIT = 2000
 """Most points of a curve that are sent to a browser."""
 # Runs and the views of ended runs stay the same objects while nothing changes on disk, so a long
@@ -134,7 +148,7 @@ def _describe(item: RunItem, view: JobView) -> dict[str, Any]:
             "profile": str(profile.get("profile", "")),
             "tags": tags_of(run.label),
             "note": run.note,
-            "error": view.reason if view.state == "failed" else None,
+            "error": view.reason if view.state in {"failed", "damaged"} else None,
         }
         | asdict(summarize_run(run) if view.is_published else RunSummary())
     )
@@ -156,11 +170,15 @@ def follow_run(item: RunItem, scheduler: Scheduler) -> dict[str, Any]:
         if run is not None:
             stages = stages_of(run, state)
             results = [
-                (rel, (run.out / rel).stat().st_mtime_ns) for rel in _RESULTS if run.has(rel)
+                (rel, (run.out / rel).stat().st_mtime_ns)
+                for rel, _ in _SHOWN.values()
+                if run.has(rel)
             ]
     except (PhysHandiError, OSError) as error:
-        described |= {"state": "failed", "reason": str(error)}
-    failure = asdict(explain(run, described["reason"])) if state == "failed" else None
+        described |= {"reason": described["reason"] or describe(error)}
+    failure = None
+    if state in {"failed", "damaged"}:
+        failure = asdict(explain(run, described["reason"], is_damaged=state == "damaged"))
     shown = [described | {"progress": None, "estimate": None}, results, failure]
     shown += [stage | {"seconds": None} for stage in stages]
     revision = hashlib.sha256(json.dumps(shown, default=str).encode()).hexdigest()[:16]
@@ -277,8 +295,7 @@ def _running_since(run: Run, finished: Sequence[Mapping[str, Any]]) -> float | N
     """When the stage that is at work began: at the end of the one before, or of this attempt."""
     environment = named_fields(run.json(ENVIRONMENT)) if run.has(ENVIRONMENT) else None
     times = [(environment or {}).get("started"), *(stage.get("time") for stage in finished[-1:])]
-    begins = [datetime.fromisoformat(time).timestamp() for time in times if isinstance(time, str)]
-    return max(begins, default=None)
+    return max((begin for time in times if (begin := moment_of(time)) is not None), default=None)
 
 
 _ADVICE = {
@@ -317,15 +334,17 @@ class Failure:
     """What the user can do."""
 
 
-def explain(run: Run | None, reason: str) -> Failure:
-    """Tell why a run failed and what to do.
+def explain(run: Run | None, reason: str, *, is_damaged: bool = False) -> Failure:
+    """Tell why a run failed or is damaged, and what to do.
 
     Args:
-        run: The failed run; None if its folder is damaged.
+        run: The run; None if it cannot be opened.
         reason: What the queue knows of it.
+        is_damaged: Whether it can be opened, but not be told how it ended.
     """
-    if run is None:
-        return Failure(reason, "Repair the named file, or delete the run's folder.")
+    if run is None or is_damaged:
+        mend = "Repair the named file" if run is None else "Resume computes again what is lost"
+        return Failure(reason, f"{mend}, or move the run's folder aside.")
     kind = str(read_mapping(run.folder / EXIT).get("error_type", ""))
     if kind in _ADVICE:
         return Failure(reason, _ADVICE[kind])
@@ -456,16 +475,16 @@ def _mean(weighted: list[tuple[float, float]]) -> float | None:
 def describe_results(run: Run) -> dict[str, dict[str, Any]]:
     """Collect what a run has found so far: losses, metrics, parameters and environment."""
     results: dict[str, dict[str, Any]] = {}
-    try:
-        for name in ("losses", "metrics"):
-            if run.has(f"{name}.json"):
-                results[name] = named_fields(run.json(f"{name}.json")) or {}
-        if run.has(ENVIRONMENT):
-            results["environment"] = named_fields(run.json(ENVIRONMENT)) or {}
-        if run.has(PARAMETERS_FILE):
-            results["parameters"] = named_fields(run.yaml(PARAMETERS_FILE)) or {}
-    except PhysHandiError as error:
-        results["problem"] = {"message": str(error)}
+    problems: list[str] = []
+    for name, (rel, kind) in _SHOWN.items():
+        try:
+            if run.has(rel):
+                content = run.yaml(rel) if rel.endswith(".yaml") else run.json(rel)
+                results[name] = dict(checked(content, kind, rel))
+        except (PhysHandiError, OSError) as error:
+            problems.append(describe(error))
+    if problems:
+        results["problem"] = {"message": " ".join(problems)}
     return results
 
 
@@ -485,9 +504,8 @@ def read_frame_errors(run: Run) -> dict[str, dict[str, Any]]:
         content = named_fields(run.json(rel)) or {}
         scores = named_fields(metrics.get(name)) or {}
         future = (named_fields(scores.get("future")) or {}).get("frames")
-        errors_of[name] = content | {
-            "future_start": future[0] if isinstance(future, list) else None
-        }
+        start = cast("list[Any]", future)[0] if isinstance(future, list) and future else None
+        errors_of[name] = content | {"future_start": start}
     return errors_of
 
 
@@ -503,9 +521,9 @@ def loss_curves(run: Run) -> tuple[dict[str, dict[str, Any]], int]:
     events, _ = read_events(run.folder)
     latest = -1
     for event in events:
-        latest = int(event.get("seq", latest))
+        latest = event.get("seq", latest)
         loss, iteration = event.get("loss"), event.get("iteration")
-        if not isinstance(loss, int | float) or not isinstance(iteration, int):
+        if loss is None or not isinstance(iteration, int):
             continue
         curve = curves.setdefault(str(event.get("stage")), [])
         while curve and iteration <= curve[-1][0]:
@@ -540,5 +558,9 @@ def thin(curve: list[list[float]], limit: int) -> list[list[float]]:
 
 def _points(curve: object) -> list[list[float]]:
     """Keep the points of a stored curve that have a finite loss."""
-    points = cast("list[Any]", curve) if isinstance(curve, list) else []
-    return [[p[0], p[1]] for p in points if isinstance(p, list) and None not in p]
+    found: list[list[float]] = []
+    for point in cast("list[Any]", curve) if isinstance(curve, list) else []:
+        values = cast("list[Any]", point)[:2] if isinstance(point, list) else []
+        if len(values) == 2 and all(isinstance(value, int | float) for value in values):
+            found.append(values)
+    return found

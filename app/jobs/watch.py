@@ -113,7 +113,7 @@ class Watch:
     def _reports(self) -> Iterator[News]:
         events, self._offset = read_events(self._folder, self._offset)
         for event in events:
-            number = int(event.get("seq", -1))
+            number = event.get("seq", -1)
             if number > self._seen:
                 self._seen = number
                 yield self._name, "progress", event

@@ -160,9 +160,11 @@ def unit_of_metric(parts: set[str], unit: str) -> str:
 
 
 def _fact(name: str, value: Any) -> str:
-    if name == "frames" and isinstance(value, list):
-        first, end = cast("list[int]", value)
-        return f"{first} to {end - 1}"
+    match (name, cast("object", value)):
+        case "frames", [int(first), int(end)]:
+            return f"{first} to {end - 1}"
+        case _:
+            pass
     fields = named_fields(value)
     if fields is not None:
         return ", ".join(f"{words(key)} {_fact(key, inner)}" for key, inner in fields.items())

@@ -16,6 +16,7 @@ from app.jobs.order import describe_settings, order_of
 from app.jobs.overview import Overview
 from app.jobs.recordings.imports import Imports
 from app.jobs.recordings.models import ModelFolders
+from app.jobs.recovery.recovery import Recovery
 from app.jobs.scheduler import ENDED, Scheduler
 from app.jobs.views import describe_results, describe_run, describe_sequence, follow_run
 from app.jobs.watch import Feed
@@ -49,6 +50,7 @@ def create_pages(
     previews: Previews,
     imports: Imports,
     models: ModelFolders,
+    recovery: Recovery,
     suites: Path,
 ) -> APIRouter:
     """Make the routes of the pages.
@@ -63,6 +65,7 @@ def create_pages(
         previews: Keeps small pictures.
         imports: Finds recordings.
         models: Finds networks of the user.
+        recovery: Knows what is damaged.
         suites: Folder of suites.
     """
     router = APIRouter(include_in_schema=False)
@@ -72,6 +75,7 @@ def create_pages(
     add_imports(router, catalog, imports, pages)
     add_suites(router, suites, pages)
     _add_launch(router, catalog, overview, pages)
+    _add_recovery(router, recovery, pages)
 
     @router.get("/runs/{run_id}")
     def run(run_id: ItemId) -> HTMLResponse:
@@ -138,6 +142,12 @@ def create_pages(
         return Response(image, media_type="image/jpeg", headers=headers)
 
     return router
+
+
+def _add_recovery(router: APIRouter, recovery: Recovery, pages: Pages) -> None:
+    @router.get("/recovery")
+    def show_recovery() -> HTMLResponse:
+        return pages.render("recovery.html", found=recovery.describe())
 
 
 def _add_launch(router: APIRouter, catalog: Catalog, overview: Overview, pages: Pages) -> None:

@@ -90,7 +90,7 @@ def file_record(path: Path) -> dict[str, Any]:
 
 
 def find_damage(folder: Path, records: dict[str, Any]) -> str | None:
-    """Name the first file that is not what its record says; None if all are whole."""
+    """SomeText the first file that is not what its record says; None if all are whole."""
     for rel, entry in records.items():
         record = named_fields(entry) or {}
         try:
@@ -114,8 +114,8 @@ RunKind = Literal["reconstruction", "simulation"]
 RunEnd = Literal["succeeded", "failed", "cancelled"]
 
 Text = Annotated[str, Meta(pattern=r"^[^\x00]*$")]
-Name = Annotated[str, Meta(pattern=r"^[^\x00]*$", min_length=1)]
-Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+SomeText = Annotated[str, Meta(pattern=r"^[^\x00]*$", min_length=1)]
+WholeNumber = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Seconds = Annotated[float, Meta(ge=0.0)]
 
 
@@ -123,8 +123,8 @@ class JobFile(TypedDict):
     """``job.yaml``: what a run was asked for."""
 
     kind: RunKind
-    sequences: Annotated[list[Name], Meta(min_length=1)]
-    sequence_names: Annotated[list[Name], Meta(min_length=1)]
+    sequences: Annotated[list[SomeText], Meta(min_length=1)]
+    sequence_names: Annotated[list[SomeText], Meta(min_length=1)]
     config: dict[str, Any]
 
 
@@ -152,7 +152,7 @@ class EventLine(TypedDict, total=False):
     stage: Required[Text]
     seq: Annotated[int, Meta(ge=-1, le=2**63 - 1)]
     time: float
-    attempt: Count
+    attempt: WholeNumber
     iteration: float
     total: float
     loss: float | None
@@ -174,7 +174,7 @@ class LeaseFile(TypedDict):
 class StageEntry(TypedDict, total=False):
     """An entry of ``stages.json``: a finished stage."""
 
-    name: Required[Name]
+    name: Required[SomeText]
     time: Text
     seconds: Seconds
     summary: dict[str, Any]
@@ -184,7 +184,7 @@ class StageEntry(TypedDict, total=False):
 class FileRecord(TypedDict):
     """A file as ``MANIFEST.json`` knows it."""
 
-    size: Count
+    size: WholeNumber
     sha256: Text
 
 
@@ -200,7 +200,7 @@ class EnvironmentFile(TypedDict, total=False):
     started: Text
     device: Text
     device_name: Text | None
-    cpu_count: Count | None
+    cpu_count: WholeNumber | None
     system: Text
     python: Text
     commit: Text | None
@@ -209,10 +209,10 @@ class EnvironmentFile(TypedDict, total=False):
 
 PartsFile = dict[str, dict[str, Any]]
 """``metrics.json`` and ``losses.json``: fields of each sequence, or of each stage."""
-Kind = TypeVar("Kind")
+Checked = TypeVar("Checked")
 
 
-def checked(content: Any, kind: type[Kind], where: object) -> Kind:
+def checked(content: Any, kind: type[Checked], where: object) -> Checked:
     """Check what was read from a file.
 
     Args:
@@ -230,7 +230,7 @@ def checked(content: Any, kind: type[Kind], where: object) -> Kind:
         msgspec.convert(content, kind)
     except (msgspec.ValidationError, RecursionError) as error:
         raise RunError(f"{where} is damaged: {_told(str(error))}.") from None
-    return cast("Kind", content)
+    return cast("Checked", content)
 
 
 _WORDS = {
@@ -350,7 +350,7 @@ def read_mapping(path: Path) -> dict[str, Any]:
     return content
 
 
-def read_record(path: Path, kind: type[Kind]) -> Kind | None:
+def read_record(path: Path, kind: type[Checked]) -> Checked | None:
     """Read a JSON file with the fields of a class above; None if there is none.
 
     Raises:

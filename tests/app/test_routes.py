@@ -183,7 +183,7 @@ def test_a_damaged_folder_is_listed_with_its_error(world: QueueWorld) -> None:
         folder.mkdir()
         (folder / file).write_text("name: [")
     run = world.client.get("/api/v1/runs").json()["runs"][0]
-    assert (run["id"], run["state"]) == ("broken", "failed")
+    assert (run["id"], run["state"]) == ("broken", "damaged")
     assert run["error"]
     assert world.client.get("/runs/broken").status_code == 200
     sequences = world.client.get("/api/v1/sequences").json()["sequences"]

@@ -102,6 +102,12 @@ def test_damaged_scores_make_no_table(scores: object) -> None:
     assert tabulate(scores) == {"tables": [], "notes": []}
 
 
+@pytest.mark.parametrize("frames", [[3], [], ["a", 2], {"a": [1]}, None])
+def test_frames_that_are_none_are_shown_as_they_are(frames: Any) -> None:
+    (table,) = tabulate({"future": {"frames": frames, "rollout": {"chamfer_l2": 0.01}}})["tables"]
+    assert " to " not in table["note"]
+
+
 def test_every_parameter_is_explained_where_it_is_declared() -> None:
     notes = {name: meaning_of(name) for name in SimulationParameters().to_dict()}
     assert all(about for about, _ in notes.values())

@@ -2,7 +2,6 @@
 
 import math
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from bad_input_world import Terminal
+from damaged_files import places
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from property_tests import SAME_EVERYWHERE
@@ -53,15 +53,6 @@ def gate(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> Terminal:
 
     monkeypatch.setattr(pipeline, "run_job", stop)
     return terminal
-
-
-def places(content: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Walk through all places of nested lists and fields."""
-    items = content.items() if isinstance(content, dict) else enumerate(content)
-    for key, value in items:
-        yield (*at, key)
-        if isinstance(value, list | dict):
-            yield from places(value, (*at, key))
 
 
 def answers(terminal: Terminal, *order: object) -> str:
