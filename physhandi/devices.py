@@ -67,11 +67,12 @@ def pick_devices(names: str) -> tuple[str, ...]:
     start_warp()
     if names == "all":
         return tuple(str(device) for device in wp.get_cuda_devices()) or ("cpu",)
-    devices = tuple(pick_device(name.strip()) for name in names.split(","))
+    named = [name.strip() for name in names.split(",")]
+    if len(named) > 1 and "cpu" in named:
+        raise UsageError(f"'{names}' names the CPU beside a GPU, which is faster; leave it out.")
+    devices = tuple(pick_device(name) for name in named)
     if len(set(devices)) < len(devices):
         raise UsageError(f"'{names}' names a device twice.")
-    if len(devices) > 1 and "cpu" in devices:
-        raise UsageError(f"'{names}' names the CPU beside a GPU, which is faster; leave it out.")
     return devices
 
 

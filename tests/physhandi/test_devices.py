@@ -57,8 +57,8 @@ def test_a_device_is_picked_by_name() -> None:
         pick_device("tpu")
     assert pick_devices("auto") == (pick_device("auto"),)
     assert card_of("cpu") is None
-    with pytest.raises(UsageError, match="names a device twice"):
-        pick_devices("cpu, cpu")
+    with pytest.raises(UsageError, match="the CPU beside a GPU"):
+        pick_devices("cuda:0, cpu")
     if not has_cuda_driver():
         assert pick_devices("all") == ("cpu",)
         with pytest.raises(UsageError, match="no device 'cuda:0'"):
@@ -71,5 +71,5 @@ def test_all_means_every_gpu_and_each_has_a_card() -> None:
     devices = pick_devices("all")
     assert devices[0] == "cuda:0"
     assert len(devices) == wp.get_cuda_device_count() == len({card_of(name) for name in devices})
-    with pytest.raises(UsageError, match="the CPU beside a GPU"):
-        pick_devices("cuda:0,cpu")
+    with pytest.raises(UsageError, match="names a device twice"):
+        pick_devices("cuda:0, cuda")
