@@ -469,7 +469,8 @@ def _add_sessions(router: APIRouter, sessions: Sessions) -> None:
     @router.post("/sessions", status_code=201)
     def open_session(new: NewScene, request: Request) -> dict[str, str]:
         target = new.query if isinstance(new, NewComparison) else new.id
-        session_id = sessions.open(new.kind, target, request.state.owner)
+        may_keep = request.state.may_change
+        session_id = sessions.open(new.kind, target, request.state.owner, may_keep=may_keep)
         return {"id": session_id, "url": f"/live/{session_id}"}
 
     def find(session_id: str, request: Request) -> AnySession:

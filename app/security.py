@@ -10,6 +10,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from urllib.parse import parse_qsl, urlencode
 
 from starlette.datastructures import Headers, MutableHeaders
@@ -18,6 +19,8 @@ from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Re
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app.settings import ServerSettings, is_loopback
+from app.token_file import read_or_make_token
+from physhandi.errors import UsageError
 
 logger = logging.getLogger(__name__)
 
@@ -26,6 +29,21 @@ _WRONG_TOKENS_PER_MINUTE = 20
 _CLIENTS_REMEMBERED = 1000
 _HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(?::[0-9]{1,5})?")
 """A Host header: a name or an address, and maybe a port."""
+
+_ID = "[A-Za-z0-9_-]+"
+LOOKING = (
+    ("POST", "/api/v1/sessions"),
+    ("PATCH", f"/api/v1/sessions/{_ID}"),
+    ("DELETE", f"/api/v1/sessions/{_ID}"),
+    ("POST", f"/viewer/{_ID}/shape"),
+    ("WEBSOCKET", f"/viewer/{_ID}/?"),
+    ("WEBSOCKET", f"/viewer/{_ID}/keys"),
+    ("POST", "/api/v1/runs/check"),
+    ("POST", f"/api/v1/runs/{_ID}/(export|replay)"),
+)
+"""What who may only look asks for by other methods than GET: live scenes of one's own, in which
+nothing can be kept, and files. All else is refused, so that a new route is guarded by itself."""
+_LOOKING = tuple((method, re.compile(path)) for method, path in LOOKING)
 
 PAGE_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
@@ -56,17 +74,32 @@ _STYLE = (
 _STYLE_HASH = base64.b64encode(hashlib.sha256(_STYLE.encode()).digest()).decode()
 _LOCKED = (
     "<p>Open the full address that <code>physhandi serve</code> printed in the terminal; it ends "
-    "in <code>?token=…</code>. Your browser then remembers it until the server stops.</p>"
-    "<p>Was the server restarted? Then it has a new token: use the new address.</p>"
+    "in <code>?token=…</code>. Your browser then remembers it until the server has another one.</p>"
+    "<p>Was the server restarted? Then it has a new token, unless it keeps that in a file "
+    "(<code>--token-file</code>): use the new address.</p>"
     # A browser that came from another site brings its cookie only when it is asked again from here.
     "<p>Did you just open that address? <a href=''>Try again</a></p>"
+)
+_READ_ONLY = (
+    "You may only look here. Open the server's full address, or ask who runs it, to launch, "
+    "change, share or delete."
 )
 SHARED = "/shared/"
 """Where pages are that can be looked at without the token; see `app.exports.shares`."""
 
 
+@dataclass(frozen=True)
+class Visitor:
+    """Somebody who may come in."""
+
+    name: str
+    """Tells browsers apart; live scenes belong to it."""
+    may_change: bool = True
+    """Whether also to launch, cancel, delete, share and keep; else only to look."""
+
+
 class Security:
-    """The server's token and what is derived from it."""
+    """The server's tokens and what is derived from them."""
 
     def __init__(
         self,
@@ -75,15 +108,24 @@ class Security:
         port: int | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Draw a token, unless one is set.
+        """Draw a token, unless one is set or kept in a file.
 
         Args:
-            settings: Address, allowed hosts and token.
+            settings: Address, allowed hosts and tokens.
             port: Port that was taken when the settings leave it open.
             clock: Tells the time [s].
+
+        Raises:
+            UsageError: If a file is no safe place for a token, or both hold the same.
+            OSError: If a file can neither be read nor made.
         """
         given = settings.token.get_secret_value() if settings.token else None
-        self.token = given or secrets.token_urlsafe(32)
+        kept = read_or_make_token(settings.token_file) if settings.token_file else None
+        self.token = given or kept or secrets.token_urlsafe(32)
+        only = settings.read_only_token_file
+        self.read_only_token = read_or_make_token(only) if only else None
+        if self.read_only_token == self.token:
+            raise UsageError(f"{only} holds the token with which everything may be changed.")
         self.is_open = not settings.auth
         self._clock = clock
         self.cookie = f"physhandi_{settings.port if port is None else port}"
@@ -94,20 +136,33 @@ class Security:
         self._lock = threading.Lock()
         self._wrong: dict[str, deque[float]] = {}
 
-    def is_token(self, candidate: str) -> bool:
-        """Compare in constant time."""
-        return hmac.compare_digest(candidate.encode(), self.token.encode())
+    def script(self, token: str) -> Visitor | None:
+        """Recognise a program by its token, compared in constant time; None if it is wrong."""
+        if _is_same(token, self.token):
+            return Visitor("bearer")
+        if self.read_only_token is not None and _is_same(token, self.read_only_token):
+            return Visitor("reader", may_change=False)
+        return None
 
-    def new_pass(self) -> str:
-        """Make a cookie value for one browser; it proves the token without containing it."""
-        visitor = secrets.token_hex(8)
-        return f"{visitor}.{self._sign(visitor)}"
+    def new_pass(self, *, may_change: bool = True) -> str:
+        """Make a cookie value for one browser; it proves a token without containing it.
 
-    def owner_of(self, cookie: str) -> str | None:
-        """Name the browser that a cookie was made for; None if it is not one of ours."""
-        visitor, _, signature = cookie.partition(".")
-        is_ours = hmac.compare_digest(signature.encode(), self._sign(visitor).encode())
-        return visitor if is_ours else None
+        Args:
+            may_change: Whether it proves the token with which everything may be changed.
+        """
+        name = secrets.token_hex(8)
+        token = self.token if may_change else (self.read_only_token or "")
+        return f"{name}.{_sign(name, token)}"
+
+    def browser(self, cookie: str) -> Visitor | None:
+        """Recognise the browser that a cookie was made for; None if it is not one of ours."""
+        name, _, signature = cookie.partition(".")
+        if _is_same(signature, _sign(name, self.token)):
+            return Visitor(name)
+        only = self.read_only_token
+        if only is not None and _is_same(signature, _sign(name, only)):
+            return Visitor(name, may_change=False)
+        return None
 
     def is_known_host(self, host: str) -> bool:
         """Check a Host header against the allow-list, against DNS rebinding."""
@@ -117,7 +172,7 @@ class Security:
         return found[1] in self._hosts or (self._any_host and _is_address(found[1]))
 
     def count_wrong(self, client: str) -> bool:
-        """Note a wrong token; returns whether this client sent too many within a minute."""
+        """Note a wrong token or cookie; returns whether one client sent too many in a minute."""
         now = self._clock()
         with self._lock:
             while len(self._wrong) >= _CLIENTS_REMEMBERED and client not in self._wrong:
@@ -126,8 +181,13 @@ class Security:
             times.append(now)
             return len(times) > _WRONG_TOKENS_PER_MINUTE and now - times[0] < 60.0
 
-    def _sign(self, visitor: str) -> str:
-        return hmac.new(self.token.encode(), visitor.encode(), "sha256").hexdigest()
+
+def _is_same(candidate: str, secret: str) -> bool:
+    return hmac.compare_digest(candidate.encode(), secret.encode())
+
+
+def _sign(name: str, token: str) -> str:
+    return hmac.new(token.encode(), name.encode(), "sha256").hexdigest()
 
 
 def _is_address(name: str) -> bool:
@@ -161,34 +221,42 @@ class Gatekeeper:
         if len(headers.getlist("host")) != 1 or not security.is_known_host(headers["host"]):
             return _error(400, "unknown_host", "This server does not answer to that host name.")
         offered = _bearer(headers)
-        owner = self._identify(headers, offered)
-        if owner is None and _is_shared(scope):
+        visitor = self._identify(headers, offered)
+        if visitor is None and _is_shared(scope):
             return None
-        if owner is None:
+        if visitor is None or (not visitor.may_change and self._brings_more(scope)):
             return self._admit(scope, headers, offered)
+        state = scope.setdefault("state", {})
+        state["visitor"] = visitor
         if offered is None and not self._has_own_origin(scope, headers):
             return _error(403, "foreign_origin", "The request comes from another site.")
-        state = scope.setdefault("state", {})
-        state["owner"] = owner
+        if not visitor.may_change and not _only_looks(scope):
+            return _error(403, "read_only", _READ_ONLY)
+        state["owner"], state["may_change"] = visitor.name, visitor.may_change
         state["is_foreign"] = offered is None and _is_foreign(headers)
         return _without_token(scope)
 
-    def _identify(self, headers: Headers, offered: str | None) -> str | None:
+    def _identify(self, headers: Headers, offered: str | None) -> Visitor | None:
         if self._security.is_open:
-            return "open"
+            return Visitor("open")
         if offered is not None:
-            return "bearer" if self._security.is_token(offered) else None
-        return self._security.owner_of(_cookie(headers, self._security.cookie))
+            return self._security.script(offered)
+        return self._security.browser(_cookie(headers, self._security.cookie))
+
+    def _brings_more(self, scope: Scope) -> bool:
+        """Whether a browser that may only look comes with the token to do more."""
+        visitor = self._security.script(_token_in_address(scope) or "")
+        return _is_visit(scope) and visitor is not None and visitor.may_change
 
     def _admit(self, scope: Scope, headers: Headers, offered: str | None) -> Response:
         """Let a browser in that brings the token in the address; refuse everybody else."""
-        token = dict(parse_qsl(scope.get("query_string", b"").decode("latin-1"))).get("token")
-        is_visit = scope["type"] == "http" and scope["method"] in {"GET", "HEAD"}
-        if token is not None and is_visit and self._security.is_token(token):
+        token, is_visit = _token_in_address(scope), _is_visit(scope)
+        visitor = self._security.script(token) if token is not None and is_visit else None
+        if visitor is not None:
             response = _without_token(scope) or Response(status_code=500)
             response.set_cookie(
                 self._security.cookie,
-                self._security.new_pass(),
+                self._security.new_pass(may_change=visitor.may_change),
                 httponly=True,
                 samesite="strict",
                 path="/",
@@ -197,12 +265,15 @@ class Gatekeeper:
             return response
         client = (scope.get("client") or ("unknown", 0))[0]
         is_guess = token is not None or offered is not None
-        if is_guess and self._security.count_wrong(client):
+        is_guess = is_guess or _cookie(headers, self._security.cookie) != ""
+        is_limited = is_guess and self._security.count_wrong(client)
+        if is_visit and "text/html" in headers.get("accept", ""):
+            # A browser whose cookie is of an older token is told what helps, however often it asks.
+            return bare_page(429 if is_limited else 401, "This page needs its token", _LOCKED)
+        if is_limited:
             limited = _error(429, "too_many_attempts", "Too many wrong tokens. Wait a minute.")
             limited.headers["Retry-After"] = "60"
             return limited
-        if is_visit and "text/html" in headers.get("accept", ""):
-            return bare_page(401, "This page needs its token", _LOCKED)
         refused = _error(401, "unauthorized", "A valid token is needed.")
         refused.headers["WWW-Authenticate"] = 'Bearer realm="physhandi"'
         return refused
@@ -277,10 +348,26 @@ def bare_page(status: int, title: str, content: str) -> Response:
     return HTMLResponse(page, status, {"Content-Security-Policy": policy})
 
 
+def _token_in_address(scope: Scope) -> str | None:
+    return dict(parse_qsl(scope.get("query_string", b"").decode("latin-1"))).get("token")
+
+
+def _is_visit(scope: Scope) -> bool:
+    return scope["type"] == "http" and scope["method"] in {"GET", "HEAD"}
+
+
+def _only_looks(scope: Scope) -> bool:
+    """Whether a request changes nothing that others see."""
+    method = scope["method"] if scope["type"] == "http" else "WEBSOCKET"
+    if method in _SAFE_METHODS:
+        return True
+    path = scope["path"]
+    return any(method == known and pattern.fullmatch(path) for known, pattern in _LOOKING)
+
+
 def _is_shared(scope: Scope) -> bool:
     """Whether a request only looks at a page that was shared."""
-    is_visit = scope["type"] == "http" and scope["method"] in {"GET", "HEAD"}
-    return is_visit and scope["path"].startswith(SHARED)
+    return _is_visit(scope) and scope["path"].startswith(SHARED)
 
 
 async def _refuse(response: Response, scope: Scope, receive: Receive, send: Send) -> None:

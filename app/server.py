@@ -253,13 +253,14 @@ def _status_of(error: PhysHandiError | OSError) -> tuple[int, str]:
 
 
 def serve(
-    settings: ServerSettings, on_ready: Callable[[str], None], *, queue_demo: bool = False
+    settings: ServerSettings, on_ready: Callable[[list[str]], None], *, queue_demo: bool = False
 ) -> None:
     """Serve until interrupted; running fits go on and are found again by the next server.
 
     Args:
         settings: Settings of the server.
-        on_ready: Called with the address to open once it answers.
+        on_ready: Called once it answers, with the address to open and, if there is a token for
+            people who may only look, the address for them.
         queue_demo: Also launch a quick fit of the bundled sequence.
 
     Raises:
@@ -288,9 +289,13 @@ def serve(
         )
         shown = "127.0.0.1" if settings.host in _ANY_ADDRESS else settings.host
         shown = f"[{shown}]" if ":" in shown else shown
-        query = "" if security.is_open else f"?token={security.token}"
-        url = f"http://{shown}:{port}/{query}"
-        _Server(config, app.state.stopping, lambda: on_ready(url)).run(sockets=[listener])
+        queries = [
+            f"?token={token}" for token in (security.token, security.read_only_token) if token
+        ]
+        urls = [
+            f"http://{shown}:{port}/{query}" for query in ([""] if security.is_open else queries)
+        ]
+        _Server(config, app.state.stopping, lambda: on_ready(urls)).run(sockets=[listener])
     finally:
         listener.close()
 

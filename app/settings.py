@@ -44,6 +44,11 @@ class ServerSettings(BaseSettings):
     """Whether requests need the token; only a loopback server may go without."""
     token: SecretStr | None = Field(default=None, min_length=16)
     """Token to use instead of a new random one at each start."""
+    token_file: Path | None = None
+    """File that keeps the token over restarts; made, for its owner alone, when missing."""
+    read_only_token_file: Path | None = None
+    """File with another token, with which everything can be looked at and nothing changed; made
+    alike when missing."""
     allowed_hosts: Annotated[tuple[str, ...], NoDecode] = ()
     """Further host names that browsers may use, as behind a reverse proxy (comma separated)."""
     parallel_fits: int | None = Field(default=None, ge=1, le=64)
@@ -98,6 +103,10 @@ class ServerSettings(BaseSettings):
 
     @model_validator(mode="after")
     def _protect(self) -> "ServerSettings":
+        if self.token and self.token_file:
+            raise ValueError("token and token_file are both set; leave one out")
+        if self.read_only_token_file and not self.auth:
+            raise ValueError("read_only_token_file protects nothing while auth is switched off")
         if not self.auth and not is_loopback(self.host):
             raise ValueError(
                 f"auth cannot be switched off on {self.host}, which other machines can reach. "

@@ -44,7 +44,7 @@ class Scenes:
     opened: dict[str, Scene] = field(default_factory=dict)
     owners: list[str] = field(default_factory=list)
 
-    def open(self, kind: str, target: str, owner: str) -> str:
+    def open(self, kind: str, target: str, owner: str, *, may_keep: bool) -> str:
         if len(self.opened) == 2:
             raise TooManySessionsError("2 live sessions are open.")
         self.owners.append(owner)

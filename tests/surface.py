@@ -77,16 +77,16 @@ def _option(command: str, text: str) -> Iterator[str]:
 
 def addresses(app: FastAPI) -> list[str]:
     """List all addresses with their methods, the fields of their queries and of their bodies."""
-    routes: list[Any] = []
+    pages: list[Any] = []
     found: list[str] = []
-    for route in _routes(app.routes):
+    for route in routes(app.routes):
         if not hasattr(route, "methods"):
             kind = "websocket" if "WebSocket" in type(route).__name__ else "files"
             found.append(f"{kind} {_plain(route.path)}")
         elif hasattr(route, "include_in_schema"):
-            routes.append(copy.copy(route))
-            routes[-1].include_in_schema = True
-    described = get_openapi(title="all", version="0", routes=routes)
+            pages.append(copy.copy(route))
+            pages[-1].include_in_schema = True
+    described = get_openapi(title="all", version="0", routes=pages)
     schemas = described.get("components", {}).get("schemas", {})
     for path, methods in described["paths"].items():
         for method, operation in methods.items():
@@ -100,14 +100,14 @@ def addresses(app: FastAPI) -> list[str]:
     return sorted({name for name in found if not _OF_PAGES.search(name)})
 
 
-def _routes(routes: Iterable[Any]) -> Iterator[Any]:
+def routes(given: Iterable[Any]) -> Iterator[Any]:
     """Walk through routes, also those that a router was included with."""
-    for route in routes:
+    for route in given:
         inner = getattr(getattr(route, "original_router", None), "routes", None)
         if inner is None:
             yield route
         else:
-            yield from _routes(inner)
+            yield from routes(inner)
 
 
 def _plain(path: str) -> str:

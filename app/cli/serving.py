@@ -17,6 +17,8 @@ def serve(
     data_dir: DataDir = None,
     device: str | None = None,
     captures: tuple[Path, ...] = (),
+    token_file: Path | None = None,
+    read_only_token_file: Path | None = None,
     demo: bool = False,
 ) -> None:
     """Serve the application and print the address to open, until interrupted.
@@ -31,16 +33,30 @@ def serve(
             all).
         captures: Folders, besides `captures/` of the data folder, from which recordings may be
             imported in the browser (PHYSHANDI_CAPTURES).
+        token_file: File that keeps the token, so that addresses and browsers stay valid over
+            restarts; made when missing (PHYSHANDI_TOKEN_FILE, else a new token at each start).
+        read_only_token_file: File with another token, made alike, for people who may look at
+            everything and change nothing (PHYSHANDI_READ_ONLY_TOKEN_FILE).
         demo: Also queue a quick fit of the bundled sequence.
     """
     from app.server import serve as serve_application
 
     settings = read_settings(
-        host=host, port=port, data_dir=data_dir, device=device, captures=captures or None
+        host=host,
+        port=port,
+        data_dir=data_dir,
+        device=device,
+        captures=captures or None,
+        token_file=token_file,
+        read_only_token_file=read_only_token_file,
     )
     named = settings.device if "device" in settings.model_fields_set else "all"
     settings = settings.model_copy(update={"device": ",".join(pick_devices(named))})
-    serve_application(settings, on_ready=lambda url: print(url, flush=True), queue_demo=demo)
+
+    def announce(urls: list[str]) -> None:
+        print(*urls, sep="\n", flush=True)
+
+    serve_application(settings, on_ready=announce, queue_demo=demo)
 
 
 def doctor(*, data_dir: DataDir = None) -> int:

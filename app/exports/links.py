@@ -54,7 +54,8 @@ def create_links(sessions: Sessions) -> APIRouter:
             raise HTTPException(503, "A live scene is not opened in advance.")
         query = read_query(request)
         state = state_from_query(query)
-        session = sessions.open(kind, target, request.state.owner, state=state)
+        owner, may_keep = request.state.owner, request.state.may_change
+        session = sessions.open(kind, target, owner, state=state, may_keep=may_keep)
         rest = urlencode(query, safe=",")
         return RedirectResponse(f"/live/{session}" + (f"?{rest}" if rest else ""), 303)
 

@@ -107,6 +107,11 @@ class Session(SceneServer):
         return self._target
 
     @property
+    def can_keep(self) -> bool:
+        """Whether presets and runs may be kept from it."""
+        return self._storage is not None
+
+    @property
     def title(self) -> str:
         """Its name."""
         return self._content.title

@@ -79,7 +79,13 @@ class Sessions:
         self._reaper: threading.Thread | None = None
 
     def open(
-        self, kind: Kind, target: str, owner: str, *, state: SessionState | None = None
+        self,
+        kind: Kind,
+        target: str,
+        owner: str,
+        *,
+        state: SessionState | None = None,
+        may_keep: bool = True,
     ) -> str:
         """Open a live session.
 
@@ -88,6 +94,7 @@ class Sessions:
             target: Id of a run or a sequence, or the query of two runs to compare.
             owner: Who asks.
             state: What to begin with; None for what suits the content.
+            may_keep: Whether presets and runs may be kept from it.
 
         Returns:
             The session's id, for ``/viewer/<id>/``.
@@ -101,7 +108,10 @@ class Sessions:
         self._reserve(owner)
         try:
             session_id = secrets.token_urlsafe(18)
-            session = self._make(session_id, kind, target, owner, state)
+            storage = self._storage if may_keep else None
+            session = self._make(
+                session_id, kind, target, owner=owner, state=state, storage=storage
+            )
             if isinstance(session, Session):
                 session.link_of = self.link_of
             with self._lock:
@@ -118,7 +128,10 @@ class Sessions:
         Raises:
             TooManySessionsError: If as many sessions as allowed are open.
         """
-        return self.open(session.kind, session.target, session.owner, state=session.state)
+        may_keep = isinstance(session, Session) and session.can_keep
+        return self.open(
+            session.kind, session.target, session.owner, state=session.state, may_keep=may_keep
+        )
 
     def get(self, session_id: str) -> AnySession | None:
         """Find a session; None if there is none of that id."""
@@ -181,7 +194,14 @@ class Sessions:
         return sum(self.close(session_id, reason) for session_id in idle)
 
     def _make(
-        self, session_id: str, kind: Kind, target: str, owner: str, state: SessionState | None
+        self,
+        session_id: str,
+        kind: Kind,
+        target: str,
+        *,
+        owner: str,
+        state: SessionState | None,
+        storage: UserStorage | None,
     ) -> AnySession:
         if kind == "comparison":
             return CompareSession(
@@ -195,7 +215,7 @@ class Sessions:
             catalog=self._catalog,
             live=self.live,
             state=state,
-            storage=self._storage,
+            storage=storage,
         )
 
     def _reserve(self, owner: str) -> None:

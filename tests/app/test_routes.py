@@ -148,7 +148,7 @@ def test_a_failure_is_told_on_top_without_the_insides_of_the_program(world: Queu
     world.until(run_id, "failed")
     # A worker's last words reach the log when the run has failed already.
     log = world.folder(run_id) / "log.txt"
-    until(lambda: "KeyError" in log.read_text())
+    until(lambda: log.is_file() and "KeyError" in log.read_text())
     assert "Traceback" in log.read_text()
     page = world.client.get(f"/runs/{run_id}").text
     assert "The fit failed in <em>zeroth order</em>" in page

@@ -97,7 +97,7 @@ def test_two_browsers_are_told_apart_and_a_forged_cookie_is_not_believed(door: D
         door.client.cookies.clear()
         refused = door.client.get("/", headers={"Cookie": f"physhandi_8080={forged}".encode()})
         assert refused.status_code == 401
-    assert Security(ServerSettings()).owner_of(f"{visitor}.{signature}") is None
+    assert Security(ServerSettings()).browser(f"{visitor}.{signature}") is None
 
 
 @pytest.mark.parametrize("other", ["_xsrf=2|a|b", '{"a":1}', "a b=1", "x[]=1", "k=a,b c", "="])
@@ -143,6 +143,25 @@ def test_wrong_tokens_are_counted_and_the_right_one_still_works(door: Door) -> N
     assert door.client.get("/", headers=door.bearer).json()["owner"] == "bearer"
     door.now = 61.0
     assert door.client.get("/", headers=wrong).status_code == 401
+
+
+def test_wrong_cookies_count_as_wrong_tokens_do(door: Door) -> None:
+    def ask(cookie: str, **headers: str) -> int:
+        sent = {"Cookie": f"other=1; physhandi_8080={cookie}", **headers}
+        return door.client.get("/", headers=sent).status_code
+
+    visitor, _, signature = door.security.new_pass().partition(".")
+    forged = signature[:-1] + ("0" if signature[-1] != "0" else "1")
+    codes = [ask(f"{visitor}.{n:04x}{forged[4:]}") for n in range(30)]
+    assert codes == [401] * 20 + [429] * 10
+    # Others from there, who guess nothing, are only told to bring a token.
+    assert door.client.get("/").status_code == 401
+    assert ask(f"{visitor}.{signature}") == 200
+    page = {"Cookie": "physhandi_8080=old", "Accept": "text/html"}
+    told = door.client.get("/", headers=page)
+    assert (told.status_code, "needs its token" in told.text) == (429, True)
+    door.now = 61.0
+    assert ask("x.y") == 401
 
 
 def test_a_bearer_needs_no_origin(door: Door) -> None:
