@@ -1,23 +1,42 @@
-# Runs the demo: docker build -t physhandi . && docker run --rm -p 127.0.0.1:8080:8080 physhandi
-FROM python:3.11-slim-bookworm
+# PhysHanDI's server. A GPU needs the NVIDIA container toolkit and nothing else here: torch and Warp
+# bring their own CUDA libraries. Without one, --build-arg TORCH_INDEX=https://download.pytorch.org/whl/cpu
+# makes the image 3 GB smaller. How to run it: docs/operations.md.
+FROM debian:bookworm-slim
+
 RUN apt-get update \
- && apt-get install -y --no-install-recommends make libgl1 libegl1 libgomp1 \
- && rm -rf /var/lib/apt/lists/*
-WORKDIR /opt/physhandi
-COPY pyproject.toml constraints.txt Makefile README.md LICENSE ./
-COPY app app
-COPY physhandi physhandi
-COPY web_assets web_assets
-COPY sequences sequences
-# The CPU build of torch keeps the image small; on a GPU host build with
-# --build-arg TORCH=torch==2.13.0 --build-arg TORCH_INDEX= for the CUDA build.
-ARG TORCH=torch==2.13.0
+    && DEBIAN_FRONTEND=noninteractive apt-get install -y --no-install-recommends ca-certificates python3 python3-venv tini \
+    && rm -rf /var/lib/apt/lists/*
+
+# Fits, scenes and what is uploaded must not run as root.
+RUN useradd --uid 1000 --create-home physhandi \
+    && install -d -o physhandi -g physhandi /data
+
 ARG TORCH_INDEX=
-RUN python3 -m venv .venv \
- && .venv/bin/python -m pip install --no-cache-dir -c constraints.txt ${TORCH_INDEX:+--index-url "$TORCH_INDEX"} "$TORCH" \
- && .venv/bin/python -m pip install --no-cache-dir -c constraints.txt . \
- && .venv/bin/physhandi doctor
+COPY constraints.txt /opt/physhandi/
+RUN python3 -m venv /opt/venv \
+    && /opt/venv/bin/pip install --no-cache-dir --upgrade pip \
+    && torch="$(grep '^torch==' /opt/physhandi/constraints.txt)" \
+    && /opt/venv/bin/pip install --no-cache-dir ${TORCH_INDEX:+--index-url "$TORCH_INDEX"} "$torch"
+
+COPY pyproject.toml README.md LICENSE /opt/physhandi/
+COPY physhandi /opt/physhandi/physhandi
+COPY app /opt/physhandi/app
+COPY web_assets /opt/physhandi/web_assets
+COPY sequences /opt/physhandi/sequences
+RUN /opt/venv/bin/pip install --no-cache-dir -c /opt/physhandi/constraints.txt -e "/opt/physhandi[capture,usd]" \
+    && /opt/venv/bin/physhandi --help > /dev/null
+
+ENV PATH=/opt/venv/bin:/usr/local/bin:/usr/bin:/bin
+ENV PYTHONUNBUFFERED=1
+ENV PHYSHANDI_HOST=0.0.0.0
+ENV PHYSHANDI_DATA_DIR=/data
+# What Warp compiles is kept with the data: the next container does not compile it again.
+ENV WARP_CACHE_PATH=/data/cache/kernels
+USER physhandi
+WORKDIR /data
 VOLUME /data
 EXPOSE 8080
-# The server listens on every interface of the container only; publish the port on loopback as above.
-CMD [".venv/bin/physhandi", "serve", "--host", "0.0.0.0", "--port", "8080", "--data-dir", "/data", "--demo"]
+HEALTHCHECK --interval=30s --timeout=5s --start-period=60s CMD python -c "import urllib.request; urllib.request.urlopen('http://127.0.0.1:8080/healthz', timeout=4)"
+# Processes of fits whose supervisor was killed are adopted and reaped.
+ENTRYPOINT ["tini", "--", "physhandi"]
+CMD ["serve"]

@@ -9,7 +9,7 @@ DATA ?= data
 TORCH ?= torch==2.13.0
 PIP_FLAGS := --quiet --disable-pip-version-check --no-compile -c constraints.txt
 
-.PHONY: install demo test coverage races reliability check fmt bench test-gpu pictures browser clean
+.PHONY: install demo test coverage races reliability check fmt bench container test-gpu pictures browser clean
 
 install: $(STAMP)
 
@@ -57,6 +57,11 @@ reliability: install
 # The README's pictures, made by the browser tests.
 pictures: install browser
 	PHYSHANDI_PICTURES=docs/images $(BIN)/python -m pytest -q tests/e2e
+
+# The Dockerfile's steps in a new Debian, as root and without Docker; then its server and health check.
+CONTAINER ?= /tmp/physhandi-container
+container:
+	$(PYTHON) tests/container_check.py $(CONTAINER) $(CONTAINER_FLAGS)
 
 test-gpu: install
 	$(BIN)/python -m pytest -m gpu

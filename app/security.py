@@ -84,6 +84,8 @@ _READ_ONLY = (
     "You may only look here. Open the server's full address, or ask who runs it, to launch, "
     "change, share or delete."
 )
+PROBES = frozenset({"/healthz", "/readyz"})
+"""What answers everybody, and tells nothing of anybody; see `app.health`."""
 SHARED = "/shared/"
 """Where pages are that can be looked at without the token; see `app.exports.shares`."""
 
@@ -222,7 +224,7 @@ class Gatekeeper:
             return _error(400, "unknown_host", "This server does not answer to that host name.")
         offered = _bearer(headers)
         visitor = self._identify(headers, offered)
-        if visitor is None and _is_shared(scope):
+        if visitor is None and (_is_shared(scope) or _is_probe(scope)):
             return None
         if visitor is None or (not visitor.may_change and self._brings_more(scope)):
             return self._admit(scope, headers, offered)
@@ -363,6 +365,11 @@ def _only_looks(scope: Scope) -> bool:
         return True
     path = scope["path"]
     return any(method == known and pattern.fullmatch(path) for known, pattern in _LOOKING)
+
+
+def _is_probe(scope: Scope) -> bool:
+    """Whether a request only asks if the server lives, or can work."""
+    return _is_visit(scope) and scope["path"] in PROBES
 
 
 def _is_shared(scope: Scope) -> bool:

@@ -14,6 +14,7 @@ from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from fastapi.staticfiles import StaticFiles
+from prometheus_client import CollectorRegistry
 from starlette.exceptions import HTTPException
 
 from app.api import create_api
@@ -22,6 +23,7 @@ from app.comparing import create_comparing
 from app.exports.cache import FileCache, TooManyFilesError
 from app.exports.routes import create_exports
 from app.exports.shares import Shares
+from app.health import RequestFigures, create_health
 from app.jobs.catalog import Catalog, NotFoundError
 from app.jobs.device_choice import DeviceChoice
 from app.jobs.machine import Cards, Machine
@@ -170,12 +172,11 @@ def create_app(
     app.include_router(create_gate(sessions))
     app.mount("/assets", StaticFiles(directory=WEB_ASSETS), name="assets")
 
-    @app.get("/healthz", include_in_schema=False)
-    def healthz() -> dict[str, str]:
-        return {"status": "ok", "version": __version__}
-
+    app.include_router(
+        create_health(catalog, scheduler, sessions, machine, figures := CollectorRegistry())
+    )
     _answer_errors(app, pages)
-    _guard(app, security)
+    _guard(app, security, figures)
     return app
 
 
@@ -185,10 +186,11 @@ def _storage(settings: ServerSettings, catalog: Catalog, scheduler: Scheduler) -
     return UserStorage(PresetStore(settings.data_dir / "presets"), saver)
 
 
-def _guard(app: FastAPI, security: Security) -> None:
+def _guard(app: FastAPI, security: Security, registry: CollectorRegistry) -> None:
     """Put in front of all routes what requests have to pass; the last that is added comes first."""
     app.add_middleware(BodyLimit, most_bytes=_BODY_LIMIT)
     app.add_middleware(Gatekeeper, security=security)
+    app.add_middleware(RequestFigures, registry=registry)
 
 
 def _answer_errors(app: FastAPI, pages: Pages) -> None:
@@ -280,7 +282,8 @@ def serve(
         config = uvicorn.Config(
             app,
             http=ImpatientProtocol,
-            log_level="warning",
+            log_config=None,
+            log_level=settings.log_level,
             access_log=False,
             server_header=False,
             ws_per_message_deflate=False,

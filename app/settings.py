@@ -3,7 +3,7 @@
 import ipaddress
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
@@ -63,6 +63,10 @@ class ServerSettings(BaseSettings):
     hung_after_s: float = Field(default=120.0, ge=0.1, le=86_400)
     """Time without a sign of life after which an idle fit is ended and started once more [s]; one
     that computes has 20 times as long."""
+    log_level: Literal["debug", "info", "warning", "error"] = "warning"
+    """What is logged: at ``info`` also every request, and what the queue does."""
+    log_format: Literal["text", "json"] = "text"
+    """Lines of the log: for people, or a JSON object each."""
     live_sessions: int = Field(default=20, ge=1, le=100)
     """Most live scenes at a time."""
     live_sessions_each: int = Field(default=10, ge=1, le=100)

@@ -39,6 +39,7 @@ def serve(
             everything and change nothing (PHYSHANDI_READ_ONLY_TOKEN_FILE).
         demo: Also queue a quick fit of the bundled sequence.
     """
+    from app.logs import write_logs
     from app.server import serve as serve_application
 
     settings = read_settings(
@@ -52,6 +53,7 @@ def serve(
     )
     named = settings.device if "device" in settings.model_fields_set else "all"
     settings = settings.model_copy(update={"device": ",".join(pick_devices(named))})
+    write_logs(settings)
 
     def announce(urls: list[str]) -> None:
         print(*urls, sep="\n", flush=True)

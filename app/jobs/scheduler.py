@@ -174,6 +174,11 @@ class Scheduler:
             self._step()
             self._thread.start()
 
+    @property
+    def is_working(self) -> bool:
+        """Whether queued runs are started."""
+        return self._thread.is_alive() and not self._closed.is_set()
+
     def shutdown(self) -> None:
         """Stop watching; running fits go on and are found again by the next server."""
         self._closed.set()
