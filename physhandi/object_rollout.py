@@ -11,7 +11,6 @@ from numpy import ndarray
 
 from physhandi.data.exporters.export import export_scene
 from physhandi.data.exporters.scene_data import SceneData
-from physhandi.data.files import named_fields
 from physhandi.data.layout import PARAMETERS_FILE, SHAPE_FILE, SequenceFiles
 from physhandi.data.run import RunFolder
 from physhandi.data.run_folder import reading
@@ -292,7 +291,7 @@ def load_fitted(run: RunFolder, sequence_name: str) -> ObjectRollout | None:
     parameters = SimulationParameters.from_dict(run.yaml(PARAMETERS_FILE))
     if run.has(files.meta):
         # As the rollout was simulated: what is stored of the world is the profile's, not this one.
-        meta = run.yaml(files.meta)
+        meta = run.recording(sequence_name)
         parameters = parameters.in_world(
             frame_rate=float(meta["frame_rate"]),
             ground_height=meta.get("ground_height"),
@@ -341,7 +340,7 @@ def load_surface(
     Returns:
         The surface, without colors if no view has any; None if the nodes have no surface.
     """
-    shape = (named_fields(run.yaml(SHAPE_FILE)) or {}) if run.has(SHAPE_FILE) else {}
+    shape = run.yaml(SHAPE_FILE) if run.has(SHAPE_FILE) else {}
     kind, width = shape.get("shape"), shape.get("thickness")
     surface = lay_surface(
         fitted.model.object_node,

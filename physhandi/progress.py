@@ -1,6 +1,7 @@
 """How long work tells what it is doing, and learns that it should stop."""
 
 import sys
+import time
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -78,17 +79,27 @@ class NullProgress(Progress):
 
 
 _QUARTERS = 4
+_LONGEST_SILENCE_S = 60.0
+"""Time after which a line is printed although no further quarter is done [s]."""
 
 
 class PrintedProgress(Progress):
-    """Shows the running stage on standard error: a bar on a terminal, else a line a quarter."""
+    """Shows the running stage on standard error: a bar on a terminal, else lines.
 
-    def __init__(self, stream: TextIO | None = None) -> None:
+    There is a line for each quarter of a stage, and one a minute while that is not reached.
+    """
+
+    def __init__(
+        self, stream: TextIO | None = None, *, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         """Show nothing until the first report.
 
         Args:
             stream: Where to; standard error if left out.
+            clock: Tells the time [s].
         """
+        self._clock = clock
+        self._line_time = 0.0
         self._stream = sys.stderr if stream is None else stream
         self._stage = ""
         self._quarter = -1
@@ -139,10 +150,12 @@ class PrintedProgress(Progress):
     def _write(self, stage: str, iteration: int, total: int, text: str, message: str) -> None:
         quarter = _QUARTERS * iteration // max(1, total)
         is_told = (stage, quarter) == (self._stage, self._quarter)
+        is_told = is_told and self._clock() - self._line_time < _LONGEST_SILENCE_S
         if is_told and not (message and iteration >= total):
             return
-        self._stage, self._quarter = stage, quarter
-        self._stream.write(f"{stage} {iteration}/{total}  {text}".rstrip() + "\n")
+        self._stage, self._quarter, self._line_time = stage, quarter, self._clock()
+        count = f" {iteration}/{total}" if total else ""
+        self._stream.write(f"{stage}{count}  {text}".rstrip() + "\n")
         self._stream.flush()
 
 

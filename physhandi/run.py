@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, cast
 from physhandi.data.files import named_fields
 from physhandi.data.layout import METRICS_FILE
 from physhandi.data.run import RunFolder
+from physhandi.data.run_folder import PartsFile, checked
 
 if TYPE_CHECKING:
     from physhandi.fitted_object import FittedObject
@@ -36,9 +37,9 @@ class Run(RunFolder):
         """The measures of each sequence by its name (docs/metrics.md).
 
         Raises:
-            RunError: If the run has not been measured yet.
+            RunError: If the run has not been measured yet, or what it holds is damaged.
         """
-        return self.json(METRICS_FILE)
+        return dict(checked(self.json(METRICS_FILE), PartsFile, self.out / METRICS_FILE))
 
     @property
     def warnings(self) -> list[dict[str, str]]:

@@ -32,7 +32,7 @@ def write_run(folder: Path, *, has_object: bool = True) -> Run:
     run = Run.create(folder, name="fit", kind="reconstruction", sequences=["/data/lift"], config={})
     with run.begin_attempt() as attempt:
         base = "sequences/lift"
-        attempt.save_yaml(f"{base}/meta.yaml", {"frame_rate": RATE, "length_unit": "m"})
+        attempt.save_yaml(f"{base}/meta.yaml", {"frame_rate": RATE, "frame_count": FRAMES})
         save_motions(attempt, "lift", _motions())
         save_hand_vertices(attempt, "lift")
         if has_object:

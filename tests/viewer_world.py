@@ -59,7 +59,7 @@ class FakeSettings:
     live_sessions: int = 3
     live_sessions_each: int = 100
     live_idle_s: float = 900.0
-    device: str = "cpu"
+    live_device: str = "cpu"
 
 
 def show_parts(client: ViewerClient) -> None:

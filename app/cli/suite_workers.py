@@ -58,7 +58,7 @@ class _ToldProgress(Progress):
         loss: float | None = None,  # noqa: ARG002
         message: str = "",  # noqa: ARG002
     ) -> None:
-        if time.monotonic() - self._last >= _TELL_EVERY:
+        if total == 0 or time.monotonic() - self._last >= _TELL_EVERY:
             self._last = time.monotonic()
             self._channel.tell(stage=stage, iteration=iteration, total=total)
 
@@ -224,8 +224,7 @@ class SuiteWorkers:
                     self._give(worker, waiting, order)
                     yield job.number
             elif job is not None:
-                share = 100 * answer["iteration"] // max(1, answer["total"])
-                worker.state = f"{job.label} {answer['stage']} {share} %"
+                worker.state = _told_of(job.label, answer)
             states = " · ".join(w.state for w in self._workers if w.state)
             self._progress.report(stage, finished, len(jobs), message=states)
 
@@ -260,6 +259,13 @@ class SuiteWorkers:
                 self._heard.put((number, message))
         except PhysHandiError as error:
             self._heard.put((number, error))
+
+
+def _told_of(label: str, report: Mapping[str, Any]) -> str:
+    """Say what a process does; what is not counted has no share."""
+    total = report["total"]
+    share = f" {100 * report['iteration'] // total} %" if total else ""
+    return f"{label} {report['stage']}{share}"
 
 
 def _lost(worker: _Worker, end: ChildEndedError) -> RunError:

@@ -255,8 +255,7 @@ def _check_frame(run: Run, query: Mapping[str, str]) -> None:
     if name not in run.sequence_names:
         names = ", ".join(run.sequence_names)
         raise UsageError(f"sequence: run '{run.id}' has no sequence '{name[:80]}', but {names}.")
-    meta = SequenceFiles(name).meta
-    count = int(run.yaml(meta).get("frame_count", 0)) if run.has(meta) else 0
+    count = run.recording(name)["frame_count"] if run.has(SequenceFiles(name).meta) else 0
     frame = state_from_query(query).frame
     if count and frame >= count:
         raise UsageError(f"f: '{name}' has frames 0 to {count - 1}, not {frame}.")

@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from app.previews.draw import HEIGHT, WIDTH, Motion, draw_motion
 from app.previews.links import marker_links
-from physhandi.data.files import named_fields, replacing
+from physhandi.data.files import replacing
 from physhandi.data.layout import SequenceFiles
 from physhandi.data.sequence import Sequence as Recording
 from physhandi.data.view import View
@@ -119,10 +119,8 @@ def _sampled(count: int, rate: float, *, is_still: bool) -> tuple[list[int], int
 
 
 def _rate_of(run: Run, name: str) -> float:
-    rel = SequenceFiles(name).meta
-    about = named_fields(run.yaml(rel)) if run.has(rel) else None
-    rate = (about or {}).get("frame_rate")
-    return float(rate) if isinstance(rate, int | float) and rate > 0 else _USUAL_RATE
+    is_known = run.has(SequenceFiles(name).meta)
+    return float(run.recording(name)["frame_rate"]) if is_known else _USUAL_RATE
 
 
 def _found_motion(run: Run, name: str, recording: Path) -> Motion:

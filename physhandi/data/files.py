@@ -314,21 +314,23 @@ class _Loader(_FastLoader):
 
 DEEPEST = 100
 """Levels of nesting that are read; the YAML reader in C has no limit of its own but the stack."""
+_TOO_LARGE = 2**64
+"""Whole numbers from here on are read nowhere."""
 _MOST_VALUES = 200_000
 """Values that are read from YAML, whose aliases can make a few lines stand for any number."""
 
 
 def require_shallow(content: Any) -> None:
-    """Refuse what is nested so deeply that who walks through it would fail.
+    """Refuse what is nested so deeply that who walks through it would fail, and numbers too large.
 
     Raises:
-        ValueError: If it is.
+        ValueError: If it holds such a thing.
     """
-    level = [content]
-    for _ in range(DEEPEST):
-        level = [
-            inner for value in level for inner in _inside(value) if isinstance(inner, list | dict)
-        ]
+    level: list[Any] = [content]
+    for _ in range(DEEPEST + 1):
+        if any(isinstance(value, int) and abs(value) >= _TOO_LARGE for value in level):
+            raise ValueError("it holds a number that is too large")
+        level = [inner for value in level for inner in _inside(value)]
         if not level:
             return
     raise ValueError("it is nested too deeply")
@@ -357,7 +359,7 @@ def require_plain(content: Any) -> None:
 def _require_plain_value(place: str, value: Any) -> None:
     if isinstance(value, float) and not math.isfinite(value):
         raise ValueError(f"field '{place}' is {value}, not a finite number")
-    if isinstance(value, int) and abs(value) >= 2**64:
+    if isinstance(value, int) and abs(value) >= _TOO_LARGE:
         raise ValueError(f"field '{place}' is a number that is too large")
     if value is not None and not isinstance(value, str | int | float | list | dict):
         kind = type(cast("object", value)).__name__

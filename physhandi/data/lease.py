@@ -6,7 +6,7 @@ import os
 import secrets
 import socket
 import time
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -112,14 +112,29 @@ def locked(folder: Path) -> Generator[None]:
 
 
 @contextmanager
-def locked_file(path: Path) -> Generator[None]:
+def locked_file(path: Path, waits: Callable[[str], None] | None = None) -> Generator[None]:
     """Hold a lock that other processes wait for; it is let go of however this one ends.
 
     Args:
-        path: The file that stands for it; made if missing, and left.
+        path: The file that stands for it, and names its holder; made if missing, and left.
+        waits: Is told who holds the lock, before it is waited for.
     """
-    with _held(_open_lock(path)):
+    descriptor = _open_lock(path)
+    if waits is not None and not _is_free(descriptor):
+        waits(path.read_text(encoding="utf-8", errors="replace")[:80] or "another process")
+    with _held(descriptor):
+        os.ftruncate(descriptor, 0)
+        os.pwrite(descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode(), 0)
         yield
+
+
+def _is_free(descriptor: int) -> bool:
+    """Tell whether a lock would be had at once; if so, it is held from now on."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 def _open_lock(path: Path) -> int:

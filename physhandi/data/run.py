@@ -42,6 +42,7 @@ from physhandi.data.run_folder import (
     ExitFile,
     JobFile,
     ManifestFile,
+    RecordingFile,
     RunEnd,
     RunKind,
     StageEntry,
@@ -273,9 +274,23 @@ class RunFolder:
         except (SafetensorError, ValueError, OSError) as error:
             raise RunError(f"Run '{self.id}': {rel} is damaged: {error}. Run it again.") from error
 
-    def yaml(self, rel: str) -> Any:
-        """Read plain data from YAML."""
-        return read_yaml(self._existing(rel))
+    def yaml(self, rel: str) -> dict[str, Any]:
+        """Read named fields from YAML.
+
+        Raises:
+            RunError: If the file is missing or damaged.
+        """
+        path = self._existing(rel)
+        return checked(read_yaml(path), dict[str, Any], path)
+
+    def recording(self, name: str) -> RecordingFile:
+        """Read what a viewer needs of one of the run's recordings.
+
+        Raises:
+            RunError: If the file is missing or damaged.
+        """
+        path = self._existing(SequenceFiles(name).meta)
+        return checked(read_yaml(path), RecordingFile, path)
 
     def json(self, rel: str) -> Any:
         """Read plain data from JSON."""
@@ -290,7 +305,7 @@ class RunFolder:
         if sequence.name not in self.sequence_names:
             return False
         meta = SequenceFiles(sequence.name).meta
-        fingerprint = self.yaml(meta).get("fingerprint") if self.has(meta) else None
+        fingerprint = self.recording(sequence.name).get("fingerprint") if self.has(meta) else None
         if fingerprint is not None:
             return fingerprint == sequence.content_fingerprint()
         folder = Path(self.sequences[self.sequence_names.index(sequence.name)])

@@ -90,7 +90,7 @@ def file_record(path: Path) -> dict[str, Any]:
 
 
 def find_damage(folder: Path, records: dict[str, Any]) -> str | None:
-    """SomeText the first file that is not what its record says; None if all are whole."""
+    """Name the first file that is not what its record says; None if all are whole."""
     for rel, entry in records.items():
         record = named_fields(entry) or {}
         try:
@@ -205,6 +205,21 @@ class EnvironmentFile(TypedDict, total=False):
     python: Text
     commit: Text | None
     packages: dict[str, Text]
+
+
+class RecordingFile(TypedDict, total=False):
+    """``sequences/<name>/meta.yaml``: what a viewer needs of a recording."""
+
+    frame_rate: Required[Annotated[float, Meta(gt=0.0, le=1e6)]]
+    frame_count: Required[Annotated[int, Meta(ge=1, le=10_000_000)]]
+    metric: bool
+    length_unit: Text
+    ground_height: float | None
+    gravity: float
+    hands: list[Text]
+    reconstruction_frames: WholeNumber
+    fingerprint: Text
+    mass: Annotated[float, Meta(gt=0.0)] | None
 
 
 PartsFile = dict[str, dict[str, Any]]

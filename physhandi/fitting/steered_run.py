@@ -62,7 +62,7 @@ def record_take(
         progress.check_cancelled()
         position.append(node)
         progress.report("recording", len(position), take.frame_count)
-    about = source.yaml(SequenceFiles(stored.sequence).meta)
+    about = source.recording(stored.sequence)
     parameters = take.parameters
     meta = SequenceMeta(
         name=folder.name,

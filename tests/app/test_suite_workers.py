@@ -4,10 +4,10 @@ import json
 import os
 import signal
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -21,7 +21,6 @@ from physhandi.data.sequence import Sequence
 from physhandi.errors import CancelledError, RunError, UsageError
 from physhandi.progress import NullProgress, Progress
 from physhandi.run import Run
-from physhandi.synthetic.suite import cells
 from physhandi.synthetic.suite.evaluation import Order, evaluate_suite, filler, list_tasks
 from physhandi.synthetic.suite.methods import parse_method
 
@@ -127,31 +126,45 @@ def test_whatever_is_made_of_other_cells_comes_last(recordings: tuple[Sequence, 
     assert [t.protocol for t in placed] == ["main"] * 6 + ["unseen"] * 4
 
 
-def test_a_cell_that_another_process_fills_is_waited_for(
-    tmp_path: Path, order: Order, monkeypatch: pytest.MonkeyPatch
+class Heard(Watched):
+    """Tells when it is told that a process waits."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.waits = threading.Event()
+
+    def report(self, stage: str, *about: Any, **more: Any) -> None:
+        super().report(stage, *about, **more)
+        if "waits for" in stage + str(more.get("message", "")):
+            self.waits.set()
+
+
+def test_a_cell_that_another_process_fills_is_waited_for_and_who_does_is_told(
+    tmp_path: Path, order: Order
 ) -> None:
-    is_asked_for = threading.Event()
-
-    @contextmanager
-    def asked_for(path: Path) -> Iterator[None]:
-        is_asked_for.set()
-        with locked_file(path):
-            yield
-
     (tmp_path / "locks").mkdir()
     fill = filler(replace(order, methods=("static",)), tmp_path, NullProgress())
     fill(0)
     (name,) = (path.name for path in (tmp_path / "cells").iterdir())
-    again = filler(replace(order, methods=("static",)), tmp_path, NullProgress())
+    heard = Heard()
+    again = filler(replace(order, methods=("static",)), tmp_path, heard)
     waiting = threading.Thread(target=lambda: again(0))
-    monkeypatch.setattr(cells, "locked_file", asked_for)
     with locked_file(tmp_path / "locks" / name):
         waiting.start()
-        assert is_asked_for.wait(LIMIT_S)
+        assert heard.waits.wait(LIMIT_S)
         assert waiting.is_alive()
     waiting.join(LIMIT_S)
     assert not waiting.is_alive()
+    told = f"waits for process {os.getpid()} on "
+    assert any(told in stage for stage, *_ in heard.told)
     assert Run.open(tmp_path / "cells" / name).attempt == 1
+
+
+def test_what_a_process_does_is_told_in_a_few_words() -> None:
+    said = {"stage": "search", "iteration": 3, "total": 8}
+    assert suite_workers._told_of("quick, low", said) == "quick, low search 37 %"
+    said = {"stage": "waits for process 7 on vm", "iteration": 0, "total": 0}
+    assert suite_workers._told_of("quick, low", said) == "quick, low waits for process 7 on vm"
 
 
 def test_a_process_that_is_killed_is_told_and_the_command_goes_on(

@@ -355,6 +355,21 @@ def test_progress_is_a_line_a_quarter_where_there_is_no_terminal() -> None:
     ]
 
 
+def test_progress_that_reaches_no_quarter_is_a_line_a_minute() -> None:
+    stream, now = io.StringIO(), [0.0]
+    progress = PrintedProgress(stream, clock=lambda: now[0])
+    progress.report("suite", 0, 102)
+    for number, now[0] in enumerate((59.0, 60.5, 119.0, 121.0), start=1):
+        progress.report("suite", number, 102, message=f"cell {number}")
+    progress.report("waits for process 7", 0, 0)
+    assert stream.getvalue().splitlines() == [
+        "suite 0/102",
+        "suite 2/102  cell 2",
+        "suite 4/102  cell 4",
+        "waits for process 7",
+    ]
+
+
 class Terminal(io.StringIO):
     def isatty(self) -> bool:
         return True

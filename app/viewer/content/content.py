@@ -1,11 +1,10 @@
 """What a session shows: hands, object, observation and cameras of one sequence."""
 
 import logging
-from collections.abc import Mapping
 from collections.abc import Sequence as Listing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -22,6 +21,7 @@ from app.viewer.content.observed import (
 )
 from physhandi.data.layout import SHAPE_FILE, SequenceFiles
 from physhandi.data.object_mass import ObjectMass, estimated_mass, given_mass
+from physhandi.data.run_folder import RecordingFile
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
 from physhandi.errors import MissingInputError, PhysHandiError, UsageError
@@ -143,7 +143,7 @@ def open_run(catalog: Catalog, run_id: str, sequence_name: str | None = None) ->
             f"Run '{run.name}' has no result for sequence '{name}' yet ({files.meta} is "
             "missing). Open it when its first stage is finished."
         )
-    meta = run.yaml(files.meta)
+    meta = run.recording(name)
     sequence = _recording(catalog, run, name)
     control = run.array(files.control) if run.has(files.control) else None
     fitted = load_fitted(run, name)
@@ -152,12 +152,12 @@ def open_run(catalog: Catalog, run_id: str, sequence_name: str | None = None) ->
     return Content(
         title=run.name,
         sequence_name=name,
-        frame_count=int(meta["frame_count"]),
+        frame_count=meta["frame_count"],
         frame_rate=float(meta["frame_rate"]),
-        reconstruction_count=int(meta.get("reconstruction_frames", meta["frame_count"])),
-        length_unit="m" if meta.get("metric", True) else str(meta.get("length_unit", "units")),
+        reconstruction_count=meta.get("reconstruction_frames", meta["frame_count"]),
+        length_unit="m" if meta.get("metric", True) else meta.get("length_unit", "units"),
         ground_height=meta.get("ground_height"),
-        hands=_hands(run, files, [str(side) for side in meta.get("hands", [])]),
+        hands=_hands(run, files, meta.get("hands", [])),
         control=control,
         fitted=fitted,
         observed=_run_observation(run, files, views) or of_recording,
@@ -187,7 +187,7 @@ def open_sequence(catalog: Catalog, sequence_id: str) -> Content:
     )
 
 
-def _mass(run: Run, meta: Mapping[str, Any], sequence: Sequence | None) -> ObjectMass | None:
+def _mass(run: Run, meta: RecordingFile, sequence: Sequence | None) -> ObjectMass | None:
     """Find what the object weighs: as the recording says today, as it said, or an estimate."""
     kilograms = meta.get("mass") if sequence is None else sequence.mass
     if kilograms is not None:

@@ -148,7 +148,7 @@ def read_scene(run: RunFolder, sequence: str | None) -> SceneData:
     files = SequenceFiles(name)
     if not run.has(files.meta):
         raise RunError(f"Run '{run.id}' has nothing of sequence '{name}'; it is {run.state}.")
-    meta = run.yaml(files.meta)
+    meta = run.recording(name)
     hands: dict[str, MovingSurface] = {}
     for side in SIDES:
         if run.has(files.hand_vertex(side)):
@@ -171,7 +171,7 @@ def read_scene(run: RunFolder, sequence: str | None) -> SceneData:
     return SceneData(
         sequence=name,
         frame_rate=float(meta["frame_rate"]),
-        length_unit=str(meta["length_unit"]),
+        length_unit=meta.get("length_unit", "m"),
         rollout=nothing if rollout is None else rollout,
         control=nothing if control is None else control[:frame_count],
         spring_nodes=model.get("spring_nodes", np.zeros((0, 2), np.int32)),

@@ -252,8 +252,12 @@ class Bench:
         """
         folder = self.out / "locks"
         folder.mkdir(parents=True, exist_ok=True)
-        with locked_file(folder / name):
+        with locked_file(folder / name, self._tell_holder):
             yield
+
+    def _tell_holder(self, holder: str) -> None:
+        """Say for whom this process waits, which may be one of another command."""
+        self.progress.report(f"waits for {holder}", 0, 0)
 
     def _filled(self, method: Method, recording: Sequence, variant: str, folder: Path) -> RunFolder:
         _raise_again(folder)

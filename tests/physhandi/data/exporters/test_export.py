@@ -34,7 +34,7 @@ def make_run(folder: Path, *, controls: str = "hand", **changes: Any) -> Run:
     )
     with run.begin_attempt() as attempt:
         base = "sequences/lift"
-        attempt.save_yaml(f"{base}/meta.yaml", {"frame_rate": 30.0, "length_unit": "m"})
+        attempt.save_yaml(f"{base}/meta.yaml", {"frame_rate": 30.0, "frame_count": len(rollout)})
         if changes.get("has_motion", True):
             attempt.save_array(f"{base}/rollout.npy", rollout)
             control = vertex if controls == "hand" else vertex[:, :2] + 1
