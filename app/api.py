@@ -352,8 +352,9 @@ def _add_imports(router: APIRouter, imports: Imports) -> None:
         return Response(status_code=204)
 
     @router.post("/imports", status_code=202)
-    def import_capture(new: NewImport) -> dict[str, Any]:
+    def import_capture(new: NewImport, request: Request) -> dict[str, Any]:
         """Make a sequence of a recording; one that was stopped goes on where it was."""
+        request.state.made = {"sequence_id": new.name}
         return asdict(imports.start(ImportOrder(**new.model_dump())))
 
     @router.get("/imports/{sequence_id}")
@@ -417,6 +418,7 @@ def _add_jobs(
     @router.post("/runs", status_code=201)
     def launch(
         new: NewRun,
+        asked: Request,
         response: Response,
         idempotency_key: Annotated[
             str | None, Header(min_length=1, max_length=255, pattern=r"^[!-~]+$")
@@ -440,6 +442,7 @@ def _add_jobs(
             accepts_missing=new.accepts_missing,
             request=request,
         )
+        asked.state.made = {"run_id": run.id}
         return describe_run(catalog.run_item(run.id), scheduler)
 
     @router.patch("/runs/{run_id}")

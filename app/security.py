@@ -232,7 +232,7 @@ class Gatekeeper:
         state["visitor"] = visitor
         if offered is None and not self._has_own_origin(scope, headers):
             return _error(403, "foreign_origin", "The request comes from another site.")
-        if not visitor.may_change and not _only_looks(scope):
+        if not visitor.may_change and not only_looks(scope):
             return _error(403, "read_only", _READ_ONLY)
         state["owner"], state["may_change"] = visitor.name, visitor.may_change
         state["is_foreign"] = offered is None and _is_foreign(headers)
@@ -256,9 +256,12 @@ class Gatekeeper:
         visitor = self._security.script(token) if token is not None and is_visit else None
         if visitor is not None:
             response = _without_token(scope) or Response(status_code=500)
+            made = self._security.new_pass(may_change=visitor.may_change)
+            state = scope.setdefault("state", {})
+            state["visitor"], state["signs_in"] = self._security.browser(made), True
             response.set_cookie(
                 self._security.cookie,
-                self._security.new_pass(may_change=visitor.may_change),
+                made,
                 httponly=True,
                 samesite="strict",
                 path="/",
@@ -358,7 +361,7 @@ def _is_visit(scope: Scope) -> bool:
     return scope["type"] == "http" and scope["method"] in {"GET", "HEAD"}
 
 
-def _only_looks(scope: Scope) -> bool:
+def only_looks(scope: Scope) -> bool:
     """Whether a request changes nothing that others see."""
     method = scope["method"] if scope["type"] == "http" else "WEBSOCKET"
     if method in _SAFE_METHODS:

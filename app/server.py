@@ -18,6 +18,7 @@ from prometheus_client import CollectorRegistry
 from starlette.exceptions import HTTPException
 
 from app.api import create_api
+from app.audit import Audited, AuditLog
 from app.body_limit import BodyLimit
 from app.comparing import create_comparing
 from app.exports.cache import FileCache, TooManyFilesError
@@ -176,7 +177,7 @@ def create_app(
         create_health(catalog, scheduler, sessions, machine, figures := CollectorRegistry())
     )
     _answer_errors(app, pages)
-    _guard(app, security, figures)
+    _guard(app, security, figures, AuditLog(settings.audit_dir))
     return app
 
 
@@ -186,10 +187,13 @@ def _storage(settings: ServerSettings, catalog: Catalog, scheduler: Scheduler) -
     return UserStorage(PresetStore(settings.data_dir / "presets"), saver)
 
 
-def _guard(app: FastAPI, security: Security, registry: CollectorRegistry) -> None:
+def _guard(
+    app: FastAPI, security: Security, registry: CollectorRegistry, audit_log: AuditLog
+) -> None:
     """Put in front of all routes what requests have to pass; the last that is added comes first."""
     app.add_middleware(BodyLimit, most_bytes=_BODY_LIMIT)
     app.add_middleware(Gatekeeper, security=security)
+    app.add_middleware(Audited, log=audit_log)
     app.add_middleware(RequestFigures, registry=registry)
 
 

@@ -164,6 +164,11 @@ class ServerSettings(BaseSettings):
         return self.data_dir / "damaged"
 
     @property
+    def audit_dir(self) -> Path:
+        """Folder of the log of who changed what."""
+        return self.data_dir / "audit"
+
+    @property
     def launches_path(self) -> Path:
         """File that says which run was launched by which key of a client."""
         return self.data_dir / "launches.json"

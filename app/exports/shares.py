@@ -200,7 +200,9 @@ def create_shares(catalog: Catalog, file_cache: FileCache, shares: Shares) -> AP
             query=urlencode(query, safe=","),
             created=datetime.now(UTC).isoformat(timespec="milliseconds"),
         )
-        return shares.add(page, about)
+        made = shares.add(page, about)
+        request.state.made = {"share_id": made.id}
+        return made
 
     @router.get("/api/v1/shares")
     def list_shares(run: Annotated[ItemId | None, Query()] = None) -> list[Share]:
