@@ -208,7 +208,7 @@ def _known_to(run: Run, settings: Mapping[str, Any]) -> dict[str, Any]:
 
     known = dict(settings)
     if "profile" in settings and "profile" in run.config:
-        known["profile"] = without_newer(settings["profile"], run.config["profile"])
+        known["profile"] = without_newer(settings["profile"], run.asked("profile", dict[str, Any]))
     return known
 
 

@@ -760,14 +760,14 @@ def run_job(
         attempt.save_json(ENVIRONMENT, environment)
         stored = StoredTake.load(run)
         if stored is not None:
-            source = RunFolder.open(Path(run.config["source"]))
+            source = RunFolder.open(Path(run.asked("source", str)))
             record_take(source, stored, Path(run.sequences[0]), watched, device=device)
         sequences = [Sequence.load(Path(path)) for path in run.sequences]
         for sequence in sequences:
             sequence.validate(reads_color=False)
         if run.kind == "simulation":
-            source = RunFolder.open(Path(run.config["source"]))
-            changes = run.config["parameters"]
+            source = RunFolder.open(Path(run.asked("source", str)))
+            changes = run.asked("parameters", dict[str, Any])
             edits = read_edits(run.folder / EDITS_FILE) if "edits" in run.config else None
             simulate(
                 source,
@@ -780,7 +780,7 @@ def run_job(
                 edits=edits,
             )
         else:
-            config = PipelineConfig.from_dict(run.config["profile"])
+            config = PipelineConfig.from_dict(run.asked("profile", dict[str, Any]))
             reconstruct(
                 sequences, config, attempt, watched, device=device, more_devices=more_devices
             )

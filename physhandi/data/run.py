@@ -38,6 +38,7 @@ from physhandi.data.run_folder import (
     SAFE_ID,
     STAGES_FILE,
     AboutFile,
+    Checked,
     EventLine,
     ExitFile,
     JobFile,
@@ -185,6 +186,21 @@ class RunFolder:
                 f"{len(job['sequence_names'])} sequence_names."
             )
         return cls(folder, job, checked(about, AboutFile, folder / RUN))
+
+    def asked(self, name: str, kind: type[Checked]) -> Checked:
+        """Give a part of the configuration without which the run cannot be computed.
+
+        Args:
+            name: Name of the part.
+            kind: What it has to be.
+
+        Raises:
+            RunError: If it is missing or wrong; names file and field.
+        """
+        path = self.folder / JOB
+        if name not in self.config:
+            raise RunError(f"{path} is damaged: field 'config.{name}' is missing.")
+        return checked(self.config[name], kind, f"{path}, 'config.{name}',")
 
     @property
     def state(self) -> RunState:

@@ -7,6 +7,7 @@ for the recordings of a run.
 from collections.abc import Sequence as Listing
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -19,7 +20,7 @@ from physhandi.data.observation import ObjectObservation
 from physhandi.data.run import RunFolder
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
-from physhandi.errors import FitError, MissingInputError
+from physhandi.errors import FitError, MissingInputError, RunError
 from physhandi.fitting import artefacts
 from physhandi.fitting.config import PipelineConfig
 from physhandi.fitting.hand_reconstruction import HandFit, keypoint_target, reconstruct_hands
@@ -59,6 +60,22 @@ class PlacedObject:
     """The fitted ones, in the world of the recording."""
 
 
+def settings_of_fit(run: RunFolder) -> PipelineConfig:
+    """Read the settings of the fit that a run is, or that it simulates again.
+
+    Raises:
+        RunError: If one of the runs in between is gone or damaged, or it simulates itself.
+        SettingsError: If they are those of another version of the program.
+    """
+    seen: set[Path] = set()
+    while run.kind == "simulation":
+        if run.folder in seen:
+            raise RunError(f"{run.folder} is damaged: run '{run.id}' simulates itself.")
+        seen.add(run.folder)
+        run = RunFolder.open(Path(run.asked("source", str)))
+    return PipelineConfig.from_dict(run.asked("profile", dict[str, Any]))
+
+
 def place_object(
     run: RunFolder,
     sequence: Sequence,
@@ -78,9 +95,7 @@ def place_object(
         FitError: If it shows another object, or its hands too poorly.
         RunError: If the run's settings or the kind of its object cannot be read.
     """
-    while run.kind == "simulation":
-        run = RunFolder.open(Path(run.config["source"]))
-    config = PipelineConfig.from_dict(run.config["profile"])
+    config = settings_of_fit(run)
     hands = reconstruct_hands(sequence, config.hand, progress) if sequence.hands else None
     observation = observe_object(sequence, progress)
     known, parameters, rest_node = fitted

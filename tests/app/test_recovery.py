@@ -128,8 +128,8 @@ def test_a_damaged_run_is_moved_aside_whole(damaged: World, fitted_folder: Path)
 def test_only_what_is_damaged_and_at_rest_is_moved_aside(
     damaged: World, fitted_folder: Path
 ) -> None:
-    client = damaged.script()
-    before = tree(damaged.settings.data_dir)
+    client, folders = damaged.script(), (damaged.settings.run_dir, damaged.settings.sequence_dir)
+    before = [tree(folder) for folder in folders]
     for path, status, words in (
         ("runs/whole", 409, "'whole' is succeeded"),
         ("runs/nobody", 404, "no run 'nobody'"),
@@ -144,7 +144,7 @@ def test_only_what_is_damaged_and_at_rest_is_moved_aside(
     foreign = damaged.browser()
     headers = {"Origin": "http://evil.example"}
     assert foreign.post("/api/v1/runs/path/aside", headers=headers).status_code == 403
-    assert tree(damaged.settings.data_dir) == before
+    assert [tree(folder) for folder in folders] == before
     made_with = make_world(damaged.settings.data_dir / "other", bundled=damaged.settings.data_dir)
     refused = made_with.script().post("/api/v1/runs/path/aside")
     assert (refused.status_code, "came with the program" in refused.text) == (409, True)

@@ -171,6 +171,28 @@ def test_no_page_keeps_anybody_out(home: Page, base: str) -> None:
         assert violations(home, "color-contrast") == [], f"{path} in the dark"
 
 
+def test_a_damaged_run_is_told_and_moved_aside(home: Page, base: str, served) -> None:
+    bad = served.data_dir / "runs" / "bad"
+    shutil.copytree(served.data_dir / "runs" / "copy0", bad)
+    (bad / "run.yaml").write_text((bad / "run.yaml").read_text() + "label: [1, 2]\n")
+    home.goto(f"{base}/runs")
+    row = home.locator("tr[data-run=bad]")
+    expect(row.locator(".state")).to_have_text("damaged")
+    expect(row.locator(".problem")).to_contain_text("run.yaml")
+    home.once("dialog", lambda dialog: dialog.dismiss())
+    row.get_by_role("button", name="Move aside").click()
+    expect(row).to_have_count(1)
+    home.goto(f"{base}/recovery")
+    assert violations(home) == []
+    home.once("dialog", lambda dialog: dialog.accept())
+    home.locator("[data-damaged=bad]").get_by_role("button", name="Move aside").click()
+    expect(home.locator("[data-damaged=bad]")).to_have_count(0)
+    expect(home.get_by_text("damaged/runs/bad", exact=True)).to_be_visible()
+    assert violations(home) == []
+    assert not bad.exists()
+    assert (served.data_dir / "damaged" / "runs" / "bad" / "job.yaml").is_file()
+
+
 def test_a_recording_is_checked_frame_by_frame(home: Page, base: str) -> None:
     home.goto(f"{base}/sequences")
     home.locator("[data-sequence=towel_fold]").get_by_role("link", name="Check").click()

@@ -337,7 +337,7 @@ class Bench:
         if base.name != still.name:
             first = self._run(still, recording, variant)
             first_seconds = self._seconds(still, recording, variant, first)
-            shared = shared_stages(first.config["profile"], self._settings_of(base))
+            shared = shared_stages(first.asked("profile", dict[str, Any]), self._settings_of(base))
             if not first_seconds:
                 return {}
             seconds |= {name: first_seconds[name] for name in shared if name in first_seconds}

@@ -277,7 +277,9 @@ def execute(
         if hands is not None and noise is not None:
             take_disturbed_hands(hands, attempt, recording.name, noise)
         elif hands is not None:
-            take_stages(hands, attempt, shared_stages(hands.config["profile"], settings))
+            take_stages(
+                hands, attempt, shared_stages(hands.asked("profile", dict[str, Any]), settings)
+            )
         config = pipeline.PipelineConfig.from_dict(settings)
         if method.rule is None:
             pipeline.reconstruct([recording], config, attempt, watched, device=device)

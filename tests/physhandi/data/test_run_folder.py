@@ -209,6 +209,15 @@ def test_lines_that_are_no_reports_are_skipped(tmp_path: Path) -> None:
     assert offset == sum(len(line) + 1 for line in lines)
 
 
+def test_a_part_of_the_configuration_that_is_needed_is_told_by_name(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "fit", config={"source": 3, "parameters": {"drag": 1.0}})
+    assert run.asked("parameters", dict[str, Any]) == {"drag": 1.0}
+    with pytest.raises(RunError, match=r"job\.yaml, 'config\.source', is damaged: expected text"):
+        run.asked("source", str)
+    with pytest.raises(RunError, match=r"job\.yaml is damaged: field 'config\.profile' is miss"):
+        run.asked("profile", dict[str, Any])
+
+
 def test_what_could_not_be_read_again_is_not_made(tmp_path: Path) -> None:
     for changes, words in (
         ({"sequences": []}, "needs a sequence"),

@@ -4,14 +4,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
+from run_world import make_run
 from scipy.spatial.transform import Rotation
 
 import physhandi as ph
 from physhandi.data.sequence_meta import SequenceMeta
 from physhandi.data.sequence_writer import write_sequence
+from physhandi.errors import RunError
 from physhandi.fitted_object import FittedObject
 from physhandi.fitting.config import load_profile
+from physhandi.fitting.placement import settings_of_fit
 from physhandi.progress import NullProgress
+from physhandi.run import Run
 from physhandi.simulation.simulator import Simulator
 
 FRAMES = 4
@@ -132,3 +137,19 @@ def test_parameters_changed_afterwards_keep_the_lengths_of_the_bent_shape(runs, 
     own = placed.model.object_spring_count
     assert changed.virtual_spring_count > placed.model.virtual_spring_count
     np.testing.assert_allclose(changed.rest_length[:own], placed.model.rest_length[:own], rtol=2e-5)
+
+
+def test_the_settings_of_a_fit_are_found_through_its_simulations(tmp_path: Path) -> None:
+    config = load_profile("quick")
+    fit = make_run(tmp_path / "fit", config={"profile": config.to_dict()})
+    again = make_run(tmp_path / "again", kind="simulation", config={"source": str(fit.folder)})
+    third = make_run(tmp_path / "third", kind="simulation", config={"source": str(again.folder)})
+    assert settings_of_fit(third) == config
+    # A damaged description must not lead round and round.
+    circle = {"source": str(third.folder)}
+    job = yaml.safe_load((again.folder / "job.yaml").read_text()) | {"config": circle}
+    (again.folder / "job.yaml").write_text(yaml.safe_dump(job))
+    with pytest.raises(RunError, match="'third' simulates itself"):
+        settings_of_fit(Run.open(third.folder))
+    with pytest.raises(RunError, match=r"field 'config\.source' is missing"):
+        settings_of_fit(make_run(tmp_path / "lost", kind="simulation", config={}))
