@@ -157,6 +157,7 @@ def test_a_senseless_scene_is_refused(client: TestClient, case: tuple[Any, int, 
 
 
 IDS = ("../../etc", "%2e%2e", "..%2f..%2fetc%2fpasswd", "a.b", "x" * 65, "%00", "a%0ab", "-/-")
+IDS += ("C:x", "%5C%5Chost%5Cs", "CON", "windows%2Fwin.ini", "C%3A%5Cwindows", "con.txt")
 
 
 @pytest.mark.parametrize(
