@@ -81,6 +81,11 @@ def damage_file(path: Path, choose: Choose) -> None:
         number = choose(range(len(lines)))
         lines[number] = json.dumps(damage_content(json.loads(lines[number]), choose)).encode()
         path.write_bytes(b"\n".join(lines) + b"\n")
+    elif deed == "structure" and path.suffix == ".csv":
+        rows = [line.split(",") for line in original.decode().splitlines()]
+        row = choose(rows)
+        row[choose(range(len(row)))] = str(choose((*WRONG, "x" * 200_000, '"', "nan", "-inf")))
+        path.write_text("\n".join(",".join(row) for row in rows))
     elif deed == "odd" and is_yaml:
         lines = original.decode().splitlines()
         number = choose(range(len(lines)))

@@ -608,7 +608,10 @@ def read_rows(text: str) -> list[SuiteRow]:
     Raises:
         ValueError: If the columns are others, or a number is not one.
     """
-    table = list(csv.reader(io.StringIO(text)))
+    try:
+        table = list(csv.reader(io.StringIO(text)))
+    except csv.Error as error:
+        raise ValueError(str(error)) from None
     if not table or tuple(table[0]) not in (SUITE_COLUMNS, SEED_COLUMNS):
         raise ValueError(f"the columns must be {', '.join(SUITE_COLUMNS)}")
     rows: list[SuiteRow] = []

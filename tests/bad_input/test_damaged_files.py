@@ -7,7 +7,7 @@ import json
 import os
 import socket
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -28,16 +28,18 @@ from app.jobs.views import (
     stages_of,
     summarize_run,
 )
+from app.pages import suites
 from app.pages.metrics import tabulate
 from app.pages.parameters import parameter_rows
-from app.pages.suites import _described
 from app.viewer.physics.presets import PresetStore
 from physhandi.data.files import plain
 from physhandi.data.lease import live_holder
 from physhandi.data.run_folder import read_events
 from physhandi.data.sequence_meta import read_meta
-from physhandi.errors import RunError, SequenceError
+from physhandi.errors import RunError, SequenceError, UsageError
+from physhandi.metrics.suite_report import SUITE_COLUMNS
 from physhandi.run import Run
+from physhandi.synthetic.suite.folder import check_folder
 
 _MANY = int(os.environ.get("PHYSHANDI_FUZZ", "0"))
 _PATIENT = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
@@ -116,7 +118,15 @@ def look_at_presets(folder: Path) -> None:
 
 
 def look_at_suite(folder: Path) -> None:
-    assert _described(folder)["name"] == folder.name
+    """Ask for what the page of a suite shows, and begin to go on with it."""
+    assert suites._described(folder)["name"] == folder.name
+    with told(folder):
+        content = suites._read(folder)
+        suites._tables(suites._rows(folder, content.about.seed_of), content.about.oracles)
+        suites._matrix(content.cells, content.about.oracles, suites.CellQuery(split="main"))
+        suites._choices(content.cells)
+    with suppress(UsageError):
+        assert check_folder(folder, "t", ["b"]) is not None
 
 
 def look_at_sequence(folder: Path) -> None:
@@ -139,6 +149,7 @@ READERS: dict[str, Callable[[Path], None]] = {
     "index.json": look_at_index,
     "presets/wet.yaml": look_at_presets,
     "cells.json": look_at_suite,
+    "table.csv": look_at_suite,
     "sequence.yaml": look_at_sequence,
 }
 
@@ -163,9 +174,20 @@ def folder(fitted: Path, sheet: Path) -> Path:
     preset = {"format": "physhandi-preset/1", "name": "Wet", "parameters": {"drag": 6.0}}
     (fitted / "presets").mkdir()
     (fitted / "presets/wet.yaml").write_text(json.dumps(preset))
-    cell = {"method": "a", "case": "b", "split": "main", "run": "c", "error": "", "figures": {}}
+    figures = {"main": {"track_error": 0.01, "chamfer_l2": None}}
+    cell = {
+        "method": "a",
+        "case": "b",
+        "split": "main",
+        "run": "c",
+        "error": "",
+        "figures": figures,
+    }
     environment = {"started": "2026", "device": "cpu", "device_name": "x"}
-    suite = {"title": "t", "cases": ["b"], "methods": {"a": ""}, "skipped": []}
+    suite = {"title": "t", "cases": ["b"], "methods": {"a": ""}, "skipped": [], "protocols": []}
+    (fitted / "table.csv").write_text(
+        f"{','.join(SUITE_COLUMNS)}\na,main,track_error,0.01,0.009,0.011,3\n"
+    )
     cells = {"about": suite | {"environment": environment}, "cells": [cell]}
     (fitted / "cells.json").write_text(json.dumps(cells))
     (sheet / "sequence.yaml").rename(fitted / "sequence.yaml")

@@ -12,7 +12,7 @@ from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 from jaxtyping import Float
@@ -23,7 +23,14 @@ from physhandi.data.files import write_array, write_json
 from physhandi.data.layout import SequenceFiles
 from physhandi.data.lease import locked_file
 from physhandi.data.run import RunFolder
-from physhandi.data.run_folder import EXIT, artefacts, read_json, read_mapping
+from physhandi.data.run_folder import (
+    EXIT,
+    artefacts,
+    checked,
+    read_json,
+    read_mapping,
+    read_record,
+)
 from physhandi.data.sequence import Sequence
 from physhandi.data.sequence_meta import SIDES
 from physhandi.data.truth import read_truth
@@ -32,6 +39,7 @@ from physhandi.errors import (
     FitError,
     MissingInputError,
     PhysHandiError,
+    RunError,
     SimulationDivergedError,
     SimulationError,
     UsageError,
@@ -79,6 +87,13 @@ class Outcome:
     """Scores against the whole recording, as `physhandi.metrics.report.score_run` returns them."""
     curves: Mapping[str, Any] = field(default_factory=dict[str, Any])
     """Errors frame by frame."""
+
+
+class StoredScores(TypedDict):
+    """A file of ``scores/``: how a run was scored."""
+
+    report: dict[str, Any]
+    curves: dict[str, Any]
 
 
 class Bench:
@@ -226,11 +241,15 @@ class Bench:
         parts += [str(len(recording.reconstruction_frames)), code_version(SCORES)]
         key = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
         path = self.out / "scores" / f"{key}.json"
-        if not path.is_file():
+        try:
+            stored = read_record(path, StoredScores)
+        except RunError:
+            stored = None  # Damaged: it is measured again.
+        if stored is None:
             report, curves = measure_cell(run, reference, recording)
             path.parent.mkdir(parents=True, exist_ok=True)
             write_json(path, {"report": report, "curves": curves})
-        stored = read_json(path)
+            stored = checked(read_json(path), StoredScores, path)
         return stored["report"], stored["curves"]
 
     def _run(self, method: Method, recording: Sequence, variant: str) -> RunFolder:

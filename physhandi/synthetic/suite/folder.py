@@ -7,17 +7,17 @@ that cells of an earlier order on the same sequences remain in them.
 from collections.abc import Iterable, Iterator, Mapping
 from collections.abc import Sequence as Many
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal, TypedDict, cast
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
 from physhandi.data.files import named_fields, write_bytes, write_json
-from physhandi.data.run_folder import read_json
+from physhandi.data.run_folder import read_json, read_record
 from physhandi.data.sequence import Sequence
 from physhandi.data.truth import read_truth
-from physhandi.errors import UsageError
+from physhandi.errors import RunError, UsageError
 from physhandi.metrics.contact import THRESHOLDS, ContactLabels, contact_scores, true_labels
 from physhandi.metrics.report import CONTACT_METRICS, METRICS
 from physhandi.metrics.suite_report import (
@@ -167,6 +167,23 @@ class SuiteFolder:
         return (self.out / "cells" / name / "run.yaml").is_file()
 
 
+class StoredAbout(TypedDict):
+    """What ``cells.json`` says of the order, as far as it is read again."""
+
+    title: str
+    methods: dict[str, str]
+    cases: list[str]
+    protocols: list[str]
+    skipped: list[str]
+
+
+class StoredTables(TypedDict):
+    """``cells.json``: the order and its cells."""
+
+    about: StoredAbout
+    cells: list[CellScores]
+
+
 def check_folder(out: Path, title: str, cases: Iterable[str]) -> dict[str, Any] | None:
     """Read the tables in a folder, and refuse those of another order.
 
@@ -182,21 +199,20 @@ def check_folder(out: Path, title: str, cases: Iterable[str]) -> dict[str, Any] 
         UsageError: If the table is of other sequences, or cannot be read.
     """
     path = out / CELLS
-    if not path.is_file():
+    try:
+        content = read_record(path, StoredTables)
+    except RunError as error:
+        raise UsageError(f"{error} Delete it; finished cells are kept without it.") from None
+    if content is None:
         return None
-    content = named_fields(read_json(path)) or {}
-    about = named_fields(content.get("about"))
-    cells = content.get("cells")
-    fields = ("title", "methods", "cases", "protocols", "skipped")
-    if about is None or not isinstance(cells, list) or any(name not in about for name in fields):
-        raise UsageError(f"{path} is damaged. Delete it; finished cells are kept without it.")
+    about, cells = content["about"], content["cells"]
     wanted_cases = list(cases)
     if about["title"] != title or set(about["cases"]) != set(wanted_cases):
         raise UsageError(
             f"{out} holds the table '{about['title']}' of {', '.join(about['cases'])}, which "
             f"'{title}' of {', '.join(wanted_cases)} would replace. Choose another --out."
         )
-    return {"about": about, "cells": cast("list[CellScores]", cells)}
+    return {"about": about, "cells": cells}
 
 
 def _with_curves(out: Path, cells: Many[CellScores]) -> list[CellScores]:
