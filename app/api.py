@@ -4,13 +4,16 @@ import asyncio
 import time
 from collections.abc import Iterable
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Header, Query, Request, Response
+from fastapi import Path as PathParameter
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_validator
 from starlette.background import BackgroundTask
+from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
 from app.comparison import NewComparison
@@ -32,6 +35,8 @@ from app.jobs.recordings.annotations import (
 )
 from app.jobs.recordings.background import BackgroundTasks
 from app.jobs.recordings.imports import ImportOrder, Imports
+from app.jobs.recordings.upload_names import MOST_FILES
+from app.jobs.recordings.uploads import NewFile, Uploads
 from app.jobs.recovery.aside import MovedFolder
 from app.jobs.recovery.recovery import Recovery
 from app.jobs.scheduler import Scheduler
@@ -184,6 +189,36 @@ class NewImport(SurveyQuery):
     """Whether a sequence of that name may be replaced."""
 
 
+class UploadFile(BaseModel):
+    """A file that is going to be sent."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    path: Annotated[str, Field(min_length=1, max_length=500)]
+    """Its name with slashes, below the folder that is sent."""
+    size: Annotated[int, Field(ge=0, le=2**50)]
+    """Its size [bytes]."""
+
+
+class UploadName(BaseModel):
+    """What an upload is called."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    name: ItemId | None = None
+    """Another name than it was announced with; none for that one."""
+
+
+class NewUpload(BaseModel):
+    """A recording, sequence or run to send: its files, or a zip archive of them."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    name: ItemId
+    """What it is to be called."""
+    files: Annotated[list[UploadFile], Field(min_length=1, max_length=2 * MOST_FILES)]
+
+
 class NewSession(BaseModel):
     """A live scene to open."""
 
@@ -218,6 +253,7 @@ def create_api(
     tasks: BackgroundTasks,
     annotations: Annotations,
     imports: Imports,
+    uploads: Uploads,
     recovery: Recovery,
 ) -> APIRouter:
     """Make the routes.
@@ -232,12 +268,14 @@ def create_api(
         tasks: Tells which recordings are being worked on.
         annotations: Finds masks and tracks.
         imports: Makes sequences of recordings.
+        uploads: Takes what is sent.
         recovery: Knows what is damaged.
     """
     router = APIRouter(prefix="/api/v1")
     _add_listings(router, catalog, scheduler)
     _add_annotations(router, annotations)
     _add_imports(router, imports)
+    _add_uploads(router, uploads)
     _add_results(router, catalog)
     _add_jobs(router, catalog, scheduler, tasks)
     _add_sessions(router, sessions)
@@ -365,6 +403,52 @@ def _add_imports(router: APIRouter, imports: Imports) -> None:
     @router.delete("/imports/{sequence_id}", status_code=204)
     def cancel_import(sequence_id: ItemId) -> Response:
         imports.cancel(sequence_id)
+        return Response(status_code=204)
+
+
+def _add_uploads(router: APIRouter, uploads: Uploads) -> None:
+    @router.get("/uploads")
+    def list_uploads() -> dict[str, Any]:
+        """List what was begun and is not finished."""
+        return {"uploads": uploads.unfinished()}
+
+    @router.post("/uploads", status_code=201)
+    def begin_upload(new: NewUpload) -> dict[str, Any]:
+        """Announce a recording, sequence or run by the names and sizes of its files."""
+        return uploads.begin(new.name, [NewFile(**file.model_dump()) for file in new.files])
+
+    @router.get("/uploads/{upload_id}")
+    def show_upload(upload_id: ItemId) -> dict[str, Any]:
+        """Tell how much of it is here, and what became of it."""
+        return uploads.describe(upload_id)
+
+    @router.put("/uploads/{upload_id}/files/{number}")
+    async def send_piece(
+        upload_id: ItemId,
+        number: Annotated[int, PathParameter(ge=0, le=MOST_FILES)],
+        offset: Annotated[int, Query(ge=0)],
+        request: Request,
+    ) -> dict[str, Any]:
+        """Append a piece of a file, the request's body, where the last one ended."""
+        piece = await request.body()
+        append = partial(uploads.append, upload_id, number, offset, piece)
+        return {"received": await run_in_threadpool(append)}
+
+    @router.post("/uploads/{upload_id}/finish", status_code=202)
+    def finish_upload(upload_id: ItemId, wish: UploadName) -> dict[str, Any]:
+        """Have a whole upload checked and put in place."""
+        return asdict(uploads.finish(upload_id, wish.name))
+
+    @router.post("/uploads/{upload_id}/cancel", status_code=204)
+    def cancel_upload(upload_id: ItemId) -> Response:
+        """Stop the check of an upload, which stays."""
+        uploads.cancel(upload_id)
+        return Response(status_code=204)
+
+    @router.delete("/uploads/{upload_id}", status_code=204)
+    def remove_upload(upload_id: ItemId) -> Response:
+        """Remove what was sent of it."""
+        uploads.remove(upload_id)
         return Response(status_code=204)
 
 

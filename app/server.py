@@ -34,6 +34,7 @@ from app.jobs.recordings.annotations import Annotations
 from app.jobs.recordings.background import BackgroundTasks
 from app.jobs.recordings.imports import Imports
 from app.jobs.recordings.models import ModelFolders
+from app.jobs.recordings.uploads import NoRoomError, Uploads
 from app.jobs.recovery.recovery import Recovery
 from app.jobs.scheduler import QueueFullError, Scheduler
 from app.jobs.views import describe_run
@@ -70,6 +71,7 @@ _STATUS: tuple[tuple[type[PhysHandiError], int, str], ...] = (
     (TooManySessionsError, 429, "too_many_sessions"),
     (QueueFullError, 429, "queue_full"),
     (TooManyFilesError, 429, "too_many_files"),
+    (NoRoomError, 507, "storage"),
     (UsageError, 422, "invalid"),
     (SequenceError, 422, "unusable_sequence"),
     (SkippedObjectError, 422, "skips_object"),
@@ -148,6 +150,7 @@ def create_app(
             tasks=tasks,
             annotations=Annotations(catalog, tasks, models),
             imports=imports,
+            uploads=Uploads(settings, tasks),
             recovery=recovery,
         )
     )

@@ -58,6 +58,8 @@ class ServerSettings(BaseSettings):
     """Least free memory of a GPU for a fit to be started on it [GiB]."""
     waiting_fits: int = Field(default=100, ge=1, le=10_000)
     """Fits that may wait in line."""
+    upload_gib: float = Field(default=20.0, gt=0, le=10_000)
+    """Size of an upload at most, unpacked [GiB]; 5 % of the disk stay free in any case."""
     cancel_grace_s: float = Field(default=8.0, gt=0, le=600)
     """Time that a cancelled fit has to stop by itself before it is killed [s]."""
     hung_after_s: float = Field(default=120.0, ge=0.1, le=86_400)

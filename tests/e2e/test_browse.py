@@ -12,6 +12,7 @@ from clicked_disc import HEIGHT, TOP, WIDTH, cameras, center, write_disc
 from playwright.sync_api import Page, expect
 from raw_capture import RawCapture
 from scene_page import TIMEOUT_MS
+from sheet_sequence import write_sheet
 
 from physhandi.data.sequence import Sequence
 
@@ -298,3 +299,23 @@ def test_a_recording_is_imported_and_its_masks_are_painted(home: Page, base: str
     assert label() == [74, 155, 232, 255]
     home.keyboard.press("Control+z")
     expect(home.get_by_role("button", name="Save the mask")).to_be_disabled()
+
+
+def test_a_sequence_is_sent_from_the_users_machine(home: Page, base: str, tmp_path: Path) -> None:
+    folder = write_sheet(tmp_path / "sheet").folder.rename(tmp_path / "My sheet (2)")
+    (folder / ".hidden").write_text("not wanted")
+    chosen = home.locator("#upload [data-of=folder]")
+    home.goto(f"{base}/import")
+    chosen.set_input_files(folder)
+    home.wait_for_url(f"{base}/sequences/My_sheet_2/check**")
+    # The name is taken now; what was sent needs not be sent again to have another one.
+    home.goto(f"{base}/import")
+    chosen.set_input_files(folder)
+    told = home.get_by_role("alert").filter(has_text="There is a 'My_sheet_2' in sequences already")
+    expect(told).to_be_visible()
+    assert violations(home) == []
+    home.get_by_label("Name for My_sheet_2").fill("other")
+    home.get_by_role("button", name="Check again").click()
+    home.wait_for_url(f"{base}/sequences/other/check**")
+    home.goto(f"{base}/import")
+    expect(home.locator("#upload .unfinished li")).to_have_count(0)

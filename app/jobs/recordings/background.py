@@ -29,9 +29,9 @@ class BackgroundTask:
 class Work:
     """What a piece of work is, for those who must not come in its way."""
 
-    kind: Literal["annotation", "import", "example"]
+    kind: Literal["annotation", "import", "example", "upload"]
     name: str
-    """Sequence that it is about."""
+    """Sequence or upload that it is about."""
     doing: str
     """Sentence that says what is being done."""
 

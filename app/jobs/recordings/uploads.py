@@ -1,0 +1,307 @@
+"""Recordings, sequences and runs that are sent by browsers and scripts, piece by piece.
+
+An upload is announced with the names and sizes of its files; its pieces are appended where the
+last one ended, so one that broke off goes on, also after a restart. When all of it is there, a
+process of its own unpacks and checks it (`app.jobs.recordings.unpacking`) and puts it in place.
+"""
+
+import json
+import logging
+import re
+import secrets
+import shutil
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from app.jobs.catalog import NotFoundError
+from app.jobs.recordings.background import BackgroundTask, BackgroundTasks, Work
+from app.jobs.recordings.upload_names import check_names, is_left_out, quoted_name
+from app.settings import ServerSettings
+from physhandi.data.files import named_fields, write_json
+from physhandi.errors import PhysHandiError, RunError, UsageError
+
+logger = logging.getLogger(__name__)
+
+CHUNK = 2**20
+"""Size of a piece at most [bytes]; no request may bring more."""
+_WORKER = "app.jobs.recordings.unpacking"
+_MOST_UPLOADS = 20
+_KEPT_S = 7 * 86_400.0
+_KEPT_FREE = 0.05
+"""Part of the disk that uploads leave to others."""
+_ABOUT = "upload.json"
+
+
+class UnknownUploadError(UsageError, NotFoundError):
+    """There is no such upload."""
+
+
+class NoRoomError(PhysHandiError):
+    """The disk has no room for an upload."""
+
+
+@dataclass(frozen=True)
+class NewFile:
+    """A file that is going to be sent."""
+
+    path: str
+    """Its name with slashes, below the folder that is sent."""
+    size: int
+    """Its size [bytes]."""
+
+
+class Uploads:
+    """Takes the pieces of uploads, and has whole ones put in place."""
+
+    def __init__(
+        self, settings: ServerSettings, tasks: BackgroundTasks, *, worker: str = _WORKER
+    ) -> None:
+        """Prepare.
+
+        Args:
+            settings: Tell the folders and how much may be sent.
+            tasks: Has whole uploads unpacked and checked, one at a time.
+            worker: Module of the process.
+        """
+        self._folder = settings.data_dir / "incoming"
+        self._most = int(settings.upload_gib * 2**30)
+        self._places = {
+            "captures": settings.capture_dir,
+            "sequences": settings.sequence_dir,
+            "runs": settings.run_dir,
+        }
+        self._tasks = tasks
+        self._worker = worker
+        self._lock = threading.Lock()
+
+    def begin(self, name: str, files: Sequence[NewFile]) -> dict[str, Any]:
+        """Announce an upload.
+
+        Args:
+            name: What it is to be called: 1 to 64 letters, digits, ``_`` and ``-``.
+            files: Its files; those that systems leave behind are not taken.
+
+        Returns:
+            `describe` of it.
+
+        Raises:
+            UsageError: If names or sizes are refused, or too many uploads are unfinished.
+            NoRoomError: If the disk has no room for it.
+        """
+        wanted = [file for file in files if not is_left_out(file.path)]
+        check_names(file.path for file in wanted)
+        if not wanted:
+            raise UsageError("It holds no files.")
+        total = sum(file.size for file in wanted)
+        if total > self._most:
+            raise UsageError(
+                f"It has {total / 2**30:.1f} GiB; this server takes {self._most / 2**30:g} GiB at "
+                "most (PHYSHANDI_UPLOAD_GIB). Copy it into the data folder instead."
+            )
+        with self._lock:
+            self._forget_old()
+            known = self.unfinished()
+            if len(known) >= _MOST_UPLOADS:
+                raise UsageError(f"{_MOST_UPLOADS} uploads are unfinished. Remove some of them.")
+            waiting = sum(one["total"] - one["received"] for one in known)
+            self._require_room(total + waiting)
+            upload_id = secrets.token_hex(8)
+            folder = self._folder / upload_id
+            folder.mkdir(parents=True)
+            listed = [[file.path, file.size] for file in wanted]
+            write_json(folder / _ABOUT, {"name": name, "files": listed})
+        return self.describe(upload_id)
+
+    def unfinished(self) -> list[dict[str, Any]]:
+        """Describe all that are unfinished, the oldest first."""
+        if not self._folder.is_dir():
+            return []
+        folders = sorted(self._folder.iterdir(), key=lambda path: path.stat().st_mtime)
+        found: list[dict[str, Any]] = []
+        for folder in folders:
+            try:
+                found.append(self.describe(folder.name))
+            except UnknownUploadError:
+                logger.warning("%s holds no upload; remove it by hand", folder)
+        return [one for one in found if "files" in one]
+
+    def describe(self, upload_id: str) -> dict[str, Any]:
+        """Tell how far an upload is.
+
+        Returns:
+            ``id name files received total chunk state reason progress result``; each file as
+            ``path size received``. ``state`` is receiving, checking, failed (with ``reason``) or
+            done (with ``kind`` and ``name`` of what it became as ``result``).
+
+        Raises:
+            UnknownUploadError: If there is none.
+        """
+        task = self._tasks.task("upload", upload_id)
+        if task.state == "done":
+            return {"id": upload_id, "state": "done", "result": task.result}
+        try:
+            name, files = self._read(upload_id)
+        except UnknownUploadError:
+            if task.state != "running":
+                raise
+            # It has just been put in place, as its process is about to say.
+            return {"id": upload_id, "state": "checking", "progress": task.progress}
+        received = [self._received(upload_id, path) for path, _ in files]
+        states = {"running": "checking", "failed": "failed"}
+        return {
+            "id": upload_id,
+            "name": name,
+            "files": [
+                {"path": path, "size": size, "received": here}
+                for (path, size), here in zip(files, received, strict=True)
+            ],
+            "received": sum(received),
+            "total": sum(size for _, size in files),
+            "chunk": CHUNK,
+            "state": states.get(task.state, "receiving"),
+            "reason": task.reason,
+            "progress": task.progress,
+            "result": {},
+        }
+
+    def append(self, upload_id: str, number: int, offset: int, piece: bytes) -> int:
+        """Take a piece of a file.
+
+        Args:
+            upload_id: The upload.
+            number: Which of its files, counted from 0.
+            offset: Where the piece begins: where the last one ended.
+            piece: The piece.
+
+        Returns:
+            How much of the file there is now [bytes].
+
+        Raises:
+            UnknownUploadError: If there is no such upload or file.
+            UsageError: If it is larger than announced.
+            RunError: If it begins elsewhere, or the upload is being checked.
+            OSError: If the disk is full; then the piece can be sent again.
+        """
+        with self._lock:
+            self._require_still(upload_id)
+            _, files = self._read(upload_id)
+            if not 0 <= number < len(files):
+                raise UnknownUploadError(f"The upload has {len(files)} files; {number} is none.")
+            path, size = files[number]
+            received = self._received(upload_id, path)
+            if offset != received:
+                raise RunError(f"{quoted_name(path)} goes on at byte {received}, not at {offset}.")
+            if received + len(piece) > size:
+                raise UsageError(
+                    f"{quoted_name(path)} was announced with {size} bytes; this is more."
+                )
+            self._require_room(len(piece))
+            target = self._path(upload_id, path)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with target.open("ab") as out:
+                try:
+                    out.write(piece)
+                    out.flush()
+                except OSError:
+                    out.truncate(received)
+                    raise
+            return received + len(piece)
+
+    def finish(self, upload_id: str, name: str | None = None) -> BackgroundTask:
+        """Have a whole upload checked and put in place.
+
+        Args:
+            upload_id: The upload.
+            name: Another name than it was announced with; None for that one.
+
+        Raises:
+            UnknownUploadError: If there is none.
+            RunError: If something of it is missing, or something else is being worked on.
+        """
+        with self._lock:
+            self._require_still(upload_id)
+            announced, files = self._read(upload_id)
+            for path, size in files:
+                received = self._received(upload_id, path)
+                if received < size:
+                    raise RunError(
+                        f"{quoted_name(path)} has {received} of {size} bytes; send the rest."
+                    )
+                if size == 0:
+                    self._path(upload_id, path).parent.mkdir(parents=True, exist_ok=True)
+                    self._path(upload_id, path).touch()
+            name = name or announced
+            work = Work("upload", upload_id, f"'{name}' was sent and is being checked.")
+            order = {
+                "folder": str(self._folder / upload_id),
+                "name": name,
+                "most_bytes": min(self._most, self._room()),
+                "places": {kind: str(path) for kind, path in self._places.items()},
+            }
+            return self._tasks.start(work, self._worker, order)
+
+    def remove(self, upload_id: str) -> None:
+        """Forget an upload with all that was sent of it.
+
+        Raises:
+            UnknownUploadError: If there is none.
+            RunError: If it is being checked; `cancel` stops that.
+        """
+        with self._lock:
+            self._require_still(upload_id)
+            self._read(upload_id)
+            shutil.rmtree(self._folder / upload_id)
+
+    def cancel(self, upload_id: str) -> None:
+        """Stop checking an upload, which can be asked for again; does nothing if it is not."""
+        self._tasks.cancel("upload", upload_id)
+
+    def _forget_old(self) -> None:
+        if not self._folder.is_dir():
+            return
+        for folder in self._folder.iterdir():
+            newest = max(path.stat().st_mtime for path in (folder, *folder.rglob("*")))
+            if time.time() - newest > _KEPT_S:
+                logger.warning("upload %s was left for a week and is removed", folder.name)
+                shutil.rmtree(folder, ignore_errors=True)
+
+    def _require_still(self, upload_id: str) -> None:
+        if self._tasks.task("upload", upload_id).state == "running":
+            raise RunError("The upload is being checked; nothing of it can change now.")
+
+    def _require_room(self, size: int) -> None:
+        if size > self._room():
+            raise NoRoomError(
+                f"The disk has no room for {size / 2**20:.0f} MiB more: uploads leave "
+                f"{_KEPT_FREE:.0%} of it free. Free some space."
+            )
+
+    def _room(self) -> int:
+        folder = self._folder if self._folder.exists() else self._folder.parent
+        disk = shutil.disk_usage(folder)
+        return max(0, disk.free - int(_KEPT_FREE * disk.total))
+
+    def _path(self, upload_id: str, path: str) -> Path:
+        return self._folder / upload_id / "files" / path
+
+    def _received(self, upload_id: str, path: str) -> int:
+        try:
+            return self._path(upload_id, path).stat().st_size
+        except OSError:
+            return 0
+
+    def _read(self, upload_id: str) -> tuple[str, list[tuple[str, int]]]:
+        unknown = UnknownUploadError(f"There is no upload '{upload_id}'.")
+        if not re.fullmatch(r"[0-9a-f]{16}", upload_id):
+            raise unknown
+        try:
+            about = named_fields(json.loads((self._folder / upload_id / _ABOUT).read_bytes())) or {}
+            files = [(str(path), int(size)) for path, size in about["files"]]
+            check_names(path for path, _ in files)
+            return str(about["name"]), files
+        except (OSError, ValueError, KeyError, TypeError, RecursionError, UsageError):
+            raise unknown from None
