@@ -26,7 +26,7 @@ from app.exports.routes import create_exports
 from app.exports.shares import Shares
 from app.health import RequestFigures, create_health
 from app.jobs.catalog import Catalog, NotFoundError
-from app.jobs.device_choice import DeviceChoice
+from app.jobs.engines.device_choice import DeviceChoice
 from app.jobs.machine import Cards, Machine
 from app.jobs.order import SkippedObjectError
 from app.jobs.overview import Overview

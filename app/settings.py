@@ -2,6 +2,7 @@
 
 import ipaddress
 import os
+import re
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -22,6 +23,19 @@ def is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:
         return False
+
+
+def is_private(host: str) -> bool:
+    """Tell whether an IP address can only be reached from this machine or its own network."""
+    try:
+        return ipaddress.ip_address(host.strip("[]").partition("%")[0]).is_private
+    except ValueError:
+        return False
+
+
+LOCAL = "local"
+"""The engine that runs fits on this machine."""
+_CLUSTER = re.compile(r"ray://([A-Za-z0-9.-]+|\[[0-9A-Fa-f:]+\]):([0-9]{1,5})")
 
 
 class ServerSettings(BaseSettings):
@@ -56,6 +70,18 @@ class ServerSettings(BaseSettings):
     device."""
     fit_memory_gib: float = Field(default=2.0, ge=0, le=1024)
     """Least free memory of a GPU for a fit to be started on it [GiB]."""
+    engine: str = LOCAL
+    """Where fits run: local, or ray://HOST:PORT, the address of the Jobs API of a Ray cluster."""
+    engine_token: SecretStr | None = Field(default=None, min_length=16)
+    """Token of the cluster, without which its Jobs API lets everybody execute what they like."""
+    cluster_python: str = Field(default="python", pattern=r"^[^\x00-\x1f]+$")
+    """Python on the nodes of the cluster in whose environment PhysHanDI is installed."""
+    cluster_cpus: int = Field(default=1, ge=1, le=1024)
+    """Processors that a fit asks of the cluster, which are its threads, too."""
+    cluster_gpus: int = Field(default=0, ge=0, le=1)
+    """GPUs that a fit asks of the cluster; without one it runs on the CPU."""
+    cluster_memory_gib: float = Field(default=0.0, ge=0, le=65_536)
+    """Memory that a fit asks of the cluster [GiB]; 0 asks for none in particular."""
     waiting_fits: int = Field(default=100, ge=1, le=10_000)
     """Fits that may wait in line."""
     upload_gib: float = Field(default=20.0, gt=0, le=10_000)
@@ -106,6 +132,35 @@ class ServerSettings(BaseSettings):
         if isinstance(value, str):
             return tuple(part.strip().lower() for part in value.split(",") if part.strip())
         return value
+
+    @field_validator("engine")
+    @classmethod
+    def _is_engine(cls, value: str) -> str:
+        found = _CLUSTER.fullmatch(value)
+        if value != LOCAL and (found is None or not 0 < int(found[2]) < 65_536):
+            raise ValueError(
+                f"{value!r} is no engine; give local, or ray://HOST:PORT with the address of a "
+                "cluster's Jobs API"
+            )
+        # A name may stand for another address by then, so it is looked at when it is called.
+        host = "localhost" if found is None else found[1]
+        is_name = host[-1].isalpha()
+        if not is_name and not is_private(host):
+            raise ValueError(
+                f"{host} is no address of a private network, so the cluster's token would cross "
+                "the internet in plain text. Lay a tunnel and name its near end"
+            )
+        return value
+
+    @model_validator(mode="after")
+    def _protect_cluster(self) -> "ServerSettings":
+        if self.engine != LOCAL and self.engine_token is None:
+            raise ValueError(
+                f"{self.engine} needs a token (PHYSHANDI_ENGINE_TOKEN): without one everybody who "
+                "reaches the cluster may execute programs on it. Start Ray with "
+                "RAY_AUTH_MODE=token, and give its token here"
+            )
+        return self
 
     @model_validator(mode="after")
     def _protect(self) -> "ServerSettings":

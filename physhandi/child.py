@@ -36,11 +36,16 @@ _LAST_WORDS = 4_000
 _LONGEST_MESSAGE = 2**20
 _PATIENCE_S = 5.0
 _SETTINGS_PREFIX = "PHYSHANDI_"
-_SECRETS = ("PHYSHANDI_TOKEN",)
+_SECRETS = ("PHYSHANDI_TOKEN", "PHYSHANDI_ENGINE_TOKEN", "RAY_AUTH_TOKEN")
 _PARENT = "PHYSHANDI_PARENT"
 """Environment variable that tells a child the process with which it has to end."""
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _PR_SET_PDEATHSIG = 1
+
+
+def thread_limits(threads: int) -> dict[str, str]:
+    """Give the environment variables that limit the threads of numeric libraries."""
+    return dict.fromkeys(_THREADS, str(threads))
 
 
 def start_module(
@@ -78,7 +83,7 @@ def start_module(
         if name not in {*_SECRETS, _PARENT}
         and not (without_settings and name.startswith(_SETTINGS_PREFIX))
     }
-    limits = {} if threads is None else dict.fromkeys(_THREADS, str(threads))
+    limits = {} if threads is None else thread_limits(threads)
     bond = {} if outlives_parent else {_PARENT: str(os.getpid())}
     return subprocess.Popen(
         [sys.executable, "-m", module, *arguments],

@@ -123,7 +123,7 @@ def queue_world(data_dir: Path, bundled: Path) -> Iterator[QueueWorld]:
         yield QueueWorld(app, client, scenes, data_dir, security.token)
     for folder in (data_dir / "runs").iterdir():
         end_processes(folder, grace_s=0.0)
-    for process in scheduler._started.values():
+    for process in scheduler._local.started.values():
         process.wait()
 
 

@@ -16,6 +16,7 @@ def serve(
     port: int | None = None,
     data_dir: DataDir = None,
     device: str | None = None,
+    engine: str | None = None,
     captures: tuple[Path, ...] = (),
     token_file: Path | None = None,
     read_only_token_file: Path | None = None,
@@ -31,6 +32,9 @@ def serve(
             first of them), cpu, or names like cuda:0,cuda:1. Each is given as many fits at a time
             as the others, one by default; the first also runs live scenes (PHYSHANDI_DEVICE, else
             all).
+        engine: Where fits run: local, or ray://HOST:PORT, the address of the Jobs API of a Ray
+            cluster, whose token PHYSHANDI_ENGINE_TOKEN holds (PHYSHANDI_ENGINE, else local; see
+            docs/operations.md).
         captures: Folders, besides `captures/` of the data folder, from which recordings may be
             imported in the browser (PHYSHANDI_CAPTURES).
         token_file: File that keeps the token, so that addresses and browsers stay valid over
@@ -47,6 +51,7 @@ def serve(
         port=port,
         data_dir=data_dir,
         device=device,
+        engine=engine,
         captures=captures or None,
         token_file=token_file,
         read_only_token_file=read_only_token_file,

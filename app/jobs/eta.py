@@ -318,7 +318,7 @@ class Forecast:
 
         Returns:
             ``starts_in_s``, ``left_s`` until it has ended and ``basis``; None if nothing is known
-            of one of them.
+            of one of them, or nobody knows yet how many have a place.
         """
         own = self._expectation(run)
         expected = [self._expectation(other) for other in ahead]
@@ -326,6 +326,8 @@ class Forecast:
         if own is None or None in expected or None in busy:
             return None
         free = [left for left in busy if left is not None] + [0.0] * (slots - len(busy))
+        if not free:
+            return None
         for other in expected:
             free.sort()
             free[0] += other.total_s if other else 0.0

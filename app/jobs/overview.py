@@ -37,12 +37,12 @@ class Overview:
         """Describe everything: `moving`, and what stays.
 
         Returns:
-            `moving` with ``program`` (``packages python system commit started``), ``device`` of
-            fits and ``data_dir``.
+            `moving` with ``program`` (``packages python system commit started``), ``device`` or
+            cluster of fits and ``data_dir``.
         """
         return self.moving() | {
             "program": self._program,
-            "device": ", ".join(self._settings.devices),
+            "device": self._scheduler.place,
             "data_dir": str(self._settings.data_dir),
         }
 

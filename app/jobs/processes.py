@@ -2,7 +2,6 @@
 
 import fcntl
 import os
-import secrets
 import signal
 import subprocess
 import time
@@ -152,15 +151,28 @@ def _signal_all(
 
 
 WORKER = "app.jobs.worker"
+_SUPERVISOR = "app.jobs.supervise"
+
+
+def supervisor_command(
+    run_folder: Path, device: str, worker: str, hung_after_s: float
+) -> tuple[str, ...]:
+    """Give what Python is called with (``-m``) to supervise a run, on whatever machine.
+
+    Args:
+        run_folder: Folder of the run.
+        device: Warp device.
+        worker: Python module that does the work.
+        hung_after_s: Time without a sign of life after which the worker is taken to hang [s].
+    """
+    return (_SUPERVISOR, str(run_folder), device, worker, str(hung_after_s))
 
 
 def start_supervisor(
-    run_folder: Path,
-    device: str,
+    command: tuple[str, ...],
+    cookie: str,
     *,
-    hung_after_s: float,
     card: str | None = None,
-    worker: str = WORKER,
     threads: int | None = None,
 ) -> "subprocess.Popen[str]":
     """Start the process that starts and watches a run's worker, in a session of its own.
@@ -168,11 +180,9 @@ def start_supervisor(
     It outlives the server; a restarted server finds it by the lock that it holds.
 
     Args:
-        run_folder: Folder of the run.
-        device: Warp device.
-        hung_after_s: Time without a sign of life after which its worker is taken to hang [s].
+        command: See `supervisor_command`.
+        cookie: Mark of this start; see `cookie_of`.
         card: The only graphics card that it sees, as ``cuda:0``; None for whatever there is.
-        worker: Python module that does the work.
         threads: How many threads its libraries may start; none for one each processor.
 
     Returns:
@@ -180,10 +190,9 @@ def start_supervisor(
     """
     only = {} if card is None else {"CUDA_VISIBLE_DEVICES": card}
     return start_module(
-        "app.jobs.supervise",
-        *(str(run_folder), device, worker, str(hung_after_s)),
+        *command,
         threads=threads,
-        environment={COOKIE: cookie_of(run_folder, secrets.token_hex(8)), **only},
+        environment={COOKIE: cookie, **only},
         outlives_parent=True,
         stderr=subprocess.DEVNULL,
         start_new_session=True,

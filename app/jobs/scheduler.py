@@ -3,7 +3,6 @@
 import fcntl
 import logging
 import os
-import subprocess
 import threading
 import time
 from collections import deque
@@ -14,25 +13,22 @@ from pathlib import Path
 from typing import Any
 
 from app.jobs.catalog import DEFECT, Catalog, RunItem
-from app.jobs.device_choice import DeviceChoice
+from app.jobs.engines.cluster import Cluster, ClusterError
+from app.jobs.engines.device_choice import DeviceChoice
+from app.jobs.engines.engine import Engine
+from app.jobs.engines.local_engine import LocalEngine
+from app.jobs.engines.ray_engine import RayEngine
 from app.jobs.eta import Forecast
 from app.jobs.launch_keys import KeyedRequest, LaunchKeys
 from app.jobs.machine import Cards
 from app.jobs.order import default_name, fit_config, require_agreement
-from app.jobs.processes import (
-    WORKER,
-    end_processes,
-    marked_processes,
-    process_with_lock,
-    processes_of,
-    start_supervisor,
-    supervisor_of,
-)
+from app.jobs.processes import WORKER, process_with_lock
 from app.jobs.recovery.aside import MovedFolder, move_aside
 from app.jobs.ticket import (
     QUEUED,
     STARTED,
     Ticket,
+    is_begun,
     is_lost,
     note_end,
     note_start,
@@ -40,10 +36,10 @@ from app.jobs.ticket import (
     read_ticket,
     start_again_or_end,
 )
-from app.settings import ServerSettings
+from app.settings import LOCAL, ServerSettings
 from physhandi.data.lease import live_holder
 from physhandi.data.run import not_whole
-from physhandi.data.run_folder import EXIT, new_run_id, now
+from physhandi.data.run_folder import CANCEL, EXIT, new_run_id, now
 from physhandi.errors import PhysHandiError, RunError, UsageError, describe
 from physhandi.run import Run
 
@@ -81,7 +77,6 @@ logger = logging.getLogger(__name__)
 
 AT_WORK = frozenset({"starting", "running", "stopping"})
 ENDED = frozenset({"succeeded", "failed", "cancelled", "damaged"})
-_LOST = "It lost its process, which something outside ended."
 _INTERVAL_S = 0.25
 _IDLE_INTERVAL_S = 1.0
 _SWEEP_INTERVAL_S = 5.0
@@ -134,21 +129,23 @@ class Scheduler:
         """Prepare; `start` begins.
 
         Args:
-            settings: Slots, devices and grace of a cancel.
+            settings: Engine, slots, devices and grace of a cancel.
             catalog: Finds runs.
-            choice: Chooses the devices of fits; none chooses among those of the settings.
+            choice: Chooses the devices of fits here; none chooses among those of the settings.
             worker: Module of the worker process.
         """
         self._settings = settings
         self._catalog = catalog
-        self._worker = worker
-        self._choice = choice or DeviceChoice(settings, Cards())
+        self._local = LocalEngine(settings, choice or DeviceChoice(settings, Cards()), worker)
+        self._engine: Engine = self._local
+        if settings.engine != LOCAL and settings.engine_token is not None:
+            cluster = Cluster(settings.engine, settings.engine_token.get_secret_value())
+            self._engine = RayEngine(settings, cluster, worker)
         self._is_short = False
         self.forecast = Forecast(catalog, settings.devices[0])
         """Estimates how long fits still take."""
         self._lock = threading.RLock()
         self._keys = LaunchKeys(settings.launches_path)
-        self._started: dict[str, subprocess.Popen[str]] = {}
         self._stopping: dict[str, threading.Thread] = {}
         self._ended: dict[str, tuple[int, JobView]] = {}
         self._hindered: dict[str, str] = {}
@@ -171,7 +168,11 @@ class Scheduler:
             self._claim = claim_folder(self._settings.data_dir)
             self._settings.run_dir.mkdir(exist_ok=True)
             self._settings.sequence_dir.mkdir(exist_ok=True)
+            self._engine.refresh()
             self._step()
+            for run in self.at_work():
+                if (run.folder / CANCEL).exists():  # The server before did not come to its end.
+                    self._begin_end(run)
             self._thread.start()
 
     @property
@@ -271,8 +272,8 @@ class Scheduler:
         """Start a run beside the line, for what takes seconds while somebody waits."""
         with self._lock:
             # It takes seconds, so it may be where memory is short.
-            device = self._choice.choose(self._devices_at_work()) or self._settings.devices[0]
-            self._start(RunItem(run.id, run.folder, False, run, None), device)
+            device = self._local.choose(self._devices_of(self._local)) or self._settings.devices[0]
+            self._start(run.folder, self._local, device)
 
     def resume(self, run_id: str) -> None:
         """Queue a run that did not succeed again; it goes on where it was.
@@ -304,10 +305,10 @@ class Scheduler:
             elif view.state not in AT_WORK:
                 raise RunError(f"Run '{run_id}' is {view.state}; there is nothing to cancel.")
             elif run_id not in self._stopping:
+                if self._engine_of(run.folder) is None:
+                    raise RunError(f"Run '{run_id}' cannot be ended here. {_elsewhere(run.folder)}")
                 run.request_cancel()
-                thread = threading.Thread(target=self._end, args=(run_id, run.folder), daemon=True)
-                self._stopping[run_id] = thread
-                thread.start()
+                self._begin_end(run)
 
     def delete(self, run_id: str) -> None:
         """Remove a run that is not at work.
@@ -341,7 +342,7 @@ class Scheduler:
                 raise RunError(
                     f"Run '{run_id}' is {view.state}; only a damaged one is moved aside."
                 )
-            is_watched = supervisor_of(item.folder) is not None or run_id in self._stopping
+            is_watched = self._is_supervised(item.folder) or run_id in self._stopping
             if is_watched or live_holder(item.folder) is not None:
                 raise RunError(
                     f"Run '{run_id}' is damaged, but processes work on it. Wait until they have "
@@ -353,7 +354,12 @@ class Scheduler:
     @property
     def slots(self) -> int:
         """Number of fits that run side by side."""
-        return self._settings.slots
+        return self._engine.slots
+
+    @property
+    def place(self) -> str:
+        """Where fits run, for people: devices of this machine, or a cluster."""
+        return self._engine.name or ", ".join(self._settings.devices)
 
     @property
     def restarts(self) -> list[LostRun]:
@@ -389,29 +395,47 @@ class Scheduler:
         return view
 
     def _look(self, run: Run) -> JobView:
-        is_supervised = supervisor_of(run.folder) is not None
         is_running = live_holder(run.folder) is not None
         if run.id in self._stopping:
             # Until nothing is left: what is started meanwhile would be ended with the rest.
             told, _ = _told_by(run)
-            return JobView("stopping", reason="Ending its processes.", progress=told)
+            trouble = self._trouble_of(run.folder)
+            return JobView(
+                "stopping", reason=_sentences("Ending its processes.", trouble), progress=told
+            )
         if is_running:
             told, problem = _told_by(run)
-            return JobView("running", reason=_remark(run.folder) or problem, progress=told)
+            reason = _sentences(_remark(run.folder) or problem, self._trouble_of(run.folder))
+            return JobView("running", reason=reason, progress=told)
         if (run.folder / QUEUED).is_file():
             return self._look_in_line(run)
-        started = self._started.get(run.id)
-        is_starting = is_supervised or (started is not None and started.poll() is None)
-        if is_starting and not (run.folder / EXIT).is_file():
-            told = f"{_remark(run.folder)} Loading the program.".lstrip()
-            return JobView("starting", reason=told)
+        if not (run.folder / EXIT).is_file() and self._is_supervised(run.folder):
+            engine = self._engine_of(run.folder)
+            told = _elsewhere(run.folder) if engine is None else engine.told(run.folder)
+            return JobView("starting", reason=_sentences(_remark(run.folder), told))
         return self._look_back(run)
+
+    def _engine_of(self, folder: Path) -> Engine | None:
+        """Give the engine that a run was started with; None if this server does not use it."""
+        ticket = read_ticket(folder / STARTED)
+        if ticket is None or ticket.engine == self._engine.name:
+            return self._engine
+        return self._local if ticket.engine == self._local.name else None
+
+    def _is_supervised(self, folder: Path) -> bool:
+        """Tell whether a run's supervisor lives; what cannot be found out counts as alive."""
+        engine = self._engine_of(folder)
+        return engine is None or engine.is_at_work(folder)
+
+    def _trouble_of(self, folder: Path) -> str:
+        engine = self._engine_of(folder)
+        return "" if engine is None else engine.trouble
 
     def _look_back(self, run: Run) -> JobView:
         """Tell how a run ended that is neither in line nor at work."""
         if is_lost(run.folder):
             told = self._hindered.get(run.id, "What is left of it is being ended.")
-            return JobView("stopping", reason=f"{_LOST} {told}")
+            return JobView("stopping", reason=f"{self._loss(run.folder)} {told}")
         state = run.state
         if state == "queued":
             return JobView("failed", reason="It was never started. Resume starts it.")
@@ -426,15 +450,16 @@ class Scheduler:
         if run.id not in line:
             return JobView("queued", reason="It was just put in line.")
         place = line.index(run.id) + 1
-        slots = self._settings.slots
-        at_a_time = "one fit runs" if slots == 1 else f"{slots} fits run"
+        engine = self._engine
+        if engine.trouble:
+            return JobView("queued", place, engine.trouble)
         if run.id in self._hindered:
             return JobView("queued", place, f"It cannot be started: {self._hindered[run.id]}")
-        if len(busy) < slots and self._is_short:
-            return JobView("queued", place, self._choice.shortage)
-        if len(busy) < slots and place == 1:
+        if len(busy) < engine.slots and self._is_short:
+            return JobView("queued", place, engine.shortage)
+        if len(busy) < engine.slots and place == 1:
             return JobView("queued", place, "It starts next.")
-        return JobView("queued", place, f"Waits for a free place: {at_a_time} at a time.")
+        return JobView("queued", place, engine.full)
 
     def _own(self, run_id: str) -> tuple[Run, JobView]:
         item = self._catalog.run_item(run_id)
@@ -460,12 +485,14 @@ class Scheduler:
     def _watch(self) -> None:
         swept = time.monotonic()
         while True:
-            is_idle = not (self._busy or self._line or self._started)
+            is_idle = not (self._busy or self._line)
             self._wake.wait(_IDLE_INTERVAL_S if is_idle else _INTERVAL_S)
             self._wake.clear()
             if self._closed.is_set():
                 return
             try:
+                self._local.refresh()
+                self._engine.refresh()
                 self._step()
                 if time.monotonic() - swept > _SWEEP_INTERVAL_S:
                     swept = time.monotonic()
@@ -474,33 +501,30 @@ class Scheduler:
                 logger.exception("the queue could not go on; it tries again")
 
     def _step(self) -> None:
-        """Forget processes that ended and start as many runs as have room."""
+        """Start as many runs as have room."""
         with self._lock:
-            for run_id, process in list(self._started.items()):
-                if process.poll() is not None:
-                    del self._started[run_id]
             items = self._catalog.runs()
             queue = self._queue(items)
             views = {item.id: self.view(item) for item in items}
             self._busy = tuple(run_id for run_id, view in views.items() if view.state in AT_WORK)
             moving = {*self._busy, *(item.id for item in queue)}
             self._known = {item.id: item.run for item in items if item.run and item.id in moving}
-            free = max(0, self._settings.slots - len(self._busy))
+            self._line = tuple(item.id for item in queue)
+            free = max(0, self._engine.slots - len(self._devices_of(self._engine)))
             # A supervisor that put its run back in line has still to end.
             ready = [
                 item
                 for item in queue
-                if item.id not in self._started and supervisor_of(item.folder) is None
+                if is_begun(item.folder) or not self._is_supervised(item.folder)
             ]
             self._is_short = False
             for item in ready[:free]:
-                device = self._choice.choose(self._devices_at_work())
+                device = self._engine.choose(self._devices_of(self._engine))
                 if device is None:
                     self._is_short = True
                     break
                 with self._hindering(item.id):
-                    self._start(item, device)
-            self._line = tuple(item.id for item in queue if item.id not in self._started)
+                    self._start(item.folder, self._engine, device)
 
     @contextmanager
     def _hindering(self, run_id: str) -> Generator[None]:
@@ -508,55 +532,51 @@ class Scheduler:
         try:
             yield
             self._hindered.pop(run_id, None)
-        except OSError as error:
+        except (OSError, ClusterError) as error:
             if run_id not in self._hindered:
                 logger.warning("run %s cannot go on: %s", run_id, describe(error))
             self._hindered[run_id] = describe(error)
 
-    def _devices_at_work(self) -> list[str]:
-        """List the devices of the runs that have a place."""
+    def _devices_of(self, engine: Engine) -> list[str]:
+        """List the devices of the runs that have a place with an engine."""
         tickets = (read_ticket(self._settings.run_dir / run_id / STARTED) for run_id in self._busy)
-        return [ticket.device for ticket in tickets if ticket is not None]
+        return [
+            ticket.device
+            for ticket in tickets
+            if ticket is not None and ticket.engine == engine.name
+        ]
 
-    def _start(self, item: RunItem, device: str) -> None:
-        note_start(item.folder, device)
-        (item.folder / EXIT).unlink(missing_ok=True)
-        at_a_time = self._settings.slots
-        card = self._choice.card(device)
-        process = start_supervisor(
-            item.folder,
-            device if card is None else "cuda:0",
-            card=card,
-            hung_after_s=self._settings.hung_after_s,
-            worker=self._worker,
-            threads=None if at_a_time == 1 else max(1, (os.cpu_count() or 1) // at_a_time),
-        )
-        self._started[item.id] = process
-        self._busy = (*self._busy, item.id)
-        (item.folder / QUEUED).unlink(missing_ok=True)
-        self._line = tuple(run_id for run_id in self._line if run_id != item.id)
-        logger.info("run %s started on %s", item.id, device)
+    def _start(self, folder: Path, engine: Engine, device: str) -> None:
+        ticket = note_start(folder, device, engine.name)
+        (folder / EXIT).unlink(missing_ok=True)
+        engine.start(folder, ticket)
+        self._busy = (*self._busy, folder.name)
+        (folder / QUEUED).unlink(missing_ok=True)
+        self._line = tuple(run_id for run_id in self._line if run_id != folder.name)
+        logger.info("run %s started on %s", folder.name, engine.name or device)
 
     def _sweep(self) -> None:
         """End what is left of runs whose supervisor was killed."""
-        for process, cookie in list(marked_processes()):
-            folder = Path(cookie.rpartition(":")[0])
-            if folder.parent != self._settings.run_dir:
-                continue
+        for folder in self._local.strays(self._settings.run_dir):
             with self._lock:  # A run that is being started has a process before it is noted.
-                is_left = folder.name not in self._started and supervisor_of(folder) is None
+                is_left = not self._local.is_at_work(folder)
             if is_left:
-                logger.warning("process %d of run %s lost its supervisor", process.pid, folder.name)
-                end_processes(folder, grace_s=0.0)
+                logger.warning("a process of run %s lost its supervisor", folder.name)
+                self._local.end_rest(folder)
         for folder in self._lost_runs():
             logger.warning("run %s lost its process", folder.name)
-            end_processes(folder, grace_s=0.0)
+            loss = self._loss(folder)
+            if self._engine_of(folder) is self._local:
+                self._local.end_rest(folder)
             with self._hindering(folder.name):
-                start_again_or_end(folder, _LOST)
+                start_again_or_end(folder, loss)
                 is_again = (folder / QUEUED).is_file()
                 did = "It was put back in line." if is_again else "It has failed."
-                self._restarts.append(LostRun(now(), folder.name, f"{_LOST} {did}"))
+                self._restarts.append(LostRun(now(), folder.name, f"{loss} {did}"))
                 self._wake.set()
+
+    def _loss(self, folder: Path) -> str:
+        return (self._engine_of(folder) or self._local).loss(folder)
 
     def _lost_runs(self) -> list[Path]:
         """Find the runs that were started, have not ended and are worked on by nobody."""
@@ -565,36 +585,34 @@ class Scheduler:
             return [
                 folder
                 for folder in folders
-                if folder.name not in self._started
-                and folder.name not in self._stopping
+                if folder.name not in self._stopping
                 and is_lost(folder)
-                and supervisor_of(folder) is None
+                and not self._is_supervised(folder)
                 and live_holder(folder) is None
             ]
 
-    def _end(self, run_id: str, folder: Path) -> None:
+    def _begin_end(self, run: Run) -> None:
+        """End a run that is to be cancelled, in a thread of its own."""
+        engine = self._engine_of(run.folder)
+        if engine is not None:
+            thread = threading.Thread(target=self._end, args=(run.folder, engine), daemon=True)
+            self._stopping[run.id] = thread
+            thread.start()
+
+    def _end(self, folder: Path, engine: Engine) -> None:
         """Wait for the worker to stop by itself, then make sure that nothing of it is left."""
         try:
-            self._wait_for_end(folder, self._settings.cancel_grace_s)
-            if any(True for _ in processes_of(folder)):
-                end_processes(folder, grace_s=2.0, spare=supervisor_of(folder))
-                self._wait_for_end(folder, 5.0)  # The supervisor notes the end.
-            end_processes(folder, grace_s=0.0)
+            end = time.monotonic() + self._settings.cancel_grace_s
+            while time.monotonic() < end and (
+                engine.is_at_work(folder) or live_holder(folder) is not None
+            ):
+                time.sleep(0.05)
+            engine.end(folder)
             note_end(folder, "Cancelled.")
         except Exception:
-            logger.exception("run %s could not be ended", run_id)
+            logger.exception("run %s could not be ended", folder.name)
         finally:
-            self._stopping.pop(run_id, None)
-
-    def _wait_for_end(self, folder: Path, seconds: float) -> None:
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            if supervisor_of(folder) is None and live_holder(folder) is None:
-                return
-            started = self._started.get(folder.name)
-            if started is not None:
-                started.poll()
-            time.sleep(0.05)
+            self._stopping.pop(folder.name, None)
 
 
 def require_unread(catalog: Catalog, sequence: Path) -> None:
@@ -611,7 +629,7 @@ def require_unread(catalog: Catalog, sequence: Path) -> None:
     for item in catalog.runs():
         if item.run is None or not any(_is_at(path, folder) for path in item.run.sequences):
             continue
-        is_at_work = live_holder(item.folder) is not None or supervisor_of(item.folder) is not None
+        is_at_work = live_holder(item.folder) is not None or is_lost(item.folder)
         if is_at_work or (item.folder / QUEUED).is_file():
             does = "is being fitted by" if is_at_work else "waits to be fitted by"
             raise RunError(
@@ -630,6 +648,16 @@ def _told_by(run: Run) -> tuple[dict[str, Any], str]:
         return run.progress, ""
     except RunError as error:
         return {}, str(error)
+
+
+def _sentences(*told: str) -> str:
+    return " ".join(sentence for sentence in told if sentence)
+
+
+def _elsewhere(folder: Path) -> str:
+    """Tell of a run that was started with an engine that this server does not use."""
+    ticket = read_ticket(folder / STARTED) or Ticket()
+    return f"It was started on {ticket.engine}; a server with that --engine follows it."
 
 
 def _remark(folder: Path) -> str:

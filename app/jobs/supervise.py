@@ -15,10 +15,10 @@ from pathlib import Path
 import psutil
 
 from app.jobs.processes import COOKIE, adopt_orphans, claim_supervision, end_processes
-from app.jobs.ticket import QUEUED, note_end, start_again_or_end
+from app.jobs.ticket import begin_start, note_end, start_again_or_end
 from app.jobs.vigil import Vigil
 from physhandi.child import Channel, Child, ChildEndedError, run_child
-from physhandi.data.run_folder import EXIT, LOG
+from physhandi.data.run_folder import LOG
 from physhandi.errors import PhysHandiError
 
 _BEATS = 6.0
@@ -26,7 +26,9 @@ _BEATS = 6.0
 
 
 def supervise(run_folder: Path, device: str, worker: str, hung_after_s: float) -> None:
-    """Run the worker of a run until it ends; nothing happens if the run has a supervisor.
+    """Run the worker of a run until it ends.
+
+    Nothing happens if the run has a supervisor, or this start of it is not valid any more.
 
     Args:
         run_folder: The run.
@@ -37,17 +39,18 @@ def supervise(run_folder: Path, device: str, worker: str, hung_after_s: float) -
     claim = claim_supervision(run_folder)
     if claim is None:
         return
+    nonce = os.environ.get(COOKIE, "").rpartition(":")[2]
+    if not begin_start(run_folder, nonce):
+        return
     adopt_orphans()
-    # A server that was killed just now has not taken it out of line.
-    (run_folder / QUEUED).unlink(missing_ok=True)
-    (run_folder / EXIT).unlink(missing_ok=True)
+    # On another machine no server sees what a killed supervisor of this run has left.
+    end_processes(run_folder, grace_s=0.0, spare=os.getpid())
     killed_before = count_memory_kills()
     beat_s = str(hung_after_s / _BEATS)
     with Child(worker, str(run_folder), device, beat_s, log=run_folder / LOG) as child:
         signal.signal(signal.SIGTERM, lambda _number, _frame: child.terminate())
         watch = _Watch(child, hung_after_s)
         error, kind = watch.hear()
-        nonce = os.environ.get(COOKIE, "").rpartition(":")[2]
         end_processes(run_folder, grace_s=0.0, spare=os.getpid(), nonce=nonce)
     if watch.hung is not None:
         start_again_or_end(run_folder, watch.hung)

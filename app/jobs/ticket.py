@@ -1,5 +1,6 @@
 """A run's ticket: its place in line, and how often it was started, as its folder keeps it."""
 
+import hashlib
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,8 @@ class Ticket:
     """Why it was started again."""
     device: str = ""
     """Warp device that it was started on."""
+    engine: str = ""
+    """Name of the engine that it was started with; see `Engine.name`."""
 
     @property
     def remark(self) -> str:
@@ -46,13 +49,20 @@ def read_ticket(path: Path) -> Ticket | None:
     except RunError:
         return Ticket()
     time, starts = content.get("time"), content.get("starts")
-    why, device = content.get("why"), content.get("device")
+    why, device, engine = content.get("why"), content.get("device"), content.get("engine")
     return Ticket(
         time=time if isinstance(time, float) else 0.0,
         starts=starts if isinstance(starts, int) and starts > 0 else 0,
         why=why if isinstance(why, str) else "",
         device=device if isinstance(device, str) else "",
+        engine=engine if isinstance(engine, str) else "",
     )
+
+
+def nonce_of(run_folder: Path, ticket: Ticket) -> str:
+    """Name one start of a run; who starts it twice by mistake gives both the same name."""
+    text = f"{run_folder}:{ticket.time!r}:{ticket.starts}"
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def put_in_line(run_folder: Path, ticket: Ticket) -> None:
@@ -60,11 +70,48 @@ def put_in_line(run_folder: Path, ticket: Ticket) -> None:
     write_json(run_folder / QUEUED, asdict(ticket))
 
 
-def note_start(run_folder: Path, device: str) -> None:
+def note_start(run_folder: Path, device: str, engine: str = "") -> Ticket:
     """Note that a run is about to be started once more; it stays in line until it has begun."""
     ticket = read_ticket(run_folder / QUEUED) or Ticket()
-    started = replace(ticket, starts=ticket.starts + 1, device=device)
+    started = replace(ticket, starts=ticket.starts + 1, device=device, engine=engine)
     write_json(run_folder / STARTED, asdict(started))
+    return started
+
+
+def is_begun(run_folder: Path) -> bool:
+    """Tell whether the next start of a run in line was noted already.
+
+    A server noted it that was killed before it could take the run out of line, or whose wish was
+    not answered.
+    """
+    queued, started = read_ticket(run_folder / QUEUED), read_ticket(run_folder / STARTED)
+    return (
+        queued is not None
+        and started is not None
+        and (queued.time, queued.starts + 1) == (started.time, started.starts)
+    )
+
+
+def begin_start(run_folder: Path, nonce: str) -> bool:
+    """Take a run out of line because its start has begun.
+
+    Args:
+        run_folder: The run.
+        nonce: Name of the start.
+
+    Returns:
+        Whether it may go on. It may not if the run is to end, has ended or was started anew since:
+        a cluster may begin a job long after it was cancelled.
+    """
+    with locked(run_folder):
+        ticket = read_ticket(run_folder / STARTED)
+        is_valid = ticket is not None and nonce_of(run_folder, ticket) == nonce
+        if not is_valid or (run_folder / CANCEL).exists():
+            return False
+        # A server that was killed just now has not done so.
+        (run_folder / QUEUED).unlink(missing_ok=True)
+        (run_folder / EXIT).unlink(missing_ok=True)
+    return True
 
 
 def start_again_or_end(run_folder: Path, why: str) -> None:

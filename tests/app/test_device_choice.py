@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from app.jobs.device_choice import DeviceChoice
+from app.jobs.engines.device_choice import DeviceChoice
 from app.jobs.machine import Cards
 from app.settings import ServerSettings
 

@@ -291,6 +291,7 @@ def test_nothing_is_told_where_nothing_is_known(
     )
     assert forecast.of_waiting(simulated, [], [], 1) is None
     assert forecast.of_waiting(run, [simulated], [], 1) is None
+    assert forecast.of_waiting(run, [], [], 0) is None  # A cluster was not asked yet.
     (run.folder / "attempts/1/stages.json").write_text("{")
     assert forecast.of_running(run) is None
     shutil.rmtree(world.settings.sequence_dir / "sheet")

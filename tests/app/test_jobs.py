@@ -16,7 +16,8 @@ from waiting import until
 
 from app.jobs import scheduler as scheduler_module
 from app.jobs.catalog import Catalog
-from app.jobs.device_choice import DeviceChoice
+from app.jobs.engines import local_engine
+from app.jobs.engines.device_choice import DeviceChoice
 from app.jobs.machine import Cards
 from app.jobs.processes import end_processes, processes_of, supervisor_of
 from app.jobs.scheduler import JobView, Scheduler
@@ -75,7 +76,7 @@ def desks(data_dir: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[
     for folder in (data_dir / "runs").iterdir():
         end_processes(folder, grace_s=0.0)
     for desk in made:
-        for process in desk.scheduler._started.values():
+        for process in desk.scheduler._local.started.values():
             process.wait()
 
 
@@ -407,7 +408,7 @@ def test_a_run_at_work_is_neither_deleted_nor_resumed(desk: Desk) -> None:
 def test_a_full_disk_keeps_a_run_in_line_until_there_is_room(
     desk: Desk, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def no_room(_: Path, __: str) -> None:
+    def no_room(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as full:
@@ -463,7 +464,7 @@ def test_a_sweep_spares_the_run_that_is_just_being_started(
         "end_processes": lambda folder, **_: ended.append((folder, lock._is_owned())),
         "start_supervisor": start,
     }.items():
-        monkeypatch.setattr(scheduler_module, name, stand_in)
+        monkeypatch.setattr(local_engine, name, stand_in)
     monkeypatch.setattr(desk.scheduler, "_lock", WatchedLock())
     desk.scheduler.start_now(new)
     sweeper.join(60)

@@ -21,6 +21,7 @@ from waiting import until
 
 from app.jobs import scheduler as scheduler_module
 from app.jobs.catalog import Catalog
+from app.jobs.engines import local_engine
 from app.jobs.recovery.left_behind import LeftBehind, find_left_behind, tidy
 from app.jobs.scheduler import Scheduler
 from app.settings import ServerSettings
@@ -98,11 +99,11 @@ def test_damaged_folders_are_rows_among_the_others(damaged: World) -> None:
 def test_the_queue_and_a_new_server_go_on_beside_damaged_folders(damaged: World) -> None:
     again = Scheduler(damaged.settings, Catalog(damaged.settings))
     run_id = again.launch(["sheet"], "quick").id
-    with patch.object(scheduler_module, "start_supervisor") as start:
+    with patch.object(local_engine, "start_supervisor") as start:
         start.return_value.poll.return_value = None
         again.start()
     again.shutdown()
-    assert [call.args[0].name for call in start.call_args_list] == [run_id]
+    assert [Path(call.args[0][1]).name for call in start.call_args_list] == [run_id]
 
 
 def test_a_damaged_run_is_moved_aside_whole(damaged: World, fitted_folder: Path) -> None:

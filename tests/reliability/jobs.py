@@ -92,7 +92,7 @@ def queue_in(folder: Path, **settings: Any) -> Iterator[Scheduler]:
             scheduler.shutdown()
             for run_folder in asked.run_dir.iterdir():
                 end_processes(run_folder, grace_s=0.0)
-            for process in scheduler._started.values():
+            for process in scheduler._local.started.values():
                 process.wait()
 
 

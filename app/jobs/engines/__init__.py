@@ -1,0 +1,1 @@
+"""Engines: what starts the processes of fits, here or on a cluster."""
