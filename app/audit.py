@@ -78,6 +78,17 @@ class AuditLog:
             else:
                 self._left_out = 0
 
+    def note_scene(self, who: str, what: str, run_id: str | None) -> None:
+        """Note what was kept or deleted from within a live scene, which is no request of its own.
+
+        Args:
+            who: Whose scene it is.
+            what: What was done.
+            run_id: Id of the run that it became; None for none.
+        """
+        made = {} if run_id is None else {"run_id": run_id}
+        self.write({"who": who, "may_change": True, "what": what, **made, "status": 200})
+
     def _may_write_refused(self, now: float) -> bool:
         times = self._refused
         if len(times) == MOST_REFUSED and 0.0 <= now - times[0] < _MINUTE:

@@ -103,7 +103,10 @@ def create_app(
     catalog = catalog or Catalog(settings)
     cards = Cards()
     scheduler = scheduler or Scheduler(settings, catalog, choice=DeviceChoice(settings, cards))
-    sessions = sessions or Sessions(settings, catalog, _storage(settings, catalog, scheduler))
+    audit_log = AuditLog(settings.audit_dir)
+    sessions = sessions or Sessions(
+        settings, catalog, _storage(settings, catalog, scheduler, audit_log)
+    )
     machine = Machine(settings.data_dir, cards)
     feed = Feed(lambda: [describe_run(item, scheduler) for item in catalog.runs()])
     tasks = tasks or BackgroundTasks()
@@ -134,9 +137,7 @@ def create_app(
         redoc_url=None,
     )
     app.state.stopping = threading.Event()
-    app.state.scheduler = scheduler
-    app.state.sessions = sessions
-    app.state.security = security
+    app.state.scheduler, app.state.sessions, app.state.security = scheduler, sessions, security
     models = ModelFolders(settings)
     overview = Overview(settings, catalog, scheduler, machine)
     app.include_router(
@@ -180,14 +181,17 @@ def create_app(
         create_health(catalog, scheduler, sessions, machine, figures := CollectorRegistry())
     )
     _answer_errors(app, pages)
-    _guard(app, security, figures, AuditLog(settings.audit_dir))
+    _guard(app, security, figures, audit_log)
     return app
 
 
-def _storage(settings: ServerSettings, catalog: Catalog, scheduler: Scheduler) -> UserStorage:
-    """Say where live scenes keep what their users make."""
+def _storage(
+    settings: ServerSettings, catalog: Catalog, scheduler: Scheduler, audit_log: AuditLog
+) -> UserStorage:
+    """Say where live scenes keep what their users make, and where it is noted."""
     saver = RunSaver(catalog, settings.run_dir, scheduler.start_now, settings.sequence_dir)
-    return UserStorage(PresetStore(settings.data_dir / "presets"), saver)
+    presets = PresetStore(settings.data_dir / "presets")
+    return UserStorage(presets, saver, audit_log.note_scene)
 
 
 def _guard(

@@ -341,6 +341,7 @@ class Session(SceneServer):
         changes = run_changes(source, fitted.parameters, take.parameters, is_automatic=False)
         stored = StoredTake(take=take, sequence=self._content.sequence_name, frame=frame)
         run = storage.saver.save_take(self._target, stored, name, changes)
+        storage.tell("keep a take", run)
         storage.saver.follow(run, report, self._gone)
 
     def _restore(self, state: SessionState) -> None:

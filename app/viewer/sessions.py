@@ -5,7 +5,7 @@ import secrets
 import threading
 from collections import Counter, OrderedDict
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import get_args
 
 from app.settings import ServerSettings
@@ -108,7 +108,9 @@ class Sessions:
         self._reserve(owner)
         try:
             session_id = secrets.token_urlsafe(18)
-            storage = self._storage if may_keep else None
+            storage = None
+            if may_keep and self._storage is not None:
+                storage = replace(self._storage, owner=owner)
             session = self._make(
                 session_id, kind, target, owner=owner, state=state, storage=storage
             )

@@ -70,6 +70,15 @@ def test_who_is_refused_cannot_fill_it(tmp_path: Path) -> None:
     assert "left_out_before" not in lines(tmp_path)[-1]
 
 
+def test_what_is_kept_from_a_scene_is_noted_without_a_request(tmp_path: Path) -> None:
+    log = AuditLog(tmp_path, clock=Clock())
+    log.note_scene("3f0c", "keep a run", "01K")
+    log.note_scene("3f0c", "delete a preset", None)
+    told = lines(tmp_path)
+    assert (told[0]["who"], told[0]["what"], told[0]["run_id"]) == ("3f0c", "keep a run", "01K")
+    assert "run_id" not in told[1]
+
+
 def test_a_full_disk_is_told_and_stops_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

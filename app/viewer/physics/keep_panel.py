@@ -256,6 +256,14 @@ class UserStorage:
     """Their presets."""
     saver: RunSaver
     """Makes runs."""
+    note: Callable[[str, str, str | None], None] = lambda _owner, _what, _run: None
+    """Told who has kept or deleted what, and the id of the run that it became."""
+    owner: str = ""
+    """Whose scene it is that keeps things."""
+
+    def tell(self, what: str, run: Run | None = None) -> None:
+        """Have noted what was just done."""
+        self.note(self.owner, what, None if run is None else run.id)
 
 
 class PresetChoice:
@@ -369,8 +377,8 @@ class KeepPanel:
         self._unit = content.length_unit
         self._sequence = content.sequence_name
         self._source = run
+        self._storage = storage
         self._store = storage.presets
-        self._saver = storage.saver
         self._closed = threading.Event()
         self._folder = gui.add_folder("Keep these parameters")
         with self._folder:
@@ -441,8 +449,10 @@ class KeepPanel:
             is_automatic=setting.is_automatic,
         )
         edits = setting.edits if setting.edits != self._history.begin.edits else None
-        run = self._saver.save(self._source.id, self._sequence, name, changes, edits)
-        self._saver.follow(run, self.show_run, self._closed)
+        saver = self._storage.saver
+        run = saver.save(self._source.id, self._sequence, name, changes, edits)
+        self._storage.tell("keep a run", run)
+        saver.follow(run, self.show_run, self._closed)
 
     def _save_preset(self, event: Any) -> None:
         history = self._history
@@ -450,6 +460,7 @@ class KeepPanel:
             history.start, history.current, is_automatic=history.is_automatic
         )
         preset = self._store.save(self._name.value, changes, self._unit)
+        self._storage.tell("keep a preset")
         self._choice.want(preset.label)
         self.show()
         kept = preset.name
@@ -462,6 +473,7 @@ class KeepPanel:
         if chosen is None or not chosen.is_own:
             raise UsageError("Choose one of your own presets first; the program's stay.")
         self._store.delete(chosen.name)
+        self._storage.tell("delete a preset")
         notify(event.client, "Preset deleted", chosen.name, color="blue")
 
 

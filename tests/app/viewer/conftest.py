@@ -41,10 +41,22 @@ def begun() -> list[Run]:
 
 
 @pytest.fixture
-def storage(catalog: FolderCatalog, tmp_path: Path, begun: list[Run]) -> UserStorage:
+def noted() -> list[tuple[str, str, str | None]]:
+    """Who has kept or deleted what, and the run that it became."""
+    return []
+
+
+@pytest.fixture
+def storage(
+    catalog: FolderCatalog,
+    tmp_path: Path,
+    begun: list[Run],
+    noted: list[tuple[str, str, str | None]],
+) -> UserStorage:
     """Where users keep presets and runs."""
     saver = RunSaver(catalog, tmp_path / "runs", begun.append)
-    return UserStorage(PresetStore(tmp_path / "presets"), saver)
+    presets = PresetStore(tmp_path / "presets")
+    return UserStorage(presets, saver, lambda *told: noted.append(told))
 
 
 @pytest.fixture

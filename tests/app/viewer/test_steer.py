@@ -179,7 +179,7 @@ def test_a_recording_is_trimmed_and_played_whenever_that_is_wanted(scene) -> Non
 
 
 def test_a_recording_is_kept_as_a_run_and_a_recording(
-    scene, begun: list[Run], tmp_path: Path
+    scene, begun: list[Run], noted: list[tuple[str, str, str | None]], tmp_path: Path
 ) -> None:
     session, client = scene
     steer(client)
@@ -190,7 +190,8 @@ def test_a_recording_is_kept_as_a_run_and_a_recording(
     client.set("take name", "Up & round")
     wait(client, lambda: session._steer._take_folder._name.value == "Up & round")
     client.set("Save as run and recording", True)
-    wait(client, lambda: begun)
+    wait(client, lambda: noted)
+    assert noted == [("me", "keep a take", begun[0].id)]
     run_job(begun[0])
     wait(client, lambda: "Saved as run" in session._steer._take_folder._progress.content)
     run = Run.open(begun[0].folder)

@@ -150,7 +150,7 @@ def test_every_control_takes_the_same_value_again_after_a_reset(sessions) -> Non
         take("substeps", "automatic", lambda: history.is_automatic)
 
 
-def test_own_presets_are_shared_by_all_scenes_and_deleted(sessions, storage) -> None:
+def test_own_presets_are_shared_by_all_scenes_and_deleted(sessions, storage, noted) -> None:
     with watch(sessions) as client, watch(sessions) as other:
         # Each slider is heard in a thread of its own: one after the other.
         client.set("drag [1/s]", 11.0)
@@ -171,6 +171,8 @@ def test_own_presets_are_shared_by_all_scenes_and_deleted(sessions, storage) -> 
         client.until(lambda: client.value("Preset") == "by hand")
         client.until(lambda: "presets/bad.yaml: format is missing" in drawn(client))
         assert [path.name for path in storage.presets.folder.iterdir()] == ["bad.yaml"]
+        until(lambda: len(noted) == 2)
+        assert noted == [("me", "keep a preset", None), ("me", "delete a preset", None)]
 
 
 def test_the_ground_is_lowered_and_taken_away(sessions) -> None:
@@ -209,7 +211,7 @@ def test_too_few_substeps_are_warned_of_with_the_number_that_is_needed(sessions)
         client.until(lambda: "No virtual spring: nothing holds the object" in client.texts())
 
 
-def test_a_run_is_saved_with_what_the_sliders_changed(sessions, begun) -> None:
+def test_a_run_is_saved_with_what_the_sliders_changed(sessions, begun, noted) -> None:
     with watch(sessions) as client:
         client.set("drag [1/s]", 11.0)
         client.until(lambda: "drag [1/s] 3 → 11" in client.texts())
@@ -230,6 +232,8 @@ def test_a_run_is_saved_with_what_the_sliders_changed(sessions, begun) -> None:
             "uses_sequence_gravity": False,
         }
         assert Run.open(Path(opened.config["source"])).id == "sheet"
+        until(lambda: noted)
+        assert noted == [("me", "keep a run", run.id)]
         link = f"<a href='/runs/{run.id}' target='_blank' rel='noopener'>"
         client.until(lambda: f"Saving run {link}Moon &lt;b&gt;sheet&lt;/b&gt;</a>" in drawn(client))
         with run.begin_attempt() as attempt:
