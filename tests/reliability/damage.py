@@ -1,6 +1,7 @@
 """Damaged and half-written folders, and one of an older version."""
 
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -19,7 +20,8 @@ from server_world import World, fit_sheet, make_world
 from sheet_sequence import write_sheet
 from waiting import until
 
-from app.jobs import scheduler as scheduler_module
+from app.jobs.catalog import DEFECT
+from app.jobs.engines.local_engine import LocalEngine
 from app.jobs.processes import end_processes
 from app.jobs.recovery.left_behind import find_left_behind, tidy
 from app.jobs.recovery.recovery import damaged_folders
@@ -82,7 +84,7 @@ class _Working:
         self._scheduler.shutdown()
         for run_folder in self._run_dir.iterdir():
             end_processes(run_folder, grace_s=0.0)
-        for process in self._scheduler._started.values():
+        for process in self._scheduler._local.started.values():
             process.wait()
 
 
@@ -92,7 +94,7 @@ def _ask_for_all(world: World, damaged: dict[str, list[str]], counts: Counter[st
         kind = next((kind for kind in damaged if f"{{{kind}}}" in path), None)
         for name in damaged[kind] if kind else ("",):
             values = {**dict.fromkeys(("run_id", "sequence_id"), name), "view_name": "front"}
-            address = path.format(**values, frame=0, session_id="none", name="none", file="a")
+            address = re.sub(r"\{(\w+)[^}]*\}", lambda part: values.get(part[1], "0"), path)  # noqa: B023
             is_api = path.startswith("/api/")
             client = world.script() if is_api else world.browser()
             client._transport.raise_server_exceptions = False
@@ -125,9 +127,11 @@ def _has_ended(world: World, run: Run) -> bool:
 
 
 def _see_the_good_ones(world: World, good: str, counts: Counter[str]) -> None:
-    runs = {run["id"]: run["state"] for run in world.script().get("/api/v1/runs").json()["runs"]}
+    listed = world.script().get("/api/v1/runs").json()["runs"]
     sequences = world.script().get("/api/v1/sequences").json()["sequences"]
-    counts["lost"] += runs.get(good) != "succeeded"
+    told = [run["reason"] for run in listed] + [sequence["error"] or "" for sequence in sequences]
+    counts["wrong"] += sum(DEFECT in reason for reason in told)  # Nobody foresaw that damage.
+    counts["lost"] += {run["id"]: run["state"] for run in listed}.get(good) != "succeeded"
     counts["lost"] += [s["error"] for s in sequences if s["id"] == "sheet"] != [None]
 
 
@@ -152,8 +156,7 @@ def open_old_folders(count: int, folder: Path) -> Report:
                 run = Run.open(run_folder)
                 counts["corrupt"] += run.is_published and is_damaged(run)
             tidy(find_left_behind(world.settings))
-            with patch.object(scheduler_module, "start_supervisor") as start:
-                start.return_value.poll.return_value = None
+            with patch.object(LocalEngine, "start") as start:
                 world.scheduler.start()
                 world.scheduler.shutdown()
             # What the queue of the older server had not begun is begun by this one.

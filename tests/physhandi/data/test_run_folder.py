@@ -76,7 +76,12 @@ WRONG = {
         "".join(f"a{n}: &a{n} [{f'*a{n - 1}, ' * 9 if n else 'x'}]\n" for n in range(9)),
         "more than 200000 values",
     ),
-    "other format": ("job.yaml", JOB | {"format": "physhandi-run/2"}, "is not in format"),
+    "other format": ("job.yaml", JOB | {"format": "a"}, "is not in format physhandi-run/1.$"),
+    "newer format": (
+        "run.yaml",
+        RUN | {"format": "physhandi-run/2"},
+        "is not in format physhandi-run/1, but physhandi-run/2: update the program",
+    ),
     "number for a kind": ("job.yaml", JOB | {"kind": 3}, r"'kind' is wrong \(expected text, got"),
     "other kind": ("job.yaml", JOB | {"kind": "dream"}, "'kind' is wrong .*dream"),
     "number for a path": ("job.yaml", JOB | {"sequences": [1]}, r"'sequences\[0\]' is wrong"),
