@@ -559,7 +559,7 @@ class Scheduler:
         """End what is left of runs whose supervisor was killed."""
         for folder in self._local.strays(self._settings.run_dir):
             with self._lock:  # A run that is being started has a process before it is noted.
-                is_left = not self._local.is_at_work(folder)
+                is_left = not self._is_supervised(folder)
             if is_left:
                 logger.warning("a process of run %s lost its supervisor", folder.name)
                 self._local.end_rest(folder)

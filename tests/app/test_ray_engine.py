@@ -95,7 +95,7 @@ def test_a_fit_is_one_job_with_the_same_supervisor(
     nonce = job["submission_id"].removeprefix(f"{run_id}-1-")
     assert len(nonce) == 16
     assert shlex.split(job["entrypoint"]) == [
-        "env",
+        *("exec", "env"),
         f"PHYSHANDI_RUN={folder}:{nonce}",
         *("OMP_NUM_THREADS=3", "OPENBLAS_NUM_THREADS=3", "MKL_NUM_THREADS=3"),
         *("/a b/py", "-m", "app.jobs.supervise", str(folder), "cuda:0", "job_worker", "120.0"),
@@ -351,6 +351,26 @@ def test_a_job_that_waits_for_a_place_is_cancelled_at_once_and_never_begins(
     assert begin_start(
         desk.folder(run_id), cluster.submitted[1]["submission_id"].rpartition("-")[2]
     )
+
+
+def test_a_job_on_the_servers_own_machine_is_not_taken_for_left_behind(
+    desk: ClusterDesk, cluster: MadeCluster
+) -> None:
+    run_id = desk.launch()
+    desk.step()
+    cluster.set("RUNNING")
+    # It has its mark, but not its lock yet.
+    ended: list[Path] = []
+    marked = [(None, f"{desk.folder(run_id)}:x")]
+    with (
+        patch.object(local_engine, "marked_processes", lambda: marked),
+        patch.object(local_engine, "end_processes", lambda folder, **_: ended.append(folder)),
+    ):
+        desk.step()
+        assert ended == []
+        cluster.set("FAILED")
+        desk.step()
+        assert ended == [desk.folder(run_id)]
 
 
 def test_what_takes_seconds_runs_beside_the_server(desk: ClusterDesk, cluster: MadeCluster) -> None:

@@ -115,13 +115,11 @@ class RayEngine:
         supervisor = supervisor_command(
             run_folder, ticket.device, self._worker, self._settings.hung_after_s
         )
-        command = shlex.join(
-            [
-                "env",
-                *(f"{name}={value}" for name, value in marks.items()),
-                *(self._settings.cluster_python, "-m", *supervisor),
-            ]
-        )
+        words = ["env", *(f"{name}={value}" for name, value in marks.items())]
+        words += [self._settings.cluster_python, "-m", *supervisor]
+        # In the place of the shell: what serves a job on its node ends only its own children, so a
+        # shell's child would live on when the node is lost.
+        command = f"exec {shlex.join(words)}"
         job = job_name(run_folder, ticket)
         try:
             about = {"run": run_folder.name, "folder": str(run_folder), "start": str(ticket.starts)}
