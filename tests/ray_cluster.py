@@ -86,7 +86,7 @@ class RealCluster:
         """Kill every process of the cluster and of its jobs."""
         mark = self.environment[_MARK]
         while left := list(_marked(mark)):
-            _kill_all(left)
+            _kill_all(_families(left))
             for started in (self.head, *self.nodes):
                 if started is not None:
                     started.poll()
@@ -95,8 +95,7 @@ class RealCluster:
         marked = list(_marked(self.environment[_MARK]))
         of_it = [process for process in marked if _group(process) == started.pid]
         # With the jobs that it runs: a job outlives the daemon of its node for a while.
-        family = {p.pid: p for one in of_it for p in (one, *_children(one))}
-        _kill_all(list(family.values()))
+        _kill_all(_families(of_it))
         started.wait()
 
     def log(self) -> str:
@@ -121,11 +120,13 @@ def _kill_all(processes: list[psutil.Process]) -> None:
     psutil.wait_procs(processes, timeout=5)
 
 
-def _children(process: psutil.Process) -> list[psutil.Process]:
-    try:
-        return process.children(recursive=True)
-    except psutil.NoSuchProcess:
-        return []
+def _families(processes: list[psutil.Process]) -> list[psutil.Process]:
+    """Add all descendants: Ray's own write their titles where their environment was."""
+    found = {process.pid: process for process in processes}
+    for process in processes:
+        with suppress(psutil.NoSuchProcess):
+            found |= {child.pid: child for child in process.children(recursive=True)}
+    return list(found.values())
 
 
 def _group(process: psutil.Process) -> int:
