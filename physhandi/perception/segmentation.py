@@ -1064,7 +1064,7 @@ def _decided_together(
     planes = [patch.lab[..., axis].astype(np.float32) for axis in range(3)]
     height, width = planes[0].shape
     total, weight = np.zeros_like(score), np.zeros((height, width), dtype=np.float32)
-    wide_score = np.pad(score, ((0, 0), (2, 2), (2, 2)), mode="edge")
+    wide_score = np.stack([np.pad(plane, 2, mode="edge") for plane in score])
     wide = [np.pad(plane, 2, mode="edge") for plane in planes]
     for down in range(5):
         for across in range(5):

@@ -119,9 +119,10 @@ class LossSum:
         surface = node_number[: target.surface_count]
         points = 0 if len(surface) == 0 else target.cloud.shape[1]
         chunks = -(-points // POINTS_PER_THREAD)
-        more = ((0, 0), (0, chunks * POINTS_PER_THREAD - points))
-        cloud = np.pad(target.cloud[:, :points], (*more, (0, 0)))
-        weight = np.pad(target.cloud_weight[:, :points], more)
+        more = chunks * POINTS_PER_THREAD - points
+        padding = np.array([[0, 0], [0, more], [0, 0]])
+        cloud = np.pad(target.cloud[:, :points], padding)
+        weight = np.pad(target.cloud_weight[:, :points], padding[:2])
         self._cloud = [self._array(surface, wp.int32), self._array(cloud, wp.vec3)]
         self._cloud_weight = self._array(weight, wp.float32)
         # A few candidates keep a GPU busy only if several threads walk over the nodes.

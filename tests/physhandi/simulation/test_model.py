@@ -89,7 +89,7 @@ def test_whole_numbers_and_numpy_values_are_converted():
     ("values", "message"),
     [
         ({"stifness": 1.0}, "no simulation parameter 'stifness'. Do you mean 'stiffness'"),
-        ({"stiffness": -1.0}, "stiffness is -1.0; expected a number from 0 on"),
+        ({"stiffness": -1.0}, "stiffness is -1.0; expected a number from 0 to 100000000"),
         ({"friction": 2.1}, "friction is 2.1"),
         ({"drag": float("nan")}, "drag is nan"),
         ({"substeps_per_frame": 0}, "substeps_per_frame is 0"),
