@@ -50,6 +50,16 @@ def test_of_cards_of_which_nothing_is_known_the_first_is_taken(tmp_path: Path) -
     assert choice_of(tmp_path, {}, device="cpu").choose(["cpu"]) == "cpu"
 
 
+def test_nobody_asks_for_cards_before_a_fit_is_placed(tmp_path: Path) -> None:
+    asked: list[str] = []
+    settings = ServerSettings(data_dir=tmp_path, device="auto")  # As `doctor` reads it.
+    choice = DeviceChoice(settings, Cards(lambda _: ""), card_of=asked.append)
+    assert asked == []
+    assert choice.choose([]) == "auto"
+    choice.card("auto")
+    assert asked == ["auto"]
+
+
 def test_one_fit_runs_on_each_device_unless_it_is_said_otherwise(tmp_path: Path) -> None:
     two = ServerSettings(data_dir=tmp_path, device="cuda:0, cuda:1")
     assert (two.devices, two.live_device, two.slots) == (("cuda:0", "cuda:1"), "cuda:0", 2)

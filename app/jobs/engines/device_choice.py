@@ -32,9 +32,8 @@ class DeviceChoice:
         self._devices = settings.devices
         self._least = settings.fit_memory_gib * _GIBIBYTE
         self._cards = cards
-        self._card = {
-            device: None if device == "cpu" else card_of(device) for device in self._devices
-        }
+        self._card_of = card_of
+        self._known: dict[str, str | None] = {}
 
     def choose(self, busy: Sequence[str]) -> str | None:
         """Choose the device of the next fit.
@@ -53,7 +52,10 @@ class DeviceChoice:
 
     def card(self, device: str) -> str | None:
         """Tell the graphics card of one of the devices; None for a CPU."""
-        return self._card[device]
+        # Asked when a fit is placed: who only looks at a data folder starts no Warp.
+        if device not in self._known:
+            self._known[device] = None if device == "cpu" else self._card_of(device)
+        return self._known[device]
 
     @property
     def shortage(self) -> str:
@@ -68,7 +70,7 @@ class DeviceChoice:
         )
 
     def _free(self, device: str) -> float | None:
-        card = self._card[device]
+        card = self.card(device)
         return None if card is None else self._cards.free_memory(card)
 
     def _is_short(self, device: str) -> bool:
