@@ -149,7 +149,8 @@ class Audited:
         if visitor is None:
             return
         is_new = state.get("signs_in") is True
-        if not is_new and only_looks(scope):
+        # What is begun and ended by requests that are noted is not noted piece by piece.
+        if not is_new and (only_looks(scope) or state.get("is_part") is True):
             return
         # Empty where there is none, or where the gatekeeper refused before any was looked for.
         path = getattr(scope.get("route"), "path", "")

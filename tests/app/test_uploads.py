@@ -20,7 +20,7 @@ from app.jobs.recordings import unpacking, upload_names, uploads
 from app.jobs.recordings.background import BackgroundTasks
 from app.jobs.recordings.unpacking import settle, unpack
 from app.jobs.recordings.upload_names import check_names
-from app.jobs.recordings.uploads import NewFile, NoRoomError, Uploads
+from app.jobs.recordings.uploads import NoRoomError, Uploads
 from app.settings import ServerSettings
 from physhandi.data.run_folder import JOB, read_yaml
 from physhandi.errors import PhysHandiError, RunError, SequenceError, UsageError
@@ -270,11 +270,18 @@ def test_an_archive_of_a_recording_is_sent_and_can_be_imported(
     client = world.script()
     archive = archive_of(tmp_path / "take.zip", [("take/color/0.png", b"picture")]).read_bytes()
     upload = announce(client, "take", {"take.zip": archive})
-    piece(client, upload, 0, 0, archive)
+    for at in (0, 50):
+        piece(client, upload, 0, at, archive[at:50] if at == 0 else archive[at:])
     client.post(f"/api/v1/uploads/{upload['id']}/finish", json={})
     until(lambda: client.get(f"/api/v1/uploads/{upload['id']}").json()["state"] == "done")
     entries = client.get("/api/v1/captures", params={"folder": "captures"}).json()["entries"]
     assert [entry["place"] for entry in entries] == ["captures/take"]
+    # Who sent it is noted, but not its pieces.
+    noted = (world.settings.audit_dir / "audit.jsonl").read_text().splitlines()
+    assert [(line["what"], line["upload_id"]) for line in map(json.loads, noted)] == [
+        ("POST /api/v1/uploads", upload["id"]),
+        ("POST /api/v1/uploads/{upload_id}/finish", upload["id"]),
+    ]
 
 
 def test_what_is_too_large_or_finds_no_room_is_refused_before_it_is_sent(
@@ -283,16 +290,16 @@ def test_what_is_too_large_or_finds_no_room_is_refused_before_it_is_sent(
     settings = ServerSettings(data_dir=data_dir, upload_gib=1)
     taken = Uploads(settings, BackgroundTasks())
     with pytest.raises(UsageError, match="this server takes 1 GiB at most"):
-        taken.begin("big", [NewFile("a", 2**29), NewFile("b", 2**29 + 1)])
+        taken.begin("big", [("a", 2**29), ("b", 2**29 + 1)])
     disk = SimpleNamespace(total=100 << 30, free=5 << 30)
     monkeypatch.setattr(uploads.shutil, "disk_usage", lambda _: disk)
     with pytest.raises(NoRoomError, match="uploads leave 5% of it free"):
-        taken.begin("small", [NewFile("a", 1 << 20)])
+        taken.begin("small", [("a", 1 << 20)])
     disk.free += 3 << 20
-    first = taken.begin("small", [NewFile("a", 2 << 20)])
+    first = taken.begin("small", [("a", 2 << 20)])
     # What was announced before counts, too.
     with pytest.raises(NoRoomError):
-        taken.begin("another", [NewFile("a", 2 << 20)])
+        taken.begin("another", [("a", 2 << 20)])
     disk.free = 5 << 30
     with pytest.raises(NoRoomError):
         taken.append(first["id"], 0, 0, b"x")
@@ -319,12 +326,12 @@ def test_an_upload_that_was_left_for_a_week_is_removed(
     data_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     taken = Uploads(ServerSettings(data_dir=data_dir), BackgroundTasks())
-    old = taken.begin("old", [NewFile("a", 1)])
-    taken.begin("new", [NewFile("a", 1)])
+    old = taken.begin("old", [("a", 1)])
+    taken.begin("new", [("a", 1)])
     assert [one["name"] for one in taken.unfinished()] == ["old", "new"]
     now = uploads.time.time() + 8 * 86_400
     monkeypatch.setattr(uploads, "time", SimpleNamespace(time=lambda: now))
-    taken.begin("newest", [NewFile("a", 1)])
+    taken.begin("newest", [("a", 1)])
     assert [one["name"] for one in taken.unfinished()] == ["newest"]
     with pytest.raises(PhysHandiError, match="There is no upload"):
         taken.describe(old["id"])

@@ -5,7 +5,6 @@ last one ended, so one that broke off goes on, also after a restart. When all of
 process of its own unpacks and checks it (`app.jobs.recordings.unpacking`) and puts it in place.
 """
 
-import json
 import logging
 import re
 import secrets
@@ -13,15 +12,16 @@ import shutil
 import threading
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 from app.jobs.catalog import NotFoundError
 from app.jobs.recordings.background import BackgroundTask, BackgroundTasks, Work
 from app.jobs.recordings.upload_names import check_names, is_left_out, quoted_name
 from app.settings import ServerSettings
-from physhandi.data.files import named_fields, write_json
+from physhandi.data.files import write_json
+from physhandi.data.run_folder import checked, read_json
 from physhandi.errors import PhysHandiError, RunError, UsageError
 
 logger = logging.getLogger(__name__)
@@ -44,14 +44,11 @@ class NoRoomError(PhysHandiError):
     """The disk has no room for an upload."""
 
 
-@dataclass(frozen=True)
-class NewFile:
-    """A file that is going to be sent."""
+class _AboutFile(TypedDict):
+    """``upload.json``: what was announced."""
 
-    path: str
-    """Its name with slashes, below the folder that is sent."""
-    size: int
-    """Its size [bytes]."""
+    name: str
+    files: list[tuple[str, int]]
 
 
 class Uploads:
@@ -77,13 +74,16 @@ class Uploads:
         self._tasks = tasks
         self._worker = worker
         self._lock = threading.Lock()
+        self._listed: dict[str, tuple[str, list[tuple[str, int]]]] = {}
+        """Name and files of uploads; what is announced stays as it is, and is read but once."""
 
-    def begin(self, name: str, files: Sequence[NewFile]) -> dict[str, Any]:
+    def begin(self, name: str, files: Sequence[tuple[str, int]]) -> dict[str, Any]:
         """Announce an upload.
 
         Args:
             name: What it is to be called: 1 to 64 letters, digits, ``_`` and ``-``.
-            files: Its files; those that systems leave behind are not taken.
+            files: Name, with slashes, below the folder that is sent, and size of each [bytes];
+                those that systems leave behind are not taken.
 
         Returns:
             `describe` of it.
@@ -92,11 +92,11 @@ class Uploads:
             UsageError: If names or sizes are refused, or too many uploads are unfinished.
             NoRoomError: If the disk has no room for it.
         """
-        wanted = [file for file in files if not is_left_out(file.path)]
-        check_names(file.path for file in wanted)
+        wanted = [(path, size) for path, size in files if not is_left_out(path)]
+        check_names(path for path, _ in wanted)
         if not wanted:
             raise UsageError("It holds no files.")
-        total = sum(file.size for file in wanted)
+        total = sum(size for _, size in wanted)
         if total > self._most:
             raise UsageError(
                 f"It has {total / 2**30:.1f} GiB; this server takes {self._most / 2**30:g} GiB at "
@@ -112,8 +112,7 @@ class Uploads:
             upload_id = secrets.token_hex(8)
             folder = self._folder / upload_id
             folder.mkdir(parents=True)
-            listed = [[file.path, file.size] for file in wanted]
-            write_json(folder / _ABOUT, {"name": name, "files": listed})
+            write_json(folder / _ABOUT, {"name": name, "files": wanted})
         return self.describe(upload_id)
 
     def unfinished(self) -> list[dict[str, Any]]:
@@ -123,10 +122,8 @@ class Uploads:
         folders = sorted(self._folder.iterdir(), key=lambda path: path.stat().st_mtime)
         found: list[dict[str, Any]] = []
         for folder in folders:
-            try:
+            with suppress(UnknownUploadError):  # What was never announced goes with the old ones.
                 found.append(self.describe(folder.name))
-            except UnknownUploadError:
-                logger.warning("%s holds no upload; remove it by hand", folder)
         return [one for one in found if "files" in one]
 
     def describe(self, upload_id: str) -> dict[str, Any]:
@@ -296,12 +293,16 @@ class Uploads:
 
     def _read(self, upload_id: str) -> tuple[str, list[tuple[str, int]]]:
         unknown = UnknownUploadError(f"There is no upload '{upload_id}'.")
-        if not re.fullmatch(r"[0-9a-f]{16}", upload_id):
+        about = self._folder / upload_id / _ABOUT
+        if not re.fullmatch(r"[0-9a-f]{16}", upload_id) or not about.is_file():
+            self._listed.pop(upload_id, None)
             raise unknown
-        try:
-            about = named_fields(json.loads((self._folder / upload_id / _ABOUT).read_bytes())) or {}
-            files = [(str(path), int(size)) for path, size in about["files"]]
-            check_names(path for path, _ in files)
-            return str(about["name"]), files
-        except (OSError, ValueError, KeyError, TypeError, RecursionError, UsageError):
-            raise unknown from None
+        if upload_id not in self._listed:
+            try:
+                content = checked(read_json(about), _AboutFile, about)
+                files = [(path, size) for path, size in content["files"]]
+                check_names(path for path, _ in files)
+            except (RunError, UsageError):
+                raise unknown from None
+            self._listed[upload_id] = content["name"], files
+        return self._listed[upload_id]
