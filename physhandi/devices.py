@@ -79,14 +79,26 @@ def pick_devices(names: str) -> tuple[str, ...]:
 def card_of(name: str) -> str | None:
     """Give the identity of a Warp device's graphics card, as `nvidia-smi` tells it; None for a CPU.
 
-    Numbers of devices do not tell: CUDA may count the cards in another order. A process that is
-    started with it in ``CUDA_VISIBLE_DEVICES`` sees this card alone, as ``cuda:0``.
+    Numbers of devices do not tell: CUDA may count the cards in another order.
     """
     import warp as wp
 
     start_warp()
     device = wp.get_device(name)
     return str(device.uuid) if device.is_cuda else None
+
+
+ONLY_CARD = "cuda:0"
+"""How a process calls the one graphics card that it sees; see `only_card`."""
+
+
+def only_card(card: str | None) -> dict[str, str]:
+    """Give the environment variables of a process that is to see one graphics card alone.
+
+    Args:
+        card: See `card_of`; None leaves it what there is.
+    """
+    return {} if card is None else {"CUDA_VISIBLE_DEVICES": card}
 
 
 def describe_device(name: str) -> str:

@@ -14,7 +14,7 @@ from tyro.conf import arg
 from app.cli.lookup import find_sequence, read_settings
 from app.cli.output import AsJson, DataDir, Devices, show
 from physhandi.data.sequence import Sequence
-from physhandi.devices import pick_devices
+from physhandi.devices import ONLY_CARD, pick_devices
 from physhandi.errors import UsageError
 from physhandi.progress import watched
 
@@ -122,7 +122,7 @@ def evaluate_suite(
             protocols=protocols or chosen.protocols,
             settings=settings,
             search_seeds=search_seeds,
-            device="cuda:0" if workers and devices[0] != "cpu" else devices[0],
+            device=ONLY_CARD if workers and devices[0] != "cpu" else devices[0],
             command=_command(suite, given, sequences, jobs, ",".join(devices)),
             at_once=jobs,
         )

@@ -15,7 +15,7 @@ from typing import Any
 
 from physhandi.child import Channel, Child, ChildEndedError, run_child
 from physhandi.data.sequence import Sequence
-from physhandi.devices import card_of
+from physhandi.devices import card_of, only_card
 from physhandi.errors import PhysHandiError, RunError, UsageError
 from physhandi.progress import Progress
 from physhandi.synthetic.suite.evaluation import Fill, Order, Task
@@ -128,7 +128,7 @@ class SuiteWorkers:
             count: How many, 2 or more.
             progress: Told what they do; may ask to stop.
             devices: Warp devices of this process. Each of them has one for itself; if that is a
-                GPU, it is their ``cuda:0``, which orders name.
+                GPU, it is their `ONLY_CARD`, which orders name.
 
         Raises:
             UsageError: If the number makes no sense.
@@ -242,12 +242,11 @@ class SuiteWorkers:
 
     def _start(self, number: int, share: Many[int], device: str) -> _Worker:
         processors = ",".join(str(processor) for processor in share)
-        card = card_of(device)
         child = Child(
             "app.cli.suite_workers",
             processors,
             threads=len(share),
-            environment=None if card is None else {"CUDA_VISIBLE_DEVICES": card},
+            environment=only_card(card_of(device)),
         )
         listener = threading.Thread(target=self._listen, args=(number, child), daemon=True)
         listener.start()

@@ -11,6 +11,7 @@ from pathlib import Path
 import psutil
 
 from physhandi.child import set_process_option, start_module
+from physhandi.devices import only_card
 
 COOKIE = "PHYSHANDI_RUN"
 """Environment variable that marks a run's processes; children inherit it, wherever they move."""
@@ -188,11 +189,10 @@ def start_supervisor(
     Returns:
         The started process.
     """
-    only = {} if card is None else {"CUDA_VISIBLE_DEVICES": card}
     return start_module(
         *command,
         threads=threads,
-        environment={COOKIE: cookie, **only},
+        environment={COOKIE: cookie, **only_card(card)},
         outlives_parent=True,
         stderr=subprocess.DEVNULL,
         start_new_session=True,

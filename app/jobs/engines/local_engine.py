@@ -19,6 +19,7 @@ from app.jobs.processes import (
 from app.jobs.ticket import Ticket, nonce_of
 from app.settings import ServerSettings
 from physhandi.data.lease import live_holder
+from physhandi.devices import ONLY_CARD
 
 _LOST = "It lost its process, which something outside ended."
 
@@ -74,7 +75,7 @@ class LocalEngine:
         card = self._choice.card(ticket.device)
         command = supervisor_command(
             run_folder,
-            ticket.device if card is None else "cuda:0",
+            ticket.device if card is None else ONLY_CARD,
             self._worker,
             self._settings.hung_after_s,
         )
