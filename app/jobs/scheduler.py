@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -512,13 +513,13 @@ class Scheduler:
             self._line = tuple(item.id for item in queue)
             free = max(0, self._engine.slots - len(self._devices_of(self._engine)))
             # A supervisor that put its run back in line has still to end.
-            ready = [
+            ready = (
                 item
                 for item in queue
                 if is_begun(item.folder) or not self._is_supervised(item.folder)
-            ]
+            )
             self._is_short = False
-            for item in ready[:free]:
+            for item in islice(ready, free):
                 device = self._engine.choose(self._devices_of(self._engine))
                 if device is None:
                     self._is_short = True
