@@ -95,14 +95,16 @@ class _State(Collector):
         """List the figures as they are now."""
         states = Tally(self._scheduler.view(item).state for item in self._catalog.runs())
         yield _family("physhandi_runs", "Runs in the data folder.", "state", states)
-        yield _single("physhandi_fit_slots", "Fits that run side by side.", self._scheduler.slots)
+        slots = self._scheduler.slots
+        yield GaugeMetricFamily("physhandi_fit_slots", "Fits that run side by side.", value=slots)
         scenes = len(self._sessions.list())
-        yield _single("physhandi_live_scenes", "Live scenes that are open.", scenes)
+        yield GaugeMetricFamily("physhandi_live_scenes", "Live scenes that are open.", value=scenes)
         load = self._machine.load()
         for name in ("memory", "disk"):
             for kind in ("used", "total"):
                 about = f"{name.capitalize()} of the machine, {kind}."
-                yield _single(f"physhandi_{name}_{kind}_bytes", about, load[name][kind])
+                title = f"physhandi_{name}_{kind}_bytes"
+                yield GaugeMetricFamily(title, about, value=load[name][kind])
         cards = {str(card["index"]): card for card in load["cards"]}
         for key, name, about in (
             ("memory", "physhandi_gpu_memory_used_bytes", "Memory of a graphics card, used."),
@@ -155,10 +157,6 @@ def create_health(
         return Response(encode(registry), media_type=kind)
 
     return router
-
-
-def _single(name: str, about: str, value: float) -> Metric:
-    return GaugeMetricFamily(name, about, value=value)
 
 
 def _family(name: str, about: str, label: str, values: dict[str, float] | Tally[str]) -> Metric:

@@ -11,7 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from urllib.parse import parse_qsl, urlencode
+from urllib.parse import parse_qsl, quote, urlencode
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import cookie_parser
@@ -381,10 +381,11 @@ def _is_shared(scope: Scope) -> bool:
 
 
 async def _refuse(response: Response, scope: Scope, receive: Receive, send: Send) -> None:
-    logger.info("refused %s with %d", scope["path"], response.status_code)
-    if scope["type"] == "http":
+    if scope["type"] == "http":  # `app.health` logs it with all others.
         await response(scope, receive, _with_headers(scope, send))
-    elif "websocket.http.response" in scope.get("extensions", {}):
+        return
+    logger.info("refused the websocket %s with %d", quote(scope["path"]), response.status_code)
+    if "websocket.http.response" in scope.get("extensions", {}):
         await response(scope, receive, send)
     else:
         await send({"type": "websocket.close", "code": 1008, "reason": "refused"})
