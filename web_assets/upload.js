@@ -151,7 +151,7 @@
         remove.setAttribute("aria-label", `Remove what was sent of ${upload.name}`);
         remove.onclick = () => busy(remove, async () => (await send("DELETE", `/api/v1/uploads/${upload.id}`), listUnfinished()));
         row.append(about);
-        if (isWhole && upload.state !== "checking") {
+        if (isWhole) {
           const name = document.createElement("input");
           name.value = `${upload.name.slice(0, 60)}_2`;
           name.maxLength = 64;

@@ -116,7 +116,7 @@ class Uploads:
         return self.describe(upload_id)
 
     def unfinished(self) -> list[dict[str, Any]]:
-        """Describe all that are unfinished, the oldest first."""
+        """Describe all that are not being checked, the oldest first."""
         if not self._folder.is_dir():
             return []
         folders = sorted(self._folder.iterdir(), key=lambda path: path.stat().st_mtime)
@@ -130,25 +130,22 @@ class Uploads:
         """Tell how far an upload is.
 
         Returns:
-            ``id name files received total chunk state reason progress result``; each file as
-            ``path size received``. ``state`` is receiving, checking, failed (with ``reason``) or
-            done (with ``kind`` and ``name`` of what it became as ``result``).
+            ``id name files received total chunk state reason``; each file as
+            ``path size received``. ``state`` is receiving, failed (with ``reason``), checking (then
+            only ``id state progress`` are told) or done (then ``id state result``: ``kind`` and
+            ``name`` of what it became).
 
         Raises:
             UnknownUploadError: If there is none.
         """
         task = self._tasks.task("upload", upload_id)
         if task.state == "done":
+            self._listed.pop(upload_id, None)
             return {"id": upload_id, "state": "done", "result": task.result}
-        try:
-            name, files = self._read(upload_id)
-        except UnknownUploadError:
-            if task.state != "running":
-                raise
-            # It has just been put in place, as its process is about to say.
+        if task.state == "running":  # Its files are on their way to their place.
             return {"id": upload_id, "state": "checking", "progress": task.progress}
+        name, files = self._read(upload_id)
         received = [self._received(upload_id, path) for path, _ in files]
-        states = {"running": "checking", "failed": "failed"}
         return {
             "id": upload_id,
             "name": name,
@@ -159,10 +156,8 @@ class Uploads:
             "received": sum(received),
             "total": sum(size for _, size in files),
             "chunk": CHUNK,
-            "state": states.get(task.state, "receiving"),
+            "state": "failed" if task.state == "failed" else "receiving",
             "reason": task.reason,
-            "progress": task.progress,
-            "result": {},
         }
 
     def append(self, upload_id: str, number: int, offset: int, piece: bytes) -> int:
