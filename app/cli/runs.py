@@ -204,6 +204,7 @@ def export(
         "mjcf",
         "newton",
         "rrd",
+        "splat-ply",
     ],
     out: Path,
     sequence: str | None = None,
@@ -226,10 +227,11 @@ def export(
             film of all frames; zip: a picture with all its data; viser: a recording for viser's
             player; html: one file that plays in any browser; mjcf and newton: the object as a
             MuJoCo scene or a Newton model, with the hand's motion and a script that simulates it
-            (ZIP); rrd: a recording for Rerun's viewer, with cameras and images.
+            (ZIP); rrd: a recording for Rerun's viewer, with cameras and images; splat-ply: what the
+            object looks like, for viewers of Gaussian splats.
         out: File or folder to write.
         sequence: Which sequence of the run; none takes the first one.
-        frame: Only this frame (ply), or which one (png, zip).
+        frame: Only this frame (ply, splat-ply), or which one (png, zip).
         link: Link of the viewer, or its part after "?": camera, layers, colors; parameters of the
             simulation that it changes have the object simulated anew.
         width: Width of a picture or film in pixels, 16 to 4096.

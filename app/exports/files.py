@@ -24,7 +24,7 @@ from app.jobs.catalog import Catalog
 from app.viewer.export.snapshot import snapshot_yaml
 from app.viewer.session import Session
 from app.viewer.sessions import Sessions
-from physhandi.data.exporters import export_run
+from physhandi.data.exporters import PLY, export_run
 from physhandi.data.layout import SequenceFiles
 from physhandi.errors import PhysHandiError, RunError, UsageError, describe
 from physhandi.run import Run
@@ -136,7 +136,8 @@ def create_files(catalog: Catalog, sessions: Sessions, file_cache: FileCache) ->
 
         `ply`, `gltf`, `usd`, `npz`, `csv`: motion; `mjcf`, `newton`: the object as a scene of
         MuJoCo or a model of Newton; `rrd`: a recording for Rerun; `yaml`: parameters
-        and metrics; `png`: a picture; `mp4`, `gif`: a film of all frames; `zip`: a picture with all
+        and metrics; `splat-ply`: what the object looks like, for viewers of Gaussian splats;
+        `png`: a picture; `mp4`, `gif`: a film of all frames; `zip`: a picture with all
         its data; `viser`, `html`: a recording that plays without the server. All fields of a link
         are understood. A parameter of the simulation by its name, such as `drag=4`, has the object
         simulated anew before it is written.
@@ -144,7 +145,7 @@ def create_files(catalog: Catalog, sessions: Sessions, file_cache: FileCache) ->
         del sequence, cam, fov, show, color, scale, theme  # Read with the rest of the link.
         run, query = catalog.run(run_id), read_query(request, without=_OWN_FIELDS)
         order = request_of(catalog, run, kind, query)
-        frame = f if kind == "ply" else None
+        frame = f if kind in PLY else None
         order = replace(order, frame=frame, **asdict(picture))
         if kind in _STORED and not state_from_query(query).is_changed:
             return _answer_stored(run, order)

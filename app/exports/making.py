@@ -3,13 +3,15 @@
 import json
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
 
 from app.exports.request import FileRequest
 from app.viewer.content.content import Content, open_run, open_sequence
@@ -17,11 +19,14 @@ from app.viewer.content.session_state import Pose, SessionState
 from app.viewer.export.bundle import Screenshot, bundle
 from app.viewer.export.snapshot import Snapshot, scene_data
 from app.viewer.restoring import complete_state
+from physhandi.appearance.binding import SplatBinding
+from physhandi.appearance.splats import Splats
 from physhandi.child import Channel, run_child
 from physhandi.data.exporters import export_scene
+from physhandi.data.exporters.splat_ply import read_splats, splats_to_ply
 from physhandi.data.files import write_atomically, write_bytes, write_json
 from physhandi.data.sequence import Sequence
-from physhandi.errors import UsageError
+from physhandi.errors import RunError, UsageError
 from physhandi.object_rollout import ObjectRollout
 from physhandi.run import Run
 from physhandi.simulation.model import SpringMassModel
@@ -125,6 +130,9 @@ def make(
             time_limit_s=time_limit_s,
         )
         return
+    if order.format == "splat-ply":
+        write_bytes(out, _splats(order, run, take))
+        return
     snapshot = Snapshot(
         content=content,
         frame=state.frame,
@@ -146,6 +154,28 @@ def make(
 def surface_of(order: FileRequest) -> ObjectSurface | None:
     """Lay the surface of a run's object, if it is shown."""
     return _open(order, order.check())[0].surface
+
+
+def carried_splats(
+    splats: Mapping[str, ndarray], node: Float[ndarray, "node 3"]
+) -> Float[ndarray, "splat 3"]:
+    """Find where stored splats are when the nodes of their object are somewhere [m]."""
+    try:
+        return SplatBinding.of(Splats.from_tensors(splats)).carry(node[None])[0]
+    except ValueError as error:
+        raise RunError(f"The splats of the run cannot be used: {error}") from error
+
+
+def _splats(order: FileRequest, run: Run | None, take: ObjectRollout | None) -> bytes:
+    """Write splats where they were fitted, or in one frame of a rollout."""
+    if run is None:
+        raise UsageError("format: only a run has splats, a recording has none.")
+    splats = read_splats(run)
+    if order.frame is None or take is None:
+        return splats_to_ply(splats)
+    if order.frame >= take.ready:
+        raise UsageError(f"f: there are frames 0 to {take.ready - 1}, not {order.frame}.")
+    return splats_to_ply(splats, carried_splats(splats, np.asarray(take.position[order.frame])))
 
 
 class _Places:

@@ -26,8 +26,9 @@ Format = Literal[
     "mjcf",
     "newton",
     "rrd",
+    "splat-ply",
 ]
-_SUFFIXES = {"gltf": "glb", "ply": "zip", "mjcf": "zip", "newton": "zip"}
+_SUFFIXES = {"gltf": "glb", "ply": "zip", "mjcf": "zip", "newton": "zip", "splat-ply": "ply"}
 """How the files of formats end, if not like the format."""
 SMALLEST, LARGEST = 16, 4_096
 """Shortest and longest side of a picture [px]."""
@@ -48,7 +49,7 @@ class FileRequest:
     query: Mapping[str, str] = field(default_factory=dict[str, str])
     """What a link would say of it; see `app.exports.permalink`."""
     frame: int | None = None
-    """Only this frame, as one file (PLY); None for all."""
+    """Only this frame, as one file (PLY); None for all, or for splats where they were fitted."""
     recordings: Mapping[str, str] = field(default_factory=dict[str, str])
     """Folders of recordings by name, for runs whose recording has moved."""
     take: str = ""

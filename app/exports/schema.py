@@ -22,6 +22,7 @@ MEDIA_TYPES: dict[str, str] = {
     "mjcf": "application/zip",
     "newton": "application/zip",
     "rrd": "application/octet-stream",
+    "splat-ply": "application/octet-stream",
 }
 
 

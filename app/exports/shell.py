@@ -8,11 +8,11 @@ from typing import Any
 from urllib.parse import parse_qsl, urlsplit
 
 from app.exports.files import request_of
-from app.exports.making import Report, make, surface_of
+from app.exports.making import Report, carried_splats, make, surface_of
 from app.exports.permalink import state_from_query
 from app.jobs.catalog import Catalog
 from app.viewer.content.camera_path import read_camera_path
-from physhandi.data.exporters import FORMATS, export_run
+from physhandi.data.exporters import FORMATS, PLY, export_run
 from physhandi.errors import UsageError
 from physhandi.run import Run
 
@@ -75,7 +75,7 @@ def export(
     order = replace(
         request_of(catalog, run, options.format, query),
         folder=str(run.folder.resolve()),
-        frame=options.frame if options.format == "ply" else None,
+        frame=options.frame if options.format in PLY else None,
         width=options.width,
         height=options.height,
         turn=options.turn,
@@ -91,10 +91,12 @@ def export(
             frame=options.frame,
             overwrite=options.overwrite,
             surface=partial(surface_of, order),
+            carry=carried_splats,
         )
-    if options.frame is not None and options.format not in {"ply", "png", "zip"}:
+    if options.frame is not None and options.format not in {*PLY, "png", "zip"}:
         raise UsageError(
-            f"A single frame can be exported as ply, png or zip, not as {options.format}."
+            f"A single frame can be exported as ply, splat-ply, png or zip, not as "
+            f"{options.format}."
         )
     order.check()
     out = options.out

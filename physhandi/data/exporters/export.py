@@ -3,7 +3,10 @@
 import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+
+import numpy as np
 
 from physhandi.data.exporters.gltf import scene_to_gltf
 from physhandi.data.exporters.mesh import frame_files
@@ -11,6 +14,7 @@ from physhandi.data.exporters.mjcf import mjcf_files
 from physhandi.data.exporters.newton import newton_files
 from physhandi.data.exporters.rrd import scene_to_rrd
 from physhandi.data.exporters.scene_data import LaySurface, SceneData, read_scene
+from physhandi.data.exporters.splat_ply import CarrySplats, read_splats, splats_to_ply
 from physhandi.data.exporters.table import (
     write_npz,
     write_summary,
@@ -22,7 +26,9 @@ from physhandi.data.files import temporary_name, write_bytes, zip_bytes
 from physhandi.data.run import RunFolder
 from physhandi.errors import UsageError
 
-FORMATS = ("ply", "npz", "csv", "yaml", "gltf", "usd")
+FORMATS = ("ply", "npz", "csv", "yaml", "gltf", "usd", "splat-ply")
+PLY = ("ply", "splat-ply")
+"""Formats of which one frame alone can be written."""
 SCENE_FORMATS = ("ply", "npz", "csv", "gltf", "usd", "mjcf", "newton", "rrd")
 
 
@@ -35,6 +41,7 @@ def export_run(
     frame: int | None = None,
     overwrite: bool = False,
     surface: LaySurface | None = None,
+    carry: CarrySplats | None = None,
 ) -> Path:
     """Write a run, or one sequence of it, in another format.
 
@@ -43,15 +50,18 @@ def export_run(
         format: ``ply`` (nodes, hand meshes and virtual springs), ``npz`` (motion and springs),
             ``csv`` (a file: trajectories; a folder: also parameters and metrics) or ``yaml``
             (settings, parameters, losses and metrics of the whole run), ``gltf`` (one ``.glb``
-            file: skinned hands, object nodes, springs and surface, moving), or ``usd`` (the same
-            without springs, for which usd-core must be installed).
+            file: skinned hands, object nodes, springs and surface, moving), ``usd`` (the same
+            without springs, for which usd-core must be installed), or ``splat-ply`` (what the
+            object looks like, as viewers of 3D Gaussian splatting read it).
         out_path: File to write; all frames as PLY go to a ``.zip``. Without the format's suffix,
             PLY and CSV make a folder.
         sequence: Which sequence; None takes the first.
-        frame: Only this frame (PLY); None takes all, which needs a folder.
+        frame: Only this frame (PLY); None takes all, which needs a folder, and leaves splats where
+            they were fitted.
         overwrite: Whether to replace an export that is there.
         surface: Lays the smooth surface of the object (PLY, glTF, USD), which a run does not hold;
             see `load_surface`.
+        carry: Moves splats to a frame; see `carried_splats`.
 
     Returns:
         The file or folder written.
@@ -63,8 +73,13 @@ def export_run(
     out = Path(out_path)
     if format not in FORMATS:
         raise UsageError(f"'{format}' is not a format; choose one of {', '.join(FORMATS)}.")
-    if frame is not None and format != "ply":
-        raise UsageError(f"A single frame can be exported as ply only, not as {format}.")
+    if frame is not None and format not in PLY:
+        raise UsageError(
+            f"A single frame can be exported as ply only (or splat-ply), not as {format}."
+        )
+    if format == "splat-ply":
+        _check_target(out, format, is_folder=False, overwrite=overwrite)
+        return _publish(out, partial(_write_splats, run, (sequence, frame), carry), is_folder=False)
     is_folder = (format == "csv" and out.suffix != ".csv") or _is_folder_of_frames(format, out)
     _check_target(out, format, is_folder=is_folder, overwrite=overwrite)
     if format == "yaml":
@@ -110,6 +125,20 @@ def export_scene(
     return _write_scene(scene, format, out, frame, is_folder=is_folder)
 
 
+def _write_splats(
+    run: RunFolder, place: tuple[str | None, int | None], carry: CarrySplats | None, path: Path
+) -> None:
+    splats, (sequence, frame) = read_splats(run), place
+    center = None
+    if frame is not None:
+        scene = read_scene(run, sequence)
+        _check_frame(scene, frame)
+        if carry is None:
+            raise UsageError("Splats can be written where they were fitted only, in frame 0.")
+        center = carry(splats, np.asarray(scene.rollout[frame], np.float64))
+    write_bytes(path, splats_to_ply(splats, center))
+
+
 def _write_scene(
     scene: SceneData,
     format: str,  # noqa: A002
@@ -129,10 +158,8 @@ def _write_scene(
     }
     if format in whole:
         return _publish(out, whole[format], is_folder=False)
-    if frame is not None and not 0 <= frame < scene.frame_count:
-        raise UsageError(
-            f"Sequence '{scene.sequence}' has frames 0 to {scene.frame_count - 1}, not {frame}."
-        )
+    if frame is not None:
+        _check_frame(scene, frame)
     if out.suffix == ".ply" and frame is None:
         raise UsageError(
             f"{out} is one file; name a folder or a .zip for all frames, or choose one frame."
@@ -144,6 +171,13 @@ def _write_scene(
         return _publish(out, lambda path: write_bytes(path, zip_bytes(files)), is_folder=False)
     ((_, content),) = files
     return _publish(out, lambda path: write_bytes(path, content), is_folder=False)
+
+
+def _check_frame(scene: SceneData, frame: int) -> None:
+    if not 0 <= frame < scene.frame_count:
+        raise UsageError(
+            f"Sequence '{scene.sequence}' has frames 0 to {scene.frame_count - 1}, not {frame}."
+        )
 
 
 def _write_files(folder: Path, files: Iterable[tuple[str, bytes]]) -> None:

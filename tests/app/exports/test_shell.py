@@ -6,12 +6,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from safetensors.numpy import save_file
 from server_world import World
 from viser_file import Recording
 
 from app.cli import main
 from app.exports.shell import ExportOptions, export, read_link
-from physhandi.errors import UsageError
+from physhandi.appearance.binding import SplatBinding
+from physhandi.appearance.splats import Splats
+from physhandi.data.layout import SPLATS_FILE
+from physhandi.errors import RunError, UsageError
 from physhandi.run import Run
 
 
@@ -48,6 +52,51 @@ def test_a_link_that_changes_parameters_is_simulated(
     recording = Recording.read(export(run, replay, world.catalog).read_bytes())
     shown = recording.at(9)["/object/nodes"]["points"].reshape(-1, 3)
     np.testing.assert_allclose(shown, changed[-1], atol=2e-4)
+
+
+def splat_places(content: bytes) -> np.ndarray:
+    """Read where the splats of a PLY file are, which begins each of 17 numbers."""
+    body = content.partition(b"end_header\n")[2]
+    return np.frombuffer(body, "<f4").reshape(-1, 17)[:, :3]
+
+
+def test_splats_are_written_where_the_nodes_of_a_rollout_carry_them(
+    world: World, run: Run, tmp_path: Path
+) -> None:
+    rollout = run.array("sequences/sheet/rollout.npy")
+    random = np.random.default_rng(2)
+    splats = Splats(
+        center=rollout[0] + np.float32(0.001),
+        scale=np.full(rollout.shape[1], 0.004, np.float32),
+        color=random.uniform(0, 1, rollout[0].shape).astype(np.float32),
+        opacity=np.full(rollout.shape[1], 0.8, np.float32),
+        rest_node=rollout[0],
+    )
+    plain = ExportOptions(format="splat-ply", out=tmp_path / "a.ply")
+    with pytest.raises(RunError, match=r"holds no splats; .*appearance\.enabled=true"):
+        export(run, plain, world.catalog)
+    save_file(splats.to_tensors(), run.out / SPLATS_FILE)
+    for link in ("", "drag=9"):
+        options = replace(plain, link=link, out=tmp_path / f"start{link}.ply")
+        found = splat_places(export(run, options, world.catalog).read_bytes())
+        np.testing.assert_array_equal(found, splats.center)
+        motion = replace(options, format="npz", out=tmp_path / f"motion{link}.npz")
+        with np.load(export(run, motion, world.catalog)) as arrays:
+            node = arrays["rollout"][9]
+        later = replace(options, frame=9, out=tmp_path / f"later{link}.ply")
+        found = splat_places(export(run, later, world.catalog).read_bytes())
+        np.testing.assert_array_equal(found, SplatBinding.of(splats).carry(node[None])[0])
+        # They stay beside their nodes, which have moved.
+        assert np.linalg.norm(found - node, axis=1).max() < 0.02
+        assert np.linalg.norm(found - splats.center, axis=1).max() > 0.05
+    answer = world.script().get("/api/v1/runs/fitted/export?format=splat-ply&f=9")
+    assert answer.status_code == 200
+    np.testing.assert_array_equal(
+        splat_places(answer.content), splat_places((tmp_path / "later.ply").read_bytes())
+    )
+    assert 'filename="fitted_00009.ply"' in answer.headers["content-disposition"]
+    with pytest.raises(UsageError, match="frames 0 to 9, not 10"):
+        export(run, replace(plain, frame=10), world.catalog)
 
 
 @pytest.mark.parametrize(
