@@ -16,10 +16,11 @@ SOURCE_FILES = sorted(
     path for part in (*PACKAGES, "web_assets") for path in (ROOT / part).rglob("*.py")
 )
 KERNEL_FILES = [
+    ROOT / "physhandi/appearance/kernels.py",
     ROOT / "physhandi/rendering/kernels.py",
     *sorted((ROOT / "physhandi/simulation/kernels").glob("*.py")),
 ]
-SHAPED = ("data", "fitting", "hand", "metrics")
+SHAPED = ("appearance", "data", "fitting", "hand", "metrics")
 """Packages of which pyproject.toml names the modules whose arrays are checked."""
 READABLE = 20
 """Files of a folder that a person reads at a glance."""

@@ -1,4 +1,5 @@
 """What an object looks like: Gaussian splats, fitted to a frame and carried by the object's nodes.
 
-`splats` says what they are and `binding` how nodes carry them.
+`splats` says what they are, `binding` how nodes carry them, `rasterise` draws them, `picture` with
+the hands that hold the object.
 """

@@ -30,20 +30,7 @@ class Splats:
 
     def __post_init__(self) -> None:
         """Raise `ValueError` if an array is wrong; names it."""
-        count = len(self.center)
-        shapes = {
-            "center": (count, 3),
-            "scale": (count,),
-            "color": (count, 3),
-            "opacity": (count,),
-            "rest_node": (len(self.rest_node), 3),
-        }
-        for name, shape in shapes.items():
-            value: ndarray = getattr(self, name)
-            if value.dtype != np.float32 or value.shape != shape:
-                raise ValueError(
-                    f"{name} is {value.dtype} {value.shape}; expected float32 {shape}."
-                )
+        for name, value in self.to_tensors().items():
             if not np.isfinite(value).all():
                 raise ValueError(f"{name} is not finite at {_first(~np.isfinite(value))}.")
         if len(self.rest_node) == 0:
@@ -72,7 +59,15 @@ class Splats:
                 f"Splats need the arrays {', '.join(sorted(names))}; "
                 f"got {', '.join(sorted(tensors)) or 'none'}."
             )
-        return cls(**{name: np.asarray(tensors[name]) for name in names})
+        count = tensors["center"].shape[:1]
+        for name, value in tensors.items():
+            shape = value.shape[:1] if name == "rest_node" else count
+            shape = shape if name in {"scale", "opacity"} else (*shape, 3)
+            if value.dtype != np.float32 or value.shape != shape:
+                raise ValueError(
+                    f"{name} is {value.dtype} {value.shape}; expected float32 {shape}."
+                )
+        return cls(**tensors)
 
 
 def _first(is_wrong: ndarray) -> str:
