@@ -73,7 +73,7 @@ bench: install
 browser:
 	@command -v chromium >/dev/null || { \
 	  if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
-	    apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends \
+	    apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get -o DPkg::Lock::Timeout=300 install -y -qq --no-install-recommends \
 	      chromium libegl-mesa0 libgl1-mesa-dri libgl1 libegl1 >/dev/null; \
 	  else echo "The browser tests need chromium: install it with your package manager." >&2; exit 1; fi; }
 
