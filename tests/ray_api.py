@@ -1,12 +1,15 @@
 """A made-up Jobs API of a Ray cluster, which does what a test tells it."""
 
 import json
+import subprocess
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from threading import Thread
 from typing import Any
+
+import psutil
 
 TOKEN = 4 * "the cluster's"
 
@@ -23,6 +26,9 @@ class MadeCluster:
     broken: tuple[int, bytes] | None = None
     """What it answers in the place of everything."""
     token: str = TOKEN
+    executes: bool = False
+    """Whether jobs are processes of this machine, at once, and their status is theirs."""
+    processes: dict[str, "subprocess.Popen[bytes]"] = field(default_factory=dict)
 
     @property
     def address(self) -> str:
@@ -56,14 +62,35 @@ class MadeCluster:
                 return 500, f"Traceback\nValueError: Job with submission_id {job} exists.".encode()
             self.submitted.append(content)
             self.jobs[job] = {"status": "PENDING", "metadata": content["metadata"]}
+            if self.executes:
+                self.processes[job] = subprocess.Popen(
+                    ["bash", "-c", content["entrypoint"]], start_new_session=True
+                )
             return None if self.silence == "submit" else (200, {"submission_id": job})
         job, _, deed = name.partition("/")
         if job not in self.jobs:
             return 404, f"Job {job} does not exist".encode()
         if deed == "stop":
             self.stopped.append(job)
+            if self.executes:
+                self.kill(job)
+                self.jobs[job]["status"] = "STOPPED"
             return 200, {"stopped": True}
+        if self.executes and self.jobs[job]["status"] in {"PENDING", "RUNNING"}:
+            code = self.processes[job].poll()
+            ended = "SUCCEEDED" if code == 0 else "FAILED"
+            self.jobs[job]["status"] = "RUNNING" if code is None else ended
         return 200, self.jobs[job]
+
+    def kill(self, job: str) -> None:
+        """Kill a job with all that it started, as when its machine loses its power."""
+        process = self.processes[job]
+        if process.poll() is None:
+            family = psutil.Process(process.pid).children(recursive=True)
+            for member in (*family, process):
+                with suppress(psutil.NoSuchProcess, ProcessLookupError):
+                    member.kill()
+        process.wait()
 
 
 @contextmanager
@@ -96,3 +123,5 @@ def made_cluster() -> Iterator[MadeCluster]:
         yield cluster
         server.shutdown()
         thread.join()
+        for job in cluster.processes:
+            cluster.kill(job)

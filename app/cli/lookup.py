@@ -26,6 +26,18 @@ def read_settings(**given: Any) -> ServerSettings:
         raise UsageError(f"{where}: {first['msg']}.") from None
 
 
+def cluster_settings(settings: ServerSettings, device: str) -> ServerSettings:
+    """Choose what is asked of a cluster by the ``--device`` of a command.
+
+    Raises:
+        UsageError: If a cluster cannot be asked for that.
+    """
+    gpus = {"auto": settings.cluster_gpus, "cpu": 0, "cuda": 1}.get(device)
+    if gpus is None:
+        raise UsageError(f"--device {device} makes no sense on a cluster; take auto, cpu or cuda.")
+    return settings.model_copy(update={"cluster_gpus": gpus})
+
+
 def open_catalog(data_dir: Path | None) -> Catalog:
     """Find sequences and runs in a data folder and among the bundled ones."""
     return Catalog(read_settings(data_dir=data_dir))

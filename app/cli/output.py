@@ -18,6 +18,14 @@ Devices = Annotated[
     str,
     arg(help="Warp device: auto, cpu, cuda or cuda:0; several GPUs: all, or cuda:0,cuda:1."),
 ]
+Engine = Annotated[
+    str | None,
+    arg(
+        help="Where it is computed: local, or ray://HOST:PORT, the address of the Jobs API of a "
+        "Ray cluster (PHYSHANDI_ENGINE, else local; see docs/operations.md). There --device is "
+        "auto, cpu or cuda."
+    ),
+]
 AsJson = Annotated[bool, arg(name="json", help="Print JSON instead of lines.")]
 
 

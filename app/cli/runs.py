@@ -9,13 +9,18 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 
 from app.cli.lookup import (
+    cluster_settings,
     find_result,
     find_sequence,
     open_catalog,
     read_settings,
 )
-from app.cli.output import AsJson, DataDir, Device, Devices, show
+from app.cli.output import AsJson, DataDir, Device, Devices, Engine, show
+from app.jobs.engines.following import FollowedRun, follow_to_end
+from app.jobs.engines.ray_engine import reached_cluster
 from app.jobs.order import default_name, fit_settings
+from app.jobs.processes import WORKER
+from app.settings import LOCAL
 from physhandi.api import prepare_run
 from physhandi.data.layout import LOSSES_FILE, METRICS_FILE, PARAMETERS_FILE
 from physhandi.data.run import RunKind
@@ -82,9 +87,13 @@ def reconstruct(
         Annotated[tuple[str, ...], arg(name="set", metavar="PATH=VALUE")]
     ] = (),
     device: Devices = "auto",
+    engine: Engine = None,
     data_dir: DataDir = None,
 ) -> None:
     """Fit hands and object of one or several sequences of the same object.
+
+    On a cluster, ctrl C ends the job, and the command returns when that is sure. If it is killed,
+    the job goes on, and the same command with --out follows it again.
 
     Args:
         sequences: Folders or names of sequences.
@@ -105,13 +114,24 @@ def reconstruct(
         print(f"physhandi: warning: {told}", file=sys.stderr)
     base = load_profile(profile)
     stored = fit_settings(base, dict(parse_override(text) for text in settings))
-    devices = pick_devices(device)
+    server = read_settings(data_dir=data_dir, engine=engine)
+    if server.engine == LOCAL:
+        cluster, devices = None, pick_devices(device)
+    else:
+        cluster, devices = reached_cluster(cluster_settings(server, device), WORKER), ()
     if out is None:
         name = default_name(recordings[0].name, stored)
         run = _run_at(_new_folder(data_dir), "reconstruction", recordings, stored, name)
     else:
         run = _run_at(out, "reconstruction", recordings, stored)
-    show(_execute(run, *devices))
+    if cluster is None:
+        show(_execute(run, *devices))
+        return
+    print(f"physhandi: {run.folder} is fitted on {cluster.name}", file=sys.stderr)
+    with watched(True) as progress, FollowedRun(run.folder, cluster) as followed:
+        follow_to_end(followed, cluster, progress, server.cancel_grace_s)
+    run.verify()
+    show(_result(run.folder))
 
 
 def simulate(
@@ -328,12 +348,17 @@ def _run_at(
 
 
 def _execute(run: Run, device: str, *more_devices: str) -> dict[str, Any]:
-    """Fill a run; gives its folder, the losses of its stages, its metrics and last its warnings."""
+    """Fill a run; see `_result`."""
     from physhandi import pipeline
 
     with watched(True) as progress:
         pipeline.run_job(run, progress, device=device, more_devices=more_devices)
-    finished = Run.open(run.folder)
+    return _result(run.folder)
+
+
+def _result(folder: Path) -> dict[str, Any]:
+    """Give a run's folder, the losses of its stages, its metrics and last its warnings."""
+    finished = Run.open(folder)
     result: dict[str, Any] = {"run": str(finished.folder)}
     if finished.has(LOSSES_FILE):
         result["losses"] = {

@@ -5,7 +5,8 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import psutil
@@ -16,6 +17,7 @@ from physhandi.devices import only_card
 COOKIE = "PHYSHANDI_RUN"
 """Environment variable that marks a run's processes; children inherit it, wherever they move."""
 _LOCK = ".supervisor.lock"
+_FOLLOWER_LOCK = ".follower.lock"
 _PR_SET_CHILD_SUBREAPER = 36
 
 
@@ -84,16 +86,43 @@ def claim_supervision(run_folder: Path) -> int | None:
     Returns:
         The descriptor that holds the claim, or None if the run has a supervisor already.
     """
-    descriptor = os.open(run_folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
-    end = time.monotonic() + 2.0
+    # Whoever asks `supervisor_of` holds the lock for a moment.
+    return _claim(run_folder / _LOCK, 2.0)
+
+
+@contextmanager
+def following(run_folder: Path, patience_s: float = 0.0) -> Generator[bool]:
+    """Be the only one who starts a run, also again; what runs already runs on.
+
+    Args:
+        run_folder: The run.
+        patience_s: How long to wait for another one, who may do so for a moment only [s].
+
+    Yields:
+        Whether it is so; False if another process, as of a command that follows the run, does.
+    """
+    claim = _claim(run_folder / _FOLLOWER_LOCK, patience_s)
+    try:
+        yield claim is not None
+    finally:
+        if claim is not None:
+            os.close(claim)
+
+
+def _claim(path: Path, patience_s: float) -> int | None:
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    end = time.monotonic() + patience_s
     while not _try_lock(descriptor, fcntl.LOCK_EX):
-        # Whoever asks `supervisor_of` holds the lock for a moment.
         if time.monotonic() > end:
             os.close(descriptor)
             return None
         time.sleep(0.02)
-    os.ftruncate(descriptor, 0)
-    os.write(descriptor, str(os.getpid()).encode())
+    try:
+        os.ftruncate(descriptor, 0)
+        os.write(descriptor, str(os.getpid()).encode())
+    except OSError:
+        os.close(descriptor)
+        raise
     return descriptor
 
 

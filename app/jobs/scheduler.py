@@ -14,16 +14,17 @@ from pathlib import Path
 from typing import Any
 
 from app.jobs.catalog import DEFECT, Catalog, RunItem
-from app.jobs.engines.cluster import Cluster, ClusterError
+from app.jobs.engines.cluster import ClusterError
 from app.jobs.engines.device_choice import DeviceChoice
 from app.jobs.engines.engine import Engine
+from app.jobs.engines.following import start_on
 from app.jobs.engines.local_engine import LocalEngine
 from app.jobs.engines.ray_engine import RayEngine
 from app.jobs.eta import Forecast
 from app.jobs.launch_keys import KeyedRequest, LaunchKeys
 from app.jobs.machine import Cards
 from app.jobs.order import default_name, fit_config, require_agreement
-from app.jobs.processes import WORKER, process_with_lock
+from app.jobs.processes import WORKER, following, process_with_lock
 from app.jobs.recovery.aside import MovedFolder, move_aside
 from app.jobs.ticket import (
     QUEUED,
@@ -32,7 +33,6 @@ from app.jobs.ticket import (
     is_begun,
     is_lost,
     note_end,
-    note_start,
     put_in_line,
     read_ticket,
     start_again_or_end,
@@ -139,9 +139,8 @@ class Scheduler:
         self._catalog = catalog
         self._local = LocalEngine(settings, choice or DeviceChoice(settings, Cards()), worker)
         self._engine: Engine = self._local
-        if settings.engine != LOCAL and settings.engine_token is not None:
-            cluster = Cluster(settings.engine, settings.engine_token.get_secret_value())
-            self._engine = RayEngine(settings, cluster, worker)
+        if settings.engine != LOCAL:
+            self._engine = RayEngine.of(settings, worker)
         self._is_short = False
         self.forecast = Forecast(catalog, settings.devices[0])
         """Estimates how long fits still take."""
@@ -524,8 +523,10 @@ class Scheduler:
                 if device is None:
                     self._is_short = True
                     break
-                with self._hindering(item.id):
-                    self._start(item.folder, self._engine, device)
+                with self._hindering(item.id), following(item.folder) as is_mine:
+                    # A command that follows it starts it itself.
+                    if is_mine and (item.folder / QUEUED).is_file():
+                        self._start(item.folder, self._engine, device)
 
     @contextmanager
     def _hindering(self, run_id: str) -> Generator[None]:
@@ -548,11 +549,8 @@ class Scheduler:
         ]
 
     def _start(self, folder: Path, engine: Engine, device: str) -> None:
-        ticket = note_start(folder, device, engine.name)
-        (folder / EXIT).unlink(missing_ok=True)
-        engine.start(folder, ticket)
+        start_on(engine, folder, device)
         self._busy = (*self._busy, folder.name)
-        (folder / QUEUED).unlink(missing_ok=True)
         self._line = tuple(run_id for run_id in self._line if run_id != folder.name)
         logger.info("run %s started on %s", folder.name, engine.name or device)
 
@@ -565,16 +563,20 @@ class Scheduler:
                 logger.warning("a process of run %s lost its supervisor", folder.name)
                 self._local.end_rest(folder)
         for folder in self._lost_runs():
-            logger.warning("run %s lost its process", folder.name)
-            loss = self._loss(folder)
-            if self._engine_of(folder) is self._local:
-                self._local.end_rest(folder)
-            with self._hindering(folder.name):
-                start_again_or_end(folder, loss)
-                is_again = (folder / QUEUED).is_file()
-                did = "It was put back in line." if is_again else "It has failed."
-                self._restarts.append(LostRun(now(), folder.name, f"{loss} {did}"))
-                self._wake.set()
+            with self._hindering(folder.name), following(folder) as is_mine:
+                if is_mine and self._is_lost(folder):
+                    self._start_again(folder)
+
+    def _start_again(self, folder: Path) -> None:
+        logger.warning("run %s lost its process", folder.name)
+        loss = self._loss(folder)
+        if self._engine_of(folder) is self._local:
+            self._local.end_rest(folder)
+        start_again_or_end(folder, loss)
+        is_again = (folder / QUEUED).is_file()
+        did = "It was put back in line." if is_again else "It has failed."
+        self._restarts.append(LostRun(now(), folder.name, f"{loss} {did}"))
+        self._wake.set()
 
     def _loss(self, folder: Path) -> str:
         return (self._engine_of(folder) or self._local).loss(folder)
@@ -583,14 +585,15 @@ class Scheduler:
         """Find the runs that were started, have not ended and are worked on by nobody."""
         with self._lock:
             folders = [run.folder for run in self.at_work()]
-            return [
-                folder
-                for folder in folders
-                if folder.name not in self._stopping
-                and is_lost(folder)
-                and not self._is_supervised(folder)
-                and live_holder(folder) is None
-            ]
+            return [folder for folder in folders if self._is_lost(folder)]
+
+    def _is_lost(self, folder: Path) -> bool:
+        return (
+            folder.name not in self._stopping
+            and is_lost(folder)
+            and not self._is_supervised(folder)
+            and live_holder(folder) is None
+        )
 
     def _begin_end(self, run: Run) -> None:
         """End a run that is to be cancelled, in a thread of its own."""

@@ -16,6 +16,7 @@ from waiting import until
 
 from app.jobs import scheduler as scheduler_module
 from app.jobs.catalog import Catalog
+from app.jobs.engines import following as following_module
 from app.jobs.engines import local_engine
 from app.jobs.engines.device_choice import DeviceChoice
 from app.jobs.machine import Cards
@@ -412,7 +413,7 @@ def test_a_full_disk_keeps_a_run_in_line_until_there_is_room(
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as full:
-        full.setattr(scheduler_module, "note_start", no_room)
+        full.setattr(following_module, "note_start", no_room)
         run_id = desk.launch("publish")
         told = "It cannot be started: No space left on device. Free some space"
         until(lambda: told in desk.view(run_id).reason, lambda: desk.view(run_id))

@@ -9,9 +9,10 @@ from pathlib import Path
 from app.jobs.engines.cluster import Cluster, ClusterError, Demand
 from app.jobs.processes import COOKIE, cookie_of, supervisor_command
 from app.jobs.ticket import STARTED, Ticket, nonce_of, read_ticket
-from app.settings import ServerSettings
+from app.settings import LOCAL, ServerSettings
 from physhandi.child import thread_limits
 from physhandi.data.lease import live_holder
+from physhandi.errors import UsageError
 
 _INTERVAL_S = 1.0
 _UNKNOWN, _PENDING, _RUNNING = "unknown", "PENDING", "RUNNING"
@@ -55,6 +56,18 @@ class RayEngine:
         self._trouble = f"The cluster at {cluster.place} was not asked yet."
         self._time = -_INTERVAL_S
 
+    @classmethod
+    def of(cls, settings: ServerSettings, worker: str) -> "RayEngine":
+        """Make the engine that settings name; see the class.
+
+        Raises:
+            UsageError: If they name none.
+        """
+        if settings.engine == LOCAL or settings.engine_token is None:
+            raise UsageError(f"{settings.engine} is no cluster with a token.")
+        cluster = Cluster(settings.engine, settings.engine_token.get_secret_value())
+        return cls(settings, cluster, worker)
+
     @property
     def name(self) -> str:
         """See `Engine`."""
@@ -68,6 +81,8 @@ class RayEngine:
     @property
     def full(self) -> str:
         """See `Engine`."""
+        if self._places == 0:
+            return "Waits for a node of the cluster that has what it asks for."
         return "Waits for a free place on the cluster."
 
     @property
@@ -187,3 +202,17 @@ class RayEngine:
             self._status[job] = "LOST" if found is None else found.status
             self._message[job] = "" if found is None else found.message
             return self._status[job]
+
+
+def reached_cluster(settings: ServerSettings, worker: str) -> RayEngine:
+    """Make the engine that settings name, for a command whose user waits.
+
+    Raises:
+        UsageError: If they name none.
+        ClusterError: If it does not answer.
+    """
+    engine = RayEngine.of(settings, worker)
+    engine.refresh()
+    if engine.trouble:
+        raise ClusterError(engine.trouble)
+    return engine
