@@ -2,6 +2,7 @@
 
 import threading
 from collections import OrderedDict
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NoReturn
@@ -110,6 +111,17 @@ class View:
         if image.max() > 3:
             self._fail("mask", frame, f"has label {image.max()}", "only 0 to 3 are known")
         return np.asarray(image)
+
+    def straightened(self) -> "View":
+        """Give the view as a camera without lens distortion would have recorded it.
+
+        Colors are interpolated; depth and labels are those of the nearest recorded pixel. What the
+        lens did not show is black, and has neither depth nor label.
+
+        Returns:
+            The view itself if its lens has no distortion.
+        """
+        return _StraightView(self) if self.camera.distortion.any() else self
 
     def files(self, kind: str) -> list[Path]:
         """List the images of ``color``, ``depth`` or ``mask`` in frame order."""
@@ -252,6 +264,49 @@ class View:
             frame=frame,
             remedy=remedy,
         )
+
+
+class _StraightView(View):
+    """A view whose images and points are moved to where a straight lens would have seen them."""
+
+    def __init__(self, recorded: View) -> None:
+        camera = recorded.camera
+        straight = replace(camera, distortion=np.zeros(5))
+        super().__init__(recorded.folder, recorded._sequence, straight, recorded.frame_count)
+        self._recorded = camera
+        size = (camera.width, camera.height)
+        self._maps = cv2.initUndistortRectifyMap(
+            camera.K, camera.distortion, np.eye(3), camera.K, size, cv2.CV_32FC1
+        )
+
+    @cached_property
+    def keypoint(self) -> Float[ndarray, "frame hand 21 3"] | None:
+        """Pixel x, pixel y and confidence of each hand's keypoints; NaN where not seen."""
+        keypoint = super().keypoint
+        if keypoint is None:
+            return None
+        pixel = self._recorded.undistort(keypoint[..., :2].astype(np.float64))
+        return np.concatenate([pixel.astype(keypoint.dtype), keypoint[..., 2:]], axis=-1)
+
+    @cached_property
+    def track(self) -> Float[ndarray, "frame track 2"] | None:
+        """Pixel of each tracked point [px]."""
+        track = super().track
+        if track is None:
+            return None
+        return self._recorded.undistort(track.astype(np.float64)).astype(track.dtype)
+
+    def color(self, frame: int) -> UInt8[ndarray, "row column 3"]:
+        """Read the color image of a frame (RGB)."""
+        return cv2.remap(super().color(frame), *self._maps, cv2.INTER_LINEAR)
+
+    def depth(self, frame: int) -> Float[ndarray, "row column"]:
+        """Read the depth image of a frame [m]; zero where nothing was measured."""
+        return cv2.remap(super().depth(frame), *self._maps, cv2.INTER_NEAREST)
+
+    def mask(self, frame: int) -> UInt8[ndarray, "row column"]:
+        """Read the labels of a frame: 0 background, 1 object, 2 right hand, 3 left hand."""
+        return cv2.remap(super().mask(frame), *self._maps, cv2.INTER_NEAREST)
 
 
 class _Video:

@@ -1,4 +1,4 @@
-"""Discs of known size before a camera that looks straight down."""
+"""Scores of pictures against sums written out here, and colors seen by a camera that looks down."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,14 +9,7 @@ import pytest
 
 from physhandi.data.camera import PinholeCamera
 from physhandi.data.view import View
-from physhandi.metrics.photometric import (
-    Drawing,
-    draw_nodes,
-    photometric_curves,
-    seen_colors,
-    shaded_psnr,
-    silhouette_iou,
-)
+from physhandi.metrics.photometric import phystwin_scores, proper_scores, seen_colors, ssim_map
 
 CAMERA = PinholeCamera(
     K=np.array([[100.0, 0, 40], [0, 100.0, 30], [0, 0, 1]]),
@@ -26,56 +19,129 @@ CAMERA = PinholeCamera(
 )
 """At height 1 above the origin, looking down: x is to the right, y up in the image."""
 RED, BLUE = (200, 0, 0), (0, 0, 200)
+SHAPE = (30, 40)
 
 
-def colors(*values: tuple[int, int, int]) -> np.ndarray:
-    return np.array(values, dtype=np.uint8)
+def similarity(one: np.ndarray, other: np.ndarray, row: int, column: int) -> float:
+    """SSIM of the window around a pixel of two grey images, as Wang et al. write it."""
+    offset = np.arange(-5, 6)
+    weight = np.exp(-(offset[:, None] ** 2 + offset[None] ** 2) / (2 * 1.5**2))
+    weight /= weight.sum()
+
+    def window(image: np.ndarray) -> np.ndarray:
+        return np.pad(image, 5)[row : row + 11, column : column + 11]
+
+    x, y = window(one), window(other)
+    mean_x, mean_y = (weight * x).sum(), (weight * y).sum()
+    variance_x = (weight * (x - mean_x) ** 2).sum()
+    variance_y = (weight * (y - mean_y) ** 2).sum()
+    covariance = (weight * (x - mean_x) * (y - mean_y)).sum()
+    return ((2 * mean_x * mean_y + 1e-4) * (2 * covariance + 9e-4)) / (
+        (mean_x**2 + mean_y**2 + 1e-4) * (variance_x + variance_y + 9e-4)
+    )
 
 
-def test_a_disc_is_where_and_as_large_as_the_camera_sees_it() -> None:
-    drawing = draw_nodes(CAMERA, np.array([[0.1, 0.05, 0.0]]), colors(RED), 0.08)
-    rows, columns = np.nonzero(drawing.is_covered)
-    assert (rows.mean(), columns.mean()) == pytest.approx((25.0, 50.0))
-    assert drawing.is_covered.sum() == pytest.approx(np.pi * 8.0**2, rel=0.1)
-    assert drawing.image[25, 50].tolist() == list(RED)
-    nearer = draw_nodes(CAMERA, np.array([[0.0, 0.0, 0.5]]), colors(RED), 0.08)
-    assert nearer.is_covered.sum() == pytest.approx(np.pi * 16.0**2, rel=0.1)
+def mean_similarity(one: np.ndarray, other: np.ndarray, counted: np.ndarray) -> float:
+    """Mean SSIM over counted pixels and all channels."""
+    found = [
+        similarity(one[..., channel], other[..., channel], row, column)
+        for row, column in np.argwhere(counted)
+        for channel in range(one.shape[2])
+    ]
+    return float(np.mean(found))
 
 
-@pytest.mark.parametrize("order", [[0, 1], [1, 0]])
-def test_the_nearer_node_hides_the_farther_one(order: list[int]) -> None:
-    node = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.3], [0.0, 0.0, 1.5]])[[*order, 2]]
-    drawing = draw_nodes(CAMERA, node, colors(*[(RED, BLUE)[i] for i in order], RED), 0.02)
-    assert drawing.image[30, 40].tolist() == list(BLUE)
+def pictures() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Color and alpha of a picture, and mask and color of a recording that differs from it."""
+    random = np.random.default_rng(3)
+    mask = np.zeros(SHAPE, np.uint8)
+    mask[6:20, 8:24] = 1
+    mask[15:18, 10:30] = 2  # A hand that hides a part of the object.
+    alpha = np.zeros(SHAPE)
+    alpha[5:21, 10:28] = random.uniform(0.6, 1.0, (16, 18))
+    alpha[2:5, 10:28] = 0.1  # A rim of which next to nothing is seen.
+    color = random.uniform(0.0, 1.0, (*SHAPE, 3)) * alpha[..., None]
+    recorded = random.integers(0, 256, (*SHAPE, 3)).astype(np.uint8)
+    return color, alpha, mask, recorded
 
 
-def halves() -> Drawing:
-    covered = np.zeros((60, 80), dtype=bool)
-    covered[:, :40] = True
-    image = np.where(covered[..., None], np.array(RED, np.uint8), np.uint8(0))
-    return Drawing(image=image, is_covered=covered)
+def test_similarity_is_that_of_each_window_written_out() -> None:
+    random = np.random.default_rng(1)
+    one, other = random.uniform(0, 1, (2, 14, 17, 2))
+    other = 0.6 * one + 0.4 * other
+    found = ssim_map(one, other)
+    for channel in range(2):
+        expected = [
+            [
+                similarity(one[..., channel], other[..., channel], row, column)
+                for column in range(17)
+            ]
+            for row in range(14)
+        ]
+        np.testing.assert_allclose(found[..., channel], expected, atol=1e-12)
+    assert 0.3 < found.mean() < 0.95
 
 
-def test_iou_counts_pixels_without_hands() -> None:
-    mask = np.zeros((60, 80), dtype=np.uint8)
-    mask[:, 20:60] = 1
-    assert silhouette_iou(halves(), mask) == pytest.approx(20 / 60)
-    mask[:, :20] = 2  # A hand hides what is drawn there.
-    assert silhouette_iou(halves(), mask) == pytest.approx(20 / 40)
-    assert np.isnan(silhouette_iou(halves(), np.full((60, 80), 3, dtype=np.uint8)))
+def test_two_even_images_have_the_similarity_and_noise_of_their_difference() -> None:
+    mask = np.ones((40, 40), np.uint8)
+    recorded = np.full((40, 40, 3), 51, np.uint8)  # 0.2, against 0.3.
+    scores = proper_scores(np.full((40, 40, 3), 0.3), np.ones((40, 40)), mask, recorded)
+    assert scores.psnr == pytest.approx(20.0)  # -20 log10 of 0.1.
+    assert scores.iou == 1.0
+    inner = ssim_map(np.full((40, 40, 1), 0.2), np.full((40, 40, 1), 0.3))[20, 20, 0]
+    assert inner == pytest.approx((2 * 0.06 + 1e-4) / (0.04 + 0.09 + 1e-4))
+    same = proper_scores(recorded / 255, np.ones((40, 40)), mask, recorded)
+    assert (same.psnr, same.ssim, same.iou) == (100.0, pytest.approx(1.0), 1.0)
 
 
-def test_psnr_is_that_of_opencv() -> None:
-    random = np.random.default_rng(0)
-    color = random.integers(0, 256, (60, 80, 3)).astype(np.uint8)
-    whole = np.ones((60, 80), dtype=np.uint8)
-    assert shaded_psnr(halves(), color, whole) == pytest.approx(cv2.PSNR(halves().image, color))
-    hand = np.full((60, 80), 2, dtype=np.uint8)
-    assert shaded_psnr(halves(), color, hand) > 100  # Nothing is left to compare.
-    mask = whole.copy()
-    mask[:, 40:] = 0
-    red = np.full((60, 80, 3), RED, dtype=np.uint8)
-    assert shaded_psnr(halves(), red, mask) > 100
+def test_phystwins_scores_count_the_whole_image_and_any_trace_of_the_picture() -> None:
+    color, alpha, mask, recorded = pictures()
+    scores = phystwin_scores(color, alpha, mask, recorded)
+    seen = np.where((mask == 1)[..., None], recorded, 0)
+    shown = np.where((mask == 2)[..., None], 0, np.rint(255 * color)).astype(np.uint8)
+    assert scores.psnr == pytest.approx(cv2.PSNR(seen, shown), abs=1e-6)
+    whole = np.ones(SHAPE, bool)
+    expected = mean_similarity(seen / 255, shown / 255, whole)
+    assert scores.ssim == pytest.approx(expected, abs=1e-9)
+    # Object: rows 6 to 19, columns 8 to 23, less 3 rows of 14 columns that the hand hides. Picture:
+    # rows 2 to 20, columns 10 to 27, less 3 rows of 18 columns.
+    is_object, is_drawn = 14 * 16 - 3 * 14, 19 * 18 - 3 * 18
+    both = 14 * 14 - 3 * 14
+    assert scores.iou == pytest.approx(both / (is_object + is_drawn - both))
+    barely = np.full(SHAPE, 0.4 / 255)
+    assert phystwin_scores(0 * color, barely, mask, None).iou == 0.0
+    assert phystwin_scores(0 * color, 2 * barely, mask, None).iou > 0.0
+
+
+def test_proper_scores_count_the_object_and_its_picture_and_no_hand() -> None:
+    color, alpha, mask, recorded = pictures()
+    scores = proper_scores(color, alpha, mask, recorded)
+    counted = ((mask == 1) | (alpha > 0.5)) & (mask != 2)
+    seen = np.where((mask == 1)[..., None], recorded, 0) / 255
+    shown = np.where(counted[..., None], color, 0.0)
+    error = np.mean([(seen[r, c] - shown[r, c]) ** 2 for r, c in np.argwhere(counted)])
+    assert scores.psnr == pytest.approx(-10 * np.log10(error))
+    assert scores.ssim == pytest.approx(mean_similarity(seen, shown, counted), abs=1e-9)
+    is_object, is_drawn = 14 * 16 - 3 * 14, 16 * 18 - 3 * 18
+    both = 14 * 14 - 3 * 14
+    assert scores.iou == pytest.approx(both / (is_object + is_drawn - both))
+    other = recorded.copy()
+    other[mask != 1] = 99
+    assert proper_scores(color, alpha, mask, other) == scores
+    behind = color.copy()
+    behind[mask == 2] = 0.9
+    assert proper_scores(behind, alpha, mask, recorded) == scores
+
+
+def test_where_nothing_can_be_compared_there_is_no_score() -> None:
+    color, alpha, mask, recorded = pictures()
+    hand = np.full(SHAPE, 3, np.uint8)
+    assert np.isnan(list(proper_scores(color, alpha, hand, recorded).to_dict().values())).all()
+    assert np.isnan(phystwin_scores(color, alpha, hand, recorded).iou)
+    for scores in (phystwin_scores, proper_scores):
+        dark = scores(color, alpha, mask, None)
+        assert np.isnan([dark.psnr, dark.ssim]).all()
+        assert dark.iou == scores(color, alpha, mask, recorded).iou > 0.3
 
 
 @pytest.fixture
@@ -136,26 +202,3 @@ def test_with_normals_pixels_at_the_outline_lend_no_color(view: View) -> None:
     up = np.tile([0.0, 0.0, 1.0], (2, 1))
     assert seen_colors([view], rim)[0].tolist() == [0, 255, 0]
     assert seen_colors([view], rim, up).tolist() == [list(RED), list(RED)]
-
-
-def test_the_right_motion_beats_standing_still(view: View) -> None:
-    still = np.stack([grid(), grid()])
-    right = np.stack([grid(), grid() + np.array([0.1, 0.0, 0.0])])
-    stood, moved = (photometric_curves([view], rollout) for rollout in (still, right))
-    # Pixels that lie within a disc of 2 px about a node, told by distance.
-    row, column = np.mgrid[:60, :80]
-    place = np.stack([(column - 40) / 100, (30 - row) / 100], axis=-1)
-    gap = np.linalg.norm(place[:, :, None] - grid()[:, :2], axis=-1).min(axis=-1)
-    drawn = gap < 0.0205
-    for frame, curves in ((0, stood), (0, moved), (1, stood)):
-        seen = view.mask(frame) == 1
-        expected = (seen & drawn).sum() / (seen | drawn).sum()
-        assert curves["iou"][frame] == pytest.approx(expected, abs=0.02)
-    assert moved["iou"][1] == pytest.approx(moved["iou"][0], abs=0.02)
-    assert stood["iou"][1] < moved["iou"][1] - 0.2
-    assert moved["psnr"][1] > stood["psnr"][1] + 1.0
-
-
-def test_without_masks_there_is_nothing_to_compare_with(view: View, tmp_path: Path) -> None:
-    bare = View(tmp_path / "nothing", "scene", CAMERA, 2)
-    assert photometric_curves([bare], np.stack([grid(), grid()])) == {}
