@@ -11,7 +11,7 @@ from typing import Any
 import uvicorn
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
-from waiting import until
+from waiting import LIMIT_S, until
 
 from app.jobs.catalog import Catalog
 from app.jobs.processes import end_processes
@@ -141,5 +141,5 @@ def serving(world: QueueWorld) -> Iterator[int]:
     yield server.servers[0].sockets[0].getsockname()[1]
     world.app.state.stopping.set()
     server.should_exit = True
-    thread.join(timeout=90)
+    thread.join(LIMIT_S)
     assert not thread.is_alive()

@@ -12,7 +12,7 @@ from numpy import ndarray
 from websockets.sync.client import connect
 
 PROTOCOL = f"viser-v{viser.__version__}"
-PATIENCE_S = 120.0
+PATIENCE_S = 300.0
 """So long a busy machine may take for what has to come; what takes longer does not come [s]."""
 
 
@@ -144,6 +144,12 @@ class ViewerClient:
 
     def take_in(self, seconds: float) -> list[dict[str, Any]]:
         """Take in the next websocket frame; returns its messages, none if it is late."""
+        messages = self._receive(seconds)
+        for message in messages:
+            self._keep(message)
+        return messages
+
+    def _receive(self, seconds: float) -> list[dict[str, Any]]:
         try:
             raw = self.connection.recv(timeout=seconds)
         except TimeoutError:
@@ -152,10 +158,7 @@ class ViewerClient:
         if isinstance(raw, str):
             return []
         self.bytes_received += len(raw)
-        messages = read_messages(raw)
-        for message in messages:
-            self._keep(message)
-        return messages
+        return read_messages(raw)
 
     def _keep(self, message: dict[str, Any]) -> None:
         if self._remembers:

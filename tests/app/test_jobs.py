@@ -12,7 +12,7 @@ from typing import Any
 
 import psutil
 import pytest
-from waiting import until
+from waiting import LIMIT_S, until
 
 from app.jobs import scheduler as scheduler_module
 from app.jobs.catalog import Catalog
@@ -231,7 +231,7 @@ def test_cancelling_ends_the_whole_tree_however_stubborn(
     told, end = threading.Event(), desk.scheduler._end
 
     def end_when_told(*run: Any) -> None:
-        assert told.wait(60)
+        assert told.wait(LIMIT_S)
         end(*run)
 
     monkeypatch.setattr(desk.scheduler, "_end", end_when_told)
@@ -294,7 +294,7 @@ def test_a_killed_worker_fails_with_a_reason_and_takes_its_children_along(desk: 
 
 
 def test_a_hung_worker_is_ended_and_its_run_started_once_more(desks: Callable[..., Desk]) -> None:
-    desk = desks(hung_after_s=2.0)
+    desk = desks(hung_after_s=5.0)
     run_id = desk.launch("frozen")
     run = desk.run(run_id)
     until(lambda: desk.state(run_id) == "running")
@@ -456,7 +456,7 @@ def test_a_sweep_spares_the_run_that_is_just_being_started(
     def start(*_: object, **__: object) -> Any:
         # The process has its mark, but has not claimed the run yet: now it is found.
         sweeper.start()
-        assert reached.wait(60)
+        assert reached.wait(LIMIT_S)
         return SimpleNamespace(poll=lambda: None)
 
     sweeper = threading.Thread(target=sweep)
@@ -468,5 +468,5 @@ def test_a_sweep_spares_the_run_that_is_just_being_started(
         monkeypatch.setattr(local_engine, name, stand_in)
     monkeypatch.setattr(desk.scheduler, "_lock", WatchedLock())
     desk.scheduler.start_now(new)
-    sweeper.join(60)
+    sweeper.join(LIMIT_S)
     assert ended == [(lost, False)]  # To end them takes long, so nobody waits for it.

@@ -11,7 +11,7 @@ from typing import Any
 
 import psutil
 import pytest
-from waiting import until
+from waiting import LIMIT_S, until
 
 from app.jobs import machine as cards_module
 from app.jobs.machine import Cards, Machine, ask_driver
@@ -150,7 +150,7 @@ def test_nobody_waits_for_a_slow_driver(monkeypatch: pytest.MonkeyPatch) -> None
 
     def slow(arguments: list[str]) -> str:
         asked.append(arguments)
-        assert answer.wait(60)
+        assert answer.wait(LIMIT_S)
         return made_up(arguments)
 
     cards = Cards(slow)

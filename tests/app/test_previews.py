@@ -17,7 +17,7 @@ import pytest
 import yaml
 from PIL import Image, ImageSequence
 from server_world import World
-from waiting import until
+from waiting import LIMIT_S, until
 
 from app.previews import store, worker
 from app.previews.camera import fitting_camera
@@ -218,7 +218,7 @@ def test_what_computes_for_too_long_is_ended_and_what_waits_is_not() -> None:
             [sys.executable, "-c", code],
             input=json.dumps({"kind": kind}).encode(),
             cwd=PACKAGE_ROOT,
-            timeout=150,
+            timeout=LIMIT_S,
             check=False,
         ).returncode
 
@@ -293,10 +293,10 @@ def test_waiting_after_a_failure_does_not_delay_the_end(
     monkeypatch.setattr(store, "_PAUSE_S", 3600.0)
     previews.look("sequence", "sheet")
     previews.start()
-    assert is_waiting.wait(60)
+    assert is_waiting.wait(LIMIT_S)
     previews.look("sequence", "sheet")  # Asking does not end the pause.
     previews.shutdown()
-    previews._thread.join(60)
+    previews._thread.join(LIMIT_S)
     assert not previews._thread.is_alive()
 
 

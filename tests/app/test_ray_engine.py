@@ -10,7 +10,7 @@ from unittest.mock import patch
 
 import pytest
 from ray_api import TOKEN, MadeCluster, made_cluster
-from waiting import until
+from waiting import LIMIT_S, until
 
 from app.cli.lookup import read_settings
 from app.jobs.catalog import Catalog
@@ -66,6 +66,7 @@ class ClusterDesk:
 @pytest.fixture
 def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[MadeCluster]:
     monkeypatch.setattr(ray_engine, "_INTERVAL_S", 0.0)
+    monkeypatch.setattr(cluster_module, "_TIMEOUT_S", LIMIT_S)
     with made_cluster() as made:
         yield made
 
@@ -300,7 +301,7 @@ def test_a_stop_is_told_only_when_nothing_is_left(desk: ClusterDesk, cluster: Ma
     assert thread.is_alive()
     assert len(cluster.stopped) - asked <= 1
     attempt._lease.release()
-    thread.join(60)
+    thread.join(LIMIT_S)
     assert desk.view(run_id).state == "cancelled"
     assert not (desk.folder(run_id) / STARTED).exists()
 

@@ -167,21 +167,22 @@ def test_a_hundred_half_requests_are_closed_and_then_others_answered(
         return PlainTextResponse(f"{len(await request.body())} bytes")
 
     app = Starlette(routes=[Route("/", answer, methods=["GET", "POST"])])
-    server = uvicorn.Server(
-        uvicorn.Config(app, host="127.0.0.1", port=0, http=Hasty, log_level="critical")
-    )
-    thread = threading.Thread(target=server.run)
+    server = uvicorn.Server(uvicorn.Config(app, http=Hasty, log_level="critical"))
+    listener = socket.create_server(("127.0.0.1", 0), backlog=200)
+    place = listener.getsockname()
+    # All is sent before the server begins: what is sent to one that has hung up loses its answer.
+    slow = [socket.create_connection(place, LIMIT_S) for _ in range(100)]
+    for number, one in enumerate(slow):
+        one.sendall((b"GET / HTTP/1.1\r\nHo", HEAD + b"x")[number % 2])
+    thread = threading.Thread(target=server.run, args=([listener],))
     thread.start()
     until(lambda: server.started)
-    place = ("127.0.0.1", server.servers[0].sockets[0].getsockname()[1])
     try:
-        slow = [socket.create_connection(place, LIMIT_S) for _ in range(100)]
-        for number, one in enumerate(slow):
-            one.sendall((b"GET / HTTP/1.1\r\nHo", HEAD + b"x")[number % 2])
         for one in slow:
             with one, one.makefile("rb") as stream:
                 assert stream.read().startswith(b"HTTP/1.1 408 ")  # Until it is closed.
-        monkeypatch.setattr(Hasty, "head_s", LIMIT_S)
+        for part in ("head_s", "body_s"):
+            monkeypatch.setattr(Hasty, part, LIMIT_S)
         with socket.create_connection(place, LIMIT_S) as good, good.makefile("rb") as stream:
             good.sendall(b"POST / HTTP/1.0\r\nHost: x\r\nContent-Length: 3\r\n\r\nabc")
             assert stream.read().endswith(b"\r\n\r\n3 bytes")

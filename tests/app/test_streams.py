@@ -9,13 +9,14 @@ from typing import Any
 
 import pytest
 from queue_world import QueueWorld, queue_world, serving
+from waiting import LIMIT_S
 
 
 class Stream:
     """A reader of server-sent events."""
 
     def __init__(self, port: int, token: str, path: str, **headers: str) -> None:
-        self.connection = HTTPConnection("127.0.0.1", port, timeout=120)
+        self.connection = HTTPConnection("127.0.0.1", port, timeout=LIMIT_S)
         self.connection.request("GET", path, headers={"Authorization": f"Bearer {token}"} | headers)
         self.response: HTTPResponse = self.connection.getresponse()
 

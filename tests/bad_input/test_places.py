@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bad_input_world import Terminal, table, tree
+from waiting import LIMIT_S
 
 from physhandi import pipeline
 from physhandi.run import Run
@@ -202,7 +203,7 @@ def in_a_process(folder: Path, *order: str, setup: str = "") -> tuple[int, str]:
         cwd=folder,
         capture_output=True,
         text=True,
-        timeout=170,
+        timeout=LIMIT_S,
         check=False,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
     )

@@ -28,7 +28,7 @@ from scene_page import (
     TIMEOUT_MS,
     ScenePage,
 )
-from waiting import until
+from waiting import LIMIT_S, until
 
 from app.jobs.processes import end_processes
 
@@ -93,7 +93,7 @@ def _serving(folder: Path) -> Iterator[Served]:
             end_processes(run, grace_s=0)
         server.terminate()
         try:
-            server.wait(120)
+            server.wait(LIMIT_S)
         finally:
             server.kill()
             server.wait()

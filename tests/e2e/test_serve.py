@@ -12,10 +12,10 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
+from waiting import LIMIT_S
 
 pytestmark = pytest.mark.e2e
 START = "from app.cli import main; main()"
-PATIENCE_S = 120.0
 
 
 @pytest.fixture
@@ -48,7 +48,7 @@ def test_the_printed_address_opens_and_the_server_ends_while_it_is_followed(
     cookie: dict[str, str] = {}
 
     def ask(path: str) -> tuple[HTTPConnection, HTTPResponse]:
-        connection = HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
+        connection = HTTPConnection("127.0.0.1", port, timeout=LIMIT_S)
         connection.request("GET", path, headers=cookie)
         return connection, connection.getresponse()
 
@@ -71,7 +71,7 @@ def test_the_printed_address_opens_and_the_server_ends_while_it_is_followed(
     connection, answer = ask("/?token=wrong-token-of-somebody")
     answer.read()
     process.send_signal(signal.SIGTERM)
-    process.wait(PATIENCE_S)  # If it waited for the stream's reader, it would never end.
+    process.wait(LIMIT_S)  # If it waited for the stream's reader, it would never end.
     for opened in (events, stream, connection):
         opened.close()
     log = (tmp_path / "log").read_text()
@@ -90,7 +90,7 @@ def test_a_second_server_on_the_same_data_folder_says_who_has_it(
         [*command, "--data-dir", str(tmp_path / "data")],
         capture_output=True,
         text=True,
-        timeout=PATIENCE_S,
+        timeout=LIMIT_S,
         check=False,
         cwd=Path(__file__).parents[2],
     )

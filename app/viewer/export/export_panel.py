@@ -30,7 +30,7 @@ _MOTION = ("GLB", "PLYs", "NPZ")
 _TABLES = ("CSV", "YAML")
 _OF_COMPARISON = ("PNG", "NPZ", "CSV", "ZIP")
 """Files that show both sides of a comparison."""
-_RENDER_SECONDS = 20.0
+_RENDER_SECONDS = 60.0
 _RENDER_SECONDS_PER_PIXEL = 5e-6
 _WINDOW, _OWN = "as this window", "own size"
 _SIZES: dict[str, tuple[int, int] | None] = {

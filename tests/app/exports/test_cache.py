@@ -11,6 +11,7 @@ import cv2
 import psutil
 import pytest
 from server_world import World
+from waiting import LIMIT_S
 
 from app.exports import cache as cache_module
 from app.exports.cache import FileCache, FileJob, TooManyFilesError
@@ -47,7 +48,7 @@ def test_a_process_makes_the_file_and_tells_how_far_it_is(
     go, run = threading.Event(), FileCache._run
 
     def run_when_told(file_cache: FileCache, order: FileRequest, work: FileJob) -> None:
-        assert go.wait(60)
+        assert go.wait(LIMIT_S)
         run(file_cache, order, work)
 
     monkeypatch.setattr(FileCache, "_run", run_when_told)
@@ -111,7 +112,7 @@ def test_there_is_an_end_to_files_that_wait(
     tmp_path: Path, order: FileRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     go = threading.Event()
-    made = pretend(monkeypatch, lambda _order, _work: go.wait(120) and None)
+    made = pretend(monkeypatch, lambda _order, _work: go.wait(LIMIT_S) and None)
     monkeypatch.setattr(cache_module, "MOST_WAITING", 3)
     file_cache = FileCache(tmp_path / "cache", at_once=1)
     works = [file_cache.begin(replace(order, query={"f": str(frame)})) for frame in range(3)]
@@ -120,8 +121,10 @@ def test_there_is_an_end_to_files_that_wait(
         file_cache.begin(replace(order, query={"f": "9"}))
     assert len(made) <= 1
     go.set()
-    assert [work.future.result(60).name for work in works] == [work.path.name for work in works]
-    file_cache.begin(replace(order, query={"f": "9"})).future.result(60)
+    assert [work.future.result(LIMIT_S).name for work in works] == [
+        work.path.name for work in works
+    ]
+    file_cache.begin(replace(order, query={"f": "9"})).future.result(LIMIT_S)
     file_cache.close()
 
 
@@ -145,7 +148,7 @@ def test_a_failure_is_told_and_the_next_order_tries_again(
     pretend(monkeypatch, fail)
     work = file_cache.begin(order)
     with pytest.raises(RunError, match="a file is damaged"):
-        work.future.result(60)
+        work.future.result(LIMIT_S)
     assert work.state == "failed"
     assert file_cache.make(order).read_bytes() == b"x" * 100
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 from queue_world import HOSTILE, QueueWorld, serving
-from waiting import until
+from waiting import LIMIT_S, until
 
 from physhandi.data.attempt import PREVIEW, PreviewFile
 from physhandi.progress import Preview
@@ -33,7 +33,7 @@ def shown(height: float) -> Preview:
 
 
 def events(port: int, token: str, path: str) -> Iterator[tuple[str, Any]]:
-    connection = HTTPConnection("127.0.0.1", port, timeout=120)
+    connection = HTTPConnection("127.0.0.1", port, timeout=LIMIT_S)
     connection.request("GET", path, headers={"Authorization": f"Bearer {token}"})
     response = connection.getresponse()
     kind = ""

@@ -221,6 +221,12 @@ def draw(session: Session, client: ViewerClient, low, high, modifier: str | None
     )
 
 
+def is_marked(client: ViewerClient, place: np.ndarray) -> bool:
+    """Whether nodes at these places, and no others, are drawn as selected."""
+    shown = client.nodes.get(CHOSEN, {}).get("points", np.zeros(0)).reshape(-1, 3)
+    return len(shown) == len(place) and np.allclose(shown, place, atol=1e-6)
+
+
 def selected(client: ViewerClient) -> str:
     return texts(client).partition("data-selected>")[2].partition("<")[0]
 
@@ -254,7 +260,7 @@ def test_a_rectangle_selects_and_each_button_is_one_step(scene, run: Run) -> Non
     assert 9 < len(right) < 40
     draw(session, client, (0.03, -0.3), (0.3, 0.3))
     wait(client, lambda: selected(client) == f"{len(right)} nodes")
-    np.testing.assert_allclose(client.array(CHOSEN, "points"), position[AT][right], atol=1e-6)
+    wait(client, lambda: is_marked(client, position[AT][right]))
     draw(session, client, (0.03, -0.3), (0.3, 0.01), "cmd/ctrl")
     fewer = [node for node in right if y[node] / (1.0 - z[node]) > 0.01 / 0.95]
     assert 0 < len(fewer) < len(right)
@@ -265,8 +271,10 @@ def test_a_rectangle_selects_and_each_button_is_one_step(scene, run: Run) -> Non
     history = session._object.panel.history
     client.set("Nodes", "Pin")
     wait(client, lambda: f"Pin {len(right)} nodes from frame {AT} on" in texts(client))
-    wait(client, lambda: "simulated 20/20" in texts(client) and session._object.newest.edits)
-    rollout = session._object.newest
+    # The panel may still tell of the rollout before, which was simulated to its end, too.
+    newest = lambda: session._object.newest  # noqa: E731
+    wait(client, lambda: newest().edits and newest().ready == len(position))
+    rollout = newest()
     assert rollout.model.pin_count == len(right)
     np.testing.assert_allclose(rollout.position[:AT], position[:AT], atol=1e-6)
     held, free = (
@@ -413,7 +421,8 @@ def test_edits_are_saved_as_a_run_and_go_into_a_copy_but_not_into_a_link(
     client.set("Springs", "Cut")
     wait(client, lambda: session.state.edits)
     edits = session.state.edits
-    wait(client, lambda: session._object.newest.edits)
+    newest = lambda: session._object.newest  # noqa: E731
+    wait(client, lambda: newest().edits and newest().ready > 0)
     rollout, frame = session._object.at(0)
     assert begin_take(rollout, frame, {}, {}).is_edited
     assert not begin_take(session._content.fitted, 0, {}, {}).is_edited

@@ -48,12 +48,17 @@ def nodes(client: ViewerClient, side: str) -> np.ndarray:
 
 def press(client: ViewerClient, hotkey: str) -> None:
     """Press a key, as the browser tells it."""
-    commands = {
+    client.until(lambda: hotkey in commands(client))
+    client.send("CommandTriggerMessage", uuid=commands(client)[hotkey])
+
+
+def commands(client: ViewerClient) -> dict[str, str]:
+    """The ids of the commands that are heard, by their keys."""
+    return {
         message["props"]["hotkey"]: message["uuid"]
         for message in client.messages
         if message["type"] == "RegisterCommandMessage" and message["props"]["modifier"] is None
     }
-    client.send("CommandTriggerMessage", uuid=commands[hotkey])
 
 
 def is_ready(client: ViewerClient) -> bool:

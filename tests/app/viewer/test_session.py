@@ -193,12 +193,12 @@ def test_hands_without_an_object_are_seen_before_the_first_video(
         np.testing.assert_allclose(pose.position, camera.T_world_camera[:3, 3], atol=1e-6)
         client.until(lambda: client.nodes["/cameras/view0"]["scale"] > 0.2)
         ground = session._server.scene._handle_from_node_name["/ground"]
-        assert not ground.visible
+        client.until(lambda: not ground.visible)
         client.set("View from", "view1")
         client.until(lambda: client.nodes["/cameras/view1"]["scale"] > 0.2)
         client.set("View from", "Overview")
         client.until(lambda: client.nodes["/cameras/view1"]["scale"] < 0.2)
-        assert ground.visible
+        client.until(lambda: ground.visible)
     for query, looks_from in (
         ({"f": "2"}, "view0"),
         ({"f": "2", "cam": "1,1,1,0,0,0"}, None),

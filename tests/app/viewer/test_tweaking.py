@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from viewer_client import ViewerClient
 from viewer_world import FRAMES, PARAMETERS
-from waiting import until
+from waiting import LIMIT_S, until
 
 from app.viewer.physics.history import Setting
 from app.viewer.physics.keep_panel import SavedRun, run_changes
@@ -279,7 +279,7 @@ def test_a_saved_run_is_followed_until_it_ends(storage, begun) -> None:
         until(lambda: len(told) == 2)
         attempt.save_array("x.npy", np.zeros(3))
         attempt.publish()
-    thread.join(timeout=60)
+    thread.join(LIMIT_S)
     assert [saved.state for saved in told] == ["queued", "running", "succeeded"]
     for name in ("", "x" * 81):
         with pytest.raises(UsageError, match="Type a name"):

@@ -13,6 +13,7 @@ import numpy as np
 import psutil
 import pytest
 from run_world import fill, make_run
+from waiting import LIMIT_S
 
 from physhandi.data import attempt as attempt_module
 from physhandi.data import lease
@@ -408,7 +409,11 @@ def test_only_one_of_several_processes_may_begin(tmp_path: Path) -> None:
         ]
         for child in children:
             child.start()
-        assert sorted(results.get(timeout=120) for _ in children) == ["begun", "refused", "refused"]
+        assert sorted(results.get(timeout=LIMIT_S) for _ in children) == [
+            "begun",
+            "refused",
+            "refused",
+        ]
         for child in children:
             child.join()
         assert run.state == "failed"

@@ -14,6 +14,7 @@ import scipy.sparse
 import torch
 from foreign_pickle import chumpy_select, python2_pickle
 from hostile_pickles import BROKEN, EXPLODING, canaries
+from waiting import LIMIT_S
 
 from physhandi.data.foreign import array_from_bytes, convert
 from physhandi.errors import ImportFailedError
@@ -129,7 +130,7 @@ def test_nothing_can_be_opened_or_started_while_a_file_is_read(tmp_path: Path) -
         cwd=Path(__file__).parents[3],
         capture_output=True,
         text=True,
-        timeout=150,
+        timeout=LIMIT_S,
         check=False,
     )
     touched, opened, started, is_there = done.stdout.splitlines()

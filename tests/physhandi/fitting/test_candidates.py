@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import warp as wp
+from waiting import LIMIT_S
 
 from physhandi.data.observation import ObjectObservation
 from physhandi.errors import CancelledError, SimulationDivergedError
@@ -236,7 +237,7 @@ def test_candidates_are_simulated_at_once_with_the_same_bits(
     alone = CandidateEvaluator(problems, ObjectFitConfig(), NullProgress(), threads=1)(candidates)
     assert len({loss for _, loss in alone}) == 6
     # Nobody leaves before another one has come.
-    pairs = threading.Barrier(2, timeout=60)
+    pairs = threading.Barrier(2, timeout=LIMIT_S)
     losses = BatchSimulator.losses
 
     def met(simulator: BatchSimulator, *arguments: Any) -> Any:

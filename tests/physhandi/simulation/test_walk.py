@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 from reference.blocks import PARAMETERS, thrown_block
+from waiting import LIMIT_S
 
 from physhandi.simulation.engines import cpu
 from physhandi.simulation.engines.cpu import FIRST_PAUSE, TRIAL, Pace
@@ -57,7 +58,7 @@ def meet_two(waited=(0, 0), stop=NO_STOP, late=(0, 0)):
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join(timeout=150)
+        thread.join(timeout=LIMIT_S)
         assert not thread.is_alive()
     return met.numpy().tolist()
 
