@@ -15,12 +15,14 @@ def askew_camera(width: int = 61, height: int = 45) -> PinholeCamera:
     return PinholeCamera(K=K, T_world_camera=pose, width=width, height=height)
 
 
-def random_splats(camera: PinholeCamera, count: int = 150, seed: int = 1) -> Splats:
+def random_splats(
+    camera: PinholeCamera, count: int = 150, seed: int = 1, beyond: float = 20
+) -> Splats:
     """Scatter splats of all sizes and opacities in and around what a camera sees."""
     random = np.random.default_rng(seed)
     depth = random.uniform(0.3, 0.6, count)
     depth[:3] = [-0.2, 0.005, 0.02]  # Behind the camera, too near, and just not too near.
-    pixel = random.uniform([-20, -20], [camera.width + 20, camera.height + 20], (count, 2))
+    pixel = random.uniform(-beyond, np.array([camera.width, camera.height]) + beyond, (count, 2))
     return Splats(
         center=camera.unproject(pixel, depth).astype(np.float32),
         scale=random.uniform(0.001, 0.02, count).astype(np.float32),

@@ -11,7 +11,11 @@ from numpy import ndarray
 from physhandi.appearance.kernels import (
     TILE_SIDE,
     Pinhole,
+    Slopes,
+    ask_splats,
     blend_splats,
+    collect_in_splats,
+    collect_in_tiles,
     find_lists,
     list_reached,
     project_splats,
@@ -27,6 +31,8 @@ _VEC3: Any = wp.vec3
 _INT: Any = wp.int32
 _LONG: Any = wp.int64
 _BOX: Any = wp.vec4i
+_VEC2: Any = wp.vec2
+_SLOPES: Any = Slopes
 PIXELS_OF_A_TILE = int(TILE_SIDE) ** 2
 """Pixels that share a list of splats, and threads of a block."""
 
@@ -101,9 +107,9 @@ class SplatDrawing:
     """A picture of splats on the current Warp device, with all that its slopes need.
 
     Attributes:
-        lens: The camera.
-        columns: Tiles of a row.
-        tiles: All tiles.
+        center: Middles of the splats [m].
+        tiles: Tiles of the picture.
+        entries: Length of the lists of all tiles.
         color: Over the background, ``(row, column)``.
         alpha: What is covered.
         depth: Mean depth of what covers [m].
@@ -135,91 +141,141 @@ class SplatDrawing:
             ValueError: If the camera has distortion.
         """
         size = (camera.height, camera.width)
-        self.lens = _lens_of(camera)
-        self.columns = -(-camera.width // int(TILE_SIDE))
+        self._pinhole = _pinhole_of(camera)
+        self._columns = -(-camera.width // int(TILE_SIDE))
         self._rows = -(-camera.height // int(TILE_SIDE))
-        self.tiles = self.columns * self._rows
-        self.center, self.scale = center, scale
-        self.splat_color, self.opacity = color, opacity
-        self.background = wp.zeros(size, dtype=wp.vec3) if background is None else background
-        self.occluder = wp.zeros(size, dtype=wp.float32) if occluder is None else occluder
+        self.tiles = self._columns * self._rows
+        self.center, self._scale = center, scale
+        self._splat_color, self._opacity = color, opacity
+        self._background = wp.zeros(size, dtype=wp.vec3) if background is None else background
+        self._occluder = wp.zeros(size, dtype=wp.float32) if occluder is None else occluder
         self._project()
         self._list()
+        # What kernels are given of tiles, and of the splats in the picture.
+        self._lists = self._columns, self._begin, self._end, self._listed
+        self._seen = self._middle, self._conic, self._away, self._splat_color, self._opacity
         self.color: Any = wp.empty(size, dtype=_VEC3)
         self.alpha: Any = wp.empty(size, dtype=_FLOAT)
         self.depth: Any = wp.empty(size, dtype=_FLOAT)
         wp.launch(
             blend_splats,
             (self.tiles, PIXELS_OF_A_TILE),
-            [*self.lists, *self.seen, self.background, self.occluder],
+            [*self._lists, *self._seen, self._background, self._occluder],
             [self.color, self.alpha, self.depth],
             block_dim=PIXELS_OF_A_TILE,
         )
 
-    @property
-    def lists(self) -> tuple[Any, ...]:
-        """What of each tile a kernel that goes through its list is given."""
-        return self.columns, self._begin, self._end, self.listed
+    def slopes(
+        self, color: wp.array, alpha: wp.array, depth: wp.array
+    ) -> tuple[wp.array, wp.array, wp.array, wp.array]:
+        """Carry the slopes of a loss back from the picture to the splats.
 
-    @property
-    def seen(self) -> tuple[Any, ...]:
-        """What of the splats in the picture such a kernel is given."""
-        return self.middle, self.conic, self.away, self.splat_color, self.opacity
+        Args:
+            color: How it changes with the color of each pixel.
+            alpha: With what is covered.
+            depth: With the mean depth of what covers [1/m].
 
-    def _project(self) -> None:
+        Returns:
+            How it changes with the splats' middles [1/m], standard deviations [1/m], colors and
+            opacities.
+        """
+        share = wp.empty((self.entries, PIXELS_OF_A_TILE), dtype=_VEC2)
+        wp.launch(
+            ask_splats,
+            (self.tiles, PIXELS_OF_A_TILE),
+            [
+                *(*self._lists, *self._seen, self._background, self._occluder),
+                *(self.alpha, self.depth, self.color, color, alpha, depth),
+            ],
+            [share],
+            block_dim=PIXELS_OF_A_TILE,
+        )
+        listed = wp.empty(self.entries, dtype=_SLOPES)
+        wp.launch(
+            collect_in_tiles,
+            self.entries,
+            [
+                *(self._columns, self._listed, self._key, self._middle, self._conic),
+                *(self.alpha, color, depth, share),
+            ],
+            [listed],
+            block_dim=PIXELS_OF_A_TILE,
+        )
         count = len(self.center)
-        self.middle = wp.zeros(count, dtype=wp.vec2)
-        self.conic = wp.zeros(count, dtype=wp.vec3)
-        self.away = wp.zeros(count, dtype=wp.float32)
+        seen = [wp.empty(count, dtype=kind) for kind in (_VEC2, _VEC3, _FLOAT)]
+        tint, opacity = wp.empty(count, dtype=_VEC3), wp.empty(count, dtype=_FLOAT)
+        wp.launch(
+            collect_in_splats,
+            count,
+            [self._first, self._reached, self._place, self._opacity, listed],
+            [*seen, tint, opacity],
+        )
+        center, scale = wp.zeros(count, dtype=wp.vec3), wp.zeros(count, dtype=wp.float32)
         wp.launch(
             project_splats,
             count,
-            [self.lens, self.center, self.scale],
-            [self.middle, self.conic, self.away],
+            [self._pinhole, self.center, self._scale],
+            [self._middle, self._conic, self._away],
+            adj_inputs=[_PINHOLE(), center, scale],
+            adj_outputs=seen,
+            adjoint=True,
+        )
+        return center, scale, tint, opacity
+
+    def _project(self) -> None:
+        count = len(self.center)
+        self._middle = wp.zeros(count, dtype=wp.vec2)
+        self._conic = wp.zeros(count, dtype=wp.vec3)
+        self._away = wp.zeros(count, dtype=wp.float32)
+        wp.launch(
+            project_splats,
+            count,
+            [self._pinhole, self.center, self._scale],
+            [self._middle, self._conic, self._away],
         )
 
     def _list(self) -> None:
         """List the splats that reach into each tile, the nearest first."""
         count = len(self.center)
         box = wp.empty(count, dtype=_BOX)
-        self.reached = wp.empty(count, dtype=_INT)
+        self._reached = wp.empty(count, dtype=_INT)
         wp.launch(
             reach_tiles,
             count,
-            [self.middle, self.conic, self.away, self.opacity, self.columns, self._rows],
-            [box, self.reached],
+            [self._middle, self._conic, self._away, self._opacity, self._columns, self._rows],
+            [box, self._reached],
         )
         end = wp.empty(count, dtype=_INT)
-        wp.utils.array_scan(self.reached, end, inclusive=True)
+        wp.utils.array_scan(self._reached, end, inclusive=True)
         self.entries = int(end[-1:].numpy()[0]) if count else 0
-        self.first = wp.empty(count, dtype=_INT)
-        wp.utils.array_scan(self.reached, self.first, inclusive=False)
+        self._first = wp.empty(count, dtype=_INT)
+        wp.utils.array_scan(self._reached, self._first, inclusive=False)
         # Sorting takes twice the room.
-        self.key: Any = wp.empty(2 * self.entries, dtype=_LONG)
+        self._key: Any = wp.empty(2 * self.entries, dtype=_LONG)
         slot = wp.empty(2 * self.entries, dtype=_INT)
         splat = wp.empty(self.entries, dtype=_INT)
         wp.launch(
             list_reached,
             count,
-            [box, self.away, self.first, self.columns],
-            [self.key, slot, splat],
+            [box, self._away, self._first, self._columns],
+            [self._key, slot, splat],
         )
         wp.utils.radix_sort_pairs(
-            self.key, slot, self.entries, end_bit=32 + self.tiles.bit_length()
+            self._key, slot, self.entries, end_bit=32 + self.tiles.bit_length()
         )
-        self.listed = wp.empty(self.entries, dtype=_INT)
-        self.place = wp.empty(self.entries, dtype=_INT)
+        self._listed = wp.empty(self.entries, dtype=_INT)
+        self._place = wp.empty(self.entries, dtype=_INT)
         self._begin = wp.zeros(self.tiles, dtype=wp.int32)
         self._end = wp.zeros(self.tiles, dtype=wp.int32)
         wp.launch(
             find_lists,
             self.entries,
-            [self.entries, self.key, slot, splat],
-            [self.listed, self.place, self._begin, self._end],
+            [self.entries, self._key, slot, splat],
+            [self._listed, self._place, self._begin, self._end],
         )
 
 
-def _lens_of(camera: PinholeCamera) -> Any:
+def _pinhole_of(camera: PinholeCamera) -> Any:
     """Describe a camera to kernels.
 
     Raises:
@@ -227,13 +283,13 @@ def _lens_of(camera: PinholeCamera) -> Any:
     """
     if camera.distortion.any():
         raise ValueError("the camera must have no lens distortion; undistort what it recorded")
-    lens = _PINHOLE()
-    lens.rotation = wp.mat33(*camera.T_camera_world[:3, :3].ravel())
-    lens.translation = wp.vec3(*camera.T_camera_world[:3, 3])
-    lens.focal = wp.vec3(camera.K[0, 0], camera.K[0, 1], camera.K[1, 1])
-    lens.middle = wp.vec2(*camera.K[:2, 2])
-    lens.size = wp.vec2i(camera.width, camera.height)
-    return lens
+    pinhole = _PINHOLE()
+    pinhole.rotation = wp.mat33(*camera.T_camera_world[:3, :3].ravel())
+    pinhole.translation = wp.vec3(*camera.T_camera_world[:3, 3])
+    pinhole.focal = wp.vec3(camera.K[0, 0], camera.K[0, 1], camera.K[1, 1])
+    pinhole.middle = wp.vec2(*camera.K[:2, 2])
+    pinhole.size = wp.vec2i(camera.width, camera.height)
+    return pinhole
 
 
 def _array(value: ndarray, dtype: Any) -> Any:

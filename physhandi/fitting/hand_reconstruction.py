@@ -20,12 +20,12 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
+from physhandi.adam import Adam
 from physhandi.data.camera import PinholeCamera, triangulate
 from physhandi.data.checkpoint import Checkpointer, SavedState, resumed_note
 from physhandi.data.observation import evenly
 from physhandi.data.sequence import Sequence
 from physhandi.errors import FitError, MissingInputError
-from physhandi.fitting.adam import Adam
 from physhandi.fitting.checks.readiness import LEAST_PALM_POINTS, PALM, REMEDIES, missing_for_hands
 from physhandi.fitting.config import HandFitConfig
 from physhandi.fitting.one_thread import one_thread

@@ -17,9 +17,9 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
+from physhandi.adam import Adam
 from physhandi.data.checkpoint import Checkpointer, resumed_note
 from physhandi.errors import FitError, SimulationDivergedError
-from physhandi.fitting.adam import Adam
 from physhandi.fitting.config import FirstOrderConfig, ObjectFitConfig
 from physhandi.fitting.object_problem import (
     SUBSTEP_SAFETY,

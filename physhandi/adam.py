@@ -67,13 +67,20 @@ class Adam:
             step = share * moments.rate / (1 - beta_1**moments.count)
             moments.tensor.addcdiv_(moments.first, size.add_(self._epsilon), value=-step)
 
+    @torch.no_grad()
+    def forget(self, is_row: Tensor) -> None:
+        """Forget the momentum of some rows of every tensor, which have become something else."""
+        for moments in self._moments:
+            moments.first[is_row] = 0.0
+            moments.second[is_row] = 0.0
+
     def state(self) -> dict[str, ndarray]:
         """Copy everything that the next steps depend on, the learned tensors included."""
         state: dict[str, ndarray] = {}
         for number, moments in enumerate(self._moments):
-            state[f"adam.{number}.value"] = moments.tensor.detach().numpy().copy()
-            state[f"adam.{number}.first"] = moments.first.numpy().copy()
-            state[f"adam.{number}.second"] = moments.second.numpy().copy()
+            state[f"adam.{number}.value"] = moments.tensor.detach().cpu().numpy().copy()
+            state[f"adam.{number}.first"] = moments.first.cpu().numpy().copy()
+            state[f"adam.{number}.second"] = moments.second.cpu().numpy().copy()
             state[f"adam.{number}.count"] = np.array([moments.count])
         return state
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.optim.adam import _single_tensor_adam
 
-from physhandi.fitting.adam import Adam
+from physhandi.adam import Adam
 
 
 class Reference:
