@@ -41,6 +41,7 @@ from app.jobs.recovery.aside import MovedFolder
 from app.jobs.recovery.recovery import Recovery
 from app.jobs.scheduler import Scheduler
 from app.jobs.streams import News, Streams
+from app.jobs.ticket import Priority
 from app.jobs.views import (
     describe_results,
     describe_run,
@@ -71,6 +72,30 @@ class NewRun(BaseModel):
     """The run that it was made from."""
     accepts_missing: bool = False
     """Whether the object may be left out although depth was recorded; else that is refused."""
+    priority: Priority = "normal"
+    """How urgent it is: ``high`` passes what came up to a day before, ``low`` lets by what comes up
+    to a day later."""
+
+
+class Again(BaseModel):
+    """A fit to start once more, with the same settings."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    afresh: bool = False
+    """Whether it begins with its first stage; else it goes on where it was."""
+    priority: Priority = "normal"
+
+
+class NewPriority(BaseModel):
+    """How urgent a fit in line is."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    priority: Priority
+
+
+IdempotencyKey = Annotated[str | None, Header(min_length=1, max_length=255, pattern=r"^[!-~]+$")]
 
 
 class Draft(BaseModel):
@@ -278,6 +303,7 @@ def create_api(
     _add_uploads(router, uploads)
     _add_results(router, catalog)
     _add_jobs(router, catalog, scheduler, tasks)
+    _add_line(router, catalog, scheduler, tasks)
     _add_sessions(router, sessions)
     _add_streams(router, catalog, scheduler, feed, machine)
     _add_system(router, overview)
@@ -507,15 +533,18 @@ def _add_jobs(
         new: NewRun,
         asked: Request,
         response: Response,
-        idempotency_key: Annotated[
-            str | None, Header(min_length=1, max_length=255, pattern=r"^[!-~]+$")
-        ] = None,
+        idempotency_key: IdempotencyKey = None,
     ) -> dict[str, Any]:
         """Launch a fit; whoever asks again with the same Idempotency-Key gets the same run."""
         request = None
+        who = asked.state.owner
         if idempotency_key is not None:
-            request = KeyedRequest.of(idempotency_key, new.model_dump(mode="json"))
-            launched = scheduler.launched_by(request)
+            # As of scripts that were written before there were priorities.
+            words = new.model_dump(mode="json", exclude={"priority"})
+            if new.priority != "normal":
+                words |= {"priority": new.priority}
+            request = KeyedRequest.of(idempotency_key, words)
+            launched = scheduler.launched_by(request, new.priority, who)
             if launched is not None:
                 response.headers["Idempotency-Replayed"] = "true"
                 return describe_run(catalog.run_item(launched.id), scheduler)
@@ -528,6 +557,8 @@ def _add_jobs(
             parent=new.parent,
             accepts_missing=new.accepts_missing,
             request=request,
+            priority=new.priority,
+            who=who,
         )
         asked.state.made = {"run_id": run.id}
         return describe_run(catalog.run_item(run.id), scheduler)
@@ -538,21 +569,54 @@ def _add_jobs(
         change_about(catalog, run_id, changes)
         return describe_run(catalog.run_item(run_id), scheduler)
 
+    @router.delete("/runs/{run_id}", status_code=204)
+    def delete(run_id: ItemId) -> Response:
+        scheduler.delete(run_id)
+        return Response(status_code=204)
+
+
+def _add_line(
+    router: APIRouter, catalog: Catalog, scheduler: Scheduler, tasks: BackgroundTasks
+) -> None:
     @router.post("/runs/{run_id}/cancel")
     def cancel(run_id: ItemId) -> dict[str, Any]:
         scheduler.cancel(run_id)
         return describe_run(catalog.run_item(run_id), scheduler)
 
-    @router.post("/runs/{run_id}/resume")
-    def resume(run_id: ItemId) -> dict[str, Any]:
-        tasks.require_settled(Path(path).name for path in catalog.run(run_id).sequences)
-        scheduler.resume(run_id)
+    @router.post("/runs/{run_id}/priority")
+    def set_priority(run_id: ItemId, new: NewPriority) -> dict[str, Any]:
+        """Change how urgent a fit in line is."""
+        scheduler.set_priority(run_id, new.priority)
         return describe_run(catalog.run_item(run_id), scheduler)
 
-    @router.delete("/runs/{run_id}", status_code=204)
-    def delete(run_id: ItemId) -> Response:
-        scheduler.delete(run_id)
-        return Response(status_code=204)
+    @router.post("/runs/{run_id}/resume")
+    def resume(
+        run_id: ItemId,
+        asked: Request,
+        response: Response,
+        again: Again | None = None,
+        idempotency_key: IdempotencyKey = None,
+    ) -> dict[str, Any]:
+        """Start a failed or cancelled fit once more; one that waits or is at work stays as it is.
+
+        Whoever asks again with the same Idempotency-Key, however late, starts nothing.
+        """
+        again = again or Again()
+        tasks.require_settled(Path(path).name for path in catalog.run(run_id).sequences)
+        request = None
+        if idempotency_key is not None:
+            words = {"resume": run_id} | again.model_dump(mode="json")
+            request = KeyedRequest.of(idempotency_key, words)
+        is_replayed = scheduler.resume(
+            run_id,
+            afresh=again.afresh,
+            request=request,
+            priority=again.priority,
+            who=asked.state.owner,
+        )
+        if is_replayed:
+            response.headers["Idempotency-Replayed"] = "true"
+        return describe_run(catalog.run_item(run_id), scheduler)
 
 
 def _add_sessions(router: APIRouter, sessions: Sessions) -> None:

@@ -34,9 +34,10 @@ from app.jobs.recordings.annotations import Annotations
 from app.jobs.recordings.background import BackgroundTasks
 from app.jobs.recordings.imports import Imports
 from app.jobs.recordings.models import ModelFolders
-from app.jobs.recordings.uploads import NoRoomError, Uploads
+from app.jobs.recordings.uploads import Uploads
 from app.jobs.recovery.recovery import Recovery
 from app.jobs.scheduler import QueueFullError, Scheduler
+from app.jobs.storage.room import NoRoomError
 from app.jobs.views import describe_run
 from app.jobs.watch import Feed
 from app.pages import Pages, create_pages
@@ -109,7 +110,7 @@ def create_app(
     )
     machine = Machine(settings.data_dir, cards)
     feed = Feed(lambda: [describe_run(item, scheduler) for item in catalog.runs()])
-    tasks = tasks or BackgroundTasks()
+    tasks = tasks or BackgroundTasks(scheduler.room)
     imports = Imports(settings, catalog, tasks)
     recovery = Recovery(settings, catalog, scheduler, tasks)
     pages = Pages()
@@ -151,7 +152,7 @@ def create_app(
             tasks=tasks,
             annotations=Annotations(catalog, tasks, models),
             imports=imports,
-            uploads=Uploads(settings, tasks),
+            uploads=Uploads(settings, tasks, scheduler.room),
             recovery=recovery,
         )
     )

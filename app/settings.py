@@ -84,6 +84,14 @@ class ServerSettings(BaseSettings):
     """Memory that a fit asks of the cluster [GiB]; 0 asks for none in particular."""
     waiting_fits: int = Field(default=100, ge=1, le=10_000)
     """Fits that may wait in line."""
+    waiting_fits_each: int | None = Field(default=None, ge=1, le=10_000)
+    """Most of them that one client, a browser or all scripts together, may have; None for all."""
+    running_fits_each: int | None = Field(default=None, ge=1, le=1024)
+    """Fits of one client that run at a time; further ones let others pass. None for all."""
+    data_gib: float | None = Field(default=None, gt=0, le=1_000_000)
+    """Size of the data folder above which nothing new is begun in it [GiB]; None for any."""
+    keep_free_gib: float = Field(default=1.0, ge=0, le=100_000)
+    """Free space of its disk below which nothing new is begun in it [GiB]."""
     upload_gib: float = Field(default=20.0, gt=0, le=10_000)
     """Size of an upload at most, unpacked [GiB]; 5 % of the disk stay free in any case."""
     cancel_grace_s: float = Field(default=8.0, gt=0, le=600)

@@ -102,8 +102,17 @@ async function shareView(run, query) {
 }
 
 async function act(button) {
-  await send("POST", `/api/v1/runs/${button.dataset.id}/${button.dataset.act}`);
+  const body = "afresh" in button.dataset ? { afresh: true } : undefined;
+  await send("POST", `/api/v1/runs/${button.dataset.id}/${button.dataset.act}`, body);
   toast(button.dataset.act === "cancel" ? "Cancelling …" : "Back in line");
+  refresh("runs");
+  dispatchEvent(new Event("run-changed"));
+}
+
+async function setPriority(button) {
+  const { id, priority } = button.dataset;
+  const { place } = await send("POST", `/api/v1/runs/${id}/priority`, { priority });
+  toast(`${priority[0].toUpperCase()}${priority.slice(1)} priority${place ? `: no. ${place} in line` : ""}`);
   refresh("runs");
   dispatchEvent(new Event("run-changed"));
 }
@@ -177,6 +186,7 @@ async function launch(form) {
     profile: fields.get("profile"),
     name: fields.get("name"),
     accepts_missing: fields.has("accepts_missing"),
+    priority: fields.get("priority"),
   });
   form.closest("dialog").close();
   form.reset();
@@ -199,6 +209,7 @@ document.addEventListener("click", (event) => {
   const data = button.dataset;
   if ("open" in data) busy(button, () => openScene(button));
   else if ("act" in data) busy(button, () => act(button));
+  else if ("priority" in data) busy(button, () => setPriority(button));
   else if ("aside" in data) busy(button, () => moveAside(button));
   else if ("delete" in data) busy(button, () => remove(button));
   else if ("share" in data) busy(button, () => shareView(data.share, ""));

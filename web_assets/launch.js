@@ -157,7 +157,7 @@ async function submit() {
   const response = await fetch("/api/v1/runs", {
     method: "POST",
     headers: { "Content-Type": "application/json" },
-    body: JSON.stringify({ ...draft(), name: order.querySelector("[name=name]").value, parent: order.dataset.parent ?? null, accepts_missing: accept.checked }),
+    body: JSON.stringify({ ...draft(), name: order.querySelector("[name=name]").value, parent: order.dataset.parent ?? null, accepts_missing: accept.checked, priority: order.querySelector("[name=priority]").value }),
   }).catch(() => {
     throw new Error("The server does not answer. Is it still running?");
   });
@@ -185,7 +185,7 @@ function find(words) {
 order.addEventListener("input", ({ target }) => {
   if ("on" in target.dataset && target.checked) suggest(target.closest("[data-setting]"));
   if ("find" in target.dataset) find(target.value);
-  else if (target.name !== "accepts_missing") onChange();
+  else if (!["accepts_missing", "priority"].includes(target.name)) onChange();
 });
 order.addEventListener("change", (event) => {
   if (!("profileChoice" in event.target.dataset)) return;

@@ -22,6 +22,17 @@ function cancelButton(run) {
   return button;
 }
 
+/** Offer the priorities above and below that of a run in line. */
+function urgencyButtons(run) {
+  const offered = { low: { normal: "▲" }, normal: { high: "▲", low: "▼" }, high: { normal: "▼" } }[run.priority] ?? {};
+  return Object.entries(offered).map(([priority, sign]) => {
+    const button = Object.assign(document.createElement("button"), { className: "secondary outline", textContent: sign, title: `${priority[0].toUpperCase()}${priority.slice(1)} priority` });
+    Object.assign(button.dataset, { priority, id: run.id });
+    button.setAttribute("aria-label", `${button.title} for ${run.name}`);
+    return button;
+  });
+}
+
 function numberCell(text) {
   const made = cell(text);
   made.className = "number";
@@ -65,8 +76,8 @@ function showSystem({ machine, slots, running, waiting }) {
     return [...cells, cell(cancelButton(run))];
   });
   fill(document.getElementById("waiting"), waiting, (run) => [
-    cell(run.place ? `No. ${run.place}` : "–"), cell(...runLink(run)), cell(run.reason),
-    cell(run.estimate ? `in ${about(run.estimate.starts_in_s)}` : "–"), cell(cancelButton(run)),
+    cell(run.place ? `No. ${run.place}` : "–"), cell(...runLink(run)), cell(run.priority ?? "normal"), cell(run.reason),
+    cell(run.estimate ? `in ${about(run.estimate.starts_in_s)}` : "–"), cell(...urgencyButtons(run), cancelButton(run)),
   ]);
 }
 

@@ -5,15 +5,14 @@ import logging
 import os
 import threading
 import time
-from collections import deque
-from collections.abc import Generator, Mapping
-from contextlib import contextmanager
+from collections import Counter, deque
+from collections.abc import Generator, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from app.jobs.catalog import DEFECT, Catalog, RunItem
+from app.jobs.catalog import DEFECT, Catalog, RunItem, UnknownRunError
 from app.jobs.engines.cluster import ClusterError
 from app.jobs.engines.device_choice import DeviceChoice
 from app.jobs.engines.engine import Engine
@@ -26,10 +25,13 @@ from app.jobs.machine import Cards
 from app.jobs.order import default_name, fit_config, require_agreement
 from app.jobs.processes import WORKER, following, process_with_lock
 from app.jobs.recovery.aside import MovedFolder, move_aside
+from app.jobs.storage.room import Room
 from app.jobs.ticket import (
     QUEUED,
     STARTED,
+    Priority,
     Ticket,
+    change_priority,
     is_begun,
     is_lost,
     note_end,
@@ -81,6 +83,10 @@ ENDED = frozenset({"succeeded", "failed", "cancelled", "damaged"})
 _INTERVAL_S = 0.25
 _IDLE_INTERVAL_S = 1.0
 _SWEEP_INTERVAL_S = 5.0
+_SURVEY_INTERVAL_S = 5.0
+"""Time between two looks at all runs, of which most have ended and do not move [s]."""
+_SURVEY_SHARE = 0.02
+"""Most of the time that these looks may take."""
 _KEPT_RESTARTS = 100
 
 
@@ -102,6 +108,8 @@ class JobView:
     """The latest report of the worker."""
     is_published: bool = False
     """Whether there are results to look at."""
+    priority: Priority | None = None
+    """How urgent it is, of a run that waits."""
 
 
 @dataclass(frozen=True)
@@ -142,6 +150,8 @@ class Scheduler:
         if settings.engine != LOCAL:
             self._engine = RayEngine.of(settings, worker)
         self._is_short = False
+        self.room = Room(settings)
+        """Tells whether the data folder has room for anything new."""
         self.forecast = Forecast(catalog, settings.devices[0])
         """Estimates how long fits still take."""
         self._lock = threading.RLock()
@@ -149,8 +159,11 @@ class Scheduler:
         self._stopping: dict[str, threading.Thread] = {}
         self._ended: dict[str, tuple[int, JobView]] = {}
         self._hindered: dict[str, str] = {}
+        self._put_off: frozenset[str] = frozenset()
         self._restarts: deque[LostRun] = deque(maxlen=_KEPT_RESTARTS)
-        self._line: tuple[str, ...] = ()
+        self._line: dict[str, Ticket] = {}
+        """Tickets of the runs that wait, the next one first; replaced, never changed."""
+        self._next_survey = 0.0
         self._busy: tuple[str, ...] = ()
         self._known: dict[str, Run] = {}
         self._claim: int | None = None
@@ -200,6 +213,8 @@ class Scheduler:
         parent: str | None = None,
         accepts_missing: bool = False,
         request: KeyedRequest | None = None,
+        priority: Priority = "normal",
+        who: str = "",
     ) -> Run:
         """Make a run of one or several sequences and queue it.
 
@@ -211,6 +226,8 @@ class Scheduler:
             parent: Id of the run that it was made from.
             accepts_missing: Whether the object may be left out although depth was recorded.
             request: The request that asks for it, if it may come again; then it is made once.
+            priority: How urgent it is; see `Ticket.turn`.
+            who: Who asks for it, as `Visitor.name`; empty if that is not known.
 
         Raises:
             UsageError: If there is no sequence or no such profile.
@@ -218,7 +235,8 @@ class Scheduler:
             UnknownRunError: If there is no such parent.
             SequenceError: If a sequence is unknown or damaged.
             MissingInputError: If there is nothing to fit, or the object would be left out.
-            QueueFullError: If too many runs wait already.
+            QueueFullError: If too many runs wait already, of all or of whoever asks.
+            NoRoomError: If the data folder or its disk is too full.
         """
         if not sequence_ids:
             raise UsageError("Name at least one sequence to fit.")
@@ -230,13 +248,10 @@ class Scheduler:
         with self._lock:
             run_id = None
             if request is not None:
-                if (launched := self.launched_by(request)) is not None:
+                if (launched := self.launched_by(request, priority, who)) is not None:
                     return launched
                 run_id = self._keys.run_of(request)
-            if len(self._queue(self._catalog.runs())) >= self._settings.waiting_fits:
-                raise QueueFullError(
-                    f"{self._settings.waiting_fits} fits wait already. Cancel some of them first."
-                )
+            self._require_place(who)
             run_id = run_id or new_run_id()
             if request is not None:
                 # Before the run: who is killed now makes the same run when it is asked again.
@@ -248,11 +263,18 @@ class Scheduler:
                 sequences=[str(sequence.folder) for sequence in sequences],
                 config=config,
             )
-            self._enqueue(run)
+            self._enqueue(run, priority, who)
         return run
 
-    def launched_by(self, request: KeyedRequest) -> Run | None:
+    def launched_by(
+        self, request: KeyedRequest, priority: Priority = "normal", who: str = ""
+    ) -> Run | None:
         """Give the run that a request has launched already; None if it has not.
+
+        Args:
+            request: The request.
+            priority: As in `launch`, for a run that was made and not put in line.
+            who: Alike.
 
         Raises:
             UsageError: If another request had its key.
@@ -265,7 +287,7 @@ class Scheduler:
             run = self._catalog.run(run_id)
             marks = (QUEUED, STARTED, EXIT)
             if run.attempt is None and not any((run.folder / mark).is_file() for mark in marks):
-                self._enqueue(run)  # The server was killed before it did so.
+                self._enqueue(run, priority, who)  # The server was killed before it did so.
             return run
 
     def start_now(self, run: Run) -> None:
@@ -275,20 +297,69 @@ class Scheduler:
             device = self._local.choose(self._devices_of(self._local)) or self._settings.devices[0]
             self._start(run.folder, self._local, device)
 
-    def resume(self, run_id: str) -> None:
-        """Queue a run that did not succeed again; it goes on where it was.
+    def resume(
+        self,
+        run_id: str,
+        *,
+        afresh: bool = False,
+        request: KeyedRequest | None = None,
+        priority: Priority = "normal",
+        who: str = "",
+    ) -> bool:
+        """Queue a run that did not succeed again, with the same settings.
+
+        Whoever asks twice gets one start: a run that waits or is at work already stays as it is.
+
+        Args:
+            run_id: The run.
+            afresh: Whether it begins anew; else it goes on where it was.
+            request: The request that asks for it, if it may come again, however late.
+            priority: How urgent it is; see `Ticket.turn`.
+            who: Who asks for it, as `Visitor.name`; empty if that is not known.
+
+        Returns:
+            Whether the same request was answered before.
 
         Raises:
-            RunError: If the run is unknown, bundled, finished or at work.
+            UsageError: If another request had its key.
+            RunError: If the run is unknown, bundled, finished or being ended.
+            QueueFullError: If too many runs wait already, of all or of whoever asks.
+            NoRoomError: If the data folder or its disk is too full.
         """
         with self._lock:
             run, view = self._own(run_id)
-            if view.state not in {"failed", "cancelled", "damaged"}:
+            if request is not None and self._keys.run_of(request) is not None:
+                return True
+            if view.state in {"succeeded", "stopping"}:
                 raise RunError(
                     f"Run '{run_id}' is {view.state}; only a failed or cancelled run is resumed."
                 )
-            run.clear_cancel()
-            self._enqueue(run)
+            if view.state in {"failed", "cancelled", "damaged"}:
+                self._require_place(who)
+                if afresh:
+                    run.start_over()
+                run.clear_cancel()
+                self._enqueue(run, priority, who)
+            if request is not None:
+                self._keys.note(request, run_id)
+            return False
+
+    def set_priority(self, run_id: str, priority: Priority) -> None:
+        """Change how urgent a run is that waits; see `Ticket.turn`.
+
+        Raises:
+            RunError: If the run is unknown, bundled or does not wait.
+        """
+        with self._lock:
+            run, view = self._own(run_id)
+            changed = change_priority(run.folder, priority) if view.state == "queued" else None
+            if changed is None:
+                raise RunError(
+                    f"Run '{run_id}' does not wait (any more); only the priority of a run in line "
+                    "can be changed."
+                )
+            self._line = _in_order({**self._line, run_id: changed})
+            self._wake.set()
 
     def cancel(self, run_id: str) -> None:
         """Take a run out of the queue, or end its process and all that it started.
@@ -302,6 +373,7 @@ class Scheduler:
                 run.request_cancel()
                 (run.folder / QUEUED).unlink(missing_ok=True)
                 note_end(run.folder, "Cancelled.")
+                self._leave_line(run_id)
             elif view.state not in AT_WORK:
                 raise RunError(f"Run '{run_id}' is {view.state}; there is nothing to cancel.")
             elif run_id not in self._stopping:
@@ -446,20 +518,32 @@ class Scheduler:
         return JobView(state, reason=reason, progress=told, is_published=run.is_published)
 
     def _look_in_line(self, run: Run) -> JobView:
-        line, busy = self._line, self._busy
-        if run.id not in line:
-            return JobView("queued", reason="It was just put in line.")
-        place = line.index(run.id) + 1
+        line = self._line
+        ticket = line.get(run.id)
+        if ticket is None:
+            ticket = read_ticket(run.folder / QUEUED) or Ticket()
+            return JobView("queued", reason="It was just put in line.", priority=ticket.priority)
+        place = list(line).index(run.id) + 1
+        reason = self._why_it_waits(run, place)
+        return JobView("queued", place, reason, priority=ticket.priority)
+
+    def _why_it_waits(self, run: Run, place: int) -> str:
         engine = self._engine
         if engine.trouble:
-            return JobView("queued", place, engine.trouble)
+            return engine.trouble
         if run.id in self._hindered:
-            return JobView("queued", place, f"It cannot be started: {self._hindered[run.id]}")
-        if len(busy) < engine.slots and self._is_short:
-            return JobView("queued", place, engine.shortage)
-        if len(busy) < engine.slots and place == 1:
-            return JobView("queued", place, "It starts next.")
-        return JobView("queued", place, engine.full)
+            return f"It cannot be started: {self._hindered[run.id]}"
+        if len(self._busy) >= engine.slots:
+            return engine.full
+        if run.id in self._put_off:
+            most = self._settings.running_fits_each
+            return (
+                f"Waits until fewer fits of the same client run: {most} at a time "
+                "(PHYSHANDI_RUNNING_FITS_EACH)."
+            )
+        if self._is_short:
+            return engine.shortage
+        return "It starts next." if place == 1 else engine.full
 
     def _own(self, run_id: str) -> tuple[Run, JobView]:
         item = self._catalog.run_item(run_id)
@@ -467,20 +551,30 @@ class Scheduler:
             raise RunError(f"Run '{run_id}' came with the program and stays as it is.")
         return self._catalog.run(run_id), self.view(item)
 
-    def _enqueue(self, run: Run) -> None:
-        put_in_line(run.folder, Ticket(time=time.time()))
-        self._line = (*self._line, run.id)
-        self._wake.set()
+    def _leave_line(self, run_id: str) -> None:
+        self._line = {k: ticket for k, ticket in self._line.items() if k != run_id}
 
-    def _queue(self, items: list[RunItem]) -> list[RunItem]:
-        waiting: list[tuple[float, str, RunItem]] = []
-        for item in items:
-            if item.run is None or item.is_bundled:
-                continue
-            ticket = read_ticket(item.folder / QUEUED)
-            if ticket is not None:
-                waiting.append((ticket.time, item.id, item))
-        return [item for _, _, item in sorted(waiting, key=lambda entry: entry[:2])]
+    def _require_place(self, who: str) -> None:
+        """Refuse a further run in line where there is no place or no room for it."""
+        self.room.require("A fit")
+        most, each = self._settings.waiting_fits, self._settings.waiting_fits_each
+        if len(self._line) >= most:
+            raise QueueFullError(
+                f"{len(self._line)} fits wait already, of at most {most} "
+                "(PHYSHANDI_WAITING_FITS). Cancel some of them first."
+            )
+        own = sum(ticket.who == who for ticket in self._line.values())
+        if each is not None and who and own >= each:
+            raise QueueFullError(
+                f"{own} fits of yours wait already, of at most {each} of one client "
+                "(PHYSHANDI_WAITING_FITS_EACH). Wait until one has started, or cancel some."
+            )
+
+    def _enqueue(self, run: Run, priority: Priority, who: str) -> None:
+        ticket = Ticket(time=time.time(), priority=priority, who=who)
+        put_in_line(run.folder, ticket)
+        self._line = _in_order({**self._line, run.id: ticket})
+        self._wake.set()
 
     def _watch(self) -> None:
         swept = time.monotonic()
@@ -500,33 +594,76 @@ class Scheduler:
             except Exception:
                 logger.exception("the queue could not go on; it tries again")
 
+    def _look_around(self) -> dict[str, RunItem]:
+        """See which runs wait and which are at work; gives what was looked at, by their ids."""
+        begin = time.monotonic()
+        is_survey = begin >= self._next_survey
+        listed = self._catalog.runs() if is_survey else self._moving_runs()
+        items = {item.id: item for item in listed if not item.is_bundled}
+        tickets = {
+            item.id: ticket
+            for item in items.values()
+            if item.run and (ticket := read_ticket(item.folder / QUEUED)) is not None
+        }
+        views = {item.id: self.view(item) for item in items.values()}
+        if is_survey:
+            took = time.monotonic() - begin
+            self._next_survey = begin + max(_SURVEY_INTERVAL_S, took / _SURVEY_SHARE)
+        busy = {run_id for run_id, view in views.items() if view.state in AT_WORK}
+        # One may have left the line, or come into it, since its ticket was read.
+        moving = {run_id for run_id, view in views.items() if view.state not in ENDED} | {*tickets}
+        runs = {i.id: i.run for i in items.values() if i.run and i.id in moving}
+        newest = sorted(runs.values(), key=lambda run: run.created, reverse=True)
+        self._busy = tuple(run.id for run in newest if run.id in busy)
+        self._known = runs
+        self._line = _in_order(tickets)
+        return items
+
     def _step(self) -> None:
         """Start as many runs as have room."""
         with self._lock:
-            items = self._catalog.runs()
-            queue = self._queue(items)
-            views = {item.id: self.view(item) for item in items}
-            self._busy = tuple(run_id for run_id, view in views.items() if view.state in AT_WORK)
-            moving = {*self._busy, *(item.id for item in queue)}
-            self._known = {item.id: item.run for item in items if item.run and item.id in moving}
-            self._line = tuple(item.id for item in queue)
-            free = max(0, self._engine.slots - len(self._devices_of(self._engine)))
-            # A supervisor that put its run back in line has still to end.
-            ready = (
-                item
-                for item in queue
-                if is_begun(item.folder) or not self._is_supervised(item.folder)
-            )
+            items = self._look_around()
             self._is_short = False
-            for item in islice(ready, free):
+            at_work = self._tickets_at_work(self._engine)
+            free = self._engine.slots - len(at_work)
+            fits_of = Counter(ticket.who for ticket in at_work)
+            put_off: set[str] = set()
+            for run_id, ticket in self._line.items():
+                if free <= 0:
+                    break
+                folder = items[run_id].folder
+                if self._has_its_share(ticket.who, fits_of):
+                    put_off.add(run_id)
+                    continue
+                # A supervisor that put its run back in line has still to end.
+                if not is_begun(folder) and self._is_supervised(folder):
+                    continue
                 device = self._engine.choose(self._devices_of(self._engine))
                 if device is None:
                     self._is_short = True
                     break
-                with self._hindering(item.id), following(item.folder) as is_mine:
+                free -= 1
+                with self._hindering(run_id), following(folder) as is_mine:
                     # A command that follows it starts it itself.
-                    if is_mine and (item.folder / QUEUED).is_file():
-                        self._start(item.folder, self._engine, device)
+                    if is_mine and (folder / QUEUED).is_file():
+                        self._start(folder, self._engine, device)
+                        fits_of[ticket.who] += 1
+            self._put_off = frozenset(put_off)
+
+    def _moving_runs(self) -> Iterator[RunItem]:
+        """List the runs that wait or are at work, as they were seen last.
+
+        What has ended moves again only if somebody resumes it, and then it was put in line here.
+        What another program puts into the folder is found when all runs are looked at.
+        """
+        for run_id in dict.fromkeys((*self._known, *self._busy, *self._line)):
+            with suppress(UnknownRunError):  # It was deleted since.
+                yield self._catalog.run_item(run_id)
+
+    def _has_its_share(self, who: str, fits_of: Counter[str]) -> bool:
+        """Tell whether a client has as many fits at work as one may have."""
+        most = self._settings.running_fits_each
+        return most is not None and who != "" and fits_of[who] >= most
 
     @contextmanager
     def _hindering(self, run_id: str) -> Generator[None]:
@@ -539,19 +676,18 @@ class Scheduler:
                 logger.warning("run %s cannot go on: %s", run_id, describe(error))
             self._hindered[run_id] = describe(error)
 
-    def _devices_of(self, engine: Engine) -> list[str]:
-        """List the devices of the runs that have a place with an engine."""
+    def _tickets_at_work(self, engine: Engine) -> list[Ticket]:
+        """Read the tickets of the runs that have a place with an engine."""
         tickets = (read_ticket(self._settings.run_dir / run_id / STARTED) for run_id in self._busy)
-        return [
-            ticket.device
-            for ticket in tickets
-            if ticket is not None and ticket.engine == engine.name
-        ]
+        return [t for t in tickets if t is not None and t.engine == engine.name]
+
+    def _devices_of(self, engine: Engine) -> list[str]:
+        return [ticket.device for ticket in self._tickets_at_work(engine)]
 
     def _start(self, folder: Path, engine: Engine, device: str) -> None:
         start_on(engine, folder, device)
         self._busy = (*self._busy, folder.name)
-        self._line = tuple(run_id for run_id in self._line if run_id != folder.name)
+        self._leave_line(folder.name)
         logger.info("run %s started on %s", folder.name, engine.name or device)
 
     def _sweep(self) -> None:
@@ -617,6 +753,11 @@ class Scheduler:
             logger.exception("run %s could not be ended", folder.name)
         finally:
             self._stopping.pop(folder.name, None)
+
+
+def _in_order(tickets: Mapping[str, Ticket]) -> dict[str, Ticket]:
+    """Sort runs in line, the next one first; ids, which tell the time, decide between equals."""
+    return dict(sorted(tickets.items(), key=lambda entry: (entry[1].turn, entry[0])))
 
 
 def require_unread(catalog: Catalog, sequence: Path) -> None:

@@ -3,7 +3,7 @@
 import hashlib
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 from physhandi.data.files import write_json
 from physhandi.data.lease import live_holder, locked
@@ -16,6 +16,10 @@ STARTED = "started.json"
 """File of a run that the queue has started and that has not ended."""
 MOST_STARTS = 2
 """How often a run is started that loses its process through no fault of its own."""
+
+Priority = Literal["low", "normal", "high"]
+_EARLIER_S = {"low": -86_400.0, "normal": 0.0, "high": 86_400.0}
+"""By how much a run of each priority counts as put in line earlier than it was [s]."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +36,19 @@ class Ticket:
     """Warp device that it was started on."""
     engine: str = ""
     """Name of the engine that it was started with; see `Engine.name`."""
+    priority: Priority = "normal"
+    """How urgent it is."""
+    who: str = ""
+    """Who asked for it, as `Visitor.name`; empty if that is not known."""
+
+    @property
+    def turn(self) -> float:
+        """What the line is sorted by [s since 1970]; it stays what it is while the run waits.
+
+        One of high priority passes those of normal priority that came up to a day before it, and
+        nothing that came earlier, so that whoever has waited for long enough is passed by nobody.
+        """
+        return self.time - _EARLIER_S[self.priority]
 
     @property
     def remark(self) -> str:
@@ -50,12 +67,15 @@ def read_ticket(path: Path) -> Ticket | None:
         return Ticket()
     time, starts = content.get("time"), content.get("starts")
     why, device, engine = content.get("why"), content.get("device"), content.get("engine")
+    priority, who = content.get("priority"), content.get("who")
     return Ticket(
         time=time if isinstance(time, float) else 0.0,
         starts=starts if isinstance(starts, int) and starts > 0 else 0,
         why=why if isinstance(why, str) else "",
         device=device if isinstance(device, str) else "",
         engine=engine if isinstance(engine, str) else "",
+        priority=next((known for known in get_args(Priority) if known == priority), "normal"),
+        who=who if isinstance(who, str) else "",
     )
 
 
@@ -68,6 +88,17 @@ def nonce_of(run_folder: Path, ticket: Ticket) -> str:
 def put_in_line(run_folder: Path, ticket: Ticket) -> None:
     """Put a run in line."""
     write_json(run_folder / QUEUED, asdict(ticket))
+
+
+def change_priority(run_folder: Path, priority: Priority) -> Ticket | None:
+    """Give a run in line another priority; returns its ticket, None if it is not in line."""
+    with locked(run_folder):  # Its supervisor may take it out of line just now.
+        ticket = read_ticket(run_folder / QUEUED)
+        if ticket is None:
+            return None
+        changed = replace(ticket, priority=priority)
+        put_in_line(run_folder, changed)
+        return changed
 
 
 def note_start(run_folder: Path, device: str, engine: str = "") -> Ticket:

@@ -123,6 +123,7 @@ def _describe(item: RunItem, view: JobView) -> dict[str, Any]:
         "is_bundled": item.is_bundled,
         "state": view.state,
         "place": view.place,
+        "priority": view.priority,
         "reason": view.reason,
         "progress": dict(view.progress),
         "is_published": view.is_published,

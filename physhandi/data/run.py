@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeVar
 from numpy import ndarray
 from safetensors import SafetensorError
 
-from physhandi.data.attempt import Attempt
+from physhandi.data.attempt import Attempt, prune
 from physhandi.data.files import (
     named_fields,
     plain,
@@ -385,6 +385,23 @@ class RunFolder:
             with locked(self.folder):
                 lease.release()
             raise
+
+    def start_over(self) -> None:
+        """Give up what attempts have computed, so that the next one begins with the first stage.
+
+        What was published stays until the next attempt publishes.
+
+        Raises:
+            RunError: If a process works on the run.
+        """
+        with locked(self.folder):
+            if live_holder(self.folder) is not None:
+                raise RunError(f"Run '{self.id}' is running. Cancel it before you start it anew.")
+            # The next attempt goes on from the latest one, so that one has to be empty.
+            latest = max(attempt_numbers(self.folder), default=0)
+            if latest:
+                (self.folder / ATTEMPTS / str(latest + 1) / OUT).mkdir(parents=True)
+                prune(self.folder, keep={latest + 1})
 
     def request_cancel(self) -> None:
         """Ask the process that works on the run to stop."""

@@ -389,15 +389,15 @@ def test_two_servers_never_share_a_data_folder(desks: Callable[..., Desk]) -> No
         desks()
 
 
-def test_a_run_at_work_is_neither_deleted_nor_resumed(desk: Desk) -> None:
+def test_a_run_at_work_is_neither_deleted_nor_started_once_more(desk: Desk) -> None:
     run_id = desk.launch("wait")
     for _ in range(2):
         with pytest.raises(RunError, match="Cancel it"):
             desk.scheduler.delete(run_id)
-        with pytest.raises(RunError, match="only a failed or cancelled"):
-            desk.scheduler.resume(run_id)
+        desk.scheduler.resume(run_id)
         desk.until(run_id, "running")
     folder = desk.run(run_id).folder
+    assert not (folder / "queued.json").exists()
     desk.scheduler.cancel(run_id)
     desk.until(run_id, "cancelled")
     desk.scheduler.delete(run_id)

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from app.jobs.storage.room import Room
 from physhandi.child import Child
 from physhandi.errors import CancelledError, PhysHandiError, RunError, describe
 
@@ -36,10 +37,24 @@ class Work:
     """Sentence that says what is being done."""
 
 
+_NAMES = {
+    "annotation": "Finding masks and tracks",
+    "import": "An import",
+    "example": "The example",
+    "upload": "Unpacking an upload",
+}
+
+
 class BackgroundTasks:
     """Starts the process that works, listens to it, and ends it with the server."""
 
-    def __init__(self) -> None:
+    def __init__(self, room: Room | None = None) -> None:
+        """Prepare.
+
+        Args:
+            room: Tells whether there is room for what is made; None asks nobody.
+        """
+        self._room = room
         self._lock = threading.Lock()
         self._tasks: dict[tuple[str, str], BackgroundTask] = {}
         self._work: Work | None = None
@@ -58,11 +73,14 @@ class BackgroundTasks:
 
         Raises:
             RunError: If another piece is at work.
+            NoRoomError: If the data folder or its disk is too full.
         """
         with self._lock:
             running = self.running
             if running is not None:
                 raise RunError(f"{running.doing} Wait until that is done, or cancel it.")
+            if self._room is not None:
+                self._room.require(_NAMES[work.kind])
             self._started.clear()
             self._child = None
             task = self._tasks[work.kind, work.name] = BackgroundTask("running")

@@ -19,10 +19,11 @@ from typing import Any, TypedDict
 from app.jobs.catalog import NotFoundError
 from app.jobs.recordings.background import BackgroundTask, BackgroundTasks, Work
 from app.jobs.recordings.upload_names import check_names, is_left_out, quoted_name
+from app.jobs.storage.room import NoRoomError, Room
 from app.settings import ServerSettings
 from physhandi.data.files import write_json
 from physhandi.data.run_folder import checked, read_json
-from physhandi.errors import PhysHandiError, RunError, UsageError
+from physhandi.errors import RunError, UsageError
 
 logger = logging.getLogger(__name__)
 
@@ -40,10 +41,6 @@ class UnknownUploadError(UsageError, NotFoundError):
     """There is no such upload."""
 
 
-class NoRoomError(PhysHandiError):
-    """The disk has no room for an upload."""
-
-
 class _AboutFile(TypedDict):
     """``upload.json``: what was announced."""
 
@@ -55,13 +52,19 @@ class Uploads:
     """Takes the pieces of uploads, and has whole ones put in place."""
 
     def __init__(
-        self, settings: ServerSettings, tasks: BackgroundTasks, *, worker: str = _WORKER
+        self,
+        settings: ServerSettings,
+        tasks: BackgroundTasks,
+        room: Room | None = None,
+        *,
+        worker: str = _WORKER,
     ) -> None:
         """Prepare.
 
         Args:
             settings: Tell the folders and how much may be sent.
             tasks: Has whole uploads unpacked and checked, one at a time.
+            room: Tells whether the data folder has room; None makes one for the settings.
             worker: Module of the process.
         """
         self._folder = settings.data_dir / "incoming"
@@ -72,6 +75,7 @@ class Uploads:
             "runs": settings.run_dir,
         }
         self._tasks = tasks
+        self._data = room or Room(settings)
         self._worker = worker
         self._lock = threading.Lock()
         self._listed: dict[str, tuple[str, list[tuple[str, int]]]] = {}
@@ -108,6 +112,7 @@ class Uploads:
             if len(known) >= _MOST_UPLOADS:
                 raise UsageError(f"{_MOST_UPLOADS} uploads are unfinished. Remove some of them.")
             waiting = sum(one["total"] - one["received"] for one in known)
+            self._data.require("The upload, with others that are unfinished,", total + waiting)
             self._require_room(total + waiting)
             upload_id = secrets.token_hex(8)
             folder = self._folder / upload_id
@@ -217,8 +222,10 @@ class Uploads:
         with self._lock:
             self._require_still(upload_id)
             announced, files = self._read(upload_id)
+            here = 0
             for path, size in files:
                 received = self._received(upload_id, path)
+                here += received
                 if received < size:
                     raise RunError(
                         f"{quoted_name(path)} has {received} of {size} bytes; send the rest."
@@ -231,7 +238,8 @@ class Uploads:
             order = {
                 "folder": str(self._folder / upload_id),
                 "name": name,
-                "most_bytes": min(self._most, self._room()),
+                # What is here already does not need the data folder's room a second time.
+                "most_bytes": min(self._most, self._room(), max(0, self._data.left() + here)),
                 "places": {kind: str(path) for kind, path in self._places.items()},
             }
             return self._tasks.start(work, self._worker, order)
