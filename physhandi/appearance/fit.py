@@ -298,7 +298,7 @@ class _Fit:
         )
         color = color * target.is_known[..., None]
         difference = (color - target.color).abs().sum() / (3.0 * target.size)
-        unlike = (1.0 - ssim_map(color, target.color)).sum() / (3.0 * target.size)
+        unlike = (1.0 - _similarity(color, target.color)).sum() / (3.0 * target.size)
         loss = (1.0 - config.similarity) * difference + config.similarity * unlike
         cover = ((alpha - target.alpha).abs() * target.is_known).sum() / target.size
         far = ((depth - target.depth).abs() * alpha.detach() * target.has_depth).sum()
@@ -373,7 +373,7 @@ def _gradient(tensor: Tensor) -> Tensor:
     return torch.zeros_like(tensor) if tensor.grad is None else tensor.grad
 
 
-def ssim_map(
+def _similarity(
     first: Float[Tensor, "row column 3"], second: Float[Tensor, "row column 3"]
 ) -> Float[Tensor, "row column 3"]:
     """Compute structural similarity (SSIM) at every pixel, with zeros beyond the border."""
