@@ -17,6 +17,7 @@ Action = Literal[
     "part_begin",
     "part_end",
     "layer",
+    "form",
     "color",
     "color_back",
     "clear",
@@ -122,6 +123,12 @@ KEYS: tuple[KeyGroup, ...] = (
                 about=f"show or hide a layer: {_LAYERS}",
                 action="layer",
                 hotkeys=_ROW,
+            ),
+            Key(
+                shown=("0",),
+                about="show the object as splats, as a surface, or as nodes",
+                action="form",
+                hotkeys=("0",),
             ),
             Key(shown=("C",), about="color by the next quantity", action="color", hotkeys=("C",)),
             Key(

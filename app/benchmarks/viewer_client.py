@@ -38,6 +38,7 @@ class ViewerClient:
         gui: Properties of each element of the panel, by its id.
         nodes: Properties of each scene node, by its path.
         positions: Where scene nodes were moved to, by path.
+        turns: Quaternions to which scene nodes were turned, w first, by path.
         visible: Whether scene nodes are shown, by path.
         camera: Where this client's camera is.
         messages: All messages in their order, if they are to be remembered.
@@ -65,6 +66,7 @@ class ViewerClient:
         self.gui: dict[str, dict[str, Any]] = {}
         self.nodes: dict[str, dict[str, Any]] = {}
         self.positions: dict[str, tuple[float, ...]] = {}
+        self.turns: dict[str, tuple[float, ...]] = {}
         self.visible: dict[str, bool] = {}
         self.camera: dict[str, Any] = {
             "wxyz": (1.0, 0.0, 0.0, 0.0),
@@ -174,9 +176,16 @@ class ViewerClient:
             self.nodes[message["name"]] = dict(props)
         elif message["type"] == "SceneNodeUpdateMessage":
             self.nodes.setdefault(message["name"], {}).update(message["updates"])
+        else:
+            self._keep_place(message)
+
+    def _keep_place(self, message: dict[str, Any]) -> None:
+        """Keep where a part of the scene or the camera is, and whether it is shown."""
         match message["type"]:
             case "SetPositionMessage":
                 self.positions[message["name"]] = tuple(message["position"])
+            case "SetOrientationMessage":
+                self.turns[message["name"]] = tuple(message["wxyz"])
             case "SetSceneNodeVisibilityMessage":
                 self.visible[message["name"]] = message["visible"]
             case str(kind) if kind.startswith("SetCamera") and not message["initial"]:

@@ -84,7 +84,7 @@ class SplatBinding:
         for frame, place in enumerate(node):
             # Row 3 k + a is column a of the rotation of node k.
             columns = np.swapaxes(turned[frame], 1, 2).reshape(3 * count, 3)
-            carried[frame] = self._blend @ np.concatenate([columns, place.astype(np.float64)])
+            carried[frame] = self.blend @ np.concatenate([columns, place.astype(np.float64)])
         return carried
 
     def rotations(self, node: Float[ndarray, "frame node 3"]) -> Float[ndarray, "frame node 3 3"]:
@@ -117,8 +117,8 @@ class SplatBinding:
         return turned
 
     @cached_property
-    def _blend(self) -> Any:
-        """Sparse matrix from rotations and nodes to splats."""
+    def blend(self) -> Any:
+        """Sparse matrix from the columns of all rotations, after them the nodes, to the splats."""
         splats, near = self.node.shape
         count = len(self.rest_node)
         offset = self.rest_center[:, None] - self.rest_node[self.node]

@@ -291,7 +291,8 @@ _Parts = tuple[bool, bool, bool]
 
 def _shown_parts(layers: Layers) -> _Parts:
     """Tell whether nodes, object springs and virtual springs show colors."""
-    return layers.nodes or layers.surface, layers.object_springs, layers.virtual_springs
+    has_nodes = layers.nodes or layers.surface or layers.splats
+    return has_nodes, layers.object_springs, layers.virtual_springs
 
 
 def _shown(

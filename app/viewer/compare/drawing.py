@@ -18,7 +18,14 @@ from app.viewer.color.quantities import QUANTITIES, Values, from_nodes, in_lengt
 from app.viewer.compare.camera import Box, Eye
 from app.viewer.compare.sides import SIDE_KEYS, ComparedSide, Sides
 from app.viewer.content.content import Content
-from app.viewer.content.layers import GREEN, SKIN, YELLOW, Layers, has_few_springs
+from app.viewer.content.layers import (
+    GREEN,
+    SKIN,
+    YELLOW,
+    Layers,
+    has_few_springs,
+    with_surface_for_splats,
+)
 from app.viewer.scene.framing import Framing
 from app.viewer.scene.nodes import ClippedNodes, Plane
 from app.viewer.scene.object_drawing import RGB, ObjectDrawing, Style, share_bytes, strengths
@@ -254,7 +261,7 @@ class CompareDrawing:
             way: How the rollouts are compared; None if they cannot be.
             is_playing: Whether the clock is running, so that less may be sent.
         """
-        look = replace(self._chosen)
+        look, layers = replace(self._chosen), with_surface_for_splats(layers)
         has_one_hand = look.mode != "side" and have_same_hands(sides)
         with self._lock, self._server.atomic():
             self._look, self._way = look, way

@@ -19,9 +19,10 @@ from app.viewer.content.observed import (
     Tracks,
     lift_keypoints,
 )
-from physhandi.data.layout import SHAPE_FILE, SequenceFiles
+from physhandi.appearance.splats import Splats
+from physhandi.data.layout import SHAPE_FILE, SPLATS_FILE, SequenceFiles
 from physhandi.data.object_mass import ObjectMass, estimated_mass, given_mass
-from physhandi.data.run_folder import RecordingFile
+from physhandi.data.run_folder import RecordingFile, reading
 from physhandi.data.sequence import Sequence
 from physhandi.data.view import View
 from physhandi.errors import MissingInputError, PhysHandiError, UsageError
@@ -98,6 +99,8 @@ class Content:
     """What the object weighs; None if it can not even be estimated."""
     surface: ObjectSurface | None = None
     """The smooth surface of the object; None if its nodes have none."""
+    splats: Splats | None = None
+    """Splats of the object; None if none were fitted."""
 
     @property
     def is_metric(self) -> bool:
@@ -165,6 +168,7 @@ def open_run(catalog: Catalog, run_id: str, sequence_name: str | None = None) ->
         views=views,
         mass=_mass(run, meta, sequence) if meta.get("metric", True) else None,
         surface=None if fitted is None else load_surface(run, fitted, views),
+        splats=None if fitted is None else _splats(run, fitted),
     )
 
 
@@ -185,6 +189,20 @@ def open_sequence(catalog: Catalog, sequence_id: str) -> Content:
         markers=Markers.of(sequence),
         views=sequence.views,
     )
+
+
+def _splats(run: Run, fitted: ObjectRollout) -> Splats | None:
+    """Load the splats of a run's object; None if none were fitted."""
+    if not run.has(SPLATS_FILE):
+        return None
+    with reading(run.out / SPLATS_FILE):
+        splats = Splats.from_tensors(run.tensors(SPLATS_FILE))
+        if len(splats.rest_node) != fitted.model.node_count:
+            raise ValueError(
+                f"rest_node has {len(splats.rest_node)} nodes, but the object has "
+                f"{fitted.model.node_count}."
+            )
+    return splats
 
 
 def _mass(run: Run, meta: RecordingFile, sequence: Sequence | None) -> ObjectMass | None:

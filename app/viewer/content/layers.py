@@ -1,6 +1,6 @@
 """Which parts of a scene are shown, and in which colors."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 from app.viewer.content.content import Content
@@ -25,6 +25,10 @@ Coloring = Literal[
 """Quantity by which nodes, surface and springs are colored."""
 COLORINGS: tuple[Coloring, ...] = get_args(Coloring)
 
+ObjectForm = Literal["splats", "surface", "nodes"]
+"""What an object can be shown as."""
+OBJECT_FORMS: tuple[ObjectForm, ...] = get_args(ObjectForm)
+
 PLAYING_SPRINGS = 2_000
 """Most springs that are streamed while the clock is running."""
 
@@ -39,6 +43,9 @@ class Layers:
     """Object nodes."""
     surface: bool = False
     """Smooth surface of the object, which follows its nodes."""
+    splats: bool = False
+    """Splats of the object in the colors of the recording; its surface stands for those that there
+    are not, and where colors mean something else."""
     controls: bool = True
     """Control nodes that hold the object by a virtual spring."""
     all_controls: bool = False
@@ -72,24 +79,45 @@ class Layers:
 def default_layers(content: Content) -> Layers:
     """Choose what is shown at first: the result if there is one, else the recording.
 
-    Nodes and springs would hide the surface of an object, and come in its place if it has none.
+    Nodes and springs would hide what an object looks like, and come in its place if nothing tells
+    that. Splats tell it best.
     Hands without an object are seen as the first camera with a picture saw them, before it.
     """
-    has_object, has_surface = content.fitted is not None, content.surface is not None
+    has_object = content.fitted is not None
+    has_splats, has_surface = content.splats is not None, content.surface is not None
+    has_look = has_splats or has_surface
     seen_from = [view.name for view in content.views if view.has_color]
     is_before_video = bool(content.hands and seen_from) and not has_object
     return Layers(
-        surface=has_surface,
-        nodes=not has_surface,
-        controls=not has_surface,
-        virtual_springs=not has_surface,
+        surface=has_surface and not has_splats,
+        splats=has_splats,
+        nodes=not has_look,
+        controls=not has_look,
+        virtual_springs=not has_look,
         observed=not has_object or (content.tracks is not None and content.tracks.node is not None),
         cameras=not has_object and bool(content.views),
         object_springs=content.fitted is not None
-        and not has_surface
+        and not has_look
         and has_few_springs(content.fitted),
         looks_from=seen_from[0] if is_before_video else None,
     )
+
+
+def with_surface_for_splats(layers: Layers) -> Layers:
+    """Show the surface where splats were asked for and cannot be shown."""
+    return replace(layers, splats=False, surface=layers.surface or layers.splats)
+
+
+def next_form(layers: Layers, content: Content) -> ObjectForm:
+    """Find as what the object is to be shown after what it is shown as now."""
+    forms: list[tuple[ObjectForm, bool]] = [
+        ("splats", content.splats is not None),
+        ("surface", content.surface is not None),
+        ("nodes", True),
+    ]
+    order: list[ObjectForm] = [form for form, is_there in forms if is_there]
+    shown = [at for at, form in enumerate(order) if getattr(layers, form)]
+    return order[(shown[0] + 1) % len(order)] if shown else order[0]
 
 
 def has_few_springs(rollout: ObjectRollout) -> bool:

@@ -226,6 +226,8 @@ def _layers_there(content: Content) -> set[str]:
         there.add("hands")
     if content.fitted is not None:
         there |= {"nodes", "surface", "virtual_springs", "object_springs", "forces", "all_controls"}
+    if content.splats is not None:
+        there.add("splats")
     if content.control is not None:
         there.add("controls")
     if content.observed is not None:

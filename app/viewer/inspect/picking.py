@@ -82,7 +82,7 @@ def pick(ray: Ray, target: Target, *, prefers_hand: bool = False) -> Pick | None
     """Find what a click means; None if there is nothing near it.
 
     Nodes come before springs, and both before the hand, through which they are seen; of the
-    object's surface and the hand the nearer one counts.
+    object's surface, which splats lie around, and the hand the nearer one counts.
 
     Args:
         ray: Where it points.
@@ -96,7 +96,7 @@ def pick(ray: Ray, target: Target, *, prefers_hand: bool = False) -> Pick | None
     found = None
     if target.rollout is not None:
         found = _pick_object(ray, target, target.rollout)
-        if found is None and layers.surface:
+        if found is None and (layers.surface or layers.splats):
             found = _pick_surface(ray, target, target.rollout, within=hand_depth)
     elif content.control is not None and layers.controls:
         at = _nearest(ray, np.asarray(content.control[frame]), target.spacing)

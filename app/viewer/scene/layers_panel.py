@@ -14,6 +14,7 @@ from app.viewer.content.layers import (
     BLUE,
     GREEN,
     GREY,
+    OBJECT_FORMS,
     PURPLE,
     RED,
     SKIN,
@@ -22,6 +23,7 @@ from app.viewer.content.layers import (
     YELLOW,
     Layers,
     Theme,
+    next_form,
 )
 from app.viewer.scene.cameras import pose_of_view
 from app.viewer.scene.framing import Framing
@@ -72,6 +74,10 @@ def legend_of(content: Content, layers: Layers) -> str:
 
 
 _OVERVIEW = "Overview"
+_HINTS = {
+    "splats": "The object as the cameras saw it. Where colors mean a quantity, and in comparisons, "
+    "its surface is shown in their place"
+}
 
 
 def _grid_label(content: Content, framing: Framing) -> str:
@@ -91,6 +97,7 @@ class LayersPanel:
         self._guard = guard
         self._redraw = redraw
         self._layers = Layers()
+        self._content: Content | None = None
         self._switches: dict[str, viser.GuiCheckboxHandle] = {}
         self._views: dict[str, View] = {}
         self._framing: Framing | None = None
@@ -101,6 +108,7 @@ class LayersPanel:
             ("hands", "Hands"),
             ("nodes", "Object nodes"),
             ("surface", "Surface"),
+            ("splats", "Splats"),
             ("controls", "Control nodes"),
             ("all_controls", "All control nodes"),
             ("virtual_springs", "Virtual springs"),
@@ -110,7 +118,7 @@ class LayersPanel:
             ("cameras", "Cameras"),
             ("ground", "Grid"),
         ):
-            switch = gui.add_checkbox(label, initial_value=True)
+            switch = gui.add_checkbox(label, initial_value=True, hint=_HINTS.get(field))
             switch.on_update(guard.by_user(self._switch(field)))
             self._switches[field] = switch
         self._scale = gui.add_slider(
@@ -122,12 +130,13 @@ class LayersPanel:
         self._theme = gui.add_dropdown("Background", THEMES)
         self._theme.on_update(guard.by_user(lambda _: self._dress()))
         bind(server, guard, "layer", lambda _, number: self._press(LAYER_KEYS[number][0]))
+        bind(server, guard, "form", lambda _, __: self._next_form())
         bind(server, guard, "theme", lambda _, __: self._turn_theme())
         self._prefers_dark = False
 
     def replace(self, content: Content, layers: Layers, framing: Framing) -> None:
         """Show the switches that a content needs, as its layers stand."""
-        self._layers, self._framing = layers, framing
+        self._layers, self._framing, self._content = layers, framing, content
         layers.dark, layers.force_scale = self._is_dark, self._scale.value
         has_object = content.fitted is not None
         has_control = content.control is not None
@@ -135,6 +144,7 @@ class LayersPanel:
             "hands": bool(content.hands or content.skeletons),
             "nodes": has_object,
             "surface": content.surface is not None,
+            "splats": content.splats is not None,
             "controls": has_control,
             "all_controls": has_object,
             "virtual_springs": has_object,
@@ -196,6 +206,17 @@ class LayersPanel:
             if switch.visible:
                 switch.value = not switch.value
                 setattr(self._layers, field, switch.value)
+        self._redraw()
+
+    def _next_form(self) -> None:
+        """Show the object as the next of what it can be shown as, and as nothing else."""
+        with self._turn:
+            if self._content is None or self._content.fitted is None:
+                return
+            chosen = next_form(self._layers, self._content)
+            for form in OBJECT_FORMS:
+                setattr(self._layers, form, form == chosen)
+                self._switches[form].value = form == chosen
         self._redraw()
 
     def _turn_theme(self) -> None:

@@ -5,9 +5,11 @@ from typing import Any
 
 import numpy as np
 import viser
+import viser._messages as messages
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 from numpy import ndarray
 
+from app.viewer.scene.splat_groups import SplatGroups
 from physhandi.srgb import to_linear
 
 _GRID = {
@@ -16,6 +18,8 @@ _GRID = {
 }
 """Colors of the grid's thin and thick lines on a light and on a dark background."""
 
+_STILL = 1e-7
+"""By so little a group of splats may be elsewhere, in metres and parts of a quaternion, unseen."""
 _DARKEST = 32
 """Least brightness of a mesh's own color, by which those of its vertices are divided."""
 _LINEAR = np.round(255 * to_linear(np.arange(256) / 255)).astype(np.uint8)
@@ -28,6 +32,7 @@ class SceneNodes:
     def __init__(self, server: viser.ViserServer) -> None:
         self._scene = server.scene
         self._nodes: dict[str, Any] = {}
+        self._splats: dict[str, _MovedSplats] = {}
 
     def __contains__(self, name: str) -> bool:
         return name in self._nodes
@@ -37,6 +42,7 @@ class SceneNodes:
         for node in reversed(self._nodes.values()):
             node.remove()
         self._nodes.clear()
+        self._splats.clear()
 
     def hide(self, *paths: str) -> None:
         """Hide all nodes, or those whose path begins with one of these."""
@@ -130,6 +136,24 @@ class SceneNodes:
         elif node is not None and is_visible:
             node.batched_positions = np.asarray(point, dtype=np.float32)
             node.batched_colors = np.asarray(color, dtype=np.uint8)
+        self.show(name, is_visible=is_visible)
+
+    def splats(
+        self, name: str, groups: SplatGroups, node: Float[ndarray, "node 3"], *, is_visible: bool
+    ) -> None:
+        """Draw splats where the nodes of their object carry them.
+
+        Args:
+            name: Path below which there is a node a group.
+            groups: The splats; always the same ones below this path.
+            node: The object's nodes [m].
+            is_visible: Whether to show them.
+        """
+        if is_visible:
+            if name not in self._nodes:
+                self._nodes[name] = self._scene.add_frame(name, show_axes=False)
+                self._splats[name] = _MovedSplats(self._scene, name, groups)
+            self._splats[name].move(node)
         self.show(name, is_visible=is_visible)
 
     def frame(self, name: str, position: Float[ndarray, " 3"]) -> None:
@@ -244,6 +268,47 @@ class SceneNodes:
         cell, section = _GRID[is_dark]
         if node is not None and tuple(node.cell_color) != cell:
             node.cell_color, node.section_color = cell, section
+
+
+class _MovedSplats:
+    """The nodes of one object's groups of splats."""
+
+    def __init__(self, scene: viser.SceneApi, name: str, groups: SplatGroups) -> None:
+        self._queue: Any = scene._queue_scene_message  # pyright: ignore[reportPrivateUsage]  # see `move`
+        self._groups = groups
+        splats = groups.splats
+        # Squares of a millimetre would have three digits in the 16-bit floats that are sent.
+        unit = float(splats.scale.max())
+        offset = (splats.center - groups.middle[groups.group]) / unit
+        covariance = np.square(splats.scale / unit)[:, None, None] * np.eye(3)
+        self._nodes: list[Any] = []
+        for group in range(groups.count):
+            of_group = groups.group == group
+            node = scene.add_gaussian_splats(
+                f"{name}/{group:03d}",
+                offset[of_group],
+                covariance[of_group],
+                splats.color[of_group],
+                splats.opacity[of_group, None],
+                scale=unit,
+            )
+            self._nodes.append(node)
+        self._pose = np.full((groups.count, 7), np.nan)
+
+    def move(self, node: Float[ndarray, "node 3"]) -> None:
+        """Move the groups that are elsewhere when the object's nodes are there.
+
+        The setters of viser compare two numbers at a time, which takes seven times as long.
+        """
+        pose = np.concatenate(self._groups.poses(node), axis=1)
+        is_still = np.abs(pose - self._pose).max(axis=1) <= _STILL  # Of nowhere: not a number.
+        moved = np.flatnonzero(~is_still)
+        for group in moved:
+            its, at = self._nodes[group], pose[group]
+            its._impl.wxyz[:], its._impl.position[:] = at[:4], at[4:]
+            self._queue(messages.SetOrientationMessage(its.name, tuple(at[:4].tolist())))
+            self._queue(messages.SetPositionMessage(its.name, tuple(at[4:].tolist())))
+        self._pose[moved] = pose[moved]
 
 
 def with_mean(color: UInt8[ndarray, "vertex 3"]) -> UInt8[ndarray, "mean_and_vertex 3"]:

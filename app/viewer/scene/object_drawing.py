@@ -19,6 +19,7 @@ from app.viewer.content.layers import (
 )
 from app.viewer.scene.framing import Framing
 from app.viewer.scene.nodes import SceneNodes
+from app.viewer.scene.splat_groups import SplatGroups
 from physhandi.object_rollout import ObjectRollout
 from physhandi.simulation.model import SpringMassModel
 from physhandi.simulation.object_surface import ObjectSurface
@@ -165,6 +166,7 @@ class ObjectDrawing:
         longest: float,
         painted: Painted | None = None,
         surface: ObjectSurface | None = None,
+        splats: SplatGroups | None = None,
     ) -> None:
         """Bring the object to a frame.
 
@@ -178,6 +180,7 @@ class ObjectDrawing:
             painted: Colors of nodes, surface and springs; None for those of the style, and for
                 what the surface looks like.
             surface: The object's surface; None if it has none.
+            splats: The object's splats; None if it has none.
         """
         root, count = self._root, rollout.model.object_spring_count
         position = np.asarray(rollout.position[frame], dtype=np.float32)
@@ -190,6 +193,8 @@ class ObjectDrawing:
         self._balls(f"{root}/object/nodes", position[shown], color, size, is_visible=is_visible)
         if surface is not None and surface.node_count == len(position):
             self._draw_surface(surface, position, painted, is_visible=layers.surface)
+        if splats is not None:
+            self._nodes.splats(f"{root}/object/splats", splats, position, is_visible=layers.splats)
         self.draw_controls(control, self.attached(rollout, frame), layers)
         point = np.concatenate([position, control])
         own = np.arange(count)[_thinned(count, budget.springs)]

@@ -12,7 +12,14 @@ from numpy import ndarray
 from app.viewer.color.coloring import Painted, Painter
 from app.viewer.color.hand_coloring import HandPainter
 from app.viewer.content.content import Content
-from app.viewer.content.layers import GREEN, GREY, SKIN, Layers, default_layers
+from app.viewer.content.layers import (
+    GREEN,
+    GREY,
+    SKIN,
+    Layers,
+    default_layers,
+    with_surface_for_splats,
+)
 from app.viewer.content.observed import BONES
 from app.viewer.scene.cameras import BACKDROP_BYTES, CameraNodes, pose_of_view
 from app.viewer.scene.framing import Framing
@@ -23,6 +30,7 @@ from app.viewer.scene.object_drawing import (
     automatic_force_unit,
     share_bytes,
 )
+from app.viewer.scene.splat_groups import SplatGroups
 from physhandi.object_rollout import ObjectRollout
 
 FRAME_BYTES = 92_000
@@ -30,6 +38,8 @@ FRAME_BYTES = 92_000
 _ARROWS = 800
 _PLAYING_ARROWS = 400
 _PLAYING_OBSERVED = 2_000
+_GROUP_BYTES = 70
+"""What the pose of a group of splats weighs, packed."""
 _LEAST_BYTES = 12_000
 """Springs and arrows get at least this much of a playing frame."""
 _OBSERVED = 0.1
@@ -68,6 +78,7 @@ class SceneDrawing:
         self.layers = default_layers(content)
         self._nodes = SceneNodes(server)
         self._object = ObjectDrawing(self._nodes, framing)
+        self._splats: SplatGroups | None = None
         self._force_unit = automatic_force_unit(content.fitted, framing)
         self.painter = Painter(content)
         self.hand_painter = HandPainter(content)
@@ -102,6 +113,8 @@ class SceneDrawing:
         rollout = rollout if rollout is not None and rollout.ready > 0 else None
         self.painter.weigh(self.layers.mass)
         layers = self.layers if hands is None else _without_observed(self.layers)
+        if layers.splats and not self._has_splats(rollout, layers):
+            layers = with_surface_for_splats(layers)
         painted = None if rollout is None else self.painter.paint(rollout, rollout_frame, layers)
         with self._server.atomic():
             self._draw_hands(frame, hands)
@@ -114,11 +127,12 @@ class SceneDrawing:
                     rollout,
                     rollout_frame,
                     layers,
-                    self._budget(rollout) if is_playing else Budget(arrows=_ARROWS),
+                    self._budget(rollout, layers) if is_playing else Budget(arrows=_ARROWS),
                     force_unit=self._force_unit,
                     longest=0.22 * self._framing.extent,
                     painted=painted,
                     surface=self._content.surface,
+                    splats=self._splats,
                 )
             elif self._content.control is not None:
                 control = np.asarray(self._content.control[frame], dtype=np.float32)
@@ -245,9 +259,17 @@ class SceneDrawing:
         line = np.stack([marker, node], axis=1)[is_seen]
         self._nodes.segments("/markers/offset", line, GREEN, 2.0, is_visible=is_visible)
 
-    def _budget(self, rollout: ObjectRollout) -> Budget:
+    def _has_splats(self, rollout: ObjectRollout | None, layers: Layers) -> bool:
+        """Tell whether the object can be shown as splats, and get them ready."""
+        splats = self._content.splats
+        if splats is None or rollout is None or layers.color != "plain":
+            return False
+        if self._splats is None:
+            self._splats = SplatGroups.of(splats)
+        return len(splats.rest_node) == rollout.model.node_count
+
+    def _budget(self, rollout: ObjectRollout, layers: Layers) -> Budget:
         """Share what the points of a playing frame leave of its bytes."""
-        layers = self.layers
         point_count = len(self._object.attached(rollout))
         colored = 0 if layers.color == "plain" else rollout.model.node_count // 4
         point_count += rollout.model.node_count + colored if layers.nodes else 0
@@ -260,6 +282,8 @@ class SceneDrawing:
             point_count += surface.vertex_count
             point_count += 0 if layers.color == "plain" else surface.vertex_count // 4
         left = self._frame_bytes - 12 * point_count
+        if layers.splats and self._splats is not None:
+            left -= _GROUP_BYTES * self._splats.count
         left -= BACKDROP_BYTES if layers.looks_from is not None else 0
         budget = share_bytes(left, rollout, layers, _PLAYING_ARROWS)
         if left >= _LEAST_BYTES or not layers.surface:
