@@ -40,6 +40,7 @@ from app.jobs.recordings.uploads import Uploads
 from app.jobs.recovery.aside import MovedFolder
 from app.jobs.recovery.recovery import Recovery
 from app.jobs.scheduler import Scheduler
+from app.jobs.storage.retention import Retention
 from app.jobs.streams import News, Streams
 from app.jobs.ticket import Priority
 from app.jobs.views import (
@@ -280,6 +281,7 @@ def create_api(
     imports: Imports,
     uploads: Uploads,
     recovery: Recovery,
+    retention: Retention,
 ) -> APIRouter:
     """Make the routes.
 
@@ -295,6 +297,7 @@ def create_api(
         imports: Makes sequences of recordings.
         uploads: Takes what is sent.
         recovery: Knows what is damaged.
+        retention: Knows what may go.
     """
     router = APIRouter(prefix="/api/v1")
     _add_listings(router, catalog, scheduler)
@@ -308,6 +311,7 @@ def create_api(
     _add_streams(router, catalog, scheduler, feed, machine)
     _add_system(router, overview)
     _add_recovery(router, scheduler, recovery)
+    _add_retention(router, retention)
     return router
 
 
@@ -716,6 +720,20 @@ def _add_recovery(router: APIRouter, scheduler: Scheduler, recovery: Recovery) -
     def set_sequence_aside(sequence_id: ItemId) -> dict[str, str]:
         """Move a sequence that cannot be read to `damaged/sequences`; nothing is deleted."""
         return answer(recovery.set_sequence_aside(sequence_id))
+
+
+def _add_retention(router: APIRouter, retention: Retention) -> None:
+    @router.get("/retention")
+    def show_retention() -> dict[str, Any]:
+        """Tell what may go by the settings of the server; nothing is changed."""
+        return retention.describe()
+
+    @router.post("/retention")
+    def remove_expendable() -> dict[str, Any]:
+        """Remove what may go now, as the server does by itself every hour."""
+        gone = retention.remove()
+        total = sum(item.bytes for item in gone)
+        return {"removed": [asdict(item) for item in gone], "bytes": total}
 
 
 def _add_system(router: APIRouter, overview: Overview) -> None:

@@ -89,6 +89,14 @@ class AuditLog:
         made = {} if run_id is None else {"run_id": run_id}
         self.write({"who": who, "may_change": True, "what": what, **made, "status": 200})
 
+    def note_removed(self, told: Mapping[str, Any]) -> None:
+        """Note what the server has removed by its rules.
+
+        Args:
+            told: What it was, as plain values.
+        """
+        self.write({"who": "server", "may_change": True, **told, "status": 200})
+
     def _may_write_refused(self, now: float) -> bool:
         times = self._refused
         if len(times) == MOST_REFUSED and 0.0 <= now - times[0] < _MINUTE:

@@ -4,8 +4,8 @@ import errno
 import logging
 import socket
 import threading
-from collections.abc import AsyncGenerator, Callable
-from contextlib import asynccontextmanager
+from collections.abc import AsyncGenerator, Callable, Sequence
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from types import FrameType
 from typing import Any
 
@@ -37,6 +37,7 @@ from app.jobs.recordings.models import ModelFolders
 from app.jobs.recordings.uploads import Uploads
 from app.jobs.recovery.recovery import Recovery
 from app.jobs.scheduler import QueueFullError, Scheduler
+from app.jobs.storage.retention import Retention
 from app.jobs.storage.room import NoRoomError
 from app.jobs.views import describe_run
 from app.jobs.watch import Feed
@@ -113,26 +114,22 @@ def create_app(
     tasks = tasks or BackgroundTasks(scheduler.room)
     imports = Imports(settings, catalog, tasks)
     recovery = Recovery(settings, catalog, scheduler, tasks)
+    uploads = Uploads(settings, tasks, scheduler.room)
+    retention = Retention(settings, catalog, scheduler, uploads, audit_log.note_removed)
     pages = Pages()
     previews = Previews(settings, catalog)
     file_cache = FileCache(settings.data_dir / "cache" / "exports")
 
-    @asynccontextmanager
-    async def lifespan(_: FastAPI) -> AsyncGenerator[None]:
-        scheduler.start()
-        previews.start()
-        recovery.start()
-        yield
-        tasks.shutdown()
-        previews.shutdown()
-        scheduler.shutdown()
-        sessions.shutdown()
-        file_cache.close()
-
     app = FastAPI(
         title="PhysHanDI",
         version=__version__,
-        lifespan=lifespan,
+        lifespan=_while_serving(
+            [scheduler.start, previews.start, recovery.start, retention.start],
+            [
+                *(retention.shutdown, tasks.shutdown, previews.shutdown),
+                *(scheduler.shutdown, sessions.shutdown, file_cache.close),
+            ],
+        ),
         openapi_url="/api/v1/openapi.json",
         docs_url=None,
         redoc_url=None,
@@ -152,8 +149,9 @@ def create_app(
             tasks=tasks,
             annotations=Annotations(catalog, tasks, models),
             imports=imports,
-            uploads=Uploads(settings, tasks, scheduler.room),
+            uploads=uploads,
             recovery=recovery,
+            retention=retention,
         )
     )
     app.include_router(
@@ -168,6 +166,7 @@ def create_app(
             imports=imports,
             models=models,
             recovery=recovery,
+            retention=retention,
             suites=settings.suite_dir,
         )
     )
@@ -184,6 +183,22 @@ def create_app(
     _answer_errors(app, pages)
     _guard(app, security, figures, audit_log)
     return app
+
+
+def _while_serving(
+    begin: Sequence[Callable[[], None]], end: Sequence[Callable[[], None]]
+) -> Callable[[FastAPI], AbstractAsyncContextManager[None]]:
+    """Say what is started before the first request, and ended after the last."""
+
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncGenerator[None]:
+        for start in begin:
+            start()
+        yield
+        for stop in end:
+            stop()
+
+    return lifespan
 
 
 def _storage(

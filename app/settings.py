@@ -94,6 +94,17 @@ class ServerSettings(BaseSettings):
     """Free space of its disk below which nothing new is begun in it [GiB]."""
     upload_gib: float = Field(default=20.0, gt=0, le=10_000)
     """Size of an upload at most, unpacked [GiB]; 5 % of the disk stay free in any case."""
+    keep_attempts_days: float | None = Field(default=None, ge=0, le=100_000)
+    """Days after its end for which a run keeps attempts that have not published its results; None
+    for ever. A failed fit that has none begins afresh when it is resumed."""
+    keep_logs_days: float | None = Field(default=None, ge=0, le=100_000)
+    """Days after its end for which a run keeps its log; None for ever."""
+    keep_cache_days: float | None = Field(default=None, ge=0, le=100_000)
+    """Days without use for which small pictures and exports are kept; None for ever."""
+    cache_gib: float | None = Field(default=None, ge=0, le=100_000)
+    """Size of both above which the oldest go [GiB]; None for any."""
+    keep_uploads_days: float | None = Field(default=7.0, ge=0, le=100_000)
+    """Days after its last piece for which an unfinished upload is kept; None for ever."""
     cancel_grace_s: float = Field(default=8.0, gt=0, le=600)
     """Time that a cancelled fit has to stop by itself before it is killed [s]."""
     hung_after_s: float = Field(default=120.0, ge=0.1, le=86_400)

@@ -109,6 +109,13 @@ async function act(button) {
   dispatchEvent(new Event("run-changed"));
 }
 
+async function removeExpendable() {
+  if (!confirm("Remove everything that is listed? It cannot be brought back.")) return;
+  const { removed, bytes } = await send("POST", "/api/v1/retention");
+  toast(`${removed.length} removed, ${(bytes / 1048576).toFixed(1)} MiB`);
+  location.reload();
+}
+
 async function setPriority(button) {
   const { id, priority } = button.dataset;
   const { place } = await send("POST", `/api/v1/runs/${id}/priority`, { priority });
@@ -209,6 +216,7 @@ document.addEventListener("click", (event) => {
   const data = button.dataset;
   if ("open" in data) busy(button, () => openScene(button));
   else if ("act" in data) busy(button, () => act(button));
+  else if ("removeExpendable" in data) busy(button, removeExpendable);
   else if ("priority" in data) busy(button, () => setPriority(button));
   else if ("aside" in data) busy(button, () => moveAside(button));
   else if ("delete" in data) busy(button, () => remove(button));

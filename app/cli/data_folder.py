@@ -8,10 +8,13 @@ from app.cli.lookup import read_settings
 from app.cli.output import AsJson, DataDir, show
 from app.exports.shares import Shares
 from app.jobs.catalog import Catalog
+from app.jobs.recordings.background import BackgroundTasks
+from app.jobs.recordings.uploads import Uploads
 from app.jobs.recovery.aside import moved_folders
 from app.jobs.recovery.left_behind import find_left_behind
 from app.jobs.recovery.recovery import damaged_folders
 from app.jobs.scheduler import Scheduler, server_of
+from app.jobs.storage.retention import Retention
 from app.settings import ServerSettings
 from app.viewer.physics.presets import PresetStore
 from physhandi.data.run_folder import read_mapping
@@ -63,7 +66,7 @@ def look_through(data_dir: Path | None) -> Iterator[tuple[bool, str]]:
         yield False, f"FAIL  {folder.kind}/{folder.id}: {folder.why}"
     for problem in _other_problems(settings):
         yield False, f"FAIL  {problem}"
-    for remark in _remarks(settings):
+    for remark in (*_remarks(settings), *_expendable(settings, catalog)):
         yield True, f"note  {remark}"
 
 
@@ -78,6 +81,23 @@ def _other_problems(settings: ServerSettings) -> Iterator[str]:
         yield f"shared page: {problem}"
     if not os.access(settings.data_dir, os.R_OK | os.W_OK | os.X_OK):
         yield f"{settings.data_dir}: files cannot be written here; change its permissions"
+
+
+def _expendable(settings: ServerSettings, catalog: Catalog) -> Iterator[str]:
+    """Say what a server with these settings would remove, by the rule that lets it go."""
+    uploads = Uploads(settings, BackgroundTasks())
+    scheduler = Scheduler(settings, catalog)
+    retention = Retention(settings, catalog, scheduler, uploads, lambda _: None)
+    items = retention.listed()
+    for rule, limit in retention.rules.items():
+        going = [item for item in items if item.rule == rule]
+        if going:
+            names = ", ".join(item.name for item in going[:5])
+            size = sum(item.bytes for item in going) / 2**20
+            yield (
+                f"{len(going)} would be removed by a server, {size:.1f} MiB ({rule}={limit:g}): "
+                f"{names}{', …' if len(going) > 5 else ''}"
+            )
 
 
 def _remarks(settings: ServerSettings) -> Iterator[str]:

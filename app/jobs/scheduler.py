@@ -6,7 +6,7 @@ import os
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -397,6 +397,28 @@ class Scheduler:
                 )
             run.delete()
             self._keys.note_deleted(run_id)
+
+    def has_ended(self, item: RunItem) -> bool:
+        """Tell whether a run has ended, and can be read."""
+        return self.view(item).state in ENDED - {"damaged"}
+
+    def do_if_ended(self, run_id: str, do: Callable[[Run], None]) -> bool:
+        """Do something with a run that has ended, while nobody starts it again.
+
+        Returns:
+            Whether it was done; False if the run is gone, damaged or not at its end.
+        """
+        with self._lock:
+            try:
+                item = self._catalog.run_item(run_id)
+            except UnknownRunError:
+                return False
+            if item.run is None or item.is_bundled or not self.has_ended(item):
+                return False
+            with following(item.folder) as is_mine:
+                if is_mine:
+                    do(item.run)
+            return is_mine
 
     def set_aside(self, run_id: str) -> MovedFolder:
         """Move the folder of a damaged run out of the way.

@@ -18,6 +18,7 @@ from app.jobs.recordings.imports import Imports
 from app.jobs.recordings.models import ModelFolders
 from app.jobs.recovery.recovery import Recovery
 from app.jobs.scheduler import ENDED, Scheduler
+from app.jobs.storage.retention import Retention
 from app.jobs.views import describe_results, describe_run, describe_sequence, follow_run
 from app.jobs.watch import Feed
 from app.pages.browse import add_lists
@@ -51,6 +52,7 @@ def create_pages(
     imports: Imports,
     models: ModelFolders,
     recovery: Recovery,
+    retention: Retention,
     suites: Path,
 ) -> APIRouter:
     """Make the routes of the pages.
@@ -66,6 +68,7 @@ def create_pages(
         imports: Finds recordings.
         models: Finds networks of the user.
         recovery: Knows what is damaged.
+        retention: Knows what may go.
         suites: Folder of suites.
     """
     router = APIRouter(include_in_schema=False)
@@ -75,7 +78,7 @@ def create_pages(
     add_imports(router, catalog, imports, pages)
     add_suites(router, suites, pages)
     _add_launch(router, catalog, overview, pages)
-    _add_recovery(router, recovery, pages)
+    _add_recovery(router, recovery, retention, pages)
 
     @router.get("/runs/{run_id}")
     def run(run_id: ItemId) -> HTMLResponse:
@@ -144,10 +147,13 @@ def create_pages(
     return router
 
 
-def _add_recovery(router: APIRouter, recovery: Recovery, pages: Pages) -> None:
+def _add_recovery(
+    router: APIRouter, recovery: Recovery, retention: Retention, pages: Pages
+) -> None:
     @router.get("/recovery")
     def show_recovery() -> HTMLResponse:
-        return pages.render("recovery.html", found=recovery.describe())
+        found, going = recovery.describe(), retention.describe()
+        return pages.render("recovery.html", found=found, going=going)
 
 
 def _add_launch(router: APIRouter, catalog: Catalog, overview: Overview, pages: Pages) -> None:

@@ -403,6 +403,17 @@ class RunFolder:
                 (self.folder / ATTEMPTS / str(latest + 1) / OUT).mkdir(parents=True)
                 prune(self.folder, keep={latest + 1})
 
+    def forget_attempts(self) -> None:
+        """Remove all attempts of an ended run but the one that has published its results.
+
+        Raises:
+            RunError: If a process works on the run.
+        """
+        with locked(self.folder):
+            if live_holder(self.folder) is not None:
+                raise RunError(f"Run '{self.id}' is running, so its attempts stay.")
+            prune(self.folder, keep=set())
+
     def request_cancel(self) -> None:
         """Ask the process that works on the run to stop."""
         write_bytes(self.folder / CANCEL, b"")

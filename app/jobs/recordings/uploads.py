@@ -31,7 +31,6 @@ CHUNK = 2**20
 """Size of a piece at most [bytes]; no request may bring more."""
 _WORKER = "app.jobs.recordings.unpacking"
 _MOST_UPLOADS = 20
-_KEPT_S = 7 * 86_400.0
 _KEPT_FREE = 0.05
 """Part of the disk that uploads leave to others."""
 _ABOUT = "upload.json"
@@ -69,6 +68,7 @@ class Uploads:
         """
         self._folder = settings.data_dir / "incoming"
         self._most = int(settings.upload_gib * 2**30)
+        self._kept_days = settings.keep_uploads_days
         self._places = {
             "captures": settings.capture_dir,
             "sequences": settings.sequence_dir,
@@ -260,13 +260,40 @@ class Uploads:
         """Stop checking an upload, which can be asked for again; does nothing if it is not."""
         self._tasks.cancel("upload", upload_id)
 
-    def _forget_old(self) -> None:
+    def left_alone(self) -> list[tuple[str, Path, float]]:
+        """List unfinished uploads, and what was never announced.
+
+        Returns:
+            Of each its id, its folder, and when something of it came last [s since 1970].
+        """
         if not self._folder.is_dir():
+            return []
+        return [
+            (path.name, path, max(one.stat().st_mtime for one in (path, *path.rglob("*"))))
+            for path in sorted(self._folder.iterdir())
+            if self._tasks.task("upload", path.name).state != "running"
+        ]
+
+    def remove_folder(self, upload_id: str) -> None:
+        """Remove what is left of an upload, announced or not.
+
+        Raises:
+            UnknownUploadError: If nothing is there.
+            RunError: If it is being checked.
+        """
+        with self._lock:
+            self._require_still(upload_id)
+            if upload_id not in {name for name, _, _ in self.left_alone()}:
+                raise UnknownUploadError(f"There is no upload '{upload_id}'.")
+            self._listed.pop(upload_id, None)
+            shutil.rmtree(self._folder / upload_id, ignore_errors=True)
+
+    def _forget_old(self) -> None:
+        if self._kept_days is None:
             return
-        for folder in self._folder.iterdir():
-            newest = max(path.stat().st_mtime for path in (folder, *folder.rglob("*")))
-            if time.time() - newest > _KEPT_S:
-                logger.warning("upload %s was left for a week and is removed", folder.name)
+        for name, folder, touched in self.left_alone():
+            if time.time() - touched > self._kept_days * 86_400.0:
+                logger.warning("upload %s was left alone and is removed", name)
                 shutil.rmtree(folder, ignore_errors=True)
 
     def _require_still(self, upload_id: str) -> None:
